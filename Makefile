@@ -1,0 +1,37 @@
+# `make demo`, `make test` and `make check` set up everything they need in .venv first.
+PYTHON ?= python3
+VENV ?= .venv
+RUN = $(VENV)/bin/python
+export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
+
+.PHONY: demo test check format benchmark clean
+
+$(VENV)/installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install --quiet --disable-pip-version-check --upgrade pip
+	$(RUN) -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	touch $@
+
+demo: $(VENV)/installed
+	$(RUN) -m crazysim demo
+
+test: $(VENV)/installed
+	$(RUN) -m pytest -n 2 $(TESTS)
+
+check: $(VENV)/installed
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/pyright
+	$(VENV)/bin/lint-imports --no-cache
+
+format: $(VENV)/installed
+	$(VENV)/bin/ruff format .
+	$(VENV)/bin/ruff check --fix .
+
+benchmark: $(VENV)/installed
+	$(RUN) benchmarks/step.py
+	$(RUN) benchmarks/compile.py
+	$(RUN) benchmarks/versus_crazyflow.py
+
+clean:
+	rm -rf $(VENV) .cache out dist build

@@ -1,0 +1,19 @@
+"""The cascade of the Crazyflie firmware, outermost first, for one drone with any leading axes."""
+
+from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
+from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque
+from crazysim.control.core import COMMAND_FIELDS, Control, command_size
+from crazysim.control.state import StateParams, state2attitude
+
+__all__ = [
+    "COMMAND_FIELDS",
+    "AllocationParams",
+    "AttitudeParams",
+    "Control",
+    "StateParams",
+    "attitude2force_torque",
+    "body_rate2force_torque",
+    "command_size",
+    "force_torque2rotor_vel",
+    "state2attitude",
+]

@@ -1,0 +1,64 @@
+"""The last step of the cascade: from a wrench to rotor speeds."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.control.core import allocation_matrix
+from crazysim.drones import Airframe
+from crazysim.dynamics.rotor import rotor_vel_of_thrust
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import matvec
+
+
+class AllocationParams(PyTree):
+    """Constants of the allocation; each is shared, or has one value per drone."""
+
+    thrust_min: Array = leaf("parameter", 1)
+    """Least thrust of a rotor that turns at all, N. (1,)"""
+    thrust_max: Array = leaf("parameter", 1)
+    """Largest thrust of one rotor, N. (1,)"""
+    arms: Array = leaf("parameter", 1)
+    """Torque per thrust about x, y (arm) and z (drag torque over thrust), m. (3,)"""
+    rpm2thrust: Array = leaf("parameter", 2)
+    """Thrust curve the controller believes in, N, N/rpm, N/rpm^2. (1, 3)"""
+    allocation_matrix: Array = leaf("parameter", 2)
+    """Wrench over the arms to rotor thrusts, 1. (n_rotors, 4)"""
+
+    @staticmethod
+    def create(airframe: Airframe) -> AllocationParams:
+        """Return the shared parameters of an airframe.
+
+        Raises:
+            ConfigError: If the airframe lacks one.
+        """
+        yaw_arm = airframe.value("controller.thrust2torque", ())
+        curve = airframe.value("rotors.thrust_curve")
+        return AllocationParams(
+            thrust_min=as_parameter(airframe.value("rotors.thrust_min", ())),
+            thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
+            arms=as_parameter([airframe.arm, airframe.arm, float(yaw_arm)]),
+            rpm2thrust=as_parameter(curve.reshape(-1, 3)),
+            allocation_matrix=as_parameter(allocation_matrix(airframe)),
+        )
+
+
+def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
+    """Return the rotor speeds that give a wrench, each within its limits.
+
+    Thrusts are shared out with the least-norm inverse of the mixing matrix and clipped one by one, as the
+    firmware's power distribution does. A collective thrust of zero or less stops the motors.
+
+    Args:
+        cmd: Collective thrust, N, and body torque, N m. (..., 4)
+        params: Constants, shared or with the leading axes of the command.
+
+    Returns:
+        Rotor speeds, rpm. (..., n_rotors)
+    """
+    p = params
+    force = cmd[..., :1]
+    thrusts = matvec(p.allocation_matrix, jnp.concatenate([force, cmd[..., 1:] / p.arms], axis=-1))
+    rotor_vel = rotor_vel_of_thrust(jnp.clip(thrusts, p.thrust_min, p.thrust_max), p.rpm2thrust)
+    return jnp.where(force > 0, rotor_vel, 0.0)

@@ -1,0 +1,163 @@
+"""The inner loop: from an attitude or body rates and a thrust to a wrench."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control.core import allocation_matrix
+from crazysim.drones import Airframe
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import matvec
+
+
+class AttitudeParams(PyTree):
+    """Gains and constants of the attitude and body-rate controllers; each is shared, or one per drone."""
+
+    kR: Array = leaf("parameter", 1)
+    """Gain on the rotation error, PWM. (3,)"""
+    kw: Array = leaf("parameter", 1)
+    """Gain on the body rates, PWM s/rad. (3,)"""
+    ki_m: Array = leaf("parameter", 1)
+    """Gain on the integral of the rotation error, PWM/(rad s). (3,)"""
+    kd_omega: Array = leaf("parameter", 1)
+    """Gain on the derivative of the body rates, PWM s^2/rad. (3,)"""
+    int_err_max: Array = leaf("parameter", 1)
+    """Limit of the integral of the rotation error, rad s. (3,)"""
+    torque_pwm_max: Array = leaf("parameter", 1)
+    """Limit of the torque command, PWM. (3,)"""
+    thrust_max: Array = leaf("parameter", 1)
+    """Largest thrust of one rotor, N. (1,)"""
+    pwm_min: Array = leaf("parameter", 1)
+    """Least PWM of a rotor that turns at all, PWM. (1,)"""
+    pwm_max: Array = leaf("parameter", 1)
+    """Largest PWM, PWM. (1,)"""
+    arms: Array = leaf("parameter", 1)
+    """Torque per thrust about x, y (arm) and z (drag torque over thrust), m. (3,)"""
+    mixing_matrix: Array = leaf("parameter", 2)
+    """Rotor thrusts to torque over the arms, 1. (3, n_rotors)"""
+    torque_allocation: Array = leaf("parameter", 2)
+    """Torque commands to PWM of each rotor, with the firmware's halves for roll and pitch, 1. (n_rotors, 3)"""
+
+    @staticmethod
+    def create(airframe: Airframe) -> AttitudeParams:
+        """Return the shared parameters of an airframe.
+
+        Raises:
+            ConfigError: If the airframe has no table for this controller.
+        """
+        yaw_arm = airframe.value("controller.thrust2torque", ())
+        # The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the
+        # least-norm share of a quadrotor in X. The same factors serve any other layout.
+        allocation = allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0]
+        gain = {
+            key: as_parameter(airframe.value(f"controller.attitude.{key}", (3,)))
+            for key in ("kR", "kw", "ki_m", "kd_omega", "int_err_max")
+        }
+        return AttitudeParams(
+            **gain,
+            torque_pwm_max=as_parameter(airframe.value("controller.torque_pwm_max", (3,))),
+            thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
+            pwm_min=as_parameter(airframe.value("controller.pwm_min", ())),
+            pwm_max=as_parameter(airframe.value("controller.pwm_max", ())),
+            arms=as_parameter([airframe.arm, airframe.arm, float(yaw_arm)]),
+            mixing_matrix=as_parameter(airframe.mixing_matrix),
+            torque_allocation=as_parameter(allocation),
+        )
+
+
+def attitude2force_torque(
+    quat: Array,
+    ang_vel: Array,
+    cmd: Array,
+    ang_vel_des: Array,
+    prev_ang_vel: Array,
+    prev_ang_vel_des: Array,
+    r_int_error: Array,
+    ctrl_freq: float,
+    *,
+    params: AttitudeParams,
+) -> tuple[Array, Array]:
+    """Return the wrench that turns the drone to an attitude, and the new integral.
+
+    The attitude part of the controller of Mellinger and Kumar (2011, eq. 10 to 13) as the Crazyflie firmware
+    has it: without the factor one half on the rotation error, with a derivative on the rates, in PWM units
+    that saturate torque by torque and rotor by rotor. A thrust of zero or less stops the motors.
+
+    Args:
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        cmd: Wanted roll, pitch, yaw, rad, and collective thrust, N. (..., 4)
+        ang_vel_des: Wanted body rates, rad/s. (..., 3)
+        prev_ang_vel: Angular velocity at the previous tick, rad/s. (..., 3)
+        prev_ang_vel_des: Wanted body rates at the previous tick, rad/s. (..., 3)
+        r_int_error: Integral of the rotation error, rad s. (..., 3)
+        ctrl_freq: Rate of this controller, Hz.
+        params: Gains, shared or with the leading axes of the state.
+
+    Returns:
+        Collective thrust, N, and body torque, N m (..., 4); the new integral, rad s (..., 3).
+    """
+    p = params
+    error = rotation.multiply(rotation.conjugate(rotation.from_rpy(cmd[..., :3])), quat)
+    rotation_error = 4 * error[..., 3:] * error[..., :3]  # vee(Rd^T R - R^T Rd)
+    rate_error_dot = ((ang_vel_des - prev_ang_vel_des) - (ang_vel - prev_ang_vel)) * ctrl_freq
+    r_int_error = jnp.clip(r_int_error - rotation_error / ctrl_freq, -p.int_err_max, p.int_err_max)
+    torque_pwm = -p.kR * rotation_error + p.kw * (ang_vel_des - ang_vel) + p.ki_m * r_int_error
+    # The firmware has no derivative about yaw.
+    torque_pwm = torque_pwm + p.kd_omega * rate_error_dot * jnp.asarray([1.0, 1.0, 0.0], quat.dtype)
+    torque_pwm = jnp.clip(torque_pwm, -p.torque_pwm_max, p.torque_pwm_max)
+
+    thrust = cmd[..., 3:4]
+    n_rotors = p.mixing_matrix.shape[-1]
+    newton_per_pwm = p.thrust_max / p.pwm_max
+    pwm = thrust / (n_rotors * newton_per_pwm) + matvec(p.torque_allocation, torque_pwm)
+    pwm = jnp.where(thrust > 0, jnp.clip(pwm, p.pwm_min, p.pwm_max), 0.0)
+    thrusts = pwm * newton_per_pwm
+    torque = p.arms * matvec(p.mixing_matrix, thrusts)
+    return jnp.concatenate([jnp.sum(thrusts, axis=-1, keepdims=True), torque], axis=-1), r_int_error
+
+
+def body_rate2force_torque(
+    quat: Array,
+    ang_vel: Array,
+    cmd: Array,
+    prev_ang_vel: Array,
+    prev_cmd: Array,
+    r_int_error: Array,
+    ctrl_freq: float,
+    *,
+    params: AttitudeParams,
+) -> tuple[Array, Array]:
+    """Return the wrench that follows body rates, and the new integral.
+
+    The firmware has no controller of its own for rates: a rate setpoint enters the attitude controller,
+    which meanwhile levels the drone at its present yaw. Set ``kR`` and ``ki_m`` to zero to follow rates alone.
+
+    Args:
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        cmd: Wanted body rates, rad/s, and collective thrust, N. (..., 4)
+        prev_ang_vel: Angular velocity at the previous tick, rad/s. (..., 3)
+        prev_cmd: Command of the previous tick. (..., 4)
+        r_int_error: Integral of the rotation error, rad s. (..., 3)
+        ctrl_freq: Rate of this controller, Hz.
+        params: Gains, shared or with the leading axes of the state.
+
+    Returns:
+        Collective thrust, N, and body torque, N m (..., 4); the new integral, rad s (..., 3).
+    """
+    yaw = rotation.to_rpy(quat)[..., 2:]
+    level = jnp.concatenate([jnp.zeros_like(ang_vel[..., :2]), yaw, cmd[..., 3:4]], axis=-1)
+    return attitude2force_torque(
+        quat,
+        ang_vel,
+        level,
+        cmd[..., :3],
+        prev_ang_vel,
+        prev_cmd[..., :3],
+        r_int_error,
+        ctrl_freq,
+        params=params,
+    )

@@ -1,0 +1,96 @@
+"""The outer loop: from a full-state setpoint to an attitude and a collective thrust."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim import rotation
+from crazysim.drones import Airframe
+from crazysim.pytree import PyTree, as_parameter, leaf
+
+
+class StateParams(PyTree):
+    """Gains and constants of the state controller; each is shared, or has one value per drone."""
+
+    mass: Array = leaf("parameter", 1)
+    """Mass the controller believes in, kg. (1,)"""
+    kp: Array = leaf("parameter", 1)
+    """Gain on position, N/m. (3,)"""
+    kd: Array = leaf("parameter", 1)
+    """Gain on velocity, N s/m. (3,)"""
+    ki: Array = leaf("parameter", 1)
+    """Gain on the integral of position, N/(m s). (3,)"""
+    gravity_vec: Array = leaf("parameter", 1)
+    """Gravitational acceleration the controller believes in, world frame, m/s^2. (3,)"""
+    thrust_scale: Array = leaf("parameter", 1)
+    """Thrust that comes out for one newton wanted: the firmware's mass_thrust does not fit its mass, 1. (1,)"""
+    int_err_max: Array = leaf("parameter", 1)
+    """Limit of the integral of position, m s. (3,)"""
+
+    @staticmethod
+    def create(airframe: Airframe) -> StateParams:
+        """Return the shared parameters of an airframe.
+
+        Raises:
+            ConfigError: If the airframe has no table for this controller.
+        """
+        to_pwm = airframe.value("controller.mass_thrust", ())
+        from_pwm = (
+            airframe.n_rotors
+            * airframe.value("rotors.thrust_max", ())
+            / airframe.value("controller.pwm_max", ())
+        )
+        return StateParams(
+            mass=as_parameter(airframe.value("controller.mass", ())),
+            kp=as_parameter(airframe.value("controller.state.kp", (3,))),
+            kd=as_parameter(airframe.value("controller.state.kd", (3,))),
+            ki=as_parameter(airframe.value("controller.state.ki", (3,))),
+            gravity_vec=as_parameter([0.0, 0.0, -9.81]),
+            thrust_scale=as_parameter(to_pwm * from_pwm),
+            int_err_max=as_parameter(airframe.value("controller.state.int_err_max", (3,))),
+        )
+
+
+def state2attitude(
+    pos: Array,
+    quat: Array,
+    vel: Array,
+    cmd: Array,
+    pos_err_i: Array,
+    ctrl_freq: float,
+    *,
+    params: StateParams,
+) -> tuple[Array, Array]:
+    """Return the attitude and thrust that lead to a full-state setpoint, and the new integral.
+
+    The position part of the controller of Mellinger and Kumar (2011, eq. 6 to 9) as the Crazyflie firmware
+    has it: a force that corrects position, velocity and their integral, a body z axis along it, and the x
+    axis that the wanted yaw leaves. A zero quaternion in the setpoint means yaw zero.
+
+    Args:
+        pos: Position, world frame, m. (..., 3)
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        vel: Velocity, world frame, m/s. (..., 3)
+        cmd: Setpoint: position, velocity, acceleration, quaternion, body rates (not used here). (..., 16)
+        pos_err_i: Integral of the position error, m s. (..., 3)
+        ctrl_freq: Rate of this controller, Hz.
+        params: Gains, shared or with the leading axes of the state.
+
+    Returns:
+        Roll, pitch, yaw, rad, and collective thrust, N (..., 4); the new integral, m s (..., 3).
+    """
+    p = params
+    pos_err, vel_err = cmd[..., 0:3] - pos, cmd[..., 3:6] - vel
+    pos_err_i = jnp.clip(pos_err_i + pos_err / ctrl_freq, -p.int_err_max, p.int_err_max)
+    force = p.mass * (cmd[..., 6:9] - p.gravity_vec) + p.kp * pos_err + p.kd * vel_err + p.ki * pos_err_i
+
+    yaw = rotation.yaw(cmd[..., 9:13])
+    cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
+    ahead, left = jnp.stack([cos, sin, zero], axis=-1), jnp.stack([-sin, cos, zero], axis=-1)
+    z_axis = rotation.safe_normalize(force, jnp.asarray([0.0, 0.0, 1.0], force.dtype))
+    y_axis = rotation.safe_normalize(rotation.cross(z_axis, ahead), left)
+    rpy = rotation.from_axes(rotation.cross(y_axis, z_axis), y_axis, z_axis)
+
+    thrust = p.thrust_scale * rotation.dot(force, rotation.z_axis(quat))
+    return jnp.concatenate([rpy, thrust], axis=-1), pos_err_i

@@ -1,0 +1,5 @@
+"""Airframes: the constants of a drone type, one TOML file each."""
+
+from crazysim.drones.airframe import Airframe, Drone, airframe_names, load_airframe
+
+__all__ = ["Airframe", "Drone", "airframe_names", "load_airframe"]

@@ -1,0 +1,6 @@
+"""Pure physics for one drone, with any leading axes."""
+
+from crazysim.dynamics import first_principles, fitted
+from crazysim.dynamics.core import Dynamics, supported_dynamics
+
+__all__ = ["Dynamics", "first_principles", "fitted", "supported_dynamics"]

@@ -1,0 +1,46 @@
+"""The dynamics models a simulation can be asked for."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from crazysim.drones import Airframe
+from crazysim.errors import ConfigError
+
+GRAVITY = (0.0, 0.0, -9.81)
+"""Gravitational acceleration, world frame, m/s^2: the value of the fits the airframes come from."""
+
+
+class Dynamics(StrEnum):
+    """Dynamics model."""
+
+    first_principles = "first_principles"
+    """Rotors with lag, thrust and torque curves, gyroscopic and reaction torque, drag, full inertia."""
+    so_rpy = "so_rpy"
+    """Second-order response of roll, pitch and yaw fitted to flights; thrust at once."""
+    so_rpy_rotor = "so_rpy_rotor"
+    """As ``so_rpy``, with a first-order lag of the collective thrust."""
+    so_rpy_rotor_drag = "so_rpy_rotor_drag"
+    """As ``so_rpy_rotor``, with linear drag in the body frame."""
+    default = first_principles
+
+
+def supported_dynamics(airframe: Airframe) -> tuple[Dynamics, ...]:
+    """Return the models for which an airframe has parameters."""
+    fitted = airframe.tables.get("fitted", {})
+    full = "thrust_curve" in airframe.table("rotors")
+    return tuple(d for d in Dynamics if (full if d == Dynamics.first_principles else d.value in fitted))
+
+
+def require_support(airframe: Airframe, dynamics: Dynamics) -> None:
+    """Check that an airframe has the parameters of a model.
+
+    Raises:
+        ConfigError: With the models it does have.
+    """
+    supported = supported_dynamics(airframe)
+    if dynamics not in supported:
+        raise ConfigError(
+            f"drone {airframe.name!r} has no parameters for dynamics {dynamics.value!r}; it has "
+            f"{', '.join(supported) or 'none'}. Pass one of these as dynamics=, or add the missing table to its TOML."
+        )

@@ -1,0 +1,155 @@
+"""A multirotor from first principles: rotors, rigid body and drag put together."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY, Dynamics, require_support
+from crazysim.dynamics.drag import drag_force
+from crazysim.dynamics.rigid_body import angular_acceleration, linear_acceleration
+from crazysim.dynamics.rotor import (
+    curve,
+    gyroscopic_torque,
+    reaction_torque,
+    rotor_acceleration,
+    rotor_torque,
+    rotor_vel_of_thrust,
+)
+from crazysim.pytree import PyTree, as_parameter, leaf
+
+
+class Params(PyTree):
+    """Parameters of the first-principles model; each is shared, or has one value per drone."""
+
+    mass: Array = leaf("parameter", 1)
+    """Mass, kg. (1,)"""
+    L: Array = leaf("parameter", 1)
+    """Arm that scales the first two rows of the mixing matrix, one or one per rotor, m. (1,)"""
+    prop_inertia: Array = leaf("parameter", 1)
+    """Inertia of a propeller with its motor about its axis, one or one per rotor, kg m^2. (1,)"""
+    gravity_vec: Array = leaf("parameter", 1)
+    """Gravitational acceleration, world frame, m/s^2. (3,)"""
+    J: Array = leaf("parameter", 2)
+    """Inertia about the centre of mass, body frame, kg m^2. (3, 3)"""
+    J_inv: Array = leaf("parameter", 2)
+    """Inverse of the inertia, body frame, 1/(kg m^2). (3, 3)"""
+    rpm2thrust: Array = leaf("parameter", 2)
+    """Thrust curve, one or one per rotor, N, N/rpm, N/rpm^2. (1, 3)"""
+    rpm2torque: Array = leaf("parameter", 2)
+    """Drag torque curve, one or one per rotor, N m, N m/rpm, N m/rpm^2. (1, 3)"""
+    mixing_matrix: Array = leaf("parameter", 2)
+    """Rotor thrusts to torque: positions over L, and signs of the drag torque, 1. (3, n_rotors)"""
+    drag_matrix: Array = leaf("parameter", 2)
+    """Linear drag coefficients, body frame, N s/m. (3, 3)"""
+    rotor_dyn_coef: Array = leaf("parameter", 2)
+    """Rotor lag on spin-up and spin-down, one or one per rotor, 1/s, 1/(s rpm). (1, 4)"""
+    rotor_vel_min: Array = leaf("parameter", 1)
+    """Least speed of a rotor that turns at all, one or one per rotor, rpm. (1,)"""
+    rotor_vel_max: Array = leaf("parameter", 1)
+    """Largest rotor speed, one or one per rotor, rpm. (1,)"""
+
+    @staticmethod
+    def create(airframe: Airframe) -> Params:
+        """Return the shared parameters of an airframe.
+
+        Raises:
+            ConfigError: If the airframe has no first-principles parameters.
+        """
+        require_support(airframe, Dynamics.first_principles)
+        thrust_curve = airframe.value("rotors.thrust_curve")
+        limits = np.array([airframe.value("rotors.thrust_min", ()), airframe.value("rotors.thrust_max", ())])
+        # In float64 whatever the simulation runs in: the limits are constants, not results.
+        k0, k1, k2 = np.atleast_2d(thrust_curve).T
+        low, high = ((-k1 + np.sqrt(k1**2 - 4 * k2 * (k0 - f))) / (2 * k2) for f in limits)
+        drag = airframe.value("drag.coefficients")
+        return Params(
+            mass=as_parameter(airframe.value("rigid_body.mass")),
+            L=as_parameter(airframe.arm),
+            prop_inertia=as_parameter(airframe.value("rotors.inertia")),
+            gravity_vec=as_parameter(GRAVITY),
+            J=as_parameter(airframe.inertia),
+            J_inv=as_parameter(np.linalg.inv(airframe.inertia)),
+            rpm2thrust=as_parameter(np.atleast_2d(thrust_curve)),
+            rpm2torque=as_parameter(np.atleast_2d(airframe.value("rotors.torque_curve"))),
+            mixing_matrix=as_parameter(airframe.mixing_matrix),
+            drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
+            rotor_dyn_coef=as_parameter(np.atleast_2d(airframe.value("rotors.lag"))),
+            rotor_vel_min=as_parameter(low),
+            rotor_vel_max=as_parameter(high),
+        )
+
+
+def dynamics(
+    pos: Array,
+    quat: Array,
+    vel: Array,
+    ang_vel: Array,
+    cmd: Array,
+    rotor_vel: Array,
+    dist_f: Array | None = None,
+    dist_t: Array | None = None,
+    *,
+    params: Params,
+) -> tuple[Array, Array, Array, Array]:
+    """Return the time derivatives of one multirotor.
+
+    Args:
+        pos: Position of the centre of mass, world frame, m. (..., 3)
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        vel: Velocity, world frame, m/s. (..., 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        cmd: Commanded rotor speeds, rpm. (..., n_rotors)
+        rotor_vel: Rotor speeds, rpm. (..., n_rotors)
+        dist_f: External force on the centre of mass, world frame, N. (..., 3)
+        dist_t: External torque, world frame, N m. (..., 3)
+        params: Parameters, shared or with the leading axes of the state.
+
+    Returns:
+        Velocity, m/s, acceleration, m/s^2 (both world frame), angular acceleration, rad/s^2 (body frame),
+        and rotor acceleration, rpm/s.
+    """
+    del pos  # nothing depends on the place: the argument keeps one signature for every model
+    p = params
+    thrust = curve(rotor_vel, p.rpm2thrust)
+    drag_torque = curve(rotor_vel, p.rpm2torque)
+    rotor_acc = rotor_acceleration(cmd, rotor_vel, p.rotor_dyn_coef)
+
+    collective = jnp.sum(thrust, axis=-1, keepdims=True)
+    force = collective * rotation.z_axis(quat) + drag_force(quat, vel, p.drag_matrix)
+    if dist_f is not None:
+        force = force + dist_f
+
+    sign = p.mixing_matrix[..., 2, :]
+    torque = rotor_torque(thrust, drag_torque, p.L, p.mixing_matrix)
+    torque = torque + gyroscopic_torque(ang_vel, rotor_vel, sign, p.prop_inertia)
+    torque = torque + reaction_torque(rotor_acc, sign, p.prop_inertia)
+    if dist_t is not None:
+        torque = torque + rotation.rotate_inverse(quat, dist_t)
+
+    acc = linear_acceleration(force, p.mass, p.gravity_vec)
+    return vel, acc, angular_acceleration(torque, ang_vel, p.J, p.J_inv), rotor_acc
+
+
+def saturate(cmd: Array, params: Params) -> Array:
+    """Return the rotor speeds a motor can take, rpm: off at zero or below, else within its limits.
+
+    Args:
+        cmd: Commanded rotor speeds, rpm. (..., n_rotors)
+        params: Parameters with the limits.
+
+    Returns:
+        Rotor speeds, rpm. (..., n_rotors)
+    """
+    return jnp.where(cmd <= 0, 0.0, jnp.clip(cmd, params.rotor_vel_min, params.rotor_vel_max))
+
+
+def hover_rotor_vel(params: Params) -> Array:
+    """Return the rotor speed at which the drone hovers, every rotor alike, rpm. (..., n_rotors)"""
+    n_rotors = params.mixing_matrix.shape[-1]
+    weight = params.mass * rotation.safe_norm(params.gravity_vec)
+    each = jnp.broadcast_to(weight / n_rotors, (*weight.shape[:-1], n_rotors))
+    return rotor_vel_of_thrust(each, params.rpm2thrust)

@@ -1,0 +1,187 @@
+"""The three models fitted to flights: roll, pitch and yaw answer a command like damped springs.
+
+    rpy'' = rpy_coef rpy + rpy_rates_coef rpy' + cmd_rpy_coef cmd_rpy
+
+The fit was made near level flight. Euler angles have no value at a pitch of 90 degrees, where the peer's
+formulas divide by zero; here the fit holds as it is up to 80 degrees of pitch, and from there to 88 degrees it
+hands over smoothly to a spring and damper on the attitude error itself, which exists everywhere. Beyond 80
+degrees no flight was fitted: the motion there is bounded and continuous, not identified.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY, Dynamics, require_support
+from crazysim.dynamics.drag import drag_force
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import matvec
+
+FITTED_UP_TO = math.cos(math.radians(80))
+HANDED_OVER_AT = math.cos(math.radians(88))
+
+
+class Params(PyTree):
+    """Parameters of a fitted model; each is shared, or has one value per drone."""
+
+    mass: Array = leaf("parameter", 1)
+    """Mass, kg. (1,)"""
+    gravity_vec: Array = leaf("parameter", 1)
+    """Gravitational acceleration, world frame, m/s^2. (3,)"""
+    J: Array = leaf("parameter", 2)
+    """Inertia about the centre of mass, body frame, kg m^2; enters with external torques only. (3, 3)"""
+    J_inv: Array = leaf("parameter", 2)
+    """Inverse of the inertia, body frame, 1/(kg m^2). (3, 3)"""
+    acc_coef: Array = leaf("parameter", 1)
+    """Thrust at command zero, N. (1,)"""
+    cmd_f_coef: Array = leaf("parameter", 1)
+    """Thrust per commanded thrust, 1. (1,)"""
+    rpy_coef: Array = leaf("parameter", 1)
+    """Stiffness of roll, pitch and yaw, 1/s^2. (3,)"""
+    rpy_rates_coef: Array = leaf("parameter", 1)
+    """Damping of roll, pitch and yaw, 1/s. (3,)"""
+    cmd_rpy_coef: Array = leaf("parameter", 1)
+    """Pull of the commanded roll, pitch and yaw, 1/s^2. (3,)"""
+    thrust_dyn_coef: Array | None = leaf("parameter", 1)
+    """Rate at which the thrust follows its command, 1/s; None where it follows at once. (1,)"""
+    drag_matrix: Array | None = leaf("parameter", 2)
+    """Linear drag coefficients, body frame, N s/m; None without drag. (3, 3)"""
+    thrust_min: Array = leaf("parameter", 1)
+    """Least collective thrust of rotors that turn at all, N. (1,)"""
+    thrust_max: Array = leaf("parameter", 1)
+    """Largest collective thrust, N. (1,)"""
+
+    @staticmethod
+    def create(airframe: Airframe, dynamics: Dynamics) -> Params:
+        """Return the shared parameters of an airframe for one of the fitted models.
+
+        Raises:
+            ConfigError: If the airframe was not fitted with that model.
+        """
+        require_support(airframe, dynamics)
+
+        def fitted(key: str) -> Array:
+            return as_parameter(airframe.value(f"fitted.{dynamics.value}.{key}"))
+
+        has_lag = dynamics in (Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
+        drag_matrix = None
+        if dynamics == Dynamics.so_rpy_rotor_drag:
+            drag = airframe.value("fitted.so_rpy_rotor_drag.drag_coefficients")
+            drag_matrix = as_parameter(np.diag(drag) if drag.ndim == 1 else drag)
+        return Params(
+            mass=as_parameter(airframe.value("rigid_body.mass")),
+            gravity_vec=as_parameter(GRAVITY),
+            J=as_parameter(airframe.inertia),
+            J_inv=as_parameter(np.linalg.inv(airframe.inertia)),
+            acc_coef=fitted("acc_coef"),
+            cmd_f_coef=fitted("cmd_f_coef"),
+            rpy_coef=fitted("rpy_coef"),
+            rpy_rates_coef=fitted("rpy_rates_coef"),
+            cmd_rpy_coef=fitted("cmd_rpy_coef"),
+            thrust_dyn_coef=fitted("thrust_dyn_coef") if has_lag else None,
+            drag_matrix=drag_matrix,
+            thrust_min=as_parameter(airframe.n_rotors * airframe.value("rotors.thrust_min", ())),
+            thrust_max=as_parameter(airframe.n_rotors * airframe.value("rotors.thrust_max", ())),
+        )
+
+
+def dynamics(
+    pos: Array,
+    quat: Array,
+    vel: Array,
+    ang_vel: Array,
+    cmd: Array,
+    rotor_vel: Array,
+    dist_f: Array | None = None,
+    dist_t: Array | None = None,
+    *,
+    params: Params,
+) -> tuple[Array, Array, Array, Array]:
+    """Return the time derivatives of one drone under a fitted model.
+
+    Args:
+        pos: Position of the centre of mass, world frame, m. (..., 3)
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        vel: Velocity, world frame, m/s. (..., 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        cmd: Roll, pitch, yaw, rad, and collective thrust, N. (..., 4)
+        rotor_vel: The thrust that the rotors give by now, N, in every entry; unused by ``so_rpy``. (..., k)
+        dist_f: External force on the centre of mass, world frame, N. (..., 3)
+        dist_t: External torque, world frame, N m. (..., 3)
+        params: Parameters, shared or with the leading axes of the state.
+
+    Returns:
+        Velocity, m/s, acceleration, m/s^2 (both world frame), angular acceleration, rad/s^2 (body frame),
+        and the rate of the thrust entries, N/s.
+    """
+    del pos  # nothing depends on the place: the argument keeps one signature for every model
+    p = params
+    thrust_cmd = cmd[..., 3:4]
+    if p.thrust_dyn_coef is None:
+        thrust, thrust_rate = thrust_cmd, jnp.zeros_like(rotor_vel)
+    else:
+        thrust, thrust_rate = rotor_vel[..., :1], p.thrust_dyn_coef * (thrust_cmd - rotor_vel)
+    force = (p.acc_coef + p.cmd_f_coef * thrust) * rotation.z_axis(quat)
+    if p.drag_matrix is not None:
+        force = force + drag_force(quat, vel, p.drag_matrix)
+    if dist_f is not None:
+        force = force + dist_f
+
+    ang_acc = _fitted_angular_acceleration(quat, ang_vel, cmd[..., :3], p)
+    if dist_t is not None:
+        ang_acc = ang_acc + matvec(p.J_inv, rotation.rotate_inverse(quat, dist_t))
+    return vel, force / p.mass + p.gravity_vec, ang_acc, thrust_rate
+
+
+def saturate(cmd: Array, params: Params) -> Array:
+    """Return the attitude command with a thrust that the rotors can give: none, or within its limits. (..., 4)"""
+    thrust = cmd[..., 3:4]
+    within = jnp.where(thrust <= 0, 0.0, jnp.clip(thrust, params.thrust_min, params.thrust_max))
+    return jnp.concatenate([cmd[..., :3], within], axis=-1)
+
+
+def _fitted_angular_acceleration(quat: Array, ang_vel: Array, cmd_rpy: Array, p: Params) -> Array:
+    """Return the fit's angular acceleration, handed over to an attitude spring near 90 degrees of pitch."""
+    x, y, z, w = quat[..., 0:1], quat[..., 1:2], quat[..., 2:3], quat[..., 3:4]
+    cos_pitch = rotation.safe_norm(jnp.concatenate([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1))
+    t = jnp.clip((cos_pitch - HANDED_OVER_AT) / (FITTED_UP_TO - HANDED_OVER_AT), 0.0, 1.0)
+    weight = t * t * t * (10 - 15 * t + 6 * t * t)
+
+    # Where the weight is zero the Euler angles must not be evaluated at all: 0 x inf is NaN, in gradients too.
+    level = jnp.asarray([0.0, 0.0, 0.0, 1.0], quat.dtype)
+    from_angles = _euler_spring(jnp.where(weight > 0, quat, level), ang_vel, cmd_rpy, p)
+
+    error = rotation.multiply(rotation.conjugate(rotation.from_rpy(cmd_rpy)), quat)
+    from_error = p.rpy_coef * 2 * error[..., 3:] * error[..., :3] + p.rpy_rates_coef * ang_vel
+    return weight * from_angles + (1 - weight) * from_error
+
+
+def _euler_spring(quat: Array, ang_vel: Array, cmd_rpy: Array, p: Params) -> Array:
+    """Return the angular acceleration of the fit, body frame, away from 90 degrees of pitch. (..., 3)"""
+    rpy = rotation.to_rpy(quat)
+    sin, cos = jnp.sin(rpy), jnp.cos(rpy)
+    sr, sp, cr, cp = sin[..., 0], sin[..., 1], cos[..., 0], cos[..., 1]
+    wx, wy, wz = ang_vel[..., 0], ang_vel[..., 1], ang_vel[..., 2]
+    yaw_rate = (sr * wy + cr * wz) / cp
+    roll_rate, pitch_rate = wx + sp * yaw_rate, cr * wy - sr * wz
+    rates = jnp.stack([roll_rate, pitch_rate, yaw_rate], axis=-1)
+
+    acc = p.rpy_coef * rpy + p.rpy_rates_coef * rates + p.cmd_rpy_coef * cmd_rpy
+    roll_acc, pitch_acc, yaw_acc = acc[..., 0], acc[..., 1], acc[..., 2]
+    # ang_vel = E(rpy) rpy', so ang_vel' = E rpy'' + E' rpy'.
+    along_pitch = -sr * roll_rate * pitch_rate + (cr * cp * roll_rate - sr * sp * pitch_rate) * yaw_rate
+    along_yaw = -cr * roll_rate * pitch_rate - (sr * cp * roll_rate + cr * sp * pitch_rate) * yaw_rate
+    return jnp.stack(
+        [
+            roll_acc - sp * yaw_acc - cp * pitch_rate * yaw_rate,
+            cr * pitch_acc + sr * cp * yaw_acc + along_pitch,
+            -sr * pitch_acc + cr * cp * yaw_acc + along_yaw,
+        ],
+        axis=-1,
+    )

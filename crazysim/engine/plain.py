@@ -1,0 +1,112 @@
+"""The reference: a pipeline as batched XLA, jitted and scanned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.extend.core import jaxpr_as_fun
+
+from crazysim.sim.data import SimData
+from crazysim.sim.pipeline import Pipeline
+from crazysim.sim.stages import flag_nonfinite
+
+StepFn = Callable[..., SimData]
+ResetFn = Callable[..., SimData]
+
+
+def build_step(pipeline: Pipeline) -> StepFn:
+    """Return ``step(data, n_steps=1) -> data``, pure, for the stages as they are now.
+
+    Within it only the leaves that some stage writes are carried from step to step; the rest, parameters above
+    all, stay constants of the loop and come back as the very arrays that went in. With ``n_steps`` a Python
+    number the loop can be differentiated; with an array one compilation serves every number of steps.
+    """
+    stages = tuple(pipeline.items())
+
+    def single(data: SimData) -> SimData:
+        for name, fn in stages:
+            with jax.named_scope(name):
+                data = fn(data)
+        return data
+
+    @jax.jit
+    def dynamic(data: SimData, n_steps: Array) -> list[Any]:
+        leaves, carried, body = _loop_body(single, data)
+        out = jax.lax.fori_loop(0, n_steps, lambda _, x: body(x), [leaves[i] for i in carried])
+        return _finish(data, carried, out)
+
+    @jax.jit(static_argnames="n_steps")
+    def unrolled(data: SimData, n_steps: int) -> list[Any]:
+        leaves, carried, body = _loop_body(single, data)
+        out, _ = jax.lax.scan(lambda x, _: (body(x), None), [leaves[i] for i in carried], length=n_steps)
+        return _finish(data, carried, out)
+
+    def step(data: SimData, n_steps: int | Array = 1) -> SimData:
+        written = unrolled(data, n_steps) if isinstance(n_steps, int) else dynamic(data, n_steps)
+        leaves, treedef = jax.tree.flatten(data)
+        return treedef.unflatten(x if new is None else new for x, new in zip(leaves, written, strict=True))
+
+    step.jitted = (dynamic, unrolled)  # type: ignore[attr-defined]
+    return step
+
+
+def _loop_body(
+    single: Callable[[SimData], SimData], data: SimData
+) -> tuple[list[Any], list[int], Callable[[list[Any]], list[Any]]]:
+    """Return the leaves, the positions of those that a step writes, and a step on these alone."""
+    leaves, treedef = jax.tree.flatten(data)
+    jaxpr, out = jax.make_jaxpr(single, return_shape=True)(data)
+    if jax.tree.structure(out) != treedef:
+        raise ValueError(
+            "a stage changed the structure of SimData (a field became None, a plugin was added or left out); "
+            "put everything in place before the step, with sim.data.replace(...)"
+        )
+    for before, after in zip(leaves, jax.tree.leaves(out), strict=True):
+        if jnp.shape(before) != after.shape or jnp.result_type(before) != after.dtype:
+            raise ValueError(
+                f"a stage turned a leaf of shape {jnp.shape(before)} and type {jnp.result_type(before)} into shape "
+                f"{after.shape} and type {after.dtype}; a step must keep both"
+            )
+    pairs = zip(jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars, strict=True)
+    carried = [i for i, (before, after) in enumerate(pairs) if before is not after]
+    step = jaxpr_as_fun(jaxpr)
+
+    def body(values: list[Any]) -> list[Any]:
+        full = list(leaves)
+        for i, value in zip(carried, values, strict=True):
+            full[i] = value
+        after = step(*full)
+        return [after[i] for i in carried]
+
+    return leaves, carried, body
+
+
+def _finish(data: SimData, carried: list[int], values: list[Any]) -> list[Any]:
+    """Return the written leaves in their places, None for the others, with the flags set."""
+    leaves, treedef = jax.tree.flatten(data)
+    for i, value in zip(carried, values, strict=True):
+        leaves[i] = value
+    out = flag_nonfinite(treedef.unflatten(leaves))
+    out = out.replace(core=out.core.replace(mjx_synced=jnp.asarray(False)))
+    return [
+        None if new is old else new
+        for old, new in zip(jax.tree.leaves(data), jax.tree.leaves(out), strict=True)
+    ]
+
+
+def build_reset(pipeline: Pipeline) -> ResetFn:
+    """Return ``reset(data, default_data, mask=None) -> data``, pure, for the stages as they are now."""
+    stages = tuple(pipeline.items())
+
+    @jax.jit
+    def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:
+        for name, fn in stages:
+            with jax.named_scope(name):
+                data = fn(data, default_data, mask)
+        return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(False)))
+
+    return reset

@@ -1,0 +1,116 @@
+"""The one base class of every record, and how a record declares the axes of its leaves."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Literal, Self, TypeVar, dataclass_transform
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+Scope = Literal["drone", "world", "shared", "whole", "parameter"]
+
+T = TypeVar("T")
+
+
+def leaf(scope: Scope, core_ndim: int = 0) -> Any:
+    """Declare an array field, or a dict of such arrays.
+
+    Args:
+        scope: Which batch axes the array carries. ``drone``: (n_worlds, n_drones, *core). ``world``:
+            (n_worlds, 1, *core). ``shared``: core. ``parameter``: shared or drone, told apart by its
+            number of dimensions. ``whole``: opaque to resets and to sharding.
+        core_ndim: Number of dimensions of the core shape.
+    """
+    return dataclasses.field(metadata={"scope": scope, "core_ndim": core_ndim})
+
+
+def static(**kwargs: Any) -> Any:
+    """Declare a field that is part of the record's type: hashable, no array, a new value recompiles."""
+    return dataclasses.field(metadata={"static": True}, **kwargs)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(leaf, static, dataclasses.field))
+class PyTree:
+    """A frozen record of arrays that JAX can look into.
+
+    Subclasses list annotated fields; an array field says with ``leaf`` which batch axes it carries, a
+    ``static`` field belongs to the type, any other field holds a record of its own.
+    """
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Make every subclass a frozen dataclass that is registered with JAX."""
+        super().__init_subclass__(**kwargs)
+        dataclasses.dataclass(frozen=True, eq=False)(cls)
+        fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+        jax.tree_util.register_dataclass(
+            cls,
+            data_fields=[f.name for f in fields if not f.metadata.get("static")],
+            meta_fields=[f.name for f in fields if f.metadata.get("static")],
+        )
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with the named fields exchanged."""
+        return dataclasses.replace(self, **changes)  # type: ignore[type-var]
+
+
+def scopes(tree: Any) -> Any:
+    """Return the same tree with the scope of every leaf in its place.
+
+    A parameter comes out as ``shared`` or ``drone``. What is declared nowhere is ``whole``.
+    """
+
+    def visit(node: Any, metadata: Any) -> Any:
+        if isinstance(node, PyTree):
+            changes = {
+                f.name: visit(getattr(node, f.name), f.metadata)
+                for f in dataclasses.fields(node)  # type: ignore[arg-type]
+                if not f.metadata.get("static")
+            }
+            return node.replace(**changes)
+        if isinstance(node, dict):
+            return {k: visit(v, metadata) for k, v in node.items()}
+        return jax.tree.map(
+            lambda x: visit(x, metadata) if isinstance(x, PyTree) else _scope(x, metadata),
+            node,
+            is_leaf=lambda x: isinstance(x, PyTree),
+        )
+
+    return visit(tree, {})
+
+
+def _scope(x: Any, metadata: Any) -> str:
+    scope = metadata.get("scope", "whole")
+    if scope != "parameter":
+        return scope
+    return "shared" if jnp.ndim(x) == metadata["core_ndim"] else "drone"
+
+
+def map_batched(fn: Callable[..., Any], tree: T, *others: T) -> T:
+    """Apply ``fn`` to the leaves that belong to a world (scope drone or world), and keep the rest."""
+    return jax.tree.map(
+        lambda scope, x, *rest: fn(x, *rest) if scope in ("drone", "world") else x,
+        scopes(tree),
+        tree,
+        *others,
+    )
+
+
+def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
+    """Return ``new`` in the worlds of ``mask`` (n_worlds,) or (n_worlds, 1), ``old`` elsewhere.
+
+    Both are broadcast to the larger of their shapes; without a mask ``new`` is taken everywhere.
+    """
+    shape = jnp.broadcast_shapes(jnp.shape(new), jnp.shape(old))
+    if mask is None:
+        return jnp.broadcast_to(new, shape)
+    mask = mask.reshape(mask.shape[0], *[1] * (len(shape) - 1))
+    return jnp.where(mask, new, old)
+
+
+def as_parameter(value: Any) -> Array:
+    """Return a number or array as a shared parameter: of floating type, and never a bare scalar."""
+    return jnp.atleast_1d(jnp.asarray(np.asarray(value, dtype=np.float64), dtype=float))

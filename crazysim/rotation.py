@@ -1,0 +1,165 @@
+"""Rotations as unit quaternions, xyzw, body to world, with gradients that stay finite everywhere.
+
+Written out element by element: a product of small matrices is slow on every device, sums of products fuse.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Return the scalar product over the last axis, kept with length one. (..., 1)"""
+    return jnp.sum(a * b, axis=-1, keepdims=True)
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return the vector product. (..., 3)"""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
+def matvec(matrix: Array, vector: Array) -> Array:
+    """Return ``matrix @ vector`` for small arrays, as a sum of scaled columns.
+
+    Args:
+        matrix: (..., m, n)
+        vector: (..., n)
+
+    Returns:
+        (..., m)
+    """
+    out = matrix[..., 0] * vector[..., 0:1]
+    for k in range(1, matrix.shape[-1]):
+        out = out + matrix[..., k] * vector[..., k : k + 1]
+    return out
+
+
+def safe_norm(x: Array) -> Array:
+    """Return the Euclidean norm over the last axis, with gradient zero at zero. (..., 1)"""
+    squared = dot(x, x)
+    is_zero = squared == 0
+    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squared)))
+
+
+def safe_normalize(x: Array, fallback: Array) -> Array:
+    """Return ``x`` scaled to length one, or ``fallback`` where ``x`` is zero. (..., n)"""
+    norm = safe_norm(x)
+    is_zero = norm == 0
+    return jnp.where(is_zero, fallback, x / jnp.where(is_zero, 1.0, norm))
+
+
+def safe_arctan2(y: Array, x: Array) -> Array:
+    """Return the angle of the point (x, y), rad, zero with gradient zero at the origin. (...)"""
+    at_origin = (x == 0) & (y == 0)
+    return jnp.where(at_origin, 0.0, jnp.arctan2(y, jnp.where(at_origin, 1.0, x)))
+
+
+def multiply(p: Array, q: Array) -> Array:
+    """Return the quaternion of the rotation ``q`` followed by ``p``. (..., 4)"""
+    px, py, pz, pw = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    qx, qy, qz, qw = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return jnp.stack(
+        [
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+            pw * qw - px * qx - py * qy - pz * qz,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(q: Array) -> Array:
+    """Return the inverse of a unit quaternion. (..., 4)"""
+    return jnp.concatenate([-q[..., :3], q[..., 3:]], axis=-1)
+
+
+def normalize(q: Array) -> Array:
+    """Return the unit quaternion along ``q``; the zero quaternion gives the identity. (..., 4)"""
+    return safe_normalize(q, jnp.asarray([0.0, 0.0, 0.0, 1.0], q.dtype))
+
+
+def rotate(q: Array, v: Array) -> Array:
+    """Return a body vector in the world frame, ``R(q) v``. (..., 3)"""
+    u = q[..., :3]
+    t = 2 * cross(u, v)
+    return v + q[..., 3:] * t + cross(u, t)
+
+
+def rotate_inverse(q: Array, v: Array) -> Array:
+    """Return a world vector in the body frame, ``R(q)^T v``. (..., 3)"""
+    return rotate(conjugate(q), v)
+
+
+def z_axis(q: Array) -> Array:
+    """Return the body z axis in the world frame. (..., 3)"""
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+
+
+def from_rotvec(rotvec: Array) -> Array:
+    """Return the quaternion of a rotation by ``|rotvec|`` rad about ``rotvec``. (..., 4)
+
+    Where the angle is small the series of ``sin(a/2)/a`` stands in for it, exact to rounding.
+    """
+    squared = dot(rotvec, rotvec)
+    small = squared < 1e-4  # the series' next term, a^6 / 645120, is then below 2e-18
+    half = 0.5 * jnp.sqrt(jnp.where(small, 1.0, squared))
+    series = 0.5 - squared / 48 + squared * squared / 3840
+    scale = jnp.where(small, series, 0.5 * jnp.sin(half) / half)
+    w = jnp.where(small, 1 - squared / 8 + squared * squared / 384, jnp.cos(half))
+    return jnp.concatenate([rotvec * scale, w], axis=-1)
+
+
+def from_rpy(rpy: Array) -> Array:
+    """Return the quaternion of ``Rz(yaw) Ry(pitch) Rx(roll)``, angles in rad. (..., 3) -> (..., 4)"""
+    half = 0.5 * rpy
+    c, s = jnp.cos(half), jnp.sin(half)
+    cr, cp, cy = c[..., 0], c[..., 1], c[..., 2]
+    sr, sp, sy = s[..., 0], s[..., 1], s[..., 2]
+    return jnp.stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ],
+        axis=-1,
+    )
+
+
+def to_rpy(q: Array) -> Array:
+    """Return roll, pitch, yaw in rad, pitch in [-pi/2, pi/2]. (..., 4) -> (..., 3)
+
+    At a pitch of exactly 90 degrees roll and yaw are not defined on their own; zero is returned for an
+    angle whose sine and cosine both vanish.
+    """
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    r00, r10 = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
+    r21, r22 = 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    cos_pitch = safe_norm(jnp.stack([r00, r10], axis=-1))[..., 0]
+    return jnp.stack(
+        [safe_arctan2(r21, r22), jnp.arctan2(2 * (w * y - x * z), cos_pitch), safe_arctan2(r10, r00)], axis=-1
+    )
+
+
+def yaw(q: Array) -> Array:
+    """Return the yaw angle of a quaternion of any length, rad; the zero quaternion has yaw zero. (...)"""
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return safe_arctan2(2 * (x * y + w * z), x * x + w * w - y * y - z * z)
+
+
+def from_axes(x: Array, y: Array, z: Array) -> Array:
+    """Return roll, pitch, yaw of the frame with these orthonormal axes, rad. (..., 3)"""
+    cos_pitch = safe_norm(jnp.stack([x[..., 0], x[..., 1]], axis=-1))[..., 0]
+    return jnp.stack(
+        [
+            safe_arctan2(y[..., 2], z[..., 2]),
+            jnp.arctan2(-x[..., 2], cos_pitch),
+            safe_arctan2(x[..., 1], x[..., 0]),
+        ],
+        axis=-1,
+    )

@@ -1,0 +1,144 @@
+"""Build the scene: a base file, one mocap body per drone, and what the user adds; then compile it."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import mjx
+
+from crazysim.drones.airframe import Airframe
+from crazysim.drones.body import LED_MATERIALS, MATERIALS, Part, body_cameras, body_parts
+from crazysim.errors import ConfigError
+
+SCENE = Path(__file__).parents[1] / "scene.xml"
+
+
+def build_spec(
+    xml_path: str | Path | None, airframe: Airframe, n_drones: int, freq: int, max_geom_pairs: int
+) -> mujoco.MjSpec:
+    """Return the scene as an editable spec, with the drones ``drone:0`` to ``drone:{n_drones - 1}`` in it.
+
+    Args:
+        xml_path: A MJCF scene without drones; None for the package's own floor, light and sky.
+        airframe: What the drones look like.
+        n_drones: How many there are.
+        freq: Physics steps per second, Hz.
+        max_geom_pairs: Cap on the pairs MJX checks per kind of collision; -1 for none.
+
+    Raises:
+        ConfigError: If the file does not exist, is no MJCF, or holds names the drones need.
+    """
+    path = SCENE if xml_path is None else Path(xml_path)
+    if not path.is_file():
+        raise ConfigError(
+            f"scene file {path} does not exist; pass xml_path= of an MJCF file, or leave it out"
+        )
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"scene file {path} is not a scene MuJoCo can read: {error}") from error
+    spec.option.timestep = 1 / freq
+    spec.add_numeric(name="max_geom_pairs", data=[max_geom_pairs])
+    # So that one body of a user's spec can be attached several times.
+    spec.copy_during_attach = True
+    taken = [body.name for body in spec.bodies if body.name.startswith("drone:")]
+    if taken:
+        raise ConfigError(
+            f"scene file {path} has bodies named {taken}; names that begin with 'drone:' are the drones'"
+        )
+    _add_drones(spec, airframe, n_drones)
+    # mjx.kinematics refuses a model without any degree of freedom, and mocap bodies have none.
+    dummy = spec.worldbody.add_body(name="_dummy", mass=1e-6, inertia=[1e-9] * 3)
+    dummy.add_joint(name="_dummy_joint", type=mujoco.mjtJoint.mjJNT_SLIDE)
+    return spec
+
+
+def _add_drones(spec: mujoco.MjSpec, airframe: Airframe, n_drones: int) -> None:
+    """Add the drones' bodies element by element: attaching a body per drone takes quadratic time and copies."""
+    for name, rgba in MATERIALS.items():
+        spec.add_material(name=name, rgba=rgba)
+    parts, cameras = body_parts(airframe), body_cameras(airframe)
+    for i in range(n_drones):
+        body = spec.worldbody.add_body(name=f"drone:{i}", mocap=True)
+        for led in LED_MATERIALS:
+            spec.add_material(name=f"{led}:{i}", rgba=(1, 1, 1, 0.15))
+        for part in parts:
+            _add_part(body, part, i)
+        for camera in cameras:
+            mode = (
+                mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+                if camera.tracks
+                else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+            )
+            added = body.add_camera(name=f"{camera.name}:{i}", pos=camera.pos, fovy=camera.fovy, mode=mode)
+            added.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
+            added.alt.xyaxes = camera.xyaxes
+
+
+def _add_part(body: mujoco.MjsBody, part: Part, i: int) -> None:
+    geom = body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}"), size=part.size, mass=0)
+    if part.end is None:
+        geom.pos = part.pos
+    else:
+        geom.fromto = [*part.pos, *part.end]
+    if part.touches:
+        geom.name, geom.group, geom.condim, geom.rgba = f"{part.name}:{i}", 3, 1, (0.5, 0.5, 0.5, 0.3)
+        geom.contype = geom.conaffinity = int(part.name == "col_sphere")
+    else:
+        geom.group, geom.contype, geom.conaffinity = 2, 0, 0
+        geom.material = f"{part.material}:{i}" if part.material in LED_MATERIALS else part.material
+
+
+def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Return the compiled model.
+
+    Raises:
+        ConfigError: With MuJoCo's message, if the spec cannot be compiled.
+    """
+    try:
+        with warnings.catch_warnings():
+            # Users attach bodies without a prefix, as the scene's documentation shows; nothing is saved here.
+            warnings.filterwarnings("ignore", message="Attaching a spec with an empty prefix")
+            return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise ConfigError(f"the scene does not compile: {error}") from error
+
+
+def put_model(mj_model: mujoco.MjModel, device: jax.Device) -> mjx.Model:
+    """Return the model as arrays on a device.
+
+    Raises:
+        ConfigError: With MJX's message, if it cannot hold something of the scene.
+    """
+    try:
+        return mjx.put_model(mj_model, device=device)
+    except NotImplementedError as error:
+        raise ConfigError(f"MJX cannot hold this scene, so contacts cannot be asked for: {error}") from error
+
+
+def make_data(mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device) -> mjx.Data:
+    """Return the state of the scene for every world, as the model has it. (n_worlds, ...)"""
+    mj_data = mujoco.MjData(mj_model)
+    one = mjx.put_data(mj_model, mj_data, device=device)
+    return jax.tree.map(lambda x: jnp.repeat(x[None], n_worlds, axis=0), one)
+
+
+def drone_mocap_ids(mj_model: mujoco.MjModel, n_drones: int) -> list[int]:
+    """Return the mocap id of each drone's body.
+
+    Raises:
+        ConfigError: If the scene has lost one of them.
+    """
+    ids = []
+    for i in range(n_drones):
+        body = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, f"drone:{i}")
+        if body < 0 or mj_model.body_mocapid[body] < 0:
+            raise ConfigError(
+                f"the scene has no mocap body 'drone:{i}'; an edit of sim.spec must leave the drones"
+            )
+        ids.append(int(mj_model.body_mocapid[body]))
+    return ids

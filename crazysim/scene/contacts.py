@@ -1,0 +1,33 @@
+"""Read contacts from a synced scene. The only place that touches MJX's private contact record."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from mujoco import mjx
+
+from crazysim.errors import UnknownNameError
+
+
+def contact_flags(mjx_data: mjx.Data) -> Array:
+    """Return for every contact slot whether its two geoms touch. (n_worlds, n_slots)"""
+    return mjx_data._impl.contact.dist < 0
+
+
+def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) -> Array:
+    """Return for every contact slot whether its two geoms touch and one is of a body. (n_worlds, n_slots)
+
+    Raises:
+        UnknownNameError: If the scene has no such body.
+    """
+    body_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body)
+    if body_id < 0:
+        names = [mj_model.body(i).name for i in range(mj_model.nbody)]
+        shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise UnknownNameError(f"the scene has no body {body!r}; it has {shown}")
+    of_body = jnp.asarray(np.flatnonzero(mj_model.geom_bodyid == body_id))
+    contact = mjx_data._impl.contact
+    geom = jnp.stack([contact.geom1, contact.geom2], axis=-1)
+    return (contact.dist < 0) & jnp.any(geom[..., None] == of_body, axis=(-1, -2))

@@ -1,0 +1,156 @@
+"""Pictures of one world, in memory or in a window."""
+
+from __future__ import annotations
+
+import os
+import sys
+import weakref
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.scene.draw import Marks
+
+MAX_SIZES = 4
+"""How many picture sizes keep a context of their own."""
+
+MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
+
+
+class RenderError(RuntimeError):
+    """No picture can be made on this machine: OpenGL is missing or does not work."""
+
+
+class Viewer:
+    """Draws ``mj_data`` of one model: offscreen in any size, or in a window. Contexts are made at first use."""
+
+    def __init__(self, mj_model: mujoco.MjModel, mj_data: mujoco.MjData, max_geom: int):
+        """Keep the model; nothing is opened yet."""
+        self._model, self._data, self._max_geom = mj_model, mj_data, max_geom
+        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
+        self._window: Any = None
+        # Contexts must go before the interpreter does, also where nobody calls close.
+        weakref.finalize(self, _free, self._renderers)
+
+    def render(
+        self,
+        mode: str,
+        camera: int | str,
+        cam_config: dict[str, Any] | None,
+        width: int,
+        height: int,
+        marks: Marks,
+    ) -> NDArray | tuple[NDArray, NDArray] | None:
+        """Return the picture that ``Sim.render`` documents."""
+        if mode not in MODES:
+            raise UnknownNameError(f"unknown render mode {mode!r}; the modes are {', '.join(MODES)}")
+        if width <= 0 or height <= 0:
+            raise ConfigError(
+                f"a picture of {width} x {height} pixels cannot be; width and height must be positive"
+            )
+        cam = self._camera(camera, cam_config)
+        if mode == "human":
+            self._render_window(cam, marks)
+            return None
+        renderer = self._renderer(width, height)
+        renderer.update_scene(self._data, camera=cam)
+        marks.write(renderer.scene)
+        color = depth = None
+        if mode in ("rgb_array", "rgbd_tuple"):
+            color = renderer.render().copy()
+        if mode in ("depth_array", "rgbd_tuple"):
+            renderer.enable_depth_rendering()
+            depth = renderer.render().copy()
+            renderer.disable_depth_rendering()
+        return (color, depth) if mode == "rgbd_tuple" else (color if depth is None else depth)
+
+    def close(self) -> None:
+        """Close the window and free the contexts."""
+        _free(self._renderers)
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _camera(self, camera: int | str, cam_config: dict[str, Any] | None) -> mujoco.MjvCamera:
+        cam = mujoco.MjvCamera()
+        if isinstance(camera, str):
+            camera_id = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+            if camera_id < 0:
+                names = [self._model.camera(i).name for i in range(self._model.ncam)]
+                raise UnknownNameError(
+                    f"the scene has no camera {camera!r}; it has {', '.join(names[:12])}, or -1"
+                )
+        else:
+            camera_id = int(camera)
+            if not -1 <= camera_id < self._model.ncam:
+                raise UnknownNameError(
+                    f"camera {camera_id} does not exist; ids go from 0 to {self._model.ncam - 1}, -1 is the free camera"
+                )
+        if camera_id >= 0:
+            cam.type, cam.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera_id
+            return cam
+        mujoco.mjv_defaultFreeCamera(self._model, cam)
+        for key, value in (cam_config or {}).items():
+            if not hasattr(cam, key):
+                raise UnknownNameError(
+                    f"a camera has no setting {key!r}; use lookat, distance, azimuth, elevation"
+                )
+            if isinstance(value, (list, tuple, np.ndarray)):
+                getattr(cam, key)[:] = value
+            else:
+                setattr(cam, key, value)
+        return cam
+
+    def _renderer(self, width: int, height: int) -> mujoco.Renderer:
+        if (width, height) not in self._renderers:
+            buffers = self._model.vis.global_
+            # Buffers are made once per context; a larger picture than any before needs a context of its own.
+            buffers.offwidth, buffers.offheight = max(buffers.offwidth, width), max(buffers.offheight, height)
+            try:
+                renderer = mujoco.Renderer(self._model, height, width, max_geom=self._max_geom)
+            except Exception as error:  # the OpenGL bindings raise whatever they like
+                raise RenderError(
+                    f"no OpenGL context could be made ({type(error).__name__}: {error}). On a machine without a "
+                    f"screen set MUJOCO_GL=egl and install libegl1 and Mesa's drivers (Debian: apt-get install "
+                    f"libegl1 libgl1-mesa-dri)."
+                ) from error
+            self._renderers[width, height] = renderer
+            if len(self._renderers) > MAX_SIZES:
+                self._renderers.pop(next(iter(self._renderers))).close()
+        return self._renderers[width, height]
+
+    def _render_window(self, cam: mujoco.MjvCamera, marks: Marks) -> None:
+        if self._window is None:
+            self._window = _open_window(self._model, self._data)
+            # The window takes the first camera, and then belongs to the mouse.
+            with self._window.lock():
+                for name in ("type", "fixedcamid", "distance", "azimuth", "elevation"):
+                    setattr(self._window.cam, name, getattr(cam, name))
+                self._window.cam.lookat[:] = cam.lookat
+        with self._window.lock():
+            self._window.user_scn.ngeom = 0
+            marks.write(self._window.user_scn)
+        self._window.sync()
+
+
+def _free(renderers: dict[tuple[int, int], mujoco.Renderer]) -> None:
+    for renderer in renderers.values():
+        renderer.close()
+    renderers.clear()
+
+
+def _open_window(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> Any:
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RenderError(
+            "render('human') needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; without a screen use "
+            "mode='rgb_array'"
+        )
+    import mujoco.viewer  # it loads GLFW, which pictures in memory do without
+
+    try:
+        return mujoco.viewer.launch_passive(mj_model, mj_data, show_left_ui=False, show_right_ui=False)
+    except Exception as error:  # GLFW and MuJoCo raise whatever they like
+        raise RenderError(f"no window could be opened ({type(error).__name__}: {error})") from error

@@ -1,0 +1,62 @@
+"""Copy the drones' poses into the scene: for every world at once with MJX, or for one world to be drawn."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from crazysim.sim.data import SimData
+
+
+@jax.jit
+def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
+    """Return the data with its flag set, and the scene as the data has it.
+
+    Writes the drones' poses to their mocap bodies, and computes the transforms of all bodies, the cameras and
+    lights, and the contacts. Mocap bodies that are no drones stay where ``mjx_data`` has them.
+
+    Args:
+        data: The simulation. Quaternions are xyzw here and wxyz in MuJoCo.
+        mjx_data: The scene of every world.
+        mjx_model: The model, shared by all worlds.
+    """
+    ids = data.core.drone_mocap_ids
+    mjx_data = mjx_data.replace(
+        mocap_pos=mjx_data.mocap_pos.at[:, ids].set(data.states.pos),
+        mocap_quat=mjx_data.mocap_quat.at[:, ids].set(jnp.roll(data.states.quat, 1, axis=-1)),
+    )
+
+    def of_world(world: mjx.Data) -> mjx.Data:
+        world = mjx.kinematics(mjx_model, world)
+        world = mjx.camlight(mjx_model, world)
+        return mjx.collision(mjx_model, world)
+
+    mjx_data = jax.vmap(of_world)(mjx_data)
+    return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
+
+
+def sync_one_world(
+    data: SimData, mjx_data: mjx.Data | None, world: int, mj_model: mujoco.MjModel, mj_data: mujoco.MjData
+) -> None:
+    """Write one world into ``mj_data``, ready to be drawn; nothing is allocated or computed for the others.
+
+    Args:
+        data: The simulation.
+        mjx_data: The scene of every world, if there is one yet: it knows where the user moved other bodies.
+        world: Which world.
+        mj_model: The model.
+        mj_data: Where it is written to.
+    """
+    if mjx_data is not None:
+        mj_data.mocap_pos[:] = mjx_data.mocap_pos[world]
+        mj_data.mocap_quat[:] = mjx_data.mocap_quat[world]
+        mj_data.qpos[:] = mjx_data.qpos[world]
+    ids = np.asarray(data.core.drone_mocap_ids)
+    mj_data.mocap_pos[ids] = data.states.pos[world]
+    mj_data.mocap_quat[ids] = np.roll(data.states.quat[world], 1, axis=-1)
+    mujoco.mj_kinematics(mj_model, mj_data)
+    mujoco.mj_comPos(mj_model, mj_data)
+    mujoco.mj_camlight(mj_model, mj_data)

@@ -1,0 +1,466 @@
+"""The simulation as an object: it holds data, pipeline and scene, and calls them in order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from mujoco import mjx
+from numpy.typing import NDArray
+
+from crazysim.control import Control
+from crazysim.drones import Airframe, Drone, load_airframe
+from crazysim.dynamics import Dynamics
+from crazysim.engine import build_reset, build_step
+from crazysim.engine.plain import ResetFn, StepFn
+from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.scene import build, contacts
+from crazysim.scene.draw import Marks
+from crazysim.scene.render import Viewer
+from crazysim.scene.sync import sync_one_world, sync_sim2mjx
+from crazysim.sim import functional as F
+from crazysim.sim.data import (
+    SimControls,
+    SimCore,
+    SimData,
+    SimState,
+    as_key,
+    create_params,
+    n_rotor_states,
+    require_pair,
+)
+from crazysim.sim.integration import Integrator
+from crazysim.sim.pipeline import Pipeline
+from crazysim.sim.sharding import place_scene, shard
+from crazysim.sim.stages import build_step_pipeline, reset
+
+__all__ = ["Sim", "sync_sim2mjx", "use_box_collision"]
+
+LARGE_SWARM = 64
+"""From this many drones a world on, MJX checks two pairs per drone instead of every pair."""
+
+
+class Sim:
+    """Worlds of drones that advance together.
+
+    ``data`` holds everything that changes, ``step_pipeline`` and ``reset_pipeline`` what happens to it, ``spec``
+    the scene. Physics never touches the scene: it is brought up to date when contacts or pictures are asked for.
+    """
+
+    def __init__(
+        self,
+        n_worlds: int = 1,
+        n_drones: int = 1,
+        drone: str | Path | Mapping[str, Any] | Airframe = Drone.cf21B_500,
+        dynamics: Dynamics | str = Dynamics.default,
+        control: Control | str = Control.default,
+        integrator: Integrator | str = Integrator.default,
+        freq: int = 500,
+        state_freq: int | None = None,
+        attitude_freq: int | None = None,
+        body_rate_freq: int | None = None,
+        force_torque_freq: int | None = None,
+        device: str | jax.Device = "cpu",
+        xml_path: str | Path | None = None,
+        rng_key: int | Array = 0,
+        *,
+        mesh: Mesh | None = None,
+    ):
+        """Build the scene's spec, the data and both pipelines; nothing of MuJoCo is allocated per world.
+
+        Args:
+            n_worlds: Number of worlds.
+            n_drones: Number of drones in each.
+            drone: Name of a built-in airframe, path of a TOML file, dict, or airframe.
+            dynamics: Dynamics model.
+            control: Command level.
+            integrator: Integration scheme.
+            freq: Physics steps per second, Hz.
+            state_freq: Rate of the state controller, Hz; 100, or the largest divisor of ``freq`` below.
+            attitude_freq: Rate of the attitude controller, Hz; 500, or the largest divisor of ``freq`` below.
+            body_rate_freq: Rate of the body-rate controller, Hz; as ``attitude_freq``.
+            force_torque_freq: Rate of the allocation, Hz; as ``attitude_freq``.
+            device: Where the data lives: a platform such as ``"cpu"`` or ``"gpu"``, or a device.
+            xml_path: MJCF scene; None for floor, light and sky.
+            rng_key: Seed, or a key.
+            mesh: Devices to spread the worlds over, from ``crazysim.sim.sharding.world_mesh``.
+
+        Raises:
+            ValueError: Any argument that cannot be, with what came and what was needed.
+        """
+        self.n_worlds = _positive("n_worlds", n_worlds)
+        self.n_drones = _positive("n_drones", n_drones)
+        self.freq = _positive("freq", freq)
+        self.dynamics = _member(Dynamics, "dynamics", dynamics)
+        self.control = _member(Control, "control", control)
+        self.integrator = _member(Integrator, "integrator", integrator)
+        if self.freq > 10_000 and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+            raise ConfigError(
+                f"freq is {freq} Hz: above 10,000 Hz a step is lost in float32 rounding. Enable float64 first: "
+                f"jax.config.update('jax_enable_x64', True)"
+            )
+        require_pair(self.dynamics, self.control)
+        self.airframe = load_airframe(drone)
+        self.drone = self.airframe.name
+        self.device = _device(device)
+        self.mesh = mesh
+        self._freqs = self._control_freqs(
+            state=state_freq, attitude=attitude_freq, body_rate=body_rate_freq, force_torque=force_torque_freq
+        )
+
+        self.max_geom_pairs = -1 if self.n_drones < LARGE_SWARM else 2 * self.n_drones
+        self.marks = Marks()
+        self.viewer: Viewer | None = None
+        self.spec = build.build_spec(xml_path, self.airframe, self.n_drones, self.freq, self.max_geom_pairs)
+        self._seed = as_key(rng_key)
+        self._compile_scene()
+        self.build_data()
+        self.build_default_data()
+
+        self.step_pipeline: Pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator)
+        self.reset_pipeline: Pipeline = {"reset": reset}
+        self.build_step_fn()
+        self.build_reset_fn()
+
+    # Data ---------------------------------------------------------------------------------------------------
+
+    @property
+    def data(self) -> SimData:
+        """Everything that changes. Assigning to it makes the scene stale."""
+        return self._data
+
+    @data.setter
+    def data(self, data: SimData) -> None:
+        self._data = data
+        self._synced = False
+
+    @property
+    def time(self) -> Array:
+        """Time since each world's last reset, s. (n_worlds, 1)"""
+        return self.data.core.steps / self.freq
+
+    @property
+    def control_freq(self) -> int:
+        """Rate at which commands are taken over, Hz; with rotor commands that is every step."""
+        return self._freqs.get(self.control, self.freq)
+
+    @property
+    def controllable(self) -> Array:
+        """In which worlds the next step takes over a staged command. (n_worlds, 1)"""
+        return F.controllable(self.data)
+
+    @property
+    def max_visual_geom(self) -> int:
+        """Most marks and geoms that one picture takes."""
+        return self.marks.limit
+
+    @max_visual_geom.setter
+    def max_visual_geom(self, limit: int) -> None:
+        self.marks.limit = _positive("max_visual_geom", limit)
+        self._close_viewer()
+
+    def build_data(self) -> SimData:
+        """Return new data at rest, as at construction, and make it the simulation's."""
+        data = SimData(
+            states=SimState.create(
+                self.n_worlds, self.n_drones, n_rotor_states(self.dynamics, self.airframe)
+            ),
+            controls=SimControls.create(
+                self.n_worlds, self.n_drones, self.control, self.dynamics, self.airframe, self._freqs
+            ),
+            params=create_params(self.dynamics, self.airframe),
+            core=SimCore.create(
+                self.freq,
+                self.n_worlds,
+                self.n_drones,
+                build.drone_mocap_ids(self.mj_model, self.n_drones),
+                self._seed,
+            ),
+        )
+        self.data = jax.device_put(data, self.device) if self.mesh is None else shard(data, self.mesh)
+        return self.data
+
+    def build_default_data(self) -> SimData:
+        """Make the data as it is now what resets return to, and return it."""
+        self.default_data = self.data
+        return self.default_data
+
+    def shard(self, mesh: Mesh) -> SimData:
+        """Spread data, default data and scene over devices, and return the data."""
+        self.mesh = mesh
+        self.data = shard(self.data, mesh)
+        self.default_data = shard(self.default_data, mesh)
+        self._mjx_model = self._mjx_data = None
+        return self.data
+
+    def seed(self, seed: int) -> None:
+        """Set the seed of all random numbers drawn from now on."""
+        if not isinstance(seed, (int, np.integer)):
+            raise ValueError(f"a seed is an integer, got {seed!r}")
+        self._seed = jax.device_put(as_key(int(seed)), self.data.core.rng_key.sharding)
+        self.data = self.data.replace(core=self.data.core.replace(rng_key=self._seed))
+
+    # Stepping -----------------------------------------------------------------------------------------------
+
+    def step(self, n_steps: int = 1) -> None:
+        """Advance every world by a number of physics steps; any number uses the same compilation."""
+        n_steps = _positive("n_steps", n_steps)
+        self.data = self._step(self.data, jnp.int32(n_steps))
+
+    def reset(self, mask: Any = None) -> None:
+        """Bring all worlds, or those of a mask, back to ``default_data``, and run the reset pipeline.
+
+        Args:
+            mask: Which worlds, of type bool; None for all. (n_worlds,)
+
+        Raises:
+            ValueError: If the mask has another shape or type.
+        """
+        if mask is not None:
+            mask = mask if isinstance(mask, jax.Array) else np.asarray(mask)
+            if mask.shape != (self.n_worlds,) or mask.dtype != bool:
+                raise ValueError(
+                    f"the mask has shape {mask.shape} and type {mask.dtype}; needed are {(self.n_worlds,)} and bool, "
+                    f"one per world"
+                )
+            mask = jnp.asarray(mask)
+        self.data = self._reset(self.data, self.default_data, mask)
+
+    def state_control(self, controls: Any, check_finite: bool = False) -> None:
+        """Stage a full-state setpoint; see ``crazysim.sim.functional.state_control``. (n_worlds, n_drones, 16)"""
+        self._command(F.state_control(self.data, controls, check_finite))
+
+    def attitude_control(self, controls: Any, check_finite: bool = False) -> None:
+        """Stage roll, pitch, yaw, rad, and collective thrust, N. (n_worlds, n_drones, 4)"""
+        self._command(F.attitude_control(self.data, controls, check_finite))
+
+    def body_rate_control(self, controls: Any, check_finite: bool = False) -> None:
+        """Stage body rates, rad/s, and collective thrust, N. (n_worlds, n_drones, 4)"""
+        self._command(F.body_rate_control(self.data, controls, check_finite))
+
+    def force_torque_control(self, controls: Any, check_finite: bool = False) -> None:
+        """Stage collective thrust, N, and body torque, N m. (n_worlds, n_drones, 4)"""
+        self._command(F.force_torque_control(self.data, controls, check_finite))
+
+    def rotor_vel_control(self, controls: Any, check_finite: bool = False) -> None:
+        """Command rotor speeds, rpm. (n_worlds, n_drones, n_rotors)"""
+        self._command(F.rotor_vel_control(self.data, controls, check_finite))
+
+    def _command(self, data: SimData) -> None:
+        self._data = data  # a command moves nothing: the scene stays as fresh as it was
+
+    def build_step_fn(self) -> StepFn:
+        """Make the step pipeline as it is now take effect; return ``step(data, n_steps=1) -> data``, pure."""
+        self._step = build_step(self.step_pipeline)
+        return self._step
+
+    def build_reset_fn(self) -> ResetFn:
+        """Make the reset pipeline as it is now take effect; return ``reset(data, default_data, mask=None)``, pure."""
+        self._reset = build_reset(self.reset_pipeline)
+        return self._reset
+
+    # Scene --------------------------------------------------------------------------------------------------
+
+    @property
+    def mjx_model(self) -> mjx.Model:
+        """The scene's model on the device; made when first read."""
+        if self._mjx_model is None:
+            model = build.put_model(self.mj_model, self.device)
+            if self.mesh is not None:
+                model = jax.device_put(model, NamedSharding(self.mesh, PartitionSpec()))
+            self._mjx_model = model
+        return self._mjx_model
+
+    @property
+    def mjx_data(self) -> mjx.Data:
+        """The scene's state in every world, as it was last synced; made when first read, and returned as it is."""
+        if self._mjx_data is None:
+            mjx_data = build.make_data(self.mj_model, self.n_worlds, self.device)
+            self._mjx_data = mjx_data if self.mesh is None else place_scene(mjx_data, self.mesh)
+        return self._mjx_data
+
+    @mjx_data.setter
+    def mjx_data(self, mjx_data: mjx.Data) -> None:
+        self._mjx_data = mjx_data
+        self._synced = False
+
+    def build_mjx(self) -> None:
+        """Compile ``spec`` again after an edit; closes the viewer, and leaves the simulation's data as it is.
+
+        Raises:
+            ConfigError: If the spec does not compile or has lost a drone; the old scene stays then.
+        """
+        self.spec.numeric("max_geom_pairs").data = [self.max_geom_pairs]
+        self._compile_scene()
+        ids = jnp.asarray(build.drone_mocap_ids(self.mj_model, self.n_drones), jnp.int32)
+        ids = jax.device_put(ids, self.data.core.drone_mocap_ids.sharding)
+        self.default_data = self.default_data.replace(
+            core=self.default_data.core.replace(drone_mocap_ids=ids)
+        )
+        self.data = self.data.replace(
+            core=self.data.core.replace(
+                drone_mocap_ids=ids, mjx_synced=self._false(self.data.core.mjx_synced)
+            )
+        )
+
+    def contacts(self, body: str | None = None) -> Array:
+        """Return which contact slots touch, after bringing the scene up to date if anything has changed.
+
+        A slot is a pair of geoms that may touch; which pair it is, ``mj_model`` and MJX decide. From 64 drones a
+        world on MJX keeps only ``max_geom_pairs`` pairs, the nearest; set it to -1 and call ``build_mjx`` for all.
+
+        Args:
+            body: Name of a body, such as ``"drone:0"``, to which a slot must belong; None for all.
+
+        Returns:
+            (n_worlds, n_slots), bool
+
+        Raises:
+            ValueError: If the scene has no such body.
+        """
+        self._sync()
+        if body is None:
+            return contacts.contact_flags(self.mjx_data)
+        return contacts.body_contact_flags(self.mjx_data, self.mj_model, body)
+
+    def render(
+        self,
+        mode: str = "human",
+        world: int = 0,
+        camera: int | str = -1,
+        cam_config: dict[str, Any] | None = None,
+        width: int = 1920,
+        height: int = 1080,
+    ) -> NDArray | tuple[NDArray, NDArray] | None:
+        """Draw one world; every argument counts at every call.
+
+        Args:
+            mode: ``"human"`` opens a window, ``"rgb_array"`` returns a picture (height, width, 3) of type uint8,
+                ``"depth_array"`` the distance along the camera's axis, m (height, width), ``"rgbd_tuple"`` both.
+            world: Which world.
+            camera: Name or id; -1 is the free camera. Drones carry ``fpv_cam:i`` and ``track_cam:i``.
+            cam_config: Settings of the free camera: lookat, distance, azimuth, elevation.
+            width: Pixels; a window chooses its own size.
+            height: Pixels.
+
+        Raises:
+            ValueError: If the world, camera, mode or a setting does not exist.
+            RenderError: If this machine cannot draw.
+        """
+        if not 0 <= world < self.n_worlds:
+            raise ValueError(f"world {world} does not exist; worlds go from 0 to {self.n_worlds - 1}")
+        self._sync(world)
+        if self.viewer is None:
+            self.viewer = Viewer(self.mj_model, self.mj_data, self.marks.limit + self.mj_model.ngeom)
+        picture = self.viewer.render(mode, camera, cam_config, width, height, self.marks)
+        self.marks.clear()
+        return picture
+
+    def close(self) -> None:
+        """Close the window and free what pictures needed."""
+        self._close_viewer()
+
+    def _sync(self, world: int | None = None) -> None:
+        """Bring the scene up to date: all of it, or ``mj_data`` with the one world that is to be drawn.
+
+        The only way to a fresh scene. A single world is drawn without touching the others; where there is only
+        one, or all are fresh already, that is the whole scene.
+        """
+        if not self._synced and (world is None or self.n_worlds == 1):
+            self._data, self._mjx_data = sync_sim2mjx(self._data, self.mjx_data, self.mjx_model)
+            self._synced = True
+        if world is not None:
+            sync_one_world(self._data, self._mjx_data, world, self.mj_model, self.mj_data)
+
+    def _compile_scene(self) -> None:
+        mj_model = build.compile_spec(self.spec)
+        build.drone_mocap_ids(mj_model, self.n_drones)  # refuses a scene that has lost a drone
+        self._close_viewer()
+        self.mj_model, self.mj_data = mj_model, mujoco.MjData(mj_model)
+        self._mjx_model: mjx.Model | None = None
+        self._mjx_data: mjx.Data | None = None
+        self._synced = False
+
+    def _close_viewer(self) -> None:
+        if self.viewer is not None:
+            self.viewer.close()
+            self.viewer = None
+
+    @staticmethod
+    def _false(like: Array) -> Array:
+        return jax.device_put(jnp.asarray(False), like.sharding)
+
+    def _control_freqs(self, **given: int | None) -> dict[Control, int]:
+        """Return the rate of every controller, checked where the controller is in use."""
+        levels = [Control.state, Control.attitude, Control.body_rate, Control.force_torque]
+        used = {
+            Control.state: (Control.state, Control.attitude, Control.force_torque),
+            Control.attitude: (Control.attitude, Control.force_torque),
+            Control.body_rate: (Control.body_rate, Control.force_torque),
+            Control.force_torque: (Control.force_torque,),
+        }.get(self.control, ())
+        freqs = {}
+        for level in levels:
+            limit = min(100 if level == Control.state else 500, self.freq)
+            default = next(f for f in range(limit, 0, -1) if self.freq % f == 0)
+            freq = (
+                default
+                if given[level.value] is None
+                else _positive(f"{level.value}_freq", given[level.value])
+            )
+            if level in used and (freq > self.freq or self.freq % freq):
+                below = next(f for f in range(min(freq, self.freq), 0, -1) if self.freq % f == 0)
+                raise ConfigError(
+                    f"{level.value}_freq is {freq} Hz, which does not divide freq = {self.freq} Hz, so it cannot fire "
+                    f"every whole number of steps. The nearest rate below is {below} Hz."
+                )
+            freqs[level] = freq
+        return freqs
+
+
+def use_box_collision(sim: Sim, enable: bool = True) -> None:
+    """Let drones touch with boxes instead of spheres, or with spheres again; compiles the scene anew.
+
+    Boxes follow the drone's outline more closely and cost more to check.
+    """
+    for geom in sim.spec.geoms:
+        kind, _, index = geom.name.partition(":")
+        if kind in ("col_sphere", "col_box") and index.isdigit():
+            geom.contype = geom.conaffinity = int((kind == "col_box") == enable)
+    sim.build_mjx()
+
+
+def _positive(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ConfigError(f"{name} is {value!r}; it must be a positive whole number")
+    return int(value)
+
+
+def _member(enum: Any, name: str, value: Any) -> Any:
+    try:
+        return enum(value)
+    except ValueError:
+        names = ", ".join(repr(m.value) for m in enum)
+        raise UnknownNameError(f"{name} is {value!r}; it must be one of {names}") from None
+
+
+def _device(device: str | jax.Device) -> jax.Device:
+    if not isinstance(device, str):
+        return device
+    platform, _, index = device.partition(":")
+    try:
+        devices = jax.devices("gpu" if platform == "cuda" else platform)
+        return devices[int(index or 0)]
+    except (RuntimeError, ValueError, IndexError) as error:
+        found = ", ".join(str(d) for d in jax.devices())
+        raise ConfigError(
+            f"device {device!r} does not exist ({error}); there is {found}. Give a platform such as 'cpu' or 'gpu', "
+            f"or 'gpu:1' for the second of its devices. GPUs need jax's CUDA packages: pip install 'crazysim[gpu]'."
+        ) from None

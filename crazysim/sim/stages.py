@@ -1,0 +1,226 @@
+"""The built-in stages: commands on their ticks, dynamics, floor and clock, as SimData -> SimData."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.control import (
+    Control,
+    attitude2force_torque,
+    body_rate2force_torque,
+    force_torque2rotor_vel,
+    state2attitude,
+)
+from crazysim.dynamics import Dynamics, first_principles, fitted
+from crazysim.pytree import PyTree, map_batched, select_worlds
+from crazysim.sim.data import SimData, SimStateDeriv
+from crazysim.sim.integration import INTEGRATORS, Integrator
+from crazysim.sim.pipeline import Pipeline
+
+FLOOR = -0.001
+"""Height below which no drone falls, m: a little under zero, so that a negative height tells a landing."""
+
+
+def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integrator) -> Pipeline:
+    """Return the stages of one physics step, in order."""
+    fitted_model = dynamics != Dynamics.first_principles
+    stages: Pipeline = {}
+    if control == Control.state:
+        stages["state_controller"] = state_controller
+    if control in (Control.state, Control.attitude):
+        if fitted_model:
+            stages["commit_attitude"] = commit_attitude
+        else:
+            stages["attitude_controller"] = attitude_controller
+    if control == Control.body_rate:
+        stages["body_rate_controller"] = body_rate_controller
+    if not fitted_model and control != Control.rotor_vel:
+        stages["force_torque_controller"] = force_torque_controller
+    stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
+    deriv_fn = fitted_derivative if fitted_model else first_principles_derivative
+    stages["integration"] = partial(INTEGRATORS[integrator], deriv_fn=deriv_fn)
+    stages["clip_floor_pos"] = clip_floor_pos
+    stages["increment_steps"] = increment_steps
+    return stages
+
+
+def tick(data: SimData, freq: int) -> Array | None:
+    """Return which worlds' controllers of a rate fire at this step, or None where all do always. (n_worlds, 1)"""
+    period = data.core.freq // freq
+    return None if period == 1 else data.core.steps % period == 0
+
+
+def _update(record: PyTree, mask: Array | None, **changes: Array) -> PyTree:
+    return record.replace(**{k: select_worlds(mask, v, getattr(record, k)) for k, v in changes.items()})
+
+
+def state_controller(data: SimData) -> SimData:
+    """Take over the staged setpoint, and stage the attitude, thrust and body rates that lead to it."""
+    states, controls = data.states, data.controls
+    ctrl, attitude = controls.state, controls.attitude
+    mask = tick(data, ctrl.freq)
+    cmd = ctrl.staged_cmd
+    attitude_cmd, pos_err_i = state2attitude(
+        states.pos, states.quat, states.vel, cmd, ctrl.pos_err_i, ctrl.freq, params=ctrl.params
+    )
+    ctrl = _update(ctrl, mask, cmd=cmd, pos_err_i=pos_err_i)
+    attitude = _update(attitude, mask, staged_cmd=attitude_cmd)
+    if attitude.staged_ang_vel_des is not None:
+        attitude = _update(attitude, mask, staged_ang_vel_des=cmd[..., 13:16])
+    return data.replace(controls=controls.replace(state=ctrl, attitude=attitude))
+
+
+def commit_attitude(data: SimData) -> SimData:
+    """Take over the staged attitude command; fitted dynamics contain the controller that follows it."""
+    ctrl = data.controls.attitude
+    ctrl = _update(ctrl, tick(data, ctrl.freq), cmd=ctrl.staged_cmd)
+    return data.replace(controls=data.controls.replace(attitude=ctrl))
+
+
+def attitude_controller(data: SimData) -> SimData:
+    """Take over the staged attitude command, and stage the wrench that turns the drone there."""
+    states, controls = data.states, data.controls
+    ctrl = controls.attitude
+    mask = tick(data, ctrl.freq)
+    wrench, r_int_error = attitude2force_torque(
+        states.quat,
+        states.ang_vel,
+        ctrl.staged_cmd,
+        ctrl.staged_ang_vel_des,
+        ctrl.prev_ang_vel,
+        ctrl.ang_vel_des,
+        ctrl.r_int_error,
+        ctrl.freq,
+        params=ctrl.params,
+    )
+    ctrl = _update(
+        ctrl,
+        mask,
+        cmd=ctrl.staged_cmd,
+        ang_vel_des=ctrl.staged_ang_vel_des,
+        r_int_error=r_int_error,
+        prev_ang_vel=states.ang_vel,
+    )
+    force_torque = _update(controls.force_torque, mask, staged_cmd=wrench)
+    return data.replace(controls=controls.replace(attitude=ctrl, force_torque=force_torque))
+
+
+def body_rate_controller(data: SimData) -> SimData:
+    """Take over the staged body rates, and stage the wrench that follows them."""
+    states, controls = data.states, data.controls
+    ctrl = controls.body_rate
+    mask = tick(data, ctrl.freq)
+    cmd = ctrl.staged_cmd
+    wrench, r_int_error = body_rate2force_torque(
+        states.quat,
+        states.ang_vel,
+        cmd,
+        ctrl.prev_ang_vel,
+        ctrl.cmd,
+        ctrl.r_int_error,
+        ctrl.freq,
+        params=ctrl.params,
+    )
+    ctrl = _update(ctrl, mask, cmd=cmd, r_int_error=r_int_error, prev_ang_vel=states.ang_vel)
+    force_torque = _update(controls.force_torque, mask, staged_cmd=wrench)
+    return data.replace(controls=controls.replace(body_rate=ctrl, force_torque=force_torque))
+
+
+def force_torque_controller(data: SimData) -> SimData:
+    """Take over the staged wrench, and command the rotor speeds that give it."""
+    controls = data.controls
+    ctrl = controls.force_torque
+    mask = tick(data, ctrl.freq)
+    cmd = ctrl.staged_cmd
+    rotor_vel = select_worlds(mask, force_torque2rotor_vel(cmd, params=ctrl.params), controls.rotor_vel)
+    return data.replace(
+        controls=controls.replace(force_torque=_update(ctrl, mask, cmd=cmd), rotor_vel=rotor_vel)
+    )
+
+
+def clip_rotor_vel_cmd(data: SimData) -> SimData:
+    """Keep commanded rotor speeds within what the motors can do; zero or less is off."""
+    rotor_vel = first_principles.saturate(data.controls.rotor_vel, data.params)
+    return data.replace(controls=data.controls.replace(rotor_vel=rotor_vel))
+
+
+def clip_thrust_cmd(data: SimData) -> SimData:
+    """Keep the commanded collective thrust within what the rotors can give; zero or less is off."""
+    ctrl = data.controls.attitude
+    ctrl = ctrl.replace(cmd=fitted.saturate(ctrl.cmd, data.params))
+    return data.replace(controls=data.controls.replace(attitude=ctrl))
+
+
+def first_principles_derivative(data: SimData) -> SimStateDeriv:
+    """Return the derivative of every drone from first principles."""
+    return _derivative(data, first_principles.dynamics, data.controls.rotor_vel)
+
+
+def fitted_derivative(data: SimData) -> SimStateDeriv:
+    """Return the derivative of every drone under a fitted model."""
+    return _derivative(data, fitted.dynamics, data.controls.attitude.cmd)
+
+
+def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: Array) -> SimStateDeriv:
+    s = data.states
+    vel, acc, ang_acc, rotor_acc = dynamics(
+        s.pos, s.quat, s.vel, s.ang_vel, cmd, s.rotor_vel, s.force, s.torque, params=data.params
+    )
+    # A drone that clip_floor_pos has stopped rests on its feet: it neither slides nor turns until it is lifted.
+    held = (s.pos[..., 2:] == FLOOR) & (s.vel[..., 2:] == 0) & (acc[..., 2:] <= 0)
+    return SimStateDeriv(
+        vel=jnp.where(held, 0.0, vel),
+        ang_vel=jnp.where(held, 0.0, s.ang_vel),
+        acc=jnp.where(held, 0.0, acc),
+        ang_acc=jnp.where(held, 0.0, ang_acc),
+        rotor_acc=rotor_acc,
+    )
+
+
+def clip_floor_pos(data: SimData) -> SimData:
+    """Stop drones at the floor: one that has fallen below it is set on it, at rest."""
+    s = data.states
+    below = s.pos[..., 2:] < FLOOR
+    states = s.replace(
+        pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(s.pos[..., 2:], FLOOR)], axis=-1),
+        vel=jnp.where(below, 0.0, s.vel),
+        ang_vel=jnp.where(below, 0.0, s.ang_vel),
+    )
+    return data.replace(states=states)
+
+
+def increment_steps(data: SimData) -> SimData:
+    """Count the step."""
+    return data.replace(core=data.core.replace(steps=data.core.steps + 1))
+
+
+def flag_nonfinite(data: SimData) -> SimData:
+    """Set the flag of every world in which a state is NaN or infinite; only a reset of that world clears it."""
+    leaves = jax.tree.leaves(data.states)
+    finite = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in leaves])
+    nonfinite = data.core.nonfinite | ~jnp.all(finite, axis=0)[:, None]
+    return data.replace(core=data.core.replace(nonfinite=nonfinite))
+
+
+def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:
+    """Bring worlds back to the default data: everything that belongs to a world, and nothing else.
+
+    What is shared between worlds (parameters that were not randomised, opaque plugin data, the seed's key)
+    stays as it is, with a mask and without. A parameter that has become one per drone goes back to its
+    default in every world that is reset. Plugins that the default does not know stay.
+
+    Args:
+        data: The simulation.
+        default_data: What it is brought back to.
+        mask: Which worlds; None for all. (n_worlds,)
+    """
+    known = {name: default_data.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
+    default_data = default_data.replace(plugins=known)
+    new = map_batched(lambda x, default: select_worlds(mask, default, x), data, default_data)
+    episode = select_worlds(mask, data.core.episode + 1, data.core.episode)
+    return new.replace(core=new.core.replace(episode=episode))

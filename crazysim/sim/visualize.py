@@ -1,0 +1,117 @@
+"""Draw into the next picture, and change the colours of drones."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crazysim.errors import UnknownNameError
+from crazysim.scene.draw import RED
+
+if TYPE_CHECKING:
+    from crazysim.sim.sim import Sim
+
+
+def draw_line(
+    sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, start_size: float = 3.0, end_size: float = 3.0
+) -> None:
+    """Draw a line through points into the next picture.
+
+    Args:
+        sim: The simulation.
+        points: World frame, m. (n, 3)
+        rgba: Colour, 0 to 1; red if left out. (4,)
+        start_size: Width at the first point, pixels.
+        end_size: Width at the last point, pixels.
+
+    Raises:
+        ValueError: If the points have another shape.
+    """
+    sim.marks.line(_points(points), RED if rgba is None else rgba, start_size, end_size)
+
+
+def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size: float = 0.01) -> None:
+    """Draw points into the next picture, as spheres.
+
+    Args:
+        sim: The simulation.
+        points: World frame, m. (n, 3)
+        rgba: Colour, 0 to 1; red if left out. (4,)
+        size: Radius, m.
+
+    Raises:
+        ValueError: If the points have another shape.
+    """
+    sim.marks.points(_points(points), RED if rgba is None else rgba, size)
+
+
+def draw_capsule(
+    sim: Sim,
+    p1: ArrayLike,
+    p2: ArrayLike,
+    radius: float = 0.05,
+    rgba: ArrayLike | None = None,
+    cylinder: bool = False,
+) -> None:
+    """Draw a capsule, or a cylinder, between two points into the next picture.
+
+    Args:
+        sim: The simulation.
+        p1: One end, world frame, m. (3,)
+        p2: The other end, world frame, m. (3,)
+        radius: Radius, m.
+        rgba: Colour, 0 to 1; red if left out. (4,)
+        cylinder: Whether its ends are flat.
+
+    Raises:
+        ValueError: If an end has another shape.
+    """
+    first, last = _points([p1, p2])
+    sim.marks.capsule(first, last, radius, RED if rgba is None else rgba, cylinder)
+
+
+def change_material(
+    sim: Sim,
+    mat_name: str,
+    drone_ids: ArrayLike,
+    rgba: ArrayLike | None = None,
+    emission: ArrayLike | None = None,
+) -> None:
+    """Change the colour or glow of a material that every drone has for itself: ``led_top`` or ``led_bot``.
+
+    Args:
+        sim: The simulation.
+        mat_name: Name of the material without the drone's number.
+        drone_ids: Which drones. (n,)
+        rgba: Colour, 0 to 1, one or one per drone. (4,) or (n, 4)
+        emission: Glow, 0 to 1, one or one per drone. () or (n,)
+
+    Raises:
+        ValueError: If a drone or a material of that name does not exist, or a shape does not fit.
+    """
+    ids = np.asarray(drone_ids)
+    if ids.ndim != 1 or not np.issubdtype(ids.dtype, np.integer):
+        raise ValueError(f"drone_ids must be a list of integers, got {drone_ids!r}")
+    if ids.size and not (ids.min() >= 0 and ids.max() < sim.n_drones):
+        raise ValueError(f"drone_ids must lie between 0 and {sim.n_drones - 1}, got {ids.tolist()}")
+    materials = [
+        mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{mat_name}:{drone}") for drone in ids
+    ]
+    if any(material < 0 for material in materials):
+        raise UnknownNameError(
+            f"drones have no material {mat_name!r} of their own; they have led_top and led_bot"
+        )
+    if rgba is not None:
+        sim.mj_model.mat_rgba[materials] = np.broadcast_to(np.asarray(rgba, float), (len(ids), 4))
+    if emission is not None:
+        sim.mj_model.mat_emission[materials] = np.broadcast_to(np.asarray(emission, float), (len(ids),))
+
+
+def _points(points: ArrayLike) -> np.ndarray:
+    array = np.atleast_2d(np.asarray(points, dtype=float))
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"points must have shape (n, 3), got {array.shape}")
+    return array

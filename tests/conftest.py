@@ -1,0 +1,65 @@
+"""Shared by all tests: two host devices, a persistent compilation cache, and simulations built once."""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+
+# Compiling is most of the suite's time; what was compiled once, in any worker or run, is kept.
+CACHE = Path(__file__).parents[1] / ".cache" / "jax"
+jax.config.update("jax_compilation_cache_dir", str(CACHE))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+# Compilation inside an example must not count as slowness, and CI must not depend on luck.
+settings.register_profile(
+    "crazysim", deadline=None, derandomize=True, max_examples=30, suppress_health_check=list(HealthCheck)
+)
+settings.load_profile("crazysim")
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item, call):
+    """Fail what is skipped where nothing may be: a skip in CI would hide a test that never ran."""
+    outcome = yield
+    report = outcome.get_result()
+    if report.skipped and os.environ.get("CRAZYSIM_NO_SKIP"):
+        report.outcome = "failed"
+        report.longrepr = f"{item.nodeid} was skipped where CRAZYSIM_NO_SKIP forbids it: {report.longrepr}"
+
+
+@pytest.fixture
+def x64():
+    """Run a test in float64."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def rng():
+    """Return a generator that gives the same numbers in every run."""
+    return np.random.default_rng(20261121)
+
+
+def can_render():
+    """Return whether this machine can make an OpenGL context."""
+    import mujoco
+
+    try:
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception:
+        return False
+    return True
+
+
+@pytest.fixture(scope="session")
+def opengl():
+    """Skip a test where no OpenGL context can be made; CI forbids the skip."""
+    if not can_render():
+        pytest.skip("no working OpenGL")
