@@ -37,9 +37,7 @@ class StateParams(PyTree):
         """
         to_pwm = airframe.value("controller.mass_thrust", ())
         from_pwm = (
-            airframe.n_rotors
-            * airframe.value("rotors.thrust_max", ())
-            / airframe.value("controller.pwm_max", ())
+            airframe.n_rotors * airframe.value("rotors.thrust_max", ()) / airframe.value("controller.pwm_max", ())
         )
         return StateParams(
             mass=as_parameter(airframe.value("controller.mass", ())),

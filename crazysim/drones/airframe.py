@@ -156,9 +156,7 @@ def _numbers(name: str, node: Any, path: tuple[str, ...]) -> Any:
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ConfigError(
-            f"airframe {name!r}: {'.'.join(path)} = {value!r} is not a number or array"
-        ) from error
+        raise ConfigError(f"airframe {name!r}: {'.'.join(path)} = {value!r} is not a number or array") from error
     if not np.all(np.isfinite(array)):
         raise ConfigError(f"airframe {name!r}: {'.'.join(path)} = {value!r} is not finite")
     array.setflags(write=False)
@@ -171,20 +169,14 @@ def _check(airframe: Airframe) -> None:
     if mass <= 0:
         raise ConfigError(f"airframe {airframe.name!r}: mass is {mass} kg, it must be positive")
     inertia = airframe.inertia
-    if (
-        inertia.shape != (3, 3)
-        or not np.allclose(inertia, inertia.T)
-        or np.min(np.linalg.eigvalsh(inertia)) <= 0
-    ):
+    if inertia.shape != (3, 3) or not np.allclose(inertia, inertia.T) or np.min(np.linalg.eigvalsh(inertia)) <= 0:
         raise ConfigError(
             f"airframe {airframe.name!r}: inertia {inertia.tolist()} must be three positive moments "
             f"or a symmetric positive definite 3 x 3 matrix, kg m^2"
         )
     position = airframe.value("rotors.position")
     if position.ndim != 2 or position.shape[1] != 3:
-        raise ConfigError(
-            f"airframe {airframe.name!r}: rotors.position has shape {position.shape}, needed is (n, 3)"
-        )
+        raise ConfigError(f"airframe {airframe.name!r}: rotors.position has shape {position.shape}, needed is (n, 3)")
     airframe.value("rotors.yaw_torque_sign", (len(position),))
     low, high = airframe.value("rotors.thrust_min", ()), airframe.value("rotors.thrust_max", ())
     if not 0 <= low < high:

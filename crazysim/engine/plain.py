@@ -92,10 +92,7 @@ def _finish(data: SimData, carried: list[int], values: list[Any]) -> list[Any]:
         leaves[i] = value
     out = flag_nonfinite(treedef.unflatten(leaves))
     out = out.replace(core=out.core.replace(mjx_synced=jnp.asarray(False)))
-    return [
-        None if new is old else new
-        for old, new in zip(jax.tree.leaves(data), jax.tree.leaves(out), strict=True)
-    ]
+    return [None if new is old else new for old, new in zip(jax.tree.leaves(data), jax.tree.leaves(out), strict=True)]
 
 
 def build_reset(pipeline: Pipeline) -> ResetFn:

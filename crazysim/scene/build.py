@@ -34,9 +34,7 @@ def build_spec(
     """
     path = SCENE if xml_path is None else Path(xml_path)
     if not path.is_file():
-        raise ConfigError(
-            f"scene file {path} does not exist; pass xml_path= of an MJCF file, or leave it out"
-        )
+        raise ConfigError(f"scene file {path} does not exist; pass xml_path= of an MJCF file, or leave it out")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
@@ -47,9 +45,7 @@ def build_spec(
     spec.copy_during_attach = True
     taken = [body.name for body in spec.bodies if body.name.startswith("drone:")]
     if taken:
-        raise ConfigError(
-            f"scene file {path} has bodies named {taken}; names that begin with 'drone:' are the drones'"
-        )
+        raise ConfigError(f"scene file {path} has bodies named {taken}; names that begin with 'drone:' are the drones'")
     _add_drones(spec, airframe, n_drones)
     # mjx.kinematics refuses a model without any degree of freedom, and mocap bodies have none.
     dummy = spec.worldbody.add_body(name="_dummy", mass=1e-6, inertia=[1e-9] * 3)
@@ -69,11 +65,7 @@ def _add_drones(spec: mujoco.MjSpec, airframe: Airframe, n_drones: int) -> None:
         for part in parts:
             _add_part(body, part, i)
         for camera in cameras:
-            mode = (
-                mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
-                if camera.tracks
-                else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
-            )
+            mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM if camera.tracks else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
             added = body.add_camera(name=f"{camera.name}:{i}", pos=camera.pos, fovy=camera.fovy, mode=mode)
             added.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
             added.alt.xyaxes = camera.xyaxes
@@ -137,8 +129,6 @@ def drone_mocap_ids(mj_model: mujoco.MjModel, n_drones: int) -> list[int]:
     for i in range(n_drones):
         body = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, f"drone:{i}")
         if body < 0 or mj_model.body_mocapid[body] < 0:
-            raise ConfigError(
-                f"the scene has no mocap body 'drone:{i}'; an edit of sim.spec must leave the drones"
-            )
+            raise ConfigError(f"the scene has no mocap body 'drone:{i}'; an edit of sim.spec must leave the drones")
         ids.append(int(mj_model.body_mocapid[body]))
     return ids

@@ -48,9 +48,7 @@ class Viewer:
         if mode not in MODES:
             raise UnknownNameError(f"unknown render mode {mode!r}; the modes are {', '.join(MODES)}")
         if width <= 0 or height <= 0:
-            raise ConfigError(
-                f"a picture of {width} x {height} pixels cannot be; width and height must be positive"
-            )
+            raise ConfigError(f"a picture of {width} x {height} pixels cannot be; width and height must be positive")
         cam = self._camera(camera, cam_config)
         if mode == "human":
             self._render_window(cam, marks)
@@ -80,9 +78,7 @@ class Viewer:
             camera_id = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
             if camera_id < 0:
                 names = [self._model.camera(i).name for i in range(self._model.ncam)]
-                raise UnknownNameError(
-                    f"the scene has no camera {camera!r}; it has {', '.join(names[:12])}, or -1"
-                )
+                raise UnknownNameError(f"the scene has no camera {camera!r}; it has {', '.join(names[:12])}, or -1")
         else:
             camera_id = int(camera)
             if not -1 <= camera_id < self._model.ncam:
@@ -95,9 +91,7 @@ class Viewer:
         mujoco.mjv_defaultFreeCamera(self._model, cam)
         for key, value in (cam_config or {}).items():
             if not hasattr(cam, key):
-                raise UnknownNameError(
-                    f"a camera has no setting {key!r}; use lookat, distance, azimuth, elevation"
-                )
+                raise UnknownNameError(f"a camera has no setting {key!r}; use lookat, distance, azimuth, elevation")
             if isinstance(value, (list, tuple, np.ndarray)):
                 getattr(cam, key)[:] = value
             else:

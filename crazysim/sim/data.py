@@ -222,9 +222,7 @@ class SimCore(PyTree):
     """Whether this data is what the scene shows. ()"""
 
     @staticmethod
-    def create(
-        freq: int, n_worlds: int, n_drones: int, drone_mocap_ids: Any, rng_key: int | Array
-    ) -> SimCore:
+    def create(freq: int, n_worlds: int, n_drones: int, drone_mocap_ids: Any, rng_key: int | Array) -> SimCore:
         """Return the core of a simulation that has not begun."""
         return SimCore(
             freq=freq,

@@ -28,9 +28,7 @@ def state_control(data: SimData, controls: Any, check_finite: bool = False) -> S
         ValueError: Wrong shape, type or command level, or a NaN or infinite command.
     """
     controls = check_command(data, Control.state, controls, check_finite)
-    return data.replace(
-        controls=data.controls.replace(state=data.controls.state.replace(staged_cmd=controls))
-    )
+    return data.replace(controls=data.controls.replace(state=data.controls.state.replace(staged_cmd=controls)))
 
 
 def attitude_control(data: SimData, controls: Any, check_finite: bool = False) -> SimData:

@@ -32,9 +32,7 @@ def prepend_fn(pipeline: Pipeline, fn: Callable[..., Any], name: str | None = No
     _insert(pipeline, 0, fn, name)
 
 
-def insert_fn_before(
-    pipeline: Pipeline, anchor: str, fn: Callable[..., Any], name: str | None = None
-) -> None:
+def insert_fn_before(pipeline: Pipeline, anchor: str, fn: Callable[..., Any], name: str | None = None) -> None:
     """Add a stage right before the stage ``anchor``.
 
     Raises:
@@ -85,9 +83,7 @@ def _insert(pipeline: Pipeline, index: int, fn: Callable[..., Any], name: str | 
     if name is None or name == "<lambda>":
         raise ValueError(f"{fn!r} has no name of its own; pass name= to be able to find the stage again")
     if name in pipeline:
-        raise UnknownNameError(
-            f"the pipeline has a stage {name!r} already; pass another name=, or use replace_fn"
-        )
+        raise UnknownNameError(f"the pipeline has a stage {name!r} already; pass another name=, or use replace_fn")
     items = list(pipeline.items())
     items.insert(index, (name, fn))
     pipeline.clear()

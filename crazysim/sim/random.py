@@ -44,6 +44,4 @@ def drone_keys(data: SimData, name: str) -> Array:
         Typed keys; draw with ``jax.vmap(jax.vmap(draw))(keys)``. (n_worlds, n_drones)
     """
     drones = jnp.arange(data.core.n_drones)
-    return jax.vmap(lambda key: jax.vmap(lambda drone: jax.random.fold_in(key, drone))(drones))(
-        world_keys(data, name)
-    )
+    return jax.vmap(lambda key: jax.vmap(lambda drone: jax.random.fold_in(key, drone))(drones))(world_keys(data, name))

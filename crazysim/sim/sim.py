@@ -169,9 +169,7 @@ class Sim:
     def build_data(self) -> SimData:
         """Return new data at rest, as at construction, and make it the simulation's."""
         data = SimData(
-            states=SimState.create(
-                self.n_worlds, self.n_drones, n_rotor_states(self.dynamics, self.airframe)
-            ),
+            states=SimState.create(self.n_worlds, self.n_drones, n_rotor_states(self.dynamics, self.airframe)),
             controls=SimControls.create(
                 self.n_worlds, self.n_drones, self.control, self.dynamics, self.airframe, self._freqs
             ),
@@ -301,13 +299,9 @@ class Sim:
         self._compile_scene()
         ids = jnp.asarray(build.drone_mocap_ids(self.mj_model, self.n_drones), jnp.int32)
         ids = jax.device_put(ids, self.data.core.drone_mocap_ids.sharding)
-        self.default_data = self.default_data.replace(
-            core=self.default_data.core.replace(drone_mocap_ids=ids)
-        )
+        self.default_data = self.default_data.replace(core=self.default_data.core.replace(drone_mocap_ids=ids))
         self.data = self.data.replace(
-            core=self.data.core.replace(
-                drone_mocap_ids=ids, mjx_synced=self._false(self.data.core.mjx_synced)
-            )
+            core=self.data.core.replace(drone_mocap_ids=ids, mjx_synced=self._false(self.data.core.mjx_synced))
         )
 
     def contacts(self, body: str | None = None) -> Array:
@@ -410,11 +404,7 @@ class Sim:
         for level in levels:
             limit = min(100 if level == Control.state else 500, self.freq)
             default = next(f for f in range(limit, 0, -1) if self.freq % f == 0)
-            freq = (
-                default
-                if given[level.value] is None
-                else _positive(f"{level.value}_freq", given[level.value])
-            )
+            freq = default if given[level.value] is None else _positive(f"{level.value}_freq", given[level.value])
             if level in used and (freq > self.freq or self.freq % freq):
                 below = next(f for f in range(min(freq, self.freq), 0, -1) if self.freq % f == 0)
                 raise ConfigError(

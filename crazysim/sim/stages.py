@@ -138,9 +138,7 @@ def force_torque_controller(data: SimData) -> SimData:
     mask = tick(data, ctrl.freq)
     cmd = ctrl.staged_cmd
     rotor_vel = select_worlds(mask, force_torque2rotor_vel(cmd, params=ctrl.params), controls.rotor_vel)
-    return data.replace(
-        controls=controls.replace(force_torque=_update(ctrl, mask, cmd=cmd), rotor_vel=rotor_vel)
-    )
+    return data.replace(controls=controls.replace(force_torque=_update(ctrl, mask, cmd=cmd), rotor_vel=rotor_vel))
 
 
 def clip_rotor_vel_cmd(data: SimData) -> SimData:

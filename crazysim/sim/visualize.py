@@ -97,13 +97,9 @@ def change_material(
         raise ValueError(f"drone_ids must be a list of integers, got {drone_ids!r}")
     if ids.size and not (ids.min() >= 0 and ids.max() < sim.n_drones):
         raise ValueError(f"drone_ids must lie between 0 and {sim.n_drones - 1}, got {ids.tolist()}")
-    materials = [
-        mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{mat_name}:{drone}") for drone in ids
-    ]
+    materials = [mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{mat_name}:{drone}") for drone in ids]
     if any(material < 0 for material in materials):
-        raise UnknownNameError(
-            f"drones have no material {mat_name!r} of their own; they have led_top and led_bot"
-        )
+        raise UnknownNameError(f"drones have no material {mat_name!r} of their own; they have led_top and led_bot")
     if rgba is not None:
         sim.mj_model.mat_rgba[materials] = np.broadcast_to(np.asarray(rgba, float), (len(ids), 4))
     if emission is not None:
