@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from crazysim import rotation
 from crazysim.control.core import allocation_matrix
@@ -100,7 +100,9 @@ def attitude2force_torque(
         Collective thrust, N, and body torque, N m (..., 4); the new integral, rad s (..., 3).
     """
     p = params
-    error = rotation.multiply(rotation.conjugate(rotation.from_rpy(cmd[..., :3])), quat)
+    # Without the barrier XLA computes the six sines and cosines anew for every number that uses them.
+    wanted = lax.optimization_barrier(rotation.from_rpy(cmd[..., :3]))
+    error = rotation.multiply(rotation.conjugate(wanted), quat)
     rotation_error = 4 * error[..., 3:] * error[..., :3]  # vee(Rd^T R - R^T Rd)
     rate_error_dot = ((ang_vel_des - prev_ang_vel_des) - (ang_vel - prev_ang_vel)) * ctrl_freq
     r_int_error = jnp.clip(r_int_error - rotation_error / ctrl_freq, -p.int_err_max, p.int_err_max)

@@ -69,7 +69,7 @@ def advance(data: SimData, deriv: SimStateDeriv, dt: float, rotvec: Array) -> Si
     s = data.states
     states = s.replace(
         pos=s.pos + dt * deriv.vel,
-        quat=rotation.normalize(rotation.multiply(s.quat, rotation.from_rotvec(rotvec))),
+        quat=rotation.turn(s.quat, rotvec),
         vel=s.vel + dt * deriv.acc,
         ang_vel=s.ang_vel + dt * deriv.ang_acc,
         rotor_vel=s.rotor_vel + dt * deriv.rotor_acc,
