@@ -79,8 +79,10 @@ def _settle(name: str, before: SimData, after: SimData) -> SimData:
     written = [i for i, (x, y) in enumerate(zip(old, new, strict=True)) if x is not y]
     leaf_scopes = jax.tree.leaves(scopes(after))
     for i, value in zip(written, jax.lax.optimization_barrier([new[i] for i in written]), strict=True):
-        is_vector = leaf_scopes[i] == "drone" and value.ndim == 3
-        new[i] = with_layout_constraint(value, Layout(major_to_minor=(2, 0, 1))) if is_vector else value
+        if leaf_scopes[i] == "drone" and value.ndim == 3:
+            many_worlds = value.shape[0] >= value.shape[1]
+            value = with_layout_constraint(value, Layout(major_to_minor=(2, 1, 0) if many_worlds else (2, 0, 1)))
+        new[i] = value
     return treedef.unflatten(new)
 
 
@@ -88,7 +90,7 @@ def _loop_body(
     single: Callable[[SimData], SimData], data: SimData
 ) -> tuple[list[Any], list[int], Callable[[list[Any]], list[Any]]]:
     """Return the leaves, the positions of those that a step writes, and a step on these alone."""
-    leaves, treedef = jax.tree.flatten(data)
+    leaves = jax.tree.leaves(data)
     jaxpr = jax.make_jaxpr(single)(data)
     pairs = zip(jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars, strict=True)
     carried = [i for i, (before, after) in enumerate(pairs) if before is not after]

@@ -56,14 +56,13 @@ class Viewer:
         renderer = self._renderer(width, height)
         renderer.update_scene(self._data, camera=cam)
         marks.write(renderer.scene)
-        color = depth = None
-        if mode in ("rgb_array", "rgbd_tuple"):
-            color = renderer.render().copy()
-        if mode in ("depth_array", "rgbd_tuple"):
-            renderer.enable_depth_rendering()
-            depth = renderer.render().copy()
-            renderer.disable_depth_rendering()
-        return (color, depth) if mode == "rgbd_tuple" else (color if depth is None else depth)
+        if mode == "rgb_array":
+            return renderer.render().copy()
+        color = renderer.render().copy() if mode == "rgbd_tuple" else None
+        renderer.enable_depth_rendering()
+        depth = renderer.render().copy()
+        renderer.disable_depth_rendering()
+        return depth if color is None else (color, depth)
 
     def close(self) -> None:
         """Close the window and free the contexts."""

@@ -102,8 +102,8 @@ class AttitudeControlData(PyTree):
     """Integral of the rotation error, rad s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
     prev_ang_vel: Array | None = leaf("drone", 1)
     """Angular velocity at the previous tick, rad/s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
-    params: AttitudeParams | None
-    """Gains and constants; None in fitted dynamics, which contain the controller."""
+    params: Any
+    """Gains and constants, ``AttitudeParams``; None in fitted dynamics, which contain the controller."""
 
 
 class BodyRateControlData(PyTree):
@@ -244,8 +244,8 @@ class SimData(PyTree):
     """Where the drones are and how they move."""
     controls: SimControls
     """What they were told."""
-    params: SimParams
-    """What they are."""
+    params: Any
+    """What they are: ``SimParams``, by the dynamics model."""
     core: SimCore
     """When it is."""
     plugins: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -290,9 +290,8 @@ def command_shape(data: SimData, control: Control) -> tuple[int, int, int]:
 
 def as_key(seed: int | Array) -> Array:
     """Return a typed random key from a seed, or a key as it is."""
-    if isinstance(seed, jax.Array) and jnp.issubdtype(seed.dtype, jax.dtypes.prng_key):
-        return seed
-    return jax.random.key(seed)
+    key = jnp.asarray(seed)
+    return key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.key(seed)
 
 
 def grid_2d(n: int, spacing: float = 1.0) -> np.ndarray:

@@ -77,7 +77,7 @@ def advance(data: SimData, deriv: SimStateDeriv, dt: float, rotvec: Array) -> Si
     return data.replace(states=states)
 
 
-INTEGRATORS: dict[Integrator, Callable[[SimData, DerivFn], SimData]] = {
+INTEGRATORS: dict[Integrator, Callable[..., SimData]] = {
     Integrator.euler: euler,
     Integrator.symplectic_euler: symplectic_euler,
     Integrator.rk4: rk4,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from crazysim.control import (
     state2attitude,
 )
 from crazysim.dynamics import Dynamics, first_principles, fitted
-from crazysim.pytree import PyTree, map_batched, select_worlds
+from crazysim.pytree import map_batched, select_worlds
 from crazysim.sim.data import SimData, SimStateDeriv
 from crazysim.sim.integration import INTEGRATORS, Integrator
 from crazysim.sim.pipeline import Pipeline
@@ -55,7 +56,7 @@ def tick(data: SimData, freq: int) -> Array | None:
     return None if period == 1 else data.core.steps % period == 0
 
 
-def _update(record: PyTree, mask: Array | None, **changes: Array) -> PyTree:
+def _update(record: Any, mask: Array | None, **changes: Array) -> Any:
     return record.replace(**{k: select_worlds(mask, v, getattr(record, k)) for k, v in changes.items()})
 
 

@@ -69,7 +69,7 @@ def draw_capsule(
     Raises:
         ValueError: If an end has another shape.
     """
-    first, last = _points([p1, p2])
+    first, last = _points(p1)[0], _points(p2)[0]
     sim.marks.capsule(first, last, radius, RED if rgba is None else rgba, cylinder)
 
 
