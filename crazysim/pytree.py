@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.errors import ConfigError
+
 Scope = Literal["drone", "world", "shared", "whole", "parameter"]
 
 T = TypeVar("T")
@@ -62,24 +64,49 @@ def scopes(tree: Any) -> Any:
 
     A parameter comes out as ``shared`` or ``drone``. What is declared nowhere is ``whole``.
     """
+    return _map_declared(lambda x, metadata, _: _scope(x, metadata), tree, {}, "")
 
-    def visit(node: Any, metadata: Any) -> Any:
-        if isinstance(node, PyTree):
-            changes = {
-                f.name: visit(getattr(node, f.name), f.metadata)
-                for f in dataclasses.fields(node)  # type: ignore[arg-type]
-                if not f.metadata.get("static")
-            }
-            return node.replace(**changes)
-        if isinstance(node, dict):
-            return {k: visit(v, metadata) for k, v in node.items()}
-        return jax.tree.map(
-            lambda x: visit(x, metadata) if isinstance(x, PyTree) else _scope(x, metadata),
-            node,
-            is_leaf=lambda x: isinstance(x, PyTree),
-        )
 
-    return visit(tree, {})
+def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
+    """Check that every leaf has the axes of its scope: a parameter of one drone must not pass for one of a world.
+
+    Raises:
+        ConfigError: If a leaf has others, with its name and the shapes it may have.
+    """
+    batches = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1), "shared": ()}
+
+    def check(x: Any, metadata: Any, name: str) -> None:
+        scope = _scope(x, metadata)
+        if scope == "whole":
+            return
+        shape, batch, core_ndim = jnp.shape(x), batches[scope], metadata["core_ndim"]
+        if shape[: len(batch)] != batch or len(shape) != len(batch) + core_ndim:
+            or_shared = f", or {core_ndim} if all drones share it" if metadata["scope"] == "parameter" else ""
+            raise ConfigError(
+                f"{name} has shape {shape}; needed are {len(batch) + core_ndim} dimensions that begin with {batch}, "
+                f"for {n_worlds} worlds of {n_drones} drones{or_shared}. For one value per world, repeat it for every "
+                f"drone with jnp.broadcast_to."
+            )
+
+    _map_declared(check, tree, {}, "data")
+
+
+def _map_declared(fn: Callable[[Any, Any, str], Any], node: Any, metadata: Any, name: str) -> Any:
+    """Return the tree with ``fn(leaf, metadata of its field, its name)`` in place of every leaf."""
+    if isinstance(node, PyTree):
+        changes = {
+            f.name: _map_declared(fn, getattr(node, f.name), f.metadata, f"{name}.{f.name}")
+            for f in dataclasses.fields(node)  # type: ignore[arg-type]
+            if not f.metadata.get("static")
+        }
+        return node.replace(**changes)
+    if isinstance(node, dict):
+        return {k: _map_declared(fn, v, metadata, f"{name}[{k!r}]") for k, v in node.items()}
+    return jax.tree.map(
+        lambda x: _map_declared(fn, x, metadata, name) if isinstance(x, PyTree) else fn(x, metadata, name),
+        node,
+        is_leaf=lambda x: isinstance(x, PyTree),
+    )
 
 
 def _scope(x: Any, metadata: Any) -> str:

@@ -11,7 +11,7 @@ from jax import Array
 from jax.experimental.layout import Layout, with_layout_constraint
 from jax.extend.core import jaxpr_as_fun
 
-from crazysim.pytree import scopes
+from crazysim.pytree import check_axes, scopes
 from crazysim.sim.data import SimData
 from crazysim.sim.pipeline import Pipeline
 from crazysim.sim.stages import flag_nonfinite
@@ -90,6 +90,7 @@ def _loop_body(
     single: Callable[[SimData], SimData], data: SimData
 ) -> tuple[list[Any], list[int], Callable[[list[Any]], list[Any]]]:
     """Return the leaves, the positions of those that a step writes, and a step on these alone."""
+    check_axes(data, *data.states.pos.shape[:2])
     leaves = jax.tree.leaves(data)
     jaxpr = jax.make_jaxpr(single)(data)
     pairs = zip(jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars, strict=True)

@@ -204,11 +204,11 @@ class SimCore(PyTree):
 
     freq: int = static()
     """Physics steps per second, Hz."""
-    steps: Array = leaf("world", 1)
+    steps: Array = leaf("world")
     """Physics steps since the world's last reset. (n_worlds, 1)"""
-    episode: Array = leaf("world", 1)
+    episode: Array = leaf("world")
     """How often the world has been reset; enters its random numbers. (n_worlds, 1)"""
-    nonfinite: Array = leaf("world", 1)
+    nonfinite: Array = leaf("world")
     """Whether the world has turned non-finite since its last reset. (n_worlds, 1)"""
     n_worlds: int = static()
     """Number of worlds."""

@@ -1,0 +1,110 @@
+"""What several tests share: the pairs of dynamics and command level, commands that hover, ways to move drones."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from crazysim import Sim
+from crazysim.dynamics import first_principles
+from crazysim.sim import functional as F
+
+FITTED = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
+LEVELS = ("state", "attitude", "body_rate", "force_torque", "rotor_vel")
+PAIRS = tuple(("first_principles", control) for control in LEVELS) + tuple(
+    (dynamics, control) for dynamics in FITTED for control in ("state", "attitude")
+)
+"""Every dynamics and command level that go together: 11."""
+INTEGRATORS = ("euler", "symplectic_euler", "rk4")
+
+
+def send(data, command, **kwargs):
+    """Return the data with a command of its own level."""
+    return getattr(F, f"{data.controls.mode.value}_control")(data, command, **kwargs)
+
+
+def command_in_force(data):
+    """Return the command that the simulation's own level follows by now."""
+    mode = data.controls.mode.value
+    return data.controls.rotor_vel if mode == "rotor_vel" else getattr(data.controls, mode).cmd
+
+
+def with_states(data, **changes):
+    """Return the data with other states, broadcast to every drone and cast."""
+    states = data.states
+    new = {k: jnp.broadcast_to(jnp.asarray(v, states.pos.dtype), getattr(states, k).shape) for k, v in changes.items()}
+    return data.replace(states=states.replace(**new))
+
+
+def with_params(data, **changes):
+    """Return the data with other parameters of its dynamics, as they are given."""
+    return data.replace(params=data.params.replace(**{k: jnp.asarray(v) for k, v in changes.items()}))
+
+
+def weight(data):
+    """Return the weight of a drone whose parameters are shared, N."""
+    return float(data.params.mass[0]) * 9.81
+
+
+def hover_thrust(data):
+    """Return the collective thrust command that carries the weight, N; a fitted model scales its command."""
+    p = data.params
+    return weight(data) if isinstance(p, first_principles.Params) else weight(data) / float(p.cmd_f_coef[0])
+
+
+def hover_rotor_state(data):
+    """Return what ``states.rotor_vel`` is in hover: rpm, or the thrust that a fitted model keeps there, N."""
+    p = data.params
+    if isinstance(p, first_principles.Params):
+        return np.asarray(first_principles.hover_rotor_vel(p), np.float64)
+    return np.full(data.states.rotor_vel.shape[-1], hover_thrust(data))
+
+
+def hover_command(data, pos=(0.0, 0.0, 1.0)):
+    """Return the command of one drone that hovers at its place. (k,)"""
+    mode = data.controls.mode.value
+    if mode == "state":
+        return np.array([*pos, *np.zeros(6), 0, 0, 0, 1, 0, 0, 0], np.float64)
+    if mode == "rotor_vel":
+        return hover_rotor_state(data)
+    thrust = hover_thrust(data)
+    return np.array([thrust, 0, 0, 0] if mode == "force_torque" else [0, 0, 0, thrust], np.float64)
+
+
+def zero_thrust_command(data):
+    """Return the command of one drone that asks for no thrust at all. (k,)
+
+    For the state level that is a fall with the gravity that the controller believes in, at the place where the drone
+    is anyway; for all others the thrust itself.
+    """
+    command = np.zeros_like(hover_command(data))
+    if data.controls.mode.value == "state":
+        command[8] = -9.81
+    return command
+
+
+def to_all(data, command):
+    """Return a command of one drone for every drone of every world."""
+    return np.broadcast_to(command, (*data.states.pos.shape[:2], len(command)))
+
+
+def trees_equal(a, b):
+    """Return whether two trees hold the same bits; NaN equals NaN."""
+    leaves_a, leaves_b = (jax.tree.leaves(jax.tree.map(as_numbers, tree)) for tree in (a, b))
+    return jax.tree.structure(a) == jax.tree.structure(b) and all(
+        np.array_equal(x, y, equal_nan=np.issubdtype(x.dtype, np.floating))
+        for x, y in zip(leaves_a, leaves_b, strict=True)
+    )
+
+
+def as_numbers(x):
+    """Return a leaf on the host, random keys as their data."""
+    x = jnp.asarray(x)
+    return np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+
+
+@functools.cache
+def shared_sim(**settings):
+    """Return a simulation that several tests step: compiled once, and to be left as it was found."""
+    return Sim(**settings)

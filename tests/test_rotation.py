@@ -1,0 +1,169 @@
+"""Quaternion algebra: group laws, an independent program, and gradients that stay finite."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from crazysim import rotation as rot
+
+# Everything below runs in float64, so what is left is its rounding (1.1e-16) times a few operations.
+ROUNDING = {"rtol": 1e-12, "atol": 1e-12}
+
+
+@pytest.fixture(autouse=True)
+def _in_float64(x64):
+    yield
+
+
+def vectors(n=3, size=10.0):
+    return arrays(np.float64, n, elements=st.floats(-size, size, allow_subnormal=False))
+
+
+unit_quats = vectors(4, 1.0).filter(lambda q: np.linalg.norm(q) > 0.1).map(lambda q: q / np.linalg.norm(q))
+angles = st.floats(-3.1, 3.1)
+
+
+def same_rotation(p, q):
+    """Assert that two unit quaternions turn alike: up to their sign."""
+    np.testing.assert_allclose(np.abs(np.sum(np.asarray(p) * np.asarray(q), axis=-1)), 1.0, atol=1e-14)
+
+
+@given(a=vectors(), b=vectors(), m=arrays(np.float64, (2, 3), elements=st.floats(-5, 5)))
+def test_products_of_vectors_are_those_of_numpy(a, b, m):
+    np.testing.assert_allclose(rot.cross(a, b), np.cross(a, b), **ROUNDING)
+    np.testing.assert_allclose(rot.dot(a, b), [a @ b], **ROUNDING)
+    np.testing.assert_allclose(rot.matvec(m, a), m @ a, **ROUNDING)
+    np.testing.assert_allclose(rot.safe_norm(jnp.asarray(a)), [np.linalg.norm(a)], **ROUNDING)
+
+
+@given(p=unit_quats, q=unit_quats, r=unit_quats)
+def test_multiplication_is_a_group(p, q, r):
+    left, right = rot.multiply(rot.multiply(p, q), r), rot.multiply(p, rot.multiply(q, r))
+    np.testing.assert_allclose(left, right, **ROUNDING)
+    identity = np.array([0.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(rot.multiply(q, rot.conjugate(q)), identity, **ROUNDING)
+    np.testing.assert_allclose(rot.multiply(q, identity), q, **ROUNDING)
+    np.testing.assert_allclose(np.linalg.norm(rot.multiply(p, q)), 1.0, **ROUNDING)
+
+
+@given(p=unit_quats, q=unit_quats, v=vectors())
+def test_rotations_act_on_vectors(p, q, v):
+    """A product turns by one after the other, lengths stay, and the inverse undoes it; scipy agrees."""
+    np.testing.assert_allclose(rot.rotate(rot.multiply(p, q), v), rot.rotate(p, rot.rotate(q, v)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(rot.rotate(q, v)), np.linalg.norm(v), **ROUNDING)
+    np.testing.assert_allclose(rot.rotate_inverse(q, rot.rotate(q, v)), v, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rot.rotate(q, v), Rotation.from_quat(q).apply(v), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rot.z_axis(q), Rotation.from_quat(q).apply([0, 0, 1]), **ROUNDING)
+
+
+@given(rotvec=vectors(3, 3.0))
+def test_from_rotvec_agrees_with_scipy(rotvec):
+    same_rotation(rot.from_rotvec(jnp.asarray(rotvec)), Rotation.from_rotvec(rotvec).as_quat())
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-4, 0.99e-2, 1.01e-2, 1.0, 3.0])
+def test_from_rotvec_is_exact_on_both_sides_of_its_series(angle):
+    """The series takes over below 1e-2 rad; what it leaves out is below 2e-18."""
+    axis = np.array([1.0, 2.0, 2.0]) / 3
+    expected = [*(axis * np.sin(angle / 2)), np.cos(angle / 2)]
+    np.testing.assert_allclose(rot.from_rotvec(jnp.asarray(angle * axis)), expected, rtol=0, atol=2e-16)
+
+
+@given(q=unit_quats, rotvec=vectors(3, np.pi / np.sqrt(3)))
+def test_turn_is_a_rotation_about_a_body_axis(q, rotvec):
+    """Up to half a revolution the polynomial is exact: the term it leaves out is 2e-17."""
+    out = rot.turn(jnp.asarray(q), jnp.asarray(rotvec))
+    np.testing.assert_allclose(out, rot.multiply(q, rot.from_rotvec(jnp.asarray(rotvec))), rtol=0, atol=1e-15)
+    expected = (Rotation.from_quat(q) * Rotation.from_rotvec(rotvec)).as_quat()
+    same_rotation(out, expected)
+
+
+def test_turn_renormalises():
+    out = rot.turn(jnp.array([0.0, 0.0, 0.0, 1.01]), jnp.array([0.1, 0.2, 0.3]))
+    np.testing.assert_allclose(jnp.linalg.norm(out), 1.0, rtol=1e-15)
+
+
+@given(roll=angles, pitch=st.floats(-1.57, 1.57), yaw=angles)
+def test_roll_pitch_yaw_there_and_back(roll, pitch, yaw):
+    """Up to 1e-3 rad short of 90 degrees of pitch; there 1/cos(pitch) magnifies the rounding to 1e-12."""
+    rpy = np.array([roll, pitch, yaw])
+    q = rot.from_rpy(jnp.asarray(rpy))
+    same_rotation(q, Rotation.from_euler("ZYX", rpy[::-1]).as_quat())
+    np.testing.assert_allclose(rot.to_rpy(q), rpy, rtol=0, atol=1e-11)
+    axes = [rot.rotate(q, axis) for axis in jnp.eye(3)]
+    np.testing.assert_allclose(rot.from_axes(*axes), rpy, rtol=0, atol=1e-11)
+
+
+@given(q=unit_quats)
+def test_to_rpy_gives_the_same_rotation_back(q):
+    same_rotation(rot.from_rpy(rot.to_rpy(jnp.asarray(q))), q)
+
+
+@given(q=unit_quats, scale=st.floats(0.1, 10))
+def test_yaw_is_that_of_to_rpy_for_any_length(q, scale):
+    yaw, pitch = rot.to_rpy(jnp.asarray(q))[2], rot.to_rpy(jnp.asarray(q))[1]
+    assume(abs(pitch) < 1.5)
+    difference = float(rot.yaw(jnp.asarray(q * scale)) - yaw)
+    assert abs(np.angle(np.exp(1j * difference))) < 1e-12
+
+
+def test_yaw_of_the_zero_quaternion_is_zero():
+    assert rot.yaw(jnp.zeros(4)) == 0
+    np.testing.assert_array_equal(jax.grad(rot.yaw)(jnp.zeros(4)), np.zeros(4))
+
+
+def test_normalize_gives_the_identity_for_zero():
+    np.testing.assert_array_equal(rot.normalize(jnp.zeros(4)), [0, 0, 0, 1])
+    np.testing.assert_allclose(rot.normalize(jnp.array([0.0, 3.0, 0.0, 4.0])), [0, 0.6, 0, 0.8], **ROUNDING)
+
+
+def test_law_07_safe_functions_have_gradient_zero_at_zero():
+    fallback = jnp.array([0.0, 0.0, 1.0])
+    assert rot.safe_norm(jnp.zeros(3)) == 0
+    np.testing.assert_array_equal(jax.grad(lambda x: rot.safe_norm(x)[0])(jnp.zeros(3)), np.zeros(3))
+    np.testing.assert_array_equal(rot.safe_normalize(jnp.zeros(3), fallback), fallback)
+    np.testing.assert_array_equal(jax.jacobian(rot.safe_normalize)(jnp.zeros(3), fallback), np.zeros((3, 3)))
+    assert rot.safe_arctan2(jnp.zeros(()), jnp.zeros(())) == 0
+    assert jax.grad(rot.safe_arctan2, argnums=(0, 1))(0.0, 0.0) == (0, 0)
+
+
+@given(y=st.floats(-5, 5), x=st.floats(-5, 5))
+def test_safe_arctan2_is_arctan2_elsewhere(y, x):
+    assume(x * x + y * y > 1e-6)
+    assert float(rot.safe_arctan2(jnp.asarray(y), jnp.asarray(x))) == pytest.approx(np.arctan2(y, x), abs=1e-15)
+
+
+JACOBIANS = {
+    fn.__name__: jax.jit(jax.jacobian(fn)) for fn in (rot.to_rpy, rot.yaw, rot.z_axis, rot.from_rotvec, rot.from_rpy)
+}
+TINY = (0.0, 1e-45, 1e-30, 1e-22, 1e-19, 1e-10, 1e-4)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("tiny", TINY)
+def test_law_07_jacobians_are_finite_at_and_next_to_90_degrees_of_pitch(tiny, dtype):
+    """Law 7: squares of numbers below 1e-19 underflow in float32, and 0/0 is near."""
+    half = np.sqrt(0.5)
+    for quat in ([0, half, 0, half], [0, -half, 0, half], [half, 0, half, 0], [0.5, 0.5, 0.5, 0.5], [1, 0, 0, 0]):
+        for where in range(4):
+            q = jnp.asarray(quat, dtype).at[where].add(tiny)
+            for name in ("to_rpy", "yaw", "z_axis"):
+                value = getattr(rot, name)(q)
+                assert np.all(np.isfinite(value)), name
+                assert np.all(np.isfinite(JACOBIANS[name](q))), name
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("tiny", TINY)
+def test_law_07_jacobians_are_finite_for_tiny_rotations(tiny, dtype):
+    for name in ("from_rotvec", "from_rpy"):
+        x = jnp.full(3, tiny, dtype)
+        np.testing.assert_allclose(JACOBIANS[name](x)[:3], 0.5 * np.eye(3), rtol=0, atol=1e-3)
+    quat = jnp.array([0.0, 0.0, 0.0, 1.0], dtype)
+    for argnum in (0, 1):
+        assert np.all(np.isfinite(jax.jacobian(rot.turn, argnum)(quat, jnp.full(3, tiny, dtype))))
