@@ -100,7 +100,7 @@ def build(n_worlds: int, n_drones: int, device: str) -> Sim:
     start = reference(jnp.zeros((n_worlds, 1)), n_drones)
     rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(sim.data.params), (n_worlds, n_drones, 4))
     states = sim.data.states.replace(pos=start[..., :3], vel=start[..., 3:6], rotor_vel=rotor_vel)
-    sim.data = jax.device_put(sim.data.replace(states=states), sim.device)
+    sim.data = sim.data.replace(states=states)
     sim.build_default_data()
     return sim
 

@@ -52,8 +52,11 @@ def safe_normalize(x: Array, fallback: Array) -> Array:
 
 
 def safe_arctan2(y: Array, x: Array) -> Array:
-    """Return the angle of the point (x, y), rad, zero with gradient zero at the origin. (...)"""
-    at_origin = (x == 0) & (y == 0)
+    """Return the angle of the point (x, y), rad, zero with gradient zero at the origin. (...)
+
+    The origin is where the squared distance, by which the gradient divides, vanishes or underflows.
+    """
+    at_origin = x * x + y * y == 0
     return jnp.where(at_origin, 0.0, jnp.arctan2(y, jnp.where(at_origin, 1.0, x)))
 
 

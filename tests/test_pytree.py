@@ -32,9 +32,7 @@ class Fleet(PyTree):
 def fleet(n_worlds=3, n_drones=2, rate=50, curve=None):
     rotor = Rotor(jnp.ones((n_worlds, n_drones, 4)), jnp.ones(3) if curve is None else curve)
     extras = {"bare": jnp.ones(n_worlds), "record": Rotor(jnp.zeros((n_worlds, n_drones, 1)), jnp.zeros(1))}
-    return Fleet(
-        rotor, jnp.zeros((n_worlds, 1)), jnp.zeros(3), jnp.zeros((n_worlds, 7)), None, extras, rate
-    )
+    return Fleet(rotor, jnp.zeros((n_worlds, 1)), jnp.zeros(3), jnp.zeros((n_worlds, 7)), None, extras, rate)
 
 
 def test_records_are_frozen():

@@ -110,5 +110,7 @@ def check_command(data: SimData, control: Control, command: Any, check_finite: b
             f"until their next reset. Check the computation it comes from."
         )
     dtype = data.states.pos.dtype
-    # Through NumPy, so that host input of any type reaches the device as one type, and nothing retraces.
-    return jnp.asarray(array.astype(dtype) if on_host else array, dtype=dtype)
+    # Host input of any type reaches the device as one type and in one place: nothing is traced or compiled anew.
+    array = array.astype(dtype)
+    inside_jit = is_tracer or isinstance(data.states.pos, jax.core.Tracer)
+    return jnp.asarray(array) if inside_jit else jax.device_put(array, data.states.pos.sharding)

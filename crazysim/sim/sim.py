@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from mujoco import mjx
 from numpy.typing import NDArray
 
@@ -138,8 +138,27 @@ class Sim:
 
     @data.setter
     def data(self, data: SimData) -> None:
+        self._advance(self._place(data))
+
+    def _advance(self, data: SimData) -> None:
         self._data = data
         self._synced = False
+
+    def _place(self, data: SimData) -> SimData:
+        """Return the data with every leaf on the simulation's device; what is there already is not touched.
+
+        An edited leaf lives wherever JAX puts new arrays by default, and an array elsewhere, or one that is merely
+        not bound to its device, would have the next step compiled anew.
+        """
+        if self.mesh is not None:
+            return shard(data, self.mesh)
+        here = SingleDeviceSharding(self.device)
+
+        def put(x: Any) -> Any:
+            is_here = isinstance(x, jax.Array) and x.committed and x.sharding == here
+            return x if is_here else jax.device_put(x, here)
+
+        return jax.tree.map(put, data)
 
     @property
     def time(self) -> Array:
@@ -182,7 +201,7 @@ class Sim:
                 self._seed,
             ),
         )
-        self.data = jax.device_put(data, self.device) if self.mesh is None else shard(data, self.mesh)
+        self.data = data
         return self.data
 
     def build_default_data(self) -> SimData:
@@ -193,7 +212,7 @@ class Sim:
     def shard(self, mesh: Mesh) -> SimData:
         """Spread data, default data and scene over devices, and return the data."""
         self.mesh = mesh
-        self.data = shard(self.data, mesh)
+        self.data = self.data
         self.default_data = shard(self.default_data, mesh)
         self._mjx_model = self._mjx_data = None
         return self.data
@@ -202,7 +221,7 @@ class Sim:
         """Set the seed of all random numbers drawn from now on."""
         if not isinstance(seed, (int, np.integer)):
             raise ValueError(f"a seed is an integer, got {seed!r}")
-        self._seed = jax.device_put(as_key(int(seed)), self.data.core.rng_key.sharding)
+        self._seed = as_key(int(seed))
         self.data = self.data.replace(core=self.data.core.replace(rng_key=self._seed))
 
     # Stepping -----------------------------------------------------------------------------------------------
@@ -210,7 +229,7 @@ class Sim:
     def step(self, n_steps: int = 1) -> None:
         """Advance every world by a number of physics steps; any number uses the same compilation."""
         n_steps = _positive("n_steps", n_steps)
-        self.data = self._step(self.data, jnp.int32(n_steps))
+        self._advance(self._step(self.data, jnp.int32(n_steps)))
 
     def reset(self, mask: Any = None) -> None:
         """Bring all worlds, or those of a mask, back to ``default_data``, and run the reset pipeline.
@@ -229,7 +248,7 @@ class Sim:
                     f"one per world"
                 )
             mask = jnp.asarray(mask)
-        self.data = self._reset(self.data, self.default_data, mask)
+        self._advance(self._reset(self.data, self.default_data, mask))
 
     def state_control(self, controls: Any, check_finite: bool = False) -> None:
         """Stage a full-state setpoint; see ``crazysim.sim.functional.state_control``. (n_worlds, n_drones, 16)"""
@@ -298,11 +317,10 @@ class Sim:
         self.spec.numeric("max_geom_pairs").data = [self.max_geom_pairs]
         self._compile_scene()
         ids = jnp.asarray(build.drone_mocap_ids(self.mj_model, self.n_drones), jnp.int32)
-        ids = jax.device_put(ids, self.data.core.drone_mocap_ids.sharding)
-        self.default_data = self.default_data.replace(core=self.default_data.core.replace(drone_mocap_ids=ids))
-        self.data = self.data.replace(
-            core=self.data.core.replace(drone_mocap_ids=ids, mjx_synced=self._false(self.data.core.mjx_synced))
-        )
+        core = self.data.core.replace(drone_mocap_ids=ids, mjx_synced=jnp.asarray(False))
+        self.data = self.data.replace(core=core)
+        core = self.default_data.core.replace(drone_mocap_ids=self.data.core.drone_mocap_ids)
+        self.default_data = self.default_data.replace(core=core)
 
     def contacts(self, body: str | None = None) -> Array:
         """Return which contact slots touch, after bringing the scene up to date if anything has changed.
@@ -386,10 +404,6 @@ class Sim:
         if self.viewer is not None:
             self.viewer.close()
             self.viewer = None
-
-    @staticmethod
-    def _false(like: Array) -> Array:
-        return jax.device_put(jnp.asarray(False), like.sharding)
 
     def _control_freqs(self, **given: int | None) -> dict[Control, int]:
         """Return the rate of every controller, checked where the controller is in use."""
