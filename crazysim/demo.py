@@ -151,14 +151,11 @@ def flight(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
 
 def report(errors: np.ndarray, touching: np.ndarray, n_steps: int, step_s: float, contact_s: float) -> None:
     """Print what the flight gave."""
-    settled = (
-        errors[int(SETTLED * len(errors) * FPS / (len(touching))) // FPS :] if len(touching) > SETTLED * FPS else errors
-    )
+    first = round(SETTLED * FPS * len(errors) / len(touching))
+    settled = 100 * (errors[first:] if first < len(errors) else errors)
     began = touching[1:] & ~touching[:-1]
     print(f"steps per second  {n_steps / step_s / 1e6:.1f} M ({n_steps / 1e6:.1f} M drone steps in {step_s:.1f} s)")
-    print(
-        f"tracking error    {100 * settled.mean():.1f} cm mean, {100 * np.percentile(settled, 95):.1f} cm 95th percentile"
-    )
+    print(f"tracking error    {settled.mean():.1f} cm mean, {np.percentile(settled, 95):.1f} cm 95th percentile")
     print(
         f"contacts          {int(began.sum() + touching[0].sum()):,} begun, in {int(touching.any((0, 2)).sum()):,} of "
         f"{touching.shape[1]:,} worlds; {1e3 * contact_s:.0f} ms a query"

@@ -1,4 +1,4 @@
-"""The errors that a wrong configuration raises."""
+"""The errors that a wrong configuration raises, and the one of a machine that cannot draw."""
 
 
 class ConfigError(ValueError):
@@ -11,3 +11,7 @@ class UnknownNameError(ConfigError, KeyError):
     def __str__(self) -> str:
         """Return the message itself; ``KeyError`` would show its quoted form."""
         return str(self.args[0])
+
+
+class RenderError(RuntimeError):
+    """No picture can be made on this machine: a screen or OpenGL is missing or does not work."""

@@ -15,9 +15,7 @@ from crazysim import rotation as rot
 ROUNDING = {"rtol": 1e-12, "atol": 1e-12}
 
 
-@pytest.fixture(autouse=True)
-def _in_float64(x64):
-    yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def vectors(n=3, size=10.0):

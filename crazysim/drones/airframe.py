@@ -46,12 +46,12 @@ class Airframe:
         """
         node: Any = self.tables
         for part in path.split("."):
-            if part not in node:
+            node = node.get(part) if isinstance(node, Mapping) else None
+            if not isinstance(node, Mapping):
                 raise ConfigError(
                     f"airframe {self.name!r} has no table [{path}]; it has {sorted(self.tables)}. "
                     f"Add [{path}] to its TOML file, or choose another dynamics or command level."
                 )
-            node = node[part]
         return node
 
     def value(self, path: str, shape: tuple[int, ...] | None = None) -> NDArray[np.float64]:
@@ -69,6 +69,8 @@ class Airframe:
         if key not in found:
             raise ConfigError(f"airframe {self.name!r} lacks {path!r}; [{table}] has {sorted(found)}")
         value = found[key]
+        if isinstance(value, Mapping):
+            raise ConfigError(f"airframe {self.name!r}: {path} is a table with {sorted(value)}, needed is a number")
         if shape is not None and value.shape != shape:
             raise ConfigError(f"airframe {self.name!r}: {path} has shape {value.shape}, needed is {shape}")
         return value
@@ -137,6 +139,8 @@ def load_airframe(source: str | Path | Mapping[str, Any] | Airframe) -> Airframe
 
 
 def _read(source: str | Path) -> tuple[str, dict[str, Any]]:
+    if not isinstance(source, (str, Path)):
+        raise ConfigError(f"a drone is a name, the path of a TOML file, a dict or an airframe, not {source!r}")
     path = FOLDER / f"{source}.toml" if str(source) in airframe_names() else Path(source)
     if not path.is_file():
         raise UnknownNameError(
@@ -183,7 +187,35 @@ def _check(airframe: Airframe) -> None:
         raise ConfigError(
             f"airframe {airframe.name!r}: thrust_min {low} N and thrust_max {high} N must be 0 <= min < max"
         )
+    for path, shapes in _optional(airframe, len(position)).items():
+        value = airframe.value(path)
+        if value.shape not in shapes:
+            raise ConfigError(
+                f"airframe {airframe.name!r}: {path} has shape {value.shape}, needed is {' or '.join(map(str, shapes))}"
+            )
     if len(position) * high <= mass * 9.81:
         raise ConfigError(
             f"airframe {airframe.name!r}: {len(position)} rotors of {high} N at most cannot lift {mass} kg"
         )
+
+
+def _optional(airframe: Airframe, n_rotors: int) -> dict[str, tuple[tuple[int, ...], ...]]:
+    """Return the shapes that numbers may have which only some models need, for those that are there."""
+    shapes: dict[str, tuple[tuple[int, ...], ...]] = {
+        "rotors.inertia": ((), (n_rotors,)),
+        "rotors.thrust_curve": ((3,), (n_rotors, 3)),
+        "rotors.torque_curve": ((3,), (n_rotors, 3)),
+        "rotors.lag": ((4,), (n_rotors, 4)),
+        "drag.coefficients": ((3,), (3, 3)),
+    }
+    for model in airframe.tables.get("fitted", {}):
+        shapes |= {f"fitted.{model}.{key}": ((3,),) for key in ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")}
+        shapes |= {f"fitted.{model}.{key}": ((),) for key in ("acc_coef", "cmd_f_coef", "thrust_dyn_coef")}
+        shapes[f"fitted.{model}.drag_coefficients"] = ((3,), (3, 3))
+    return {path: allowed for path, allowed in shapes.items() if _has(airframe.tables, path)}
+
+
+def _has(tables: Mapping[str, Any], path: str) -> bool:
+    first, _, rest = path.partition(".")
+    node = tables.get(first) if isinstance(tables, Mapping) else None
+    return node is not None and (not rest or _has(node, rest))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,27 +65,27 @@ def body_parts(airframe: Airframe) -> list[Part]:
 
     ``col_sphere`` and ``col_box`` are the shapes that touch; all others are seen only.
     """
-    shape = airframe.table("shape")
-    plate, battery, led = shape["plate"] / 2, shape["battery"] / 2, float(shape["led_radius"])
+    shape = partial(_outline, airframe)
+    plate, battery, led = shape("plate") / 2, shape("battery") / 2, float(shape("led_radius"))
     parts = [
         Part("box", plate, np.zeros(3), "drone_plate"),
-        Part("box", battery, np.array([0, 0, float(shape["battery_height"])]), "drone_battery"),
+        Part("box", battery, np.array([0, 0, float(shape("battery_height"))]), "drone_battery"),
         # A coloured bar over the leading edge: a drone seen from afar must show where it looks.
         Part("box", plate * [0.1, 0.7, 1.6], np.array([0.95 * plate[0], 0, 0]), "drone_nose"),
     ]
-    motor, height = float(shape["motor_radius"]), float(shape["motor_height"])
-    disc = np.array([float(shape["propeller_radius"]), 0.03 * motor + 5e-4, 0])
+    motor, height = float(shape("motor_radius")), float(shape("motor_height"))
+    disc = np.array([float(shape("propeller_radius")), 0.03 * motor + 5e-4, 0])
     for rotor in airframe.value("rotors.position"):
-        arm = np.array([float(shape["arm_radius"]), 0, 0])
-        hub = rotor + [0, 0, float(shape["propeller_height"])]
+        arm = np.array([float(shape("arm_radius")), 0, 0])
+        hub = rotor + [0, 0, float(shape("propeller_height"))]
         parts += [
             Part("capsule", arm, np.zeros(3), "drone_carbon", end=rotor),
             Part("cylinder", np.array([motor, height / 2, 0]), rotor + [0, 0, 0.3 * height], "drone_metal"),
             Part("cylinder", disc, hub, "drone_propeller"),
         ]
-    for material, z in zip(LED_MATERIALS, shape["led_heights"], strict=True):
+    for material, z in zip(LED_MATERIALS, shape("led_heights"), strict=True):
         parts.append(Part("ellipsoid", np.array([led, led, led / 2]), np.array([0, 0, z]), material))
-    sphere, box = shape["collision_sphere"], shape["collision_box"]
+    sphere, box = shape("collision_sphere"), shape("collision_box")
     return [
         *parts,
         Part("sphere", np.array([sphere[3], 0, 0]), sphere[:3], name="col_sphere", touches=True),
@@ -94,12 +95,16 @@ def body_parts(airframe: Airframe) -> list[Part]:
 
 def body_cameras(airframe: Airframe) -> list[BodyCamera]:
     """Return ``fpv_cam``, which looks ahead from the drone, and ``track_cam``, which follows and looks at it."""
-    shape = airframe.table("shape")
-    back = shape["track_camera"]
+    shape = partial(_outline, airframe)
+    back = shape("track_camera")
     # Looking from behind with z up: right is body -y, up leans over by as much as the camera looks down.
     up = np.array([-back[2] * np.sign(back[0]), 0, abs(back[0])]) / np.hypot(back[0], back[2])
     right = np.array([0.0, -1.0, 0.0])
     return [
-        BodyCamera("fpv_cam", shape["fpv_camera"], np.concatenate([right, [0, 0, 1]]), fovy=70.0),
+        BodyCamera("fpv_cam", shape("fpv_camera"), np.concatenate([right, [0, 0, 1]]), fovy=70.0),
         BodyCamera("track_cam", back, np.concatenate([right, up]), tracks=True),
     ]
+
+
+def _outline(airframe: Airframe, key: str) -> NDArray[np.float64]:
+    return airframe.value(f"shape.{key}")

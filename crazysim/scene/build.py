@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 
 from crazysim.drones.airframe import Airframe
@@ -117,6 +118,26 @@ def make_data(mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device) -> mj
     mj_data = mujoco.MjData(mj_model)
     one = mjx.put_data(mj_model, mj_data, device=device)
     return jax.tree.map(lambda x: jnp.repeat(x[None], n_worlds, axis=0), one)
+
+
+def check_poses(mjx_data: mjx.Data, mj_model: mujoco.MjModel, n_worlds: int) -> mjx.Data:
+    """Return a scene's state that a user has written poses into, with these as floats.
+
+    Raises:
+        ConfigError: If the poses are not one per world and mocap body, or come from the host and are not finite.
+    """
+    changes = {}
+    for name, size in (("mocap_pos", 3), ("mocap_quat", 4)):
+        value, needed = getattr(mjx_data, name), (n_worlds, mj_model.nmocap, size)
+        if np.shape(value) != needed:
+            raise ConfigError(
+                f"mjx_data.{name} has shape {np.shape(value)}; this scene needs {needed} = (n_worlds, mocap bodies, "
+                f"{size}). To move some bodies write sim.mjx_data.{name}.at[:, ids].set(...)."
+            )
+        if not isinstance(value, jax.Array) and not np.isfinite(value).all():
+            raise ConfigError(f"mjx_data.{name} holds numbers that are not finite")
+        changes[name] = jnp.asarray(value, dtype=float)
+    return mjx_data.replace(**changes)
 
 
 def drone_mocap_ids(mj_model: mujoco.MjModel, n_drones: int) -> list[int]:

@@ -26,26 +26,25 @@ class Marks:
     def line(self, points: NDArray, rgba: ArrayLike, start_size: float, end_size: float) -> None:
         """Add a line through points (n, 3), its width in pixels going from one size to the other."""
         widths = np.linspace(start_size, end_size, max(len(points) - 1, 1))
-        for a, b, width in zip(points[:-1], points[1:], widths, strict=False):
-            self._add(mujoco.mjtGeom.mjGEOM_LINE, width, a, b, rgba)
+        pieces = zip(points[:-1], points[1:], widths, strict=False)
+        self._add([(mujoco.mjtGeom.mjGEOM_LINE, width, a, b) for a, b, width in pieces], rgba)
 
     def points(self, points: NDArray, rgba: ArrayLike, size: float) -> None:
         """Add spheres of a radius, m, at points (n, 3)."""
-        for point in points:
-            self._add(mujoco.mjtGeom.mjGEOM_SPHERE, size, point, None, rgba)
+        self._add([(mujoco.mjtGeom.mjGEOM_SPHERE, size, point, None) for point in points], rgba)
 
     def capsule(self, p1: NDArray, p2: NDArray, radius: float, rgba: ArrayLike, cylinder: bool) -> None:
         """Add a capsule or cylinder of a radius, m, between two points."""
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER if cylinder else mujoco.mjtGeom.mjGEOM_CAPSULE
-        self._add(kind, radius, p1, p2, rgba)
+        self._add([(kind, radius, p1, p2)], rgba)
 
-    def _add(self, kind: int, size: float, a: NDArray, b: NDArray | None, rgba: ArrayLike) -> None:
-        if len(self._geoms) >= self.limit:
+    def _add(self, geoms: list[tuple], rgba: ArrayLike) -> None:
+        if len(self) + len(geoms) > self.limit:
             raise ValueError(
                 f"a picture takes {self.limit} marks at most; draw fewer, or raise sim.max_visual_geom before drawing"
             )
         rgba = np.broadcast_to(np.asarray(rgba, np.float32), (4,))
-        self._geoms.append((kind, float(size), np.asarray(a, float), b, rgba))
+        self._geoms += [(*geom, rgba) for geom in geoms]
 
     def write(self, scene: mujoco.MjvScene) -> None:
         """Append the marks to a scene that is about to be drawn."""

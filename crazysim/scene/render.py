@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import weakref
 from typing import Any
 
@@ -11,17 +9,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, RenderError, UnknownNameError
 from crazysim.scene.draw import Marks
+from crazysim.scene.window import Window
 
 MAX_SIZES = 4
 """How many picture sizes keep a context of their own."""
 
 MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
-
-
-class RenderError(RuntimeError):
-    """No picture can be made on this machine: OpenGL is missing or does not work."""
 
 
 class Viewer:
@@ -31,9 +26,9 @@ class Viewer:
         """Keep the model; nothing is opened yet."""
         self._model, self._data, self._max_geom = mj_model, mj_data, max_geom
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
-        self._window: Any = None
+        self._windows: list[Window] = []
         # Contexts must go before the interpreter does, also where nobody calls close.
-        weakref.finalize(self, _free, self._renderers)
+        weakref.finalize(self, _free, self._renderers, self._windows)
 
     def render(
         self,
@@ -47,11 +42,15 @@ class Viewer:
         """Return the picture that ``Sim.render`` documents."""
         if mode not in MODES:
             raise UnknownNameError(f"unknown render mode {mode!r}; the modes are {', '.join(MODES)}")
-        if width <= 0 or height <= 0:
-            raise ConfigError(f"a picture of {width} x {height} pixels cannot be; width and height must be positive")
+        if not all(isinstance(n, (int, np.integer)) and n > 0 for n in (width, height)):
+            raise ConfigError(
+                f"a picture of {width} x {height} pixels cannot be; width and height must be positive whole numbers"
+            )
         cam = self._camera(camera, cam_config)
         if mode == "human":
-            self._render_window(cam, marks)
+            if not self._windows:
+                self._windows.append(Window(self._model, self._max_geom, width, height))
+            self._windows[0].draw(self._data, cam, marks, width, height)
             return None
         renderer = self._renderer(width, height)
         renderer.update_scene(self._data, camera=cam)
@@ -66,10 +65,7 @@ class Viewer:
 
     def close(self) -> None:
         """Close the window and free the contexts."""
-        _free(self._renderers)
-        if self._window is not None:
-            self._window.close()
-            self._window = None
+        _free(self._renderers, self._windows)
 
     def _camera(self, camera: int | str, cam_config: dict[str, Any] | None) -> mujoco.MjvCamera:
         cam = mujoco.MjvCamera()
@@ -115,35 +111,9 @@ class Viewer:
                 self._renderers.pop(next(iter(self._renderers))).close()
         return self._renderers[width, height]
 
-    def _render_window(self, cam: mujoco.MjvCamera, marks: Marks) -> None:
-        if self._window is None:
-            self._window = _open_window(self._model, self._data)
-            # The window takes the first camera, and then belongs to the mouse.
-            with self._window.lock():
-                for name in ("type", "fixedcamid", "distance", "azimuth", "elevation"):
-                    setattr(self._window.cam, name, getattr(cam, name))
-                self._window.cam.lookat[:] = cam.lookat
-        with self._window.lock():
-            self._window.user_scn.ngeom = 0
-            marks.write(self._window.user_scn)
-        self._window.sync()
 
-
-def _free(renderers: dict[tuple[int, int], mujoco.Renderer]) -> None:
-    for renderer in renderers.values():
-        renderer.close()
+def _free(renderers: dict[tuple[int, int], mujoco.Renderer], windows: list[Window]) -> None:
+    for holder in (*renderers.values(), *windows):
+        holder.close()
     renderers.clear()
-
-
-def _open_window(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> Any:
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise RenderError(
-            "render('human') needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; without a screen use "
-            "mode='rgb_array'"
-        )
-    import mujoco.viewer  # it loads GLFW, which pictures in memory do without
-
-    try:
-        return mujoco.viewer.launch_passive(mj_model, mj_data, show_left_ui=False, show_right_ui=False)
-    except Exception as error:  # GLFW and MuJoCo raise whatever they like
-        raise RenderError(f"no window could be opened ({type(error).__name__}: {error})") from error
+    windows.clear()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from typing import Any
 
 import mujoco
@@ -32,7 +33,8 @@ class Window:
         glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API if egl else glfw.NATIVE_CONTEXT_API)
         glfw.window_hint(glfw.VISIBLE, True)
         glfw.window_hint(glfw.SAMPLES, model.vis.quality.offsamples)
-        self._window = glfw.create_window(width, height, "crazysim", None, None)
+        with warnings.catch_warnings(action="ignore"):  # GLFW's warning and an error would say one thing twice
+            self._window = glfw.create_window(width, height, "crazysim", None, None)
         glfw.default_window_hints()
         if not self._window:
             raise RenderError("no window could be opened; without a working screen use mode='rgb_array'")
@@ -113,7 +115,9 @@ def _glfw() -> Any:
         )
     import glfw  # comes with mujoco; pictures in memory do without
 
-    if not glfw.init():
+    with warnings.catch_warnings(action="ignore"):
+        works = glfw.init()
+    if not works:
         raise RenderError("no screen can be reached (GLFW does not start); without a screen use mode='rgb_array'")
     return glfw
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from crazysim.control import Control
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
+from crazysim.dynamics.core import require_support
 from crazysim.engine import build_reset, build_step
 from crazysim.engine.plain import ResetFn, StepFn
 from crazysim.errors import ConfigError, UnknownNameError
@@ -108,6 +109,7 @@ class Sim:
             )
         require_pair(self.dynamics, self.control)
         self.airframe = load_airframe(drone)
+        require_support(self.airframe, self.dynamics)
         self.drone = self.airframe.name
         self.device = _device(device)
         self.mesh = mesh
@@ -150,15 +152,7 @@ class Sim:
         An edited leaf lives wherever JAX puts new arrays by default, and an array elsewhere, or one that is merely
         not bound to its device, would have the next step compiled anew.
         """
-        if self.mesh is not None:
-            return shard(data, self.mesh)
-        here = SingleDeviceSharding(self.device)
-
-        def put(x: Any) -> Any:
-            is_here = isinstance(x, jax.Array) and x.committed and x.sharding == here
-            return x if is_here else jax.device_put(x, here)
-
-        return jax.tree.map(put, data)
+        return _put(data, self.device) if self.mesh is None else shard(data, self.mesh)
 
     @property
     def time(self) -> Array:
@@ -214,7 +208,9 @@ class Sim:
         self.mesh = mesh
         self.data = self.data
         self.default_data = shard(self.default_data, mesh)
-        self._mjx_model = self._mjx_data = None
+        self._mjx_model = None
+        if self._mjx_data is not None:
+            self.mjx_data = self._mjx_data
         return self.data
 
     def seed(self, seed: int) -> None:
@@ -297,16 +293,22 @@ class Sim:
 
     @property
     def mjx_data(self) -> mjx.Data:
-        """The scene's state in every world, as it was last synced; made when first read, and returned as it is."""
+        """The scene's state in every world, as it was last synced; made when first read, and returned as it is.
+
+        Assigning to it makes the scene stale. Poses of bodies that are no drones, ``mocap_pos`` and ``mocap_quat``,
+        must be one per world and finite, or it raises a ValueError.
+        """
         if self._mjx_data is None:
-            mjx_data = build.make_data(self.mj_model, self.n_worlds, self.device)
-            self._mjx_data = mjx_data if self.mesh is None else place_scene(mjx_data, self.mesh)
+            self._mjx_data = self._place_scene(build.make_data(self.mj_model, self.n_worlds, self.device))
         return self._mjx_data
 
     @mjx_data.setter
     def mjx_data(self, mjx_data: mjx.Data) -> None:
-        self._mjx_data = mjx_data
+        self._mjx_data = self._place_scene(build.check_poses(mjx_data, self.mj_model, self.n_worlds))
         self._synced = False
+
+    def _place_scene(self, mjx_data: mjx.Data) -> mjx.Data:
+        return _put(mjx_data, self.device) if self.mesh is None else place_scene(mjx_data, self.mesh)
 
     def build_mjx(self) -> None:
         """Compile ``spec`` again after an edit; closes the viewer, and leaves the simulation's data as it is.
@@ -354,12 +356,12 @@ class Sim:
         """Draw one world; every argument counts at every call.
 
         Args:
-            mode: ``"human"`` opens a window, ``"rgb_array"`` returns a picture (height, width, 3) of type uint8,
+            mode: ``"human"`` draws into a window, which its user may close for good, ``"rgb_array"`` returns a picture (height, width, 3) of type uint8,
                 ``"depth_array"`` the distance along the camera's axis, m (height, width), ``"rgbd_tuple"`` both.
             world: Which world.
             camera: Name or id; -1 is the free camera. Drones carry ``fpv_cam:i`` and ``track_cam:i``.
             cam_config: Settings of the free camera: lookat, distance, azimuth, elevation.
-            width: Pixels; a window chooses its own size.
+            width: Pixels. A window takes it when it opens and when it changes; its user may resize it.
             height: Pixels.
 
         Raises:
@@ -439,6 +441,17 @@ def use_box_collision(sim: Sim, enable: bool = True) -> None:
         if kind in ("col_sphere", "col_box") and index.isdigit():
             geom.contype = geom.conaffinity = int((kind == "col_box") == enable)
     sim.build_mjx()
+
+
+def _put(tree: Any, device: jax.Device) -> Any:
+    """Return the tree on a device, bound to it; leaves that are so already are not touched."""
+    here = SingleDeviceSharding(device)
+
+    def put(x: Any) -> Any:
+        is_here = isinstance(x, jax.Array) and x.committed and x.sharding == here
+        return x if is_here else jax.device_put(x, here)
+
+    return jax.tree.map(put, tree)
 
 
 def _positive(name: str, value: Any) -> int:

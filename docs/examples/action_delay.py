@@ -1,0 +1,60 @@
+"""Let commands arrive late, and see a controller lose its grip as the delay grows.
+
+The commands under way are kept in a record that declares one queue per drone. So a masked reset empties the queues of
+the worlds that are reset, and of no others.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import PyTree, Sim, leaf
+from crazysim.sim.pipeline import replace_fn
+
+
+class Delay(PyTree):
+    """Commands on their way to the drone."""
+
+    queue: Array = leaf("drone", 2)
+    """Oldest first. (n_worlds, n_drones, delay in steps, 4)"""
+
+
+def add_delay(sim: Sim, n_steps: int) -> None:
+    """Hand the attitude controller what was commanded some steps ago."""
+    controller = sim.step_pipeline["attitude_controller"]
+
+    def staged(data, cmd):
+        attitude = data.controls.attitude.replace(staged_cmd=cmd)
+        return data.replace(controls=data.controls.replace(attitude=attitude))
+
+    def late_controller(data):
+        sent, queue = data.controls.attitude.staged_cmd, data.plugins["delay"].queue
+        data = staged(controller(staged(data, queue[..., 0, :])), sent)
+        queue = jnp.concatenate([queue[..., 1:, :], sent[..., None, :]], axis=-2)
+        return data.replace(plugins=data.plugins | {"delay": Delay(queue)})
+
+    queue = jnp.zeros((sim.n_worlds, sim.n_drones, n_steps, 4))
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {"delay": Delay(queue)})
+    sim.build_default_data()
+    replace_fn(sim.step_pipeline, late_controller, "attitude_controller")
+    sim.build_step_fn()
+
+
+def main() -> None:
+    for delay in (0, 10, 50, 75, 100):
+        sim = Sim(n_worlds=2, control="attitude")
+        if delay:
+            add_delay(sim, delay)
+        weight, heights = 9.81 * float(sim.data.params.mass[0]), []
+        for _ in range(300):  # a spring and a damper on the height, at 50 Hz
+            z, vz = np.asarray(sim.data.states.pos[..., 2]), np.asarray(sim.data.states.vel[..., 2])
+            sim.attitude_control(np.stack([0 * z, 0 * z, 0 * z, weight * (1 + 1.2 * (1 - z) - 0.5 * vz)], axis=-1))
+            sim.step(10)
+            heights.append(z[0, 0])
+        print(f"{2 * delay:3d} ms: last second between {min(heights[-50:]):.3f} and {max(heights[-50:]):.3f} m")
+    sim.reset(np.array([True, False]))
+    print("commands under way after a reset of world 0:", np.abs(sim.data.plugins["delay"].queue).sum((1, 2, 3)))
+
+
+if __name__ == "__main__":
+    main()

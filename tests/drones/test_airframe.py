@@ -1,0 +1,288 @@
+"""Airframes: what their files hold, the mixing that follows from rotor positions, and a user's own."""
+
+import copy
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.control import AllocationParams, AttitudeParams, StateParams
+from crazysim.drones import Airframe, Drone, airframe_names, load_airframe
+from crazysim.drones.airframe import FOLDER
+from crazysim.dynamics import Dynamics, first_principles, fitted, supported_dynamics
+
+FILES = sorted(FOLDER.glob("*.toml"))
+
+
+def raw(name):
+    return tomllib.loads((FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
+
+
+def numbers(node, path=""):
+    """Yield the path and entry of every key that is no table of further keys."""
+    for key, entry in node.items():
+        if isinstance(entry, dict) and "value" not in entry:
+            yield from numbers(entry, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", entry
+
+
+def plain(name):
+    """Return a built-in airframe as a user would write it: a dict of plain numbers."""
+
+    def strip(node):
+        return {k: (v["value"] if "value" in v else strip(v)) for k, v in node.items()}
+
+    return strip({k: v for k, v in raw(name).items() if k != "sources"})
+
+
+def test_every_file_is_an_airframe_and_the_other_way_round():
+    assert {path.stem for path in FILES} == set(airframe_names())
+    assert len(FILES) >= 7
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_every_number_has_a_unit_and_a_source(path):
+    tables = raw(path.stem)
+    sources = tables.pop("sources")
+    found = list(numbers(tables))
+    assert len(found) > 30
+    for key, entry in found:
+        assert isinstance(entry, dict), f"{key} is a bare number"
+        assert set(entry) == {"value", "unit", "source"}, key
+        assert isinstance(entry["unit"], str), key
+        assert entry["unit"], key
+        assert entry["source"] in sources, f"{key}: no [sources] entry {entry['source']!r}"
+    assert all(len(text) > 10 for text in sources.values())
+    unused = set(sources) - {entry["source"] for _, entry in found}
+    assert not unused
+
+
+@pytest.mark.parametrize("name", airframe_names())
+def test_every_airframe_gives_parameters_for_all_it_supports(name):
+    airframe = load_airframe(name)
+    assert airframe.name == name
+    supported = supported_dynamics(airframe)
+    assert supported
+    for dynamics in Dynamics:
+        is_full = dynamics == Dynamics.first_principles
+        create = first_principles.Params.create if is_full else lambda a, d=dynamics: fitted.Params.create(a, d)
+        if dynamics in supported:
+            create(airframe)
+        else:
+            with pytest.raises(
+                ConfigError, match=f"no parameters for dynamics '{dynamics.value}'; it has {supported[0]}"
+            ):
+                create(airframe)
+    StateParams.create(airframe)
+    AttitudeParams.create(airframe)
+    if Dynamics.first_principles in supported:
+        AllocationParams.create(airframe)
+
+
+@pytest.mark.parametrize("name", airframe_names())
+def test_numbers_of_an_airframe_are_plausible(name):
+    """Thrust to weight between 1.3 and 12 (a racer), drag that dissipates, and curves that rise."""
+    airframe = load_airframe(name)
+    to_weight = airframe.n_rotors * airframe.value("rotors.thrust_max") / (airframe.value("rigid_body.mass") * 9.81)
+    assert 1.3 < to_weight < 12
+    moments = np.sort(np.linalg.eigvalsh(airframe.inertia))
+    assert moments[0] + moments[1] >= moments[2] * (1 - 1e-9), "no rigid body has such moments of inertia"
+    assert sorted(np.abs(airframe.value("rotors.yaw_torque_sign"))) == [1] * airframe.n_rotors
+    assert np.sum(airframe.value("rotors.yaw_torque_sign")) == 0
+    if Dynamics.first_principles in supported_dynamics(airframe):
+        assert np.max(airframe.value("drag.coefficients")) <= 0
+        params = first_principles.Params.create(airframe)
+        low, hover, high = (
+            float(np.min(x))
+            for x in (params.rotor_vel_min, first_principles.hover_rotor_vel(params), params.rotor_vel_max)
+        )
+        assert 0 <= low < hover < high
+        assert 5_000 < high < 40_000
+
+
+def test_mixing_matrix_by_hand():
+    """Rotors ahead-left (0.1, 0.2), ahead-right (0.3, -0.2), behind (-0.4, 0): arm 0.4.
+
+    A thrust at (x, y) pushes up along z, so its torque is (y, -x, 0): left rotors roll to the right, rotors ahead
+    raise the nose, which is a negative torque about y.
+    """
+    tables = plain("cf21B_500")
+    tables["rotors"]["position"] = [[0.1, 0.2, 0.0], [0.3, -0.2, 0.0], [-0.4, 0.0, 0.1]]
+    tables["rotors"]["yaw_torque_sign"] = [1, -1, 1]
+    airframe = load_airframe(tables)
+    assert airframe.arm == 0.4
+    np.testing.assert_allclose(airframe.mixing_matrix, [[0.5, -0.5, 0.0], [-0.25, -0.75, 1.0], [1, -1, 1]])
+
+
+def test_mixing_matrix_of_a_crazyflie():
+    """Rotors 1 to 4 go clockwise from ahead-right, seen from above; 1 and 3 turn so that their drag yaws right."""
+    expected = [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]
+    np.testing.assert_array_equal(load_airframe("cf21B_500").mixing_matrix, expected)
+
+
+def test_names_files_and_dicts_give_the_same_airframe(tmp_path):
+    text = (FOLDER / "cf2x_L250.toml").read_text(encoding="utf-8")
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    by_name, by_str, by_path = load_airframe(Drone.cf2x_L250), load_airframe(str(path)), load_airframe(path)
+    by_dict = load_airframe(plain("cf2x_L250"))
+    assert (by_name.name, by_str.name, by_path.name, by_dict.name) == ("cf2x_L250", "mine", "mine", "custom")
+    assert load_airframe(plain("cf2x_L250") | {"name": "named"}).name == "named"
+    for other in (by_str, by_path, by_dict):
+        for key, entry in numbers(by_name.tables):
+            np.testing.assert_array_equal(entry, other.value(key), key)
+    assert load_airframe(by_name) is by_name
+
+
+def test_a_users_dict_is_left_alone_and_an_airframe_cannot_be_changed():
+    tables = plain("cf21B_500") | {"name": "mine"}
+    before = copy.deepcopy(tables)
+    airframe = load_airframe(tables)
+    assert tables == before
+    with pytest.raises(ValueError, match="read-only"):
+        airframe.value("rigid_body.inertia")[0] = 1.0
+
+
+def hexacopter():
+    """Return a Crazyflie with six rotors on a circle of 60 mm, the first ahead, neighbours turning against."""
+    tables = plain("cf21B_500") | {"name": "hexa"}
+    angle = np.pi / 3 * np.arange(6)
+    position = 0.06 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+    rotors = tables["rotors"] | {"position": position.tolist(), "yaw_torque_sign": [1, -1, 1, -1, 1, -1]}
+    del tables["fitted"]
+    return tables | {"rotors": rotors, "rigid_body": {"mass": 0.06, "inertia": [6e-5, 6e-5, 1e-4]}}
+
+
+@pytest.mark.parametrize("control", ["rotor_vel", "attitude"])
+def test_a_hexacopter_from_a_dict_hovers(control):
+    sim = Sim(n_worlds=2, drone=hexacopter(), control=control)
+    assert sim.data.states.rotor_vel.shape == (2, 1, 6)
+    rotor_vel = first_principles.hover_rotor_vel(sim.data.params)
+    assert rotor_vel.shape == (6,)
+    pos = sim.data.states.pos.at[..., 2].set(1.0)
+    rotors = np.broadcast_to(rotor_vel, (2, 1, 6))
+    # World 1 begins turned by 5 degrees about every axis, which its attitude controller has to undo.
+    tilted = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (2, 1, 4)).copy()
+    if control == "attitude":
+        tilted[1] = [0.0427, 0.0427, 0.0427, 0.9973]
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos, rotor_vel=rotors, quat=tilted))
+    if control == "rotor_vel":
+        sim.rotor_vel_control(rotors)
+    else:
+        sim.attitude_control(np.broadcast_to([0, 0, 0, 0.06 * 9.81], (2, 1, 4)))
+    sim.step(250)
+    states = sim.data.states
+    # Rotor speeds in float32 are known to 1e-3 rpm, the thrust to 1e-6 of the weight: micrometres in half a second.
+    np.testing.assert_allclose(states.pos[0, 0], [0, 0, 1], atol=1e-4)
+    np.testing.assert_allclose(states.quat[0, 0], [0, 0, 0, 1], atol=1e-4)
+    # From 5 degrees of tilt the controller settles to below 1 degree of yaw, its slowest axis, and 0.2 of the others.
+    np.testing.assert_allclose(states.quat[1, 0], [0, 0, 0, 1], atol=8e-3)
+    np.testing.assert_allclose(states.quat[1, 0, :2], [0, 0], atol=2e-3)
+    np.testing.assert_allclose(states.pos[1, 0], [0, 0, 1], atol=0.2)
+
+
+def test_a_toml_file_anywhere_on_disk_flies(tmp_path):
+    """No file of the package is touched, and none but the user's is needed."""
+    path = tmp_path / "heavy.toml"
+    path.write_text(
+        (FOLDER / "cf21B_500.toml").read_text(encoding="utf-8").replace("0.0434", "0.0500"), encoding="utf-8"
+    )
+    sim = Sim(drone=path, control="rotor_vel")
+    assert sim.drone == "heavy"
+    np.testing.assert_allclose(sim.data.params.mass, [0.05])
+
+
+def without(path):
+    def change(tables):
+        *parents, key = path.split(".")
+        node = tables
+        for parent in parents:
+            node = node[parent]
+        del node[key]
+
+    return change
+
+
+def setting(path, value):
+    def change(tables):
+        *parents, key = path.split(".")
+        node = tables
+        for parent in parents:
+            node = node[parent]
+        node[key] = value
+
+    return change
+
+
+WRONG = {
+    "no rigid body": (without("rigid_body"), r"no table \[rigid_body\]"),
+    "no mass": (without("rigid_body.mass"), "lacks 'rigid_body.mass'"),
+    "mass a string": (setting("rigid_body.mass", "heavy"), "rigid_body.mass = 'heavy' is not a number"),
+    "mass a list": (setting("rigid_body.mass", [0.03]), r"rigid_body.mass has shape \(1,\), needed is \(\)"),
+    "mass a table": (setting("rigid_body.mass", {"kilos": 0.03}), "rigid_body.mass is a table"),
+    "mass negative": (setting("rigid_body.mass", -0.03), "mass is -0.03 kg, it must be positive"),
+    "mass nan": (setting("rigid_body.mass", float("nan")), "not finite"),
+    "too heavy": (setting("rigid_body.mass", 0.2), "4 rotors of 0.2 N at most cannot lift 0.2 kg"),
+    "inertia of two": (setting("rigid_body.inertia", [1e-5, 1e-5]), "three positive moments"),
+    "inertia negative": (setting("rigid_body.inertia", [1e-5, 1e-5, -1e-5]), "three positive moments"),
+    "inertia askew": (
+        setting("rigid_body.inertia", [[1e-5, 1e-6, 0], [0, 1e-5, 0], [0, 0, 1e-5]]),
+        "symmetric positive definite",
+    ),
+    "rotors a number": (setting("rotors", 4), r"no table \[rotors\]"),
+    "positions flat": (setting("rotors.position", [0.1, 0.1]), r"rotors.position has shape \(2,\), needed is \(n, 3\)"),
+    "ragged positions": (setting("rotors.position", [[0.1, 0.1], [0.1]]), "is not a number or array"),
+    "three signs": (
+        setting("rotors.yaw_torque_sign", [1, -1, 1]),
+        r"rotors.yaw_torque_sign has shape \(3,\), needed is \(4,\)",
+    ),
+    "thrusts reversed": (setting("rotors.thrust_max", 0.01), "must be 0 <= min < max"),
+    "curve of two": (
+        setting("rotors.thrust_curve", [0.0, 1e-10]),
+        r"rotors.thrust_curve has shape \(2,\), needed is \(3,\) or \(4, 3\)",
+    ),
+    "one drag": (setting("drag.coefficients", [-0.02]), r"drag.coefficients has shape \(1,\), needed is \(3,\)"),
+    "lag of two": (setting("rotors.lag", [14.0, 1e-4]), r"rotors.lag has shape \(2,\), needed is \(4,\)"),
+    "stiffness": (
+        setting("fitted.so_rpy.rpy_coef", -150.0),
+        r"fitted.so_rpy.rpy_coef has shape \(\), needed is \(3,\)",
+    ),
+    "no gain": (without("controller.attitude.kR"), "lacks 'controller.attitude.kR'"),
+    "no controller": (without("controller"), r"no table \[controller\]"),
+    "no shape": (without("shape"), r"no table \[shape\]"),
+    "no battery": (without("shape.battery"), "lacks 'shape.battery'"),
+    "no drag": (without("drag"), r"no table \[drag\]"),
+    "no thrust curve": (without("rotors.thrust_curve"), "no parameters for dynamics 'first_principles'; it has so_rpy"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_law_09_a_wrong_airframe_is_told_at_once(case):
+    change, message = WRONG[case]
+    tables = plain("cf21B_500")
+    change(tables)
+    with pytest.raises(ConfigError, match=message):
+        Sim(drone=tables)
+
+
+@pytest.mark.parametrize(
+    "source", ["no_such_drone", "missing.toml", Path("nowhere") / "x.toml", "", 5, None, ["cf21B_500"]]
+)
+def test_law_09_a_source_that_is_no_airframe_is_told_with_the_names_there_are(source):
+    with pytest.raises(ConfigError, match=r"cf21B_500.*or a dict|a drone is a name, the path of a TOML file"):
+        load_airframe(source)
+
+
+def test_law_09_a_broken_toml_file_is_told_with_its_path(tmp_path):
+    path = tmp_path / "broken.toml"
+    path.write_text("[rotors\nposition = 3", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"broken\.toml is not valid TOML"):
+        load_airframe(path)
+
+
+def test_an_airframe_shows_its_name():
+    assert repr(load_airframe("hb_x500")) == "Airframe('hb_x500')"
+    assert isinstance(load_airframe("hb_x500"), Airframe)

@@ -1,0 +1,155 @@
+"""The fitted models: the fit itself up to 80 degrees of pitch, bounded and continuous beyond."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import FITTED
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from crazysim import load_airframe, rotation
+from crazysim.dynamics import Dynamics, fitted
+
+pytestmark = pytest.mark.usefixtures("x64")
+
+model = jax.jit(fitted.dynamics)
+sweep = jax.jit(jax.vmap(fitted.dynamics, (None, 0, None, None, None, None)))
+
+
+def params(dynamics="so_rpy", name="cf21B_500"):
+    return fitted.Params.create(load_airframe(name), Dynamics(dynamics))
+
+
+def vectors(n, size):
+    return arrays(np.float64, n, elements=st.floats(-size, size))
+
+
+def body_rates(rpy, rates):
+    """Return body rates by differences of scipy's rotations: an independent way to the Euler kinematics."""
+    h = 1e-6
+    ahead, behind = (Rotation.from_euler("ZYX", (rpy + s * h * rates)[::-1]) for s in (1, -1))
+    return (behind.inv() * ahead).as_rotvec() / (2 * h)
+
+
+@given(
+    rpy=st.tuples(st.floats(-3, 3), st.floats(-1.38, 1.38), st.floats(-3, 3)).map(np.array),
+    rates=vectors(3, 3),
+    cmd=vectors(3, 1.0),
+)
+def test_below_80_degrees_the_angles_obey_the_fit(rpy, rates, cmd):
+    """rpy'' = a rpy + b rpy' + c cmd, turned into body rates: the change of E(rpy) rpy' along that motion.
+
+    The pitch stays below 1.38 rad, 79 degrees. Differences of differences leave 1e-5 of 1e3 rad/s^2.
+    """
+    p = params()
+    acc = np.asarray(p.rpy_coef * rpy + p.rpy_rates_coef * rates + p.cmd_rpy_coef * cmd)
+    h = 1e-4
+    ahead, behind = (body_rates(rpy + s * h * rates + h * h / 2 * acc, rates + s * h * acc) for s in (1, -1))
+    quat = Rotation.from_euler("ZYX", rpy[::-1]).as_quat()
+    still = np.zeros(3)
+    command = np.concatenate([cmd, [0.4]])
+    _, _, ang_acc, _ = model(still, quat, still, body_rates(rpy, rates), command, np.zeros(4), params=p)
+    np.testing.assert_allclose(ang_acc, (ahead - behind) / (2 * h), rtol=1e-4, atol=0.05)
+
+
+@pytest.mark.parametrize("dynamics", FITTED)
+def test_translation_by_hand(dynamics):
+    """Nose down by 0.2 rad at 3 m/s along x, commanded thrust 0.5 N, thrust by now 0.3 N."""
+    p = params(dynamics)
+    quat = rotation.from_rpy(jnp.array([0.0, 0.2, 0.0]))
+    vel = np.array([3.0, 0, 0])
+    out = model(np.zeros(3), quat, vel, np.zeros(3), np.array([0, 0, 0, 0.5]), np.full(4, 0.3), params=p)
+    by_now = 0.5 if dynamics == "so_rpy" else 0.3
+    thrust = float(p.acc_coef[0] + p.cmd_f_coef[0] * by_now)
+    force = thrust * np.array([np.sin(0.2), 0, np.cos(0.2)])
+    if dynamics == "so_rpy_rotor_drag":
+        along, across = np.array([np.cos(0.2), 0, -np.sin(0.2)]), np.array([np.sin(0.2), 0, np.cos(0.2)])
+        coefficients = np.diag(p.drag_matrix)
+        force += coefficients[0] * (along @ vel) * along + coefficients[2] * (across @ vel) * across
+    np.testing.assert_allclose(out[1], force / 0.0434 + [0, 0, -9.81], atol=1e-12)
+    rate = 0.0 if dynamics == "so_rpy" else float(p.thrust_dyn_coef[0]) * 0.2
+    np.testing.assert_allclose(out[3], np.full(4, rate), atol=1e-12)
+
+
+def test_external_wrench_acts_in_the_world_frame():
+    """Yawed by 90 degrees to the left, body y along world -x: 1e-3 N m about world x is -1e-3 about body y."""
+    p = params()
+    half = np.sqrt(0.5)
+    args = (np.zeros(3), np.array([0, 0, half, half]), np.zeros(3), np.zeros(3), np.array([0, 0, 0, 0.4]), np.zeros(4))
+    free, pushed = model(*args, params=p), model(*args, np.array([0.0434, 0, 0]), np.array([1e-3, 0, 0]), params=p)
+    np.testing.assert_allclose(pushed[1] - free[1], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(pushed[2] - free[2], [0, -1e-3 / 28e-6, 0], atol=1e-9)
+
+
+def test_saturate_cuts_the_thrust_alone():
+    p = params()
+    low, high = float(p.thrust_min[0]), float(p.thrust_max[0])
+    thrust = np.array([-1.0, 0.0, 1e-6, 0.3, 10.0])
+    cmd = np.concatenate([np.full((5, 3), 9.0), thrust[:, None]], axis=-1)
+    out = fitted.saturate(cmd, p)
+    np.testing.assert_array_equal(out[:, :3], cmd[:, :3])
+    np.testing.assert_allclose(out[:, 3], [0, 0, low, 0.3, high])
+
+
+def over_the_top(n, first=79.0, last=101.0):
+    """Return attitudes that pitch over the vertical, with some roll and yaw, as quaternions. (n, 4)"""
+    pitch = jnp.deg2rad(jnp.linspace(first, last, n))
+    return rotation.from_rpy(jnp.stack([jnp.full(n, 0.2), pitch, jnp.full(n, 0.3)], axis=-1))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("dynamics", FITTED)
+def test_fault_04_angular_acceleration_is_continuous_and_bounded_over_90_degrees(dynamics, sign):
+    """Fault 4 of the peer: NaN at 90 degrees of pitch. Half the step, half the largest change: no jump."""
+    ang_vel, cmd = np.array([1.0, -2.0, 1.5]), np.array([0.1, 0.2, -0.3, 0.4])
+    changes = []
+    for n in (20_001, 40_001):
+        quats = over_the_top(n, 79.0 * sign, 101.0 * sign)
+        ang_acc = sweep(np.zeros(3), quats, np.zeros(3), ang_vel, cmd, np.zeros(4), params=params(dynamics))[2]
+        assert np.all(np.isfinite(ang_acc))
+        # At level flight the spring of 156 /s^2 pulls with up to 156 pi; near the vertical 1/cos(pitch) adds to it.
+        assert np.max(np.abs(ang_acc)) < 5000
+        changes.append(np.max(np.abs(np.diff(ang_acc, axis=0))))
+    assert changes[0] < 30  # in 0.001 degrees
+    assert changes[1] == pytest.approx(changes[0] / 2, rel=0.05)
+
+
+@given(quat=vectors(4, 1.0).filter(lambda q: np.linalg.norm(q) > 0.1), ang_vel=vectors(3, 10))
+def test_fault_04_angular_acceleration_is_bounded_for_every_attitude(quat, ang_vel):
+    quat = quat / np.linalg.norm(quat)
+    cmd = np.array([0.1, 0.2, -0.3, 0.4])
+    ang_acc = model(np.zeros(3), quat, np.zeros(3), ang_vel, cmd, np.zeros(4), params=params())[2]
+    assert np.all(np.isfinite(ang_acc))
+    assert np.max(np.abs(ang_acc)) < 20_000
+
+
+def test_law_07_gradients_are_finite_over_90_degrees():
+    """Law 7, with the vertical itself, exactly and to either side of it, and at both ends of the handover."""
+    quats = over_the_top(2001)
+    half = np.sqrt(0.5)
+    exact = np.array([[0, half, 0, half], [0, -half, 0, half], [0.5, 0.5, 0.5, 0.5], [-0.5, 0.5, 0.5, 0.5]])
+    for dtype in (jnp.float64, jnp.float32):
+        p = jax.tree.map(lambda x, d=dtype: x.astype(d), params("so_rpy_rotor_drag"))
+
+        def pulled(quat, ang_vel, cmd, p=p, dtype=dtype):
+            zero = jnp.zeros(3, dtype)
+            return jnp.sum(fitted.dynamics(zero, quat, zero, ang_vel, cmd, jnp.zeros(4, dtype), params=p)[2])
+
+        gradient = jax.jit(jax.vmap(jax.grad(pulled, argnums=(0, 1, 2)), (0, None, None)))
+        at = jnp.concatenate([quats, jnp.asarray(exact)]).astype(dtype)
+        for values in gradient(at, jnp.array([1.0, -2.0, 1.5], dtype), jnp.array([0.1, 0.2, -0.3, 0.4], dtype)):
+            assert np.all(np.isfinite(values))
+            assert np.max(np.abs(values)) < 1e6
+
+
+def test_beyond_the_handover_the_drone_is_pulled_to_its_commanded_attitude():
+    """At exactly 90 degrees, at rest: the spring turns the shortest way to level, about -y."""
+    half = np.sqrt(0.5)
+    quat = np.array([0, half, 0, half])
+    ang_acc = model(
+        np.zeros(3), quat, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 0.4]), np.zeros(4), params=params()
+    )[2]
+    np.testing.assert_allclose(ang_acc, [0, float(params().rpy_coef[1]), 0], atol=1e-9)

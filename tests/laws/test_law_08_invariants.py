@@ -1,0 +1,166 @@
+"""Law 8: physics keeps its invariants, and integrators show their order."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crazysim import Sim, rotation
+from crazysim.dynamics.drag import drag_force
+from crazysim.dynamics.rigid_body import angular_acceleration
+from crazysim.dynamics.rotor import gyroscopic_torque
+
+INTEGRATORS = ("euler", "symplectic_euler", "rk4")
+SPIN = np.array([-1.0, 1.0, -1.0, 1.0])
+number = st.floats(-10, 10, width=32)
+vectors = st.tuples(number, number, number).map(np.array)
+speeds = st.tuples(*[st.floats(0, 25_000, width=32)] * 4).map(np.array)
+
+
+def thrown(integrator, freq=500, ang_vel=(0.0, 0.0, 0.0), inertia=None, gravity=True):
+    """Return a drone without rotors or air, thrown: nothing but a rigid body. Float64 under the x64 fixture."""
+    sim = Sim(control="rotor_vel", integrator=integrator, freq=freq)
+    inertia = np.diag([2e-5, 3e-5, 5e-5]) if inertia is None else inertia
+    p = sim.data.params
+    params = p.replace(
+        drag_matrix=0 * p.drag_matrix,
+        rpm2thrust=0 * p.rpm2thrust + jnp.asarray([0.0, 0.0, 1e-30]),
+        rpm2torque=0 * p.rpm2torque,
+        J=jnp.asarray(inertia),
+        J_inv=jnp.asarray(np.linalg.inv(inertia)),
+        gravity_vec=p.gravity_vec * gravity,
+    )
+    states = sim.data.states.replace(
+        pos=jnp.asarray([[[0.0, 0.0, 100.0]]]),
+        vel=jnp.asarray([[[1.0, -2.0, 3.0]]]),
+        ang_vel=jnp.asarray([[ang_vel]], dtype=float),
+    )
+    sim.data = sim.data.replace(states=states, params=params)
+    return sim
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_free_fall_equals_the_integrators_closed_form(integrator, x64):
+    """Under constant acceleration each scheme has a sum in closed form: v0 t + g t^2/2, minus or plus g t dt/2."""
+    sim = thrown(integrator)
+    n, dt = 500, 1 / 500
+    sim.step(n)
+    t, g, v0 = n * dt, -9.81, np.array([1.0, -2.0, 3.0])
+    error = {"euler": -0.5 * g * t * dt, "symplectic_euler": 0.5 * g * t * dt, "rk4": 0.0}[integrator]
+    expected = np.array([0, 0, 100.0]) + v0 * t + np.array([0, 0, 0.5 * g * t**2 + error])
+    # 500 additions of numbers near 100, each rounded to 1.4e-14
+    np.testing.assert_allclose(sim.data.states.pos[0, 0], expected, atol=500 * 1.5e-14, rtol=0)
+    np.testing.assert_allclose(sim.data.states.vel[0, 0], v0 + [0, 0, g * t], atol=1e-11, rtol=0)
+
+
+def precession(integrator, freq):
+    """Return drift of angular momentum (world) and energy of a torque-free tumble over 0.5 s, relative."""
+    ang_vel = np.array([4.0, 1.0, 7.0])
+    inertia = np.diag([2e-5, 3e-5, 5e-5])
+    sim = thrown(integrator, freq, ang_vel, inertia)
+    sim.step(freq // 2)
+    s = jax.tree.map(lambda x: np.asarray(x[0, 0]), sim.data.states)
+    momentum = np.asarray(rotation.rotate(jnp.asarray(s.quat), jnp.asarray(inertia @ s.ang_vel)))
+    before = inertia @ ang_vel
+    energy = s.ang_vel @ inertia @ s.ang_vel / (ang_vel @ before) - 1
+    return np.linalg.norm(momentum - before) / np.linalg.norm(before), abs(energy)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+def test_torque_free_precession_keeps_momentum_and_energy_to_order(integrator, x64):
+    """What drifts is the integrator's error: it shrinks by 2^order when the step is halved."""
+    order = {"euler": 1, "rk4": 4}[integrator]
+    coarse, fine = precession(integrator, 250), precession(integrator, 500)
+    for drift_coarse, drift_fine in zip(coarse, fine, strict=True):
+        assert drift_fine < 1e-1
+        assert np.log2(drift_coarse / drift_fine) > order - 0.4
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_convergence_order_of_position_and_attitude(integrator, x64):
+    """Against a reference with steps eight times finer than the finest: slope of error over step, log-log.
+
+    The body tumbles about an axis that turns, in a drag that depends on attitude, so that rotations which do not
+    commute, and the coupling of attitude to velocity, both count.
+    """
+    order = {"euler": 1, "symplectic_euler": 1, "rk4": 4}[integrator]
+    freqs = (100, 200, 400) if order == 4 else (400, 800, 1600)
+
+    def flight(freq, scheme):
+        sim = thrown(scheme, freq, (4.0, 1.0, 7.0))
+        drag = jnp.diag(jnp.asarray([-0.02, -0.05, -0.2]))
+        sim.data = sim.data.replace(params=sim.data.params.replace(drag_matrix=drag))
+        sim.step(freq // 2)
+        s = sim.data.states
+        return np.asarray(s.pos[0, 0]), np.asarray(s.quat[0, 0])
+
+    exact = flight(6400, "rk4")
+    errors = np.array([[np.linalg.norm(x - e) for x, e in zip(flight(f, integrator), exact, strict=True)] for f in freqs])
+    for name, column in zip(("position", "attitude"), errors.T, strict=True):
+        slope = np.polyfit(np.log(1 / np.array(freqs)), np.log(column), 1)[0]
+        assert abs(slope - order) < 0.35, (name, slope, column)
+
+
+@given(ang_vel=vectors, rotor_vel=speeds)
+def test_gyroscopic_torque_does_no_work(ang_vel, rotor_vel):
+    torque = np.asarray(gyroscopic_torque(jnp.asarray(ang_vel), jnp.asarray(rotor_vel), SPIN, jnp.asarray([4e-8])))
+    # float32 rounding of two products of 10 rad/s and 4e-4 N m
+    np.testing.assert_allclose(torque @ ang_vel, 0.0, atol=1e-8)
+
+
+def test_gyroscopic_torque_by_hand():
+    """One rotor at 10,000 rpm that drags the body to -z spins to +z: h = 1e-7 * 1047.198 = 1.047e-4 N m s.
+
+    Turning about x at 2 rad/s it answers with -w x h = -(2,0,0) x (0,0,h) = (0, 2h, 0).
+    """
+    torque = gyroscopic_torque(
+        jnp.asarray([2.0, 0, 0]), jnp.asarray([10_000.0]), jnp.asarray([-1.0]), jnp.asarray([1e-7])
+    )
+    np.testing.assert_allclose(torque, [0, 2.0944e-4, 0], atol=1e-8)
+
+
+@given(ang_vel=vectors)
+def test_euler_term_does_no_work(ang_vel):
+    """Without a torque, energy w J w / 2 has derivative w . J w' = 0."""
+    inertia = np.diag([2e-5, 3e-5, 5e-5]).astype(np.float32)
+    acc = np.asarray(angular_acceleration(jnp.zeros(3), jnp.asarray(ang_vel, jnp.float32), inertia, np.linalg.inv(inertia)))
+    np.testing.assert_allclose(ang_vel @ inertia @ acc, 0.0, atol=1e-7)  # rounding of terms of 1e-2
+
+
+@given(vel=vectors, quat=st.tuples(number, number, number, number).filter(lambda q: np.linalg.norm(q) > 0.1))
+def test_drag_only_dissipates(vel, quat):
+    quat = jnp.asarray(np.array(quat) / np.linalg.norm(quat), jnp.float32)
+    force = drag_force(quat, jnp.asarray(vel, jnp.float32), jnp.diag(jnp.asarray([-0.02, -0.03, -0.05])))
+    assert float(np.asarray(force) @ vel) <= 1e-6
+
+
+def test_a_free_body_under_a_wrench_agrees_with_mujoco(x64):
+    """C MuJoCo with its own Runge-Kutta and ours fly the same free joint under one wrench in the world frame.
+
+    Both are of order 4 with steps of 1 ms: they agree to 1e-8 in position and attitude after 0.5 s.
+    """
+    inertia = np.array([2e-5, 3e-5, 5e-5])
+    model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco><option integrator="RK4" timestep="0.001" gravity="0 0 -9.81"><flag contact="disable"/></option>
+        <worldbody><body pos="0 0 100"><freejoint/>
+        <inertial pos="0 0 0" mass="0.0434" diaginertia="{" ".join(map(str, inertia))}"/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    force, torque = np.array([0.02, -0.05, 0.3]), np.array([3e-5, -2e-5, 1e-5])
+    data.qvel[:] = [1, -2, 3, 4, 1, 7]
+    data.xfrc_applied[1] = [*force, *torque]
+    for _ in range(500):
+        mujoco.mj_step(model, data)
+
+    sim = thrown("rk4", 1000, (4.0, 1.0, 7.0), np.diag(inertia))
+    states = sim.data.states.replace(force=jnp.asarray([[force]]), torque=jnp.asarray([[torque]]))
+    sim.data = sim.data.replace(states=states)
+    sim.step(500)
+    s = sim.data.states
+    np.testing.assert_allclose(s.pos[0, 0], data.qpos[:3], atol=1e-8, rtol=0)
+    np.testing.assert_allclose(s.vel[0, 0], data.qvel[:3], atol=1e-8, rtol=0)
+    ours = np.roll(s.quat[0, 0], 1)
+    np.testing.assert_allclose(ours * np.sign(ours @ data.qpos[3:]), data.qpos[3:], atol=1e-8, rtol=0)
+    np.testing.assert_allclose(s.ang_vel[0, 0], data.qvel[3:], atol=1e-7, rtol=0)

@@ -1,0 +1,72 @@
+"""The command line and the demo, as a user runs them, but smaller."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from imageio_ffmpeg import get_ffmpeg_exe
+
+from crazysim import demo
+from crazysim.__main__ import main
+
+
+def test_without_a_command_it_lists_what_there_is(capsys):
+    assert main([]) == 0
+    assert "demo" in capsys.readouterr().out
+
+
+def test_as_a_module_in_a_process_of_its_own():
+    out = subprocess.run([sys.executable, "-m", "crazysim", "--help"], capture_output=True, text=True, check=True)
+    assert "demo" in out.stdout
+
+
+def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
+    """Three seconds of 8 worlds of 4 drones: figures are printed and both files are pictures of something."""
+    assert main(["demo", "--worlds", "8", "--seconds", "3", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    for word in ("compile time", "steps per second", "tracking error", "contacts"):
+        assert word in out
+    error_cm = float(out.split("tracking error")[1].split("cm")[0])
+    assert 0.1 < error_cm < 20  # the cascade lags some centimetres behind; a crashed drone would be metres off
+    assert (tmp_path / "tracks.png").read_bytes().startswith(b"\x89PNG")
+    film = tmp_path / "flight.mp4"
+    decode = [get_ffmpeg_exe(), "-loglevel", "error", "-i", film, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)
+    frames = pixels.reshape(-1, 544, 960, 3)
+    assert len(frames) == 75  # 3 s of 25 pictures
+    assert np.mean(np.abs(frames[-1].astype(float) - frames[0])) > 1, "nothing moves in the film"
+
+
+def test_without_opengl_the_demo_says_so_and_does_the_rest(tmp_path, capsys, monkeypatch):
+    def no_picture(*args, **kwargs):
+        raise demo.RenderError("no OpenGL context could be made")
+
+    monkeypatch.setattr(demo.Sim, "render", no_picture)
+    assert main(["demo", "--worlds", "8", "--seconds", "3", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert len([line for line in out.splitlines() if line.startswith("no film")]) == 1
+    assert (tmp_path / "tracks.png").exists()
+    assert not (tmp_path / "flight.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [(["--seconds", "0"], "--seconds"), (["--worlds", "0"], "n_worlds"), (["--device", "toaster"], "toaster")],
+)
+def test_wrong_arguments_are_one_line(arguments, word, capsys):
+    assert main(["demo", *arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert word in error
+    assert "\n" not in error
+
+
+def test_the_poles_are_where_drones_can_hit_them():
+    """Contacts are found in some worlds and not in all: the check would be worthless otherwise."""
+    sim = demo.build(64, 4, "cpu")
+    fly = demo.flight(sim)
+    touched = np.zeros(64, bool)
+    for _ in range(75):
+        sim.data, _ = fly(sim.data)
+        touched |= np.asarray(sim.contacts().any(axis=1))
+    assert 0 < touched.sum() < 64
