@@ -51,6 +51,14 @@ def safe_normalize(x: Array, fallback: Array) -> Array:
     return jnp.where(is_zero, fallback, x / jnp.where(is_zero, 1.0, norm))
 
 
+def safe_clip(x: Array, low: Array | float, high: Array | float) -> Array:
+    """Return ``x`` within limits, with gradient one at a limit itself: that of the inner side. (...)
+
+    ``jnp.clip`` gives one half there, which is the slope of neither side.
+    """
+    return jnp.where(x > high, high, jnp.where(x < low, low, x))
+
+
 def safe_arctan2(y: Array, x: Array) -> Array:
     """Return the angle of the point (x, y), rad, zero with gradient zero at the origin. (...)
 

@@ -9,7 +9,7 @@ from crazysim.control.core import allocation_matrix
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import matvec
+from crazysim.rotation import matvec, safe_clip
 
 
 class AllocationParams(PyTree):
@@ -60,5 +60,5 @@ def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
     p = params
     force = cmd[..., :1]
     thrusts = matvec(p.allocation_matrix, jnp.concatenate([force, cmd[..., 1:] / p.arms], axis=-1))
-    rotor_vel = rotor_vel_of_thrust(jnp.clip(thrusts, p.thrust_min, p.thrust_max), p.rpm2thrust)
+    rotor_vel = rotor_vel_of_thrust(safe_clip(thrusts, p.thrust_min, p.thrust_max), p.rpm2thrust)
     return jnp.where(force > 0, rotor_vel, 0.0)

@@ -105,17 +105,17 @@ def attitude2force_torque(
     error = rotation.multiply(rotation.conjugate(wanted), quat)
     rotation_error = 4 * error[..., 3:] * error[..., :3]  # vee(Rd^T R - R^T Rd)
     rate_error_dot = ((ang_vel_des - prev_ang_vel_des) - (ang_vel - prev_ang_vel)) * ctrl_freq
-    r_int_error = jnp.clip(r_int_error - rotation_error / ctrl_freq, -p.int_err_max, p.int_err_max)
+    r_int_error = rotation.safe_clip(r_int_error - rotation_error / ctrl_freq, -p.int_err_max, p.int_err_max)
     torque_pwm = -p.kR * rotation_error + p.kw * (ang_vel_des - ang_vel) + p.ki_m * r_int_error
     # The firmware has no derivative about yaw.
     torque_pwm = torque_pwm + p.kd_omega * rate_error_dot * jnp.asarray([1.0, 1.0, 0.0], quat.dtype)
-    torque_pwm = jnp.clip(torque_pwm, -p.torque_pwm_max, p.torque_pwm_max)
+    torque_pwm = rotation.safe_clip(torque_pwm, -p.torque_pwm_max, p.torque_pwm_max)
 
     thrust = cmd[..., 3:4]
     n_rotors = p.mixing_matrix.shape[-1]
     newton_per_pwm = p.thrust_max / p.pwm_max
     pwm = thrust / (n_rotors * newton_per_pwm) + matvec(p.torque_allocation, torque_pwm)
-    pwm = jnp.where(thrust > 0, jnp.clip(pwm, p.pwm_min, p.pwm_max), 0.0)
+    pwm = jnp.where(thrust > 0, rotation.safe_clip(pwm, p.pwm_min, p.pwm_max), 0.0)
     thrusts = pwm * newton_per_pwm
     torque = p.arms * matvec(p.mixing_matrix, thrusts)
     return jnp.concatenate([jnp.sum(thrusts, axis=-1, keepdims=True), torque], axis=-1), r_int_error

@@ -144,7 +144,7 @@ def saturate(cmd: Array, params: Params) -> Array:
     Returns:
         Rotor speeds, rpm. (..., n_rotors)
     """
-    return jnp.where(cmd <= 0, 0.0, jnp.clip(cmd, params.rotor_vel_min, params.rotor_vel_max))
+    return jnp.where(cmd <= 0, 0.0, rotation.safe_clip(cmd, params.rotor_vel_min, params.rotor_vel_max))
 
 
 def hover_rotor_vel(params: Params) -> Array:

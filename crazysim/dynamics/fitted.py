@@ -142,7 +142,7 @@ def dynamics(
 def saturate(cmd: Array, params: Params) -> Array:
     """Return the attitude command with a thrust that the rotors can give: none, or within its limits. (..., 4)"""
     thrust = cmd[..., 3:4]
-    within = jnp.where(thrust <= 0, 0.0, jnp.clip(thrust, params.thrust_min, params.thrust_max))
+    within = jnp.where(thrust <= 0, 0.0, rotation.safe_clip(thrust, params.thrust_min, params.thrust_max))
     return jnp.concatenate([cmd[..., :3], within], axis=-1)
 
 

@@ -33,6 +33,8 @@ def build_spec(
     Raises:
         ConfigError: If the file does not exist, is no MJCF, or holds names the drones need.
     """
+    if xml_path is not None and not isinstance(xml_path, (str, Path)):
+        raise ConfigError(f"xml_path is {xml_path!r}; it must be the path of an MJCF file, or None")
     path = SCENE if xml_path is None else Path(xml_path)
     if not path.is_file():
         raise ConfigError(f"scene file {path} does not exist; pass xml_path= of an MJCF file, or leave it out")

@@ -22,7 +22,7 @@ def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) 
     Raises:
         UnknownNameError: If the scene has no such body.
     """
-    body_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body)
+    body_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body) if isinstance(body, str) else -1
     if body_id < 0:
         names = [mj_model.body(i).name for i in range(mj_model.nbody)]
         shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")

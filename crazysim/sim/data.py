@@ -289,9 +289,20 @@ def command_shape(data: SimData, control: Control) -> tuple[int, int, int]:
 
 
 def as_key(seed: int | Array) -> Array:
-    """Return a typed random key from a seed, or a key as it is."""
-    key = jnp.asarray(seed)
-    return key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.key(seed)
+    """Return a typed random key from a seed, or a key as it is.
+
+    Raises:
+        ConfigError: If it is neither.
+    """
+    dtype = getattr(seed, "dtype", np.dtype(int) if type(seed) is int else None)
+    is_key = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    is_integer = dtype is not None and jnp.issubdtype(dtype, jnp.integer)
+    if np.shape(seed) != () or not (is_key or is_integer):
+        raise ConfigError(f"a seed is an integer, or one key as jax.random.key makes, got {seed!r}")
+    try:
+        return seed if is_key else jax.random.key(seed)  # type: ignore[return-value]
+    except OverflowError as error:
+        raise ConfigError(f"the seed {seed} needs more than 64 bits; a smaller integer will do") from error
 
 
 def grid_2d(n: int, spacing: float = 1.0) -> np.ndarray:

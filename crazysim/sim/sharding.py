@@ -27,6 +27,8 @@ def placement(data: SimData, mesh: Mesh) -> SimData:
     Raises:
         ConfigError: If the worlds cannot be split evenly.
     """
+    if not isinstance(mesh, Mesh):
+        raise ConfigError(f"a mesh is what world_mesh(jax.devices()) returns, not {mesh!r}")
     n_devices = mesh.shape.get(WORLD_AXIS)
     if n_devices is None:
         raise ConfigError(

@@ -214,10 +214,12 @@ class Sim:
         return self.data
 
     def seed(self, seed: int) -> None:
-        """Set the seed of all random numbers drawn from now on."""
-        if not isinstance(seed, (int, np.integer)):
-            raise ValueError(f"a seed is an integer, got {seed!r}")
-        self._seed = as_key(int(seed))
+        """Set the seed of all random numbers drawn from now on.
+
+        Raises:
+            ValueError: If it is no integer.
+        """
+        self._seed = as_key(seed)
         self.data = self.data.replace(core=self.data.core.replace(rng_key=self._seed))
 
     # Stepping -----------------------------------------------------------------------------------------------
@@ -237,7 +239,10 @@ class Sim:
             ValueError: If the mask has another shape or type.
         """
         if mask is not None:
-            mask = mask if isinstance(mask, jax.Array) else np.asarray(mask)
+            try:
+                mask = mask if isinstance(mask, jax.Array) else np.asarray(mask)
+            except ValueError as error:
+                raise ValueError(f"the mask {mask!r} is no regular array; needed is one bool per world") from error
             if mask.shape != (self.n_worlds,) or mask.dtype != bool:
                 raise ValueError(
                     f"the mask has shape {mask.shape} and type {mask.dtype}; needed are {(self.n_worlds,)} and bool, "
@@ -356,8 +361,9 @@ class Sim:
         """Draw one world; every argument counts at every call.
 
         Args:
-            mode: ``"human"`` draws into a window, which its user may close for good, ``"rgb_array"`` returns a picture (height, width, 3) of type uint8,
-                ``"depth_array"`` the distance along the camera's axis, m (height, width), ``"rgbd_tuple"`` both.
+            mode: ``"human"`` draws into a window, which its user may close for good; ``"rgb_array"`` returns a picture
+                (height, width, 3) of type uint8, ``"depth_array"`` the distance along the camera's axis, m
+                (height, width), ``"rgbd_tuple"`` both.
             world: Which world.
             camera: Name or id; -1 is the free camera. Drones carry ``fpv_cam:i`` and ``track_cam:i``.
             cam_config: Settings of the free camera: lookat, distance, azimuth, elevation.
@@ -469,8 +475,10 @@ def _member(enum: Any, name: str, value: Any) -> Any:
 
 
 def _device(device: str | jax.Device) -> jax.Device:
-    if not isinstance(device, str):
+    if isinstance(device, jax.Device):
         return device
+    if not isinstance(device, str):
+        raise ConfigError(f"a device is a platform such as 'cpu', 'gpu' or 'gpu:1', or a jax.Device, not {device!r}")
     platform, _, index = device.partition(":")
     try:
         devices = jax.devices("gpu" if platform == "cuda" else platform)

@@ -35,13 +35,13 @@ def main() -> None:
         return (height - RISE) ** 2 + 0.05 * climb**2 + 1e-3 * effort
 
     value_and_grad = jax.jit(jax.value_and_grad(cost))
-    thrusts = velocity = jnp.full(N_THRUSTS, weight)
+    thrusts = jnp.full(N_THRUSTS, weight)
     velocity = jnp.zeros_like(thrusts)
     for i in range(ROUNDS + 1):
         value, grad = value_and_grad(thrusts)
         if i % 15 == 0:
             print(f"round {i:2d}: cost {value:.5f}, norm of the gradient {jnp.linalg.norm(grad):.4f}")
-        velocity = 0.9 * velocity - 5e-3 * grad
+        velocity = 0.9 * velocity - 2e-2 * grad
         thrusts = jnp.clip(thrusts + velocity, 0.1 * weight, 1.8 * weight)
     print("thrust over weight:", " ".join(f"{t:.2f}" for t in thrusts[::4] / weight))
 

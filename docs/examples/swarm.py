@@ -1,14 +1,21 @@
-"""Let a swarm change places: sixteen drones of one world fly across to the far side, at three heights.
+"""Let sixteen drones of one world change sides of a circle: straight through its middle, and around it.
 
-After every tenth of a second the closest pair is looked up, and MuJoCo is asked once at the end of each leg whether
-any drone touches anything. Flying straight through the middle, it does.
+Ten times a second MuJoCo is asked whether any drone touches anything; the scene is brought up to date for that
+question alone.
 """
 
 import numpy as np
 
 from crazysim import Sim
 
-N_DRONES, SECONDS, RADIUS = 16, 5, 1.5
+N_DRONES, SECONDS, RADIUS, HEIGHT = 16, 4, 1.5, 1.0
+
+
+def places(along: float, around: bool) -> np.ndarray:
+    """Return where the drones should be after a part of the way, 0 to 1, m. (n_drones, 3)"""
+    angle = np.linspace(0, 2 * np.pi, N_DRONES, endpoint=False) + (np.pi * along if around else 0)
+    radius = RADIUS if around else RADIUS * (1 - 2 * along)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(N_DRONES, HEIGHT)], axis=-1)
 
 
 def closest_pair(pos: np.ndarray) -> float:
@@ -18,24 +25,23 @@ def closest_pair(pos: np.ndarray) -> float:
 
 
 def main() -> None:
-    for n_layers in (1, 4):
-        sim = Sim(n_drones=N_DRONES, control="state")
-        angle = np.linspace(0, 2 * np.pi, N_DRONES, endpoint=False)
-        height = 1.0 + 0.4 * (np.arange(N_DRONES) % n_layers)
-        start = np.stack([RADIUS * np.cos(angle), RADIUS * np.sin(angle), height], axis=-1)
-        goal = start * [-1.0, -1.0, 1.0]
-        sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.asarray(start[None], np.float32)))
+    sim = Sim(n_drones=N_DRONES, control="state")
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=places(0.0, False)[None].astype(np.float32)))
+    sim.build_default_data()
 
-        setpoint, closest, touched = np.zeros((1, N_DRONES, 16)), np.inf, False
-        for tick in range(10 * SECONDS):
-            along = min(1.0, tick / (8 * SECONDS))
-            setpoint[0, :, :3] = start + along**2 * (3 - 2 * along) * (goal - start)
+    for around in (False, True):
+        sim.reset()
+        setpoint, closest, n_touching = np.zeros((1, N_DRONES, 16)), np.inf, 0
+        for tick in range(10 * (SECONDS + 1)):
+            part = min(1.0, tick / (10 * SECONDS))
+            setpoint[0, :, :3] = places(part**2 * (3 - 2 * part), around)
             sim.state_control(setpoint)
             sim.step(sim.freq // 10)
             closest = min(closest, closest_pair(np.asarray(sim.data.states.pos[0])))
-            touched = touched or bool(sim.contacts().any())
-        off = np.linalg.norm(np.asarray(sim.data.states.pos[0]) - goal, axis=-1).max()
-        print(f"{n_layers} layer(s): closest pair {closest:.3f} m, touched: {touched}, {off:.3f} m off at the end")
+            n_touching = max(n_touching, int(sim.contacts().sum()))
+        off = np.linalg.norm(np.asarray(sim.data.states.pos[0]) - setpoint[0, :, :3], axis=-1).max()
+        way = "around" if around else "straight"
+        print(f"{way:8s}: closest {closest:.3f} m, at most {n_touching} contacts at once, {off:.3f} m off at the end")
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ from crazysim import PyTree, Sim, leaf
 from crazysim.sim.pipeline import insert_fn_before
 from crazysim.sim.random import drone_keys
 
-STEADY = np.array([4e-3, 0.0, 0.0])  # N; the drone weighs 0.43 N
-GUST, GUST_TIME = 4e-3, 0.5  # N, s
+STEADY = np.array([20e-3, 0.0, 0.0])  # N; the drone weighs 426 mN
+GUST, GUST_TIME = 10e-3, 0.5  # N, s
 
 
 class Gusts(PyTree):

@@ -1,0 +1,128 @@
+"""Law 1: physics and control are written for one drone, and accept any leading axes: ``f(batch)[i] == f(batch[i])``."""
+
+import ast
+import inspect
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import FITTED
+
+import crazysim
+from crazysim import Dynamics, load_airframe
+from crazysim.control import AllocationParams, AttitudeParams, StateParams, allocation, attitude, state
+from crazysim.dynamics import drag, first_principles, fitted, rigid_body, rotor
+
+BATCH = (3, 2)
+AIRFRAME = load_airframe("cf21B_500")
+MODULES = (rigid_body, rotor, drag, first_principles, fitted, allocation, attitude, state)
+
+
+def functions_of(module):
+    """Return the public functions of a module that return arrays."""
+    own = [f for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__]
+    return [f for f in own if "Array" in f.__annotations__["return"] and not f.__name__.startswith("_")]
+
+
+CASES = [
+    pytest.param(module, function, model, id="-".join(filter(None, [function.__module__[9:], function.__name__, model])))
+    for module in MODULES
+    for function in functions_of(module)
+    for model in (FITTED if module is fitted else (None,))
+]
+
+
+def parameters(module, model):
+    """Return the shared parameters that the functions of a module take."""
+    if module is fitted:
+        return fitted.Params.create(AIRFRAME, Dynamics(model))
+    records = {allocation: AllocationParams, attitude: AttitudeParams, state: StateParams}
+    return records.get(module, first_principles.Params).create(AIRFRAME)
+
+
+def command(module, function, rng):
+    """Return commands that reach limits and switches too, some of them without thrust."""
+    if module in (rotor, first_principles):
+        return rng.uniform(-2e3, 3e4, (*BATCH, 4))
+    if module is state:
+        return rng.normal(size=(*BATCH, 16))
+    thrust, others = rng.uniform(-0.2, 0.8, (*BATCH, 1)), rng.uniform(-1, 1, (*BATCH, 3))
+    if function is allocation.force_torque2rotor_vel:
+        return np.concatenate([thrust, 0.01 * others], -1)
+    return np.concatenate([others, thrust], -1)
+
+
+def arguments(module, function, model, rng, per_drone):
+    """Return random arguments by name, each with the batch axes, and those that every drone shares."""
+    shared = parameters(module, model)
+    if per_drone:
+        shared = jax.tree.map(lambda x: x * rng.uniform(0.9, 1.1, (*BATCH, *x.shape)), shared)
+    drawn = {
+        "quat": lambda: (q := rng.normal(size=(*BATCH, 4))) / np.linalg.norm(q, axis=-1, keepdims=True),
+        "cmd": lambda: command(module, function, rng),
+        "prev_cmd": lambda: command(module, function, rng),
+        "rotor_vel": lambda: rng.uniform(0, 2.5e4, (*BATCH, 4)) if module is not fitted else rng.uniform(0, 1, (*BATCH, 4)),
+        "rotor_acc": lambda: rng.normal(size=(*BATCH, 4)) * 1e4,
+        "thrust": lambda: rng.uniform(0, 0.2, (*BATCH, 4)),
+        "drag_torque": lambda: rng.uniform(0, 1e-3, (*BATCH, 4)),
+    }
+    batched, common = {}, {}
+    for name in inspect.signature(function).parameters:
+        if name == "ctrl_freq":
+            common[name] = 100.0
+        elif name == "params":
+            (batched if per_drone else common)[name] = shared
+        elif name in ("coefficients", "yaw_torque_sign") or hasattr(shared, name):
+            value = {"coefficients": "rpm2thrust", "yaw_torque_sign": "mixing_matrix"}.get(name, name)
+            value = getattr(shared, value)
+            (batched if per_drone else common)[name] = value[..., 2, :] if name == "yaw_torque_sign" else value
+        else:
+            batched[name] = drawn.get(name, lambda: rng.normal(size=(*BATCH, 3)))()
+    return jax.tree.map(jnp.asarray, batched), common
+
+
+@pytest.mark.parametrize("per_drone", [False, True], ids=["shared", "per_drone"])
+@pytest.mark.parametrize("module, function, model", CASES)
+def test_a_batch_is_its_drones(module, function, model, per_drone, x64, rng):
+    """Law 1 for every function of dynamics and control, with parameters shared and one per drone."""
+    batched, common = arguments(module, function, model, rng, per_drone)
+    # Nothing has batch axes where all there is to pass are shared parameters.
+    axes = BATCH if batched else ()
+    compiled = jax.jit(lambda batched: function(**batched, **common))
+    whole = jax.tree.leaves(compiled(batched))
+    for i in np.ndindex(axes):
+        alone = jax.tree.leaves(compiled(jax.tree.map(lambda x, i=i: x[i], batched)))
+        for many, one in zip(whole, alone, strict=True):
+            assert many.shape == (*axes, *one.shape)
+            assert np.all(np.isfinite(one))
+            # float64 rounding: one drone and many may be vectorised and contracted (FMA) differently
+            scale = 1e-13 * max(1.0, float(np.abs(many).max()))
+            np.testing.assert_allclose(many[i], one, rtol=1e-12, atol=scale)
+
+
+def test_the_cases_cover_dynamics_and_control():
+    """No module of physics or control that computes arrays is missing above."""
+    covered = {m.__name__ for m in MODULES}
+    for path in sources():
+        name = "crazysim." + ".".join(path.relative_to(Path(crazysim.__file__).parent).with_suffix("").parts)
+        assert name in covered or path.stem in ("__init__", "core"), name
+    assert len(CASES) >= 17
+
+
+def sources():
+    """Return the source files of physics and control."""
+    root = Path(crazysim.__file__).parent
+    paths = [p for package in ("dynamics", "control") for p in sorted((root / package).glob("*.py"))]
+    assert len(paths) >= 10
+    return paths
+
+
+def test_physics_and_control_know_no_batch():
+    """Law 1: they contain no vmap, no loop of JAX, and no batch index."""
+    forbidden = {"vmap", "pmap", "shard_map", "scan", "fori_loop", "while_loop", "n_worlds", "n_drones"}
+    for path in sources():
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = {getattr(node, key, None) for key in ("id", "attr", "arg", "name")}
+            assert not names & forbidden, f"{path.name}:{node.lineno} uses {names & forbidden}"

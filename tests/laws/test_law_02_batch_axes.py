@@ -1,0 +1,176 @@
+"""Law 2: batch axes are declared, never guessed from lengths."""
+
+import ast
+import dataclasses
+import inspect
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import LEVELS, PAIRS, shared_sim, with_params, with_states
+
+from crazysim import ConfigError, Control, PyTree, Sim
+from crazysim.pytree import scopes
+from crazysim.sim.data import SimControls, SimCore, SimData, SimState, n_rotor_states
+
+SIZES = [(n, m) for n in (1, 2, 3, 4) for m in (1, 2, 3, 4)]
+
+
+def resized(sim, n_worlds, n_drones):
+    """Return the data that ``Sim`` would build for so many worlds and drones, without another scene."""
+    freqs = dict.fromkeys(Control, 100)
+    return SimData(
+        states=SimState.create(n_worlds, n_drones, n_rotor_states(sim.dynamics, sim.airframe)),
+        controls=SimControls.create(n_worlds, n_drones, sim.control, sim.dynamics, sim.airframe, freqs),
+        params=sim.data.params,
+        core=SimCore.create(sim.freq, n_worlds, n_drones, np.arange(n_drones), 0),
+    )
+
+
+def per_drone(data):
+    """Return the data with every parameter that all drones shared given to each drone."""
+    shape = data.states.pos.shape[:2]
+
+    def spread(record):
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (*shape, *x.shape)), record)
+
+    controls = data.controls
+    changes = {
+        level: record.replace(params=spread(record.params))
+        for level in LEVELS[:4]
+        if (record := getattr(controls, level)) is not None
+    }
+    return data.replace(params=spread(data.params), controls=controls.replace(**changes))
+
+
+def signature(tree):
+    """Return structure, shapes and types of a tree."""
+    return jax.tree.structure(tree), [(x.shape, x.dtype) for x in jax.tree.leaves(tree)]
+
+
+@pytest.mark.parametrize("dynamics, control", PAIRS)
+def test_a_step_keeps_every_shape_and_type(dynamics, control):
+    """Law 2: whatever the numbers of worlds and drones, equal ones included, parameters shared or one per drone."""
+    sim = shared_sim(dynamics=dynamics, control=control)
+    step = sim.build_step_fn()
+    for n_worlds, n_drones in SIZES:
+        data = resized(sim, n_worlds, n_drones)
+        if (n_worlds + n_drones) % 2 == 0:
+            data = per_drone(data)
+        after = jax.eval_shape(lambda d: step(d, 1), data)
+        assert signature(after) == signature(data), (n_worlds, n_drones)
+
+
+@pytest.mark.parametrize("dynamics, control", PAIRS)
+def test_scopes_say_the_axes(dynamics, control):
+    """Law 2: drone leaves are (n_worlds, n_drones, *core), world leaves (n_worlds, 1, *core), shared ones core."""
+    sim = shared_sim(dynamics=dynamics, control=control)
+    one = resized(sim, 1, 1)
+    counts = dict.fromkeys(("drone", "world", "shared"), 0)
+    for n_worlds, n_drones in SIZES:
+        data = resized(sim, n_worlds, n_drones)
+        for at, scope, x in zip(*flat(scopes(data)), jax.tree.leaves(data), strict=True):
+            core = {"drone": leaf_at(one, at).shape[2:], "world": leaf_at(one, at).shape[2:]}.get(
+                scope, (n_drones,) if at.endswith("drone_mocap_ids") else leaf_at(one, at).shape
+            )
+            batch = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1), "shared": ()}[scope]
+            assert x.shape == (*batch, *core), (at, scope)
+            counts[scope] += 1
+        spread = scopes(per_drone(data))
+        assert set(jax.tree.leaves((spread.params, spread.controls))) == {"drone"}
+    assert all(counts.values())
+
+
+def flat(tree):
+    """Return the names and the leaves of a tree."""
+    pairs = jax.tree_util.tree_leaves_with_path(tree)
+    return [jax.tree_util.keystr(path) for path, _ in pairs], [x for _, x in pairs]
+
+
+def leaf_at(tree, name):
+    """Return the leaf of a name."""
+    names, leaves = flat(tree)
+    return leaves[names.index(name)]
+
+
+def test_the_resized_data_are_what_sim_builds():
+    """The shapes above are those of a real simulation, with as many worlds as drones and with more drones."""
+    for n_worlds, n_drones in ((3, 3), (2, 4)):
+        sim = Sim(n_worlds, n_drones, control="state", attitude_freq=100, force_torque_freq=100)
+        assert signature(sim.data) == signature(resized(sim, n_worlds, n_drones))
+
+
+@pytest.fixture(scope="module")
+def square():
+    """Three worlds of three drones without weight or thrust, high up."""
+    sim = Sim(3, 3, control="rotor_vel")
+    p = sim.data.params
+    data = with_params(sim.data, gravity_vec=0 * p.gravity_vec, rpm2thrust=p.rpm2thrust.at[:, 0].set(0.0))
+    sim.data = with_states(data, pos=[0.0, 0.0, 10.0], force=[0.03, -0.02, 0.01])
+    return sim
+
+
+def test_a_mass_belongs_to_its_world_and_drone(square):
+    """Law 2, where lengths could deceive: three worlds, three drones, three axes, and nine masses."""
+    mass = 0.01 * np.arange(1, 10).reshape(3, 3, 1)
+    data = square._step(with_params(square.data, mass=np.asarray(mass, np.float32)), jnp.int32(1))
+    expected = np.array([0.03, -0.02, 0.01]) / mass / square.freq
+    # float32: force, mass, quotient, product and sum each round to 6e-8
+    np.testing.assert_allclose(data.states.vel, expected, rtol=5e-7)
+
+
+@pytest.mark.parametrize("shape", [(3, 1), (3, 1, 1), (1, 3, 1), (3, 3), (3, 3, 1, 1), (2, 3, 1)])
+def test_a_mass_of_a_world_alone_is_refused(square, shape):
+    """Law 2: a parameter is shared or per drone; one per world must be spread over its drones by hand."""
+    wrong = with_params(square.data, mass=np.full(shape, 0.03, np.float32))
+    with pytest.raises(ConfigError, match=r"params\.mass.*shape.*\(3, 3\)"):
+        square._step(wrong, jnp.int32(1))
+
+
+def records(root):
+    """Return the classes of all records within a record."""
+    found = {type(root)}
+    for field in dataclasses.fields(root):
+        value = getattr(root, field.name)
+        if isinstance(value, PyTree):
+            found |= records(value)
+            assert found
+    return found
+
+
+def documented_shapes(record):
+    """Return the shape that the docstring of every field of a record ends with, None where it has none."""
+    body = ast.parse(inspect.getsource(record)).body[0].body
+    shapes = {}
+    for field, text in zip(body, body[1:], strict=False):
+        if isinstance(field, ast.AnnAssign):
+            assert isinstance(text, ast.Expr), f"{record.__name__}.{field.target.id} has no docstring"
+            shape = re.search(r"\(([\w, ]*)\)$", text.value.value)
+            shapes[field.target.id] = None if shape is None else shape[1]
+    return shapes
+
+
+@pytest.mark.parametrize("dynamics, control", PAIRS)
+def test_docstrings_tell_the_shapes(dynamics, control):
+    """Law 2: every array field of every record says its shape, and tells the truth."""
+    data = resized(shared_sim(dynamics=dynamics, control=control), 2, 3)
+    sizes = {"n_worlds": 2, "n_drones": 3, "n_rotors": 4}
+    n_arrays = 0
+
+    def check(record):
+        nonlocal n_arrays
+        shapes = documented_shapes(type(record))
+        for field in dataclasses.fields(record):
+            value, shape = getattr(record, field.name), shapes[field.name]
+            if isinstance(value, PyTree):
+                check(value)
+            elif isinstance(value, jax.Array):
+                assert shape is not None, f"{type(record).__name__}.{field.name} does not say its shape"
+                words = [word.strip() for word in shape.split(",") if word.strip()]
+                assert tuple(sizes.get(w) or int(w) for w in words) == value.shape, (type(record), field.name)
+                n_arrays += 1
+
+    check(data)
+    assert n_arrays == len(jax.tree.leaves(data))
