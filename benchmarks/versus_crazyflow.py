@@ -89,19 +89,20 @@ class Worker:
         """Start the process."""
         command = [python, __file__, "--worker", name]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._in, self._out = self._process.stdin, self._process.stdout
 
     def ask(self, **request: Any) -> dict[str, Any]:
         """Return the answer to a request."""
-        self._process.stdin.write(json.dumps(request) + "\n")
-        self._process.stdin.flush()
-        for line in self._process.stdout:
+        self._in.write(json.dumps(request) + "\n")
+        self._in.flush()
+        for line in self._out:
             if line.startswith("{"):  # whatever the packages print on import is no answer
                 return json.loads(line)
         raise SystemExit("a worker ended without an answer; its error stands above")
 
     def close(self) -> None:
         """End the process."""
-        self._process.stdin.close()
+        self._in.close()
         self._process.wait()
 
 

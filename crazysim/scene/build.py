@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from crazysim.drones.airframe import Airframe
 from crazysim.drones.body import LED_MATERIALS, MATERIALS, Part, body_cameras, body_parts
 from crazysim.errors import ConfigError
+from crazysim.scene import mjx
 
 SCENE = Path(__file__).parents[1] / "scene.xml"
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjx
 
 from crazysim.errors import UnknownNameError
+from crazysim.scene import mjx
 
 
 def contact_flags(mjx_data: mjx.Data) -> Array:
@@ -22,12 +22,21 @@ def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) 
     Raises:
         UnknownNameError: If the scene has no such body.
     """
-    body_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body) if isinstance(body, str) else -1
-    if body_id < 0:
-        names = [mj_model.body(i).name for i in range(mj_model.nbody)]
-        shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-        raise UnknownNameError(f"the scene has no body {body!r}; it has {shown}")
-    of_body = jnp.asarray(np.flatnonzero(mj_model.geom_bodyid == body_id))
+    of_body = jnp.asarray(np.flatnonzero(mj_model.geom_bodyid == body_id(mj_model, body)))
     contact = mjx_data._impl.contact
     geom = jnp.stack([contact.geom1, contact.geom2], axis=-1)
     return (contact.dist < 0) & jnp.any(geom[..., None] == of_body, axis=(-1, -2))
+
+
+def body_id(mj_model: mujoco.MjModel, body: str) -> int:
+    """Return the id of a body.
+
+    Raises:
+        UnknownNameError: If the scene has no such body.
+    """
+    found = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body) if isinstance(body, str) else -1
+    if found < 0:
+        names = [mj_model.body(i).name for i in range(mj_model.nbody)]
+        shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise UnknownNameError(f"the scene has no body {body!r}; it has {shown}")
+    return found

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
+from crazysim.scene import mjx
 from crazysim.sim.data import SimData
 
 

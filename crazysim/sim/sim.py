@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
-from mujoco import mjx
 from numpy.typing import NDArray
 
 from crazysim.control import Control
@@ -22,7 +21,7 @@ from crazysim.dynamics.core import require_support
 from crazysim.engine import build_reset, build_step
 from crazysim.engine.plain import ResetFn, StepFn
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.scene import build, contacts
+from crazysim.scene import build, contacts, mjx
 from crazysim.scene.draw import Marks
 from crazysim.scene.render import Viewer
 from crazysim.scene.sync import sync_one_world, sync_sim2mjx
@@ -344,6 +343,8 @@ class Sim:
         Raises:
             ValueError: If the scene has no such body.
         """
+        if body is not None:
+            contacts.body_id(self.mj_model, body)  # a wrong name is told before anything is touched
         self._sync()
         if body is None:
             return contacts.contact_flags(self.mjx_data)

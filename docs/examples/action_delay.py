@@ -1,7 +1,6 @@
 """Let commands arrive late, and see a controller lose its grip as the delay grows.
 
-The commands under way are kept in a record that declares one queue per drone. So a masked reset empties the queues of
-the worlds that are reset, and of no others.
+The commands under way are kept in a record that declares one queue per drone, so a masked reset resets those alone.
 """
 
 import jax.numpy as jnp

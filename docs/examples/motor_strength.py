@@ -13,7 +13,6 @@ import numpy as np
 from crazysim import Sim
 from crazysim.dynamics.first_principles import hover_rotor_vel
 from crazysim.pytree import select_worlds
-from crazysim.sim.pipeline import append_fn
 from crazysim.sim.random import drone_keys
 
 

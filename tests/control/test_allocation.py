@@ -1,0 +1,72 @@
+"""The allocation: from a wrench to rotor speeds, and the way back through the dynamics."""
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from crazysim import load_airframe
+from crazysim.control import COMMAND_FIELDS, AllocationParams, Control, command_size, force_torque2rotor_vel
+from crazysim.control.core import allocation_matrix
+from crazysim.dynamics.rotor import curve
+
+pytestmark = pytest.mark.usefixtures("x64")
+
+allocate = jax.jit(force_torque2rotor_vel)
+
+
+def setup(name="cf21B_500"):
+    airframe = load_airframe(name)
+    return airframe, AllocationParams.create(airframe)
+
+
+@given(thrusts=arrays(np.float64, 4, elements=st.floats(0.03, 0.19)))
+@pytest.mark.parametrize("name", ["cf21B_500", "crazyflie"])
+def test_a_wrench_within_the_limits_is_given_exactly(name, thrusts):
+    """Thrusts to wrench with the mixing matrix, and back by the allocation."""
+    airframe, params = setup(name)
+    thrusts = thrusts * airframe.value("rotors.thrust_max") / 0.2
+    arms = [airframe.arm, airframe.arm, airframe.value("controller.thrust2torque")]
+    torque = arms * (airframe.mixing_matrix @ thrusts)
+    rotor_vel = allocate(np.array([np.sum(thrusts), *torque]), params=params)
+    np.testing.assert_allclose(curve(rotor_vel, params.rpm2thrust), thrusts, rtol=1e-9)
+
+
+@given(cmd=arrays(np.float64, 4, elements=st.floats(-1, 1)))
+def test_law_09_every_rotor_stays_within_its_limits_or_stands(cmd):
+    _, params = setup()
+    thrusts = curve(allocate(cmd, params=params), params.rpm2thrust)
+    if cmd[0] <= 0:
+        np.testing.assert_array_equal(thrusts, np.zeros(4))
+    else:
+        assert np.all(thrusts >= params.thrust_min[0] - 1e-12)
+        assert np.all(thrusts <= params.thrust_max[0] + 1e-12)
+
+
+@pytest.mark.parametrize("thrust", [0.0, -0.1])
+def test_fault_06_zero_thrust_stops_the_motors_whatever_the_torque(thrust):
+    _, params = setup()
+    np.testing.assert_array_equal(allocate(np.array([thrust, 1e-3, 1e-3, 1e-3]), params=params), np.zeros(4))
+
+
+def test_allocation_matrix_of_a_quadrotor_in_x_is_its_signs_over_four():
+    airframe, _ = setup()
+    expected = np.vstack([np.ones(4), airframe.mixing_matrix]).T / 4
+    np.testing.assert_allclose(allocation_matrix(airframe), expected, atol=1e-15)
+
+
+def test_law_07_gradients_are_finite_at_zero_and_at_saturation():
+    _, params = setup()
+    cmds = np.array([[0, 0, 0, 0], [0.4, 0, 0, 0], [9, 0, 0, 0], [0.4, 1, 1, 1], [-1, 0, 0, 0], [1e-9, 0, 0, 0]])
+    jacobians = jax.jit(jax.vmap(lambda cmd: jax.jacobian(force_torque2rotor_vel)(cmd, params=params)))(cmds)
+    assert np.all(np.isfinite(jacobians))
+    assert np.all(jacobians[1, :, 0] > 0)
+    assert not np.any(jacobians[2])  # at full thrust on every rotor nothing more comes out
+
+
+def test_every_level_has_a_size_and_says_what_its_numbers_are():
+    sizes = {level.value: command_size(level, 6) for level in Control}
+    assert sizes == {"state": 16, "attitude": 4, "body_rate": 4, "force_torque": 4, "rotor_vel": 6}
+    assert set(COMMAND_FIELDS) == set(Control)

@@ -1,0 +1,178 @@
+"""The inner loop, from attitude or body rates to a wrench."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from crazysim import load_airframe
+from crazysim.control import AttitudeParams, attitude2force_torque, body_rate2force_torque
+
+pytestmark = pytest.mark.usefixtures("x64")
+
+LEVEL, ZERO = np.array([0.0, 0, 0, 1]), np.zeros(3)
+HALF = 0.4  # N, half of what the four rotors give: as far from every limit as can be
+attitude = jax.jit(attitude2force_torque, static_argnames="ctrl_freq")
+body_rate = jax.jit(body_rate2force_torque, static_argnames="ctrl_freq")
+
+
+def vectors(n, size):
+    return arrays(np.float64, n, elements=st.floats(-size, size))
+
+
+def params(**changes):
+    out = AttitudeParams.create(load_airframe("cf21B_500"))
+    return out.replace(**{k: jnp.asarray(v, float) for k, v in changes.items()})
+
+
+def hold(cmd, quat=LEVEL, rates=ZERO, wanted=ZERO, before=None, wanted_before=None, integral=ZERO, freq=500, p=None):
+    before = rates if before is None else before
+    wanted_before = wanted if wanted_before is None else wanted_before
+    args = (quat, rates, np.asarray(cmd, float), wanted, before, wanted_before, integral, freq)
+    return attitude(*args, params=params() if p is None else p)
+
+
+def torque_of_pwm(roll, pitch, yaw):
+    """Return the torque that PWM commands become on a Crazyflie, N m: the firmware mixes roll/2, pitch/2, yaw."""
+    newton, arm, yaw_arm = 0.2 / 65535, 0.035355, 0.00593893393599368
+    return np.array([4 * roll / 2 * newton * arm, 4 * pitch / 2 * newton * arm, 4 * yaw * newton * yaw_arm])
+
+
+def test_at_its_attitude_it_passes_the_thrust_on():
+    wrench, integral = hold([0, 0, 0, HALF])
+    np.testing.assert_allclose(wrench, [HALF, 0, 0, 0], atol=1e-15)
+    np.testing.assert_array_equal(integral, ZERO)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_it_turns_towards_the_wanted_attitude(axis):
+    """By hand: a small error e about one axis is vee(Rd^T R - R^T Rd) = 2 sin e, times kR, in PWM."""
+    cmd = np.array([0, 0, 0, HALF])
+    cmd[axis] = 0.02
+    p = params(ki_m=ZERO)
+    wrench, _ = hold(cmd, p=p)
+    pwm = np.zeros(3)
+    pwm[axis] = 2 * np.sin(0.02) * p.kR[axis]
+    np.testing.assert_allclose(wrench, [HALF, *torque_of_pwm(*pwm)], atol=1e-9)
+    assert wrench[1 + axis] > 0
+
+
+@given(
+    quat=vectors(4, 1.0).filter(lambda q: np.linalg.norm(q) > 0.1),
+    rpy=st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3)).map(np.array),
+)
+def test_rotation_error_is_that_of_mellinger_and_kumar(quat, rpy):
+    """Eq. 10 without its one half; small gains keep every limit far."""
+    p = params(kR=[100.0, 100, 100], ki_m=ZERO)
+    quat = quat / np.linalg.norm(quat)
+    now, wanted = Rotation.from_quat(quat).as_matrix(), Rotation.from_euler("ZYX", rpy[::-1]).as_matrix()
+    difference = wanted.T @ now - now.T @ wanted
+    error = np.array([difference[2, 1], difference[0, 2], difference[1, 0]])
+    wrench, integral = hold([*rpy, HALF], quat, p=p)
+    np.testing.assert_allclose(wrench[1:], torque_of_pwm(*(-100 * error)), atol=1e-9)
+    np.testing.assert_allclose(integral, np.clip(-error / 500, -p.int_err_max, p.int_err_max), atol=1e-12)
+
+
+@given(rates=vectors(3, 0.3), wanted=vectors(3, 0.3))
+def test_rate_error_is_damped(rates, wanted):
+    p = params(kd_omega=ZERO, ki_m=ZERO)
+    wrench, _ = hold([0, 0, 0, HALF], rates=rates, wanted=wanted, p=p)
+    np.testing.assert_allclose(wrench[1:], torque_of_pwm(*(np.asarray(p.kw) * (wanted - rates))), atol=1e-12)
+
+
+@pytest.mark.parametrize("freq", [100, 500])
+def test_the_derivative_acts_on_roll_and_pitch_and_knows_its_rate(freq):
+    p = params(kw=ZERO, ki_m=ZERO, kd_omega=[200.0, 200.0, 200.0])
+    before, now = np.array([0.0, 0.01, -0.01]), np.array([0.01, -0.01, 0.02])
+    wrench, _ = hold([0, 0, 0, HALF], rates=now, before=before, freq=freq, p=p)
+    pwm = -200 * (now - before) * freq * [1, 1, 0]
+    np.testing.assert_allclose(wrench[1:], torque_of_pwm(*pwm), atol=1e-12)
+    # A jump of the wanted rates counts the other way round, so following them exactly costs nothing.
+    wrench, _ = hold([0, 0, 0, HALF], rates=now, before=before, wanted=now, wanted_before=before, freq=freq, p=p)
+    np.testing.assert_allclose(wrench[1:], ZERO, atol=1e-15)
+
+
+def test_the_integral_acts_and_is_limited():
+    p = params(ki_m=[0, 0, 500.0], kR=ZERO, int_err_max=[1.0, 1.0, 2.0])
+    wrench, integral = hold([0, 0, 0, HALF], integral=np.array([0, 0, 5.0]), p=p)
+    np.testing.assert_allclose(integral, [0, 0, 2.0])
+    np.testing.assert_allclose(wrench[1:], torque_of_pwm(0, 0, 1000.0), atol=1e-15)
+
+
+@given(cmd=vectors(4, 3.0), rates=vectors(3, 30))
+def test_law_09_thrusts_saturate_rotor_by_rotor_as_documented(cmd, rates):
+    """What comes out is what four rotors can give, each between pwm_min and full, or none at all."""
+    wrench, _ = hold(cmd, rates=rates)
+    airframe = load_airframe("cf21B_500")
+    mixing = np.vstack([np.ones(4), airframe.mixing_matrix * [[0.035355], [0.035355], [0.00593893393599368]]])
+    thrusts = np.linalg.solve(mixing, wrench)
+    if cmd[3] <= 0:
+        np.testing.assert_array_equal(wrench, np.zeros(4))
+    else:
+        assert np.all(thrusts >= 0.2 * 7000 / 65535 - 1e-12)
+        assert np.all(thrusts <= 0.2 + 1e-12)
+
+
+def test_torque_commands_saturate_one_by_one():
+    p = params(torque_pwm_max=[100.0, 200.0, 300.0])
+    wrench, _ = hold([1.0, 1.0, 1.0, HALF], p=p)
+    np.testing.assert_allclose(wrench[1:], torque_of_pwm(100, 200, 300), atol=1e-12)
+
+
+@pytest.mark.parametrize("thrust", [0.0, -1.0])
+def test_fault_06_no_thrust_means_no_torque_either(thrust):
+    wrench, _ = hold([1.0, 1.0, 1.0, thrust], rates=np.ones(3))
+    np.testing.assert_array_equal(wrench, np.zeros(4))
+
+
+@given(rates=vectors(3, 0.2), cmd=vectors(3, 0.2), yaw=st.floats(-3, 3))
+def test_body_rate_is_the_attitude_controller_at_level_with_the_present_yaw(rates, cmd, yaw):
+    quat = Rotation.from_euler("ZYX", [yaw, 0.1, -0.2]).as_quat()
+    before, cmd_before = 0.5 * rates, np.append(0.5 * cmd, 0.3)
+    out, integral = body_rate(quat, rates, np.append(cmd, HALF), before, cmd_before, ZERO, 500, params=params())
+    expected, expected_integral = hold(
+        [0, 0, yaw, HALF], quat, rates, wanted=cmd, before=before, wanted_before=cmd_before[:3]
+    )
+    np.testing.assert_allclose(out, expected, atol=1e-12)
+    np.testing.assert_allclose(integral, expected_integral, atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_body_rate_alone_follows_rates_without_levelling(axis):
+    """With kR and ki_m zero the attitude does not matter, as the docstring says."""
+    p = params(kR=ZERO, ki_m=ZERO)
+    cmd = np.array([0, 0, 0, HALF])
+    cmd[axis] = 0.1
+    tilted = Rotation.from_euler("ZYX", [0.3, 0.8, -0.5]).as_quat()
+    outs = [body_rate(q, ZERO, cmd, ZERO, cmd, ZERO, 500, params=p)[0] for q in (LEVEL, tilted)]
+    np.testing.assert_allclose(outs[0], outs[1], atol=1e-15)
+    assert outs[0][1 + axis] > 5e-5
+
+
+POSES = {
+    "level": [0, 0, 0, 1.0],
+    "upside down": [1.0, 0, 0, 0],
+    "nose down": [0, np.sqrt(0.5), 0, np.sqrt(0.5)],
+    "nose up": [0, -np.sqrt(0.5), 0, np.sqrt(0.5)],
+}
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("level", [attitude2force_torque, body_rate2force_torque])
+def test_law_07_gradients_are_finite_in_every_pose_and_at_saturation(level, dtype):
+    p = jax.tree.map(lambda x: x.astype(dtype), params())
+    zero = jnp.zeros(3, dtype)
+
+    def total(quat, rates, cmd):
+        extra = (cmd[:3], zero, zero) if level is attitude2force_torque else (zero, cmd)
+        wrench, integral = level(quat, rates, cmd, *extra, zero, 500, params=p)
+        return jnp.sum(wrench) + jnp.sum(integral)
+
+    gradient = jax.jit(jax.vmap(jax.vmap(jax.grad(total, argnums=(0, 1, 2)), (None, None, 0)), (0, None, None)))
+    cmds = jnp.array([[0, 0, 0, HALF], [0, 0, 0, 0], [0, 0, 0, 99], [9, 9, 9, HALF], [0, 0, 0, -1]], dtype)
+    for out in gradient(jnp.array(list(POSES.values()), dtype), zero, cmds):
+        assert np.all(np.isfinite(out))

@@ -1,0 +1,133 @@
+"""Law 10: same seed, same numbers, whatever else is simulated along and on however many devices."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import as_numbers
+
+from crazysim import Sim
+from crazysim.pytree import select_worlds
+from crazysim.sim.pipeline import append_fn
+from crazysim.sim.random import drone_keys, world_keys
+from crazysim.sim.sharding import world_mesh
+
+
+def randomise_mass(data, default_data, mask=None):
+    """Draw the mass of every drone anew, between 30 and 60 g, in the worlds that are reset."""
+    draw = jax.vmap(jax.vmap(lambda key: jax.random.uniform(key, (1,), minval=0.03, maxval=0.06)))
+    mass = select_worlds(mask, draw(drone_keys(data, "mass")), data.params.mass)
+    return data.replace(params=data.params.replace(mass=mass))
+
+
+def randomised(n_worlds, seed=7, mesh=None):
+    sim = Sim(n_worlds=n_worlds, n_drones=3, rng_key=seed, mesh=mesh)
+    sim.data = sim.data.replace(params=sim.data.params.replace(mass=jnp.full((n_worlds, 3, 1), 0.0434)))
+    sim.build_default_data()
+    append_fn(sim.reset_pipeline, randomise_mass)
+    sim.build_reset_fn()
+    return sim
+
+
+@pytest.fixture(scope="module")
+def four():
+    return randomised(4)
+
+
+def after_resets(sim, *masks, seed=7):
+    """Return the masses, and the episodes, after the start and these resets. (n_worlds, n_drones)"""
+    sim.data = sim.default_data
+    sim.seed(seed)
+    for mask in masks:
+        sim.reset(None if mask is None else np.array(mask))
+    return np.asarray(sim.data.params.mass[..., 0])
+
+
+def test_a_world_draws_the_same_with_other_numbers_of_worlds(four):
+    two = randomised(2)
+    for n_resets in (1, 2, 3):
+        masks = [None] * n_resets
+        np.testing.assert_array_equal(after_resets(two, *masks), after_resets(four, *masks)[:2])
+
+
+def test_a_world_draws_the_same_whichever_worlds_are_reset_along(four):
+    alone = after_resets(four, [False, False, True, False])
+    along = after_resets(four, [True, False, True, True])
+    everyone = after_resets(four, None)
+    np.testing.assert_array_equal(alone[2], everyone[2])
+    np.testing.assert_array_equal(along[[0, 2, 3]], everyone[[0, 2, 3]])
+    # What the mask leaves out keeps what it had.
+    np.testing.assert_array_equal(alone[[0, 1, 3]], np.float32(0.0434))
+    # World 2 in its second episode draws as it does when all worlds are in theirs.
+    twice = after_resets(four, [False, False, True, False], [False, True, True, False])
+    np.testing.assert_array_equal(twice[2], after_resets(four, None, None)[2])
+    np.testing.assert_array_equal(twice[1], everyone[1])
+
+
+def test_worlds_drones_and_episodes_draw_different_numbers(four):
+    """36 draws of 24 bits: that two are alike by chance has a probability of 4e-5, and the seed is fixed."""
+    draws = np.stack([after_resets(four, *[None] * n) for n in (1, 2, 3)])
+    assert draws.shape == (3, 4, 3)
+    assert len(np.unique(draws)) == draws.size
+    assert 0.03 <= draws.min() < draws.max() <= 0.06
+
+
+def test_seeds_give_their_numbers_again_and_differ_from_each_other(four):
+    first, other, again = (after_resets(four, None, seed=seed) for seed in (7, 8, 7))
+    np.testing.assert_array_equal(first, again)
+    assert not np.any(first == other)
+
+
+def test_the_seed_of_construction_and_of_seed_are_one(four):
+    sim = randomised(4, seed=7)
+    sim.reset()
+    np.testing.assert_array_equal(sim.data.params.mass[..., 0], after_resets(four, None, seed=7))
+
+
+def test_resets_and_steps_leave_the_seeds_key(four):
+    """Batch stages may split it themselves; a reset that moved it would tie worlds to each other."""
+    after_resets(four, None, [True, False, False, True])
+    np.testing.assert_array_equal(as_numbers(four.data.core.rng_key), as_numbers(jax.random.key(7)))
+    four.step(2)
+    np.testing.assert_array_equal(as_numbers(four.data.core.rng_key), as_numbers(jax.random.key(7)))
+
+
+def test_seed_survives_new_data(four):
+    four.seed(11)
+    before = four.data
+    four.build_data()
+    np.testing.assert_array_equal(as_numbers(four.data.core.rng_key), as_numbers(jax.random.key(11)))
+    four.data = before
+
+
+def key_numbers(data, name="wind"):
+    return as_numbers(world_keys(data, name)), as_numbers(drone_keys(data, name))
+
+
+def test_keys_differ_by_world_drone_stage_name_and_step(four):
+    data = four.default_data
+    by_world, by_drone = key_numbers(data)
+    assert by_world.shape == (4, 2)
+    assert by_drone.shape == (4, 3, 2)
+    later = data.replace(core=data.core.replace(steps=data.core.steps + 1))
+    next_episode = data.replace(core=data.core.replace(episode=data.core.episode + 1))
+    everything = [by_world, by_drone, *key_numbers(data, "gust"), *key_numbers(later), *key_numbers(next_episode)]
+    keys = np.concatenate([x.reshape(-1, 2) for x in everything])
+    assert len(keys) == 4 * (4 + 12)
+    assert len(np.unique(keys, axis=0)) == len(keys)
+
+
+def test_keys_do_not_depend_on_where_another_world_is_in_its_time(four):
+    data = four.default_data
+    moved = data.replace(core=data.core.replace(steps=data.core.steps.at[1].set(99), episode=data.core.episode.at[2].set(5)))
+    for before, after in zip(key_numbers(data), key_numbers(moved), strict=True):
+        np.testing.assert_array_equal(before[[0, 3]], after[[0, 3]])
+        assert not np.any(np.all(before[[1, 2]] == after[[1, 2]], axis=-1))
+
+
+def test_two_devices_give_the_same_numbers_as_one(four):
+    assert len(jax.devices()) >= 2, "conftest forces two host devices"
+    split = randomised(4, mesh=world_mesh(jax.devices()[:2]))
+    for masks in ([None], [None, [True, False, True, False]]):
+        np.testing.assert_array_equal(after_resets(split, *masks), after_resets(four, *masks))
+    assert len(split.data.params.mass.sharding.device_set) == 2

@@ -1,0 +1,104 @@
+"""Law 11: no buffer is taken from a caller. What was handed in stays readable and as it was."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import as_numbers, to_all, hover_command
+
+from crazysim import Sim
+from crazysim.sim import functional as F
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return Sim(n_worlds=2, n_drones=2)
+
+
+def snapshot(tree):
+    """Return host copies of all leaves, which no device can change any more."""
+    return [np.array(as_numbers(x)) for x in jax.tree.leaves(tree)]
+
+
+def assert_unchanged(tree, before):
+    leaves = jax.tree.leaves(tree)
+    assert len(leaves) == len(before) > 20
+    for x, kept in zip(leaves, before, strict=True):
+        assert not x.is_deleted()
+        np.testing.assert_array_equal(as_numbers(x), kept)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda sim: sim.step(),
+        lambda sim: sim.step(20),
+        lambda sim: sim.reset(),
+        lambda sim: sim.reset(np.array([True, False])),
+        lambda sim: sim.build_step_fn()(sim.data, 3),
+        lambda sim: sim.build_step_fn()(sim.data, jnp.int32(3)),
+        lambda sim: sim.build_reset_fn()(sim.data, sim.default_data),
+        lambda sim: jax.jit(F.attitude_control)(sim.data, jnp.zeros((2, 2, 4))),
+        lambda sim: sim.contacts(),
+    ],
+    ids=["step", "steps", "reset", "masked-reset", "pure-steps", "pure-step", "pure-reset", "command", "contacts"],
+)
+def test_held_data_stays_readable_and_unchanged(sim, use):
+    sim.attitude_control(to_all(sim.data, hover_command(sim.data)))
+    sim.step(5)
+    held, default = sim.data, sim.default_data
+    kept, kept_default = snapshot(held), snapshot(default)
+    use(sim)
+    assert_unchanged(held, kept)
+    assert_unchanged(default, kept_default)
+    assert sim.default_data is default
+
+
+def test_a_command_array_stays_its_callers(sim):
+    """Neither does the simulation keep a view of host memory: what is written into it later does not count."""
+    command = np.zeros((2, 2, 4), np.float32)
+    on_device = jnp.full((2, 2, 4), 0.25)
+    sim.attitude_control(on_device)
+    sim.step()
+    np.testing.assert_array_equal(on_device, 0.25)
+    sim.attitude_control(command)
+    command[:] = 9.0
+    np.testing.assert_array_equal(sim.data.controls.attitude.staged_cmd, 0.0)
+
+
+def test_default_data_survives_many_steps_and_resets(sim):
+    default, kept = sim.default_data, snapshot(sim.default_data)
+    for i in range(30):
+        sim.attitude_control(to_all(sim.data, hover_command(sim.data)))
+        sim.step(2)
+        sim.reset(np.array([True, i % 2 == 0]))
+    assert sim.default_data is default
+    assert_unchanged(default, kept)
+    np.testing.assert_array_equal(sim.data.states.pos[0], default.states.pos[0])
+
+
+def test_one_state_can_be_stepped_twice(sim):
+    """The branches of a tree search begin with the same arrays."""
+    step, start = sim.build_step_fn(), sim.data
+    first, second = step(start, jnp.int32(4)), step(start, jnp.int32(4))
+    for x, y in zip(snapshot(first), snapshot(second), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_nothing_is_donated_in_the_compiled_programs(sim):
+    """On CPU a donated buffer may happen to survive, so the programs themselves are looked at."""
+    step, reset = sim.build_step_fn(), sim.build_reset_fn()
+    dynamic, unrolled = step.jitted
+    programs = [
+        dynamic.lower(sim.data, jnp.int32(1)),
+        unrolled.lower(sim.data, n_steps=2),
+        reset.lower(sim.data, sim.default_data, jnp.ones(2, bool)),
+    ]
+    for program in programs:
+        text = program.as_text()
+        assert "func.func public @main" in text
+        for mark in ("donated", "tf.aliasing_output", "jax.buffer_donor"):
+            assert mark not in text
+    # The marks are the right ones: this is how a program looks that does take a buffer.
+    taking = jax.jit(lambda x: x + 1, donate_argnums=0).lower(jnp.ones(3)).as_text()
+    assert "tf.aliasing_output" in taking or "jax.buffer_donor" in taking
