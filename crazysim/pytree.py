@@ -18,7 +18,7 @@ Scope = Literal["drone", "world", "shared", "whole", "parameter"]
 T = TypeVar("T")
 
 
-def leaf(scope: Scope, core_ndim: int = 0) -> Any:
+def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None) -> Any:
     """Declare an array field, or a dict of such arrays.
 
     Args:
@@ -26,8 +26,10 @@ def leaf(scope: Scope, core_ndim: int = 0) -> Any:
             (n_worlds, 1, *core). ``shared``: core. ``parameter``: shared or drone, told apart by its
             number of dimensions. ``whole``: opaque to resets and to sharding.
         core_ndim: Number of dimensions of the core shape.
+        core: The core shape, where it can be no other. It keeps one mass for each of three worlds from passing
+            for one along each of three axes.
     """
-    return dataclasses.field(metadata={"scope": scope, "core_ndim": core_ndim})
+    return dataclasses.field(metadata={"scope": scope, "core_ndim": core_ndim, "core": core})
 
 
 def static(**kwargs: Any) -> Any:
@@ -79,13 +81,17 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
         scope = _scope(x, metadata)
         if scope == "whole":
             return
-        shape, batch, core_ndim = jnp.shape(x), batches[scope], metadata["core_ndim"]
-        if shape[: len(batch)] != batch or len(shape) != len(batch) + core_ndim:
-            or_shared = f", or {core_ndim} if all drones share it" if metadata["scope"] == "parameter" else ""
+        shape, batch, core_ndim, core = jnp.shape(x), batches[scope], metadata["core_ndim"], metadata["core"]
+        has_axes = shape[: len(batch)] == batch and len(shape) == len(batch) + core_ndim
+        if not has_axes or core not in (None, shape[len(batch) :]):
+            is_parameter = metadata["scope"] == "parameter"
+            batch = batches["drone"] if is_parameter else batch
+            or_shared = f", or {core_ndim} if all drones share it" if is_parameter else ""
+            ending = "" if core is None else f" and end with {core}"
             raise ConfigError(
-                f"{name} has shape {shape}; needed are {len(batch) + core_ndim} dimensions that begin with {batch}, "
-                f"for {n_worlds} worlds of {n_drones} drones{or_shared}. For one value per world, repeat it for every "
-                f"drone with jnp.broadcast_to."
+                f"{name} has shape {shape}; needed are {len(batch) + core_ndim} dimensions that begin with {batch}"
+                f"{ending}, for {n_worlds} worlds of {n_drones} drones{or_shared}. For one value per world, repeat it "
+                f"for every drone with jnp.broadcast_to."
             )
 
     _map_declared(check, tree, {}, "data")

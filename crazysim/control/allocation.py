@@ -61,4 +61,4 @@ def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
     force = cmd[..., :1]
     thrusts = matvec(p.allocation_matrix, jnp.concatenate([force, cmd[..., 1:] / p.arms], axis=-1))
     rotor_vel = rotor_vel_of_thrust(safe_clip(thrusts, p.thrust_min, p.thrust_max), p.rpm2thrust)
-    return jnp.where(force > 0, rotor_vel, 0.0)
+    return jnp.where(force <= 0, 0.0, rotor_vel)  # NaN must come through, to be flagged

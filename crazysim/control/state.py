@@ -13,7 +13,7 @@ from crazysim.pytree import PyTree, as_parameter, leaf
 class StateParams(PyTree):
     """Gains and constants of the state controller; each is shared, or has one value per drone."""
 
-    mass: Array = leaf("parameter", 1)
+    mass: Array = leaf("parameter", 1, (1,))
     """Mass the controller believes in, kg. (1,)"""
     kp: Array = leaf("parameter", 1)
     """Gain on position, N/m. (3,)"""
@@ -23,7 +23,7 @@ class StateParams(PyTree):
     """Gain on the integral of position, N/(m s). (3,)"""
     gravity_vec: Array = leaf("parameter", 1)
     """Gravitational acceleration the controller believes in, world frame, m/s^2. (3,)"""
-    thrust_scale: Array = leaf("parameter", 1)
+    thrust_scale: Array = leaf("parameter", 1, (1,))
     """Thrust that comes out for one newton wanted: the firmware's mass_thrust does not fit its mass, 1. (1,)"""
     int_err_max: Array = leaf("parameter", 1)
     """Limit of the integral of position, m s. (3,)"""

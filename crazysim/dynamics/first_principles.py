@@ -25,7 +25,7 @@ from crazysim.pytree import PyTree, as_parameter, leaf
 class Params(PyTree):
     """Parameters of the first-principles model; each is shared, or has one value per drone."""
 
-    mass: Array = leaf("parameter", 1)
+    mass: Array = leaf("parameter", 1, (1,))
     """Mass, kg. (1,)"""
     L: Array = leaf("parameter", 1)
     """Arm that scales the first two rows of the mixing matrix, one or one per rotor, m. (1,)"""

@@ -30,7 +30,7 @@ HANDED_OVER_AT = math.cos(math.radians(88))
 class Params(PyTree):
     """Parameters of a fitted model; each is shared, or has one value per drone."""
 
-    mass: Array = leaf("parameter", 1)
+    mass: Array = leaf("parameter", 1, (1,))
     """Mass, kg. (1,)"""
     gravity_vec: Array = leaf("parameter", 1)
     """Gravitational acceleration, world frame, m/s^2. (3,)"""
@@ -38,9 +38,9 @@ class Params(PyTree):
     """Inertia about the centre of mass, body frame, kg m^2; enters with external torques only. (3, 3)"""
     J_inv: Array = leaf("parameter", 2)
     """Inverse of the inertia, body frame, 1/(kg m^2). (3, 3)"""
-    acc_coef: Array = leaf("parameter", 1)
+    acc_coef: Array = leaf("parameter", 1, (1,))
     """Thrust at command zero, N. (1,)"""
-    cmd_f_coef: Array = leaf("parameter", 1)
+    cmd_f_coef: Array = leaf("parameter", 1, (1,))
     """Thrust per commanded thrust, 1. (1,)"""
     rpy_coef: Array = leaf("parameter", 1)
     """Stiffness of roll, pitch and yaw, 1/s^2. (3,)"""

@@ -112,6 +112,6 @@ def rotor_vel_of_thrust(thrust: Array, rpm2thrust: Array) -> Array:
     """
     k0, k1, k2 = rpm2thrust[..., 0], rpm2thrust[..., 1], rpm2thrust[..., 2]
     discriminant = k1 * k1 - 4 * k2 * (k0 - thrust)
-    has_root = discriminant > 0
+    has_root = ~(discriminant <= 0)  # NaN must come through
     root = jnp.where(has_root, jnp.sqrt(jnp.where(has_root, discriminant, 1.0)), 0.0)
     return (root - k1) / (2 * k2)

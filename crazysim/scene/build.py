@@ -68,7 +68,7 @@ def _add_drones(spec: mujoco.MjSpec, airframe: Airframe, n_drones: int) -> None:
         for part in parts:
             _add_part(body, part, i)
         for camera in cameras:
-            mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM if camera.tracks else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+            mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK if camera.tracks else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
             added = body.add_camera(name=f"{camera.name}:{i}", pos=camera.pos, fovy=camera.fovy, mode=mode)
             added.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
             added.alt.xyaxes = camera.xyaxes
@@ -112,7 +112,10 @@ def put_model(mj_model: mujoco.MjModel, device: jax.Device) -> mjx.Model:
     try:
         return mjx.put_model(mj_model, device=device)
     except NotImplementedError as error:
-        raise ConfigError(f"MJX cannot hold this scene, so contacts cannot be asked for: {error}") from error
+        raise ConfigError(
+            f"MJX cannot hold this scene, so contacts cannot be asked for: {error} A geom that need not touch anything "
+            f"takes part in no pair with contype='0' conaffinity='0'."
+        ) from error
 
 
 def make_data(mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device) -> mjx.Data:

@@ -36,7 +36,7 @@ def body_id(mj_model: mujoco.MjModel, body: str) -> int:
     """
     found = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body) if isinstance(body, str) else -1
     if found < 0:
-        names = [mj_model.body(i).name for i in range(mj_model.nbody)]
+        names = [name for name in (mj_model.body(i).name for i in range(mj_model.nbody)) if not name.startswith("_")]
         shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
         raise UnknownNameError(f"the scene has no body {body!r}; it has {shown}")
     return found

@@ -10,6 +10,9 @@ import numpy as np
 from crazysim.scene import mjx
 from crazysim.sim.data import SimData
 
+COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
+"""Cameras that follow a centre of mass, which nothing else needs."""
+
 
 @jax.jit
 def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
@@ -30,12 +33,29 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
     )
 
     def of_world(world: mjx.Data) -> mjx.Data:
-        world = mjx.kinematics(mjx_model, world)
+        world = mjx.kinematics(_carry_children(mjx_model, world), world)
+        if np.isin(mjx_model.cam_mode, COM_CAMERAS).any():
+            world = mjx.com_pos(mjx_model, world)
         world = mjx.camlight(mjx_model, world)
         return mjx.collision(mjx_model, world)
 
     mjx_data = jax.vmap(of_world)(mjx_data)
     return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
+
+
+def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
+    """Return a model whose mocap bodies stand where this world has them, if some carry bodies of their own.
+
+    MJX 3.17 places mocap bodies after it has gone down the tree, and leaves their children where the model has them.
+    """
+    mocap = np.flatnonzero(mjx_model.body_mocapid >= 0)
+    if not np.isin(mjx_model.body_parentid, mocap).any():
+        return mjx_model
+    norm = jnp.linalg.norm(world.mocap_quat, axis=-1, keepdims=True)
+    return mjx_model.replace(
+        body_pos=mjx_model.body_pos.at[mocap].set(world.mocap_pos),
+        body_quat=mjx_model.body_quat.at[mocap].set(world.mocap_quat / norm),
+    )
 
 
 def sync_one_world(

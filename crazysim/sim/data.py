@@ -176,7 +176,8 @@ class SimControls(PyTree):
         state = attitude = body_rate = force_torque = rotor_vel = None
         if control == Control.state:
             cmd = zeros(16).at[..., 12].set(1.0)
-            state = StateControlData(cmd, cmd, freqs[Control.state], zeros(3), StateParams.create(airframe))
+            # A copy, for two leaves that share a buffer cannot both be donated.
+            state = StateControlData(cmd, cmd.copy(), freqs[Control.state], zeros(3), StateParams.create(airframe))
         if control in (Control.state, Control.attitude):
             attitude = AttitudeControlData(
                 cmd=zeros(4),

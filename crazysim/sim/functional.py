@@ -102,15 +102,16 @@ def check_command(data: SimData, control: Control, command: Any, check_finite: b
         )
     if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
         raise ValueError(f"{control.value} command has type {array.dtype}; needed are real numbers")
+    dtype = data.states.pos.dtype
+    # Host input of any type reaches the device as one type and in one place: nothing is traced or compiled anew.
+    with np.errstate(over="ignore"):  # what is too large for the type becomes infinite, and is told as that below
+        array = array.astype(dtype)
     is_tracer = isinstance(array, jax.core.Tracer)
     if (on_host or (check_finite and not is_tracer)) and not np.all(np.isfinite(array)):
         worlds = np.unique(np.nonzero(~np.isfinite(np.asarray(array)))[0])[:8]
         raise ValueError(
-            f"{control.value} command is NaN or infinite in world(s) {worlds.tolist()}; it would poison them "
-            f"until their next reset. Check the computation it comes from."
+            f"{control.value} command is NaN or infinite in world(s) {worlds.tolist()}, as {dtype}; it would poison "
+            f"them until their next reset. Check the computation it comes from."
         )
-    dtype = data.states.pos.dtype
-    # Host input of any type reaches the device as one type and in one place: nothing is traced or compiled anew.
-    array = array.astype(dtype)
     inside_jit = is_tracer or isinstance(data.states.pos, jax.core.Tracer)
     return jnp.asarray(array) if inside_jit else jax.device_put(array, data.states.pos.sharding)

@@ -20,7 +20,7 @@ from crazysim.dynamics import Dynamics
 from crazysim.dynamics.core import require_support
 from crazysim.engine import build_reset, build_step
 from crazysim.engine.plain import ResetFn, StepFn
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError
 from crazysim.scene import build, contacts, mjx
 from crazysim.scene.draw import Marks
 from crazysim.scene.render import Viewer
@@ -38,6 +38,7 @@ from crazysim.sim.data import (
 )
 from crazysim.sim.integration import Integrator
 from crazysim.sim.pipeline import Pipeline
+from crazysim.sim.settings import control_freqs, find_device, member, positive
 from crazysim.sim.sharding import place_scene, shard
 from crazysim.sim.stages import build_step_pipeline, reset
 
@@ -95,12 +96,12 @@ class Sim:
         Raises:
             ValueError: Any argument that cannot be, with what came and what was needed.
         """
-        self.n_worlds = _positive("n_worlds", n_worlds)
-        self.n_drones = _positive("n_drones", n_drones)
-        self.freq = _positive("freq", freq)
-        self.dynamics = _member(Dynamics, "dynamics", dynamics)
-        self.control = _member(Control, "control", control)
-        self.integrator = _member(Integrator, "integrator", integrator)
+        self.n_worlds = positive("n_worlds", n_worlds)
+        self.n_drones = positive("n_drones", n_drones)
+        self.freq = positive("freq", freq)
+        self.dynamics = member(Dynamics, "dynamics", dynamics)
+        self.control = member(Control, "control", control)
+        self.integrator = member(Integrator, "integrator", integrator)
         if self.freq > 10_000 and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
             raise ConfigError(
                 f"freq is {freq} Hz: above 10,000 Hz a step is lost in float32 rounding. Enable float64 first: "
@@ -110,11 +111,15 @@ class Sim:
         self.airframe = load_airframe(drone)
         require_support(self.airframe, self.dynamics)
         self.drone = self.airframe.name
-        self.device = _device(device)
+        self.device = find_device(device)
         self.mesh = mesh
-        self._freqs = self._control_freqs(
-            state=state_freq, attitude=attitude_freq, body_rate=body_rate_freq, force_torque=force_torque_freq
-        )
+        asked = {
+            Control.state: state_freq,
+            Control.attitude: attitude_freq,
+            Control.body_rate: body_rate_freq,
+            Control.force_torque: force_torque_freq,
+        }
+        self._freqs = control_freqs(self.control, self.freq, asked)
 
         self.max_geom_pairs = -1 if self.n_drones < LARGE_SWARM else 2 * self.n_drones
         self.marks = Marks()
@@ -175,7 +180,7 @@ class Sim:
 
     @max_visual_geom.setter
     def max_visual_geom(self, limit: int) -> None:
-        self.marks.limit = _positive("max_visual_geom", limit)
+        self.marks.limit = positive("max_visual_geom", limit)
         self._close_viewer()
 
     def build_data(self) -> SimData:
@@ -225,7 +230,7 @@ class Sim:
 
     def step(self, n_steps: int = 1) -> None:
         """Advance every world by a number of physics steps; any number uses the same compilation."""
-        n_steps = _positive("n_steps", n_steps)
+        n_steps = positive("n_steps", n_steps)
         self._advance(self._step(self.data, jnp.int32(n_steps)))
 
     def reset(self, mask: Any = None) -> None:
@@ -394,11 +399,18 @@ class Sim:
         The only way to a fresh scene. A single world is drawn without touching the others; where there is only
         one, or all are fresh already, that is the whole scene.
         """
-        if not self._synced and (world is None or self.n_worlds == 1):
+        if not self._synced and (world is None or (self.n_worlds == 1 and self._mjx_holds_scene())):
             self._data, self._mjx_data = sync_sim2mjx(self._data, self.mjx_data, self.mjx_model)
             self._synced = True
         if world is not None:
             sync_one_world(self._data, self._mjx_data, world, self.mj_model, self.mj_data)
+
+    def _mjx_holds_scene(self) -> bool:
+        """Return whether contacts can be asked for; what MJX cannot hold can still be drawn."""
+        try:
+            return self.mjx_model is not None
+        except ConfigError:
+            return False
 
     def _compile_scene(self) -> None:
         mj_model = build.compile_spec(self.spec)
@@ -413,29 +425,6 @@ class Sim:
         if self.viewer is not None:
             self.viewer.close()
             self.viewer = None
-
-    def _control_freqs(self, **given: int | None) -> dict[Control, int]:
-        """Return the rate of every controller, checked where the controller is in use."""
-        levels = [Control.state, Control.attitude, Control.body_rate, Control.force_torque]
-        used = {
-            Control.state: (Control.state, Control.attitude, Control.force_torque),
-            Control.attitude: (Control.attitude, Control.force_torque),
-            Control.body_rate: (Control.body_rate, Control.force_torque),
-            Control.force_torque: (Control.force_torque,),
-        }.get(self.control, ())
-        freqs = {}
-        for level in levels:
-            limit = min(100 if level == Control.state else 500, self.freq)
-            default = next(f for f in range(limit, 0, -1) if self.freq % f == 0)
-            freq = default if given[level.value] is None else _positive(f"{level.value}_freq", given[level.value])
-            if level in used and (freq > self.freq or self.freq % freq):
-                below = next(f for f in range(min(freq, self.freq), 0, -1) if self.freq % f == 0)
-                raise ConfigError(
-                    f"{level.value}_freq is {freq} Hz, which does not divide freq = {self.freq} Hz, so it cannot fire "
-                    f"every whole number of steps. The nearest rate below is {below} Hz."
-                )
-            freqs[level] = freq
-        return freqs
 
 
 def use_box_collision(sim: Sim, enable: bool = True) -> None:
@@ -459,34 +448,3 @@ def _put(tree: Any, device: jax.Device) -> Any:
         return x if is_here else jax.device_put(x, here)
 
     return jax.tree.map(put, tree)
-
-
-def _positive(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ConfigError(f"{name} is {value!r}; it must be a positive whole number")
-    return int(value)
-
-
-def _member(enum: Any, name: str, value: Any) -> Any:
-    try:
-        return enum(value)
-    except ValueError:
-        names = ", ".join(repr(m.value) for m in enum)
-        raise UnknownNameError(f"{name} is {value!r}; it must be one of {names}") from None
-
-
-def _device(device: str | jax.Device) -> jax.Device:
-    if isinstance(device, jax.Device):
-        return device
-    if not isinstance(device, str):
-        raise ConfigError(f"a device is a platform such as 'cpu', 'gpu' or 'gpu:1', or a jax.Device, not {device!r}")
-    platform, _, index = device.partition(":")
-    try:
-        devices = jax.devices("gpu" if platform == "cuda" else platform)
-        return devices[int(index or 0)]
-    except (RuntimeError, ValueError, IndexError) as error:
-        found = ", ".join(str(d) for d in jax.devices())
-        raise ConfigError(
-            f"device {device!r} does not exist ({error}); there is {found}. Give a platform such as 'cpu' or 'gpu', "
-            f"or 'gpu:1' for the second of its devices. GPUs need jax's CUDA packages: pip install 'crazysim[gpu]'."
-        ) from None

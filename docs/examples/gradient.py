@@ -12,7 +12,7 @@ from crazysim.sim import functional as F
 
 N_THRUSTS, HELD = 25, 10  # 25 thrusts, each held for 10 steps of 2 ms
 RISE = 0.2  # m
-ROUNDS = 40
+ROUNDS = 60
 
 
 def main() -> None:
@@ -42,9 +42,9 @@ def main() -> None:
     velocity = jnp.zeros_like(thrusts)
     for i in range(ROUNDS + 1):
         value, grad = value_and_grad(thrusts)
-        if i % 10 == 0:
+        if i % 15 == 0:
             print(f"round {i:2d}: cost {value:.5f}, norm of the gradient {jnp.linalg.norm(grad):.4f}")
-        velocity = 0.9 * velocity - 1.5e-1 * grad
+        velocity = 0.9 * velocity - 6e-2 * grad
         thrusts = jnp.clip(thrusts + velocity, 0.1 * weight, 1.8 * weight)
     rise, climb = fly(thrusts)
     print(f"rises by {rise:.3f} m and leaves with {climb:+.3f} m/s")

@@ -27,7 +27,9 @@ def functions_of(module):
 
 
 CASES = [
-    pytest.param(module, function, model, id="-".join(filter(None, [function.__module__[9:], function.__name__, model])))
+    pytest.param(
+        module, function, model, id="-".join(filter(None, [function.__module__[9:], function.__name__, model]))
+    )
     for module in MODULES
     for function in functions_of(module)
     for model in (FITTED if module is fitted else (None,))
@@ -63,7 +65,9 @@ def arguments(module, function, model, rng, per_drone):
         "quat": lambda: (q := rng.normal(size=(*BATCH, 4))) / np.linalg.norm(q, axis=-1, keepdims=True),
         "cmd": lambda: command(module, function, rng),
         "prev_cmd": lambda: command(module, function, rng),
-        "rotor_vel": lambda: rng.uniform(0, 2.5e4, (*BATCH, 4)) if module is not fitted else rng.uniform(0, 1, (*BATCH, 4)),
+        "rotor_vel": lambda: (
+            rng.uniform(0, 2.5e4, (*BATCH, 4)) if module is not fitted else rng.uniform(0, 1, (*BATCH, 4))
+        ),
         "rotor_acc": lambda: rng.normal(size=(*BATCH, 4)) * 1e4,
         "thrust": lambda: rng.uniform(0, 0.2, (*BATCH, 4)),
         "drag_torque": lambda: rng.uniform(0, 1e-3, (*BATCH, 4)),

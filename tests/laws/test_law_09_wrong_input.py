@@ -195,7 +195,7 @@ def test_device_commands_are_looked_at_only_when_asked(at_level):
     sim, before = at_level, at_level.data
     set_command = getattr(sim, f"{sim.control.value}_control")
     command = jnp.zeros(command_shape(sim.data, sim.control)).at[2, 0, 1].set(jnp.nan)
-    with pytest.raises(ValueError, match=r"NaN or infinite in world\(s\) \[2\]"):
+    with pytest.raises(ValueError, match=r"NaN or infinite.* in world\(s\) \[2\]"):
         set_command(command, check_finite=True)
     assert sim.data is before
     set_command(command)
@@ -205,7 +205,7 @@ def test_device_commands_are_looked_at_only_when_asked(at_level):
 
 def test_commands_are_cast_to_the_type_of_the_state(at_level):
     """The one conversion that is documented: nothing of the values is lost but digits, and nothing is clipped."""
-    sim, before = at_level, at_level.data
+    before = at_level.data
     level, shape = at_level.control.value, command_shape(at_level.data, at_level.control)
     command = np.arange(np.prod(shape)).reshape(shape) * 1000
     for given in (command, command.tolist(), command.astype(np.float64), jnp.asarray(command, jnp.int32)):

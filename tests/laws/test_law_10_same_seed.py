@@ -119,7 +119,9 @@ def test_keys_differ_by_world_drone_stage_name_and_step(four):
 
 def test_keys_do_not_depend_on_where_another_world_is_in_its_time(four):
     data = four.default_data
-    moved = data.replace(core=data.core.replace(steps=data.core.steps.at[1].set(99), episode=data.core.episode.at[2].set(5)))
+    moved = data.replace(
+        core=data.core.replace(steps=data.core.steps.at[1].set(99), episode=data.core.episode.at[2].set(5))
+    )
     for before, after in zip(key_numbers(data), key_numbers(moved), strict=True):
         np.testing.assert_array_equal(before[[0, 3]], after[[0, 3]])
         assert not np.any(np.all(before[[1, 2]] == after[[1, 2]], axis=-1))

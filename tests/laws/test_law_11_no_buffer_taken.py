@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import as_numbers, to_all, hover_command
+from cases import as_numbers, hover_command, to_all
 
 from crazysim import Sim
 from crazysim.sim import functional as F

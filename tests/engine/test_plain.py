@@ -1,0 +1,162 @@
+"""The plain engine: loops over the pipeline, carries what is written, refuses what a step cannot keep."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import send, shared_sim, trees_equal, with_states
+
+from crazysim import ConfigError
+from crazysim.engine import build_reset, build_step
+from crazysim.pytree import scopes
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return shared_sim(n_worlds=3, n_drones=2, control="attitude")
+
+
+@pytest.fixture(scope="module")
+def data(sim):
+    data = with_states(sim.data, pos=[0, 0, 1.0], vel=[0.3, -0.2, 0.1], ang_vel=[1.0, -1.0, 0.5])
+    return send(data, np.broadcast_to([0.05, -0.1, 0.2, 0.45], (3, 2, 4)))
+
+
+@pytest.fixture(scope="module")
+def step(sim):
+    return build_step(sim.step_pipeline)
+
+
+def test_steps_at_once_are_steps_one_by_one(data, step):
+    """Bit by bit: the loop runs the same program, however often it is entered."""
+    one_by_one = data
+    for _ in range(7):
+        one_by_one = step(one_by_one, jnp.int32(1))
+    assert trees_equal(step(data, jnp.int32(7)), one_by_one)
+
+
+def test_a_static_number_of_steps_gives_what_a_dynamic_one_gives(data, step):
+    """Two programs of the same arithmetic: float32 rounding of what a scan and a loop fuse differently."""
+    static, dynamic = step(data, 7), step(data, jnp.int32(7))
+    for name in ("pos", "quat", "vel", "ang_vel"):
+        np.testing.assert_allclose(getattr(static.states, name), getattr(dynamic.states, name), rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(static.core.steps, np.full((3, 1), 7))
+    np.testing.assert_array_equal(dynamic.core.steps, np.full((3, 1), 7))
+
+
+def test_no_step_is_no_motion(data, step):
+    after = step(data, jnp.int32(0))
+    assert trees_equal(after.states, data.states)
+    assert trees_equal(after.core.steps, data.core.steps)
+
+
+def test_what_no_stage_writes_comes_back_as_the_very_arrays_that_went_in(data, step):
+    """Parameters and external forces are inputs only: nothing is copied, and no output is made for them."""
+    for n_steps in (2, jnp.int32(2)):
+        after = step(data, n_steps)
+        assert all(a is b for a, b in zip(jax.tree.leaves(after.params), jax.tree.leaves(data.params), strict=True))
+        for name in ("force", "torque"):
+            assert getattr(after.states, name) is getattr(data.states, name)
+        assert after.controls.attitude.staged_cmd is data.controls.attitude.staged_cmd
+        assert after.core.rng_key is data.core.rng_key
+        assert after.core.episode is data.core.episode
+
+
+def test_a_step_returns_far_fewer_arrays_than_it_takes(data, step):
+    written = step.jitted[0].eval_shape(data, jnp.int32(1))
+    n_written = sum(x is not None for x in written)
+    assert n_written <= 16 < len(jax.tree.leaves(data))
+
+
+def test_one_drone_is_the_parameter_of_one_drone_whatever_the_batch(data, step):
+    """Law 2 at the level of the step, with (n_worlds, n_drones) masses: each divides its own drone's force."""
+    mass = jnp.linspace(0.03, 0.05, 6).reshape(3, 2, 1)
+    force = jnp.full((3, 2, 3), 0.5)
+    before = data.replace(
+        params=data.params.replace(mass=mass, drag_matrix=jnp.zeros((3, 3))),
+        states=data.states.replace(force=force, vel=jnp.zeros((3, 2, 3))),
+    )
+    vel = step(before, jnp.int32(1)).states.vel
+    np.testing.assert_allclose(vel[..., 0], 0.002 * 0.5 / mass[..., 0], rtol=1e-6)
+
+
+def stage_error(sim, stage):
+    """Return what a step says whose pipeline has this stage at its end."""
+    step = build_step(sim.step_pipeline | {"mine": stage})
+    with pytest.raises(ValueError) as error:
+        step(sim.data, jnp.int32(1))
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    "stage, fragments",
+    [
+        (
+            lambda d: d.replace(states=d.states.replace(vel=d.states.vel[..., :2])),
+            ("'mine'", "shape (3, 2, 3) and type float32 into shape (3, 2, 2)"),
+        ),
+        (
+            lambda d: d.replace(core=d.core.replace(steps=d.core.steps.astype(float))),
+            ("'mine'", "type int32 into shape (3, 1) and type float32"),
+        ),
+        (lambda d: d.replace(plugins={"new": jnp.zeros(3)}), ("'mine'", "structure", "put everything in place before")),
+        (lambda d: d.replace(states=d.states.replace(force=None)), ("'mine'", "structure")),
+        (lambda d: d.replace(params=d.params.replace(mass=jnp.ones((3, 2, 1)))), ("'mine'", "shape (1,)")),
+        (lambda d: None, ("'mine'",)),
+    ],
+)
+def test_law_09_a_stage_that_does_not_keep_the_record_is_named(sim, stage, fragments):
+    message = stage_error(sim, stage)
+    for fragment in fragments:
+        assert fragment in message
+
+
+@pytest.mark.parametrize("shape", [(3, 1), (3, 1, 1), (3, 3), (2, 3, 1), ()])
+def test_fault_09_a_parameter_is_shared_or_has_the_full_shape(sim, shape):
+    """Law 2, and fault 9 of the peer: with as many worlds as drones, (n_worlds, 1) would pass for one per drone."""
+    square = shared_sim(n_worlds=3, n_drones=3, control="rotor_vel")
+    data = square.data.replace(params=square.data.params.replace(mass=jnp.ones(shape)))
+    with pytest.raises(ConfigError) as error:
+        build_step(square.step_pipeline)(data, jnp.int32(1))
+    assert f"data.params.mass has shape {shape}; needed are 3 dimensions that begin with (3, 3)" in str(error.value)
+    assert "or 1 if all drones share it" in str(error.value)
+
+
+def test_a_reset_runs_its_stages_in_order_with_default_and_mask(sim, data):
+    seen = []
+
+    def first(data, default_data, mask):
+        seen.append(("first", mask is None))
+        return data.replace(states=default_data.states)
+
+    def second(data, default_data, mask):
+        seen.append(("second", mask is None))
+        return data.replace(states=data.states.replace(vel=data.states.vel + 1))
+
+    reset = build_reset({"first": first, "second": second})
+    out = reset(data, sim.default_data)
+    np.testing.assert_array_equal(out.states.vel, np.ones((3, 2, 3)))
+    reset(data, sim.default_data, jnp.array([True, False, True]))
+    assert seen == [("first", True), ("second", True), ("first", False), ("second", False)]
+
+
+def test_every_step_and_reset_tells_the_scene_that_it_is_stale(sim, data, step):
+    fresh = data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True)))
+    reset = build_reset(sim.reset_pipeline)
+    for after in (step(fresh, 1), step(fresh, jnp.int32(1)), reset(fresh, sim.default_data)):
+        assert not after.core.mjx_synced
+
+
+def test_a_full_reset_brings_back_all_that_belongs_to_a_world_and_nothing_else(sim, data, step):
+    reset = build_reset(sim.reset_pipeline)
+    shared = data.replace(params=data.params.replace(mass=jnp.array([0.05])))
+    after = reset(step(shared, jnp.int32(5)), sim.default_data)
+    owned = jax.tree.map(lambda scope, x, d: x is d or scope not in ("drone", "world"), scopes(after), after, after)
+    assert all(jax.tree.leaves(owned))
+    assert trees_equal(after.states, sim.default_data.states)
+    assert trees_equal(
+        after.controls.attitude.replace(params=None), sim.default_data.controls.attitude.replace(params=None)
+    )
+    np.testing.assert_array_equal(after.params.mass, np.float32([0.05]))
+    np.testing.assert_array_equal(after.core.episode, np.ones((3, 1)))
+    np.testing.assert_array_equal(after.core.steps, np.zeros((3, 1)))

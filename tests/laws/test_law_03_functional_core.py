@@ -1,0 +1,145 @@
+"""Law 3: what ``Sim`` does, the functional API does inside jit, scan, vmap and grad."""
+
+import ast
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import hover_command, to_all, trees_equal, with_states
+
+from crazysim import Sim, dynamics
+from crazysim.sim import functional as F
+from crazysim.sim import sim as shell
+
+MASK = np.array([False, True, False])
+ROUNDING = {"rtol": 2e-6, "atol": 2e-6}  # float32: another program around the step fuses and rounds differently
+
+
+@pytest.fixture(scope="module")
+def start():
+    """Three worlds of two drones in flight, their step and reset, and commands that turn them."""
+    sim = Sim(3, 2, attitude_freq=250)
+    sim.data = with_states(
+        sim.data, pos=[0.1, 0.2, 2.0], vel=[0.5, -0.3, 0.1], rotor_vel=[12000.0, 13000, 12500, 12000]
+    )
+    sim.build_default_data()
+    commands = to_all(sim.data, hover_command(sim.data)) * np.ones((4, 3, 2, 1))
+    commands = commands + np.random.default_rng(3).uniform(-0.1, 0.1, commands.shape)
+    return sim, sim.data, sim.build_step_fn(), sim.build_reset_fn(), commands.astype(np.float32)
+
+
+def assert_close(a, b):
+    """Check two data for equality, states to rounding and whole numbers to the bit."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for name in ("steps", "episode", "nonfinite"):
+        np.testing.assert_array_equal(getattr(a.core, name), getattr(b.core, name))
+    for x, y in zip(jax.tree.leaves((a.states, a.controls)), jax.tree.leaves((b.states, b.controls)), strict=True):
+        scale = max(1.0, float(jnp.abs(y).max()))  # rotor speeds are near 1e4
+        np.testing.assert_allclose(x / scale, y / scale, **ROUNDING)
+
+
+@pytest.fixture(scope="module")
+def shell_rollout(start):
+    """What the object does: command, steps, masked reset, command, steps."""
+    sim, data, _, _, commands = start
+    sim.data = data
+    sim.attitude_control(commands[0])
+    sim.step(3)
+    sim.attitude_control(commands[1])
+    sim.step(4)
+    sim.reset(MASK)
+    sim.attitude_control(commands[2])
+    sim.step(3)
+    return sim.data
+
+
+def rollout(start, step):
+    """Return the same as a pure function of the data and the commands."""
+    _, default, _, reset, _ = start
+
+    def function(data, commands):
+        data = step(F.attitude_control(data, commands[0]), 3)
+        data = step(F.attitude_control(data, commands[1]), 4)
+        data = reset(data, default, MASK)
+        return step(F.attitude_control(data, commands[2]), 3)
+
+    return function
+
+
+def test_the_shell_only_calls_the_core(start, shell_rollout):
+    """Law 3: the same calls on the pure functions give the same bits, and the data that went in are unchanged."""
+    _, data, step, _, commands = start
+    before = jax.tree.map(jnp.copy, data)
+    run = rollout(start, lambda d, n: step(d, jnp.int32(n)))  # as Sim.step calls it: any number, one compilation
+    assert trees_equal(run(data, commands), shell_rollout)
+    assert trees_equal(data, before)
+    assert shell_rollout.core.steps[:, 0].tolist() == [10, 3, 10]
+    assert shell_rollout.core.episode[:, 0].tolist() == [0, 1, 0]
+
+
+def test_jit_does_what_the_shell_does(start, shell_rollout):
+    """Law 3: commands, steps and a masked reset as one compiled function."""
+    _, data, step, _, commands = start
+    assert_close(jax.jit(rollout(start, step))(data, jnp.asarray(commands)), shell_rollout)
+
+
+def test_scan_does_what_the_shell_does(start):
+    """Law 3: a rollout in ``lax.scan``, a command before every step."""
+    sim, data, step, _, commands = start
+    commands = np.concatenate([commands, commands[::-1]])
+
+    def body(data, command):
+        data = step(F.attitude_control(data, command), 1)
+        return data, data.states.pos
+
+    final, track = jax.jit(lambda d, c: jax.lax.scan(body, d, c))(data, jnp.asarray(commands))
+    sim.data, expected = data, []
+    for command in commands:
+        sim.attitude_control(command)
+        sim.step()
+        expected.append(sim.data.states.pos)
+    assert_close(final, sim.data)
+    np.testing.assert_allclose(track, np.stack(expected), **ROUNDING)
+
+
+def test_vmap_over_commands_is_a_loop(start):
+    """Law 3: a batch of rollouts that differ in their commands."""
+    _, data, step, _, commands = start
+
+    def run(command):
+        return step(F.attitude_control(data, command), 5)
+
+    many, compiled = jax.jit(jax.vmap(run))(jnp.asarray(commands)), jax.jit(run)
+    for i, command in enumerate(commands):
+        assert_close(jax.tree.map(lambda x, i=i: x[i], many), compiled(jnp.asarray(command)))
+    spread = np.ptp(many.states.ang_vel, axis=0)
+    assert np.all(spread.max(-1) > 1e-3)  # the commands did matter
+
+
+def test_grad_is_finite_and_points_up(start):
+    """Law 3: the thrust command of a drone lifts that drone and no other."""
+    _, data, step, _, commands = start
+
+    def height(command):
+        return step(F.attitude_control(data, command), 10).states.vel[1, 0, 2]
+
+    gradient = np.asarray(jax.jit(jax.grad(height))(jnp.asarray(commands[0])))
+    assert np.all(np.isfinite(gradient))
+    assert gradient[1, 0, 3] > 0
+    others = gradient.copy()
+    others[1, 0] = 0
+    assert not others.any()
+
+
+def test_there_is_no_physics_in_the_shell():
+    """Law 3: ``Sim`` computes nothing; of JAX's numpy it makes arrays only, and of dynamics it knows names."""
+    used = {
+        node.attr
+        for node in ast.walk(ast.parse(inspect.getsource(shell)))
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "jnp"
+    }
+    assert used <= {"asarray", "int32"}
+    for module in (dynamics.first_principles, dynamics.fitted):
+        assert module not in vars(shell).values()

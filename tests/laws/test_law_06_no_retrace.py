@@ -1,0 +1,123 @@
+"""Law 6: ten calls, one trace, whatever the input comes as."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import Sim
+from crazysim.sim import pipeline
+
+
+@pytest.fixture(scope="module")
+def counted():
+    """A simulation whose last stage counts how often Python runs it."""
+    sim, traces = Sim(2, 2), []
+
+    def count(data):
+        traces.append(1)
+        return data
+
+    pipeline.append_fn(sim.step_pipeline, count)
+    sim.build_step_fn()
+    return sim, traces
+
+
+def compilations(fn):
+    """Return how many programs a jitted function holds."""
+    return fn._cache_size()
+
+
+COMMAND = [[[0.0, 0.0, 0.0, 1.0]] * 2] * 2
+INPUTS = {
+    "float32": np.asarray(COMMAND, np.float32),
+    "float64": np.asarray(COMMAND, np.float64),
+    "int": np.asarray(COMMAND, np.int64),
+    "list": COMMAND,
+    "tuple": tuple(map(tuple, COMMAND)),
+    "jax": jnp.asarray(COMMAND),
+    "jax int": jnp.asarray(COMMAND, jnp.int32),
+    "jax half": jnp.asarray(COMMAND, jnp.bfloat16),
+    "not contiguous": np.asarray(COMMAND, np.float64)[::-1, :, ::-1][..., ::-1],
+    "committed": jax.device_put(np.asarray(COMMAND, np.float32), jax.devices()[0]),
+}
+
+
+def test_ten_commands_one_trace(counted):
+    """Law 6: NumPy, JAX, int, float64 or list input alike, and all mean the same command."""
+    sim, traces = counted
+    sim.reset()
+    for name, command in INPUTS.items():
+        sim.attitude_control(command)
+        staged = sim.data.controls.attitude.staged_cmd
+        np.testing.assert_array_equal(staged, np.asarray(COMMAND, np.float32), err_msg=name)
+        assert staged.dtype == sim.data.states.pos.dtype
+        sim.step()
+        assert (len(traces), compilations(sim._step.jitted[0])) == (1, 1), name
+    assert int(sim.data.core.steps[0, 0]) == 10
+
+
+def test_any_number_of_steps_any_edit_any_reset_one_program(counted):
+    """Law 6: the number of steps is no constant of the program, and edits and resets bring no new kind of array."""
+    sim, traces = counted
+    program, n_steps = sim._step.jitted[0], 0
+    sim.reset()
+
+    def check(n, why):
+        nonlocal n_steps
+        sim.step(n)
+        n_steps += int(n)
+        assert (len(traces), compilations(program)) == (1, 1), why
+        assert int(sim.data.core.steps[0, 0]) == n_steps, why
+
+    for n in (1, 5, 7, np.int64(3)):
+        check(n, f"step({n!r})")
+    states = sim.data.states
+    edits = {
+        "a new array of JAX": {"pos": jnp.ones_like(states.pos)},
+        "NumPy": {"vel": np.zeros(states.vel.shape, np.float32)},
+        "an update": {"quat": states.quat.at[0].set(jnp.asarray([0.0, 0.0, 0.0, 1.0]))},
+        "a result of jit": {"force": jax.jit(lambda x: x + 0.0)(jnp.zeros(states.force.shape))},
+        "another device": {"torque": jax.device_put(np.zeros(states.torque.shape, np.float32), jax.devices()[1])},
+    }
+    for why, changes in edits.items():
+        sim.data = sim.data.replace(states=sim.data.states.replace(**changes))
+        check(2, why)
+    sim.data = sim.data.replace(core=sim.data.core.replace(steps=sim.data.core.steps + jnp.int32(0)))
+    check(1, "another step count")
+    sim.seed(7)
+    check(1, "another seed")
+    sim.build_default_data()
+    sim.reset(np.array([False, True]))
+    check(1, "a masked reset")
+    sim.reset(jnp.asarray([False, True]))
+    check(1, "a masked reset from the device")
+    sim.reset()
+    n_steps = int(sim.data.core.steps[0, 0])
+    check(1, "a reset")
+
+
+def test_resets_have_one_program_each_way(counted):
+    """Law 6: all worlds, or those of a mask in whatever form."""
+    sim, _ = counted
+    sim.build_reset_fn()
+    for mask in ([True, False], [False, False], [True, True]):
+        sim.reset(np.array(mask))
+        sim.step()
+        sim.reset(jnp.asarray(mask))
+        sim.reset(mask)
+        sim.reset()
+    jitted = sim._reset
+    assert compilations(jitted) == 2  # one with a mask, one without
+
+
+def test_a_rollout_in_jit_traces_once(counted):
+    """Law 6 for the functional API: ten calls of a jitted rollout run the stages in Python once."""
+    sim, traces = counted
+    step = sim.build_step_fn()
+    rollout = jax.jit(lambda data: step(data, 4))
+    data, before = sim.data, len(traces)
+    for _ in range(10):
+        data = rollout(data)
+    assert len(traces) - before == 1
+    assert compilations(rollout) == 1

@@ -1,0 +1,156 @@
+"""Law 7: no NaN from valid input, in values or gradients, and one bad world never touches another."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import (
+    PAIRS,
+    hover_command,
+    hover_rotor_state,
+    send,
+    shared_sim,
+    trees_equal,
+    zero_thrust_command,
+)
+
+from crazysim.sim.stages import FLOOR
+
+HALF = np.sqrt(0.5)
+SITUATIONS = (
+    "hover",
+    "rest at zero",
+    "rest on floor",
+    "below floor",
+    "pitch +90",
+    "pitch -90",
+    "upside down",
+    "zero command",
+    "saturated",
+    "saturated below",
+    "zero thrust, tilted",
+)
+N_STEPS = 50
+
+
+def tilted(data):
+    """Return a command without thrust that asks for a tilt, or the wrench or rotor speeds nearest to that."""
+    command = np.array(zero_thrust_command(data))
+    mode = data.controls.mode.value
+    if mode == "attitude":
+        command[:3] = 0.5, -0.3, 0.8
+    elif mode in ("body_rate", "force_torque"):
+        command[slice(3) if mode == "body_rate" else slice(1, 4)] = 0.01
+    return command
+
+
+@functools.cache
+def situations(dynamics, control):
+    """Return a simulation with one situation a world, its data, and the commands."""
+    sim = shared_sim(n_worlds=len(SITUATIONS), dynamics=dynamics, control=control)
+    n = len(SITUATIONS)
+    pos, quat, rotor_vel = np.zeros((n, 1, 3)), np.zeros((n, 1, 4)), np.zeros((n, 1, 4))
+    pos[..., 2], quat[..., 3] = 1.0, 1.0
+    commands = np.broadcast_to(hover_command(sim.data), (n, 1, len(hover_command(sim.data)))).copy()
+    at = {name: i for i, name in enumerate(SITUATIONS)}
+    rotor_vel[at["hover"]] = hover_rotor_state(sim.data)
+    for name, height in (("rest at zero", 0.0), ("rest on floor", FLOOR), ("below floor", -1.0)):
+        pos[at[name], 0, 2] = height
+        commands[at[name]] = 0.0
+    quat[at["pitch +90"]] = 0, HALF, 0, HALF
+    quat[at["pitch -90"]] = 0, -HALF, 0, HALF
+    quat[at["upside down"]] = 1, 0, 0, 0
+    quat[at["zero thrust, tilted"]] = np.sin(0.4), 0, 0, np.cos(0.4)
+    commands[at["zero command"]] = 0.0
+    for name, sign in (("saturated", 1), ("saturated below", -1)):
+        commands[at[name]] = sign * (1e6 if control == "rotor_vel" else 100.0)
+        if control == "attitude":  # angles do not saturate; these are the largest there are
+            commands[at[name], 0, :3] = sign * np.pi * np.array([1.0, 0.5, -1.0])
+    commands[at["zero thrust, tilted"]] = tilted(sim.data)
+    arrays = {"pos": pos, "quat": quat, "rotor_vel": rotor_vel}
+    states = sim.data.states.replace(**{k: jnp.asarray(v, jnp.float32) for k, v in arrays.items()})
+    return sim, sim.data.replace(states=states), jnp.asarray(commands, jnp.float32)
+
+
+@functools.cache
+def flight(dynamics, control):
+    """Return a compiled flight: gradients of positions and velocities at its end, and the data there."""
+    step = situations(dynamics, control)[0].build_step_fn()
+
+    @jax.jit
+    @functools.partial(jax.grad, has_aux=True)
+    def fly(start, data):
+        states = data.states.replace(**{k: v for k, v in start.items() if k != "command"})
+        data = step(send(data.replace(states=states), start["command"]), N_STEPS)
+        s = data.states
+        return sum(jnp.sum(x) for x in (s.pos, s.vel, s.quat, s.ang_vel)), data
+
+    return fly
+
+
+def start_of(data, commands):
+    """Return what the gradients are taken with respect to."""
+    names = ("pos", "quat", "vel", "ang_vel", "rotor_vel")
+    return {"command": commands} | {name: getattr(data.states, name) for name in names}
+
+
+@pytest.mark.parametrize("dynamics, control", PAIRS)
+def test_values_and_gradients_are_finite(dynamics, control):
+    """Law 7: every situation, every kind of dynamics and command, after 50 steps."""
+    _, data, commands = situations(dynamics, control)
+    gradients, end = flight(dynamics, control)(start_of(data, commands), data)
+    for world, name in enumerate(SITUATIONS):
+        for leaf, x in {**vars(end.states), **{f"gradient of {k}": v for k, v in gradients.items()}}.items():
+            assert np.all(np.isfinite(x[world])), f"{leaf} in {name!r}"
+    assert not end.core.nonfinite.any()
+    assert np.all(end.states.pos[..., 2] >= np.float32(FLOOR))
+    # The drones did fly: the place of each counts fully in where it ends, but on the floor.
+    assert np.all(np.asarray(gradients["pos"])[SITUATIONS.index("upside down"), 0, :2] != 0)
+    # float32 rounding of 50 renormalisations
+    np.testing.assert_allclose(np.linalg.norm(end.states.quat, axis=-1), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("dynamics, control", PAIRS)
+def test_a_bad_world_touches_no_other(dynamics, control):
+    """Law 7: with NaN in world 1 every other world ends bit-equal, its gradients too, and only world 1 is flagged."""
+    _, data, commands = situations(dynamics, control)
+    fly = flight(dynamics, control)
+    good_gradients, good = fly(start_of(data, commands), data)
+    states = data.states
+    for changes in (
+        {"pos": states.pos.at[1].set(jnp.nan), "quat": states.quat.at[1, 0, 2].set(jnp.nan)},
+        {"vel": states.vel.at[1].set(jnp.inf), "ang_vel": states.ang_vel.at[1, 0, 0].set(-jnp.inf)},
+    ):
+        bad_gradients, bad = fly(start_of(data.replace(states=states.replace(**changes)), commands), data)
+        others = np.arange(len(SITUATIONS)) != 1
+        for a, b in ((good, bad), (good_gradients, bad_gradients)):
+            a, b = ((x.states, x.controls) if x in (good, bad) else x for x in (a, b))
+            assert trees_equal(*(only_drones(tree, others) for tree in (a, b)))
+        assert bad.core.nonfinite[:, 0].tolist() == (~others).tolist()
+
+
+def only_drones(tree, worlds):
+    """Return the leaves of these worlds."""
+    return [np.asarray(x)[worlds] for x in jax.tree.leaves(tree) if x.ndim == 3 and x.shape[0] == len(worlds)]
+
+
+@pytest.mark.parametrize("control", ["state", "attitude", "body_rate"])
+def test_a_reset_heals_the_bad_world_alone(control):
+    """Law 7: whatever a NaN got into, integrals included, a reset of that world clears; no other world is reset."""
+    sim, data, commands = situations("first_principles", control)
+    mask = np.arange(len(SITUATIONS)) == 1
+    kept = sim.data
+    sim.data = send(data.replace(states=data.states.replace(quat=data.states.quat.at[1].set(jnp.nan))), commands)
+    sim.step(10)
+    before = sim.data
+    assert sim.data.core.nonfinite[:, 0].tolist() == mask.tolist()
+    sim.reset(mask)
+    assert not sim.data.core.nonfinite.any()
+    after = (sim.data.states, sim.data.controls)
+    assert trees_equal(only_drones(after, mask), only_drones((kept.states, kept.controls), mask))
+    assert trees_equal(only_drones(after, ~mask), only_drones((before.states, before.controls), ~mask))
+    sim.step(10)
+    assert not sim.data.core.nonfinite.any()
+    sim.data = kept

@@ -1,0 +1,260 @@
+"""Contacts against distances worked out by hand, and against C MuJoCo, in many worlds at once."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim.sim import Sim
+from crazysim.sim.sharding import world_mesh
+from crazysim.sim.sim import sync_sim2mjx, use_box_collision
+
+N_WORLDS = 64
+RADIUS, OFFSET = 0.086, np.array([0.0, 0.0, 0.02])  # collision sphere of cf21B_500, in its body frame
+BALL, BALL_RADIUS = np.array([0.25, 0.0, 0.3]), 0.15
+POLE_RADIUS, POLE_HALF = 0.03, 0.3
+OBSTACLES = f"""
+<mujoco>
+  <worldbody>
+    <body name="ball"><geom name="ball" type="sphere" size="{BALL_RADIUS}"/></body>
+    <body name="pole"><geom name="pole" type="capsule" size="{POLE_RADIUS} {POLE_HALF}"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def add_obstacles(sim):
+    spec = mujoco.MjSpec.from_string(OBSTACLES)
+    frame = sim.spec.worldbody.add_frame()
+    frame.attach_body(spec.body("ball"), "", "").pos = BALL
+    frame.attach_body(spec.body("pole"), "", "").mocap = True
+    sim.build_mjx()
+
+
+def random_quats(rng, *shape):
+    quat = rng.normal(size=(*shape, 4))
+    return quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+
+
+def rotate(quat_xyzw, vector):
+    xyz, w = quat_xyzw[..., :3], quat_xyzw[..., 3:]
+    t = 2 * np.cross(xyz, vector)
+    return vector + w * t + np.cross(xyz, t)
+
+
+def scatter(sim):
+    """Give every drone and the pole of every world another pose, near enough for half of them to touch something."""
+    rng = np.random.default_rng(7)
+    pos = rng.uniform([-0.25, -0.25, 0], [0.25, 0.25, 0.5], (sim.n_worlds, sim.n_drones, 3))
+    quat = random_quats(rng, sim.n_worlds, sim.n_drones)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos), quat=jnp.asarray(quat)))
+    pole = sim.mj_model.body("pole").mocapid.item()
+    pole_pos = rng.uniform([-0.4, -0.4, 0.1], [0.4, 0.4, 0.6], (sim.n_worlds, 3))
+    pole_quat = random_quats(rng, sim.n_worlds)
+    sim.mjx_data = sim.mjx_data.replace(
+        mocap_pos=sim.mjx_data.mocap_pos.at[:, pole].set(pole_pos),
+        mocap_quat=sim.mjx_data.mocap_quat.at[:, pole].set(np.roll(pole_quat, 1, axis=-1)),
+    )
+    return pos, quat, pole_pos, pole_quat
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    """Worlds of two drones, a ball that is part of the scene and a pole that is placed anew in every world."""
+    sim = Sim(n_worlds=N_WORLDS, n_drones=2)
+    add_obstacles(sim)
+    return sim, *scatter(sim)
+
+
+def touching(sim):
+    """Return for every pair of geom names in how many worlds it touches, as one bool per world."""
+    flags = np.asarray(sim.contacts())
+    contact = sim.mjx_data._impl.contact
+    found = {}
+    for world in range(sim.n_worlds):
+        for slot in range(flags.shape[1]):
+            ids = int(contact.geom1[world, slot]), int(contact.geom2[world, slot])
+            pair = frozenset(sim.mj_model.geom(i).name for i in ids)
+            found.setdefault(pair, np.zeros(sim.n_worlds, bool))[world] |= flags[world, slot]
+    return found
+
+
+def to_segment(point, middle, half):
+    """Return the distance from points to segments that reach ``half`` (n, 3) to both sides of their middle."""
+    t = np.sum((point - middle) * half, -1) / np.sum(half * half, -1)
+    return np.linalg.norm(point - middle - np.clip(t, -1, 1)[:, None] * half, axis=-1)
+
+
+def test_contacts_of_mocap_bodies_are_not_empty():
+    """MJX before 3.12 makes no contacts of mocap bodies: any() of an empty array would pass for no contact."""
+    sim = Sim(n_worlds=3)
+    contacts = sim.contacts()
+    assert contacts.shape == (3, 1)
+    assert contacts.dtype == bool
+    assert np.asarray(contacts).all(), "a drone that stands on the floor touches it"
+
+
+def test_touching_is_a_distance_below_zero(crowd):
+    """Every pair of spheres, capsules and floor touches where the distance worked out by hand is negative."""
+    sim, pos, quat, pole_pos, pole_quat = crowd
+    spheres = pos + rotate(quat, OFFSET)
+    half = rotate(pole_quat, np.array([0.0, 0.0, POLE_HALF]))
+    distances = {
+        ("col_sphere:0", "col_sphere:1"): np.linalg.norm(spheres[:, 0] - spheres[:, 1], axis=-1) - 2 * RADIUS,
+        ("floor", "pole"): pole_pos[:, 2] - np.abs(half[:, 2]) - POLE_RADIUS,
+        ("ball", "pole"): to_segment(np.broadcast_to(BALL, (N_WORLDS, 3)), pole_pos, half) - POLE_RADIUS - BALL_RADIUS,
+    }
+    for i in range(2):
+        sphere = f"col_sphere:{i}"
+        distances["floor", sphere] = spheres[:, i, 2] - RADIUS
+        distances["ball", sphere] = np.linalg.norm(spheres[:, i] - BALL, axis=-1) - RADIUS - BALL_RADIUS
+        distances["pole", sphere] = to_segment(spheres[:, i], pole_pos, half) - RADIUS - POLE_RADIUS
+
+    found = touching(sim)
+    assert set(found) == {frozenset(pair) for pair in distances}
+    for pair, distance in distances.items():
+        clear = np.abs(distance) > 1e-5  # nearer to touching than float32 can tell
+        np.testing.assert_array_equal(found[frozenset(pair)][clear], distance[clear] < 0, err_msg=str(pair))
+        assert 3 < np.sum(distance < 0) < N_WORLDS - 3, f"{pair}: both outcomes must occur for this to test anything"
+
+
+def test_boxes_touch_where_c_mujoco_says_so():
+    """With box collision drones touch the floor, the ball, the pole and each other as C MuJoCo's distances have it."""
+    sim = Sim(n_worlds=N_WORLDS, n_drones=2)
+    add_obstacles(sim)
+    use_box_collision(sim)
+    pos, quat, pole_pos, pole_quat = scatter(sim)
+    found = touching(sim)
+    pairs = [("col_box:0", "col_box:1"), ("floor", "col_box:0"), ("ball", "col_box:1"), ("pole", "col_box:0")]
+    assert {frozenset(pair) for pair in pairs} < set(found)
+    assert not any("col_sphere" in name for pair in found for name in pair)
+
+    data, drones = mujoco.MjData(sim.mj_model), np.asarray(sim.data.core.drone_mocap_ids)
+    pole = sim.mj_model.body("pole").mocapid.item()
+    distances = np.empty((N_WORLDS, len(pairs)))
+    for world in range(N_WORLDS):
+        data.mocap_pos[drones], data.mocap_pos[pole] = pos[world], pole_pos[world]
+        data.mocap_quat[drones] = np.roll(quat[world], 1, -1)
+        data.mocap_quat[pole] = np.roll(pole_quat[world], 1)
+        mujoco.mj_kinematics(sim.mj_model, data)
+        for k, pair in enumerate(pairs):
+            a, b = (sim.mj_model.geom(name).id for name in pair)
+            distances[world, k] = mujoco.mj_geomDistance(sim.mj_model, data, a, b, 1.0, None)
+    for k, pair in enumerate(pairs):
+        clear = np.abs(distances[:, k]) > 2e-3
+        np.testing.assert_array_equal(
+            found[frozenset(pair)][clear], distances[clear, k] < 0, err_msg=f"{pair} {distances[:, k]}"
+        )
+        assert 3 < np.sum(distances[:, k] < 0) < N_WORLDS - 3
+
+    use_box_collision(sim, False)
+    assert {frozenset(("floor", "col_sphere:0")), frozenset(("col_sphere:0", "col_sphere:1"))} <= set(touching(sim))
+
+
+@pytest.mark.parametrize("body", ["drone:0", "drone:1", "pole", "ball", "world"])
+def test_a_body_filters_its_own_slots(crowd, body):
+    """Asking for a body keeps the slots of its geoms and clears the others, in every world."""
+    sim = crowd[0]
+    contact = sim.mjx_data._impl.contact
+    bodies = sim.mj_model.geom_bodyid[np.stack([contact.geom1, contact.geom2])]
+    of_body = (bodies == sim.mj_model.body(body).id).any(0)
+    assert 0 < of_body.sum() < of_body.size
+    np.testing.assert_array_equal(sim.contacts(body), np.asarray(sim.contacts()) & of_body)
+
+
+def test_a_body_without_geoms_touches_nothing(crowd):
+    assert not np.asarray(crowd[0].contacts("_dummy")).any()
+
+
+def test_an_unknown_body_is_told_with_the_names_there_are(crowd):
+    with pytest.raises(ValueError, match=r"no body 'gate'; it has world, drone:0, drone:1, ball, pole"):
+        crowd[0].contacts("gate")
+
+
+def test_a_closed_over_scene_gives_the_same_contacts(crowd):
+    """The contact check for tight loops: the scene is a constant of the compiled function, the poles an argument."""
+    sim = crowd[0]
+    expected = np.asarray(sim.contacts())
+    _mjx_data, mjx_model = sim.mjx_data, sim.mjx_model
+    traces = []
+
+    @jax.jit
+    def check_contacts(sim_data, obstacle_mocap_pos):
+        traces.append(1)
+        mjx_data = _mjx_data.replace(mocap_pos=obstacle_mocap_pos)
+        _, mjx_data = sync_sim2mjx(sim_data, mjx_data, mjx_model)
+        return mjx_data._impl.contact.dist < 0
+
+    mocap_pos = sim.mjx_data.mocap_pos
+    np.testing.assert_array_equal(check_contacts(sim.data, mocap_pos), expected)
+    far = check_contacts(sim.data, mocap_pos.at[:, sim.mj_model.body("pole").mocapid.item()].set(9.0))
+    contact = sim.mjx_data._impl.contact
+    of_pole = np.asarray(
+        (contact.geom1 == sim.mj_model.geom("pole").id) | (contact.geom2 == sim.mj_model.geom("pole").id)
+    )
+    assert expected[of_pole].any()
+    np.testing.assert_array_equal(far, expected & ~of_pole)
+    assert len(traces) == 1
+    assert sim.mjx_data is _mjx_data, "the check is pure"
+
+
+def test_spread_worlds_have_the_same_contacts(crowd):
+    """Contacts on two devices equal those on one, whether spread from the start or later, poles that moved included."""
+    expected = np.asarray(crowd[0].contacts())
+    mesh = world_mesh(jax.devices()[:2])
+    born = Sim(n_worlds=N_WORLDS, n_drones=2, mesh=mesh)
+    add_obstacles(born)
+    scatter(born)
+    np.testing.assert_array_equal(born.contacts(), expected)
+    assert len(born.contacts().sharding.device_set) == 2
+
+    later = Sim(n_worlds=N_WORLDS, n_drones=2)
+    add_obstacles(later)
+    scatter(later)
+    later.shard(mesh)
+    np.testing.assert_array_equal(later.contacts(), expected)
+    assert len(later.mjx_data.mocap_pos.sharding.device_set) == 2
+
+
+def test_a_large_swarm_keeps_the_nearest_pairs():
+    """From 64 drones on slots are fewer than pairs; drones that touch are near, so they keep theirs."""
+    sim = Sim(n_worlds=1, n_drones=64)
+    pos = np.asarray(sim.data.states.pos).copy()
+    pos[..., 2] = 1.0
+    pos[0, 40] = pos[0, 41] + [0.1, 0, 0]
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos)))
+    contacts = np.asarray(sim.contacts())
+    assert contacts.shape[1] < 64 * 63 // 2
+    assert contacts.sum() == 1
+    assert np.asarray(sim.contacts("drone:40")).sum() == 1
+    assert np.asarray(sim.contacts("drone:41")).sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("mocap_pos", np.zeros((3, 3)), r"shape \(3, 3\); this scene needs \(64, 3, 3\)"),
+        ("mocap_quat", np.zeros((64, 2, 4)), r"shape \(64, 2, 4\); this scene needs \(64, 3, 4\)"),
+        ("mocap_pos", np.full((64, 3, 3), np.nan), "not finite"),
+    ],
+)
+def test_poses_that_cannot_be_are_told(crowd, name, value, message):
+    """Poses without a world axis, for another number of bodies, or not finite raise, and change nothing."""
+    sim = crowd[0]
+    before = sim.mjx_data
+    with pytest.raises(ValueError, match=message):
+        sim.mjx_data = sim.mjx_data.replace(**{name: value})
+    assert sim.mjx_data is before
+
+
+def test_poses_may_be_numpy_arrays_of_any_number(crowd):
+    """Positions written as integers or float64 are cast; drones do not snap to whole metres."""
+    sim, pos, _quat, *_ = crowd
+    expected = np.asarray(sim.contacts())
+    mocap_pos, far = np.asarray(sim.mjx_data.mocap_pos), sim.mjx_data
+    sim.mjx_data = far.replace(mocap_pos=np.rint(mocap_pos).astype(int))
+    sim.contacts()
+    np.testing.assert_allclose(np.asarray(sim.mjx_data.mocap_pos)[:, sim.data.core.drone_mocap_ids], pos, rtol=1e-6)
+    sim.mjx_data = sim.mjx_data.replace(mocap_pos=mocap_pos.astype(np.float64))
+    np.testing.assert_array_equal(sim.contacts(), expected)

@@ -1,0 +1,136 @@
+"""What a sync writes: the poses SimData owns, and all that MuJoCo derives from them; nothing else."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim.scene.sync import sync_one_world
+from crazysim.sim import Sim
+from crazysim.sim.sim import sync_sim2mjx
+
+TOWER = """
+<mujoco>
+  <worldbody>
+    <body name="tower">
+      <geom type="capsule" size="0.05 0.3"/>
+      <body name="arm" pos="0 0.2 0.3" euler="30 0 0">
+        <geom type="sphere" size="0.04" pos="0.1 0 0"/>
+        <camera name="lookout" pos="0 0 0.1" euler="90 0 0"/>
+        <camera name="com" mode="trackcom" pos="-1 0 0.3"/>
+        <light name="beacon" pos="0 0 0.2" dir="1 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+DERIVED = ("xpos", "xquat", "xmat", "geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat")
+
+
+@pytest.fixture(scope="module")
+def sim():
+    """Three worlds of two drones at random poses, and a tower with parts that is moved by hand."""
+    sim = Sim(n_worlds=3, n_drones=2)
+    tower = sim.spec.worldbody.add_frame().attach_body(mujoco.MjSpec.from_string(TOWER).body("tower"), "", "")
+    tower.mocap = True
+    sim.build_mjx()
+    rng = np.random.default_rng(3)
+    pos, quat = rng.normal(size=(3, 2, 3)), rng.normal(size=(3, 2, 4))
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos), quat=jnp.asarray(quat)))
+    turned = rng.normal(size=(3, 4))
+    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+    tower = sim.mj_model.body("tower").mocapid.item()
+    sim.mjx_data = sim.mjx_data.replace(
+        mocap_pos=sim.mjx_data.mocap_pos.at[:, tower].set(rng.normal(size=(3, 3))),
+        mocap_quat=sim.mjx_data.mocap_quat.at[:, tower].set(turned),
+    )
+    return sim
+
+
+@pytest.fixture(scope="module")
+def synced(sim):
+    return sync_sim2mjx(sim.data, sim.mjx_data, sim.mjx_model)
+
+
+def reference(sim, world):
+    """Return the world as C MuJoCo computes it from poses that are written here, one by one."""
+    data = mujoco.MjData(sim.mj_model)
+    for i in range(sim.n_drones):
+        k = sim.mj_model.body(f"drone:{i}").mocapid.item()
+        x, y, z, w = np.asarray(sim.data.states.quat[world, i])
+        data.mocap_pos[k], data.mocap_quat[k] = sim.data.states.pos[world, i], (w, x, y, z)
+    k = sim.mj_model.body("tower").mocapid.item()
+    data.mocap_pos[k], data.mocap_quat[k] = sim.mjx_data.mocap_pos[world, k], sim.mjx_data.mocap_quat[world, k]
+    mujoco.mj_kinematics(sim.mj_model, data)
+    mujoco.mj_comPos(sim.mj_model, data)
+    mujoco.mj_camlight(sim.mj_model, data)
+    return data
+
+
+@pytest.mark.parametrize("world", range(3))
+def test_every_transform_is_that_of_c_mujoco(sim, synced, world):
+    """Bodies, geoms and cameras of every world are where C MuJoCo has them, quaternions converted to wxyz."""
+    _, mjx_data = synced
+    expected = reference(sim, world)
+    for name in DERIVED:
+        found = np.asarray(getattr(mjx_data, name)[world]).reshape(getattr(expected, name).shape)
+        np.testing.assert_allclose(found, getattr(expected, name), atol=2e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("world", range(3))
+def test_a_world_to_be_drawn_is_that_of_c_mujoco(sim, world):
+    """The sync of one world for a picture gives the same, and the lights besides, without MJX."""
+    expected = reference(sim, world)
+    data = mujoco.MjData(sim.mj_model)
+    sync_one_world(sim.data, sim.mjx_data, world, sim.mj_model, data)
+    for name in (*DERIVED, "light_xpos", "light_xdir"):
+        np.testing.assert_allclose(getattr(data, name), getattr(expected, name), atol=1e-6, err_msg=name)
+
+
+def test_only_what_the_simulation_owns_is_written(sim, synced):
+    """Poses of bodies that a user attached stay as they were; so do positions and speeds of joints."""
+    _, mjx_data = synced
+    tower = sim.mj_model.body("tower").mocapid.item()
+    np.testing.assert_array_equal(mjx_data.mocap_pos[:, tower], sim.mjx_data.mocap_pos[:, tower])
+    np.testing.assert_array_equal(mjx_data.mocap_quat[:, tower], sim.mjx_data.mocap_quat[:, tower])
+    for name in ("qpos", "qvel", "ctrl", "time", "act", "xfrc_applied"):
+        np.testing.assert_array_equal(getattr(mjx_data, name), getattr(sim.mjx_data, name), err_msg=name)
+
+
+def test_the_data_comes_back_with_its_flag_set_and_nothing_else_changed(sim, synced):
+    data, _ = synced
+    assert bool(data.core.mjx_synced)
+    assert not bool(sim.data.core.mjx_synced), "the data that went in is as it was"
+    before, after = (d.replace(core=d.core.replace(mjx_synced=None, rng_key=None)) for d in (sim.data, data))
+    jax.tree.map(np.testing.assert_array_equal, before, after)
+
+
+def test_a_sync_works_within_transformations(sim, synced):
+    """Within jit and scan it gives what it gives alone: rollouts may look for contacts at every step."""
+
+    @jax.jit
+    def twice(data, mjx_data):
+        def body(carry, _):
+            data, mjx_data = sync_sim2mjx(*carry, sim.mjx_model)
+            return (data, mjx_data), mjx_data._impl.contact.dist
+
+        return jax.lax.scan(body, (data, mjx_data), length=2)
+
+    (data, _), dist = twice(sim.data, sim.mjx_data)
+    assert bool(data.core.mjx_synced)
+    for k in range(2):
+        np.testing.assert_allclose(dist[k], synced[1]._impl.contact.dist, atol=1e-6)
+
+
+def test_syncs_compile_once(sim):
+    """A scene written with NumPy or JAX arrays, on any data, is synced by one compilation."""
+    sim.contacts()
+    before = sync_sim2mjx._cache_size()
+    mocap_pos = np.asarray(sim.mjx_data.mocap_pos)
+    for poses in (mocap_pos, mocap_pos.astype(np.float64), jnp.asarray(mocap_pos)):
+        sim.mjx_data = sim.mjx_data.replace(mocap_pos=poses)
+        sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.asarray(sim.data.states.pos) + 0.0))
+        sim.contacts()
+    assert sync_sim2mjx._cache_size() == before
