@@ -20,19 +20,24 @@ StepFn = Callable[..., SimData]
 ResetFn = Callable[..., SimData]
 
 
-def build_step(pipeline: Pipeline) -> StepFn:
+def build_step(pipeline: Pipeline, by_component: bool = True) -> StepFn:
     """Return ``step(data, n_steps=1) -> data``, pure, for the stages as they are now.
 
     Within it only the leaves that some stage writes are carried from step to step; the rest, parameters above
     all, stay constants of the loop and come back as the very arrays that went in. With ``n_steps`` a Python
     number the loop can be differentiated; with an array one compilation serves every number of steps.
+
+    Args:
+        pipeline: The stages.
+        by_component: Whether vectors are held component by component. Not for data that is spread over devices:
+            XLA gathers whatever a layout is asked for.
     """
     stages = tuple(pipeline.items())
 
     def single(data: SimData) -> SimData:
         for name, fn in stages:
             with jax.named_scope(name):
-                data = _settle(name, data, fn(data))
+                data = _settle(name, data, fn(data), by_component)
         return data
 
     @jax.jit
@@ -56,7 +61,7 @@ def build_step(pipeline: Pipeline) -> StepFn:
     return step
 
 
-def _settle(name: str, before: SimData, after: SimData) -> SimData:
+def _settle(name: str, before: SimData, after: SimData, by_component: bool) -> SimData:
     """Return what a stage made, checked, with what it wrote computed once and laid out for the next stage.
 
     XLA's CPU backend repeats shared arithmetic for every array that needs it, unless a barrier stops it. And it
@@ -79,7 +84,7 @@ def _settle(name: str, before: SimData, after: SimData) -> SimData:
     written = [i for i, (x, y) in enumerate(zip(old, new, strict=True)) if x is not y]
     leaf_scopes = jax.tree.leaves(scopes(after))
     for i, value in zip(written, jax.lax.optimization_barrier([new[i] for i in written]), strict=True):
-        if leaf_scopes[i] == "drone" and value.ndim == 3:
+        if by_component and leaf_scopes[i] == "drone" and value.ndim == 3:
             many_worlds = value.shape[0] >= value.shape[1]
             value = with_layout_constraint(value, Layout(major_to_minor=(2, 1, 0) if many_worlds else (2, 0, 1)))
         new[i] = value

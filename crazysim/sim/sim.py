@@ -215,6 +215,7 @@ class Sim:
         self._mjx_model = None
         if self._mjx_data is not None:
             self.mjx_data = self._mjx_data
+        self.build_step_fn()
         return self.data
 
     def seed(self, seed: int) -> None:
@@ -280,7 +281,7 @@ class Sim:
 
     def build_step_fn(self) -> StepFn:
         """Make the step pipeline as it is now take effect; return ``step(data, n_steps=1) -> data``, pure."""
-        self._step = build_step(self.step_pipeline)
+        self._step = build_step(self.step_pipeline, by_component=self.mesh is None)
         return self._step
 
     def build_reset_fn(self) -> ResetFn:

@@ -18,7 +18,7 @@ from crazysim.control import (
     state2attitude,
 )
 from crazysim.dynamics import Dynamics, first_principles, fitted
-from crazysim.pytree import map_batched, select_worlds
+from crazysim.pytree import map_batched, scopes, select_worlds
 from crazysim.sim.data import SimData, SimStateDeriv
 from crazysim.sim.integration import INTEGRATORS, Integrator
 from crazysim.sim.pipeline import Pipeline
@@ -199,8 +199,10 @@ def increment_steps(data: SimData) -> SimData:
 
 
 def flag_nonfinite(data: SimData) -> SimData:
-    """Set the flag of every world in which a state is NaN or infinite; only a reset of that world clears it."""
-    leaves = jax.tree.leaves(data.states)
+    """Set the flag of every world in which a state or a command is NaN or infinite; only its reset clears it."""
+    watched = (data.states, data.controls)
+    pairs = zip(jax.tree.leaves(scopes(watched)), jax.tree.leaves(watched), strict=True)
+    leaves = [x for scope, x in pairs if scope == "drone"]
     finite = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in leaves])
     nonfinite = data.core.nonfinite | ~jnp.all(finite, axis=0)[:, None]
     return data.replace(core=data.core.replace(nonfinite=nonfinite))

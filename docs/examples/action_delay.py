@@ -40,7 +40,7 @@ def add_delay(sim: Sim, n_steps: int) -> None:
 
 
 def main() -> None:
-    for delay in (0, 10, 50, 75, 100):
+    for delay in (0, 50, 75, 100):
         sim = Sim(n_worlds=2, control="attitude")
         if delay:
             add_delay(sim, delay)

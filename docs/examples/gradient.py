@@ -24,29 +24,25 @@ def main() -> None:
     rotor_vel = jnp.broadcast_to(hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
     start = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0), rotor_vel=rotor_vel))
 
-    def fly(thrusts: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def cost(thrusts: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         def hold(data, thrust):
             cmd = jnp.zeros((1, 1, 4)).at[..., 3].set(thrust)
             return step(F.attitude_control(data, cmd), HELD), None
 
         end, _ = jax.lax.scan(hold, start, thrusts)
-        return end.states.pos[0, 0, 2] - 1.0, end.states.vel[0, 0, 2]
-
-    def cost(thrusts: jax.Array) -> jax.Array:
-        rise, climb = fly(thrusts)
+        rise, climb = end.states.pos[0, 0, 2] - 1.0, end.states.vel[0, 0, 2]
         effort = jnp.mean((thrusts / weight - 1) ** 2)
-        return (rise - RISE) ** 2 + 0.1 * climb**2 + 1e-4 * effort
+        return (rise - RISE) ** 2 + 0.1 * climb**2 + 1e-4 * effort, (rise, climb)
 
-    value_and_grad = jax.jit(jax.value_and_grad(cost))
+    value_and_grad = jax.jit(jax.value_and_grad(cost, has_aux=True))
     thrusts = jnp.full(N_THRUSTS, weight)
     velocity = jnp.zeros_like(thrusts)
     for i in range(ROUNDS + 1):
-        value, grad = value_and_grad(thrusts)
+        (value, (rise, climb)), grad = value_and_grad(thrusts)
         if i % 15 == 0:
             print(f"round {i:2d}: cost {value:.5f}, norm of the gradient {jnp.linalg.norm(grad):.4f}")
         velocity = 0.9 * velocity - 6e-2 * grad
         thrusts = jnp.clip(thrusts + velocity, 0.1 * weight, 1.8 * weight)
-    rise, climb = fly(thrusts)
     print(f"rises by {rise:.3f} m and leaves with {climb:+.3f} m/s")
     print("thrust over weight:", " ".join(f"{t:.2f}" for t in thrusts[::4] / weight))
 

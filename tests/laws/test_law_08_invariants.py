@@ -144,10 +144,10 @@ def test_a_free_body_under_a_wrench_agrees_with_mujoco(x64):
     Both are of order 4 with steps of 1 ms: they agree to 1e-8 in position and attitude after 0.5 s.
     """
     inertia = np.array([2e-5, 3e-5, 5e-5])
-    model = mujoco.MjModel.from_xml_string(f"""
+    model = mujoco.MjModel.from_xml_string("""
         <mujoco><option integrator="RK4" timestep="0.001" gravity="0 0 -9.81"/>
         <worldbody><body pos="0 0 100"><freejoint/>
-        <inertial pos="0 0 0" mass="0.0434" diaginertia="{" ".join(map(str, inertia))}"/></body></worldbody></mujoco>""")
+        <inertial pos="0 0 0" mass="0.0434" diaginertia="2e-5 3e-5 5e-5"/></body></worldbody></mujoco>""")
     data = mujoco.MjData(model)
     force, torque = np.array([0.02, -0.05, 0.3]), np.array([3e-5, -2e-5, 1e-5])
     data.qvel[:] = [1, -2, 3, 4, 1, 7]

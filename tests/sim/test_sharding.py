@@ -102,7 +102,6 @@ def test_law_06_sharded_steps_trace_once(spread):
     assert len(traces) == 1
 
 
-@pytest.mark.xfail(strict=True, reason="XLA gathers what a layout constraint takes: a sharded step moves every state")
 def test_a_step_needs_no_word_between_devices(spread):
     """Worlds are independent, so the compiled step holds no collective operation."""
     step = spread.build_step_fn()

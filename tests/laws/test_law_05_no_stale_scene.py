@@ -1,0 +1,371 @@
+"""Law 5: the scene is synced when, and only when, something has changed since the last sync.
+
+One world more than asked is never computed, one question more than needed is never answered from the past. Fault 7 of
+the peer, contacts that stay as they were after a teleport or a rebuild, is tested here.
+"""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
+
+import crazysim.sim.sim as shell
+from crazysim.sim import Sim
+from crazysim.sim import functional as F
+from crazysim.sim.sim import sync_sim2mjx, use_box_collision
+
+UP = 1.0
+"""Height, m, at which a drone touches nothing."""
+SMALL = {"mode": "rgb_array", "width": 32, "height": 24}
+
+
+@pytest.fixture(scope="module")
+def one():
+    """One world of one drone."""
+    return Sim()
+
+
+@pytest.fixture(scope="module")
+def two():
+    """Two worlds of one drone, and a ball that a user moves."""
+    sim = Sim(n_worlds=2)
+    add_ball(sim)
+    return sim
+
+
+@pytest.fixture
+def syncs(monkeypatch):
+    """Return a list that grows by one with every sync of all worlds."""
+    done = []
+
+    def counted(*args):
+        done.append(1)
+        return sync_sim2mjx(*args)
+
+    monkeypatch.setattr(shell, "sync_sim2mjx", counted)
+    return done
+
+
+def add_ball(sim):
+    xml = (
+        '<mujoco><worldbody><body name="ball"><geom name="ball" type="sphere" size="0.1"/></body></worldbody></mujoco>'
+    )
+    body = mujoco.MjSpec.from_string(xml).body("ball")
+    ball = sim.spec.worldbody.add_frame().attach_body(body, "", "")
+    ball.mocap, ball.pos = True, [0, 0, 5]
+    sim.build_mjx()
+
+
+def at_height(data, *heights):
+    """Return the data with every world's drones at a height of its own."""
+    pos = data.states.pos.at[..., 2].set(jnp.asarray(heights)[:, None])
+    return data.replace(states=data.states.replace(pos=pos))
+
+
+def ball_at(sim, *heights):
+    """Return the scene with the ball at another height in every world."""
+    ids = sim.mj_model.body("ball").mocapid.item()
+    mocap_pos = sim.mjx_data.mocap_pos.at[:, ids].set(jnp.asarray([[0, 0, z] for z in heights]))
+    return sim.mjx_data.replace(mocap_pos=mocap_pos)
+
+
+def drone_touches(sim):
+    """Return in which worlds the drone touches anything."""
+    return np.asarray(sim.contacts("drone:0")).any(-1).tolist()
+
+
+def fresh(sim, *heights):
+    """Put the drones of all worlds somewhere, the ball away, and have the scene synced."""
+    sim.reset()
+    sim.data = at_height(sim.data, *heights)
+    if sim.n_worlds == 2:
+        sim.mjx_data = ball_at(sim, 5, 5)
+    sim.contacts()
+
+
+# What clears the flag -------------------------------------------------------------------------------------------
+
+
+def test_contacts_after_a_teleport_are_those_of_the_new_place(two, syncs):
+    """Fault 7: assigning sim.data makes the scene stale, whatever flag the assigned data carries."""
+    fresh(two, 0.0, UP)
+    assert drone_touches(two) == [True, False]
+    assert bool(two.data.core.mjx_synced), "the data that is assigned next claims to be synced"
+    two.data = at_height(two.data, UP, 0.0)
+    assert drone_touches(two) == [False, True]
+
+
+def test_contacts_after_a_rebuild_are_those_of_the_new_scene(syncs):
+    """Fault 7: floor contact stays floor contact through build_mjx, and what was added touches at once."""
+    sim = Sim(n_worlds=2)
+    sim.data = at_height(sim.data, 0.0, UP)
+    assert drone_touches(sim) == [True, False]
+    sim.build_mjx()
+    assert not bool(sim.data.core.mjx_synced)
+    assert drone_touches(sim) == [True, False]
+    add_ball(sim)
+    assert drone_touches(sim) == [True, False]
+    sim.mjx_data = ball_at(sim, 5, UP)
+    assert drone_touches(sim) == [True, True]
+    assert len(syncs) == 4
+
+
+def test_contacts_after_box_collision_are_those_of_boxes(one):
+    """The sphere of 8.6 cm reaches the floor from 5 cm up, the box of 2 cm half height does not."""
+    fresh(one, 0.05)
+    assert drone_touches(one) == [True]
+    slots = one.contacts().shape
+    use_box_collision(one)
+    try:
+        assert one.contacts().shape != slots
+        assert drone_touches(one) == [False]
+    finally:
+        use_box_collision(one, False)
+    assert drone_touches(one) == [True]
+
+
+def test_contacts_after_a_body_was_moved_are_those_of_its_new_place(two, syncs):
+    """Assigning sim.mjx_data makes the scene stale: a ball put on the drone of world 1 touches it."""
+    fresh(two, UP, UP)
+    assert drone_touches(two) == [False, False]
+    syncs.clear()
+    two.mjx_data = ball_at(two, 5, UP)
+    assert drone_touches(two) == [False, True]
+    assert drone_touches(two) == [False, True]
+    assert len(syncs) == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda sim: sim.step(), id="step"),
+        pytest.param(lambda sim: sim.step(3), id="three steps"),
+        pytest.param(lambda sim: sim.reset(), id="reset"),
+        pytest.param(lambda sim: sim.reset(np.array([True, False])), id="masked reset"),
+        pytest.param(lambda sim: setattr(sim, "data", sim.data), id="sim.data"),
+        pytest.param(lambda sim: setattr(sim, "mjx_data", sim.mjx_data), id="sim.mjx_data"),
+        pytest.param(
+            lambda sim: setattr(sim, "data", F.attitude_control(sim.data, np.zeros((2, 1, 4)))), id="F command"
+        ),
+        pytest.param(lambda sim: sim.seed(3), id="seed"),
+        pytest.param(lambda sim: sim.build_data(), id="build_data"),
+        pytest.param(lambda sim: sim.build_mjx(), id="build_mjx"),
+    ],
+)
+def test_a_change_has_the_next_question_sync_once(two, syncs, change):
+    fresh(two, UP, UP)
+    syncs.clear()
+    change(two)
+    assert not syncs, "a change alone syncs nothing"
+    two.contacts()
+    assert len(syncs) == 1
+    two.contacts()
+    assert len(syncs) == 1
+
+
+def test_the_flag_of_the_data_follows(two):
+    """``data.core.mjx_synced`` is set by a question, and cleared by step and reset, as the peer's code reads it."""
+    fresh(two, UP, UP)
+    for change in (two.step, two.reset):
+        two.contacts()
+        assert bool(two.data.core.mjx_synced)
+        change()
+        assert not bool(two.data.core.mjx_synced)
+
+
+def test_what_sync_returns_may_be_assigned(two, syncs):
+    """After the pair of sync_sim2mjx is assigned one sync too many is allowed, a stale answer never."""
+    fresh(two, UP, UP)
+    syncs.clear()
+    two.data, two.mjx_data = sync_sim2mjx(at_height(two.data, 0.0, UP), two.mjx_data, two.mjx_model)
+    assert drone_touches(two) == [True, False]
+    assert len(syncs) <= 1
+
+
+# What does not --------------------------------------------------------------------------------------------------
+
+
+def test_questions_share_one_sync_and_a_step_between_forces_two(one, syncs, opengl):
+    """Grouped after a step, contacts and a picture need one sync; with a step between them, two."""
+    one.step(5)
+    syncs.clear()
+    one.contacts()
+    one.render(**SMALL)
+    one.contacts("drone:0")
+    one.render(**SMALL | {"mode": "depth_array"})
+    assert len(syncs) == 1
+
+    one.step(5)
+    syncs.clear()
+    one.contacts()
+    one.step(5)
+    one.render(**SMALL)
+    assert len(syncs) == 2
+
+
+def test_pictures_sync_once_however_many_steps_went_by(one, syncs, opengl):
+    """Ten blocks of steps with two pictures are two syncs; steps alone are none."""
+    one.reset()
+    one.render(**SMALL)
+    syncs.clear()
+    for i in range(10):
+        one.step(5)
+        if i % 5 == 0:
+            one.render(**SMALL)
+    assert len(syncs) == 2
+
+
+def test_commands_leave_the_scene_fresh(two, syncs):
+    """A command moves nothing: neither flag is cleared."""
+    fresh(two, UP, UP)
+    syncs.clear()
+    two.attitude_control(np.zeros((2, 1, 4)))
+    assert bool(two.data.core.mjx_synced)
+    two.contacts()
+    assert not syncs
+
+
+def test_wrong_questions_change_nothing(two, syncs):
+    fresh(two, UP, UP)
+    data, mjx_data = two.data, two.mjx_data
+    for wrong in (lambda: two.contacts("gate"), lambda: two.render("film"), lambda: two.render("rgb_array", world=2)):
+        with pytest.raises(ValueError):
+            wrong()
+    assert two.data is data
+    assert two.mjx_data is mjx_data
+
+
+def test_asking_reads_no_device(two, syncs):
+    """Whether a sync is due is known on the host: a flag that cannot be read does no harm."""
+
+    class Unreadable:
+        def __bool__(self):
+            raise AssertionError("the device's flag was read")
+
+        __array__ = __jax_array__ = __bool__
+
+    fresh(two, UP, UP)
+    fine = two._data
+    try:
+        two._data = fine.replace(core=fine.core.replace(mjx_synced=Unreadable()))
+        syncs.clear()
+        two.contacts()
+        two.contacts("drone:0")
+        assert not syncs
+    finally:
+        two._data = fine
+
+
+# What is allocated ----------------------------------------------------------------------------------------------
+
+
+def test_nothing_of_the_scene_is_held_per_world_before_it_is_asked_for():
+    """Flying, resetting and rebuilding hold no MuJoCo state of any world; contacts do."""
+    n_worlds = 977  # as no other test has, so that an array of so many rows is this simulation's
+    sim = Sim(n_worlds=n_worlds)
+
+    def foreign_bytes():
+        own = {id(x) for x in jax.tree.leaves((sim.data, sim.default_data))}
+        return sum(x.nbytes for x in jax.live_arrays() if x.ndim and x.shape[0] == n_worlds and id(x) not in own)
+
+    assert sim._mjx_data is None
+    assert foreign_bytes() == 0
+    sim.step(2)
+    sim.reset()
+    sim.build_mjx()
+    assert sim._mjx_data is None
+    assert foreign_bytes() == 0
+    assert sim.mjx_data.mocap_pos.shape == (n_worlds, 1, 3)
+    assert foreign_bytes() > 1000 * n_worlds
+
+
+def test_drawing_one_world_of_several_holds_none_of_the_others(opengl, syncs):
+    """A picture needs one world's poses: no MJX, no scene state, no sync of all worlds."""
+    sim = Sim(n_worlds=2)
+    sim.step()
+    assert sim.render(**SMALL, world=1).shape == (24, 32, 3)
+    assert sim._mjx_data is None
+    assert sim._mjx_model is None
+    assert not syncs
+
+
+def test_the_scene_is_returned_as_it_is(two, syncs):
+    """Reading sim.mjx_data syncs nothing: it is as the last question left it, and the same object every time."""
+    fresh(two, UP, UP)
+    syncs.clear()
+    before = two.mjx_data
+    two.data = at_height(two.data, 0.25, 0.5)
+    assert two.mjx_data is before
+    np.testing.assert_allclose(two.mjx_data.mocap_pos[:, two.data.core.drone_mocap_ids[0], 2], UP)
+    assert not syncs
+    two.contacts()
+    np.testing.assert_allclose(two.mjx_data.mocap_pos[:, two.data.core.drone_mocap_ids[0], 2], [0.25, 0.5])
+
+
+# Any order ------------------------------------------------------------------------------------------------------
+
+heights = st.tuples(st.sampled_from([0.0, 0.5, UP]), st.sampled_from([0.0, 0.5, UP]))
+
+
+class AnyOrder(RuleBasedStateMachine):
+    """Whatever is done in whatever order, contacts are those of the poses as they are, with no sync too many."""
+
+    sim = None
+    """Built once: a simulation of two worlds with a ball."""
+
+    @initialize()
+    def begin(self):
+        if AnyOrder.sim is None:
+            AnyOrder.sim = Sim(n_worlds=2)
+            add_ball(AnyOrder.sim)
+        self.ball = (5.0, 5.0)
+        fresh(self.sim, UP, UP)
+        self.changed = False
+
+    @rule(heights=heights)
+    def teleport(self, heights):
+        self.sim.data = at_height(self.sim.data, *heights)
+        self.changed = True
+
+    @rule(heights=heights)
+    def move_ball(self, heights):
+        self.sim.mjx_data = ball_at(self.sim, *heights)
+        self.ball, self.changed = heights, True
+
+    @rule(n=st.integers(1, 3))
+    def step(self, n):
+        self.sim.step(n)
+        self.changed = True
+
+    @rule(mask=st.lists(st.booleans(), min_size=2, max_size=2))
+    def reset(self, mask):
+        self.sim.reset(np.array(mask))
+        self.changed = True
+
+    @rule()
+    def command(self):
+        self.sim.attitude_control(np.zeros((2, 1, 4)))
+
+    @rule()
+    def read(self):
+        assert self.sim.mjx_data is self.sim.mjx_data
+
+    @precondition(lambda self: hasattr(self, "ball"))
+    @rule()
+    def ask(self):
+        z = np.asarray(self.sim.data.states.pos[:, 0, 2]) + 0.02
+        expected = (z < 0.086) | (np.abs(z - self.ball) < 0.186)
+        done = []
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(shell, "sync_sim2mjx", lambda *args: done.append(1) or sync_sim2mjx(*args))
+            assert drone_touches(self.sim) == expected.tolist()
+        assert len(done) == self.changed
+        self.changed = False
+
+
+TestAnyOrder = AnyOrder.TestCase
+TestAnyOrder.settings = settings(max_examples=15, stateful_step_count=15, deadline=None)

@@ -1,0 +1,352 @@
+"""The scene is a spec that users edit: what is in it, what may be added, and what is refused."""
+
+import struct
+import time
+import zlib
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim.drones import airframe_names, load_airframe
+from crazysim.scene.build import build_spec, compile_spec
+from crazysim.sim import Sim
+
+BOX = """
+<mujoco>
+  <worldbody>
+    <body name="obstacle">
+      <geom type="box" size="0.1 0.1 0.1" rgba="0.8 0.2 0.2 1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def sim():
+    """One world of two drones, whose spec these tests do not touch."""
+    return Sim(n_drones=2)
+
+
+def write_stl(path, size):
+    """Write a tetrahedron as a binary STL file."""
+    corners = size * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], np.float32)
+    faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+    triangles = b"".join(struct.pack("<12fH", *np.zeros(3), *corners[list(face)].ravel(), 0) for face in faces)
+    path.write_bytes(bytes(80) + struct.pack("<I", len(faces)) + triangles)
+
+
+def write_png(path, rgb):
+    """Write a PNG of 8 by 8 pixels of one colour."""
+
+    def chunk(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    rows = (b"\0" + bytes(rgb) * 8) * 8
+    header = struct.pack(">IIBBBBB", 8, 8, 8, 2, 0, 0, 0)
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    )
+
+
+SCENE = """
+<mujoco>
+  <asset>
+    <mesh name="rock" file="meshes/rock.stl"/>
+    <texture name="paint" type="2d" file="textures/paint.png"/>
+    <material name="paint" texture="paint"/>
+  </asset>
+  <worldbody>
+    <light pos="0 0 5" dir="0 0 -1" type="directional"/>
+    <geom name="ground" type="plane" size="0 0 1"/>
+    <geom name="rock" type="mesh" mesh="rock" material="paint" pos="2 0 1" contype="0" conaffinity="0"/>
+    <camera name="above" pos="2 0 3"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    """A scene with a mesh and a texture beside it, found by relative paths."""
+    for folder in ("meshes", "textures"):
+        (tmp_path / folder).mkdir()
+    write_stl(tmp_path / "meshes" / "rock.stl", 0.3)
+    write_png(tmp_path / "textures" / "paint.png", (255, 0, 0))
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE)
+    return path
+
+
+def attach_boxes(sim, places):
+    """Add boxes as the documentation does."""
+    obstacle_spec = mujoco.MjSpec.from_string(BOX)
+    frame = sim.spec.worldbody.add_frame()
+    for i, pos in enumerate(places):
+        body = obstacle_spec.body("obstacle")
+        attached = frame.attach_body(body, "", f":{i}")
+        attached.pos = pos
+
+
+# The drones -----------------------------------------------------------------------------------------------------
+
+
+def test_drones_are_mocap_bodies_that_weigh_nothing(sim):
+    """MuJoCo moves nothing here: drones are placed, not simulated, and the one joint is a dummy."""
+    model = sim.mj_model
+    for i in range(2):
+        body = model.body(f"drone:{i}")
+        assert body.mocapid.item() == int(sim.data.core.drone_mocap_ids[i])
+        assert body.mass.item() == 0
+    assert model.nv == 1
+    assert model.opt.timestep == 1 / sim.freq
+
+
+@pytest.mark.parametrize("name", airframe_names())
+def test_every_airframe_has_a_body(name):
+    """Each built-in airframe gives a body of primitives: a disc over each rotor, two LEDs, cameras, shapes to touch."""
+    airframe = load_airframe(name)
+    model = compile_spec(build_spec(None, airframe, 1, 500, -1))
+    of_drone = model.geom_bodyid == model.body("drone:0").id
+    assert not np.isin(model.geom_type[of_drone], [mujoco.mjtGeom.mjGEOM_MESH]).any()
+    discs = of_drone & (model.geom_matid == model.material("drone_propeller").id)
+    rotors = airframe.value("rotors.position")
+    np.testing.assert_allclose(model.geom_pos[discs][:, :2], rotors[:, :2], atol=1e-6)
+    for led in ("led_top:0", "led_bot:0"):
+        assert np.sum(model.geom_matid == model.material(led).id) == 1
+    assert {model.camera(i).name for i in range(model.ncam)} == {"fpv_cam:0", "track_cam:0"}
+    touching = of_drone & ((model.geom_contype | model.geom_conaffinity) > 0)
+    assert [model.geom(i).name for i in np.flatnonzero(touching)] == ["col_sphere:0"]
+    assert model.geom("col_sphere:0").size[0] >= np.linalg.norm(rotors[:, :2], axis=-1).max()
+
+
+def test_the_tracking_camera_looks_at_its_drone():
+    """It stands behind and above, its view goes through the drone, and up is up."""
+    model = compile_spec(build_spec(None, load_airframe("cf21B_500"), 1, 500, -1))
+    data = mujoco.MjData(model)
+    data.mocap_pos[0], data.mocap_quat[0] = [1, 2, 3], [np.cos(0.4), 0, np.sin(0.4), 0]
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
+    camera = model.camera("track_cam:0").id
+    right, up, back = data.cam_xmat[camera].reshape(3, 3).T
+    to_drone = np.array([1, 2, 3]) - data.cam_xpos[camera]
+    np.testing.assert_allclose(np.cross(to_drone, -back), 0, atol=1e-6)
+    assert to_drone @ -back > 0
+    assert up[2] > 0
+    assert abs(right[2]) < 1e-9
+    forward = model.camera("fpv_cam:0").id
+    np.testing.assert_allclose(-data.cam_xmat[forward].reshape(3, 3)[:, 2], [np.cos(0.8), 0, -np.sin(0.8)], atol=1e-6)
+
+
+def test_a_swarm_of_thousands_builds_in_seconds():
+    """Time per drone must not grow with their number: attaching a body per drone takes quadratic time."""
+    airframe = load_airframe("cf21B_500")
+
+    def seconds(n):
+        begin = time.perf_counter()
+        model = compile_spec(build_spec(None, airframe, n, 500, 2 * n))
+        assert model.nmocap == n
+        return time.perf_counter() - begin
+
+    seconds(16)
+    few, many = seconds(512), seconds(4096)
+    assert many < 30
+    assert many / few < 8 * 4, f"{few:.2f} s for 512 drones, {many:.2f} s for 4,096"
+
+
+# What users add -------------------------------------------------------------------------------------------------
+
+
+def test_boxes_attached_from_a_string_are_touched():
+    """The documentation's example: two boxes, attached from one body, each at its place."""
+    sim = Sim(n_worlds=1, n_drones=1)
+    attach_boxes(sim, [[1.0, 0.0, 0.5], [2.0, 0.0, 0.5]])
+    sim.build_mjx()
+    sim.reset()
+    np.testing.assert_allclose(sim.mj_model.body("obstacle:1").pos, [2, 0, 0.5])
+    for place, touched in ([0, 0, 0.5], [0, 0]), ([1, 0, 0.5], [1, 0]), ([2, 0, 0.62], [0, 1]), ([1.5, 0, 0.5], [0, 0]):
+        sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.array([[place]], np.float32)))
+        assert [bool(sim.contacts(f"obstacle:{i}").any()) for i in range(2)] == touched, place
+
+
+def test_a_body_from_a_file_brings_its_own_meshes(tmp_path, scene_file):
+    """A gate's MJCF lies in a folder of its own, with a mesh and a texture by relative path, as racing tracks have it."""
+    (tmp_path / "gate.xml").write_text("""
+        <mujoco>
+          <asset>
+            <mesh name="frame" file="meshes/rock.stl"/>
+            <texture name="logo" type="2d" file="textures/paint.png"/>
+            <material name="logo" texture="logo"/>
+          </asset>
+          <worldbody>
+            <body name="gate">
+              <geom type="mesh" mesh="frame" material="logo" contype="0" conaffinity="0"/>
+              <geom name="bar" type="box" size="0.02 0.2 0.02"/>
+            </body>
+          </worldbody>
+        </mujoco>""")
+    sim = Sim(xml_path=scene_file)
+    gate_spec = mujoco.MjSpec.from_file(str(tmp_path / "gate.xml"))
+    frame = sim.spec.worldbody.add_frame()
+    for i in range(2):
+        frame.attach_body(gate_spec.body("gate"), "", f":{i}").mocap = True
+    sim.build_mjx()
+    assert sim.mj_model.nmocap == 3
+    assert sim.mj_model.nmesh >= 2
+    assert sim.mjx_data.mocap_pos.shape == (1, 3, 3)
+
+
+def test_a_rebuild_leaves_the_drones_where_they_are():
+    """State, time and seed go on; a reset still returns to the default data."""
+    sim = Sim(n_worlds=2, n_drones=2)
+    sim.step(3)
+    before = sim.data
+    attach_boxes(sim, [[1.0, 0.0, 0.5]])
+    sim.build_mjx()
+    for part in ("states", "params", "controls"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(sim.data, part), getattr(before, part))
+    np.testing.assert_array_equal(sim.data.core.steps, before.core.steps)
+    sim.step(2)
+    np.testing.assert_array_equal(sim.data.core.steps, 5)
+    sim.reset()
+    np.testing.assert_array_equal(sim.data.core.steps, 0)
+
+
+def test_mocap_ids_follow_when_bodies_are_added_before_the_drones():
+    """Ids are looked up by name at every rebuild, so drones stay drones when other mocap bodies come first."""
+    sim = Sim(n_drones=2)
+    tower = sim.spec.worldbody.first_body().first_child() if False else sim.spec.worldbody.add_body(name="tower")
+    tower.mocap = True
+    tower.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
+    sim.build_mjx()
+    expected = [sim.mj_model.body(f"drone:{i}").mocapid.item() for i in range(2)]
+    assert sim.data.core.drone_mocap_ids.tolist() == expected
+    assert sim.default_data.core.drone_mocap_ids.tolist() == expected
+
+
+# Scenes of one's own --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("as_type", [str, lambda path: path], ids=["str", "Path"])
+def test_a_scene_of_ones_own_finds_its_files(scene_file, as_type):
+    """Meshes and textures are looked for beside the scene file, wherever the program runs."""
+    sim = Sim(xml_path=as_type(scene_file))
+    assert sim.mj_model.mesh("rock").vertnum.item() == 4
+    np.testing.assert_array_equal(sim.mj_model.tex_data[:3], [255, 0, 0])
+    assert sim.mj_model.body("drone:0").mocapid.item() == 0
+    assert [bool(x) for x in sim.contacts().ravel()] == [True], "the drone stands on this scene's ground"
+
+
+def test_the_files_of_a_scene_are_seen(scene_file, opengl):
+    """The mesh is drawn with its texture, red, in the middle of its camera's picture."""
+    sim = Sim(n_worlds=2, xml_path=scene_file)
+    picture = sim.render("rgb_array", camera="above", width=64, height=48).astype(int)
+    red = (picture[..., 0] > 60) & (picture[..., 0] > 2 * picture[..., 1]) & (picture[..., 0] > 2 * picture[..., 2])
+    assert red[24, 32]
+    assert 50 < red.sum() < red.size / 3
+    sim.close()
+
+
+def broken_scene(tmp_path, text):
+    path = tmp_path / "broken.xml"
+    path.write_text(text)
+    return path
+
+
+WORLD = "<mujoco><worldbody>{}</worldbody></mujoco>"
+BROKEN = {
+    "no XML": ("this is no XML", "is not a scene MuJoCo can read"),
+    "empty": ("", "is not a scene MuJoCo can read"),
+    "cut off": ("<mujoco><worldbody>", "is not a scene MuJoCo can read"),
+    "unknown element": (WORLD.format("<wall/>"), "is not a scene MuJoCo can read"),
+    "include that is not there": ("<mujoco><include file='none.xml'/></mujoco>", "is not a scene MuJoCo can read"),
+    "mesh that is not there": (
+        "<mujoco><asset><mesh name='m' file='none.stl'/></asset></mujoco>",
+        "does not compile.*none.stl",
+    ),
+    "geom without size": (WORLD.format("<geom type='sphere'/>"), "does not compile"),
+    "a drone of its own": (WORLD.format("<body name='drone:0'/>"), "has bodies named .'drone:0'."),
+    "a drone deep in the tree": (
+        WORLD.format("<body name='a'><body name='drone:7'/></body>"),
+        "has bodies named .'drone:7'.",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_scene_is_told_at_once(tmp_path, case):
+    text, message = BROKEN[case]
+    with pytest.raises(ValueError, match=message):
+        Sim(xml_path=broken_scene(tmp_path, text))
+
+
+@pytest.mark.parametrize("path", ["nowhere.xml", "."])
+def test_a_missing_scene_is_told_at_once(path):
+    with pytest.raises(ValueError, match="does not exist"):
+        Sim(xml_path=path)
+
+
+def test_a_scene_may_not_take_the_drones_names(tmp_path):
+    """Names of the drones' materials and cameras, too, are the drones'."""
+    for taken in (
+        "<mujoco><asset><material name='led_top:0'/></asset></mujoco>",
+        WORLD.format("<camera name='fpv_cam:0'/>"),
+        WORLD.format("<geom name='col_sphere:0' size='1'/>"),
+    ):
+        with pytest.raises(ValueError):
+            Sim(xml_path=broken_scene(tmp_path, taken))
+
+
+# Rebuilds that cannot be ----------------------------------------------------------------------------------------
+
+
+def test_a_spec_that_does_not_compile_leaves_the_old_scene(sim):
+    """After a refused rebuild the simulation goes on with the scene it had, and with one mended it takes the new."""
+    sim = Sim()
+    model, data = sim.mj_model, sim.data
+    wrong = sim.spec.worldbody.add_geom(name="wrong", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0, 0, 0])
+    with pytest.raises(ValueError, match="does not compile"):
+        sim.build_mjx()
+    assert sim.mj_model is model
+    assert sim.data is data
+    sim.step()
+    assert np.asarray(sim.contacts()).all()
+    wrong.size = [0.1, 0, 0]
+    sim.build_mjx()
+    assert sim.mj_model.geom("wrong").size[0] == 0.1
+
+
+def test_a_spec_that_has_lost_a_drone_is_refused():
+    sim = Sim(n_drones=2)
+    model = sim.mj_model
+    sim.spec.body("drone:1").mocap = False
+    with pytest.raises(ValueError, match="no mocap body 'drone:1'"):
+        sim.build_mjx()
+    assert sim.mj_model is model
+
+
+@pytest.fixture(scope="module")
+def not_for_mjx():
+    """A world that MJX cannot check for contacts: a box and a cylinder that are moved by hand."""
+    sim = Sim()
+    shapes = [(mujoco.mjtGeom.mjGEOM_BOX, [0.1, 0.1, 0.1]), (mujoco.mjtGeom.mjGEOM_CYLINDER, [0.1, 0.1, 0])]
+    for i, (kind, size) in enumerate(shapes):
+        body = sim.spec.worldbody.add_body(name=f"shape:{i}", pos=[1, i, 1], mocap=True)
+        body.add_geom(type=kind, size=size)
+    sim.build_mjx()
+    return sim
+
+
+def test_shapes_that_mjx_cannot_check_are_told_when_contacts_are_asked_for(not_for_mjx):
+    """MJX has no box against cylinder: the scene flies, and says so when it is asked what touches."""
+    not_for_mjx.step()
+    with pytest.raises(ValueError, match="MJX cannot hold this scene"):
+        not_for_mjx.contacts()
+
+
+def test_shapes_that_mjx_cannot_check_are_drawn_all_the_same(not_for_mjx, opengl):
+    assert not_for_mjx.render("rgb_array", width=32, height=24).shape == (24, 32, 3)
+    not_for_mjx.close()
