@@ -433,9 +433,9 @@ def use_box_collision(sim: Sim, enable: bool = True) -> None:
 
     Boxes follow the drone's outline more closely and cost more to check.
     """
-    for geom in sim.spec.geoms:
-        kind, _, index = geom.name.partition(":")
-        if kind in ("col_sphere", "col_box") and index.isdigit():
+    for i in range(sim.n_drones):
+        for kind in ("col_sphere", "col_box"):
+            geom = sim.spec.geom(f"{kind}:{i}")
             geom.contype = geom.conaffinity = int((kind == "col_box") == enable)
     sim.build_mjx()
 

@@ -56,7 +56,8 @@ def test_a_step_keeps_every_shape_and_type(dynamics, control):
     """Law 2: whatever the numbers of worlds and drones, equal ones included, parameters shared or one per drone."""
     sim = shared_sim(dynamics=dynamics, control=control)
     step = sim.build_step_fn()
-    for n_worlds, n_drones in SIZES:
+    # Every size for one pair; the others, whose stages are batched alike, with equal numbers only.
+    for n_worlds, n_drones in SIZES if control == "attitude" else SIZES[::5]:
         data = resized(sim, n_worlds, n_drones)
         if (n_worlds + n_drones) % 2 == 0:
             data = per_drone(data)
