@@ -101,8 +101,8 @@ def body_cameras(airframe: Airframe) -> list[BodyCamera]:
     up = np.array([-back[2] * np.sign(back[0]), 0, abs(back[0])]) / np.hypot(back[0], back[2])
     right = np.array([0.0, -1.0, 0.0])
     return [
-        BodyCamera("fpv_cam", shape("fpv_camera"), np.concatenate([right, [0, 0, 1]]), fovy=70.0),
         BodyCamera("track_cam", back, np.concatenate([right, up]), tracks=True),
+        BodyCamera("fpv_cam", shape("fpv_camera"), np.concatenate([right, [0, 0, 1]]), fovy=70.0),
     ]
 
 

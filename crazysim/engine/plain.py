@@ -58,6 +58,7 @@ def build_step(pipeline: Pipeline, by_component: bool = True) -> StepFn:
         return treedef.unflatten(x if new is None else new for x, new in zip(leaves, written, strict=True))
 
     step.jitted = (dynamic, unrolled)  # type: ignore[attr-defined]
+    step._cache_size = lambda: dynamic._cache_size() + unrolled._cache_size()  # type: ignore[attr-defined]
     return step
 
 

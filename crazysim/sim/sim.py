@@ -40,9 +40,9 @@ from crazysim.sim.integration import Integrator
 from crazysim.sim.pipeline import Pipeline
 from crazysim.sim.settings import control_freqs, find_device, member, positive
 from crazysim.sim.sharding import place_scene, shard
-from crazysim.sim.stages import build_step_pipeline, reset
+from crazysim.sim.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
 
-__all__ = ["Sim", "sync_sim2mjx", "use_box_collision"]
+__all__ = ["Sim", "clip_floor_pos", "increment_steps", "reset", "seed_sim", "sync_sim2mjx", "use_box_collision"]
 
 LARGE_SWARM = 64
 """From this many drones a world on, MJX checks two pairs per drone instead of every pair."""
@@ -426,6 +426,11 @@ class Sim:
         if self.viewer is not None:
             self.viewer.close()
             self.viewer = None
+
+
+def seed_sim(data: SimData, seed: int) -> SimData:
+    """Return the data with another seed for all random numbers drawn from now on."""
+    return data.replace(core=data.core.replace(rng_key=as_key(seed)))
 
 
 def use_box_collision(sim: Sim, enable: bool = True) -> None:

@@ -35,7 +35,7 @@ def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integr
         stages["state_controller"] = state_controller
     if control in (Control.state, Control.attitude):
         if fitted_model:
-            stages["commit_attitude"] = commit_attitude
+            stages["attitude_controller" if control == Control.state else "commit_attitude"] = commit_attitude
         else:
             stages["attitude_controller"] = attitude_controller
     if control == Control.body_rate:
