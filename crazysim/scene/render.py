@@ -53,6 +53,8 @@ class Viewer:
             self._windows[0].draw(self._data, cam, marks, width, height)
             return None
         renderer = self._renderer(width, height)
+        # Twice: MuJoCo lays endless floors out around the camera of the update before.
+        renderer.update_scene(self._data, camera=cam)
         renderer.update_scene(self._data, camera=cam)
         marks.write(renderer.scene)
         if mode == "rgb_array":
@@ -75,10 +77,10 @@ class Viewer:
                 names = [self._model.camera(i).name for i in range(self._model.ncam)]
                 raise UnknownNameError(f"the scene has no camera {camera!r}; it has {', '.join(names[:12])}, or -1")
         else:
-            camera_id = int(camera)
-            if not -1 <= camera_id < self._model.ncam:
+            camera_id = camera
+            if not isinstance(camera, (int, np.integer)) or not -1 <= camera < self._model.ncam:
                 raise UnknownNameError(
-                    f"camera {camera_id} does not exist; ids go from 0 to {self._model.ncam - 1}, -1 is the free camera"
+                    f"camera {camera!r} does not exist; ids go from 0 to {self._model.ncam - 1}, -1 is the free camera"
                 )
         if camera_id >= 0:
             cam.type, cam.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera_id
@@ -87,10 +89,10 @@ class Viewer:
         for key, value in (cam_config or {}).items():
             if not hasattr(cam, key):
                 raise UnknownNameError(f"a camera has no setting {key!r}; use lookat, distance, azimuth, elevation")
-            if isinstance(value, (list, tuple, np.ndarray)):
-                getattr(cam, key)[:] = value
-            else:
-                setattr(cam, key, value)
+            try:
+                setattr(cam, key, value if np.ndim(value) == 0 else np.asarray(value, float))
+            except (TypeError, ValueError) as error:
+                raise ConfigError(f"the camera's {key} cannot be {value!r}") from error
         return cam
 
     def _renderer(self, width: int, height: int) -> mujoco.Renderer:

@@ -294,12 +294,13 @@ class Sim:
     @property
     def mjx_model(self) -> mjx.Model:
         """The scene's model on the device; made when first read."""
-        if self._mjx_model is None:
+        model = self._mjx_model
+        if model is None:
             model = build.put_model(self.mj_model, self.device)
             if self.mesh is not None:
                 model = jax.device_put(model, NamedSharding(self.mesh, PartitionSpec()))
             self._mjx_model = model
-        return self._mjx_model
+        return model
 
     @property
     def mjx_data(self) -> mjx.Data:

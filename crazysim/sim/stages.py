@@ -60,9 +60,14 @@ def _update(record: Any, mask: Array | None, **changes: Array) -> Any:
     return record.replace(**{k: select_worlds(mask, v, getattr(record, k)) for k, v in changes.items()})
 
 
+def _controls(data: SimData) -> Any:
+    """Return the controls untyped: which of their fields are None follows from the pipeline a stage stands in."""
+    return data.controls
+
+
 def state_controller(data: SimData) -> SimData:
     """Take over the staged setpoint, and stage the attitude, thrust and body rates that lead to it."""
-    states, controls = data.states, data.controls
+    states, controls = data.states, _controls(data)
     ctrl, attitude = controls.state, controls.attitude
     mask = tick(data, ctrl.freq)
     cmd = ctrl.staged_cmd
@@ -85,7 +90,7 @@ def commit_attitude(data: SimData) -> SimData:
 
 def attitude_controller(data: SimData) -> SimData:
     """Take over the staged attitude command, and stage the wrench that turns the drone there."""
-    states, controls = data.states, data.controls
+    states, controls = data.states, _controls(data)
     ctrl = controls.attitude
     mask = tick(data, ctrl.freq)
     wrench, r_int_error = attitude2force_torque(
@@ -113,7 +118,7 @@ def attitude_controller(data: SimData) -> SimData:
 
 def body_rate_controller(data: SimData) -> SimData:
     """Take over the staged body rates, and stage the wrench that follows them."""
-    states, controls = data.states, data.controls
+    states, controls = data.states, _controls(data)
     ctrl = controls.body_rate
     mask = tick(data, ctrl.freq)
     cmd = ctrl.staged_cmd
@@ -134,7 +139,7 @@ def body_rate_controller(data: SimData) -> SimData:
 
 def force_torque_controller(data: SimData) -> SimData:
     """Take over the staged wrench, and command the rotor speeds that give it."""
-    controls = data.controls
+    controls = _controls(data)
     ctrl = controls.force_torque
     mask = tick(data, ctrl.freq)
     cmd = ctrl.staged_cmd
@@ -144,7 +149,7 @@ def force_torque_controller(data: SimData) -> SimData:
 
 def clip_rotor_vel_cmd(data: SimData) -> SimData:
     """Keep commanded rotor speeds within what the motors can do; zero or less is off."""
-    rotor_vel = first_principles.saturate(data.controls.rotor_vel, data.params)
+    rotor_vel = first_principles.saturate(_controls(data).rotor_vel, data.params)
     return data.replace(controls=data.controls.replace(rotor_vel=rotor_vel))
 
 
@@ -157,7 +162,7 @@ def clip_thrust_cmd(data: SimData) -> SimData:
 
 def first_principles_derivative(data: SimData) -> SimStateDeriv:
     """Return the derivative of every drone from first principles."""
-    return _derivative(data, first_principles.dynamics, data.controls.rotor_vel)
+    return _derivative(data, first_principles.dynamics, _controls(data).rotor_vel)
 
 
 def fitted_derivative(data: SimData) -> SimStateDeriv:

@@ -1,0 +1,423 @@
+"""Pictures are looked at, not only measured: what is in them, where, how far away, and of which world."""
+
+import os
+import select
+import shutil
+import subprocess
+import sys
+import textwrap
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim.errors import RenderError
+from crazysim.sim import Sim
+
+HEIGHT, WIDTH, FOVY = 120, 160, 45.0
+ABOVE = 2.0
+"""Height of the camera that looks straight down, m."""
+SCENE = f"""
+<mujoco>
+  <statistic center="0 0 0.5" extent="2"/>
+  <visual><headlight ambient="0.5 0.5 0.5" diffuse="0.4 0.4 0.4" specular="0 0 0"/><quality shadowsize="0"/></visual>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1" rgba="0.9 0.9 0.9 1"/>
+    <camera name="down" pos="0 0 {ABOVE}" fovy="{FOVY}"/>
+    <camera name="aside" pos="5 0 {ABOVE}" fovy="{FOVY}"/>
+  </worldbody>
+</mujoco>
+"""
+PLACES = np.array([[[0.4, 0.2, 0.5]], [[-0.5, -0.3, 1.0]]])
+"""Where the drone of each world is, m. (2, 1, 3)"""
+SHOT = {"mode": "rgb_array", "camera": "down", "width": WIDTH, "height": HEIGHT}
+
+
+def place(sim, pos):
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos, jnp.float32)))
+
+
+@pytest.fixture(scope="module")
+def sim(opengl, tmp_path_factory):
+    """Two worlds over a plain floor, each with its drone elsewhere, and a camera that looks straight down."""
+    path = tmp_path_factory.mktemp("scene") / "scene.xml"
+    path.write_text(SCENE)
+    sim = Sim(n_worlds=2, xml_path=path)
+    place(sim, PLACES)
+    yield sim
+    sim.close()
+
+
+@pytest.fixture(scope="module")
+def empty(sim):
+    """The picture from above without any drone in it."""
+    place(sim, PLACES + [100, 0, 0])
+    picture = sim.render(**SHOT)
+    place(sim, PLACES)
+    return picture
+
+
+def pixel(point, height=HEIGHT, width=WIDTH):
+    """Return row and column at which the camera that looks straight down sees a point."""
+    focal = 0.5 * height / np.tan(np.deg2rad(FOVY / 2))
+    x, y, z = point
+    return 0.5 * height - focal * y / (ABOVE - z), 0.5 * width + focal * x / (ABOVE - z)
+
+
+def difference(picture, empty):
+    return np.abs(picture.astype(int) - empty.astype(int)).sum(-1) > 30
+
+
+# What is in the picture -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("world", [0, 1])
+def test_the_drone_of_the_world_is_seen_where_it_is(sim, empty, world):
+    """Pixels that differ from the empty floor lie around the drone's projection, as wide as the drone is there."""
+    changed = difference(sim.render(**SHOT, world=world), empty)
+    rows, columns = np.nonzero(changed)
+    row, column = pixel(PLACES[world, 0])
+    assert len(rows) > 20
+    np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [row, column], atol=1.0)
+    focal = 0.5 * HEIGHT / np.tan(np.deg2rad(FOVY / 2))
+    reach = 0.09 * focal / (ABOVE - PLACES[world, 0, 2])  # the propellers' tips are within 9 cm of the centre
+    assert 0.5 * reach < np.abs(np.stack([rows - row, columns - column])).max() < reach + 1
+
+
+def test_the_empty_picture_is_plain_floor(empty):
+    assert empty.shape == (HEIGHT, WIDTH, 3)
+    assert empty.dtype == np.uint8
+    assert empty.min() > 100
+    assert np.ptp(empty.reshape(-1, 3), axis=0).max() < 20
+
+
+def test_a_drone_that_moved_is_drawn_at_its_new_place(sim, empty):
+    """Whatever way the state has changed, the next picture shows it."""
+    place(sim, [[[0.0, 0.4, 0.3]], [[0.0, 0.0, 0.3]]])
+    rows, columns = np.nonzero(difference(sim.render(**SHOT), empty))
+    place(sim, PLACES)
+    np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], pixel([0, 0.4, 0.3]), atol=1.0)
+
+
+def test_a_drone_that_rolled_shows_its_side(sim, empty):
+    """Attitude is converted to MuJoCo's order: rolled by 90 degrees the drone is narrow across, as long ahead."""
+
+    def widths(quat_xyzw):
+        states = sim.data.states
+        sim.data = sim.data.replace(states=states.replace(quat=jnp.broadcast_to(jnp.asarray(quat_xyzw), (2, 1, 4))))
+        rows, columns = np.nonzero(difference(sim.render(**SHOT), empty))
+        return np.ptp(rows), np.ptp(columns)
+
+    half = np.sqrt(0.5)
+    level, rolled, pitched = widths([0, 0, 0, 1.0]), widths([half, 0, 0, half]), widths([0, half, 0, half])
+    widths([0, 0, 0, 1.0])
+    assert rolled[0] < 0.6 * level[0]
+    assert rolled[1] > 0.8 * level[1]
+    assert pitched[1] < 0.6 * level[1]
+    assert pitched[0] > 0.8 * level[0]
+
+
+def test_a_body_that_a_user_moved_is_drawn_where_it_is(opengl):
+    """Bodies moved through mjx_data are seen in each world where that world has them; without it, where they began."""
+    sim = Sim(n_worlds=2)
+    ball = sim.spec.worldbody.add_body(name="ball", pos=[0, 0, 1], mocap=True)
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.3, 0, 0], rgba=[1, 0, 0, 1])
+    sim.build_mjx()
+    shot = {"mode": "rgb_array", "width": 64, "height": 48}
+    view = {"lookat": [0, 0, 1], "distance": 4, "azimuth": 90, "elevation": 0}  # along +y: x is right
+
+    def where(world):
+        picture = sim.render(**shot, world=world, cam_config=view).astype(int)
+        columns = np.nonzero((picture[..., 0] > 80) & (picture[..., 1] < 60))[1]
+        assert len(columns) > 20
+        return columns.mean() + 0.5
+
+    assert abs(where(0) - 32) < 1
+    assert sim._mjx_data is None
+    k = sim.mj_model.body("ball").mocapid.item()
+    sim.mjx_data = sim.mjx_data.replace(mocap_pos=sim.mjx_data.mocap_pos.at[:, k, 0].set(jnp.array([-0.8, 0.8])))
+    assert where(0) < 25
+    assert where(1) > 39
+    sim.close()
+
+
+# Cameras --------------------------------------------------------------------------------------------------------
+
+
+def test_a_camera_by_name_is_the_camera_of_its_id(sim):
+    for name in ("down", "aside", "fpv_cam:0", "track_cam:0"):
+        by_id = sim.render(**SHOT | {"camera": sim.mj_model.camera(name).id})
+        np.testing.assert_array_equal(sim.render(**SHOT | {"camera": name}), by_id)
+
+
+def test_the_free_camera_looks_where_it_is_told(sim, empty):
+    """A free camera at the place of the fixed one sees what it sees; every call may tell another place."""
+    free = {"lookat": [0, 0, 0], "distance": ABOVE, "azimuth": 90, "elevation": -90}
+    sim.mj_model.vis.global_.fovy = FOVY
+    shot = SHOT | {"camera": -1}
+    seen = difference(sim.render(**shot, cam_config=free), empty)
+    fixed = difference(sim.render(**SHOT), empty)
+    assert np.mean(seen == fixed) > 0.995
+    moved = difference(sim.render(**shot, cam_config=free | {"lookat": [0.4, 0.2, 0]}), empty)
+    rows, columns = np.nonzero(moved)
+    x, y, z = PLACES[0, 0] - [0.4, 0.2, 0]
+    np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], pixel((x, y, z)), atol=1.0)
+    array = sim.render(**shot, cam_config=free | {"lookat": np.array([0.4, 0.2, 0])})
+    np.testing.assert_array_equal(difference(array, empty), moved)
+
+
+def test_the_onboard_camera_turns_with_the_drone(sim):
+    """Looking ahead it sees the horizon in the middle, pitched down by 90 degrees only floor."""
+    shot = SHOT | {"mode": "depth_array", "camera": "fpv_cam:0"}
+    ahead = sim.render(**shot)
+    assert ahead[-1].max() < 1.0, "the floor is near below the horizon"
+    assert ahead[0].min() > 10.0, "there is nothing above it"
+    states = sim.data.states
+    down = jnp.broadcast_to(jnp.asarray([0, np.sqrt(0.5), 0, np.sqrt(0.5)]), (2, 1, 4))
+    sim.data = sim.data.replace(states=states.replace(quat=down))
+    depth = sim.render(**shot)
+    sim.data = sim.data.replace(states=states)
+    np.testing.assert_allclose(depth[0], PLACES[0, 0, 2] - 0.03, atol=5e-3)  # the camera is 3 cm ahead of the centre
+
+
+# Every call counts (fault 12) -----------------------------------------------------------------------------------
+
+
+def test_every_argument_counts_at_every_call(sim, empty):
+    """Size, camera, world and mode of a later call are not those of the first."""
+    first = sim.render(**SHOT)
+    small = sim.render(**SHOT | {"width": 40, "height": 30})
+    large = sim.render(**SHOT | {"width": 320, "height": 240})
+    assert (small.shape, large.shape) == ((30, 40, 3), (240, 320, 3))
+    for picture, factor in ((small, 4), (large, 0.5)):
+        rows, columns = np.nonzero(np.abs(picture.astype(int) - empty[0, 0]).sum(-1) > 40)
+        row, column = pixel(PLACES[0, 0])
+        np.testing.assert_allclose(factor * np.array([rows.mean() + 0.5, columns.mean() + 0.5]), [row, column], atol=3)
+    assert not difference(sim.render(**SHOT | {"camera": "aside"}), empty).any()
+    assert difference(sim.render(**SHOT, world=1), first).any()
+    np.testing.assert_array_equal(sim.render(**SHOT), first)
+
+
+def test_many_sizes_follow_each_other(sim):
+    """More sizes than are kept at once, larger than any before among them, come out as first asked."""
+    sizes = [(48, 32), (2000, 40), (64, 64), (33, 17), (40, 1100), (160, 120), (48, 32)]
+    for width, height in sizes:
+        assert sim.render(**SHOT | {"width": width, "height": height}).shape == (height, width, 3)
+    np.testing.assert_array_equal(sim.render(**SHOT), sim.render(**SHOT | {"width": np.int64(WIDTH)}))
+
+
+def test_a_second_simulation_draws_beside_the_first(sim):
+    """Two simulations draw in turns, each its own drones; one that is closed draws again when asked."""
+    before = sim.render(**SHOT)
+    other = Sim(n_worlds=1, n_drones=3)
+    shot = {"mode": "rgb_array", "camera": "track_cam:2", "width": WIDTH, "height": HEIGHT}
+    picture = other.render(**shot)
+    np.testing.assert_array_equal(sim.render(**SHOT), before)
+    np.testing.assert_array_equal(other.render(**shot), picture)
+    other.close()
+    other.close()
+    np.testing.assert_array_equal(sim.render(**SHOT), before)
+    np.testing.assert_array_equal(other.render(**shot), picture)
+    other.close()
+
+
+# Depth ----------------------------------------------------------------------------------------------------------
+
+
+def test_depth_is_the_distance_along_the_axis_in_metres(sim):
+    """Straight down the floor is everywhere as far as the camera is high, whatever the angle; the drone is nearer."""
+    depth = sim.render(**SHOT | {"mode": "depth_array"})
+    assert depth.shape == (HEIGHT, WIDTH)
+    assert depth.dtype == np.float32
+    floor = np.abs(depth - ABOVE) < 2e-3
+    assert floor[[0, 0, -1, -1], [0, -1, 0, -1]].all()
+    row, column = (int(x) for x in pixel(PLACES[0, 0]))
+    around = depth[row - 6 : row + 7, column - 6 : column + 7]
+    distance = ABOVE - PLACES[0, 0, 2]
+    assert distance - 0.05 < around.min() < distance
+    outside = depth.copy()
+    outside[row - 12 : row + 13, column - 12 : column + 13] = ABOVE
+    np.testing.assert_allclose(outside, ABOVE, atol=2e-3)
+
+
+def test_colour_and_depth_together_are_colour_and_depth_alone(sim):
+    color, depth = sim.render(**SHOT | {"mode": "rgbd_tuple"})
+    np.testing.assert_array_equal(color, sim.render(**SHOT))
+    np.testing.assert_array_equal(depth, sim.render(**SHOT | {"mode": "depth_array"}))
+
+
+def test_pictures_are_the_callers_own(sim):
+    """A later picture does not write into an earlier one."""
+    first = sim.render(**SHOT)
+    copy = first.copy()
+    sim.render(**SHOT, world=1)
+    np.testing.assert_array_equal(first, copy)
+
+
+# Wrong input ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"mode": "film"}, "unknown render mode 'film'; the modes are human"),
+        ({"camera": "up"}, "no camera 'up'; it has down, aside, track_cam:0, fpv_cam:0"),
+        ({"camera": 4}, "camera 4 does not exist; ids go from 0 to 3"),
+        ({"camera": -2}, "camera -2 does not exist"),
+        ({"camera": 1.5}, "camera 1.5 does not exist"),
+        ({"world": 2}, "world 2 does not exist; worlds go from 0 to 1"),
+        ({"world": -1}, "world -1 does not exist"),
+        ({"width": 0}, "0 x 120 pixels cannot be"),
+        ({"height": -5}, "160 x -5 pixels cannot be"),
+        ({"width": 40.5}, "40.5 x 120 pixels cannot be"),
+        ({"camera": -1, "cam_config": {"zoom": 2}}, "no setting 'zoom'"),
+        ({"camera": -1, "cam_config": {"lookat": [1, 2]}}, "lookat cannot be"),
+        ({"camera": -1, "cam_config": {"distance": "far"}}, "distance cannot be"),
+    ],
+)
+def test_a_picture_that_cannot_be_is_told(sim, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        sim.render(**SHOT | wrong)
+
+
+# Windows --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def screen(tmp_path_factory):
+    """A virtual screen, and the file that holds its pixels."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("no Xvfb")
+    folder = tmp_path_factory.mktemp("screen")
+    read, write = os.pipe()
+    options = ["-displayfd", str(write), "-screen", "0", "800x600x24", "-fbdir", str(folder), "-nolisten", "tcp"]
+    server = subprocess.Popen(["Xvfb", *options], pass_fds=[write], stderr=subprocess.DEVNULL)
+    os.close(write)
+    ready, _, _ = select.select([read], [], [], 30)
+    number = os.read(read, 16).decode().strip() if ready else ""
+    assert number, "Xvfb did not start"
+    yield f":{number}", folder / "Xvfb_screen0"
+    server.terminate()
+    server.wait(10)
+    os.close(read)
+
+
+def screen_pixels(path):
+    """Return what a screen shows, read from its X window dump. (height, width, 3)"""
+    raw = path.read_bytes()
+    header = np.frombuffer(raw[:100], ">u4").astype(int)
+    start = header[0] + 12 * header[19]
+    width, height, line = header[4], header[5], header[12]
+    rows = np.frombuffer(raw[start : start + height * line], np.uint8).reshape(height, line)
+    return rows[:, : 4 * width].reshape(height, width, 4)[..., 2::-1]
+
+
+WINDOW = textwrap.dedent("""
+    import sys
+    import numpy as np
+    from crazysim.sim import Sim
+    from crazysim.sim.visualize import draw_points
+
+    def wait(word):
+        print(word, flush=True)
+        sys.stdin.readline()
+
+    sim = Sim(n_worlds=2)
+    view = {"lookat": [0, 0, 0], "distance": 2.0, "azimuth": 90, "elevation": -90}
+    shot = {"mode": "human", "width": 400, "height": 300}
+    for i in range(5):
+        sim.step(5)
+        draw_points(sim, [[0.3, 0, 0.05]], rgba=[1, 0, 0, 1], size=0.05)
+        sim.render(**shot, cam_config=view)
+    wait("red")
+    picture = sim.render("rgb_array", width=64, height=48)
+    assert picture.shape == (48, 64, 3) and picture.std() > 1
+    draw_points(sim, [[-0.3, 0, 0.05]], rgba=[0, 0, 1, 1], size=0.05)
+    sim.render(**shot, world=1, cam_config=view)
+    wait("blue")
+    sim.render(**shot | {"width": 200, "height": 150}, camera="track_cam:0")
+    sim.close()
+    sim.render(**shot)
+    window = sim.viewer._windows[0]
+    window._glfw.set_window_should_close(window._window, True)
+    sim.step()
+    sim.render(**shot)
+    assert not window.is_open
+    print("done", flush=True)
+""")
+
+
+@pytest.mark.parametrize("backend", ["glfw", "egl"])
+def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
+    """A window follows the simulation from call to call, beside pictures in memory, and its end is no crash."""
+    display, pixels = screen
+    environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": backend, "PYTHONWARNINGS": "error"}
+    program = subprocess.Popen(
+        [sys.executable, "-c", WINDOW], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True
+    )
+
+    def seen(word):
+        assert program.stdout.readline().strip() == word
+        picture = screen_pixels(pixels).astype(int)
+        program.stdin.write("\n")
+        program.stdin.flush()
+        red = (picture[..., 0] > 150) & (picture[..., 1:].max(-1) < 90)
+        blue = (picture[..., 2] > 150) & (picture[..., :2].max(-1) < 90)
+        return picture, red, blue
+
+    try:
+        first, red, blue = seen("red")
+        lit = np.nonzero(first.max(-1) > 20)
+        assert np.ptp(lit[0]) + 1 == 300
+        assert np.ptp(lit[1]) + 1 == 400
+        assert red.sum() > 100
+        assert not blue.any()
+        assert np.nonzero(red)[1].mean() > lit[1].mean() + 20, "x is right in a view from above"
+        _, red, blue = seen("blue")
+        assert blue.sum() > 100
+        assert not red.any(), "marks are for one picture only"
+        assert np.nonzero(blue)[1].mean() < lit[1].mean() - 20
+        assert program.stdout.readline().strip() == "done"
+        assert program.wait(60) == 0
+    finally:
+        program.kill()
+        program.wait()
+        program.stdin.close()
+        program.stdout.close()
+
+
+@pytest.mark.parametrize("display", [None, ":54321"])
+def test_without_a_screen_a_window_is_refused_in_one_line(display, monkeypatch):
+    """There is nothing to open a window on: the error says so, and what to do instead."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if display is not None:
+        monkeypatch.setenv("DISPLAY", display)
+    sim = Sim(n_worlds=2)
+    with pytest.raises(RenderError, match="mode='rgb_array'") as caught:
+        sim.render("human")
+    assert "\n" not in str(caught.value)
+    sim.step()
+
+
+def test_without_opengl_a_picture_is_refused_in_one_line(monkeypatch):
+    """Whatever the OpenGL bindings raise becomes one error that says what to install."""
+
+    def broken(*args, **kwargs):
+        raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")
+
+    monkeypatch.setattr(mujoco, "Renderer", broken)
+    sim = Sim(n_worlds=2)
+    with pytest.raises(RenderError, match="MUJOCO_GL=egl and install libegl1") as caught:
+        sim.render("rgb_array")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_program_that_forgets_to_close_ends_well(opengl):
+    """Contexts are freed before the interpreter goes: no error is printed at exit."""
+    program = "from crazysim.sim import Sim; sim = Sim(2); sim.render('rgb_array', width=32, height=24)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0
+    assert not done.stderr
+    assert not done.stdout
