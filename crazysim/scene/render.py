@@ -56,10 +56,12 @@ class Viewer:
         # Twice: MuJoCo lays endless floors out around the camera of the update before.
         renderer.update_scene(self._data, camera=cam)
         renderer.update_scene(self._data, camera=cam)
+        bodies = renderer.scene.ngeom
         marks.write(renderer.scene)
         if mode == "rgb_array":
             return renderer.render().copy()
         color = renderer.render().copy() if mode == "rgbd_tuple" else None
+        renderer.scene.ngeom = bodies  # marks are paint: no distance is measured to them
         renderer.enable_depth_rendering()
         depth = renderer.render().copy()
         renderer.disable_depth_rendering()

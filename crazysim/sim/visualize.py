@@ -1,4 +1,4 @@
-"""Draw into the next picture, and change the colours of drones."""
+"""Draw into the next picture, where depth does not see it, and change the colours of drones."""
 
 from __future__ import annotations
 
@@ -69,7 +69,9 @@ def draw_capsule(
     Raises:
         ValueError: If an end has another shape.
     """
-    first, last = _points(p1)[0], _points(p2)[0]
+    first, last = np.asarray(p1, dtype=float), np.asarray(p2, dtype=float)
+    if first.shape != (3,) or last.shape != (3,):
+        raise ValueError(f"the ends of a capsule must have shape (3,), got {first.shape} and {last.shape}")
     sim.marks.capsule(first, last, radius, RED if rgba is None else rgba, cylinder)
 
 

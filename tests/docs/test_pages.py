@@ -21,6 +21,37 @@ def test_page_runs(page, tmp_path, monkeypatch, opengl):
         exec(compile(code, str(page), "exec"), namespace)
 
 
+SCENE_PAGES = ("docs/concepts/scene.md", "docs/guides/obstacles.md", "docs/guides/pictures.md")
+PEER_CODE = (
+    "sim = Sim(n_worlds=1, n_drones=1)",
+    '<geom type="box" size="0.1 0.1 0.1" rgba="0.8 0.2 0.2 1"/>',
+    "mujoco.MjSpec.from_string(box_xml)",
+    "mujoco.MjSpec.from_file(",
+    "frame = sim.spec.worldbody.add_frame()",
+    'attached = frame.attach_body(body, "", f":{i}")',
+    "attached.pos = pos",
+    "sim.build_mjx()",
+    "sim.reset()",
+    "attached.mocap = True",
+    "sim.mjx_data.mocap_pos",
+    "if i % 5 == 0:",
+    "contacts = sim.contacts()",
+    "sim.data.core.mjx_synced",
+    "from crazysim.sim.sim import sync_sim2mjx",
+    "_mjx_data = sim.mjx_data",
+    "mjx_data = _mjx_data.replace(mocap_pos=obstacle_mocap_pos)",
+    "_, mjx_data = sync_sim2mjx(sim_data, mjx_data,",
+    "return mjx_data._impl.contact.dist < 0",
+)
+"""What code written for Crazyflow does with its scene; each is on a page, in a block that runs."""
+
+
+def test_the_peers_way_with_the_scene_is_on_the_pages():
+    code = "".join("".join(BLOCK.findall((ROOT / page).read_text())) for page in SCENE_PAGES)
+    for line in PEER_CODE:
+        assert line in code, line
+
+
 def test_pages_have_code():
     assert sum(len(BLOCK.findall(page.read_text())) for page in PAGES) > 20
 

@@ -6,7 +6,9 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import time
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -304,8 +306,11 @@ def screen(tmp_path_factory):
 
 
 def screen_pixels(path):
-    """Return what a screen shows, read from its X window dump. (height, width, 3)"""
-    raw = path.read_bytes()
+    """Return what a screen shows once it is at rest, read from its X window dump. (height, width, 3)"""
+    raw, before, deadline = path.read_bytes(), b"", time.monotonic() + 20
+    while raw != before and time.monotonic() < deadline:  # the server draws a picture strip by strip
+        time.sleep(0.3)
+        raw, before = path.read_bytes(), raw
     header = np.frombuffer(raw[:100], ">u4").astype(int)
     start = header[0] + 12 * header[19]
     width, height, line = header[4], header[5], header[12]
@@ -385,6 +390,95 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
         program.wait()
         program.stdin.close()
         program.stdout.close()
+
+
+PRINTED = textwrap.dedent("""
+    import crazysim.sim.sim as shell
+    from crazysim.sim.sim import sync_sim2mjx as whole
+    syncs = []
+    shell.sync_sim2mjx = lambda *args: syncs.append(1) or whole(*args)
+
+    # What follows is code as it is printed for the peer, with the name of the package exchanged.
+
+    import mujoco
+    from crazysim.sim import Sim
+
+    sim = Sim(n_worlds=1, n_drones=1)
+
+    # Define a box body as an inline XML string (or load from a file)
+    box_xml = '''
+    <mujoco>
+      <worldbody>
+        <body name="obstacle">
+          <geom type="box" size="0.1 0.1 0.1" rgba="0.8 0.2 0.2 1"/>
+        </body>
+      </worldbody>
+    </mujoco>
+    '''
+    obstacle_spec = mujoco.MjSpec.from_string(box_xml)
+
+    # Attach one or more instances to a new frame in the scene
+    frame = sim.spec.worldbody.add_frame()
+    for i, pos in enumerate([[1.0, 0.0, 0.5], [2.0, 0.0, 0.5]]):
+        body = obstacle_spec.body("obstacle")
+        attached = frame.attach_body(body, "", f":{i}")
+        attached.pos = pos
+    attached.mocap = True
+
+    sim.build_mjx()
+    sim.reset()
+
+    for i in range(10):
+        sim.step(5)  # JAX physics only, mjx_synced = False
+        if i % 5 == 0:
+            sim.render()  # syncs once: kinematics + camlight + collision
+    assert len(syncs) == 2, syncs
+    syncs.clear()
+
+    sim.step(5)
+    contacts = sim.contacts()  # sync runs here
+    assert sim.data.core.mjx_synced
+    sim.render()  # flag already set, no second sync
+    assert len(syncs) == 1, syncs
+    syncs.clear()
+
+    sim.step(5)
+    contacts = sim.contacts()  # sync runs here
+    sim.step(5)  # flag cleared
+    assert not sim.data.core.mjx_synced
+    sim.render()  # sync runs again
+    assert len(syncs) == 2, syncs
+
+    import jax
+    from jax import Array
+    from crazysim.sim.data import SimData
+    from crazysim.sim.sim import sync_sim2mjx
+
+    _mjx_data = sim.mjx_data  # captured in closure
+
+    def check_contacts(sim_data: SimData, obstacle_mocap_pos: Array) -> Array:
+        # Update obstacle positions and sync inside JIT
+        mjx_data = _mjx_data.replace(mocap_pos=obstacle_mocap_pos)
+        _, mjx_data = sync_sim2mjx(sim_data, mjx_data, sim.mjx_model)
+        return mjx_data._impl.contact.dist < 0
+
+    check = jax.jit(check_contacts)
+    pos = sim.mjx_data.mocap_pos
+    assert (check(sim.data, pos) == contacts).all()
+    assert check(sim.data, pos.at[0, 1].set([0.0, 0.0, 0.1])).sum() > contacts.sum()
+    sim.close()
+    print("done")
+""")
+
+
+def test_code_written_for_the_peer_runs_as_printed(screen, opengl):
+    """Boxes, sync loop, grouped and interleaved questions in a window, and the fused check, line for line."""
+    display, _ = screen
+    cache = str(jax.config.jax_compilation_cache_dir)
+    environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": "glfw", "JAX_COMPILATION_CACHE_DIR": cache}
+    done = subprocess.run([sys.executable, "-c", PRINTED], capture_output=True, text=True, env=environment, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "done\n"
 
 
 @pytest.mark.parametrize("display", [None, ":54321"])
