@@ -363,12 +363,17 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
     )
 
     def seen(word):
+        """Return the screen once it shows the mark of this colour: a screen server draws when it gets to it."""
         assert program.stdout.readline().strip() == word
-        picture = screen_pixels(pixels).astype(int)
+        for _ in range(100):
+            picture = screen_pixels(pixels).astype(int)
+            red = (picture[..., 0] > 150) & (picture[..., 1:].max(-1) < 90)
+            blue = (picture[..., 2] > 150) & (picture[..., :2].max(-1) < 90)
+            if {"red": red, "blue": blue}[word].sum() > 100:
+                break
+            time.sleep(0.1)
         program.stdin.write("\n")
         program.stdin.flush()
-        red = (picture[..., 0] > 150) & (picture[..., 1:].max(-1) < 90)
-        blue = (picture[..., 2] > 150) & (picture[..., :2].max(-1) < 90)
         return picture, red, blue
 
     try:
