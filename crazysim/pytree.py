@@ -133,14 +133,14 @@ def map_batched(fn: Callable[..., Any], tree: T, *others: T) -> T:
 
 
 def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
-    """Return ``new`` in the worlds of ``mask`` (n_worlds,) or (n_worlds, 1), ``old`` elsewhere.
+    """Return ``new`` where ``mask`` says so, ``old`` elsewhere; the mask (n_worlds,), (n_worlds, 1) or of one world ().
 
     Both are broadcast to the larger of their shapes; without a mask ``new`` is taken everywhere.
     """
     shape = jnp.broadcast_shapes(jnp.shape(new), jnp.shape(old))
     if mask is None:
         return jnp.broadcast_to(new, shape)
-    mask = mask.reshape(mask.shape[0], *[1] * (len(shape) - 1))
+    mask = mask.reshape(mask.shape + (1,) * (len(shape) - mask.ndim))
     return jnp.where(mask, new, old)
 
 

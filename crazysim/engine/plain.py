@@ -11,9 +11,10 @@ from jax import Array
 from jax.experimental.layout import Layout, with_layout_constraint
 from jax.extend.core import jaxpr_as_fun
 
-from crazysim.pytree import check_axes, scopes
+from crazysim.pytree import check_axes
 from crazysim.sim.data import SimData
 from crazysim.sim.pipeline import Pipeline
+from crazysim.sim.stage import Axes, Stage, as_stages
 from crazysim.sim.stages import flag_nonfinite
 
 StepFn = Callable[..., SimData]
@@ -32,12 +33,13 @@ def build_step(pipeline: Pipeline, by_component: bool = True) -> StepFn:
         by_component: Whether vectors are held component by component. Not for data that is spread over devices:
             XLA gathers whatever a layout is asked for.
     """
-    stages = tuple(pipeline.items())
+    stages = as_stages(pipeline)
 
     def single(data: SimData) -> SimData:
-        for name, fn in stages:
-            with jax.named_scope(name):
-                data = _settle(name, data, fn(data), by_component)
+        axes = Axes(data)
+        for stage in stages:
+            with jax.named_scope(stage.__name__):
+                data = _settle(axes, stage, data, stage(data), by_component)
         return data
 
     @jax.jit
@@ -62,34 +64,21 @@ def build_step(pipeline: Pipeline, by_component: bool = True) -> StepFn:
     return step
 
 
-def _settle(name: str, before: SimData, after: SimData, by_component: bool) -> SimData:
+def _settle(axes: Axes, stage: Stage, before: SimData, after: SimData, by_component: bool) -> SimData:
     """Return what a stage made, checked, with what it wrote computed once and laid out for the next stage.
 
     XLA's CPU backend repeats shared arithmetic for every array that needs it, unless a barrier stops it. And it
     keeps vectors as rows of three or four numbers, which no vector unit can be filled with, unless told to hold
     them component by component; their logical shape stays. On two CPU cores the two halve the time of a step.
     """
-    old, treedef = jax.tree.flatten(before)
-    new, new_treedef = jax.tree.flatten(after)
-    if new_treedef != treedef:
-        raise ValueError(
-            f"stage {name!r} changed the structure of SimData (a field became None, or a plugin came or went); "
-            f"put everything in place before the step, with sim.data = sim.data.replace(...)"
-        )
-    for x, y in zip(old, new, strict=True):
-        if jnp.shape(x) != jnp.shape(y) or jnp.result_type(x) != jnp.result_type(y):
-            raise ValueError(
-                f"stage {name!r} turned a leaf of shape {jnp.shape(x)} and type {jnp.result_type(x)} into shape "
-                f"{jnp.shape(y)} and type {jnp.result_type(y)}; a step must keep both"
-            )
-    written = [i for i, (x, y) in enumerate(zip(old, new, strict=True)) if x is not y]
-    leaf_scopes = jax.tree.leaves(scopes(after))
+    written = axes.written(jax.tree.leaves(before), after, stage)
+    new = jax.tree.leaves(after)
     for i, value in zip(written, jax.lax.optimization_barrier([new[i] for i in written]), strict=True):
-        if by_component and leaf_scopes[i] == "drone" and value.ndim == 3:
+        if by_component and axes.scopes[i] == "drone" and value.ndim == 3:
             many_worlds = value.shape[0] >= value.shape[1]
             value = with_layout_constraint(value, Layout(major_to_minor=(2, 1, 0) if many_worlds else (2, 0, 1)))
         new[i] = value
-    return treedef.unflatten(new)
+    return axes.treedef.unflatten(new)
 
 
 def _loop_body(

@@ -215,6 +215,10 @@ class SimCore(PyTree):
     """Number of worlds."""
     n_drones: int = static()
     """Number of drones per world."""
+    world_id: Array = leaf("world")
+    """Number of the world; enters its random numbers. (n_worlds, 1)"""
+    drone_id: Array = leaf("drone")
+    """Number of the drone in its world; enters its random numbers. (n_worlds, n_drones)"""
     drone_mocap_ids: Array = leaf("shared", 1)
     """MuJoCo mocap ids of the drones' bodies. (n_drones,)"""
     rng_key: Array = leaf("shared", 0)
@@ -232,6 +236,8 @@ class SimCore(PyTree):
             nonfinite=jnp.zeros((n_worlds, 1), bool),
             n_worlds=n_worlds,
             n_drones=n_drones,
+            world_id=jnp.arange(n_worlds, dtype=jnp.int32)[:, None],
+            drone_id=jnp.tile(jnp.arange(n_drones, dtype=jnp.int32), (n_worlds, 1)),
             drone_mocap_ids=jnp.asarray(drone_mocap_ids, jnp.int32),
             rng_key=as_key(rng_key),
             mjx_synced=jnp.asarray(False),

@@ -22,9 +22,20 @@ from crazysim.pytree import map_batched, scopes, select_worlds
 from crazysim.sim.data import SimData, SimStateDeriv
 from crazysim.sim.integration import INTEGRATORS, Integrator
 from crazysim.sim.pipeline import Pipeline
+from crazysim.sim.stage import Stage, StageScope
 
 FLOOR = -0.001
 """Height below which no drone falls, m: a little under zero, so that a negative height tells a landing."""
+
+
+def _built_in(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
+    """Declare a stage whose functions take data of one drone, one world or all worlds alike."""
+    return lambda fn: Stage(fn, scope, when, batched=True)
+
+
+def _ticks(controller: str) -> Callable[[SimData], Array | None]:
+    """Return the condition under which a controller acts: at its own rate."""
+    return lambda data: tick(data, getattr(data.controls, controller).freq)
 
 
 def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integrator) -> Pipeline:
@@ -44,7 +55,7 @@ def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integr
         stages["force_torque_controller"] = force_torque_controller
     stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
     deriv_fn = fitted_derivative if fitted_model else first_principles_derivative
-    stages["integration"] = partial(INTEGRATORS[integrator], deriv_fn=deriv_fn)
+    stages["integration"] = _built_in("drone")(partial(INTEGRATORS[integrator], deriv_fn=deriv_fn))
     stages["clip_floor_pos"] = clip_floor_pos
     stages["increment_steps"] = increment_steps
     return stages
@@ -56,43 +67,40 @@ def tick(data: SimData, freq: int) -> Array | None:
     return None if period == 1 else data.core.steps % period == 0
 
 
-def _update(record: Any, mask: Array | None, **changes: Array) -> Any:
-    return record.replace(**{k: select_worlds(mask, v, getattr(record, k)) for k, v in changes.items()})
-
-
 def _controls(data: SimData) -> Any:
     """Return the controls untyped: which of their fields are None follows from the pipeline a stage stands in."""
     return data.controls
 
 
+@_built_in("drone", when=_ticks("state"))
 def state_controller(data: SimData) -> SimData:
     """Take over the staged setpoint, and stage the attitude, thrust and body rates that lead to it."""
     states, controls = data.states, _controls(data)
     ctrl, attitude = controls.state, controls.attitude
-    mask = tick(data, ctrl.freq)
     cmd = ctrl.staged_cmd
     attitude_cmd, pos_err_i = state2attitude(
         states.pos, states.quat, states.vel, cmd, ctrl.pos_err_i, ctrl.freq, params=ctrl.params
     )
-    ctrl = _update(ctrl, mask, cmd=cmd, pos_err_i=pos_err_i)
-    attitude = _update(attitude, mask, staged_cmd=attitude_cmd)
+    ctrl = ctrl.replace(cmd=cmd, pos_err_i=pos_err_i)
+    attitude = attitude.replace(staged_cmd=attitude_cmd)
     if attitude.staged_ang_vel_des is not None:
-        attitude = _update(attitude, mask, staged_ang_vel_des=cmd[..., 13:16])
+        attitude = attitude.replace(staged_ang_vel_des=cmd[..., 13:16])
     return data.replace(controls=controls.replace(state=ctrl, attitude=attitude))
 
 
+@_built_in("drone", when=_ticks("attitude"))
 def commit_attitude(data: SimData) -> SimData:
     """Take over the staged attitude command; fitted dynamics contain the controller that follows it."""
     ctrl = data.controls.attitude
-    ctrl = _update(ctrl, tick(data, ctrl.freq), cmd=ctrl.staged_cmd)
+    ctrl = ctrl.replace(cmd=ctrl.staged_cmd)
     return data.replace(controls=data.controls.replace(attitude=ctrl))
 
 
+@_built_in("drone", when=_ticks("attitude"))
 def attitude_controller(data: SimData) -> SimData:
     """Take over the staged attitude command, and stage the wrench that turns the drone there."""
     states, controls = data.states, _controls(data)
     ctrl = controls.attitude
-    mask = tick(data, ctrl.freq)
     wrench, r_int_error = attitude2force_torque(
         states.quat,
         states.ang_vel,
@@ -104,23 +112,21 @@ def attitude_controller(data: SimData) -> SimData:
         ctrl.freq,
         params=ctrl.params,
     )
-    ctrl = _update(
-        ctrl,
-        mask,
+    ctrl = ctrl.replace(
         cmd=ctrl.staged_cmd,
         ang_vel_des=ctrl.staged_ang_vel_des,
         r_int_error=r_int_error,
         prev_ang_vel=states.ang_vel,
     )
-    force_torque = _update(controls.force_torque, mask, staged_cmd=wrench)
+    force_torque = controls.force_torque.replace(staged_cmd=wrench)
     return data.replace(controls=controls.replace(attitude=ctrl, force_torque=force_torque))
 
 
+@_built_in("drone", when=_ticks("body_rate"))
 def body_rate_controller(data: SimData) -> SimData:
     """Take over the staged body rates, and stage the wrench that follows them."""
     states, controls = data.states, _controls(data)
     ctrl = controls.body_rate
-    mask = tick(data, ctrl.freq)
     cmd = ctrl.staged_cmd
     wrench, r_int_error = body_rate2force_torque(
         states.quat,
@@ -132,27 +138,29 @@ def body_rate_controller(data: SimData) -> SimData:
         ctrl.freq,
         params=ctrl.params,
     )
-    ctrl = _update(ctrl, mask, cmd=cmd, r_int_error=r_int_error, prev_ang_vel=states.ang_vel)
-    force_torque = _update(controls.force_torque, mask, staged_cmd=wrench)
+    ctrl = ctrl.replace(cmd=cmd, r_int_error=r_int_error, prev_ang_vel=states.ang_vel)
+    force_torque = controls.force_torque.replace(staged_cmd=wrench)
     return data.replace(controls=controls.replace(body_rate=ctrl, force_torque=force_torque))
 
 
+@_built_in("drone", when=_ticks("force_torque"))
 def force_torque_controller(data: SimData) -> SimData:
     """Take over the staged wrench, and command the rotor speeds that give it."""
     controls = _controls(data)
     ctrl = controls.force_torque
-    mask = tick(data, ctrl.freq)
-    cmd = ctrl.staged_cmd
-    rotor_vel = select_worlds(mask, force_torque2rotor_vel(cmd, params=ctrl.params), controls.rotor_vel)
-    return data.replace(controls=controls.replace(force_torque=_update(ctrl, mask, cmd=cmd), rotor_vel=rotor_vel))
+    rotor_vel = force_torque2rotor_vel(ctrl.staged_cmd, params=ctrl.params)
+    force_torque = ctrl.replace(cmd=ctrl.staged_cmd)
+    return data.replace(controls=controls.replace(force_torque=force_torque, rotor_vel=rotor_vel))
 
 
+@_built_in("drone")
 def clip_rotor_vel_cmd(data: SimData) -> SimData:
     """Keep commanded rotor speeds within what the motors can do; zero or less is off."""
     rotor_vel = first_principles.saturate(_controls(data).rotor_vel, data.params)
     return data.replace(controls=data.controls.replace(rotor_vel=rotor_vel))
 
 
+@_built_in("drone")
 def clip_thrust_cmd(data: SimData) -> SimData:
     """Keep the commanded collective thrust within what the rotors can give; zero or less is off."""
     ctrl = data.controls.attitude
@@ -186,6 +194,7 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
     )
 
 
+@_built_in("drone")
 def clip_floor_pos(data: SimData) -> SimData:
     """Stop drones at the floor: one that has fallen below it is set on it, at rest."""
     s = data.states
@@ -198,6 +207,7 @@ def clip_floor_pos(data: SimData) -> SimData:
     return data.replace(states=states)
 
 
+@_built_in("world")
 def increment_steps(data: SimData) -> SimData:
     """Count the step."""
     return data.replace(core=data.core.replace(steps=data.core.steps + 1))
