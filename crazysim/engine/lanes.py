@@ -1,0 +1,191 @@
+"""Lanes: every number of a drone is a vector over drones, so that XLA sees element-wise arithmetic only.
+
+Between stages that are written out (``program``) nothing has the shape of a small vector or matrix. A stage that is
+not is given ordinary arrays, and takes the step apart at its place.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.engine import xla
+from crazysim.engine.program import Program, Segment, Slot, is_key
+
+
+class Lanes:
+    """Leaves of all drones, each as an array or as lanes, whichever was asked for last."""
+
+    def __init__(self, program: Program, leaves: list[Any]):
+        """Hold leaves as arrays."""
+        self.program = program
+        self.n_worlds, self.n_drones = _batch(program, leaves)
+        self.arrays: dict[int, Any] = dict(enumerate(leaves))
+        self.lanes: dict[Slot, Any] = {}
+
+    @property
+    def shape(self) -> tuple[int]:
+        """Shape of the lanes: one for each drone, world after world."""
+        return (self.n_worlds * self.n_drones,)
+
+    def get(self, slot: Slot) -> Any:
+        """Return a number of every drone, or the one number that all share."""
+        if slot not in self.lanes:
+            self._split(slot[0])
+        return self.lanes[slot]
+
+    def set(self, slot: Slot, value: Any) -> None:
+        """Write a number of every drone."""
+        if slot not in self.lanes:
+            self._split(slot[0])
+        self.lanes[slot] = jnp.broadcast_to(value, self.shape)
+        self.arrays.pop(slot[0], None)
+
+    def array(self, leaf: int) -> Any:
+        """Return a leaf as the array that it is outside."""
+        if leaf not in self.arrays:
+            example = self.program.leaves[leaf]
+            items = [self.lanes[leaf, k] for k in range(self.program.sizes(leaf))]
+            core = example.shape[2:]
+            array = jnp.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *core)
+            self.arrays[leaf] = array[:, :1] if self.program.axes.scopes[leaf] == "world" else array
+        return self.arrays[leaf]
+
+    def set_array(self, leaf: int, value: Any) -> None:
+        """Write a leaf."""
+        self.arrays[leaf] = value
+        for k in range(self.program.sizes(leaf)):
+            self.lanes.pop((leaf, k), None)
+
+    def _split(self, leaf: int) -> None:
+        x, scope = self.arrays[leaf], self.program.axes.scopes[leaf]
+        size = self.program.sizes(leaf)
+        if is_key(x):
+            x = jax.random.key_data(x)
+        if scope == "world":
+            x = jnp.broadcast_to(x, (self.n_worlds, self.n_drones, *x.shape[2:]))
+        batch = self.shape if scope in ("drone", "world") else ()
+        x = x.reshape(*batch, size)
+        self.lanes.update(((leaf, k), x[..., k]) for k in range(size))
+
+
+def _batch(program: Program, leaves: list[Any]) -> tuple[int, int]:
+    """Return the number of worlds and drones: under a mesh, of those on this device."""
+    drone = next(i for i, scope in enumerate(program.axes.scopes) if scope == "drone")
+    return leaves[drone].shape[0], leaves[drone].shape[1]
+
+
+def advance(program: Program, lanes: Lanes) -> None:
+    """Run a step."""
+    for segment in program.segments:
+        match segment.scope:
+            case "drone":
+                _run_drones(segment, lanes)
+            case "world":
+                _run_worlds(segment, lanes)
+            case "batch":
+                _run_batch(program, segment, lanes)
+
+
+def _run_drones(segment: Segment, lanes: Lanes) -> None:
+    assert segment.block is not None
+    outs = xla.run(segment.block, [lanes.get(slot) for slot in segment.reads], lanes.shape)
+    for slot, value in zip(segment.writes, outs, strict=True):
+        lanes.set(slot, value)
+
+
+def _run_worlds(segment: Segment, lanes: Lanes) -> None:
+    """Run a program of worlds: a drone's numbers are those of its world, at its place."""
+    assert segment.block is not None
+    program, shape = lanes.program, (lanes.n_worlds, lanes.n_drones)
+
+    def of_world(slot: Slot) -> Any:
+        leaf, k = slot
+        if program.axes.scopes[leaf] == "drone":
+            drone, k = divmod(k, program.sizes(leaf))
+            return lanes.get((leaf, k)).reshape(shape)[:, drone]
+        value = lanes.get(slot)
+        return value.reshape(shape)[:, 0] if jnp.ndim(value) else value
+
+    outs = xla.run(segment.block, [of_world(slot) for slot in segment.reads], shape[:1])
+    new: dict[Slot, dict[int, Array]] = {}
+    for (leaf, k), value in zip(segment.writes, outs, strict=True):
+        value = jnp.broadcast_to(value, shape[:1])
+        if program.axes.scopes[leaf] == "drone":
+            drone, k = divmod(k, program.sizes(leaf))
+            new.setdefault((leaf, k), {})[drone] = value
+        else:
+            new[leaf, k] = dict.fromkeys(range(lanes.n_drones), value)
+    for slot, columns in new.items():
+        old = lanes.get(slot)
+        old = jnp.broadcast_to(old, lanes.shape).reshape(shape)
+        rows = [columns.get(d, old[:, d]) for d in range(lanes.n_drones)]
+        lanes.set(slot, jnp.stack(rows, axis=-1).reshape(lanes.shape))
+
+
+def _run_batch(program: Program, segment: Segment, lanes: Lanes) -> None:
+    (stage,) = segment.stages
+    arrays = [lanes.array(i) if i in segment.used else lanes.arrays.get(i, program.leaves[i]) for i in range(len(program.leaves))]
+    data = program.axes.treedef.unflatten(arrays)
+    with jax.named_scope(stage.__name__):
+        after = jax.tree.leaves(stage(data))
+    for i in segment.written:
+        lanes.set_array(i, after[i])
+
+
+def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+    """Return the written leaves after some steps, and which worlds are finite. (n_worlds, 1)
+
+    A step count that is a Python number makes a loop that can be differentiated.
+    """
+    start = Lanes(program, leaves)
+    by_lanes = sorted({slot for s in program.segments for slot in _slots(program, s)})
+    by_array = sorted({i for s in program.segments if s.scope == "batch" for i in s.written})
+    by_lanes = [slot for slot in by_lanes if slot[0] not in by_array]
+
+    def turn(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
+        lanes = Lanes(program, leaves)
+        lanes.lanes.update(start.lanes)
+        for slot, value in zip(by_lanes, carry[0], strict=True):
+            lanes.set(slot, value)
+        for leaf, value in zip(by_array, carry[1], strict=True):
+            lanes.set_array(leaf, value)
+        advance(program, lanes)
+        return [lanes.get(slot) for slot in by_lanes], [lanes.array(leaf) for leaf in by_array]
+
+    carry = [jnp.broadcast_to(start.get(slot), start.shape) for slot in by_lanes], [leaves[i] for i in by_array]
+    for segment in program.segments:  # what is only read is taken apart once, outside the loop
+        for leaf, k in segment.reads:
+            start.get((leaf, k % program.sizes(leaf)))
+    if isinstance(n_steps, int):
+        carry, _ = jax.lax.scan(lambda c, _: (turn(c), None), carry, length=n_steps)
+    else:
+        carry = jax.lax.fori_loop(0, n_steps, lambda _, c: turn(c), carry)
+    end = Lanes(program, leaves)
+    for slot, value in zip(by_lanes, carry[0], strict=True):
+        end.set(slot, value)
+    for leaf, value in zip(by_array, carry[1], strict=True):
+        end.set_array(leaf, value)
+    return [end.array(i) for i in program.written], finite(program, end)
+
+
+def _slots(program: Program, segment: Segment) -> list[Slot]:
+    """Return what a segment writes, as numbers of drones."""
+    if segment.scope != "world":
+        return segment.writes
+    return [(leaf, k % program.sizes(leaf)) for leaf, k in segment.writes]
+
+
+def finite(program: Program, lanes: Lanes) -> Array:
+    """Return which worlds have no NaN and no infinity in what is watched. (n_worlds, 1)"""
+    check = program.check
+    if check is None or check.block is None:
+        return jnp.ones((lanes.n_worlds, 1), bool)
+    (fine,) = xla.run(check.block, [lanes.get(slot) for slot in check.reads], lanes.shape)
+    fine = jnp.broadcast_to(fine, lanes.shape).reshape(lanes.n_worlds, lanes.n_drones)
+    return jnp.all(fine, axis=1, keepdims=True)
+
+

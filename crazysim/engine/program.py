@@ -1,0 +1,252 @@
+"""From a pipeline of stages to programs: which stages run together, what they read, and what they write."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core
+
+import crazysim.engine.rules  # noqa: F401  (fills the reader's table)
+from crazysim.engine.ir import Block, Element, Value, constant
+from crazysim.engine.lower import Elements, NoRuleError, Reader, pack
+from crazysim.sim.stage import Axes, Stage, StageScope
+
+Slot = tuple[int, int]
+"""A number of the data: which leaf, and which element of what one drone (or one world) has of it."""
+
+LARGEST_SWARM = 8
+"""Most drones of a world for which a stage of one world is written out; its program grows with their square."""
+
+
+@dataclasses.dataclass
+class Segment:
+    """Stages that run together: a program on single numbers, or one stage that runs as it is written."""
+
+    scope: StageScope
+    """Whose numbers the program computes on; ``batch`` has no program."""
+    stages: list[Stage]
+    """The stages."""
+    block: Block | None = None
+    """The program."""
+    reads: list[Slot] = dataclasses.field(default_factory=list)
+    """What its inputs are."""
+    writes: list[Slot] = dataclasses.field(default_factory=list)
+    """What its outputs are."""
+    used: list[int] = dataclasses.field(default_factory=list)
+    """Leaves that a stage without a program reads."""
+    written: list[int] = dataclasses.field(default_factory=list)
+    """Leaves that are written."""
+    why: str = ""
+    """Why there is no program."""
+    first: dict[int, Elements] = dataclasses.field(default_factory=dict)
+    """Elements of the leaves it reads, as they come in."""
+    now: dict[int, Elements] = dataclasses.field(default_factory=dict)
+    """Elements of the leaves, as they are behind the last stage read."""
+
+
+class Program:
+    """What a pipeline does to the data of a simulation, ready for an engine."""
+
+    def __init__(
+        self,
+        stages: Sequence[Stage],
+        data: Any,
+        zeros: dict[int, frozenset[int]] | None = None,
+        watched: Callable[[Any], list[Any]] | None = None,
+    ):
+        """Read the stages.
+
+        Args:
+            stages: The stages, in order.
+            data: Data of the simulation, or its shapes and types.
+            zeros: Elements of shared leaves that are known to be zero, by leaf: nothing is computed with them.
+            watched: Picks the leaves that are watched for NaN and infinity.
+        """
+        self.axes, self.leaves = Axes(data), jax.tree.leaves(data)
+        self.n_drones = data.core.n_drones
+        self.zeros = zeros or {}
+        self.segments: list[Segment] = []
+        for stage in stages:
+            self._add(stage)
+        for segment in self.segments:
+            if segment.block is not None:
+                _close(segment)
+        self.check = self._watch(watched(data)) if watched else None
+
+    @property
+    def fused(self) -> bool:
+        """Whether all of it is one program on the numbers of one drone."""
+        return len(self.segments) == 1 and self.segments[0].scope == "drone"
+
+    @property
+    def written(self) -> list[int]:
+        """Numbers of the leaves that are written."""
+        return sorted({i for s in self.segments for i in s.written})
+
+    @property
+    def read(self) -> list[int]:
+        """Numbers of the leaves that are read."""
+        return sorted({i for s in self.segments for i in [*s.used, *(leaf for leaf, _ in s.reads)]})
+
+    def sizes(self, leaf: int, scope: StageScope = "drone") -> int:
+        """Return how many numbers one drone (or world) has of a leaf; a key is two words."""
+        aval = self.axes.of_one(self.leaves, scope)[leaf]
+        return int(np.prod(aval.shape, dtype=int)) * (2 if is_key(aval) else 1)
+
+    def _add(self, stage: Stage) -> None:
+        if stage.scope == "batch":
+            return self._add_batch(stage, "it is not declared for one drone or one world")
+        traced = _Traced(stage, self.axes, self.leaves)
+        scope = stage.scope
+        if scope == "world" and not any(self.axes.scopes[i] == "drone" for i in [*traced.used, *traced.written]):
+            scope = "drone"  # nothing of any drone is in it: every drone's lane can do it for its world
+        if scope == "world" and self.n_drones > LARGEST_SWARM:
+            return self._add_batch(stage, f"of one world, it is written out for up to {LARGEST_SWARM} drones")
+        last = self.segments[-1] if self.segments else None
+        segment = last if last is not None and last.scope == scope else Segment(scope, [], Block())
+        try:
+            values = self._lower(segment, traced)
+        except NoRuleError as error:
+            return self._add_batch(stage, str(error))
+        if segment is not last:
+            self.segments.append(segment)
+        segment.stages.append(stage)
+        segment.now.update(values)
+        assert segment.block is not None
+        segment.block.mark()
+
+    def _lower(self, segment: Segment, traced: _Traced) -> dict[int, Elements]:
+        """Return what the written leaves of a stage become, as elements of the segment's block."""
+        assert segment.block is not None
+        reader = Reader(segment.block)
+        args = [self._elements(segment, i, traced.avals[i]) for i in traced.used]
+        if traced.when is None:
+            return dict(zip(traced.written, reader.read(traced.fn, args), strict=True))
+        mask = reader.read(traced.when, args)[0][()]
+        inner = reader.inner()
+        new = inner.read(traced.fn, args)
+        old = [self._elements(segment, i, traced.avals[i]) for i in traced.written]
+        inner.block.outputs = [x for array in new for x in array.reshape(-1)]
+        olds = [x for array in old for x in array.reshape(-1)]
+        whole = segment.block.add("when", (mask, *olds), bool, (), (inner.block,))
+        items = iter([segment.block.add("item", (whole,), x.dtype, (("index", k),)) for k, x in enumerate(olds)])
+        return {i: pack([next(items) for _ in range(x.size)], x.shape)
+                for i, x in zip(traced.written, old, strict=True)}  # fmt: skip
+
+    def _elements(self, segment: Segment, leaf: int, aval: Any) -> Elements:
+        """Return a leaf's elements as they are now in a segment; inputs, if no stage of it has written them."""
+        if leaf not in segment.now:
+            assert segment.block is not None
+            segment.now[leaf] = segment.first[leaf] = _inputs(segment.block, aval, self.zeros.get(leaf, frozenset()))
+        return segment.now[leaf]
+
+    def _add_batch(self, stage: Stage, why: str) -> None:
+        traced = _Traced(Stage(stage, "batch", name=stage.__name__), self.axes, self.leaves)
+        self.segments.append(
+            Segment("batch", [stage], used=sorted({*traced.used, *traced.written}), written=traced.written, why=why)
+        )
+
+    def _watch(self, watched: list[Any]) -> Segment:
+        """Return a program that tells whether all watched numbers of a drone are finite."""
+        ids = {id(x) for x in watched}
+        segment = Segment("drone", [], Block())
+        assert segment.block is not None
+        avals = self.axes.of_one(self.leaves, "drone")
+        finite: Element = constant(True, bool)
+        for i, x in enumerate(self.leaves):
+            if id(x) in ids and self.axes.scopes[i] == "drone":
+                for item in self._elements(segment, i, avals[i]).reshape(-1):
+                    finite = segment.block.add("and", (finite, segment.block.add("is_finite", (item,), bool)), bool)
+        segment.block.outputs = [finite]
+        _connect(segment)
+        return segment
+
+
+class _Traced:
+    """A stage as jaxprs on flat lists of leaves: its function, and its condition if it has one."""
+
+    def __init__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]):
+        self.avals = axes.of_one(list(leaves), stage.scope)
+        self.written: list[int] = []
+        has_mask = False
+
+        def apply(values: list[Any]) -> list[Any]:
+            after = stage.fn(axes.treedef.unflatten(values))
+            self.written = axes.written(values, after, stage)
+            new = jax.tree.leaves(after)
+            return [new[i] for i in self.written]
+
+        def condition(values: list[Any]) -> Any:
+            nonlocal has_mask
+            mask = stage.when(axes.treedef.unflatten(values)) if stage.when is not None else None
+            has_mask = mask is not None
+            return mask if has_mask else 0
+
+        fn, when = jax.make_jaxpr(apply)(self.avals), jax.make_jaxpr(condition)(self.avals)
+        used = _used(fn) | (_used(when) if has_mask else set())
+        self.used = sorted(used)
+        self.fn = _with_inputs(fn, self.used)
+        self.when = _with_inputs(when, self.used) if has_mask else None
+
+
+def is_key(x: Any) -> bool:
+    """Return whether an array holds random keys."""
+    return jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _used(jaxpr: core.ClosedJaxpr) -> set[int]:
+    inner = jaxpr.jaxpr
+    used = {v for eqn in inner.eqns for v in eqn.invars if not isinstance(v, core.Literal)}
+    used |= {v for v in inner.outvars if not isinstance(v, core.Literal)}
+    return {i for i, v in enumerate(inner.invars) if v in used}
+
+
+def _with_inputs(jaxpr: core.ClosedJaxpr, inputs: Sequence[int]) -> core.ClosedJaxpr:
+    inner = jaxpr.jaxpr
+    invars = [inner.invars[i] for i in inputs]
+    return core.ClosedJaxpr(
+        core.Jaxpr(inner.constvars, invars, inner.outvars, inner.eqns, inner.effects, inner.debug_info), jaxpr.consts
+    )
+
+
+def _inputs(block: Block, aval: Any, zeros: frozenset[int]) -> Elements:
+    size = int(np.prod(aval.shape, dtype=int))
+    if is_key(aval):
+        return pack([(block.input(np.uint32), block.input(np.uint32)) for _ in range(size)], aval.shape)
+    items = [constant(0, aval.dtype) if k in zeros else block.input(aval.dtype) for k in range(size)]
+    return pack(items, aval.shape)
+
+
+def _words(elements: Elements) -> list[Element]:
+    return [w for x in elements.reshape(-1) for w in (x if isinstance(x, tuple) else (x,))]
+
+
+def _close(segment: Segment) -> None:
+    """Fix what a segment writes, and drop what nothing needs."""
+    assert segment.block is not None
+    outputs: list[Element] = []
+    for leaf, elements in segment.now.items():
+        before = _words(segment.first[leaf]) if leaf in segment.first else [None] * elements.size
+        for k, (old, new) in enumerate(zip(before, _words(elements), strict=True)):
+            if old is not new:
+                segment.writes.append((leaf, k))
+                outputs.append(new)
+    segment.written = sorted({leaf for leaf, _ in segment.writes})
+    segment.block.outputs = outputs
+    _connect(segment)
+
+
+def _connect(segment: Segment) -> None:
+    """Keep the inputs that are used, and note what they are."""
+    block = segment.block
+    assert block is not None
+    block.drop_unused()
+    used = {id(x) for v in block.walk() for x in v.args} | {id(x) for x in block.outputs}
+    used |= {id(x) for v in block.walk() for b in v.blocks for x in b.outputs}
+    slots = {id(x): (leaf, k) for leaf, elements in segment.first.items() for k, x in enumerate(_words(elements))}
+    block.inputs = [x for x in block.inputs if id(x) in used and isinstance(x, Value)]
+    segment.reads = [slots[id(x)] for x in block.inputs]

@@ -1,0 +1,173 @@
+"""A reader of programs (``ir``) that writes them down as source, for CUDA and for the host's C++ compiler alike.
+
+A value is a variable that is assigned once, an operation a call of an inline function. What the functions and types
+are, a preamble of each target says (``targets/``); what is written here is the same for both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from crazysim.engine.ir import Block, Element, Value
+from crazysim.engine.lower import NoRuleError
+
+TYPES = {"float32": "f32", "float64": "f64", "int32": "i32", "uint32": "u32", "bool": "b1"}
+
+OPERATIONS = set(
+    "abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp cos cosh div eq erf erfc erf_inv exp exp2 "
+    "expm1 floor ge gt is_finite le log log1p logistic lt max min mul ne neg not or pow rem rsqrt select_n "
+    "shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt sub tan tanh xor".split()
+)
+"""Operations that both preambles have."""
+
+INDENT = "  "
+
+
+class Writer:
+    """Writes blocks as lines of source."""
+
+    def __init__(self) -> None:
+        """Begin with nothing written."""
+        self.lines: list[str] = []
+        self.names: dict[int, str] = {}
+        self._count = 0
+
+    def new(self, prefix: str = "v") -> str:
+        """Return a name that is not in use."""
+        self._count += 1
+        return f"{prefix}{self._count}"
+
+    def line(self, text: str, depth: int) -> None:
+        """Write a line."""
+        self.lines.append(INDENT * depth + text)
+
+    def block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
+        """Write a block's operations, and return the names of its outputs.
+
+        Raises:
+            NoRuleError: If there is no source for an operation or a type.
+        """
+        self.names.update(zip(map(id, block.inputs), inputs, strict=True))
+        for value in block.values:
+            self._value(value, depth)
+        return [self.element(x) for x in block.outputs]
+
+    def element(self, x: Element) -> str:
+        """Return an element as an expression."""
+        return self.names[id(x)] if isinstance(x, Value) else literal(x)
+
+    def _value(self, value: Value, depth: int) -> None:
+        args = [self.element(a) for a in value.args]
+        match value.op:
+            case "mark":
+                return
+            case "item":
+                self.names[id(value)] = f"{args[0]}_{dict(value.params)['index']}"
+                return
+            case "when":
+                return self._when(value, args, depth)
+            case "loop":
+                return self._loop(value, args, depth)
+            case "while":
+                return self._while(value, args, depth)
+            case "threefry2x32":
+                name = self.names[id(value)] = self.new()
+                self.line(f"auto {name}_0 = u32_lanes({args[2]}), {name}_1 = u32_lanes({args[3]});", depth)
+                self.line(f"threefry2x32({args[0]}, {args[1]}, {name}_0, {name}_1);", depth)
+                return
+            case "custom_jvp":  # the derivative is not asked for here
+                outs = self.block(value.blocks[0], args, depth)
+                name = self.names[id(value)] = self.new()
+                for k, out in enumerate(outs):
+                    self.line(f"const auto {name}_{k} = {out};", depth)
+                return
+        self.names[id(value)] = name = self.new()
+        self.line(f"const auto {name} = {self._expression(value, args)};", depth)
+
+    def _expression(self, value: Value, args: list[str]) -> str:
+        kind = type_name(value.dtype)
+        if value.op == "convert_element_type":
+            return f"to_{kind}({args[0]})"
+        if value.op == "bitcast_convert_type":
+            return f"bits_{kind}({args[0]})"
+        if value.op == "integer_pow":
+            return f"integer_pow({args[0]}, {dict(value.params)['y']})"
+        if value.op == "round":
+            even = int(dict(value.params)["rounding_method"]) == 1
+            return f"{'round_even' if even else 'round_away'}({args[0]})"
+        if value.op not in OPERATIONS:
+            raise NoRuleError(f"operation {value.op!r} has no source")
+        return f"{value.op}_({', '.join(args)})"
+
+    def _when(self, value: Value, args: list[str], depth: int) -> None:
+        mask, *old = args
+        name = self._carry(value.blocks[0].outputs, old, depth)
+        self.names[id(value)] = name
+        self.line(f"if (any({mask})) {{", depth)
+        for k, out in enumerate(self.block(value.blocks[0], [], depth + 1)):
+            self.line(f"{name}_{k} = select_n_({mask}, {name}_{k}, {out});", depth + 1)
+        self.line("}", depth)
+
+    def _loop(self, value: Value, args: list[str], depth: int) -> None:
+        (body,) = value.blocks
+        name = self._carry(body.outputs, args, depth)
+        self.names[id(value)] = name
+        turn = self.new("n")
+        self.line(f"for (int {turn} = 0; {turn} < {dict(value.params)['length']}; ++{turn}) {{", depth)
+        outs = self.block(body, [f"{name}_{k}" for k in range(len(args))], depth + 1)
+        self._assign(name, outs, None, depth + 1)
+        self.line("}", depth)
+
+    def _while(self, value: Value, args: list[str], depth: int) -> None:
+        test, body = value.blocks
+        name = self._carry(body.outputs, args, depth)
+        self.names[id(value)] = name
+        carry = [f"{name}_{k}" for k in range(len(args))]
+        self.line("for (;;) {", depth)
+        (goes_on,) = self.block(test, carry, depth + 1)
+        self.line(f"if (!any({goes_on})) break;", depth + 1)
+        self._assign(name, self.block(body, carry, depth + 1), goes_on, depth + 1)
+        self.line("}", depth)
+
+    def _carry(self, like: Sequence[Element], start: Sequence[str], depth: int) -> str:
+        name = self.new()
+        for k, (x, value) in enumerate(zip(like, start, strict=True)):
+            self.line(f"auto {name}_{k} = {type_name(x.dtype)}_lanes({value});", depth)
+        return name
+
+    def _assign(self, name: str, outs: Sequence[str], mask: str | None, depth: int) -> None:
+        """Assign all results of a turn at once: one may be what another was."""
+        fresh = [self.new() for _ in outs]
+        for k, (f, out) in enumerate(zip(fresh, outs, strict=True)):
+            self.line(f"const auto {f} = {out if mask is None else f'select_n_({mask}, {name}_{k}, {out})'};", depth)
+        for k, f in enumerate(fresh):
+            self.line(f"{name}_{k} = {f};", depth)
+
+
+def type_name(dtype: Any) -> str:
+    """Return what a type is called in the source.
+
+    Raises:
+        NoRuleError: If it has no name there.
+    """
+    name = np.dtype(dtype).name
+    if name not in TYPES:
+        raise NoRuleError(f"numbers of type {name} have no source")
+    return TYPES[name]
+
+
+def literal(x: np.generic) -> str:
+    """Return a constant, exactly."""
+    kind = type_name(x.dtype)
+    if kind == "b1":
+        return "b1(1)" if bool(x) else "b1(0)"
+    if kind in ("f32", "f64"):
+        if not np.isfinite(x):
+            return f"{kind}_nan()" if np.isnan(x) else f"{'-' if x < 0 else ''}{kind}_infinity()"
+        return f"{kind}({float(x).hex()})"
+    if kind == "i32":
+        return f"i32({int(x)})" if int(x) != -(2**31) else "i32(-2147483647 - 1)"
+    return f"u32({int(x)}u)"

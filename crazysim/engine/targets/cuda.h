@@ -1,0 +1,16 @@
+// A lane is a thread.
+#define FN static __device__ __forceinline__
+#define RSQRTF(x) rsqrtf(x)
+#define BITS_F32(x) __uint_as_float(x)
+#define BITS_U32(x) __float_as_uint(x)
+#include "scalar.h"
+
+FN b1 any(b1 x) { return x; }
+FN f32 f32_lanes(f32 x) { return x; }
+FN f64 f64_lanes(f64 x) { return x; }
+FN i32 i32_lanes(i32 x) { return x; }
+FN u32 u32_lanes(u32 x) { return x; }
+FN b1 b1_lanes(b1 x) { return x; }
+
+#define LOAD(p, index) p[index]
+#define STORE(p, index, value) if (active) p[index] = value;

@@ -1,0 +1,193 @@
+// A block of W lanes is a vector, held as GCC's and Clang's vector types; what all lanes share stays a number.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <thread>
+#include <type_traits>
+#include <vector>
+
+#include "xla/ffi/api/c_api.h"
+
+#define FN static inline __attribute__((always_inline))
+#define RSQRTF(x) (1.0f / sqrtf(x))
+static inline float bits_to_float(unsigned x) { float y; std::memcpy(&y, &x, 4); return y; }
+static inline unsigned bits_of_float(float x) { unsigned y; std::memcpy(&y, &x, 4); return y; }
+#define BITS_F32(x) bits_to_float(x)
+#define BITS_U32(x) bits_of_float(x)
+#include "scalar.h"
+
+#if defined(__AVX512F__)
+#define W 16
+#elif defined(__AVX__)
+#define W 8
+#else
+#define W 4
+#endif
+
+template <class T> struct vec { typedef T type __attribute__((vector_size(sizeof(T) * W))); };
+typedef vec<f32>::type f32v;
+typedef vec<f64>::type f64v;
+typedef vec<i32>::type i32v;
+typedef vec<u32>::type u32v;
+typedef vec<int64_t>::type i64v;
+struct b1v { i32v m; };  // all bits set where true
+
+// How a type is lifted to lanes, and what one lane of it is.
+template <class T> struct is_lanes { static const bool value = false; };
+template <> struct is_lanes<f32v> { static const bool value = true; typedef f32 one; };
+template <> struct is_lanes<f64v> { static const bool value = true; typedef f64 one; };
+template <> struct is_lanes<i32v> { static const bool value = true; typedef i32 one; };
+template <> struct is_lanes<u32v> { static const bool value = true; typedef u32 one; };
+template <> struct is_lanes<b1v> { static const bool value = true; typedef b1 one; };
+template <class... T> struct any_lanes { static const bool value = (is_lanes<T>::value || ...); };
+FN f32v lift(f32 x) { return f32v{} + x; }
+FN f64v lift(f64 x) { return f64v{} + x; }
+FN i32v lift(i32 x) { return i32v{} + x; }
+FN u32v lift(u32 x) { return u32v{} + x; }
+FN b1v lift(b1 x) { return {i32v{} - i32(x)}; }
+template <class V, class = std::enable_if_t<is_lanes<V>::value>> FN V lift(V x) { return x; }
+template <class T> FN f32v f32_lanes(T x) { return lift(x); }
+template <class T> FN f64v f64_lanes(T x) { return lift(x); }
+template <class T> FN i32v i32_lanes(T x) { return lift(x); }
+template <class T> FN u32v u32_lanes(T x) { return lift(x); }
+template <class T> FN b1v b1_lanes(T x) { return lift(x); }
+
+FN b1v mask(i32v m) { return {m}; }
+FN b1v mask(i64v m) { return {__builtin_convertvector(m, i32v)}; }
+FN b1 any(b1 x) { return x; }
+FN b1 any(b1v x) { i32 sum = 0; for (int i = 0; i < W; ++i) sum |= x.m[i]; return sum != 0; }
+
+#define LANES1(A) template <class A, class = std::enable_if_t<is_lanes<A>::value>> FN
+#define LANES2(A, B) template <class A, class B, class = std::enable_if_t<any_lanes<A, B>::value>> FN
+#define OPERATOR(NAME, OP) LANES2(A, B) auto NAME##_(A a, B b) { return lift(a) OP lift(b); }
+OPERATOR(add, +) OPERATOR(sub, -) OPERATOR(mul, *)
+#define COMPARE(NAME, OP) LANES2(A, B) b1v NAME##_(A a, B b) { return mask(lift(a) OP lift(b)); }
+COMPARE(lt, <) COMPARE(le, <=) COMPARE(gt, >) COMPARE(ge, >=)
+FN b1v same(b1v a, b1v b) { return {a.m == b.m}; }
+template <class V> FN b1v same(V a, V b) { return mask(a == b); }
+FN b1v not_(b1v a) { return {~a.m}; }
+FN i32v not_(i32v a) { return ~a; }
+FN u32v not_(u32v a) { return ~a; }
+LANES2(A, B) b1v eq_(A a, B b) { return same(lift(a), lift(b)); }
+LANES2(A, B) b1v ne_(A a, B b) { return not_(same(lift(a), lift(b))); }
+#define BITWISE(NAME, OP) \
+  FN b1v NAME##_lanes(b1v a, b1v b) { return {a.m OP b.m}; } template <class V> FN V NAME##_lanes(V a, V b) { return a OP b; } \
+  LANES2(A, B) auto NAME##_(A a, B b) { return NAME##_lanes(lift(a), lift(b)); }
+BITWISE(and, &) BITWISE(or, |) BITWISE(xor, ^)
+
+FN f32v pick(b1v w, f32v no, f32v yes) { return w.m ? yes : no; }
+FN i32v pick(b1v w, i32v no, i32v yes) { return w.m ? yes : no; }
+FN u32v pick(b1v w, u32v no, u32v yes) { return w.m ? yes : no; }
+FN f64v pick(b1v w, f64v no, f64v yes) { return __builtin_convertvector(w.m, i64v) ? yes : no; }
+FN b1v pick(b1v w, b1v no, b1v yes) { return {(w.m & yes.m) | (~w.m & no.m)}; }
+template <class C, class A, class B, class = std::enable_if_t<any_lanes<C, A, B>::value>>
+FN auto select_n_(C which, A no, B yes) { return pick(lift(which), lift(no), lift(yes)); }
+LANES2(A, B) auto max_(A a, B b) { return select_n_(or_(gt_(a, b), ne_(a, a)), b, a); }
+LANES2(A, B) auto min_(A a, B b) { return select_n_(or_(lt_(a, b), ne_(a, a)), b, a); }
+template <class A, class B, class C, class = std::enable_if_t<any_lanes<A, B, C>::value>>
+FN auto clamp_(A low, B x, C high) { return min_(max_(x, low), high); }
+
+// One lane after the other, in a form that compilers turn into vector instructions where there are any.
+template <class R, class F, class V> FN R each(F f, V x) {
+  typename is_lanes<V>::one a[W];
+  typename is_lanes<R>::one r[W];
+  std::memcpy(a, &x, sizeof(x));
+  for (int i = 0; i < W; ++i) r[i] = f(a[i]);
+  R out;
+  std::memcpy(&out, r, sizeof(out));
+  return out;
+}
+template <class F, class V> FN V each2(F f, V x, V y) {
+  typename is_lanes<V>::one a[W], b[W];
+  std::memcpy(a, &x, sizeof(x));
+  std::memcpy(b, &y, sizeof(y));
+  for (int i = 0; i < W; ++i) a[i] = f(a[i], b[i]);
+  std::memcpy(&x, a, sizeof(x));
+  return x;
+}
+#define EACH(NAME) LANES1(V) V NAME##_(V x) { typedef typename is_lanes<V>::one T; return each<V>([](T t) { return NAME##_(t); }, x); }
+EACH(acos) EACH(acosh) EACH(asin) EACH(asinh) EACH(atan) EACH(atanh) EACH(cbrt) EACH(ceil) EACH(cosh) EACH(erf) EACH(erfc)
+EACH(erf_inv) EACH(exp) EACH(exp2) EACH(expm1) EACH(floor) EACH(log) EACH(log1p) EACH(logistic) EACH(round_even)
+EACH(round_away) EACH(sign) EACH(sinh) EACH(sqrt) EACH(tan) EACH(tanh)
+#define EACH2(NAME) LANES2(A, B) auto NAME##_(A x, B y) { \
+  typedef typename is_lanes<decltype(lift(x))>::one T; return each2([](T s, T t) { return NAME##_(s, t); }, lift(x), lift(y)); }
+EACH2(atan2) EACH2(pow) EACH2(rem) EACH2(shift_right_arithmetic) EACH2(shift_left) EACH2(shift_right_logical)
+LANES1(V) V neg_(V x) { return -x; }
+LANES1(V) V abs_(V x) { return select_n_(lt_(x, V{}), select_n_(eq_(x, V{}), x, V{}), -x); }
+LANES1(V) V rsqrt_(V x) { return lift(typename is_lanes<V>::one(1)) / sqrt_(x); }
+FN f32v quotient(f32v a, f32v b) { return a / b; }
+FN f64v quotient(f64v a, f64v b) { return a / b; }
+FN i32v quotient(i32v a, i32v b) { return each2([](i32 s, i32 t) { return div_(s, t); }, a, b); }
+FN u32v quotient(u32v a, u32v b) { return each2([](u32 s, u32 t) { return div_(s, t); }, a, b); }
+LANES2(A, B) auto div_(A a, B b) { return quotient(lift(a), lift(b)); }
+LANES1(V) b1v is_finite_(V x) { return eq_(x - x, V{}); }
+LANES1(V) V integer_pow(V x, int y) {
+  V p = lift(typename is_lanes<V>::one(1)), one = p;
+  for (int n = y < 0 ? -y : y; n; n >>= 1, x = x * x) if (n & 1) p = p * x;
+  return y < 0 ? one / p : p;
+}
+
+// Sine and cosine of float32 lanes: reduction by pi/2 in three parts (Cody and Waite), then the polynomials of
+// S. L. Moshier's Cephes library; beyond 8192 rad the reduction is left to the C library.
+FN void sincos(f32v x, f32v& s, f32v& c) {
+  const f32v turns = round_even_(x * 0.636619772367581343f);
+  const f32v r = ((x - turns * 1.5703125f) - turns * 4.837512969970703125e-4f) - turns * 7.54978995489188216e-8f;
+  const i32v q = __builtin_convertvector(turns, i32v);
+  const f32v z = r * r;
+  const f32v a = r + r * z * (-1.6666654611e-1f + z * (8.3321608736e-3f + z * -1.9515295891e-4f));
+  const f32v b = 1.0f - 0.5f * z + z * z * (4.166664568298827e-2f + z * (-1.388731625493765e-3f + z * 2.443315711809948e-5f));
+  const i32v odd = (q & 1) != 0;
+  const f32v sine = odd ? b : a, cosine = odd ? a : b;
+  s = (q & 2) != 0 ? -sine : sine;
+  c = ((q + 1) & 2) != 0 ? -cosine : cosine;
+}
+FN b1 is_large(f32v x) { return any(not_(lt_(abs_(x), 8192.0f))); }
+FN f32v sin_(f32v x) { f32v s, c; if (is_large(x)) return each<f32v>([](f32 t) { return sinf(t); }, x); sincos(x, s, c); return s; }
+FN f32v cos_(f32v x) { f32v s, c; if (is_large(x)) return each<f32v>([](f32 t) { return cosf(t); }, x); sincos(x, s, c); return c; }
+FN f64v sin_(f64v x) { return each<f64v>([](f64 t) { return sin(t); }, x); }
+FN f64v cos_(f64v x) { return each<f64v>([](f64 t) { return cos(t); }, x); }
+
+FN f32v to_f32(f32v x) { return x; }
+FN f32v to_f32(f64v x) { return __builtin_convertvector(x, f32v); }
+FN f32v to_f32(i32v x) { return __builtin_convertvector(x, f32v); }
+FN f32v to_f32(u32v x) { return __builtin_convertvector(x, f32v); }
+FN f32v to_f32(b1v x) { return __builtin_convertvector(-x.m, f32v); }
+FN f64v to_f64(f64v x) { return x; }
+FN f64v to_f64(b1v x) { return __builtin_convertvector(-x.m, f64v); }
+LANES1(V) f64v to_f64(V x) { return __builtin_convertvector(x, f64v); }
+LANES1(V) i32v to_i32(V x) { return each<i32v>([](typename is_lanes<V>::one t) { return to_i32(t); }, x); }
+LANES1(V) u32v to_u32(V x) { return each<u32v>([](typename is_lanes<V>::one t) { return to_u32(t); }, x); }
+FN i32v to_i32(b1v x) { return -x.m; }
+FN u32v to_u32(b1v x) { return (u32v)(-x.m); }
+FN b1v to_b1(b1v x) { return x; }
+LANES1(V) b1v to_b1(V x) { return ne_(x, V{}); }
+template <class V> FN u32v bits_u32(V x) { return (u32v)x; }
+template <class V> FN i32v bits_i32(V x) { return (i32v)x; }
+template <class V> FN f32v bits_f32(V x) { return (f32v)x; }
+
+// Where each lane's numbers lie.
+struct places { int64_t at[W]; };
+FN places operator*(const places& p, int64_t size) { places r; for (int i = 0; i < W; ++i) r.at[i] = p.at[i] * size; return r; }
+FN places operator+(const places& p, int64_t k) { places r; for (int i = 0; i < W; ++i) r.at[i] = p.at[i] + k; return r; }
+template <class T> FN typename vec<T>::type LOAD(const T* p, const places& from) {
+  typename vec<T>::type x;
+  for (int i = 0; i < W; ++i) x[i] = p[from.at[i]];
+  return x;
+}
+FN b1v LOAD(const b1* p, const places& from) { b1v x; for (int i = 0; i < W; ++i) x.m[i] = -i32(p[from.at[i]]); return x; }
+template <class T, class V> FN void store(T* p, const places& to, int n, V x) { for (int i = 0; i < n; ++i) p[to.at[i]] = x[i]; }
+FN void store(b1* p, const places& to, int n, b1v x) { for (int i = 0; i < n; ++i) p[to.at[i]] = x.m[i] != 0; }
+#define STORE(p, to, value) store(p, to, n_active, value);
+#define STORE_WORLD(p, to, value) store(p, to, n_active, value);
+
+// Work that is worth it is shared between the cores, in whole blocks of lanes.
+template <class F> static void in_parallel(int64_t n_lanes, int n_steps, const F& run) {
+  const int64_t n_blocks = (n_lanes + W - 1) / W, n_cores = std::thread::hardware_concurrency();
+  const int64_t n_threads = std::min(n_cores, n_blocks * n_steps / 512);
+  std::vector<std::thread> threads;
+  const auto bound = [=](int64_t k) { return std::min(n_lanes, n_blocks * k / std::max<int64_t>(n_threads, 1) * W); };
+  for (int64_t k = 1; k < n_threads; ++k) threads.emplace_back(run, bound(k), bound(k + 1));
+  run(0, bound(1));
+  for (auto& t : threads) t.join();
+}
