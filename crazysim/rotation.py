@@ -58,7 +58,8 @@ def safe_clip(x: Array, low: Array | float, high: Array | float) -> Array:
 
     ``jnp.clip`` gives one half there, which is the slope of neither side.
     """
-    return jnp.where(x > high, high, jnp.where(x < low, low, x))
+    raised = jnp.where(x < low, low, x)
+    return jnp.where(raised > high, high, raised)
 
 
 def safe_arctan2(y: Array, x: Array) -> Array:
@@ -95,25 +96,35 @@ def normalize(q: Array) -> Array:
     return safe_normalize(q, jnp.asarray([0.0, 0.0, 0.0, 1.0], q.dtype))
 
 
+def matrix(q: Array) -> Array:
+    """Return the rotation matrix of a unit quaternion, body to world. (..., 3, 3)
+
+    A step turns several vectors by the same attitude, so its nine numbers are worth having.
+    """
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    x2, y2, z2 = 2 * x, 2 * y, 2 * z
+    wx, wy, wz, xx, yy, zz = w * x2, w * y2, w * z2, x * x2, y * y2, z * z2
+    rows = [
+        [1 - yy - zz, x * y2 - wz, x * z2 + wy],
+        [x * y2 + wz, 1 - xx - zz, y * z2 - wx],
+        [x * z2 - wy, y * z2 + wx, 1 - xx - yy],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
 def rotate(q: Array, v: Array) -> Array:
     """Return a body vector in the world frame, ``R(q) v``. (..., 3)"""
-    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    a, b, c = v[..., 0], v[..., 1], v[..., 2]
-    ta, tb, tc = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
-    return jnp.stack(
-        [a + w * ta + y * tc - z * tb, b + w * tb + z * ta - x * tc, c + w * tc + x * tb - y * ta], axis=-1
-    )
+    return matvec(matrix(q), v)
 
 
 def rotate_inverse(q: Array, v: Array) -> Array:
     """Return a world vector in the body frame, ``R(q)^T v``. (..., 3)"""
-    return rotate(conjugate(q), v)
+    return matvec(jnp.swapaxes(matrix(q), -1, -2), v)
 
 
 def z_axis(q: Array) -> Array:
     """Return the body z axis in the world frame. (..., 3)"""
-    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    return jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+    return matrix(q)[..., 2]
 
 
 def from_rotvec(rotvec: Array) -> Array:
@@ -130,13 +141,13 @@ def from_rotvec(rotvec: Array) -> Array:
     return jnp.concatenate([rotvec * scale, w], axis=-1)
 
 
-def turn(q: Array, rotvec: Array) -> Array:
-    """Return the attitude after a turn about a body axis by less than half a revolution, renormalised. (..., 4)
+def turn(q: Array, rotvec: Array, normalize: bool = True) -> Array:
+    """Return the attitude after a turn about a body axis by less than half a revolution. (..., 4)
 
     The turn of one physics step: polynomials of sine and cosine take the place of functions that cost more than
     the whole rest of the step. Up to ``|rotvec| = pi`` they are exact to rounding: the first term left out is
     (pi/2)^14 / 14! = 6e-9 in float32 and (pi/2)^22 / 22! = 2e-17 in float64. Renormalising keeps rounding from
-    adding up.
+    adding up; an attitude that is used once can do without.
     """
     s = 0.25 * dot(rotvec, rotvec)
     n_terms = 6 if s.dtype == jnp.float32 else 10
@@ -145,7 +156,7 @@ def turn(q: Array, rotvec: Array) -> Array:
         sinc = sinc * s + (-1) ** n / math.factorial(2 * n + 1)
         cos = cos * s + (-1) ** n / math.factorial(2 * n)
     turned = multiply(q, jnp.concatenate([0.5 * sinc * rotvec, cos], axis=-1))
-    return turned * lax.rsqrt(dot(turned, turned))
+    return turned * lax.rsqrt(dot(turned, turned)) if normalize else turned
 
 
 def from_rpy(rpy: Array) -> Array:

@@ -29,7 +29,7 @@ def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> A
     up = cmd > rotor_vel
     a = jnp.where(up, rotor_dyn_coef[..., 0], rotor_dyn_coef[..., 2])
     b = jnp.where(up, rotor_dyn_coef[..., 1], rotor_dyn_coef[..., 3])
-    return a * (cmd - rotor_vel) + b * (cmd * cmd - rotor_vel * rotor_vel)
+    return (cmd - rotor_vel) * (a + b * (cmd + rotor_vel))
 
 
 def curve(rotor_vel: Array, coefficients: Array) -> Array:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.engine import kernel, lanes, native
+from crazysim.engine import cuda, kernel, lanes, native
 from crazysim.engine.program import Program, is_key
 
 
@@ -48,8 +48,8 @@ def _call(
     inputs = [_bare(leaves[i]) for i in source.inputs]
     outputs = [jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in source.outputs]
     flags = jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)
-    call = jax.ffi.ffi_call(native.target(source), [*outputs, flags])
-    *written, finite = call(jnp.asarray([n_lanes], jnp.int32), count.reshape(1), *inputs)
+    call = cuda.call if platform == "gpu" else native.call
+    *written, finite = call(source, n_lanes, count.reshape(1), inputs, [*outputs, flags])
     return written, jnp.all(finite, axis=1, keepdims=True)
 
 

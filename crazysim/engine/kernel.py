@@ -56,7 +56,7 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
     """
     writer = Writer()
     segments = [s for s in program.segments if s.block is not None]
-    slots = dict.fromkeys(slot for s in segments for slot in _of_drone(program, s, s.reads))
+    slots = dict.fromkeys(slot for s in segments for slot in _of_drone(program, s, [*s.reads, *s.constants]))
     written = list(dict.fromkeys(slot for s in segments for slot in _of_drone(program, s, s.writes)))
     check = program.check
     slots.update(dict.fromkeys([*written, *(check.reads if check else [])]))
@@ -73,9 +73,10 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
         changes = slot in set(written)
         writer.line(f"auto {names[slot]} = {kind}_lanes({access});" if changes
                     else f"const auto {names[slot]} = {access};", 1)  # fmt: skip
+    before = [writer.block(s.before, [names[slot] for slot in s.constants], 1) if s.before else [] for s in segments]
     writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
-    for segment in segments:
-        _step(writer, program, segment, names)
+    for segment, constants in zip(segments, before, strict=True):
+        _step(writer, program, segment, names, constants)
     writer.line("}", 1)
     if check is not None and check.block is not None:
         (fine,) = writer.block(check.block, [names[slot] for slot in check.reads], 1)
@@ -100,10 +101,12 @@ def _of_drone(program: Program, segment: Segment, slots: Sequence[Slot]) -> list
     return [(leaf, k % program.sizes(leaf)) if program.axes.scopes[leaf] == "drone" else (leaf, k) for leaf, k in slots]
 
 
-def _step(writer: Writer, program: Program, segment: Segment, names: dict[Slot, str]) -> None:
+def _step(
+    writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str]
+) -> None:
     assert segment.block is not None
     writer.line("{", 2)
-    outs = writer.block(segment.block, [names[slot] for slot in segment.reads], 3)
+    outs = writer.block(segment.block, [*(names[slot] for slot in segment.reads), *constants], 3)
     fresh = [writer.new() for _ in outs]
     for name, out in zip(fresh, outs, strict=True):
         writer.line(f"const auto {name} = {out};", 3)

@@ -78,21 +78,34 @@ def _batch(program: Program, leaves: list[Any]) -> tuple[int, int]:
     return leaves[drone].shape[0], leaves[drone].shape[1]
 
 
-def advance(program: Program, lanes: Lanes) -> None:
+Constants = dict[int, list[Any]]
+"""What has been computed before the first step, by the segment that needs it."""
+
+
+def prepare(program: Program, lanes: Lanes) -> Constants:
+    """Compute what no step changes."""
+    return {
+        k: xla.run(s.before, [lanes.get(slot) for slot in s.constants], lanes.shape)
+        for k, s in enumerate(program.segments)
+        if s.before is not None
+    }
+
+
+def advance(program: Program, lanes: Lanes, constants: Constants) -> None:
     """Run a step."""
-    for segment in program.segments:
+    for k, segment in enumerate(program.segments):
         match segment.scope:
             case "drone":
-                _run_drones(segment, lanes)
+                _run_drones(segment, lanes, constants.get(k, []))
             case "world":
                 _run_worlds(segment, lanes)
             case "batch":
                 _run_batch(program, segment, lanes)
 
 
-def _run_drones(segment: Segment, lanes: Lanes) -> None:
+def _run_drones(segment: Segment, lanes: Lanes, constants: list[Any]) -> None:
     assert segment.block is not None
-    outs = xla.run(segment.block, [lanes.get(slot) for slot in segment.reads], lanes.shape)
+    outs = xla.run(segment.block, [*(lanes.get(slot) for slot in segment.reads), *constants], lanes.shape)
     for slot, value in zip(segment.writes, outs, strict=True):
         lanes.set(slot, value)
 
@@ -142,6 +155,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
     A step count that is a Python number makes a loop that can be differentiated.
     """
     start = Lanes(program, leaves)
+    constants = prepare(program, start)
     by_lanes = sorted({slot for s in program.segments for slot in _slots(program, s)})
     by_array = sorted({i for s in program.segments if s.scope == "batch" for i in s.written})
     by_lanes = [slot for slot in by_lanes if slot[0] not in by_array]
@@ -153,7 +167,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
             lanes.set(slot, value)
         for leaf, value in zip(by_array, carry[1], strict=True):
             lanes.set_array(leaf, value)
-        advance(program, lanes)
+        advance(program, lanes, constants)
         return [lanes.get(slot) for slot in by_lanes], [lanes.array(leaf) for leaf in by_array]
 
     carry = [jnp.broadcast_to(start.get(slot), start.shape) for slot in by_lanes], [leaves[i] for i in by_array]

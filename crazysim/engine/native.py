@@ -9,15 +9,25 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
+import numpy as np
+from jax import Array
 
 from crazysim.engine.kernel import Kernel
 
 FLAGS = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-shared",
          "-fPIC", "-fvisibility=hidden", "-pthread", "-w")  # fmt: skip
 """Options of the compiler: contraction of multiply and add is allowed, nothing that forgets NaN is."""
+
+
+def call(kernel: Kernel, n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
+    """Return what a kernel writes; arguments as in ``cuda.call``."""
+    run = jax.ffi.ffi_call(target(kernel), list(outputs))
+    return list(run(np.asarray([n_lanes], np.int32), count, *inputs))
 
 
 @functools.cache

@@ -36,6 +36,10 @@ class Segment:
     """What its inputs are."""
     writes: list[Slot] = dataclasses.field(default_factory=list)
     """What its outputs are."""
+    before: Block | None = None
+    """What is computed once, before the first step; its inputs are those of ``constants``."""
+    constants: list[Slot] = dataclasses.field(default_factory=list)
+    """What the inputs of ``before`` are. Its outputs are further inputs of ``block``, behind ``reads``."""
     used: list[int] = dataclasses.field(default_factory=list)
     """Leaves that a stage without a program reads."""
     written: list[int] = dataclasses.field(default_factory=list)
@@ -75,6 +79,12 @@ class Program:
         for segment in self.segments:
             if segment.block is not None:
                 _close(segment)
+        changing = {slot for s in self.segments for slot in s.writes} | {
+            (leaf, k) for s in self.segments if s.block is None for leaf in s.written for k in range(self.sizes(leaf))
+        }
+        for segment in self.segments:
+            if segment.block is not None and segment.scope == "drone":
+                _hoist(segment, changing)
         self.check = self._watch(watched(data)) if watched else None
 
     @property
@@ -244,9 +254,83 @@ def _connect(segment: Segment) -> None:
     """Keep the inputs that are used, and note what they are."""
     block = segment.block
     assert block is not None
-    block.drop_unused()
-    used = {id(x) for v in block.walk() for x in v.args} | {id(x) for x in block.outputs}
-    used |= {id(x) for v in block.walk() for b in v.blocks for x in b.outputs}
     slots = {id(x): (leaf, k) for leaf, elements in segment.first.items() for k, x in enumerate(_words(elements))}
-    block.inputs = [x for x in block.inputs if id(x) in used and isinstance(x, Value)]
-    segment.reads = [slots[id(x)] for x in block.inputs]
+    segment.reads = [slots[i] for i in _keep_used_inputs(block)]
+
+
+EXPENSIVE = frozenset(
+    "div rem sqrt rsqrt cbrt pow exp exp2 expm1 log log1p sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh "
+    "atanh logistic erf erfc erf_inv threefry2x32 loop while".split()
+)
+"""Operations that are worth a register to be done once instead of at every step."""
+
+
+def _hoist(segment: Segment, changing: set[Slot]) -> None:
+    """Move what no step changes, and is expensive, out of the loop over steps.
+
+    A division by such a number becomes a product with its inverse, which is one rounding less exact.
+    """
+    block = segment.block
+    assert block is not None
+    fixed = {id(x) for x, slot in zip(block.inputs, segment.reads, strict=True) if slot not in changing}
+    worth: set[int] = set()
+    values: list[Value] = []
+    replaced: dict[int, Element] = {}
+    before = Block()
+
+    def is_fixed(x: Element) -> bool:
+        return not isinstance(x, Value) or id(x) in fixed
+
+    for value in block.values:
+        value.args = tuple(replaced.get(id(x), x) for x in value.args)
+        if value.op == "div" and value.dtype.kind == "f" and is_fixed(value.args[1]) and not is_fixed(value.args[0]):
+            a, b = value.args
+            inverse = Value("div", (constant(1, value.dtype), b), value.dtype)
+            fixed.add(id(inverse))
+            worth.add(id(inverse))
+            values += [inverse, product := Value("mul", (a, inverse), value.dtype)]
+            replaced[id(value)] = product
+            continue
+        values.append(value)
+        if value.op != "mark" and not value.blocks and all(map(is_fixed, value.args)):
+            fixed.add(id(value))
+            if value.op in EXPENSIVE or any(id(x) in worth for x in value.args):
+                worth.add(id(value))
+    block.values = values
+    _replace(block, replaced)
+    needed = {id(x) for v in block.walk() if id(v) not in worth for x in v.args}
+    needed |= {id(x) for b in _blocks(block) for x in b.outputs}
+    moved = [v for v in values if id(v) in worth and id(v) in needed]
+    if not moved:
+        return
+    # What is cheap stays in both blocks: it depends on nothing that has moved.
+    before.values = [v for v in values if id(v) in fixed]
+    before.outputs = list(moved)
+    slots = dict(zip(map(id, block.inputs), segment.reads, strict=True))
+    before.inputs = list(block.inputs)
+    segment.constants = [slots[i] for i in _keep_used_inputs(before)]
+    stand_ins = {id(v): Value("input", (), v.dtype) for v in moved}
+    block.values = [v for v in values if id(v) not in worth]
+    _replace(block, stand_ins)
+    segment.reads = [slots[i] for i in _keep_used_inputs(block)]
+    block.inputs += stand_ins.values()
+    segment.before = before
+
+
+def _replace(block: Block, new: dict[int, Any]) -> None:
+    for value in block.walk():
+        value.args = tuple(new.get(id(x), x) for x in value.args)
+    for inner in _blocks(block):
+        inner.outputs = [new.get(id(x), x) for x in inner.outputs]
+
+
+def _keep_used_inputs(block: Block) -> list[int]:
+    """Drop what nothing needs, inputs as well; return the ids of the inputs that stay."""
+    block.drop_unused()
+    used = {id(x) for v in block.walk() for x in v.args} | {id(x) for b in _blocks(block) for x in b.outputs}
+    block.inputs = [x for x in block.inputs if id(x) in used]
+    return [id(x) for x in block.inputs]
+
+
+def _blocks(block: Block) -> list[Block]:
+    return [block, *(b for v in block.walk() for b in v.blocks)]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.engine.ir import Block, Element, Value
+from crazysim.engine.ir import Block, Element, Value, is_constant
 from crazysim.engine.lower import NoRuleError
 
 TYPES = {"float32": "f32", "float64": "f64", "int32": "i32", "uint32": "u32", "bool": "b1"}
@@ -98,6 +98,9 @@ class Writer:
         if value.op == "round":
             even = int(dict(value.params)["rounding_method"]) == 1
             return f"{'round_even' if even else 'round_away'}({args[0]})"
+        limit = _limit(value)
+        if limit is not None:
+            return f"{limit}({args[1]}, {args[2]})"
         if value.op not in OPERATIONS:
             raise NoRuleError(f"operation {value.op!r} has no source")
         return f"{value.op}_({', '.join(args)})"
@@ -145,6 +148,20 @@ class Writer:
             self.line(f"const auto {f} = {out if mask is None else f'select_n_({mask}, {name}_{k}, {out})'};", depth)
         for k, f in enumerate(fresh):
             self.line(f"{name}_{k} = {f};", depth)
+
+
+def _limit(value: Value) -> str | None:
+    """Return what a selection is called that keeps its first case above or below its second: ``x < low ? low : x``."""
+    if value.op != "select_n" or value.dtype.kind != "f" or not isinstance(value.args[0], Value):
+        return None
+    test, x, limit = value.args
+    if test.op not in ("lt", "gt") or test.args[0] is not x or not _same(test.args[1], limit):
+        return None
+    return "at_least" if test.op == "lt" else "at_most"
+
+
+def _same(a: Element, b: Element) -> bool:
+    return a is b or (is_constant(a) and is_constant(b) and literal(a) == literal(b))
 
 
 def type_name(dtype: Any) -> str:

@@ -54,22 +54,22 @@ def rk4(data: SimData, deriv_fn: DerivFn) -> SimData:
     dt = 1 / data.core.freq
     k1 = deriv_fn(data)
     r1 = dt * k1.ang_vel
-    k2 = deriv_fn(advance(data, k1, dt / 2, r1 / 2))
+    k2 = deriv_fn(advance(data, k1, dt / 2, r1 / 2, normalize=False))
     r2 = dt * k2.ang_vel
-    k3 = deriv_fn(advance(data, k2, dt / 2, r2 / 2 + rotation.cross(r1, r2) / 8))
+    k3 = deriv_fn(advance(data, k2, dt / 2, r2 / 2 + rotation.cross(r1, r2) / 8, normalize=False))
     r3 = dt * k3.ang_vel
-    k4 = deriv_fn(advance(data, k3, dt, r3))
+    k4 = deriv_fn(advance(data, k3, dt, r3, normalize=False))
     r4 = dt * k4.ang_vel
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
     return advance(data, mean, dt, dt * mean.ang_vel + rotation.cross(r1, r4) / 12)
 
 
-def advance(data: SimData, deriv: SimStateDeriv, dt: float, rotvec: Array) -> SimData:
+def advance(data: SimData, deriv: SimStateDeriv, dt: float, rotvec: Array, normalize: bool = True) -> SimData:
     """Return the data ``dt`` seconds along a derivative, the attitude turned by a body rotation vector, rad."""
     s = data.states
     states = s.replace(
         pos=s.pos + dt * deriv.vel,
-        quat=rotation.turn(s.quat, rotvec),
+        quat=rotation.turn(s.quat, rotvec, normalize),
         vel=s.vel + dt * deriv.acc,
         ang_vel=s.ang_vel + dt * deriv.ang_acc,
         rotor_vel=s.rotor_vel + dt * deriv.rotor_acc,

@@ -186,8 +186,8 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
     # A drone that clip_floor_pos has stopped rests on its feet: it neither slides nor turns until it is lifted.
     held = (s.pos[..., 2:] == FLOOR) & (s.vel[..., 2:] == 0) & (acc[..., 2:] <= 0)
     return SimStateDeriv(
-        vel=jnp.where(held, 0.0, vel),
-        ang_vel=jnp.where(held, 0.0, s.ang_vel),
+        vel=vel,
+        ang_vel=s.ang_vel,
         acc=jnp.where(held, 0.0, acc),
         ang_acc=jnp.where(held, 0.0, ang_acc),
         rotor_acc=rotor_acc,
@@ -196,13 +196,14 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
 
 @_built_in("drone")
 def clip_floor_pos(data: SimData) -> SimData:
-    """Stop drones at the floor: one that has fallen below it is set on it, at rest."""
+    """Stop drones at the floor: one that is below it, or on it and not rising, is set on it, at rest."""
     s = data.states
-    below = s.pos[..., 2:] < FLOOR
+    height, climb = s.pos[..., 2:], s.vel[..., 2:]
+    stopped = (height < FLOOR) | ((height == FLOOR) & (climb <= 0))
     states = s.replace(
-        pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(s.pos[..., 2:], FLOOR)], axis=-1),
-        vel=jnp.where(below, 0.0, s.vel),
-        ang_vel=jnp.where(below, 0.0, s.ang_vel),
+        pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(height, FLOOR)], axis=-1),
+        vel=jnp.where(stopped, 0.0, s.vel),
+        ang_vel=jnp.where(stopped, 0.0, s.ang_vel),
     )
     return data.replace(states=states)
 

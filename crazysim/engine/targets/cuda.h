@@ -3,6 +3,13 @@
 #define RSQRTF(x) rsqrtf(x)
 #define BITS_F32(x) __uint_as_float(x)
 #define BITS_U32(x) __float_as_uint(x)
+#if __CUDA_ARCH__ >= 800
+// One instruction each.
+#define F32_LIMITS \
+  FN f32 max_(f32 a, f32 b) { f32 r; asm("max.NaN.f32 %0, %1, %2;" : "=f"(r) : "f"(a), "f"(b)); return r; } \
+  FN f32 min_(f32 a, f32 b) { f32 r; asm("min.NaN.f32 %0, %1, %2;" : "=f"(r) : "f"(a), "f"(b)); return r; } \
+  FN f32 at_least(f32 x, f32 low) { return max_(x, low); } FN f32 at_most(f32 x, f32 high) { return min_(x, high); }
+#endif
 #include "scalar.h"
 
 FN b1 any(b1 x) { return x; }

@@ -85,6 +85,8 @@ template <class C, class A, class B, class = std::enable_if_t<any_lanes<C, A, B>
 FN auto select_n_(C which, A no, B yes) { return pick(lift(which), lift(no), lift(yes)); }
 LANES2(A, B) auto max_(A a, B b) { return select_n_(or_(gt_(a, b), ne_(a, a)), b, a); }
 LANES2(A, B) auto min_(A a, B b) { return select_n_(or_(lt_(a, b), ne_(a, a)), b, a); }
+LANES2(A, B) auto at_least(A x, B low) { return select_n_(lt_(x, low), x, low); }
+LANES2(A, B) auto at_most(A x, B high) { return select_n_(gt_(x, high), x, high); }
 template <class A, class B, class C, class = std::enable_if_t<any_lanes<A, B, C>::value>>
 FN auto clamp_(A low, B x, C high) { return min_(max_(x, low), high); }
 

@@ -62,14 +62,22 @@ FN f64 erf_inv_(f64 x) {
   return x < 0 ? -y : x > 0 ? y : x;
 }
 
-#define ARITHMETIC(T) \
+#define COMMON(T) \
   FN T add_(T a, T b) { return a + b; } FN T sub_(T a, T b) { return a - b; } FN T mul_(T a, T b) { return a * b; } \
   FN b1 lt_(T a, T b) { return a < b; } FN b1 le_(T a, T b) { return a <= b; } FN b1 gt_(T a, T b) { return a > b; } \
   FN b1 ge_(T a, T b) { return a >= b; } FN b1 eq_(T a, T b) { return a == b; } FN b1 ne_(T a, T b) { return a != b; } \
-  FN T max_(T a, T b) { return (a > b || a != a) ? a : b; } FN T min_(T a, T b) { return (a < b || a != a) ? a : b; } \
-  FN T clamp_(T low, T x, T high) { return min_(max_(x, low), high); } \
   FN T select_n_(b1 which, T no, T yes) { return which ? yes : no; }
-ARITHMETIC(f32) ARITHMETIC(f64) ARITHMETIC(i32) ARITHMETIC(u32)
+#define LIMITS(T) /* NaN comes through */ \
+  FN T at_least(T x, T low) { return x < low ? low : x; } FN T at_most(T x, T high) { return x > high ? high : x; } \
+  FN T max_(T a, T b) { return (a > b || a != a) ? a : b; } FN T min_(T a, T b) { return (a < b || a != a) ? a : b; }
+#ifdef F32_LIMITS
+F32_LIMITS
+#else
+LIMITS(f32)
+#endif
+LIMITS(f64) LIMITS(i32) LIMITS(u32)
+template <class T> FN T clamp_(T low, T x, T high) { return min_(max_(x, low), high); }
+COMMON(f32) COMMON(f64) COMMON(i32) COMMON(u32)
 FN b1 select_n_(b1 which, b1 no, b1 yes) { return which ? yes : no; }
 FN b1 eq_(b1 a, b1 b) { return a == b; }
 FN b1 ne_(b1 a, b1 b) { return a != b; }
