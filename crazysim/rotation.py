@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -39,11 +40,23 @@ def matvec(matrix: Array, vector: Array) -> Array:
     return jnp.stack(rows, axis=-1)
 
 
+@jax.custom_jvp
+def safe_sqrt(x: Array) -> Array:
+    """Return the square root of what is positive, else zero, with gradient zero there; NaN comes through. (...)"""
+    return jnp.sqrt(jnp.maximum(x, 0.0))
+
+
+@safe_sqrt.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (x_dot,) = primals, tangents
+    root = safe_sqrt(x)
+    positive = ~(x <= 0)
+    return root, jnp.where(positive, 0.5 / jnp.where(positive, root, 1.0), 0.0) * x_dot
+
+
 def safe_norm(x: Array) -> Array:
     """Return the Euclidean norm over the last axis, with gradient zero at zero. (..., 1)"""
-    squared = dot(x, x)
-    is_zero = squared == 0
-    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squared)))
+    return safe_sqrt(dot(x, x))
 
 
 def safe_normalize(x: Array, fallback: Array) -> Array:

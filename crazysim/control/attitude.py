@@ -115,8 +115,7 @@ def attitude2force_torque(
     n_rotors = p.mixing_matrix.shape[-1]
     newton_per_pwm = p.thrust_max / p.pwm_max
     pwm = thrust / (n_rotors * newton_per_pwm) + matvec(p.torque_allocation, torque_pwm)
-    pwm = jnp.where(thrust <= 0, 0.0, rotation.safe_clip(pwm, p.pwm_min, p.pwm_max))  # NaN must come through
-    thrusts = pwm * newton_per_pwm
+    thrusts = rotation.safe_clip(pwm, p.pwm_min, p.pwm_max) * jnp.where(thrust <= 0, 0.0, newton_per_pwm)
     torque = p.arms * matvec(p.mixing_matrix, thrusts)
     return jnp.concatenate([jnp.sum(thrusts, axis=-1, keepdims=True), torque], axis=-1), r_int_error
 

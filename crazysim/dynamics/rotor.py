@@ -7,7 +7,7 @@ import math
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.rotation import matvec
+from crazysim.rotation import matvec, safe_sqrt
 
 RPM_TO_RAD_S = 2 * math.pi / 60
 
@@ -111,7 +111,4 @@ def rotor_vel_of_thrust(thrust: Array, rpm2thrust: Array) -> Array:
         Rotor speeds, rpm. (..., n_rotors)
     """
     k0, k1, k2 = rpm2thrust[..., 0], rpm2thrust[..., 1], rpm2thrust[..., 2]
-    discriminant = k1 * k1 - 4 * k2 * (k0 - thrust)
-    has_root = ~(discriminant <= 0)  # NaN must come through
-    root = jnp.where(has_root, jnp.sqrt(jnp.where(has_root, discriminant, 1.0)), 0.0)
-    return (root - k1) / (2 * k2)
+    return (safe_sqrt(k1 * k1 - 4 * k2 * k0 + 4 * k2 * thrust) - k1) / (2 * k2)

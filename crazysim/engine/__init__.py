@@ -1,5 +1,6 @@
 """How a step is executed."""
 
-from crazysim.engine.plain import build_reset, build_step
+from crazysim.engine.plain import build_reset
+from crazysim.engine.step import ENGINES, Step, explain
 
-__all__ = ["build_reset", "build_step"]
+__all__ = ["ENGINES", "Step", "build_reset", "explain"]

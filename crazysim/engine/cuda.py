@@ -27,6 +27,9 @@ TARGET = "__gpu$xla.gpu.ptx"
 OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false", "--device-as-default-execution-space")
 """Division and square root to 2 and 1 units in the last place, as XLA has them; no other shortcut."""
 
+BLOCKS_AT_ONCE = (8, 6)
+"""How many blocks of 64 threads are tried to fit: 128 or 168 registers for each thread."""
+
 DEFAULT_ARCHITECTURE = "compute_90"
 """What is compiled for where there is no GPU to ask."""
 
@@ -51,6 +54,7 @@ def call(kernel: Kernel, n_lanes: int, count: Array, inputs: Sequence[Array], ou
         inputs: What it reads.
         outputs: Shapes and types of what it writes.
     """
+    kernel = fitted(kernel) if architecture() is not DEFAULT_ARCHITECTURE else kernel
     n_blocks = -(-n_lanes // kernel.block)
     launch = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1, "block_x": kernel.block, "block_y": 1, "block_z": 1}
     run = jax.ffi.ffi_call(TARGET, list(outputs))
@@ -76,6 +80,20 @@ def architecture() -> str:
     except RuntimeError:
         return DEFAULT_ARCHITECTURE
     return f"compute_{str(capability).replace('.', '')}"
+
+
+@functools.cache
+def fitted(kernel: Kernel) -> Kernel:
+    """Return a kernel with as many blocks at once on a multiprocessor as its registers allow without spilling.
+
+    More blocks hide more latency, until registers that no longer fit cost more than that.
+    """
+    least = resources(kernel)
+    for n in BLOCKS_AT_ONCE:
+        candidate = kernel.with_blocks(n)
+        if resources(candidate).spilled <= least.spilled + 8:
+            return candidate
+    return kernel
 
 
 @functools.cache

@@ -14,33 +14,91 @@ from crazysim.engine import cuda, kernel, lanes, native
 from crazysim.engine.program import Program, is_key
 
 
+def missing(platform: str) -> str | None:
+    """Return what keeps kernels from running on a platform, or None."""
+    if platform == "gpu":
+        return None if cuda.nvrtc() else "NVRTC was not found, which comes with pip install 'jax[cuda13]' or 'jax[cuda12]'"
+    if platform != "cpu":
+        return f"there are no kernels for {platform}"
+    return None if native.compiler() else "no C++ compiler was found (g++, clang++, or the variable CXX)"
+
+
 def build(program: Program, platform: str) -> Callable[[list[Any], int | Array], tuple[list[Any], Array]]:
-    """Return what ``lanes.steps`` is, in one kernel: leaves and a number of steps to written leaves and flags.
+    """Return what ``lanes.steps`` is, in kernels: leaves and a number of steps to written leaves and flags.
 
     Raises:
         NoRuleError: If the program has something that there is no source for.
     """
-    source = kernel.write(program, "cuda" if platform == "gpu" else "host")
+    target = "cuda" if platform == "gpu" else "host"
+    run = _one_kernel(program, target) if program.fused else _split(program, target)
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         """Run the kernel; its derivative is that of the same program on lanes."""
 
         @jax.custom_jvp
-        def run(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
-            return _call(program, source, leaves, count, platform)
+        def advance(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+            return run(leaves, count)
 
-        @run.defjvp
+        @advance.defjvp
         def _(primals: Any, tangents: Any) -> Any:
             (values, _), (slopes, _) = primals, tangents
             return jax.jvp(lambda x: lanes.steps(program, x, n_steps), (values,), (slopes,))
 
-        return run(leaves, jnp.asarray(n_steps, jnp.int32))
+        return advance(leaves, jnp.asarray(n_steps, jnp.int32))
 
     return steps
 
 
+def describe(program: Program, platform: str) -> str:
+    """Return what a kernel takes, in a line."""
+    if platform != "gpu":
+        return f"kernel: compiled by {native.compiler()}"
+    source = cuda.fitted(kernel.write(program, "cuda"))
+    used = cuda.resources(source)
+    return f"kernel: {source.block} threads a block, {used.registers} registers, {used.spilled} bytes spilled"
+
+
+def _one_kernel(program: Program, target: str) -> Callable[[list[Any], Array], tuple[list[Any], Array]]:
+    source = kernel.write(program, target)
+    return lambda leaves, count: _call(program, source, leaves, count, target)
+
+
+def _split(program: Program, target: str) -> Callable[[list[Any], Array], tuple[list[Any], Array]]:
+    """Return the same for a step that some stage takes apart: a kernel for what is between such stages."""
+    parts = [program.part(k) for k in range(len(program.segments))]
+    kernels = [kernel.write(p, target) if p.fused else None for p in parts]
+    written = program.written
+
+    def turn(leaves: list[Any]) -> list[Any]:
+        leaves = list(leaves)
+        for part, source in zip(parts, kernels, strict=True):
+            if source is not None:
+                out, _ = _call(part, source, leaves, jnp.asarray(1, jnp.int32), target)
+            else:
+                out, _ = lanes.steps(part, leaves, 1)
+            for i, value in zip(part.written, out, strict=True):
+                leaves[i] = value
+        return leaves
+
+    def run(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+        def body(_: Any, values: list[Any]) -> list[Any]:
+            full = list(leaves)
+            for i, value in zip(written, values, strict=True):
+                full[i] = value
+            after = turn(full)
+            return [after[i] for i in written]
+
+        out = jax.lax.fori_loop(0, count, body, [leaves[i] for i in written])
+        full = list(leaves)
+        for i, value in zip(written, out, strict=True):
+            full[i] = value
+        return out, lanes.finite(program, lanes.Lanes(program, full))
+
+    return run
+
+
 def _call(
-    program: Program, source: kernel.Kernel, leaves: list[Any], count: Array, platform: str
+    program: Program, source: kernel.Kernel, leaves: list[Any], count: Array, target: str
 ) -> tuple[list[Any], Array]:
     drone = next(i for i, scope in enumerate(program.axes.scopes) if scope == "drone")
     n_worlds, n_drones = leaves[drone].shape[:2]
@@ -48,7 +106,7 @@ def _call(
     inputs = [_bare(leaves[i]) for i in source.inputs]
     outputs = [jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in source.outputs]
     flags = jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)
-    call = cuda.call if platform == "gpu" else native.call
+    call = cuda.call if target == "cuda" else native.call
     *written, finite = call(source, n_lanes, count.reshape(1), inputs, [*outputs, flags])
     return written, jnp.all(finite, axis=1, keepdims=True)
 

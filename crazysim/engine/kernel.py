@@ -14,7 +14,9 @@ import numpy as np
 from crazysim.engine.program import Program, Segment, Slot, is_key
 from crazysim.engine.source import Writer, type_name
 
-BLOCK = 128
+UNBOUNDED = "1 /* blocks at least */"
+
+BLOCK = 64
 """Threads of a block on a GPU."""
 
 
@@ -32,6 +34,10 @@ class Kernel:
     """Drones of a world."""
     block: int = BLOCK
     """Threads of a block on a GPU: whole worlds."""
+
+    def with_blocks(self, n: int) -> Kernel:
+        """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
+        return dataclasses.replace(self, text=self.text.replace(UNBOUNDED, f"{n}"))
 
 
 def preamble(target: str) -> str:
@@ -67,7 +73,11 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
     slots.update(dict.fromkeys(whole))
 
     names = {slot: f"x{slot[0]}_{slot[1]}" for slot in slots}
+    late = _used_when_needed(segments, {*written, *(check.reads if check else [])})
     for slot in slots:
+        if slot in late:
+            names[slot] = _load(program, slot)
+            continue
         kind = type_name(_dtype(program, slot))
         access = _load(program, slot)
         changes = slot in set(written)
@@ -92,6 +102,19 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
     frame = {"cuda": _cuda, "host": _host}[target]
     text = preamble(target) + frame(pointers, body, n_drones, block) + epilogue(target)
     return Kernel(text, inputs, outputs, n_drones, block)
+
+
+def _used_when_needed(segments: Sequence[Segment], needed: set[Slot]) -> set[Slot]:
+    """Return the constants that only stages below the step rate use: they are loaded there, and take no register."""
+    late: set[Slot] = set()
+    for segment in segments:
+        block = segment.block
+        assert block is not None
+        now = {id(x) for v in block.values for x in v.args} | {id(x) for x in block.outputs}
+        late |= {slot for x, slot in zip(block.inputs, segment.reads, strict=False) if id(x) not in now}
+        needed |= {slot for x, slot in zip(block.inputs, segment.reads, strict=False) if id(x) in now}
+        needed |= set(segment.constants)
+    return late - needed
 
 
 def _of_drone(program: Program, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
@@ -146,7 +169,7 @@ def _cuda(pointers: Sequence[str], body: str, n_drones: int, block: int) -> str:
     arguments = ", ".join([*scalars, *pointers, "b1* __restrict__ finite"])
     return f"""
 #define STORE_WORLD(p, index, value) if (active && lane % {n_drones} == 0) p[index] = value;
-extern "C" __global__ void __launch_bounds__({block}) advance({arguments}) {{
+extern "C" __global__ void __launch_bounds__({block}, {UNBOUNDED}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0];
   const int thread = blockIdx.x * {block} + threadIdx.x;
   const bool active = thread < n_lanes;

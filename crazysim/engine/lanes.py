@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.extend import core
 
 from crazysim.engine import xla
 from crazysim.engine.program import Program, Segment, Slot, is_key
@@ -49,8 +50,7 @@ class Lanes:
         if leaf not in self.arrays:
             example = self.program.leaves[leaf]
             items = [self.lanes[leaf, k] for k in range(self.program.sizes(leaf))]
-            core = example.shape[2:]
-            array = jnp.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *core)
+            array = jnp.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *example.shape[2:])
             self.arrays[leaf] = array[:, :1] if self.program.axes.scopes[leaf] == "world" else array
         return self.arrays[leaf]
 
@@ -100,7 +100,7 @@ def advance(program: Program, lanes: Lanes, constants: Constants) -> None:
             case "world":
                 _run_worlds(segment, lanes)
             case "batch":
-                _run_batch(program, segment, lanes)
+                _run_batch(segment, lanes)
 
 
 def _run_drones(segment: Segment, lanes: Lanes, constants: list[Any]) -> None:
@@ -139,14 +139,11 @@ def _run_worlds(segment: Segment, lanes: Lanes) -> None:
         lanes.set(slot, jnp.stack(rows, axis=-1).reshape(lanes.shape))
 
 
-def _run_batch(program: Program, segment: Segment, lanes: Lanes) -> None:
-    (stage,) = segment.stages
-    arrays = [lanes.array(i) if i in segment.used else lanes.arrays.get(i, program.leaves[i]) for i in range(len(program.leaves))]
-    data = program.axes.treedef.unflatten(arrays)
-    with jax.named_scope(stage.__name__):
-        after = jax.tree.leaves(stage(data))
-    for i in segment.written:
-        lanes.set_array(i, after[i])
+def _run_batch(segment: Segment, lanes: Lanes) -> None:
+    assert segment.fn is not None
+    after = core.jaxpr_as_fun(segment.fn)(*(lanes.array(i) for i in segment.used))
+    for i, value in zip(segment.written, after, strict=True):
+        lanes.set_array(i, value)
 
 
 def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:

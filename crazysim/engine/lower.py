@@ -350,22 +350,22 @@ def _call(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("custom_jvp_call")
 def _custom_jvp(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """A call that brings a derivative of its own, which is kept beside it as a block."""
+    """A call that brings a derivative of its own, which is read when somebody asks for it."""
     body = r.inner()
-    inputs = [_inputs(body, x) for x in args]
-    body.block.outputs = _flat(body.read(closed(eqn.params["call_jaxpr"]), inputs))
+    body.block.outputs = _flat(body.read(closed(eqn.params["call_jaxpr"]), [_inputs(body, x) for x in args]))
 
-    single = core.jaxpr_as_fun(_jaxpr_of(eqn))
-    avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+    @functools.cache
+    def slope() -> Block:
+        """Return the program from operands and their changes to the changes of the results."""
+        single = core.jaxpr_as_fun(_jaxpr_of(eqn))
+        avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+        traced = jax.make_jaxpr(lambda x, dx: jax.jvp(single, x, dx)[1])(avals, avals)
+        reader = Reader(Block())
+        inputs = [_inputs(reader, x) for x in (*args, *args)]
+        reader.block.outputs = _flat(reader.read(traced, inputs))
+        return reader.block
 
-    def tangents(primals: Any, tangents: Any) -> Any:
-        return jax.jvp(lambda *a: tuple(single(*a)), tuple(primals), tuple(tangents))[1]
-
-    traced = jax.make_jaxpr(tangents)(avals, avals)
-    slope = r.inner()
-    both = [_inputs(slope, x) for x in (*args, *args)]
-    slope.block.outputs = _flat(slope.read(traced, both))
-    return _results(r, "custom_jvp", eqn, _flat(args), (body.block, slope.block))
+    return _results(r, "custom_jvp", eqn, _flat(args), (body.block,), (("slope", slope),))
 
 
 @rule("custom_linear_solve")

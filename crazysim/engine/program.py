@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -46,6 +47,8 @@ class Segment:
     """Leaves that are written."""
     why: str = ""
     """Why there is no program."""
+    fn: core.ClosedJaxpr | None = None
+    """What runs then, from ``used`` to ``written``."""
     first: dict[int, Elements] = dataclasses.field(default_factory=dict)
     """Elements of the leaves it reads, as they come in."""
     now: dict[int, Elements] = dataclasses.field(default_factory=dict)
@@ -100,7 +103,13 @@ class Program:
     @property
     def read(self) -> list[int]:
         """Numbers of the leaves that are read."""
-        return sorted({i for s in self.segments for i in [*s.used, *(leaf for leaf, _ in s.reads)]})
+        return sorted({i for s in self.segments for i in [*s.used, *(leaf for leaf, _ in [*s.reads, *s.constants])]})
+
+    def part(self, k: int) -> Program:
+        """Return one segment as a program of its own."""
+        part = copy.copy(self)
+        part.segments, part.check = [self.segments[k]], None
+        return part
 
     def sizes(self, leaf: int, scope: StageScope = "drone") -> int:
         """Return how many numbers one drone (or world) has of a leaf; a key is two words."""
@@ -157,7 +166,7 @@ class Program:
     def _add_batch(self, stage: Stage, why: str) -> None:
         traced = _Traced(Stage(stage, "batch", name=stage.__name__), self.axes, self.leaves)
         self.segments.append(
-            Segment("batch", [stage], used=sorted({*traced.used, *traced.written}), written=traced.written, why=why)
+            Segment("batch", [stage], used=traced.used, written=traced.written, why=why, fn=traced.fn)
         )
 
     def _watch(self, watched: list[Any]) -> Segment:

@@ -123,7 +123,8 @@ def _when(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int, 
 
 
 def _custom_jvp(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int, Any]) -> list[Any]:
-    body, slope = value.blocks
+    (body,) = value.blocks
+    slope = dict(value.params)["slope"]
 
     @jax.custom_jvp
     def call(*args: Any) -> list[Any]:
@@ -132,7 +133,7 @@ def _custom_jvp(value: Value, args: list[Any], shape: tuple[int, ...], env: dict
     @call.defjvp
     def _(primals: Any, tangents: Any) -> Any:
         outs = call(*primals)
-        changes = run(slope, [*primals, *tangents], shape, env)
+        changes = run(slope(), [*primals, *tangents], shape)
         return outs, [_lanes(t, np.shape(o)) for t, o in zip(changes, outs, strict=True)]
 
     return call(*(jnp.asarray(x) for x in args))

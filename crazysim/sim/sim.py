@@ -18,8 +18,8 @@ from crazysim.control import Control
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.core import require_support
-from crazysim.engine import build_reset, build_step
-from crazysim.engine.plain import ResetFn, StepFn
+from crazysim.engine import Step, build_reset, explain
+from crazysim.engine.plain import ResetFn
 from crazysim.errors import ConfigError
 from crazysim.scene import build, contacts, mjx
 from crazysim.scene.draw import Marks
@@ -73,6 +73,7 @@ class Sim:
         rng_key: int | Array = 0,
         *,
         mesh: Mesh | None = None,
+        engine: str = "auto",
     ):
         """Build the scene's spec, the data and both pipelines; nothing of MuJoCo is allocated per world.
 
@@ -92,6 +93,8 @@ class Sim:
             xml_path: MJCF scene; None for floor, light and sky.
             rng_key: Seed, or a key.
             mesh: Devices to spread the worlds over, from ``crazysim.sim.sharding.world_mesh``.
+            engine: How a step is executed: ``"plain"``, ``"lanes"`` or ``"fused"``; ``"auto"`` takes the fastest that
+                can run the step pipeline here. ``explain`` tells which that is.
 
         Raises:
             ValueError: Any argument that cannot be, with what came and what was needed.
@@ -113,6 +116,7 @@ class Sim:
         self.drone = self.airframe.name
         self.device = find_device(device)
         self.mesh = mesh
+        self.engine = engine
         asked = {
             Control.state: state_freq,
             Control.attitude: attitude_freq,
@@ -126,6 +130,7 @@ class Sim:
         self.viewer: Viewer | None = None
         self.spec = build.build_spec(xml_path, self.airframe, self.n_drones, self.freq, self.max_geom_pairs)
         self._seed = as_key(rng_key)
+        self._counts: dict[int, Array] = {}
         self._compile_scene()
         self.build_data()
         self.build_default_data()
@@ -232,7 +237,17 @@ class Sim:
     def step(self, n_steps: int = 1) -> None:
         """Advance every world by a number of physics steps; any number uses the same compilation."""
         n_steps = positive("n_steps", n_steps)
-        self._advance(self._step(self.data, jnp.int32(n_steps)))
+        self._advance(self._step(self.data, self._count(n_steps)))
+
+    def _count(self, n_steps: int) -> Array:
+        """Return a number of steps where the step wants it; making a device's number anew costs more than a step."""
+        if n_steps not in self._counts:
+            self._counts[n_steps] = jnp.int32(n_steps)
+        return self._counts[n_steps]
+
+    def explain(self) -> str:
+        """Return in a few lines which engine runs the step, what it fuses, and what it cannot fuse and why."""
+        return explain(self._step, self.data)
 
     def reset(self, mask: Any = None) -> None:
         """Bring all worlds, or those of a mask, back to ``default_data``, and run the reset pipeline.
@@ -279,9 +294,9 @@ class Sim:
     def _command(self, data: SimData) -> None:
         self._data = data  # a command moves nothing: the scene stays as fresh as it was
 
-    def build_step_fn(self) -> StepFn:
+    def build_step_fn(self) -> Step:
         """Make the step pipeline as it is now take effect; return ``step(data, n_steps=1) -> data``, pure."""
-        self._step = build_step(self.step_pipeline, by_component=self.mesh is None)
+        self._step = Step(self.step_pipeline, self.engine, self.device.platform, self.mesh)
         return self._step
 
     def build_reset_fn(self) -> ResetFn:

@@ -20,7 +20,7 @@ from crazysim.control import (
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.pytree import map_batched, scopes, select_worlds
 from crazysim.sim.data import SimData, SimStateDeriv
-from crazysim.sim.integration import INTEGRATORS, Integrator
+from crazysim.sim.integration import INTEGRATORS, DerivFn, Integrator
 from crazysim.sim.pipeline import Pipeline
 from crazysim.sim.stage import Stage, StageScope
 
@@ -54,7 +54,9 @@ def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integr
     if not fitted_model and control != Control.rotor_vel:
         stages["force_torque_controller"] = force_torque_controller
     stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
-    deriv_fn = fitted_derivative if fitted_model else first_principles_derivative
+    deriv_fn: DerivFn = fitted_derivative if fitted_model else first_principles_derivative
+    if integrator != Integrator.euler:
+        deriv_fn = held_on_floor(deriv_fn)
     stages["integration"] = _built_in("drone")(partial(INTEGRATORS[integrator], deriv_fn=deriv_fn))
     stages["clip_floor_pos"] = clip_floor_pos
     stages["increment_steps"] = increment_steps
@@ -183,15 +185,22 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
     vel, acc, ang_acc, rotor_acc = dynamics(
         s.pos, s.quat, s.vel, s.ang_vel, cmd, s.rotor_vel, s.force, s.torque, params=data.params
     )
-    # A drone that clip_floor_pos has stopped rests on its feet: it neither slides nor turns until it is lifted.
-    held = (s.pos[..., 2:] == FLOOR) & (s.vel[..., 2:] == 0) & (acc[..., 2:] <= 0)
-    return SimStateDeriv(
-        vel=vel,
-        ang_vel=s.ang_vel,
-        acc=jnp.where(held, 0.0, acc),
-        ang_acc=jnp.where(held, 0.0, ang_acc),
-        rotor_acc=rotor_acc,
-    )
+    return SimStateDeriv(vel=vel, ang_vel=s.ang_vel, acc=acc, ang_acc=ang_acc, rotor_acc=rotor_acc)
+
+
+def held_on_floor(deriv_fn: DerivFn) -> DerivFn:
+    """Return a derivative in which a drone that stands on the floor and does not lift off neither slides nor turns.
+
+    Needed where positions move with velocities of the same step. Explicit Euler moves them with those of the last,
+    which ``clip_floor_pos`` has set to zero.
+    """
+
+    def held(data: SimData) -> SimStateDeriv:
+        s, deriv = data.states, deriv_fn(data)
+        stands = (s.pos[..., 2:] == FLOOR) & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
+        return deriv.replace(acc=jnp.where(stands, 0.0, deriv.acc), ang_acc=jnp.where(stands, 0.0, deriv.ang_acc))
+
+    return held
 
 
 @_built_in("drone")
@@ -214,14 +223,13 @@ def increment_steps(data: SimData) -> SimData:
     return data.replace(core=data.core.replace(steps=data.core.steps + 1))
 
 
-def flag_nonfinite(data: SimData) -> SimData:
-    """Set the flag of every world in which a state or a command is NaN or infinite; only its reset clears it."""
+def finite(data: SimData) -> Array:
+    """Return in which worlds no state and no command is NaN or infinite. (n_worlds, 1)"""
     watched = (data.states, data.controls)
     pairs = zip(jax.tree.leaves(scopes(watched)), jax.tree.leaves(watched), strict=True)
     leaves = [x for scope, x in pairs if scope == "drone"]
-    finite = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in leaves])
-    nonfinite = data.core.nonfinite | ~jnp.all(finite, axis=0)[:, None]
-    return data.replace(core=data.core.replace(nonfinite=nonfinite))
+    each = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in leaves])
+    return jnp.all(each, axis=0)[:, None]
 
 
 def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:

@@ -88,10 +88,9 @@ def test_one_state_can_be_stepped_twice(sim):
 def test_nothing_is_donated_in_the_compiled_programs(sim):
     """On CPU a donated buffer may happen to survive, so the programs themselves are looked at."""
     step, reset = sim.build_step_fn(), sim.build_reset_fn()
-    dynamic, unrolled = step.jitted
     programs = [
-        dynamic.lower(sim.data, jnp.int32(1)),
-        unrolled.lower(sim.data, n_steps=2),
+        step.lower(sim.data, jnp.int32(1)),
+        step.lower(sim.data, 2),
         reset.lower(sim.data, sim.default_data, jnp.ones(2, bool)),
     ]
     for program in programs:

@@ -1,0 +1,276 @@
+"""The step of a simulation: a pipeline, run by the engine that was asked for or by the fastest that can."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.sharding import Mesh, PartitionSpec
+
+from crazysim.engine import fused, lanes, plain
+from crazysim.engine.lower import NoRuleError
+from crazysim.engine.program import Program, Segment
+from crazysim.errors import ConfigError
+from crazysim.pytree import check_axes, scopes
+from crazysim.sim.data import SimData
+from crazysim.sim.pipeline import Pipeline
+from crazysim.sim.sharding import WORLD_AXIS
+from crazysim.sim.stage import as_stages
+
+ENGINES = ("auto", "plain", "lanes", "fused")
+"""What ``engine=`` may be."""
+
+Steps = Callable[[list[Any], int | Array], tuple[list[Any], Array]]
+"""Leaves and a number of steps to the written leaves and which worlds are finite."""
+
+
+class Plan(NamedTuple):
+    """How data of one structure is stepped."""
+
+    engine: str
+    """Engine that runs."""
+    why: str
+    """Why it is not a faster one."""
+    program: Program | None
+    """What it runs; None for ``plain``."""
+    read: tuple[int, ...]
+    """Leaves that go in."""
+    written: tuple[int, ...]
+    """Leaves that come out."""
+    flags: tuple[int, int]
+    """Leaves of the two flags: that a world is not finite, that the scene is fresh."""
+    dynamic: Callable[..., Any]
+    """The compiled step, for a number of steps that is an array."""
+    static: Callable[..., Any]
+    """The same for a number of steps that is known, which can be differentiated."""
+
+
+class Step:
+    """``step(data, n_steps=1) -> data``, pure: usable inside jit, vmap, grad and scan.
+
+    ``n_steps`` as an array: one compilation serves every number. As a Python number: the loop can be differentiated
+    in reverse.
+    """
+
+    def __init__(self, pipeline: Pipeline, engine: str = "auto", platform: str = "cpu", mesh: Mesh | None = None):
+        """Take the stages as they are now.
+
+        Args:
+            pipeline: The stages.
+            engine: One of ``ENGINES``.
+            platform: Where it runs, ``"cpu"`` or ``"gpu"``.
+            mesh: Devices that the worlds are spread over.
+
+        Raises:
+            ConfigError: If there is no such engine, or it cannot run here.
+        """
+        if engine not in ENGINES:
+            raise ConfigError(f"engine {engine!r} does not exist; choose one of {', '.join(ENGINES)}")
+        if engine == "fused" and (missing := fused.missing(platform)):
+            raise ConfigError(f"engine 'fused' cannot run here: {missing}. Use engine='lanes', or 'auto'.")
+        self.engine, self.platform, self.mesh = engine, platform, mesh
+        self.stages = as_stages(pipeline)
+        self._plans: dict[Any, Plan] = {}
+        self._zeros = _Zeros()
+
+    def __call__(self, data: SimData, n_steps: int | Array = 1) -> SimData:
+        """Return the data some steps later."""
+        leaves, treedef = jax.tree.flatten(data)
+        plan = self._plan(data, leaves, treedef)
+        step = plan.static if isinstance(n_steps, int) else plan.dynamic
+        out = step([leaves[i] for i in plan.read], leaves[plan.flags[0]], n_steps)
+        for i, value in zip((*plan.written, *plan.flags), out, strict=True):
+            leaves[i] = value
+        return treedef.unflatten(leaves)
+
+    def plan(self, data: SimData) -> Plan:
+        """Return how this data is stepped."""
+        leaves, treedef = jax.tree.flatten(data)
+        return self._plan(data, leaves, treedef)
+
+    def lower(self, data: SimData, n_steps: int | Array = 1) -> Any:
+        """Return the step lowered for this data, as ``jax.jit(...).lower`` does: to look at, or to compile ahead."""
+        plan, leaves = self.plan(data), jax.tree.leaves(data)
+        step = plan.static if isinstance(n_steps, int) else plan.dynamic
+        return step.lower([leaves[i] for i in plan.read], leaves[plan.flags[0]], n_steps)
+
+    def _cache_size(self) -> int:
+        """Return how many compilations there are; the tests of law 6 count them."""
+        plans = self._plans.values()
+        return sum(p.dynamic._cache_size() + p.static._cache_size() for p in plans)  # type: ignore[attr-defined]
+
+    def _plan(self, data: SimData, leaves: list[Any], treedef: Any) -> Plan:
+        zeros = self._zeros(data, leaves)
+        key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros)
+        plan = self._plans.get(key)
+        if plan is None:
+            self._check(data)
+            check_axes(data, data.core.n_worlds, data.core.n_drones)
+            plan = self._plans[key] = self._make_plan(data, zeros)
+        return plan
+
+    def _check(self, data: SimData) -> None:
+        pos = data.states.pos
+        if self.mesh is None and not isinstance(pos, jax.core.Tracer) and len(pos.sharding.device_set) > 1:
+            raise ConfigError(
+                f"the data is spread over {len(pos.sharding.device_set)} devices, but the step was built for one; "
+                f"build the simulation with Sim(mesh=world_mesh(devices)), or call sim.shard(mesh)"
+            )
+
+    def _make_plan(self, data: SimData, zeros: tuple[tuple[int, frozenset[int]], ...]) -> Plan:
+        names = {id(x): i for i, x in enumerate(jax.tree.leaves(data))}
+        flags = names[id(data.core.nonfinite)], names[id(data.core.mjx_synced)]
+        if self.engine == "plain":
+            return self._plain(data, flags, "it was asked for")
+        undeclared = [s.__name__ for s in self.stages if s.scope == "batch"]
+        if self.mesh is not None and undeclared:
+            return self._plain(data, flags, f"with a mesh every stage must be declared, and {undeclared[0]!r} is not")
+        program = Program(self.stages, data, dict(zeros), _watched)
+        split = [s for s in program.segments if s.block is None]
+        if self.mesh is not None and split:
+            return self._plain(data, flags, f"with a mesh every stage must be fused, and {_unfused(split[0])}")
+        engine, why, run = "lanes", "it was asked for", functools.partial(lanes.steps, program)
+        if self.engine in ("auto", "fused"):
+            why = fused.missing(self.platform) or ""
+            try:
+                if not why:
+                    engine, run = "fused", fused.build(program, self.platform)
+            except NoRuleError as error:
+                why = str(error)
+                if self.engine == "fused":
+                    raise ConfigError(f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'.") from None
+        return self._wrap(engine, why, program, tuple(program.read), tuple(program.written), flags, run, len(names))
+
+    def _plain(self, data: SimData, flags: tuple[int, int], why: str) -> Plan:
+        run, written = plain.build(self.stages, data, by_component=self.mesh is None)
+        everything = tuple(range(len(jax.tree.leaves(data))))
+        # XLA spreads what is plain over a mesh by itself.
+        return self._wrap("plain", why, None, everything, tuple(written), flags, run, len(everything), shard=False)
+
+    def _wrap(
+        self,
+        engine: str,
+        why: str,
+        program: Program | None,
+        read: tuple[int, ...],
+        written: tuple[int, ...],
+        flags: tuple[int, int],
+        run: Steps,
+        n_leaves: int,
+        shard: bool = True,
+    ) -> Plan:
+        read = tuple(sorted({*read, *written, *(_needed(program) if program else ())}))
+
+        def advance(values: list[Any], nonfinite: Array, n_steps: int | Array) -> list[Any]:
+            leaves: list[Any] = [None] * n_leaves
+            for i, value in zip(read, values, strict=True):
+                leaves[i] = value
+            out, fine = run(leaves, n_steps)
+            return [*out, nonfinite | ~fine, jnp.asarray(False)]
+
+        if self.mesh is None or not shard or program is None:
+            return Plan(engine, why, program, read, written, flags, *_jitted(advance))
+        split, whole = PartitionSpec(WORLD_AXIS), PartitionSpec()
+        axes = program.axes.scopes
+        specs = [split if axes[i] in ("drone", "world") else whole for i in range(n_leaves)]
+        outs = [*(specs[i] for i in written), split, whole]
+
+        def spread(values: list[Any], nonfinite: Array, n_steps: int | Array) -> list[Any]:
+            known = isinstance(n_steps, int)
+            count = [] if known else [n_steps]
+            local = jax.shard_map(
+                lambda values, nonfinite, *count: advance(values, nonfinite, *(count or [n_steps])),
+                mesh=self.mesh,
+                in_specs=([specs[i] for i in read], split, *[whole for _ in count]),
+                out_specs=outs,
+                check_vma=False,
+            )
+            return local(values, nonfinite, *count)
+
+        return Plan(engine, why, program, read, written, flags, *_jitted(spread))
+
+
+def _jitted(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return the function compiled for any number of steps, and for a number that is known."""
+    return jax.jit(advance), jax.jit(lambda values, flag, n: advance(values, flag, n), static_argnums=2)
+
+
+def _watched(data: SimData) -> list[Any]:
+    """Return the leaves that a NaN or infinity must not enter unseen: states and commands."""
+    return jax.tree.leaves((data.states, data.controls))
+
+
+def _needed(program: Program) -> list[int]:
+    """Return the leaves that are watched, and one by which the number of worlds is told."""
+    check = program.check
+    watched = [leaf for leaf, _ in check.reads] if check is not None else []
+    return [*watched, next(i for i, scope in enumerate(program.axes.scopes) if scope == "drone")]
+
+
+class _Zeros:
+    """Which elements of shared parameters are zero: an inertia without products, a force without a component.
+
+    They are looked at once for each array. Inside someone's jit there is nothing to look at, and nothing is assumed.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: Sequence[Any] = ()
+        self._found: tuple[tuple[int, frozenset[int]], ...] = ()
+        self._shared: dict[Any, list[int]] = {}
+
+    def __call__(self, data: SimData, leaves: list[Any]) -> tuple[tuple[int, frozenset[int]], ...]:
+        places = self._places(data, leaves)
+        arrays = [leaves[i] for i in places]
+        if len(arrays) == len(self._arrays) and all(map(_is, arrays, self._arrays)):
+            return self._found
+        if any(isinstance(x, jax.core.Tracer) for x in arrays):
+            return ()
+        found = {i: frozenset(np.flatnonzero(np.asarray(x) == 0).tolist()) for i, x in zip(places, arrays, strict=True)}
+        self._arrays, self._found = arrays, tuple((i, zeros) for i, zeros in found.items() if zeros)
+        return self._found
+
+    def _places(self, data: SimData, leaves: list[Any]) -> list[int]:
+        key = tuple([x.ndim for x in jax.tree.leaves((data.params, data.controls))])
+        if key not in self._shared:
+            ids = {id(x) for x in jax.tree.leaves((data.params, data.controls))}
+            self._shared[key] = [
+                i
+                for i, (scope, x) in enumerate(zip(jax.tree.leaves(scopes(data)), leaves, strict=True))
+                if scope == "shared" and id(x) in ids and jnp.issubdtype(x.dtype, jnp.floating)
+            ]
+        return self._shared[key]
+
+
+def _is(a: Any, b: Any) -> bool:
+    return a is b
+
+
+def explain(step: Step, data: SimData) -> str:
+    """Return in a few lines which engine runs the step, what it fuses, and what it cannot fuse and why."""
+    plan = step.plan(data)
+    lines = [f"engine: {plan.engine}" + (f" ({plan.why})" if plan.why else "")]
+    if plan.program is None:
+        return "\n".join([*lines, f"stages: {', '.join(s.__name__ for s in step.stages)}"])
+    for segment in plan.program.segments:
+        names = ", ".join(s.__name__ for s in segment.stages)
+        if segment.block is None:
+            lines.append(f"splits the step: {_unfused(segment)}")
+        else:
+            lines.append(f"fused, for one {segment.scope}: {names} ({_operations(segment)} operations)")
+    if plan.engine == "fused":
+        lines.append(fused.describe(plan.program, step.platform))
+    return "\n".join(lines)
+
+
+def _unfused(segment: Segment) -> str:
+    return f"{segment.stages[0].__name__!r} is not fused: {segment.why}"
+
+
+def _operations(segment: Segment) -> int:
+    return sum(v.op not in ("mark", "item") for v in segment.block.walk()) if segment.block else 0
+
