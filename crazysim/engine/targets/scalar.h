@@ -21,11 +21,10 @@ FN f64 f64_infinity() { return f64(f32_infinity()); }
 #define UNARY(NAME, F32, F64) FN f32 NAME##_(f32 x) { return F32; } FN f64 NAME##_(f64 x) { return F64; }
 UNARY(acos, acosf(x), acos(x)) UNARY(acosh, acoshf(x), acosh(x)) UNARY(asin, asinf(x), asin(x))
 UNARY(asinh, asinhf(x), asinh(x)) UNARY(atan, atanf(x), atan(x)) UNARY(atanh, atanhf(x), atanh(x))
-UNARY(cbrt, cbrtf(x), cbrt(x)) UNARY(ceil, ceilf(x), ceil(x)) UNARY(cos, cosf(x), cos(x))
-UNARY(cosh, coshf(x), cosh(x)) UNARY(erf, erff(x), erf(x)) UNARY(erfc, erfcf(x), erfc(x))
+UNARY(cbrt, cbrtf(x), cbrt(x)) UNARY(ceil, ceilf(x), ceil(x)) UNARY(cosh, coshf(x), cosh(x)) UNARY(erf, erff(x), erf(x)) UNARY(erfc, erfcf(x), erfc(x))
 UNARY(exp, expf(x), exp(x)) UNARY(exp2, exp2f(x), exp2(x)) UNARY(expm1, expm1f(x), expm1(x))
 UNARY(floor, floorf(x), floor(x)) UNARY(log, logf(x), log(x)) UNARY(log1p, log1pf(x), log1p(x))
-UNARY(sin, sinf(x), sin(x)) UNARY(sinh, sinhf(x), sinh(x)) UNARY(sqrt, sqrtf(x), sqrt(x))
+UNARY(sinh, sinhf(x), sinh(x)) UNARY(sqrt, sqrtf(x), sqrt(x))
 UNARY(rsqrt, RSQRTF(x), 1.0 / sqrt(x)) UNARY(tan, tanf(x), tan(x)) UNARY(tanh, tanhf(x), tanh(x))
 UNARY(logistic, 1.0f / (1.0f + expf(-x)), 1.0 / (1.0 + exp(-x)))
 UNARY(round_even, rintf(x), rint(x)) UNARY(round_away, roundf(x), round(x))
@@ -37,6 +36,15 @@ FN i32 abs_(i32 x) { return x < 0 ? neg_(x) : x; }
 FN i32 sign_(i32 x) { return (x > 0) - (x < 0); }
 FN b1 is_finite_(f32 x) { return fabsf(x) < f32_infinity(); }
 FN b1 is_finite_(f64 x) { return fabs(x) < f64_infinity(); }
+
+FN f64 sin_(f64 x) { return sin(x); }
+FN f64 cos_(f64 x) { return cos(x); }
+#ifdef F32_SINE
+F32_SINE
+#else
+FN f32 sin_(f32 x) { return sinf(x); }
+FN f32 cos_(f32 x) { return cosf(x); }
+#endif
 
 // M. Giles, Approximating the erfinv function, GPU Computing Gems 2 (2010); one Newton step more for float64.
 FN f32 erf_inv_(f32 x) {
