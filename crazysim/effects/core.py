@@ -136,6 +136,11 @@ def require_rotors(sim: Simulation, effect: str) -> None:
         raise ConfigError(f"{effect} acts on single rotors, which only dynamics='first_principles' has")
 
 
+def controls_of(data: SimData) -> Any:
+    """Return the controls untyped: which of their fields are None follows from the command level and the model."""
+    return data.controls
+
+
 def as_setting(
     sim: Simulation,
     name: str,
