@@ -49,6 +49,7 @@ def install(
     influence: Influence | None = None,
     default: PyTree | None = None,
     before: str = "integration",
+    felt_first: bool = False,
 ) -> None:
     """Switch an effect on: put its record and its stage in place, and build the step.
 
@@ -62,6 +63,7 @@ def install(
         influence: What the dynamics feel; None if nothing.
         default: The record that resets return to; None for the record as it is now.
         before: The stage in front of which the effect's own stage goes.
+        felt_first: Whether the influence comes before those of the effects that are on already, else after.
 
     Raises:
         ConfigError: If the effect is on already, its name is taken, or the step has no built-in integration.
@@ -74,26 +76,48 @@ def install(
         )
     pipeline = dict(sim.step_pipeline)
     if influence is not None:
-        replace_fn(pipeline, _felt(pipeline.get("integration"), influence), "integration")
+        replace_fn(pipeline, _felt(pipeline.get("integration"), influence, felt_first), "integration")
     if stage is not None:
         insert_fn_before(pipeline, before, stage, name)
-    sim.data = sim.data.replace(plugins=sim.data.plugins | {name: record})
-    placed = sim.data.plugins[name] if default is None else default
-    sim.default_data = sim.default_data.replace(plugins=sim.default_data.plugins | {name: placed})
+    _put(sim, name, record if default is None else default)
+    sim.default_data = sim.default_data.replace(plugins=sim.default_data.plugins | {name: sim.data.plugins[name]})
+    _put(sim, name, record)
     sim.step_pipeline = pipeline
     sim.build_step_fn()
 
 
-def _felt(integration: Any, influence: Influence) -> Stage:
-    """Return an integration whose derivative is taken of what an influence makes of the data."""
+def _put(sim: Simulation, name: str, record: PyTree) -> None:
+    """Put a record into the data, and by that onto the simulation's devices."""
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {name: record})
+
+
+class Influenced:
+    """A time derivative of the data as effects change them, each after the other."""
+
+    def __init__(self, deriv_fn: Callable[..., Any], influences: tuple[Influence, ...]):
+        """Take the derivative without effects, and the influences in their order."""
+        self.deriv_fn, self.influences = deriv_fn, influences
+
+    def __call__(self, data: SimData) -> Any:
+        """Return the derivative."""
+        for influence in self.influences:
+            data = influence(data)
+        return self.deriv_fn(data)
+
+
+def _felt(integration: Any, influence: Influence, first: bool) -> Stage:
+    """Return an integration with one more influence on its derivative."""
     fn = getattr(integration, "fn", None)
     if not isinstance(fn, partial) or "deriv_fn" not in fn.keywords:
         raise ConfigError(
             f"effects act on the time derivative within the stage 'integration', which is {integration!r} here; add "
             f"effects before that stage is exchanged or taken out"
         )
-    deriv_fn = fn.keywords["deriv_fn"]
-    influenced = partial(fn, deriv_fn=lambda data: deriv_fn(influence(data)))
+    deriv_fn, present = fn.keywords["deriv_fn"], ()
+    if isinstance(deriv_fn, Influenced):
+        deriv_fn, present = deriv_fn.deriv_fn, deriv_fn.influences
+    influences = (influence, *present) if first else (*present, influence)
+    influenced = partial(fn, deriv_fn=Influenced(deriv_fn, influences))
     return Stage(influenced, integration.scope, integration.when, integration.batched, "integration")
 
 

@@ -32,8 +32,8 @@ class Motors(PyTree):
 def add(sim: Simulation, effectiveness: Any = 1.0, fail_step: Any = None, rate: Any = None) -> None:
     """Let rotors be weaker than the airframe's, and fail.
 
-    A rotor of effectiveness e gives e times the thrust and the drag torque of its speed. One that has failed gives none,
-    and runs down. What the controllers believe stays as it was.
+    A rotor of effectiveness e gives e times the thrust and the drag torque of its speed. One that has failed gives
+    none, and runs down. What the controllers believe stays as it was.
 
     Args:
         sim: The simulation, with first-principles dynamics.
