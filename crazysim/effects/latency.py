@@ -23,8 +23,7 @@ class Latency(PyTree):
     delay: Array = leaf("parameter", 1, (1,))
     """Steps from sending a command to its arrival. (1,)"""
     queue: Array = leaf("drone", 2)
-    """What was sent in the last steps, the command of step i in row i modulo the rows. (n_worlds, n_drones, max_delay +
-    1, k)"""
+    """What was sent in the last steps, that of step i in row i modulo n_rows. (n_worlds, n_drones, n_rows, k)"""
     arrived: Array = leaf("drone", 1)
     """Command that has arrived by now. (n_worlds, n_drones, k)"""
 

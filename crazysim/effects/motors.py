@@ -21,8 +21,7 @@ class Motors(PyTree):
     """What is left of every rotor."""
 
     effectiveness: Array = leaf("drone", 1)
-    """Fraction of its thrust and drag torque that a rotor still has, 1; zero has failed. (n_worlds, n_drones, n_rotors)
-    """
+    """Fraction of its thrust and drag torque that a rotor still has, 1. (n_worlds, n_drones, n_rotors)"""
     fail_step: Array | None = leaf("parameter", 1)
     """Step of the episode in which a rotor fails, negative for never; None if none is set. (n_rotors,)"""
     rate: Array | None = leaf("parameter", 1)

@@ -1,5 +1,10 @@
 """What holds for every effect: off it is not there, on it keeps to the laws, and all of them go together."""
 
+import ast
+import inspect
+import itertools
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -108,6 +113,57 @@ def test_float64_stays_float64(x64):
     assert all(x.dtype != jnp.float32 for x in jax.tree.leaves(sim.data.plugins))
     after = jax.eval_shape(lambda d: sim._step(d, 1), sim.data)
     assert signature(after) == signature(sim.data)
+
+
+STAGES = ("battery", "downwash", "latency", "motors", "wind", "integration")
+
+
+@pytest.fixture(scope="module")
+def flown(every):
+    """Data in flight, with everything at work."""
+    before = every.data
+    every.attitude_control(to_all(before, hover_command(before) + [0.1, -0.2, 0.0, 0.1]))
+    every.step(20)
+    data, every.data = every.data, before
+    return data
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_law_01_what_a_stage_does_to_all_it_does_to_one(every, flown, name):
+    """A stage on the data of one drone, or one world, gives what it gives on all data at that place."""
+    stage = every.step_pipeline[name]
+    for index in [(0, 0), (1, 1), (2, 0)]:
+
+        def at(scope, x, index=index):
+            if scope == "world":
+                return x[index[0], 0]
+            return x[index if stage.scope == "drone" else index[0]] if scope == "drone" else x
+
+        expected = jax.tree.map(at, scopes(flown), stage(flown))
+        one = stage.one(jax.tree.map(at, scopes(flown), flown))
+        for x, y in zip(*map(jax.tree.leaves, (expected, one)), strict=True):
+            if jnp.issubdtype(y.dtype, jnp.floating):
+                # float32: one drone's arithmetic is fused in another way
+                np.testing.assert_allclose(y, x, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_stages_are_straight_line(every, flown, name):
+    """Nothing of a stage loops or branches, or engines could not turn it into scalar code."""
+    jaxpr = str(jax.make_jaxpr(every.step_pipeline[name])(flown))
+    for word in ("while[", "scan[", "cond[", "sort[", "dot_general["):
+        assert word not in jaxpr, word
+
+
+def test_docstrings_tell_the_shapes(every):
+    sizes = {"n_worlds": 3, "n_drones": 2, "n_rotors": 4, "n_rows": 3, "k": 4}
+    for name, record in every.data.plugins.items():
+        body = ast.parse(inspect.getsource(type(record))).body[0].body
+        for field, text in itertools.pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(x := getattr(record, field.target.id), jax.Array):
+                words = re.search(r"\(([\w, ]*)\)$", text.value.value)[1].replace(" ", "").split(",")
+                shape = tuple(sizes.get(w) or int(w) for w in words if w)
+                assert shape == x.shape, f"{name}.{field.target.id}"
 
 
 def test_law_06_one_trace_whatever_is_reset_and_changed(every):
