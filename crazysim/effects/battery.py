@@ -14,7 +14,7 @@ from crazysim.sim.data import SimData
 from crazysim.sim.stage import stage
 
 NOMINAL_VOLTAGE = 3.7
-"""Nominal voltage of a lithium-polymer cell, V (IEC 61960-3 calls it so; every maker prints it on the cell)."""
+"""Nominal voltage of a lithium-polymer cell, V, as makers print it on the cell."""
 
 
 class Battery(PyTree):

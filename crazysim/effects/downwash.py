@@ -76,7 +76,7 @@ def jet(apart: Array, axis: Array, thrust: Array, diameter: Array, air_density: 
 
     From 2.5 drone diameters downwards the mean flow below a quadrotor is that of one round turbulent jet (Bauersfeld
     et al., Robotics meets Fluid Dynamics, RA-L 2025), whose speed falls as one over the distance and whose profile
-    keeps its shape (Pope 2000, equations 5.6 and 5.82):
+    keeps its shape (Pope 2000, sections 5.1 and 5.2):
 
         u = u_0 / (1 + s / (B d)) / (1 + (sqrt(2) - 1) (r / b)^2)^2,  b = S (s + B d)
 

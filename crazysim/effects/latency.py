@@ -54,10 +54,9 @@ def add(sim: Simulation, delay: Any, max_delay: int | None = None) -> None:
         install(sim, "latency", record, queue_up, late_rotor_vel, default, felt_first=True)
         return
     name = _controller(sim)
-    pipeline = dict(sim.step_pipeline)
-    replace_fn(pipeline, _late(as_stages(pipeline)[list(pipeline).index(name)]), name)
+    (controller,) = as_stages({name: sim.step_pipeline[name]})
     install(sim, "latency", record, queue_up, default=default, before=name)
-    replace_fn(sim.step_pipeline, pipeline[name], name)
+    replace_fn(sim.step_pipeline, _late(controller), name)
     sim.build_step_fn()
 
 
