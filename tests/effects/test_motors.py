@@ -1,0 +1,138 @@
+"""Motors: what weak and failed rotors push and twist, worked out from the airframe; when they fail."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import hover_rotor_state, with_states
+
+from crazysim import ConfigError, Sim
+from crazysim.effects import motors
+
+DT = 1 / 500
+
+
+def build(n_worlds=3, n_drones=2, **kwargs):
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", rng_key=1)
+    sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=hover_rotor_state(sim.data))
+    sim.build_default_data()
+    motors.add(sim, **kwargs)
+    sim.rotor_vel_control(np.asarray(sim.data.states.rotor_vel))
+    return sim
+
+
+def left(sim):
+    return np.asarray(sim.data.plugins["motors"].effectiveness)
+
+
+@pytest.fixture(scope="module")
+def weak():
+    effectiveness = np.ones((3, 2, 4))
+    effectiveness[0, 0] = 0.0  # all gone
+    effectiveness[0, 1, 2] = 0.0  # rotor 2 gone
+    effectiveness[1, 0] = 0.5
+    effectiveness[1, 1] = 0.9, 1.0, 0.7, 1.0
+    return build(effectiveness=effectiveness)
+
+
+def test_a_failed_rotor_gives_no_thrust_and_a_weak_one_its_fraction(weak):
+    """One step from hover: v = g dt (mean effectiveness - 1), and J w' = the torque of what is left."""
+    sim, before = weak, weak.data
+    sim.step()
+    states, sim.data = sim.data.states, before
+    e = left(sim)
+    np.testing.assert_allclose(states.vel[..., 2], 9.81 * DT * (e.mean(axis=-1) - 1), rtol=1e-5, atol=1e-7)  # float32
+    p, speed = before.params, np.asarray(before.states.rotor_vel, np.float64)
+    thrust = e * 0.0434 * 9.81 / 4
+    arm, J = 0.035355, np.array([25e-6, 28e-6, 49e-6])
+    y, x, spin = np.array([-1, -1, 1, 1]), np.array([1, -1, -1, 1]), np.array([-1, 1, -1, 1])
+    np.testing.assert_allclose(states.ang_vel[..., 0], DT / J[0] * (arm * y * thrust).sum(-1), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(states.ang_vel[..., 1], DT / J[1] * (-arm * x * thrust).sum(-1), rtol=1e-4, atol=1e-5)
+    # About z: the propellers' drag, and what rotors that run down give back to the body.
+    drag = e * (1.65886356219615e-9 * speed + 2.4693477924534137e-12 * speed**2)
+    slow_down = np.where(e > 0, 0.0, -5.933168530682111 * speed - 0.00031951312393561264 * speed**2)
+    torque = (spin * (drag + 38.93e-9 * 2 * np.pi / 60 * slow_down)).sum(-1)
+    np.testing.assert_allclose(states.ang_vel[..., 2], DT / J[2] * torque, rtol=1e-4, atol=1e-5)
+    assert np.array_equal(p.rpm2thrust, sim.data.params.rpm2thrust)
+
+
+def test_a_drone_without_rotors_falls_like_a_stone(weak):
+    """Free fall of explicit Euler with linear drag, whatever its rotors still turn; commands are left alone."""
+    sim, before = weak, weak.data
+    sim.step(100)
+    states, controls, sim.data = sim.data.states, sim.data.controls, before
+    keep = 1 - 0.02477138502714662 / 0.0434 * DT
+    fall = -9.81 * DT * (1 - keep**100) / (1 - keep)
+    np.testing.assert_allclose(states.vel[0, 0, 2], fall, rtol=1e-5)  # float32 over 100 steps
+    assert states.rotor_vel[0, 0].max() < 0.2 * before.states.rotor_vel[0, 0].min(), "failed rotors run down"
+    np.testing.assert_array_equal(controls.rotor_vel, before.controls.rotor_vel)
+    np.testing.assert_allclose(states.vel[2], 0.0, atol=1e-4)  # at full strength it hovers, in float32
+
+
+def test_rotors_fail_in_their_step_and_come_back_with_a_reset():
+    fail_step = np.full((3, 2, 4), -1)
+    fail_step[0, 0, 1], fail_step[1, 1] = 4, [7, -1, 0, 9]
+    sim = build(fail_step=fail_step)
+    for step in range(12):
+        sim.step()
+        np.testing.assert_array_equal(left(sim), np.where((fail_step >= 0) & (fail_step <= step), 0.0, 1.0))
+    sim.reset(np.array([False, True, False]))
+    np.testing.assert_array_equal(left(sim)[1], 1.0)
+    assert left(sim)[0, 0, 1] == 0
+
+
+def test_rotors_fail_by_chance_at_their_rate():
+    """After t a fraction exp(-rate t) still works; nothing that failed comes back."""
+    n = 2048
+    sim = build(n_worlds=n, n_drones=1, rate=[0.0, 5.0, 20.0, 5.0])
+    sim.step(20)
+    early = left(sim)
+    sim.step(30)
+    for steps, found in ((20, early), (50, left(sim))):
+        works = np.exp(-np.array([0.0, 5.0, 20.0, 5.0]) * steps * DT)
+        # four standard errors of a binomial fraction
+        np.testing.assert_array_less(np.abs((found == 1).mean(axis=(0, 1)) - works), 4 * np.sqrt(0.25 / n))
+    assert np.all(left(sim) <= early)
+    assert set(np.unique(left(sim))) == {0.0, 1.0}
+    pairs = (left(sim)[:, 0, 1] == 1) & (left(sim)[:, 0, 3] == 1)
+    assert abs(pairs.mean() - np.exp(-1.0)) < 4 * np.sqrt(0.25 / n), "rotors fail independently"
+
+
+def test_rotors_fail_when_told(weak):
+    before = weak.data
+    mask = np.zeros((3, 2, 4), bool)
+    mask[2, 1, 3] = True
+    motors.fail(weak, mask)
+    changed, weak.data = left(weak), before
+    np.testing.assert_array_equal(changed != left(weak), mask)
+    assert changed[2, 1, 3] == 0
+
+
+def test_the_gradient_with_respect_to_effectiveness_is_the_thrust(weak):
+    """dv_z / de_i = dt thrust_i / m: a fault can be identified by descent."""
+    step = weak.build_step_fn()
+
+    def climb(e):
+        data = weak.data.replace(plugins={"motors": weak.data.plugins["motors"].replace(effectiveness=e)})
+        return jnp.sum(step(data, 1).states.vel[..., 2])
+
+    gradient = jax.grad(climb)(jnp.full((3, 2, 4), 0.8))
+    np.testing.assert_allclose(gradient, np.full((3, 2, 4), DT * 9.81 / 4), rtol=1e-5)
+
+
+@pytest.mark.parametrize("kwargs, message", [
+    ({"effectiveness": 1.1}, "effectiveness.*from 0.0 to 1.0"),
+    ({"effectiveness": np.ones(3)}, r"shape \(4,\) for all drones, or \(2, 3, 4\)"),
+    ({"fail_step": 1.5}, "whole numbers"),
+    ({"rate": -1.0}, "rate.*from 0.0"),
+])  # fmt: skip
+def test_law_09_motors_that_cannot_be_are_told(kwargs, message):
+    with pytest.raises(ConfigError, match=message):
+        motors.add(Sim(n_worlds=2, n_drones=3), **kwargs)
+
+
+def test_law_09_fitted_dynamics_have_no_rotors():
+    with pytest.raises(ConfigError, match="first_principles"):
+        motors.add(Sim(dynamics="so_rpy"))
+    with pytest.raises(ConfigError, match="has been called"):
+        motors.fail(Sim(), np.ones((1, 1, 4), bool))
