@@ -13,11 +13,16 @@ from jax import Array
 from crazysim.engine import cuda, kernel, lanes, native
 from crazysim.engine.program import Program, is_key
 
+Run = Callable[[list[Any], Array], tuple[list[Any], Array]]
+"""Leaves and a number of steps to the written leaves and which worlds are finite."""
+
 
 def missing(platform: str) -> str | None:
     """Return what keeps kernels from running on a platform, or None."""
     if platform == "gpu":
-        return None if cuda.nvrtc() else "NVRTC was not found, which comes with pip install 'jax[cuda13]' or 'jax[cuda12]'"
+        return (
+            None if cuda.nvrtc() else "NVRTC was not found, which comes with pip install 'jax[cuda13]' or 'jax[cuda12]'"
+        )
     if platform != "cpu":
         return f"there are no kernels for {platform}"
     return None if native.compiler() else "no C++ compiler was found (g++, clang++, or the variable CXX)"
@@ -31,13 +36,14 @@ def build(program: Program, platform: str) -> Callable[[list[Any], int | Array],
     """
     target = "cuda" if platform == "gpu" else "host"
     run = _one_kernel(program, target) if program.fused else _split(program, target)
+    batched = _over_batches(program, run)
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         """Run the kernel; its derivative is that of the same program on lanes."""
 
         @jax.custom_jvp
         def advance(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
-            return run(leaves, count)
+            return batched(leaves, count)
 
         @advance.defjvp
         def _(primals: Any, tangents: Any) -> Any:
@@ -58,12 +64,43 @@ def describe(program: Program, platform: str) -> str:
     return f"kernel: {source.block} threads a block, {used.registers} registers, {used.spilled} bytes spilled"
 
 
-def _one_kernel(program: Program, target: str) -> Callable[[list[Any], Array], tuple[list[Any], Array]]:
+def _over_batches(program: Program, run: Run) -> Run:
+    """Return a kernel call that vmap understands: more of the same worlds are more worlds."""
+
+    @jax.custom_batching.custom_vmap
+    def call(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+        return run(leaves, count)
+
+    @call.def_vmap
+    def _(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
+        batched, count_batched = in_batched
+        own = [scope in ("drone", "world") for scope in program.axes.scopes]
+        out_batched = ([True] * len(program.written), True)
+        if count_batched or not program.fused or any(b and not o for b, o in zip(batched, own, strict=True)):
+            # What the worlds of a batch share is not the same in all batches: one after the other.
+            whole = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
+                     for x, b in zip(leaves, batched, strict=True)]  # fmt: skip
+            counts = count if count_batched else jnp.broadcast_to(count, (size,))
+            return jax.lax.map(lambda xs: run(*xs), (whole, counts)), out_batched
+
+        def join(x: Any, b: bool) -> Any:
+            x = x if b else jnp.broadcast_to(x, (size, *x.shape))
+            return x.reshape(-1, *x.shape[2:])
+
+        joined = [join(x, b) if o and x is not None else x for x, b, o in zip(leaves, batched, own, strict=True)]
+        written, finite = run(joined, count)
+        apart = [x.reshape(size, -1, *x.shape[1:]) for x in (*written, finite)]
+        return (apart[:-1], apart[-1]), out_batched
+
+    return call
+
+
+def _one_kernel(program: Program, target: str) -> Run:
     source = kernel.write(program, target)
     return lambda leaves, count: _call(program, source, leaves, count, target)
 
 
-def _split(program: Program, target: str) -> Callable[[list[Any], Array], tuple[list[Any], Array]]:
+def _split(program: Program, target: str) -> Run:
     """Return the same for a step that some stage takes apart: a kernel for what is between such stages."""
     parts = [program.part(k) for k in range(len(program.segments))]
     kernels = [kernel.write(p, target) if p.fused else None for p in parts]

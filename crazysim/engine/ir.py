@@ -149,7 +149,7 @@ def simplify(op: str, args: tuple[Element, ...], dtype: np.dtype, params: tuple)
             return cases[0]
     if op == "convert_element_type" and args[0].dtype == dtype:
         return args[0]
-    if op in ("and", "or") and dtype == bool:
+    if op in ("and", "or") and dtype.kind == "b":
         for a, b in (args, args[::-1]):
             if is_constant(a):
                 return b if bool(a) == (op == "and") else a

@@ -61,7 +61,7 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
         NoRuleError: If an operation or a type has no source.
     """
     writer = Writer()
-    segments = [s for s in program.segments if s.block is not None]
+    segments = [s for s in program.segments if s.scope != "batch"]
     slots = dict.fromkeys(slot for s in segments for slot in _of_drone(program, s, [*s.reads, *s.constants]))
     written = list(dict.fromkeys(slot for s in segments for slot in _of_drone(program, s, s.writes)))
     check = program.check
@@ -88,7 +88,7 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
     for segment, constants in zip(segments, before, strict=True):
         _step(writer, program, segment, names, constants)
     writer.line("}", 1)
-    if check is not None and check.block is not None:
+    if check is not None:
         (fine,) = writer.block(check.block, [names[slot] for slot in check.reads], 1)
         writer.line(f"STORE(finite, lane, b1_lanes({fine}))", 1)
     for slot in whole:
@@ -109,7 +109,6 @@ def _used_when_needed(segments: Sequence[Segment], needed: set[Slot]) -> set[Slo
     late: set[Slot] = set()
     for segment in segments:
         block = segment.block
-        assert block is not None
         now = {id(x) for v in block.values for x in v.args} | {id(x) for x in block.outputs}
         late |= {slot for x, slot in zip(block.inputs, segment.reads, strict=False) if id(x) not in now}
         needed |= {slot for x, slot in zip(block.inputs, segment.reads, strict=False) if id(x) in now}
@@ -124,10 +123,7 @@ def _of_drone(program: Program, segment: Segment, slots: Sequence[Slot]) -> list
     return [(leaf, k % program.sizes(leaf)) if program.axes.scopes[leaf] == "drone" else (leaf, k) for leaf, k in slots]
 
 
-def _step(
-    writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str]
-) -> None:
-    assert segment.block is not None
+def _step(writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str]) -> None:
     writer.line("{", 2)
     outs = writer.block(segment.block, [*(names[slot] for slot in segment.reads), *constants], 3)
     fresh = [writer.new() for _ in outs]
@@ -180,7 +176,7 @@ extern "C" __global__ void __launch_bounds__({block}, {UNBOUNDED}) advance({argu
 """
 
 
-def _host(pointers: Sequence[str], body: str, n_drones: int, block: int) -> str:
+def _host(pointers: Sequence[str], body: str, n_drones: int, _block: int) -> str:
     arguments = ", ".join(pointers)
     kinds = [p.split("*")[0].removeprefix("const ") for p in pointers]
     n_in = sum(p.startswith("const") for p in pointers)

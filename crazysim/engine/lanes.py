@@ -104,7 +104,6 @@ def advance(program: Program, lanes: Lanes, constants: Constants) -> None:
 
 
 def _run_drones(segment: Segment, lanes: Lanes, constants: list[Any]) -> None:
-    assert segment.block is not None
     outs = xla.run(segment.block, [*(lanes.get(slot) for slot in segment.reads), *constants], lanes.shape)
     for slot, value in zip(segment.writes, outs, strict=True):
         lanes.set(slot, value)
@@ -112,7 +111,6 @@ def _run_drones(segment: Segment, lanes: Lanes, constants: list[Any]) -> None:
 
 def _run_worlds(segment: Segment, lanes: Lanes) -> None:
     """Run a program of worlds: a drone's numbers are those of its world, at its place."""
-    assert segment.block is not None
     program, shape = lanes.program, (lanes.n_worlds, lanes.n_drones)
 
     def of_world(slot: Slot) -> Any:
@@ -140,7 +138,6 @@ def _run_worlds(segment: Segment, lanes: Lanes) -> None:
 
 
 def _run_batch(segment: Segment, lanes: Lanes) -> None:
-    assert segment.fn is not None
     after = core.jaxpr_as_fun(segment.fn)(*(lanes.array(i) for i in segment.used))
     for i, value in zip(segment.written, after, strict=True):
         lanes.set_array(i, value)
@@ -193,10 +190,8 @@ def _slots(program: Program, segment: Segment) -> list[Slot]:
 def finite(program: Program, lanes: Lanes) -> Array:
     """Return which worlds have no NaN and no infinity in what is watched. (n_worlds, 1)"""
     check = program.check
-    if check is None or check.block is None:
+    if check is None:
         return jnp.ones((lanes.n_worlds, 1), bool)
     (fine,) = xla.run(check.block, [lanes.get(slot) for slot in check.reads], lanes.shape)
     fine = jnp.broadcast_to(fine, lanes.shape).reshape(lanes.n_worlds, lanes.n_drones)
     return jnp.all(fine, axis=1, keepdims=True)
-
-

@@ -13,6 +13,7 @@ rule of their own:
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -162,6 +163,21 @@ def _add_any(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     return [r.each("add", args, eqn.outvars[0].aval.dtype)]
 
 
+@rule("lt_to", "le_to", "eq_to")
+def _total_order(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Comparisons in which NaN is the largest number, and equal to itself."""
+    name = eqn.primitive.name.removesuffix("_to")
+    if eqn.invars[0].aval.dtype.kind != "f":
+        return [r.each(name, args, bool)]
+    a_nan, b_nan = (r.each("ne", [x, x], bool) for x in args)
+    of_nan = {
+        "lt": lambda: r.each("and", [b_nan, r.each("not", [a_nan], bool)], bool),
+        "le": lambda: b_nan,
+        "eq": lambda: r.each("and", [a_nan, b_nan], bool),
+    }[name]()
+    return [r.each("or", [r.each(name, args, bool), of_nan], bool)]
+
+
 @rule("optimization_barrier")
 def _barrier(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     r.block.mark()
@@ -218,7 +234,7 @@ def move_many(eqn: Any, args: list[Elements], fixed: Sequence[Any] = ()) -> list
     for x in args:
         numbers.append(np.arange(len(elements), len(elements) + x.size, dtype=np.int32).reshape(x.shape))
         elements.extend(x.reshape(-1))
-    params = {"fill_value": None} if eqn.primitive.name == "gather" else {}
+    params = {"fill_value": 0} if eqn.primitive.name == "gather" else {}  # never used: all places are inside
     places = run_now(eqn, [*numbers, *fixed], **params)
     return [pack([elements[i] for i in p.reshape(-1)], p.shape) for p in places]
 
@@ -260,7 +276,7 @@ def _cumulate(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     op = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}[eqn.primitive.name]
     x = np.moveaxis(args[0], eqn.params["axis"], 0).copy()
     order = range(len(x))[::-1] if eqn.params["reverse"] else range(len(x))
-    for last, i in zip(order, order[1:], strict=False):
+    for last, i in itertools.pairwise(order):
         x[i] = r.each(op, [np.asarray(x[last], object), np.asarray(x[i], object)], eqn.outvars[0].aval.dtype)
     return [np.moveaxis(x, 0, eqn.params["axis"])]
 
@@ -294,7 +310,7 @@ def _sort(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
         for i in range(turn % 2, n - 1, 2):
             first = [np.asarray(c[i], object) for c in columns]
             second = [np.asarray(c[i + 1], object) for c in columns]
-            swap, tied = None, None
+            swap, tied = constants(False, bool), constants(True, bool)
             for a, b, dtype in zip(first[:n_keys], second[:n_keys], dtypes, strict=False):
                 above = r.each("lt", [b, a], bool)
                 equal = r.each("eq", [a, b], bool)
@@ -302,9 +318,8 @@ def _sort(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
                     a_nan, b_nan = r.each("ne", [a, a], bool), r.each("ne", [b, b], bool)
                     above = r.each("or", [above, r.each("and", [a_nan, r.each("not", [b_nan], bool)], bool)], bool)
                     equal = r.each("or", [equal, r.each("and", [a_nan, b_nan], bool)], bool)
-                swap = above if swap is None else r.each("or", [swap, r.each("and", [tied, above], bool)], bool)
-                tied = equal if tied is None else r.each("and", [tied, equal], bool)
-            assert swap is not None
+                swap = r.each("or", [swap, r.each("and", [tied, above], bool)], bool)
+                tied = r.each("and", [tied, equal], bool)
             for c, a, b, dtype in zip(columns, first, second, dtypes, strict=True):
                 c[i] = r.each("select_n", [swap, a, b], dtype)
                 c[i + 1] = r.each("select_n", [swap, b, a], dtype)
@@ -357,7 +372,7 @@ def _custom_jvp(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     @functools.cache
     def slope() -> Block:
         """Return the program from operands and their changes to the changes of the results."""
-        single = core.jaxpr_as_fun(_jaxpr_of(eqn))
+        single = _as_function(eqn)
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
         traced = jax.make_jaxpr(lambda x, dx: jax.jvp(single, x, dx)[1])(avals, avals)
         reader = Reader(Block())
@@ -396,6 +411,14 @@ def _cond(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     return results
 
 
+@rule("platform_index")
+def _platform_index(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Of code that is written for several platforms, what serves all of them, else what serves the CPU."""
+    platforms = list(eqn.params["platforms"])
+    cpu = next((k for k, names in enumerate(platforms) if names is not None and "cpu" in names), 0)
+    return [constants(platforms.index(None) if None in platforms else cpu, np.int32)]
+
+
 @rule("scan")
 def _scan(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     p = eqn.params
@@ -408,7 +431,9 @@ def _scan(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
         inner.block.outputs = _flat(inner.read(body, [*fixed, *inputs]))
         return _results(r, "loop", eqn, _flat(carry), (inner.block,), (("length", length),))
     if length > UNROLL:
-        raise NoRuleError(f"primitive 'scan' with inputs or outputs for each of {length} turns; written out are {UNROLL}")
+        raise NoRuleError(
+            f"primitive 'scan' with inputs or outputs for each of {length} turns; written out are {UNROLL}"
+        )
     stacked: list[list[Elements]] = []
     for i in range(length)[::-1] if p["reverse"] else range(length):
         outs = r.read(body, [*fixed, *carry, *(np.asarray(x[i], object) for x in xs)])
@@ -436,12 +461,14 @@ def closed(jaxpr: Any) -> core.ClosedJaxpr:
     return jaxpr if isinstance(jaxpr, core.ClosedJaxpr) else core.ClosedJaxpr(jaxpr, ())
 
 
-def _jaxpr_of(eqn: Any) -> core.ClosedJaxpr:
-    variables = [v for v in eqn.invars if not isinstance(v, core.Literal)]
-    unique = list(dict.fromkeys(variables))
-    if len(unique) != len(eqn.invars):
-        raise NoRuleError(f"primitive {eqn.primitive.name!r} with a constant, or one operand twice")
-    return core.ClosedJaxpr(core.Jaxpr((), unique, eqn.outvars, [eqn], eqn.effects), ())
+def _as_function(eqn: Any) -> Callable[..., Any]:
+    """Return an operation as a function of arrays."""
+
+    def call(*args: Any) -> Any:
+        functions, params = eqn.primitive.get_bind_params(eqn.params)
+        return eqn.primitive.bind(*functions, *args, **params)
+
+    return call
 
 
 def _inputs(r: Reader, like: Elements) -> Elements:

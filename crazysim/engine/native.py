@@ -33,7 +33,9 @@ def call(kernel: Kernel, n_lanes: int, count: Array, inputs: Sequence[Array], ou
 @functools.cache
 def compiler() -> str | None:
     """Return the C++ compiler: of the variable CXX, or the first that is found; None if there is none."""
-    return next((path for name in (os.environ.get("CXX"), "g++", "clang++") if name and (path := shutil.which(name))), None)
+    return next(
+        (path for name in (os.environ.get("CXX"), "g++", "clang++") if name and (path := shutil.which(name))), None
+    )
 
 
 @functools.cache

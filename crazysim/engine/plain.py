@@ -38,6 +38,7 @@ def build(
         the written leaves.
     """
     axes = Axes(data)
+    by_component = by_component and all(stage.batched for stage in stages)  # not every operation of XLA takes layouts
 
     def single(leaves: list[Any]) -> list[Any]:
         data = axes.treedef.unflatten(leaves)

@@ -31,8 +31,8 @@ class Segment:
     """Whose numbers the program computes on; ``batch`` has no program."""
     stages: list[Stage]
     """The stages."""
-    block: Block | None = None
-    """The program."""
+    block: Block = dataclasses.field(default_factory=Block)
+    """The program; empty if there is none."""
     reads: list[Slot] = dataclasses.field(default_factory=list)
     """What its inputs are."""
     writes: list[Slot] = dataclasses.field(default_factory=list)
@@ -47,8 +47,8 @@ class Segment:
     """Leaves that are written."""
     why: str = ""
     """Why there is no program."""
-    fn: core.ClosedJaxpr | None = None
-    """What runs then, from ``used`` to ``written``."""
+    fn: Any = None
+    """The jaxpr that runs then, from ``used`` to ``written``."""
     first: dict[int, Elements] = dataclasses.field(default_factory=dict)
     """Elements of the leaves it reads, as they come in."""
     now: dict[int, Elements] = dataclasses.field(default_factory=dict)
@@ -80,13 +80,17 @@ class Program:
         for stage in stages:
             self._add(stage)
         for segment in self.segments:
-            if segment.block is not None:
+            if segment.scope != "batch":
                 _close(segment)
         changing = {slot for s in self.segments for slot in s.writes} | {
-            (leaf, k) for s in self.segments if s.block is None for leaf in s.written for k in range(self.sizes(leaf))
+            (leaf, k)
+            for s in self.segments
+            if s.scope == "batch"
+            for leaf in s.written
+            for k in range(self.sizes(leaf))
         }
         for segment in self.segments:
-            if segment.block is not None and segment.scope == "drone":
+            if segment.scope == "drone":
                 _hoist(segment, changing)
         self.check = self._watch(watched(data)) if watched else None
 
@@ -118,29 +122,30 @@ class Program:
 
     def _add(self, stage: Stage) -> None:
         if stage.scope == "batch":
-            return self._add_batch(stage, "it is not declared for one drone or one world")
+            self._add_batch(stage, "it is not declared for one drone or one world")
+            return
         traced = _Traced(stage, self.axes, self.leaves)
-        scope = stage.scope
+        scope: StageScope = stage.scope
         if scope == "world" and not any(self.axes.scopes[i] == "drone" for i in [*traced.used, *traced.written]):
             scope = "drone"  # nothing of any drone is in it: every drone's lane can do it for its world
         if scope == "world" and self.n_drones > LARGEST_SWARM:
-            return self._add_batch(stage, f"of one world, it is written out for up to {LARGEST_SWARM} drones")
+            self._add_batch(stage, f"of one world, it is written out for up to {LARGEST_SWARM} drones")
+            return
         last = self.segments[-1] if self.segments else None
-        segment = last if last is not None and last.scope == scope else Segment(scope, [], Block())
+        segment = last if last is not None and last.scope == scope else Segment(scope, [])
         try:
             values = self._lower(segment, traced)
         except NoRuleError as error:
-            return self._add_batch(stage, str(error))
+            self._add_batch(stage, str(error))
+            return
         if segment is not last:
             self.segments.append(segment)
         segment.stages.append(stage)
         segment.now.update(values)
-        assert segment.block is not None
         segment.block.mark()
 
     def _lower(self, segment: Segment, traced: _Traced) -> dict[int, Elements]:
         """Return what the written leaves of a stage become, as elements of the segment's block."""
-        assert segment.block is not None
         reader = Reader(segment.block)
         args = [self._elements(segment, i, traced.avals[i]) for i in traced.used]
         if traced.when is None:
@@ -159,21 +164,17 @@ class Program:
     def _elements(self, segment: Segment, leaf: int, aval: Any) -> Elements:
         """Return a leaf's elements as they are now in a segment; inputs, if no stage of it has written them."""
         if leaf not in segment.now:
-            assert segment.block is not None
             segment.now[leaf] = segment.first[leaf] = _inputs(segment.block, aval, self.zeros.get(leaf, frozenset()))
         return segment.now[leaf]
 
     def _add_batch(self, stage: Stage, why: str) -> None:
         traced = _Traced(Stage(stage, "batch", name=stage.__name__), self.axes, self.leaves)
-        self.segments.append(
-            Segment("batch", [stage], used=traced.used, written=traced.written, why=why, fn=traced.fn)
-        )
+        self.segments.append(Segment("batch", [stage], used=traced.used, written=traced.written, why=why, fn=traced.fn))
 
     def _watch(self, watched: list[Any]) -> Segment:
         """Return a program that tells whether all watched numbers of a drone are finite."""
         ids = {id(x) for x in watched}
-        segment = Segment("drone", [], Block())
-        assert segment.block is not None
+        segment = Segment("drone", [])
         avals = self.axes.of_one(self.leaves, "drone")
         finite: Element = constant(True, bool)
         for i, x in enumerate(self.leaves):
@@ -246,7 +247,6 @@ def _words(elements: Elements) -> list[Element]:
 
 def _close(segment: Segment) -> None:
     """Fix what a segment writes, and drop what nothing needs."""
-    assert segment.block is not None
     outputs: list[Element] = []
     for leaf, elements in segment.now.items():
         before = _words(segment.first[leaf]) if leaf in segment.first else [None] * elements.size
@@ -262,7 +262,6 @@ def _close(segment: Segment) -> None:
 def _connect(segment: Segment) -> None:
     """Keep the inputs that are used, and note what they are."""
     block = segment.block
-    assert block is not None
     slots = {id(x): (leaf, k) for leaf, elements in segment.first.items() for k, x in enumerate(_words(elements))}
     segment.reads = [slots[i] for i in _keep_used_inputs(block)]
 
@@ -280,7 +279,6 @@ def _hoist(segment: Segment, changing: set[Slot]) -> None:
     A division by such a number becomes a product with its inverse, which is one rounding less exact.
     """
     block = segment.block
-    assert block is not None
     fixed = {id(x) for x, slot in zip(block.inputs, segment.reads, strict=True) if slot not in changing}
     worth: set[int] = set()
     values: list[Value] = []

@@ -11,7 +11,7 @@ import numpy as np
 from jax.extend.random import threefry_prng_impl
 from jax.lax import GatherScatterMode
 
-from crazysim.engine.ir import Element, Value, constant, is_constant
+from crazysim.engine.ir import Element, constant, is_constant
 from crazysim.engine.lower import (
     UNROLL,
     Elements,
@@ -127,11 +127,11 @@ def _gather(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
         shape[axis] = size
     row_of = np.broadcast_to(np.arange(len(rows)).reshape(shape), out.shape).reshape(-1)
 
-    result: list[Element] | None = None
+    result: list[Element] = []
     for corner in itertools.product(*(range(limit + 1) for limit in limits)):
         static = np.broadcast_to(np.array(corner, np.int32), indices.shape)
         here = move_many(eqn, [x], [static])[0].reshape(-1)
-        if result is None:
+        if not result:
             result = list(here)
             continue
         hit = [_all(r, (_at(r, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0)) for row in rows]
@@ -139,7 +139,6 @@ def _gather(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
             condition = hit[row_of[o]]
             if condition is not None and item is not result[o]:
                 result[o] = _select(r, condition, pack([item], ()), pack([result[o]], ()))[()]
-    assert result is not None
     if mode == GatherScatterMode.FILL_OR_DROP:
         inside = [_inside(r, row, limits) for row in rows]
         fill = eqn.params["fill_value"]
@@ -162,7 +161,9 @@ def _gather_filled(eqn: Any, x: Elements, indices: np.ndarray) -> Elements:
 def _fill_value(dtype: Any) -> Any:
     """What JAX fills with: NaN, the least signed or the largest unsigned integer, True."""
     kind = np.dtype(dtype).kind
-    return np.nan if kind == "f" else np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max if kind == "u" else True
+    return (
+        np.nan if kind == "f" else np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max if kind == "u" else True
+    )
 
 
 def _inside(r: Reader, row: Elements, limits: list[int]) -> Elements:
@@ -174,7 +175,7 @@ def _inside(r: Reader, row: Elements, limits: list[int]) -> Elements:
     return constants(True, bool) if inside is None else inside
 
 
-@rule("scatter", "scatter-add", "scatter_add", "scatter-mul", "scatter_mul", "scatter_min", "scatter_max", "scatter_sub")
+@rule("scatter", *(f"scatter{mark}{op}" for mark in "-_" for op in ("add", "sub", "mul", "min", "max")))
 def _scatter(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     """``x.at[i].set(u)`` and its kin, one row of indices after the other."""
     x, indices, updates = args
@@ -372,7 +373,6 @@ def _threefry(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
             a, b = (np.uint32(x) for x in run_now(eqn, [np.asarray(w) for w in words]))
         else:
             both = r.block.add("threefry2x32", words, np.uint32)
-            assert isinstance(both, Value)
             a, b = (r.block.add("item", (both,), np.uint32, (("index", i),)) for i in (0, 1))
         first.append(a)
         second.append(b)

@@ -68,11 +68,14 @@ class Writer:
                 self.names[id(value)] = f"{args[0]}_{dict(value.params)['index']}"
                 return
             case "when":
-                return self._when(value, args, depth)
+                self._when(value, args, depth)
+                return
             case "loop":
-                return self._loop(value, args, depth)
+                self._loop(value, args, depth)
+                return
             case "while":
-                return self._while(value, args, depth)
+                self._while(value, args, depth)
+                return
             case "threefry2x32":
                 name = self.names[id(value)] = self.new()
                 self.line(f"auto {name}_0 = u32_lanes({args[2]}), {name}_1 = u32_lanes({args[3]});", depth)
@@ -183,7 +186,7 @@ def literal(x: np.generic) -> str:
         return "b1(1)" if bool(x) else "b1(0)"
     if kind in ("f32", "f64"):
         if not np.isfinite(x):
-            return f"{kind}_nan()" if np.isnan(x) else f"{'-' if x < 0 else ''}{kind}_infinity()"
+            return f"{kind}_nan()" if np.isnan(x) else f"{'-' if float(x) < 0 else ''}{kind}_infinity()"
         return f"{kind}({float(x).hex()})"
     if kind == "i32":
         return f"i32({int(x)})" if int(x) != -(2**31) else "i32(-2147483647 - 1)"

@@ -131,7 +131,7 @@ class Step:
         if self.mesh is not None and undeclared:
             return self._plain(data, flags, f"with a mesh every stage must be declared, and {undeclared[0]!r} is not")
         program = Program(self.stages, data, dict(zeros), _watched)
-        split = [s for s in program.segments if s.block is None]
+        split = [s for s in program.segments if s.scope == "batch"]
         if self.mesh is not None and split:
             return self._plain(data, flags, f"with a mesh every stage must be fused, and {_unfused(split[0])}")
         engine, why, run = "lanes", "it was asked for", functools.partial(lanes.steps, program)
@@ -143,7 +143,9 @@ class Step:
             except NoRuleError as error:
                 why = str(error)
                 if self.engine == "fused":
-                    raise ConfigError(f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'.") from None
+                    raise ConfigError(
+                        f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'."
+                    ) from None
         return self._wrap(engine, why, program, tuple(program.read), tuple(program.written), flags, run, len(names))
 
     def _plain(self, data: SimData, flags: tuple[int, int], why: str) -> Plan:
@@ -258,7 +260,7 @@ def explain(step: Step, data: SimData) -> str:
         return "\n".join([*lines, f"stages: {', '.join(s.__name__ for s in step.stages)}"])
     for segment in plan.program.segments:
         names = ", ".join(s.__name__ for s in segment.stages)
-        if segment.block is None:
+        if segment.scope == "batch":
             lines.append(f"splits the step: {_unfused(segment)}")
         else:
             lines.append(f"fused, for one {segment.scope}: {names} ({_operations(segment)} operations)")
@@ -272,5 +274,4 @@ def _unfused(segment: Segment) -> str:
 
 
 def _operations(segment: Segment) -> int:
-    return sum(v.op not in ("mark", "item") for v in segment.block.walk()) if segment.block else 0
-
+    return sum(v.op not in ("mark", "item") for v in segment.block.walk())

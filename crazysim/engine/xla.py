@@ -12,6 +12,7 @@ from jax import Array, lax
 from jax.extend.random import threefry2x32_p
 
 from crazysim.engine.ir import Block, Element, Value
+from crazysim.engine.lower import ELEMENTWISE
 
 
 def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: dict[int, Any] | None = None) -> list[Any]:
@@ -77,8 +78,7 @@ def _apply(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int,
 
 def _broadcast(args: Sequence[Any]) -> list[Array]:
     shape = jnp.broadcast_shapes(*map(np.shape, args))
-    return [x if np.shape(x) == shape and isinstance(x, jax.Array) else lax.full(shape, x) if isinstance(x, np.generic)
-            else jnp.broadcast_to(x, shape) for x in args]  # fmt: skip
+    return [x if isinstance(x, jax.Array) and x.shape == shape else jnp.full(shape, jnp.asarray(x)) for x in args]
 
 
 def _lanes(x: Any, shape: tuple[int, ...]) -> Array:
@@ -151,12 +151,9 @@ STRUCTURE: dict[str, Callable[..., Any]] = {
     "threefry2x32": _threefry,
 }
 
+OTHER_NAMES = {"and": "bitwise_and", "or": "bitwise_or", "xor": "bitwise_xor", "not": "bitwise_not"}
 FUNCTIONS: dict[str, Callable[..., Any]] = {
-    name: getattr(lax, {"and": "bitwise_and", "or": "bitwise_or", "xor": "bitwise_xor", "not": "bitwise_not"}.get(name, name))
-    for name in (
-        "add sub mul div rem neg sign abs floor ceil round is_finite exp exp2 log log1p expm1 tanh sin cos tan asin "
-        "acos atan sinh cosh asinh acosh atanh atan2 logistic sqrt rsqrt cbrt pow integer_pow max min and or xor not "
-        "eq ne lt le gt ge nextafter select_n clamp shift_left shift_right_logical shift_right_arithmetic erf erf_inv "
-        "erfc lgamma digamma population_count clz reduce_precision"
-    ).split()
-}  # fmt: skip
+    name: getattr(lax, OTHER_NAMES.get(name, name))
+    for name in ELEMENTWISE
+    if name != "square"  # is written as a product
+}

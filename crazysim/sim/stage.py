@@ -30,7 +30,8 @@ class Stage:
         name: str | None = None,
     ):
         """Declare a stage; see ``stage``. ``batched`` promises that the functions take any leading axes as well."""
-        self.fn, self.scope, self.when, self.batched = fn, scope, when, batched
+        self.fn, self.when, self.batched = fn, when, batched
+        self.scope: StageScope = scope
         self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
         self.__doc__ = fn.__doc__
 
@@ -76,7 +77,9 @@ def stage(
         ConfigError: If the scope is neither.
     """
     if scope not in ("drone", "world"):
-        raise ConfigError(f"a stage is of one 'drone' or one 'world', not {scope!r}; undeclared, it sees the whole batch")
+        raise ConfigError(
+            f"a stage is of one 'drone' or one 'world', not {scope!r}; undeclared, it sees the whole batch"
+        )
     return lambda fn: Stage(fn, scope, when)
 
 
