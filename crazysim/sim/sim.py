@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import NDArray
@@ -113,6 +114,7 @@ class Sim:
         self._scene = Scene(xml_path, self.airframe, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
         self._seed = as_key(rng_key)
         self._counts: dict[int, Array] = {}
+        self._cleared: Any = None
         self.build_data()
         self.build_default_data()
 
@@ -125,15 +127,18 @@ class Sim:
 
     @property
     def data(self) -> SimData:
-        """Everything that changes. Assigning to it makes the scene stale."""
+        """Everything that changes. Assigning to it makes the scene stale, and clears ``core.mjx_synced``."""
         return self._data
 
     @data.setter
     def data(self, data: SimData) -> None:
+        if data.core.mjx_synced is not self._cleared:
+            # A new array, for what is read from here may be donated, and must then be nobody else's.
+            data = data.replace(core=data.core.replace(mjx_synced=np.False_))
         self._advance(self._place(data))
 
     def _advance(self, data: SimData) -> None:
-        self._data = data
+        self._data, self._cleared = data, data.core.mjx_synced
         self._scene.invalidate()
 
     def _place(self, data: SimData) -> SimData:
@@ -264,17 +269,24 @@ class Sim:
     mj_model = Held[mujoco.MjModel]("What ``spec`` was compiled to.")
     mj_data = Held[mujoco.MjData]("The one world that was drawn last.")
     mjx_model = Held[mjx.Model]("The scene's model on the device; made when first read.")
-    mjx_data = Held[mjx.Data](
+    max_geom_pairs = Held[int]("Cap on the pairs MJX checks per kind of collision, from the next ``build_mjx`` on.")
+    max_visual_geom = Held[int]("Most marks that one picture takes.")
+    marks = Held[Marks]("What is drawn over the next picture.")
+    viewer = Held[Viewer | None]("What draws; made for the first picture.")
+
+    @property
+    def mjx_data(self) -> mjx.Data:
         """The scene's state in every world, as it was last synced; made when first read, and returned as it is.
 
         Assigning to it makes the scene stale. Poses of bodies that are no drones, ``mocap_pos`` and ``mocap_quat``,
         must be one per world and finite, or it raises a ValueError.
         """
-    )
-    max_geom_pairs = Held[int]("Cap on the pairs MJX checks per kind of collision, from the next ``build_mjx`` on.")
-    max_visual_geom = Held[int]("Most marks that one picture takes.")
-    marks = Held[Marks]("What is drawn over the next picture.")
-    viewer = Held[Viewer | None]("What draws; made for the first picture.")
+        return self._scene.mjx_data
+
+    @mjx_data.setter
+    def mjx_data(self, mjx_data: mjx.Data) -> None:
+        self._scene.mjx_data = mjx_data
+        self.data = self.data
 
     def build_mjx(self) -> None:
         """Compile ``spec`` again after an edit; closes the viewer, and leaves the simulation's data as it is.
@@ -284,10 +296,9 @@ class Sim:
         """
         self._scene.compile()
         ids = jnp.asarray(self._scene.drone_mocap_ids, jnp.int32)
-        core = self.data.core.replace(drone_mocap_ids=ids, mjx_synced=jnp.asarray(False))
-        self.data = self.data.replace(core=core)
-        core = self.default_data.core.replace(drone_mocap_ids=self.data.core.drone_mocap_ids)
-        self.default_data = self.default_data.replace(core=core)
+        self.data = self.data.replace(core=self.data.core.replace(drone_mocap_ids=ids))
+        ids = self.data.core.drone_mocap_ids
+        self.default_data = self.default_data.replace(core=self.default_data.core.replace(drone_mocap_ids=ids))
 
     def contacts(self, body: str | None = None) -> Array:
         """Return which contact slots touch, after bringing the scene up to date if anything has changed.

@@ -23,6 +23,15 @@ UP = 1.0
 SMALL = {"mode": "rgb_array", "width": 32, "height": 24}
 
 
+class Unreadable:
+    """A flag that nobody may look at."""
+
+    def __bool__(self):
+        raise AssertionError("the device's flag was read")
+
+    __array__ = __jax_array__ = __bool__
+
+
 @pytest.fixture(scope="module")
 def one():
     """One world of one drone."""
@@ -168,13 +177,52 @@ def test_a_change_has_the_next_question_sync_once(two, syncs, change):
 
 
 def test_the_flag_of_the_data_follows(two):
-    """``data.core.mjx_synced`` is set by a question, and cleared by step and reset, as the peer's code reads it."""
+    """``data.core.mjx_synced`` is set by a question, and cleared by whatever makes the scene stale."""
     fresh(two, UP, UP)
-    for change in (two.step, two.reset):
+    synced = two.data
+    changes = {
+        "step": two.step,
+        "reset": two.reset,
+        "build_mjx": two.build_mjx,
+        "the same data": lambda: setattr(two, "data", two.data),
+        "data that was synced": lambda: setattr(two, "data", synced),
+        "data that claims to be": lambda: setattr(
+            two, "data", two.data.replace(core=two.data.core.replace(mjx_synced=np.True_))
+        ),
+        "mjx_data": lambda: setattr(two, "mjx_data", two.mjx_data),
+        "what a sync returns": lambda: setattr(two, "data", sync_sim2mjx(two.data, two.mjx_data, two.mjx_model)[0]),
+    }
+    for name, change in changes.items():
         two.contacts()
-        assert bool(two.data.core.mjx_synced)
-        change()
-        assert not bool(two.data.core.mjx_synced)
+        assert bool(two.data.core.mjx_synced), name
+        for _ in range(2):
+            change()
+            assert not bool(two.data.core.mjx_synced), name
+
+
+def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two):
+    """Whatever the flag is, it is exchanged; one that is known to be clear stays, so that edits cost no transfer."""
+    fresh(two, UP, UP)
+    two.step()
+    compiled = two._step.jitted[0]._cache_size()
+    for flag in (Unreadable(), False, True, jnp.asarray(True), np.asarray(True)):
+        two.data = two.data.replace(core=two.data.core.replace(mjx_synced=flag))
+        two.step()
+    assert two._step.jitted[0]._cache_size() == compiled
+    clear = two.data.core.mjx_synced
+    two.data = at_height(two.data, UP, UP)
+    assert two.data.core.mjx_synced is clear
+
+
+def test_a_cleared_flag_is_an_array_of_its_own(two):
+    """Who donates what was read from ``sim.data`` takes no array from data that is kept, such as the default."""
+    fresh(two, UP, UP)
+    flags = [two.default_data.core.mjx_synced]
+    for _ in range(3):
+        two.contacts()
+        two.data = two.data
+        flags.append(two.data.core.mjx_synced)
+    assert len(set(map(id, flags))) == len(flags)
 
 
 def test_what_sync_returns_may_be_assigned(two, syncs):
@@ -241,12 +289,6 @@ def test_wrong_questions_change_nothing(two, syncs):
 
 def test_asking_reads_no_device(two, syncs):
     """Whether a sync is due is known on the host: a flag that cannot be read does no harm."""
-
-    class Unreadable:
-        def __bool__(self):
-            raise AssertionError("the device's flag was read")
-
-        __array__ = __jax_array__ = __bool__
 
     fresh(two, UP, UP)
     fine = two._data
