@@ -1,5 +1,8 @@
 """Quaternion algebra: group laws, an independent program, and gradients that stay finite."""
 
+import functools
+
+import cases
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,12 +20,8 @@ ROUNDING = {"rtol": 1e-12, "atol": 1e-12}
 
 pytestmark = pytest.mark.usefixtures("x64")
 
-
-def vectors(n=3, size=10.0):
-    return arrays(np.float64, n, elements=st.floats(-size, size, allow_subnormal=False))
-
-
-unit_quats = vectors(4, 1.0).filter(lambda q: np.linalg.norm(q) > 0.1).map(lambda q: q / np.linalg.norm(q))
+vectors = functools.partial(cases.vectors, allow_subnormal=False)
+unit_quats = cases.unit_quats(allow_subnormal=False)
 angles = st.floats(-3.1, 3.1)
 
 

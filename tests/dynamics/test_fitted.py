@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FITTED
+from cases import FITTED, vectors
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from crazysim import load_airframe, rotation
@@ -20,10 +19,6 @@ model = jax.jit(fitted.dynamics)
 
 def params(dynamics="so_rpy", name="cf21B_500"):
     return fitted.Params.create(load_airframe(name), Dynamics(dynamics))
-
-
-def vectors(n, size):
-    return arrays(np.float64, n, elements=st.floats(-size, size))
 
 
 def body_rates(rpy, rates):

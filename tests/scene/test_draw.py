@@ -3,34 +3,22 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import ABOVE, FOVY
 
 from crazysim.scene.draw import Marks
 from crazysim.sim import Sim
 from crazysim.sim.visualize import change_material, draw_capsule, draw_line, draw_points
 
 HEIGHT, WIDTH = 180, 240
-ABOVE = 2.0
-SCENE = f"""
-<mujoco>
-  <statistic center="0 0 0.5" extent="2"/>
-  <visual><headlight ambient="0.5 0.5 0.5" diffuse="0.4 0.4 0.4" specular="0 0 0"/><quality shadowsize="0"/></visual>
-  <worldbody>
-    <geom name="floor" type="plane" size="0 0 1" rgba="0.9 0.9 0.9 1"/>
-    <camera name="down" pos="0 0 {ABOVE}" fovy="45"/>
-  </worldbody>
-</mujoco>
-"""
-FOCAL = 0.5 * HEIGHT / np.tan(np.deg2rad(22.5))
+FOCAL = 0.5 * HEIGHT / np.tan(np.deg2rad(FOVY / 2))
 DRONES = np.array([[0.3, 0.0, 1.4], [-0.3, 0.0, 1.4]])
 RED, GREEN, BLUE = ([1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1])
 
 
 @pytest.fixture(scope="module")
-def sim(opengl, tmp_path_factory):
+def sim(opengl, plain_scene):
     """Two worlds of two drones near a camera that looks straight down on a plain floor."""
-    path = tmp_path_factory.mktemp("scene") / "scene.xml"
-    path.write_text(SCENE)
-    sim = Sim(n_worlds=2, n_drones=2, xml_path=path)
+    sim = Sim(n_worlds=2, n_drones=2, xml_path=plain_scene)
     pos = jnp.broadcast_to(jnp.asarray(DRONES), (2, 2, 3))
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     yield sim
