@@ -104,11 +104,6 @@ def conjugate(q: Array) -> Array:
     return jnp.concatenate([-q[..., :3], q[..., 3:]], axis=-1)
 
 
-def normalize(q: Array) -> Array:
-    """Return the unit quaternion along ``q``; the zero quaternion gives the identity. (..., 4)"""
-    return safe_normalize(q, jnp.asarray([0.0, 0.0, 0.0, 1.0], q.dtype))
-
-
 def matrix(q: Array) -> Array:
     """Return the rotation matrix of a unit quaternion, body to world. (..., 3, 3)
 
@@ -138,20 +133,6 @@ def rotate_inverse(q: Array, v: Array) -> Array:
 def z_axis(q: Array) -> Array:
     """Return the body z axis in the world frame. (..., 3)"""
     return matrix(q)[..., 2]
-
-
-def from_rotvec(rotvec: Array) -> Array:
-    """Return the quaternion of a rotation by ``|rotvec|`` rad about ``rotvec``. (..., 4)
-
-    Where the angle is small the series of ``sin(a/2)/a`` stands in for it, exact to rounding.
-    """
-    squared = dot(rotvec, rotvec)
-    small = squared < 1e-4  # the series' next term, a^6 / 645120, is then below 2e-18
-    half = 0.5 * jnp.sqrt(jnp.where(small, 1.0, squared))
-    series = 0.5 - squared / 48 + squared * squared / 3840
-    scale = jnp.where(small, series, 0.5 * jnp.sin(half) / half)
-    w = jnp.where(small, 1 - squared / 8 + squared * squared / 384, jnp.cos(half))
-    return jnp.concatenate([rotvec * scale, w], axis=-1)
 
 
 def turn(q: Array, rotvec: Array, normalize: bool = True) -> Array:

@@ -1,12 +1,14 @@
-"""What several tests share: the pairs of dynamics and command level, commands that hover, ways to move drones."""
+"""What several tests share: pairs of dynamics and command level, commands that hover, random vectors, scenes."""
 
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from crazysim import Sim
+from crazysim import Sim, load_airframe
 from crazysim.dynamics import first_principles
 from crazysim.sim import functional as F
 
@@ -17,6 +19,50 @@ PAIRS = tuple(("first_principles", control) for control in LEVELS) + tuple(
 )
 """Every dynamics and command level that go together: 11."""
 INTEGRATORS = ("euler", "symplectic_euler", "rk4")
+
+BOX = """
+<mujoco>
+  <worldbody>
+    <body name="obstacle">
+      <geom type="box" size="0.1 0.1 0.1" rgba="0.8 0.2 0.2 1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""The obstacle of the documentation."""
+ABOVE = 2.0
+"""Height of the cameras of the plain scene, m."""
+FOVY = 45.0
+"""What they see from top to bottom, degrees."""
+PLAIN_SCENE = f"""
+<mujoco>
+  <statistic center="0 0 0.5" extent="2"/>
+  <visual><headlight ambient="0.5 0.5 0.5" diffuse="0.4 0.4 0.4" specular="0 0 0"/><quality shadowsize="0"/></visual>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1" rgba="0.9 0.9 0.9 1"/>
+    <camera name="down" pos="0 0 {ABOVE}" fovy="{FOVY}"/>
+    <camera name="aside" pos="5 0 {ABOVE}" fovy="{FOVY}"/>
+  </worldbody>
+</mujoco>
+"""
+"""A floor of one colour, without shadows, under a camera that looks straight down, and one 5 m beside it."""
+
+
+def vectors(n=3, size=10.0, **options):
+    """Return a strategy for vectors of ``n`` numbers, each up to a size."""
+    return arrays(np.float64, n, elements=st.floats(-size, size, **options))
+
+
+def unit_quats(**options):
+    """Return a strategy for attitudes, xyzw."""
+    longer = vectors(4, 1.0, **options).filter(lambda q: np.linalg.norm(q) > 0.1)
+    return longer.map(lambda q: q / np.linalg.norm(q))
+
+
+def controller_params(record, **changes):
+    """Return the parameters of a controller for the usual airframe, some changed."""
+    out = record.create(load_airframe("cf21B_500"))
+    return out.replace(**{k: jnp.asarray(v, float) for k, v in changes.items()})
 
 
 def send(data, command, **kwargs):

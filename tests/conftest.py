@@ -49,6 +49,16 @@ def rng():
     return np.random.default_rng(20261121)
 
 
+@pytest.fixture(scope="session")
+def plain_scene(tmp_path_factory):
+    """Return the path of the plain scene's file."""
+    from cases import PLAIN_SCENE
+
+    path = tmp_path_factory.mktemp("scene") / "scene.xml"
+    path.write_text(PLAIN_SCENE)
+    return path
+
+
 def can_render():
     """Return whether this machine can make an OpenGL context."""
     import mujoco

@@ -1,5 +1,8 @@
 """Quaternion algebra: group laws, an independent program, and gradients that stay finite."""
 
+import functools
+
+import cases
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,12 +20,8 @@ ROUNDING = {"rtol": 1e-12, "atol": 1e-12}
 
 pytestmark = pytest.mark.usefixtures("x64")
 
-
-def vectors(n=3, size=10.0):
-    return arrays(np.float64, n, elements=st.floats(-size, size, allow_subnormal=False))
-
-
-unit_quats = vectors(4, 1.0).filter(lambda q: np.linalg.norm(q) > 0.1).map(lambda q: q / np.linalg.norm(q))
+vectors = functools.partial(cases.vectors, allow_subnormal=False)
+unit_quats = cases.unit_quats(allow_subnormal=False)
 angles = st.floats(-3.1, 3.1)
 
 
@@ -59,24 +58,13 @@ def test_rotations_act_on_vectors(p, q, v):
     np.testing.assert_allclose(rot.z_axis(q), Rotation.from_quat(q).apply([0, 0, 1]), **ROUNDING)
 
 
-@given(rotvec=vectors(3, 3.0))
-def test_from_rotvec_agrees_with_scipy(rotvec):
-    same_rotation(rot.from_rotvec(jnp.asarray(rotvec)), Rotation.from_rotvec(rotvec).as_quat())
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-4, 0.99e-2, 1.01e-2, 1.0, 3.0])
-def test_from_rotvec_is_exact_on_both_sides_of_its_series(angle):
-    """The series takes over below 1e-2 rad; what it leaves out is below 2e-18."""
-    axis = np.array([1.0, 2.0, 2.0]) / 3
-    expected = [*(axis * np.sin(angle / 2)), np.cos(angle / 2)]
-    np.testing.assert_allclose(rot.from_rotvec(jnp.asarray(angle * axis)), expected, rtol=0, atol=2e-16)
-
-
 @given(q=unit_quats, rotvec=vectors(3, np.pi / np.sqrt(3)))
 def test_turn_is_a_rotation_about_a_body_axis(q, rotvec):
     """Up to half a revolution the polynomial is exact: the term it leaves out is 2e-17."""
     out = rot.turn(jnp.asarray(q), jnp.asarray(rotvec))
-    np.testing.assert_allclose(out, rot.multiply(q, rot.from_rotvec(jnp.asarray(rotvec))), rtol=0, atol=1e-15)
+    angle = np.linalg.norm(rotvec)
+    by_hand = np.array([*(0.5 * rotvec * np.sinc(angle / 2 / np.pi)), np.cos(angle / 2)])
+    np.testing.assert_allclose(out, rot.multiply(q, by_hand), rtol=0, atol=1e-15)
     expected = (Rotation.from_quat(q) * Rotation.from_rotvec(rotvec)).as_quat()
     same_rotation(out, expected)
 
@@ -115,11 +103,6 @@ def test_yaw_of_the_zero_quaternion_is_zero():
     np.testing.assert_array_equal(jax.grad(rot.yaw)(jnp.zeros(4)), np.zeros(4))
 
 
-def test_normalize_gives_the_identity_for_zero():
-    np.testing.assert_array_equal(rot.normalize(jnp.zeros(4)), [0, 0, 0, 1])
-    np.testing.assert_allclose(rot.normalize(jnp.array([0.0, 3.0, 0.0, 4.0])), [0, 0.6, 0, 0.8], **ROUNDING)
-
-
 def test_law_07_safe_functions_have_gradient_zero_at_zero():
     fallback = jnp.array([0.0, 0.0, 1.0])
     assert rot.safe_norm(jnp.zeros(3)) == 0
@@ -136,9 +119,7 @@ def test_safe_arctan2_is_arctan2_elsewhere(y, x):
     assert float(rot.safe_arctan2(jnp.asarray(y), jnp.asarray(x))) == pytest.approx(np.arctan2(y, x), abs=1e-15)
 
 
-JACOBIANS = {
-    fn.__name__: jax.jit(jax.jacobian(fn)) for fn in (rot.to_rpy, rot.yaw, rot.z_axis, rot.from_rotvec, rot.from_rpy)
-}
+JACOBIANS = {fn.__name__: jax.jit(jax.jacobian(fn)) for fn in (rot.to_rpy, rot.yaw, rot.z_axis, rot.from_rpy)}
 TINY = (0.0, 1e-45, 1e-30, 1e-22, 1e-19, 1e-10, 1e-4)
 
 
@@ -169,9 +150,7 @@ def test_law_07_yaw_of_a_quaternion_next_to_zero_has_finite_gradients(tiny, dtyp
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("tiny", TINY)
 def test_law_07_jacobians_are_finite_for_tiny_rotations(tiny, dtype):
-    for name in ("from_rotvec", "from_rpy"):
-        x = jnp.full(3, tiny, dtype)
-        np.testing.assert_allclose(JACOBIANS[name](x)[:3], 0.5 * np.eye(3), rtol=0, atol=1e-3)
+    np.testing.assert_allclose(JACOBIANS["from_rpy"](jnp.full(3, tiny, dtype))[:3], 0.5 * np.eye(3), rtol=0, atol=1e-3)
     quat = jnp.array([0.0, 0.0, 0.0, 1.0], dtype)
     for argnum in (0, 1):
         assert np.all(np.isfinite(jax.jacobian(rot.turn, argnum)(quat, jnp.full(3, tiny, dtype))))

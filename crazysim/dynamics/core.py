@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
+from pathlib import Path
+from typing import Any
 
-from crazysim.drones import Airframe
-from crazysim.errors import ConfigError
+from crazysim.drones import Airframe, Drone, load_airframe
+from crazysim.errors import ConfigError, UnknownNameError
 
 GRAVITY = (0.0, 0.0, -9.81)
 """Gravitational acceleration, world frame, m/s^2: the value of the fits the airframes come from."""
@@ -25,11 +28,23 @@ class Dynamics(StrEnum):
     default = first_principles
 
 
-def supported_dynamics(airframe: Airframe) -> tuple[Dynamics, ...]:
-    """Return the models for which an airframe has parameters."""
+def supported_dynamics(drone: str | Path | Mapping[str, Any] | Airframe) -> tuple[Dynamics, ...]:
+    """Return the models for which an airframe, or whatever ``load_airframe`` makes one of, has parameters."""
+    airframe = load_airframe(drone)
     fitted = airframe.tables.get("fitted", {})
     full = "thrust_curve" in airframe.table("rotors")
     return tuple(d for d in Dynamics if (full if d == Dynamics.first_principles else d.value in fitted))
+
+
+def supported_drones(dynamics: Dynamics | str) -> tuple[Drone, ...]:
+    """Return the built-in airframes that have parameters for a model.
+
+    Raises:
+        UnknownNameError: If there is no such model.
+    """
+    if dynamics not in tuple(Dynamics):
+        raise UnknownNameError(f"dynamics is {dynamics!r}; it must be one of {', '.join(Dynamics)}")
+    return tuple(drone for drone in Drone if dynamics in supported_dynamics(drone))
 
 
 def require_support(airframe: Airframe, dynamics: Dynamics) -> None:

@@ -4,8 +4,10 @@
 
 The fit was made near level flight. Euler angles have no value at a pitch of 90 degrees, where the peer's
 formulas divide by zero; here the fit holds as it is up to 80 degrees of pitch, and from there to 88 degrees it
-hands over smoothly to a spring and damper on the attitude error itself, which exists everywhere. Beyond 80
-degrees no flight was fitted: the motion there is bounded and continuous, not identified.
+hands over smoothly to a spring and damper on the attitude error itself, which exists everywhere. It does so
+between 100 and 200 rad/s, too, and between commands of 100 and 200 rad: a drone that is pulled through the
+vertical would gain rate from the singularity at every passage, without end. Beyond these limits no flight was
+fitted: the motion there is bounded and continuous, not identified.
 """
 
 from __future__ import annotations
@@ -25,6 +27,12 @@ from crazysim.rotation import matvec
 
 FITTED_UP_TO = math.cos(math.radians(80))
 HANDED_OVER_AT = math.cos(math.radians(88))
+FITTED_UP_TO_SIZE = 100.0
+"""Body rate, rad/s, and commanded angles, rad, up to which the fit holds; it is handed over at twice as much.
+
+Three times the 2,000 degrees per second that a Crazyflie's gyroscope can measure (BMI088, data sheet), and sixteen
+turns.
+"""
 
 
 class Params(PyTree):
@@ -147,15 +155,20 @@ def saturate(cmd: Array, params: Params) -> Array:
 
 
 def _fitted_angular_acceleration(quat: Array, ang_vel: Array, cmd_rpy: Array, p: Params) -> Array:
-    """Return the fit's angular acceleration, handed over to an attitude spring near 90 degrees of pitch."""
+    """Return the fit's angular acceleration, handed over to an attitude spring outside of what was flown."""
     x, y, z, w = quat[..., 0:1], quat[..., 1:2], quat[..., 2:3], quat[..., 3:4]
     cos_pitch = rotation.safe_norm(jnp.concatenate([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1))
     t = jnp.clip((cos_pitch - HANDED_OVER_AT) / (FITTED_UP_TO - HANDED_OVER_AT), 0.0, 1.0)
+    size = jnp.maximum(rotation.dot(ang_vel, ang_vel), rotation.dot(cmd_rpy, cmd_rpy)) / FITTED_UP_TO_SIZE**2
+    t = t * jnp.clip((4 - size) / 3, 0.0, 1.0)
     weight = t * t * t * (10 - 15 * t + 6 * t * t)
 
-    # Where the weight is zero the Euler angles must not be evaluated at all: 0 x inf is NaN, in gradients too.
+    # Where the weight is zero the fit must not be evaluated at all: 0 x inf is NaN, in gradients too.
     level = jnp.asarray([0.0, 0.0, 0.0, 1.0], quat.dtype)
-    from_angles = _euler_spring(jnp.where(weight > 0, quat, level), ang_vel, cmd_rpy, p)
+    fits = weight > 0
+    from_angles = _euler_spring(
+        jnp.where(fits, quat, level), jnp.where(fits, ang_vel, 0.0), jnp.where(fits, cmd_rpy, 0.0), p
+    )
 
     error = rotation.multiply(rotation.conjugate(rotation.from_rpy(cmd_rpy)), quat)
     from_error = p.rpy_coef * 2 * error[..., 3:] * error[..., :3] + p.rpy_rates_coef * ang_vel

@@ -120,6 +120,14 @@ def _add_part(body: mujoco.MjsBody, part: Part, i: int) -> None:
         geom.material = f"{part.material}:{i}" if part.material in LED_MATERIALS else part.material
 
 
+def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:
+    """Let drones touch with their boxes, or with their spheres, once the spec is compiled again."""
+    for i in range(n_drones):
+        for kind in ("col_sphere", "col_box"):
+            geom = spec.geom(f"{kind}:{i}")
+            geom.contype = geom.conaffinity = int((kind == "col_box") == enable)
+
+
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Return the compiled model.
 

@@ -259,6 +259,26 @@ class SimData(PyTree):
     """Whatever stages of the user keep. Records (``PyTree``) declare the scope of their leaves and are reset with
     their world; bare arrays are opaque, and no reset touches them."""
 
+    @staticmethod
+    def create(
+        n_worlds: int,
+        n_drones: int,
+        dynamics: Dynamics,
+        control: Control,
+        airframe: Airframe,
+        freq: int,
+        freqs: dict[Control, int],
+        drone_mocap_ids: Any,
+        rng_key: int | Array,
+    ) -> SimData:
+        """Return drones at rest that have not begun, without plugins; ``freqs`` are the controllers' rates, Hz."""
+        return SimData(
+            states=SimState.create(n_worlds, n_drones, n_rotor_states(dynamics, airframe)),
+            controls=SimControls.create(n_worlds, n_drones, control, dynamics, airframe, freqs),
+            params=create_params(dynamics, airframe),
+            core=SimCore.create(freq, n_worlds, n_drones, drone_mocap_ids, rng_key),
+        )
+
 
 def require_pair(dynamics: Dynamics, control: Control) -> None:
     """Check that a command level exists in a dynamics model.

@@ -72,7 +72,7 @@ def remove_fn(pipeline: Pipeline, name: str) -> None:
 
 def _index(pipeline: Pipeline, name: str) -> int:
     if name not in pipeline:
-        raise UnknownNameError(f"the pipeline has no stage {name!r}; its stages are {', '.join(pipeline)}")
+        raise UnknownNameError(f"No stage named {name!r} in the pipeline; its stages are {', '.join(pipeline)}")
     return list(pipeline).index(name)
 
 
@@ -81,9 +81,9 @@ def _insert(pipeline: Pipeline, index: int, fn: Callable[..., Any], name: str | 
         raise ValueError(f"a stage is a function, not {fn!r}")
     name = name if name is not None else getattr(fn, "__name__", None)
     if name is None or name == "<lambda>":
-        raise ValueError(f"{fn!r} has no name of its own; pass name= to be able to find the stage again")
+        raise ValueError(f"{fn!r} has no name of its own and needs an explicit name; pass name=")
     if name in pipeline:
-        raise UnknownNameError(f"the pipeline has a stage {name!r} already; pass another name=, or use replace_fn")
+        raise UnknownNameError(f"a stage named {name!r} already exists; pass another name=, or use replace_fn")
     items = list(pipeline.items())
     items.insert(index, (name, fn))
     pipeline.clear()

@@ -12,7 +12,12 @@ from collections.abc import Callable
 import jax
 from jax import Array
 
-from crazysim.sim.data import SimData
+from crazysim.sim.data import SimData, as_key
+
+
+def seed_sim(data: SimData, seed: int | Array) -> SimData:
+    """Return the data with another seed, or key, for all random numbers drawn from now on."""
+    return data.replace(core=data.core.replace(rng_key=as_key(seed)))
 
 
 def world_key(data: SimData, name: str) -> Array:

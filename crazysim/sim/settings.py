@@ -1,11 +1,13 @@
-"""What a simulation is asked to be, checked once, at construction."""
+"""What a simulation is asked to be and to do, checked at once."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from crazysim.control import Control
 from crazysim.errors import ConfigError, UnknownNameError
@@ -16,6 +18,17 @@ def positive(name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ConfigError(f"{name} is {value!r}; it must be a positive whole number")
     return int(value)
+
+
+def physics_freq(freq: Any) -> int:
+    """Return the physics steps per second, Hz, or say why there cannot be so many."""
+    freq = positive("freq", freq)
+    if freq > 10_000 and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+        raise ConfigError(
+            f"freq is {freq} Hz: above 10,000 Hz a step is lost in float32 rounding. Enable float64 first: "
+            f"jax.config.update('jax_enable_x64', True)"
+        )
+    return freq
 
 
 def member(enum: Any, name: str, value: Any) -> Any:
@@ -43,6 +56,21 @@ def find_device(device: str | jax.Device) -> jax.Device:
             f"device {device!r} does not exist ({error}); there is {found}. Give a platform such as 'cpu' or 'gpu', "
             f"or 'gpu:1' for the second of its devices. GPUs need jax's CUDA packages: pip install 'crazysim[gpu]'."
         ) from None
+
+
+def as_mask(mask: Any, n_worlds: int) -> Array | None:
+    """Return which worlds are meant, None for all, or say what a mask must be. (n_worlds,)"""
+    if mask is None:
+        return None
+    try:
+        array = mask if isinstance(mask, jax.Array) else np.asarray(mask)
+    except ValueError as error:
+        raise ValueError(f"the mask {mask!r} is no regular array; needed is one bool per world") from error
+    if array.shape != (n_worlds,) or array.dtype != bool:
+        raise ValueError(
+            f"the mask has shape {array.shape} and type {array.dtype}; needed are {(n_worlds,)} and bool, one per world"
+        )
+    return jnp.asarray(array)
 
 
 def control_freqs(control: Control, freq: int, given: dict[Control, int | None]) -> dict[Control, int]:

@@ -1,4 +1,4 @@
-"""Spread worlds over several devices."""
+"""Where worlds live: on one device, or spread over several."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from crazysim.errors import ConfigError
 from crazysim.pytree import scopes
@@ -14,6 +14,17 @@ from crazysim.sim.data import SimData
 
 WORLD_AXIS = "worlds"
 """Name of the mesh axis that worlds are spread over."""
+
+
+def put(tree: Any, device: jax.Device) -> Any:
+    """Return the tree on a device, bound to it; leaves that are so already are not touched."""
+    here = SingleDeviceSharding(device)
+
+    def place(x: Any) -> Any:
+        is_here = isinstance(x, jax.Array) and x.committed and x.sharding == here
+        return x if is_here else jax.device_put(x, here)
+
+    return jax.tree.map(place, tree)
 
 
 def world_mesh(devices: Sequence[jax.Device]) -> Mesh:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
+from jax.sharding import Mesh
 from numpy.typing import NDArray
 
 from crazysim.control import Control
@@ -20,32 +20,23 @@ from crazysim.dynamics import Dynamics
 from crazysim.dynamics.core import require_support
 from crazysim.engine import Step, build_reset, explain
 from crazysim.engine.plain import ResetFn
-from crazysim.errors import ConfigError
-from crazysim.scene import build, contacts, mjx
+from crazysim.scene import mjx
+from crazysim.scene.build import use_boxes
+from crazysim.scene.contacts import body_id
 from crazysim.scene.draw import Marks
 from crazysim.scene.render import Viewer
-from crazysim.scene.sync import sync_one_world, sync_sim2mjx
+from crazysim.scene.scene import Held, Scene
+from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim import functional as F
-from crazysim.sim.data import (
-    SimControls,
-    SimCore,
-    SimData,
-    SimState,
-    as_key,
-    create_params,
-    n_rotor_states,
-    require_pair,
-)
+from crazysim.sim.data import SimData, as_key, require_pair
 from crazysim.sim.integration import Integrator
 from crazysim.sim.pipeline import Pipeline
-from crazysim.sim.settings import control_freqs, find_device, member, positive
-from crazysim.sim.sharding import place_scene, shard
+from crazysim.sim.random import seed_sim
+from crazysim.sim.settings import as_mask, control_freqs, find_device, member, physics_freq, positive
+from crazysim.sim.sharding import put, shard
 from crazysim.sim.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
 
 __all__ = ["Sim", "clip_floor_pos", "increment_steps", "reset", "seed_sim", "sync_sim2mjx", "use_box_collision"]
-
-LARGE_SWARM = 64
-"""From this many drones a world on, MJX checks two pairs per drone instead of every pair."""
 
 
 class Sim:
@@ -101,15 +92,10 @@ class Sim:
         """
         self.n_worlds = positive("n_worlds", n_worlds)
         self.n_drones = positive("n_drones", n_drones)
-        self.freq = positive("freq", freq)
+        self.freq = physics_freq(freq)
         self.dynamics = member(Dynamics, "dynamics", dynamics)
         self.control = member(Control, "control", control)
         self.integrator = member(Integrator, "integrator", integrator)
-        if self.freq > 10_000 and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
-            raise ConfigError(
-                f"freq is {freq} Hz: above 10,000 Hz a step is lost in float32 rounding. Enable float64 first: "
-                f"jax.config.update('jax_enable_x64', True)"
-            )
         require_pair(self.dynamics, self.control)
         self.airframe = load_airframe(drone)
         require_support(self.airframe, self.dynamics)
@@ -125,13 +111,10 @@ class Sim:
         }
         self._freqs = control_freqs(self.control, self.freq, asked)
 
-        self.max_geom_pairs = -1 if self.n_drones < LARGE_SWARM else 2 * self.n_drones
-        self.marks = Marks()
-        self.viewer: Viewer | None = None
-        self.spec = build.build_spec(xml_path, self.airframe, self.n_drones, self.freq, self.max_geom_pairs)
+        self._scene = Scene(xml_path, self.airframe, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
         self._seed = as_key(rng_key)
         self._counts: dict[int, Array] = {}
-        self._compile_scene()
+        self._cleared: Any = None
         self.build_data()
         self.build_default_data()
 
@@ -144,16 +127,19 @@ class Sim:
 
     @property
     def data(self) -> SimData:
-        """Everything that changes. Assigning to it makes the scene stale."""
+        """Everything that changes. Assigning to it makes the scene stale, and clears ``core.mjx_synced``."""
         return self._data
 
     @data.setter
     def data(self, data: SimData) -> None:
+        if data.core.mjx_synced is not self._cleared:
+            # A new array, for what is read from here may be donated, and must then be nobody else's.
+            data = data.replace(core=data.core.replace(mjx_synced=np.False_))
         self._advance(self._place(data))
 
     def _advance(self, data: SimData) -> None:
-        self._data = data
-        self._synced = False
+        self._data, self._cleared = data, data.core.mjx_synced
+        self._scene.invalidate()
 
     def _place(self, data: SimData) -> SimData:
         """Return the data with every leaf on the simulation's device; what is there already is not touched.
@@ -161,7 +147,7 @@ class Sim:
         An edited leaf lives wherever JAX puts new arrays by default, and an array elsewhere, or one that is merely
         not bound to its device, would have the next step compiled anew.
         """
-        return _put(data, self.device) if self.mesh is None else shard(data, self.mesh)
+        return put(data, self.device) if self.mesh is None else shard(data, self.mesh)
 
     @property
     def time(self) -> Array:
@@ -178,33 +164,19 @@ class Sim:
         """In which worlds the next step takes over a staged command. (n_worlds, 1)"""
         return F.controllable(self.data)
 
-    @property
-    def max_visual_geom(self) -> int:
-        """Most marks and geoms that one picture takes."""
-        return self.marks.limit
-
-    @max_visual_geom.setter
-    def max_visual_geom(self, limit: int) -> None:
-        self.marks.limit = positive("max_visual_geom", limit)
-        self._close_viewer()
-
     def build_data(self) -> SimData:
         """Return new data at rest, as at construction, and make it the simulation's."""
-        data = SimData(
-            states=SimState.create(self.n_worlds, self.n_drones, n_rotor_states(self.dynamics, self.airframe)),
-            controls=SimControls.create(
-                self.n_worlds, self.n_drones, self.control, self.dynamics, self.airframe, self._freqs
-            ),
-            params=create_params(self.dynamics, self.airframe),
-            core=SimCore.create(
-                self.freq,
-                self.n_worlds,
-                self.n_drones,
-                build.drone_mocap_ids(self.mj_model, self.n_drones),
-                self._seed,
-            ),
+        self.data = SimData.create(
+            self.n_worlds,
+            self.n_drones,
+            self.dynamics,
+            self.control,
+            self.airframe,
+            self.freq,
+            self._freqs,
+            self._scene.drone_mocap_ids,
+            self._seed,
         )
-        self.data = data
         return self.data
 
     def build_default_data(self) -> SimData:
@@ -217,9 +189,7 @@ class Sim:
         self.mesh = mesh
         self.data = self.data
         self.default_data = shard(self.default_data, mesh)
-        self._mjx_model = None
-        if self._mjx_data is not None:
-            self.mjx_data = self._mjx_data
+        self._scene.shard(mesh)
         self.build_step_fn()
         return self.data
 
@@ -230,7 +200,7 @@ class Sim:
             ValueError: If it is no integer.
         """
         self._seed = as_key(seed)
-        self.data = self.data.replace(core=self.data.core.replace(rng_key=self._seed))
+        self.data = seed_sim(self.data, self._seed)
 
     # Stepping -----------------------------------------------------------------------------------------------
 
@@ -258,18 +228,7 @@ class Sim:
         Raises:
             ValueError: If the mask has another shape or type.
         """
-        if mask is not None:
-            try:
-                mask = mask if isinstance(mask, jax.Array) else np.asarray(mask)
-            except ValueError as error:
-                raise ValueError(f"the mask {mask!r} is no regular array; needed is one bool per world") from error
-            if mask.shape != (self.n_worlds,) or mask.dtype != bool:
-                raise ValueError(
-                    f"the mask has shape {mask.shape} and type {mask.dtype}; needed are {(self.n_worlds,)} and bool, "
-                    f"one per world"
-                )
-            mask = jnp.asarray(mask)
-        self._advance(self._reset(self.data, self.default_data, mask))
+        self._advance(self._reset(self.data, self.default_data, as_mask(mask, self.n_worlds)))
 
     def state_control(self, controls: Any, check_finite: bool = False) -> None:
         """Stage a full-state setpoint; see ``crazysim.sim.functional.state_control``. (n_worlds, n_drones, 16)"""
@@ -306,16 +265,14 @@ class Sim:
 
     # Scene --------------------------------------------------------------------------------------------------
 
-    @property
-    def mjx_model(self) -> mjx.Model:
-        """The scene's model on the device; made when first read."""
-        model = self._mjx_model
-        if model is None:
-            model = build.put_model(self.mj_model, self.device)
-            if self.mesh is not None:
-                model = jax.device_put(model, NamedSharding(self.mesh, PartitionSpec()))
-            self._mjx_model = model
-        return model
+    spec = Held[mujoco.MjSpec]("The scene, to be edited; ``build_mjx`` has an edit take effect.")
+    mj_model = Held[mujoco.MjModel]("What ``spec`` was compiled to.")
+    mj_data = Held[mujoco.MjData]("The one world that was drawn last.")
+    mjx_model = Held[mjx.Model]("The scene's model on the device; made when first read.")
+    max_geom_pairs = Held[int]("Cap on the pairs MJX checks per kind of collision, from the next ``build_mjx`` on.")
+    max_visual_geom = Held[int]("Most marks that one picture takes.")
+    marks = Held[Marks]("What is drawn over the next picture.")
+    viewer = Held[Viewer | None]("What draws; made for the first picture.")
 
     @property
     def mjx_data(self) -> mjx.Data:
@@ -324,17 +281,12 @@ class Sim:
         Assigning to it makes the scene stale. Poses of bodies that are no drones, ``mocap_pos`` and ``mocap_quat``,
         must be one per world and finite, or it raises a ValueError.
         """
-        if self._mjx_data is None:
-            self._mjx_data = self._place_scene(build.make_data(self.mj_model, self.n_worlds, self.device))
-        return self._mjx_data
+        return self._scene.mjx_data
 
     @mjx_data.setter
     def mjx_data(self, mjx_data: mjx.Data) -> None:
-        self._mjx_data = self._place_scene(build.check_poses(mjx_data, self.mj_model, self.n_worlds))
-        self._synced = False
-
-    def _place_scene(self, mjx_data: mjx.Data) -> mjx.Data:
-        return _put(mjx_data, self.device) if self.mesh is None else place_scene(mjx_data, self.mesh)
+        self._scene.mjx_data = mjx_data
+        self.data = self.data
 
     def build_mjx(self) -> None:
         """Compile ``spec`` again after an edit; closes the viewer, and leaves the simulation's data as it is.
@@ -342,13 +294,11 @@ class Sim:
         Raises:
             ConfigError: If the spec does not compile or has lost a drone; the old scene stays then.
         """
-        self.spec.numeric("max_geom_pairs").data = [self.max_geom_pairs]
-        self._compile_scene()
-        ids = jnp.asarray(build.drone_mocap_ids(self.mj_model, self.n_drones), jnp.int32)
-        core = self.data.core.replace(drone_mocap_ids=ids, mjx_synced=jnp.asarray(False))
-        self.data = self.data.replace(core=core)
-        core = self.default_data.core.replace(drone_mocap_ids=self.data.core.drone_mocap_ids)
-        self.default_data = self.default_data.replace(core=core)
+        self._scene.compile()
+        ids = jnp.asarray(self._scene.drone_mocap_ids, jnp.int32)
+        self.data = self.data.replace(core=self.data.core.replace(drone_mocap_ids=ids))
+        ids = self.data.core.drone_mocap_ids
+        self.default_data = self.default_data.replace(core=self.default_data.core.replace(drone_mocap_ids=ids))
 
     def contacts(self, body: str | None = None) -> Array:
         """Return which contact slots touch, after bringing the scene up to date if anything has changed.
@@ -366,11 +316,9 @@ class Sim:
             ValueError: If the scene has no such body.
         """
         if body is not None:
-            contacts.body_id(self.mj_model, body)  # a wrong name is told before anything is touched
-        self._sync()
-        if body is None:
-            return contacts.contact_flags(self.mjx_data)
-        return contacts.body_contact_flags(self.mjx_data, self.mj_model, body)
+            body_id(self.mj_model, body)  # a wrong name is told before anything is touched
+        self._data = self._scene.sync(self._data)
+        return self._scene.contacts(body)
 
     def render(
         self,
@@ -399,54 +347,12 @@ class Sim:
         """
         if not 0 <= world < self.n_worlds:
             raise ValueError(f"world {world} does not exist; worlds go from 0 to {self.n_worlds - 1}")
-        self._sync(world)
-        if self.viewer is None:
-            self.viewer = Viewer(self.mj_model, self.mj_data, self.marks.limit + self.mj_model.ngeom)
-        picture = self.viewer.render(mode, camera, cam_config, width, height, self.marks)
-        self.marks.clear()
-        return picture
+        self._data = self._scene.sync(self._data, world)
+        return self._scene.draw(mode, camera, cam_config, width, height)
 
     def close(self) -> None:
         """Close the window and free what pictures needed."""
-        self._close_viewer()
-
-    def _sync(self, world: int | None = None) -> None:
-        """Bring the scene up to date: all of it, or ``mj_data`` with the one world that is to be drawn.
-
-        The only way to a fresh scene. A single world is drawn without touching the others; where there is only
-        one, or all are fresh already, that is the whole scene.
-        """
-        if not self._synced and (world is None or (self.n_worlds == 1 and self._mjx_holds_scene())):
-            self._data, self._mjx_data = sync_sim2mjx(self._data, self.mjx_data, self.mjx_model)
-            self._synced = True
-        if world is not None:
-            sync_one_world(self._data, self._mjx_data, world, self.mj_model, self.mj_data)
-
-    def _mjx_holds_scene(self) -> bool:
-        """Return whether contacts can be asked for; what MJX cannot hold can still be drawn."""
-        try:
-            return self.mjx_model is not None
-        except ConfigError:
-            return False
-
-    def _compile_scene(self) -> None:
-        mj_model = build.compile_spec(self.spec)
-        build.drone_mocap_ids(mj_model, self.n_drones)  # refuses a scene that has lost a drone
-        self._close_viewer()
-        self.mj_model, self.mj_data = mj_model, mujoco.MjData(mj_model)
-        self._mjx_model: mjx.Model | None = None
-        self._mjx_data: mjx.Data | None = None
-        self._synced = False
-
-    def _close_viewer(self) -> None:
-        if self.viewer is not None:
-            self.viewer.close()
-            self.viewer = None
-
-
-def seed_sim(data: SimData, seed: int) -> SimData:
-    """Return the data with another seed for all random numbers drawn from now on."""
-    return data.replace(core=data.core.replace(rng_key=as_key(seed)))
+        self._scene.close()
 
 
 def use_box_collision(sim: Sim, enable: bool = True) -> None:
@@ -454,19 +360,5 @@ def use_box_collision(sim: Sim, enable: bool = True) -> None:
 
     Boxes follow the drone's outline more closely and cost more to check.
     """
-    for i in range(sim.n_drones):
-        for kind in ("col_sphere", "col_box"):
-            geom = sim.spec.geom(f"{kind}:{i}")
-            geom.contype = geom.conaffinity = int((kind == "col_box") == enable)
+    use_boxes(sim.spec, sim.n_drones, enable)
     sim.build_mjx()
-
-
-def _put(tree: Any, device: jax.Device) -> Any:
-    """Return the tree on a device, bound to it; leaves that are so already are not touched."""
-    here = SingleDeviceSharding(device)
-
-    def put(x: Any) -> Any:
-        is_here = isinstance(x, jax.Array) and x.committed and x.sharding == here
-        return x if is_here else jax.device_put(x, here)
-
-    return jax.tree.map(put, tree)

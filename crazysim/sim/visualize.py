@@ -96,9 +96,9 @@ def change_material(
     """
     ids = np.asarray(drone_ids)
     if ids.ndim != 1 or not np.issubdtype(ids.dtype, np.integer):
-        raise ValueError(f"drone_ids must be a list of integers, got {drone_ids!r}")
+        raise ValueError(f"drone_ids must be 1D arrays or lists of integers, got {drone_ids!r}")
     if ids.size and not (ids.min() >= 0 and ids.max() < sim.n_drones):
-        raise ValueError(f"drone_ids must lie between 0 and {sim.n_drones - 1}, got {ids.tolist()}")
+        raise ValueError(f"drone_ids must be in range [0, {sim.n_drones - 1}], got {ids.tolist()}")
     materials = [mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{mat_name}:{drone}") for drone in ids]
     if any(material < 0 for material in materials):
         raise UnknownNameError(f"drones have no material {mat_name!r} of their own; they have led_top and led_bot")

@@ -1,12 +1,14 @@
 """The inner loop, from attitude or body rates to a wrench."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import controller_params, vectors
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from crazysim import load_airframe
@@ -18,15 +20,7 @@ LEVEL, ZERO = np.array([0.0, 0, 0, 1]), np.zeros(3)
 HALF = 0.4  # N, half of what the four rotors give: as far from every limit as can be
 attitude = jax.jit(attitude2force_torque, static_argnames="ctrl_freq")
 body_rate = jax.jit(body_rate2force_torque, static_argnames="ctrl_freq")
-
-
-def vectors(n, size):
-    return arrays(np.float64, n, elements=st.floats(-size, size))
-
-
-def params(**changes):
-    out = AttitudeParams.create(load_airframe("cf21B_500"))
-    return out.replace(**{k: jnp.asarray(v, float) for k, v in changes.items()})
+params = functools.partial(controller_params, AttitudeParams)
 
 
 def hold(cmd, quat=LEVEL, rates=ZERO, wanted=ZERO, before=None, wanted_before=None, integral=ZERO, freq=500, p=None):

@@ -1,30 +1,23 @@
 """The outer loop, from setpoint to attitude and thrust."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import controller_params, vectors
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from crazysim import load_airframe
 from crazysim.control import StateParams, state2attitude
 
 pytestmark = pytest.mark.usefixtures("x64")
 
 LEVEL = np.array([0.0, 0, 0, 1])
 controller = jax.jit(state2attitude, static_argnames="ctrl_freq")
-
-
-def vectors(n, size):
-    return arrays(np.float64, n, elements=st.floats(-size, size))
-
-
-def params(**changes):
-    out = StateParams.create(load_airframe("cf21B_500"))
-    return out.replace(**{k: jnp.asarray(v, float) for k, v in changes.items()})
+params = functools.partial(controller_params, StateParams)
 
 
 def setpoint(pos=(0, 0, 0), vel=(0, 0, 0), acc=(0, 0, 0), quat=(0, 0, 0, 1), rates=(0, 0, 0)):

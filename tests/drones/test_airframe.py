@@ -11,7 +11,7 @@ from crazysim import ConfigError, Sim
 from crazysim.control import AllocationParams, AttitudeParams, StateParams
 from crazysim.drones import Airframe, Drone, airframe_names, load_airframe
 from crazysim.drones.airframe import FOLDER
-from crazysim.dynamics import Dynamics, first_principles, fitted, supported_dynamics
+from crazysim.dynamics import Dynamics, first_principles, fitted, supported_drones, supported_dynamics
 
 FILES = sorted(FOLDER.glob("*.toml"))
 
@@ -60,12 +60,23 @@ def test_every_number_has_a_unit_and_a_source(path):
     assert not unused
 
 
+def test_drones_of_a_model_are_those_that_support_it():
+    for dynamics in Dynamics:
+        drones = supported_drones(dynamics.value)
+        assert drones == tuple(drone for drone in Drone if dynamics in supported_dynamics(drone))
+    assert Drone.hb_x500 in supported_drones("so_rpy")
+    assert Drone.hb_x500 not in supported_drones(Dynamics.first_principles)
+    with pytest.raises(ValueError, match="'so_rpyx'; it must be one of first_principles, so_rpy"):
+        supported_drones("so_rpyx")
+
+
 @pytest.mark.parametrize("name", airframe_names())
 def test_every_airframe_gives_parameters_for_all_it_supports(name):
     airframe = load_airframe(name)
     assert airframe.name == name
     supported = supported_dynamics(airframe)
     assert supported
+    assert supported == supported_dynamics(name)
     for dynamics in Dynamics:
         is_full = dynamics == Dynamics.first_principles
         create = first_principles.Params.create if is_full else lambda a, d=dynamics: fitted.Params.create(a, d)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import unit_quats, vectors
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -18,11 +19,7 @@ pytestmark = pytest.mark.usefixtures("x64")
 model = jax.jit(first_principles.dynamics)
 
 
-def vectors(n, size):
-    return arrays(np.float64, n, elements=st.floats(-size, size))
-
-
-quats = vectors(4, 1.0).filter(lambda q: np.linalg.norm(q) > 0.1).map(lambda q: q / np.linalg.norm(q))
+quats = unit_quats()
 
 
 def reference(quat, vel, ang_vel, cmd, rotor_vel, force, torque, airframe):

@@ -1,13 +1,12 @@
-"""The fitted models: the fit itself up to 80 degrees of pitch, bounded and continuous beyond."""
+"""The fitted models: the fit itself as far as it was flown, bounded and continuous beyond."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FITTED
+from cases import FITTED, vectors
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from crazysim import load_airframe, rotation
@@ -20,10 +19,6 @@ model = jax.jit(fitted.dynamics)
 
 def params(dynamics="so_rpy", name="cf21B_500"):
     return fitted.Params.create(load_airframe(name), Dynamics(dynamics))
-
-
-def vectors(n, size):
-    return arrays(np.float64, n, elements=st.floats(-size, size))
 
 
 def body_rates(rpy, rates):
@@ -64,6 +59,36 @@ def test_up_to_80_degrees_the_fit_is_not_touched_by_what_lies_beyond(pitch, rate
     rpy, cmd = np.array([0.5, np.deg2rad(pitch), -0.7]), np.array([0.1, 0.2, -0.3])
     expected = by_the_fit(rpy, np.array(rates), cmd, params())
     np.testing.assert_allclose(by_the_model(rpy, np.array(rates), cmd, params()), expected, rtol=1e-4, atol=0.05)
+
+
+@pytest.mark.parametrize("cmd, rates", [(57.0, 0.0), (0.3, 50.0), (-57.0, -20.0)])
+def test_up_to_100_rad_and_100_rad_a_second_the_fit_holds(cmd, rates):
+    """Three equal numbers of 57 have a length of 98.7; three angles that change by 50 rad/s turn the body by 92.
+
+    Differences are off by 2e-4 of themselves here.
+    """
+    rpy, cmd, rates = np.array([0.5, -0.2, -0.7]), np.full(3, cmd), np.full(3, rates)
+    expected = by_the_fit(rpy, rates, cmd, params())
+    np.testing.assert_allclose(by_the_model(rpy, rates, cmd, params()), expected, rtol=3e-4, atol=0.05)
+
+
+@pytest.mark.parametrize("what", ["rate", "command"])
+def test_beyond_the_fit_is_handed_over_without_a_jump(what):
+    """From 90 to 210 rad/s, or rad: half the step, half the largest change; at 200 it is the spring and damper."""
+    changes, p = [], params()
+    quat, fixed = np.asarray(rotation.from_rpy(jnp.array([0.2, 0.9, 0.3]))), np.array([0.6, 0.0, 0.8])
+    for n in (20_001, 40_001):
+        varied = np.linspace(90, 210, n)[:, None] * fixed
+        rates = varied if what == "rate" else np.zeros((n, 3))
+        commands = np.concatenate([varied if what == "command" else np.zeros((n, 3)), np.full((n, 1), 0.4)], axis=-1)
+        still = np.zeros((n, 3))
+        ang_acc = model(still, np.tile(quat, (n, 1)), still, rates, commands, np.zeros((n, 4)), params=p)[2]
+        changes.append(np.max(np.abs(np.diff(ang_acc, axis=0))))
+    assert changes[1] == pytest.approx(changes[0] / 2, rel=0.05)
+    error = Rotation.from_euler("ZYX", commands[-1, 2::-1]).inv() * Rotation.from_quat(quat)
+    x, y, z, w = error.as_quat()
+    expected = 2 * w * p.rpy_coef * np.array([x, y, z]) + p.rpy_rates_coef * rates[-1]
+    np.testing.assert_allclose(ang_acc[-1], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("dynamics", FITTED)

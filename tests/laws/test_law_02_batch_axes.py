@@ -14,20 +14,15 @@ from cases import LEVELS, PAIRS, shared_sim, with_params, with_states
 
 from crazysim import ConfigError, Control, PyTree, Sim
 from crazysim.pytree import scopes
-from crazysim.sim.data import SimControls, SimCore, SimData, SimState, n_rotor_states
+from crazysim.sim.data import SimData
 
 SIZES = [(n, m) for n in (1, 2, 3, 4) for m in (1, 2, 3, 4)]
 
 
 def resized(sim, n_worlds, n_drones):
     """Return the data that ``Sim`` would build for so many worlds and drones, without another scene."""
-    freqs = dict.fromkeys(Control, 100)
-    return SimData(
-        states=SimState.create(n_worlds, n_drones, n_rotor_states(sim.dynamics, sim.airframe)),
-        controls=SimControls.create(n_worlds, n_drones, sim.control, sim.dynamics, sim.airframe, freqs),
-        params=sim.data.params,
-        core=SimCore.create(sim.freq, n_worlds, n_drones, np.arange(n_drones), 0),
-    )
+    freqs, ids = dict.fromkeys(Control, 100), np.arange(n_drones)
+    return SimData.create(n_worlds, n_drones, sim.dynamics, sim.control, sim.airframe, sim.freq, freqs, ids, 0)
 
 
 def per_drone(data):

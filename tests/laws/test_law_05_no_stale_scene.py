@@ -13,7 +13,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-import crazysim.sim.sim as shell
+import crazysim.scene.scene as place
 from crazysim.sim import Sim
 from crazysim.sim import functional as F
 from crazysim.sim.sim import sync_sim2mjx, use_box_collision
@@ -21,6 +21,15 @@ from crazysim.sim.sim import sync_sim2mjx, use_box_collision
 UP = 1.0
 """Height, m, at which a drone touches nothing."""
 SMALL = {"mode": "rgb_array", "width": 32, "height": 24}
+
+
+class Unreadable:
+    """A flag that nobody may look at."""
+
+    def __bool__(self):
+        raise AssertionError("the device's flag was read")
+
+    __array__ = __jax_array__ = __bool__
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +55,7 @@ def syncs(monkeypatch):
         done.append(1)
         return sync_sim2mjx(*args)
 
-    monkeypatch.setattr(shell, "sync_sim2mjx", counted)
+    monkeypatch.setattr(place, "sync_sim2mjx", counted)
     return done
 
 
@@ -168,13 +177,52 @@ def test_a_change_has_the_next_question_sync_once(two, syncs, change):
 
 
 def test_the_flag_of_the_data_follows(two):
-    """``data.core.mjx_synced`` is set by a question, and cleared by step and reset, as the peer's code reads it."""
+    """``data.core.mjx_synced`` is set by a question, and cleared by whatever makes the scene stale."""
     fresh(two, UP, UP)
-    for change in (two.step, two.reset):
+    synced = two.data
+    changes = {
+        "step": two.step,
+        "reset": two.reset,
+        "build_mjx": two.build_mjx,
+        "the same data": lambda: setattr(two, "data", two.data),
+        "data that was synced": lambda: setattr(two, "data", synced),
+        "data that claims to be": lambda: setattr(
+            two, "data", two.data.replace(core=two.data.core.replace(mjx_synced=np.True_))
+        ),
+        "mjx_data": lambda: setattr(two, "mjx_data", two.mjx_data),
+        "what a sync returns": lambda: setattr(two, "data", sync_sim2mjx(two.data, two.mjx_data, two.mjx_model)[0]),
+    }
+    for name, change in changes.items():
         two.contacts()
-        assert bool(two.data.core.mjx_synced)
-        change()
-        assert not bool(two.data.core.mjx_synced)
+        assert bool(two.data.core.mjx_synced), name
+        for _ in range(2):
+            change()
+            assert not bool(two.data.core.mjx_synced), name
+
+
+def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two):
+    """Whatever the flag is, it is exchanged; one that is known to be clear stays, so that edits cost no transfer."""
+    fresh(two, UP, UP)
+    two.step()
+    compiled = two._step._cache_size()
+    for flag in (Unreadable(), False, True, jnp.asarray(True), np.asarray(True)):
+        two.data = two.data.replace(core=two.data.core.replace(mjx_synced=flag))
+        two.step()
+    assert two._step._cache_size() == compiled
+    clear = two.data.core.mjx_synced
+    two.data = at_height(two.data, UP, UP)
+    assert two.data.core.mjx_synced is clear
+
+
+def test_a_cleared_flag_is_an_array_of_its_own(two):
+    """Who donates what was read from ``sim.data`` takes no array from data that is kept, such as the default."""
+    fresh(two, UP, UP)
+    flags = [two.default_data.core.mjx_synced]
+    for _ in range(3):
+        two.contacts()
+        two.data = two.data
+        flags.append(two.data.core.mjx_synced)
+    assert len(set(map(id, flags))) == len(flags)
 
 
 def test_what_sync_returns_may_be_assigned(two, syncs):
@@ -242,12 +290,6 @@ def test_wrong_questions_change_nothing(two, syncs):
 def test_asking_reads_no_device(two, syncs):
     """Whether a sync is due is known on the host: a flag that cannot be read does no harm."""
 
-    class Unreadable:
-        def __bool__(self):
-            raise AssertionError("the device's flag was read")
-
-        __array__ = __jax_array__ = __bool__
-
     fresh(two, UP, UP)
     fine = two._data
     try:
@@ -272,12 +314,12 @@ def test_nothing_of_the_scene_is_held_per_world_before_it_is_asked_for():
         own = {id(x) for x in jax.tree.leaves((sim.data, sim.default_data))}
         return sum(x.nbytes for x in jax.live_arrays() if x.ndim and x.shape[0] == n_worlds and id(x) not in own)
 
-    assert sim._mjx_data is None
+    assert sim._scene._mjx_data is None
     assert foreign_bytes() == 0
     sim.step(2)
     sim.reset()
     sim.build_mjx()
-    assert sim._mjx_data is None
+    assert sim._scene._mjx_data is None
     assert foreign_bytes() == 0
     assert sim.mjx_data.mocap_pos.shape == (n_worlds, 1, 3)
     assert foreign_bytes() > 1000 * n_worlds
@@ -288,8 +330,8 @@ def test_drawing_one_world_of_several_holds_none_of_the_others(opengl, syncs):
     sim = Sim(n_worlds=2)
     sim.step()
     assert sim.render(**SMALL, world=1).shape == (24, 32, 3)
-    assert sim._mjx_data is None
-    assert sim._mjx_model is None
+    assert sim._scene._mjx_data is None
+    assert sim._scene._mjx_model is None
     assert not syncs
 
 
@@ -361,7 +403,7 @@ class AnyOrder(RuleBasedStateMachine):
         expected = (z < 0.086) | (np.abs(z - self.ball) < 0.186)
         done = []
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(shell, "sync_sim2mjx", lambda *args: done.append(1) or sync_sim2mjx(*args))
+            patch.setattr(place, "sync_sim2mjx", lambda *args: done.append(1) or sync_sim2mjx(*args))
             assert drone_touches(self.sim) == expected.tolist()
         assert len(done) == self.changed
         self.changed = False

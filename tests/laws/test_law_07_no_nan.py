@@ -7,15 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import (
+    INTEGRATORS,
     PAIRS,
     hover_command,
     hover_rotor_state,
     send,
     shared_sim,
     trees_equal,
+    with_states,
     zero_thrust_command,
 )
 
+from crazysim import Sim
 from crazysim.sim.stages import FLOOR
 
 HALF = np.sqrt(0.5)
@@ -110,6 +113,30 @@ def test_values_and_gradients_are_finite(dynamics, control):
     assert np.all(np.asarray(gradients["pos"])[SITUATIONS.index("upside down"), 0, :2] != 0)
     # float32 rounding of 50 renormalisations
     np.testing.assert_allclose(np.linalg.norm(end.states.quat, axis=-1), 1.0, atol=1e-6)
+
+
+ABSURD = (20.0, 50.0, 90.0, 99.0, 150.0, 1e3, 1e6, 1e30, 3e38)
+ALONG = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (-1, 1, -1), (0, -1, 0), (0.3, 1, -0.5))
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("drone", ["cf21B_500", "cf2x_L250"])
+def test_attitudes_that_no_drone_can_take_keep_a_fitted_model_bounded(drone, integrator):
+    """Law 7: angles have no limit to saturate at. Two seconds of any number that float32 has, each axis and all.
+
+    The fit alone would have 50 rad of pitch pull a drone through the vertical time and again, faster each time.
+    """
+    sim = Sim(len(ABSURD) * len(ALONG), drone=drone, dynamics="so_rpy_rotor", control="attitude", integrator=integrator)
+    sim.data = with_states(sim.data, pos=[0.0, 0.0, 100.0])
+    angles = (np.array(ABSURD)[:, None, None] * np.array(ALONG)).reshape(-1, 1, 3)
+    sim.attitude_control(np.concatenate([angles, np.full((len(angles), 1, 1), 0.4)], axis=-1))
+    fastest = 0.0
+    for _ in range(200):
+        sim.step(5)
+        fastest = max(fastest, float(jnp.abs(sim.data.states.ang_vel).max()))
+        assert np.isfinite(fastest)
+    assert not sim.data.core.nonfinite.any()
+    assert 50 < fastest < 500  # rad/s; handed over from 100 to 200, and a step of 2 ms may overshoot
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)

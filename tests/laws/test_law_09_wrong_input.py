@@ -244,14 +244,18 @@ WRONG_CALLS = [
     (lambda sim: sim.render("rgb_array", world=3), "world 3 does not exist", "0 to 2"),
     (lambda sim: sim.render("rgb_array", world=-1), "world -1 does not exist", "0 to 2"),
     (lambda sim: setattr(sim, "max_visual_geom", 0), "max_visual_geom is 0", "positive whole number"),
-    (lambda sim: remove_fn(sim.step_pipeline, "wind"), "no stage 'wind'", "integration"),
-    (lambda sim: replace_fn(sim.step_pipeline, stage_that_is_none, "wind"), "no stage 'wind'", "integration"),
+    (lambda sim: remove_fn(sim.step_pipeline, "wind"), "No stage named 'wind'", "integration"),
+    (lambda sim: replace_fn(sim.step_pipeline, stage_that_is_none, "wind"), "No stage named 'wind'", "integration"),
     (
         lambda sim: insert_fn_before(sim.step_pipeline, "wind", stage_that_is_none),
-        "no stage 'wind'",
+        "No stage named 'wind'",
         "integration",
     ),
-    (lambda sim: append_fn(sim.step_pipeline, stage_that_is_none, "integration"), "'integration' already", "name="),
+    (
+        lambda sim: append_fn(sim.step_pipeline, stage_that_is_none, "integration"),
+        "'integration' already exists",
+        "name=",
+    ),
     (lambda sim: append_fn(sim.step_pipeline, None), "not None", "a function"),
 ]
 

@@ -8,21 +8,12 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from cases import BOX
 
 from crazysim.drones import airframe_names, load_airframe
 from crazysim.scene import build
 from crazysim.scene.build import build_spec, compile_spec
 from crazysim.sim import Sim
-
-BOX = """
-<mujoco>
-  <worldbody>
-    <body name="obstacle">
-      <geom type="box" size="0.1 0.1 0.1" rgba="0.8 0.2 0.2 1"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
 
 
 @pytest.fixture(scope="module")

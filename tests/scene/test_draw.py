@@ -3,34 +3,22 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import ABOVE, FOVY
 
 from crazysim.scene.draw import Marks
 from crazysim.sim import Sim
 from crazysim.sim.visualize import change_material, draw_capsule, draw_line, draw_points
 
 HEIGHT, WIDTH = 180, 240
-ABOVE = 2.0
-SCENE = f"""
-<mujoco>
-  <statistic center="0 0 0.5" extent="2"/>
-  <visual><headlight ambient="0.5 0.5 0.5" diffuse="0.4 0.4 0.4" specular="0 0 0"/><quality shadowsize="0"/></visual>
-  <worldbody>
-    <geom name="floor" type="plane" size="0 0 1" rgba="0.9 0.9 0.9 1"/>
-    <camera name="down" pos="0 0 {ABOVE}" fovy="45"/>
-  </worldbody>
-</mujoco>
-"""
-FOCAL = 0.5 * HEIGHT / np.tan(np.deg2rad(22.5))
+FOCAL = 0.5 * HEIGHT / np.tan(np.deg2rad(FOVY / 2))
 DRONES = np.array([[0.3, 0.0, 1.4], [-0.3, 0.0, 1.4]])
 RED, GREEN, BLUE = ([1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1])
 
 
 @pytest.fixture(scope="module")
-def sim(opengl, tmp_path_factory):
+def sim(opengl, plain_scene):
     """Two worlds of two drones near a camera that looks straight down on a plain floor."""
-    path = tmp_path_factory.mktemp("scene") / "scene.xml"
-    path.write_text(SCENE)
-    sim = Sim(n_worlds=2, n_drones=2, xml_path=path)
+    sim = Sim(n_worlds=2, n_drones=2, xml_path=plain_scene)
     pos = jnp.broadcast_to(jnp.asarray(DRONES), (2, 2, 3))
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     yield sim
@@ -208,10 +196,16 @@ def test_the_lower_led_is_seen_from_below(opengl):
         (lambda sim: draw_capsule(sim, np.zeros((2, 3)), [1, 1, 1]), r"shape \(3,\), got \(2, 3\)"),
         (lambda sim: draw_points(sim, np.zeros((4, 3)), rgba=[1, 0]), "broadcast|shape"),
         (lambda sim: draw_points(sim, np.zeros((20_000, 3))), "10000 marks at most"),
-        (lambda sim: change_material(sim, "led_top", [2], rgba=RED), "between 0 and 1"),
-        (lambda sim: change_material(sim, "led_top", [-1], rgba=RED), "between 0 and 1"),
-        (lambda sim: change_material(sim, "led_top", 0, rgba=RED), "list of integers"),
-        (lambda sim: change_material(sim, "led_top", [0.5], rgba=RED), "list of integers"),
+        (
+            lambda sim: change_material(sim, "led_top", [2], rgba=RED),
+            r"drone_ids must be in range \[0, 1\], got \[-?\d",
+        ),
+        (
+            lambda sim: change_material(sim, "led_top", [-1], rgba=RED),
+            r"drone_ids must be in range \[0, 1\], got \[-?\d",
+        ),
+        (lambda sim: change_material(sim, "led_top", 0, rgba=RED), "drone_ids must be 1D array.* of integers"),
+        (lambda sim: change_material(sim, "led_top", [0.5], rgba=RED), "drone_ids must be 1D array.* of integers"),
         (lambda sim: change_material(sim, "lamp", [0], rgba=RED), "no material 'lamp'"),
         (lambda sim: change_material(sim, "led_top", [0], rgba=[1, 0]), "broadcast|shape"),
     ],

@@ -13,24 +13,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from cases import ABOVE, BOX, FOVY
 
 from crazysim.errors import RenderError
 from crazysim.sim import Sim
 
-HEIGHT, WIDTH, FOVY = 120, 160, 45.0
-ABOVE = 2.0
-"""Height of the camera that looks straight down, m."""
-SCENE = f"""
-<mujoco>
-  <statistic center="0 0 0.5" extent="2"/>
-  <visual><headlight ambient="0.5 0.5 0.5" diffuse="0.4 0.4 0.4" specular="0 0 0"/><quality shadowsize="0"/></visual>
-  <worldbody>
-    <geom name="floor" type="plane" size="0 0 1" rgba="0.9 0.9 0.9 1"/>
-    <camera name="down" pos="0 0 {ABOVE}" fovy="{FOVY}"/>
-    <camera name="aside" pos="5 0 {ABOVE}" fovy="{FOVY}"/>
-  </worldbody>
-</mujoco>
-"""
+HEIGHT, WIDTH = 120, 160
 PLACES = np.array([[[0.4, 0.2, 0.5]], [[-0.5, -0.3, 1.0]]])
 """Where the drone of each world is, m. (2, 1, 3)"""
 SHOT = {"mode": "rgb_array", "camera": "down", "width": WIDTH, "height": HEIGHT}
@@ -41,11 +29,9 @@ def place(sim, pos):
 
 
 @pytest.fixture(scope="module")
-def sim(opengl, tmp_path_factory):
+def sim(opengl, plain_scene):
     """Two worlds over a plain floor, each with its drone elsewhere, and a camera that looks straight down."""
-    path = tmp_path_factory.mktemp("scene") / "scene.xml"
-    path.write_text(SCENE)
-    sim = Sim(n_worlds=2, xml_path=path)
+    sim = Sim(n_worlds=2, xml_path=plain_scene)
     place(sim, PLACES)
     yield sim
     sim.close()
@@ -136,7 +122,7 @@ def test_a_body_that_a_user_moved_is_drawn_where_it_is(opengl):
         return columns.mean() + 0.5
 
     assert abs(where(0) - 32) < 1
-    assert sim._mjx_data is None
+    assert sim._scene._mjx_data is None
     k = sim.mj_model.body("ball").mocapid.item()
     sim.mjx_data = sim.mjx_data.replace(mocap_pos=sim.mjx_data.mocap_pos.at[:, k, 0].set(jnp.array([-0.8, 0.8])))
     assert where(0) < 25
@@ -398,10 +384,10 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
 
 
 PRINTED = textwrap.dedent("""
-    import crazysim.sim.sim as shell
+    import crazysim.scene.scene as place
     from crazysim.sim.sim import sync_sim2mjx as whole
     syncs = []
-    shell.sync_sim2mjx = lambda *args: syncs.append(1) or whole(*args)
+    place.sync_sim2mjx = lambda *args: syncs.append(1) or whole(*args)
 
     # What follows is code as it is printed for the peer, with the name of the package exchanged.
 
@@ -411,15 +397,7 @@ PRINTED = textwrap.dedent("""
     sim = Sim(n_worlds=1, n_drones=1)
 
     # Define a box body as an inline XML string (or load from a file)
-    box_xml = '''
-    <mujoco>
-      <worldbody>
-        <body name="obstacle">
-          <geom type="box" size="0.1 0.1 0.1" rgba="0.8 0.2 0.2 1"/>
-        </body>
-      </worldbody>
-    </mujoco>
-    '''
+    box_xml = '''BOX'''
     obstacle_spec = mujoco.MjSpec.from_string(box_xml)
 
     # Attach one or more instances to a new frame in the scene
@@ -473,7 +451,7 @@ PRINTED = textwrap.dedent("""
     assert check(sim.data, pos.at[0, 1].set([0.0, 0.0, 0.1])).sum() > contacts.sum()
     sim.close()
     print("done")
-""")
+""").replace("BOX", BOX)
 
 
 def test_code_written_for_the_peer_runs_as_printed(screen, opengl):

@@ -66,22 +66,30 @@ def test_replace_keeps_the_place_and_exchanges_the_function(pipeline):
 @pytest.mark.parametrize(
     "change, error, fragment",
     [
-        (lambda p: append_fn(p, first), UnknownNameError, "has a stage 'first' already"),
-        (lambda p: prepend_fn(p, third, "second"), UnknownNameError, "has a stage 'second' already"),
+        (lambda p: append_fn(p, first), UnknownNameError, "stage named 'first' already exists"),
+        (lambda p: prepend_fn(p, third, "second"), UnknownNameError, "stage named 'second' already exists"),
         (
             lambda p: insert_fn_before(p, "zeroth", third),
             UnknownNameError,
-            "no stage 'zeroth'; its stages are first, second",
+            "No stage named 'zeroth' in the pipeline; its stages are first, second",
         ),
         (
             lambda p: insert_fn_after(p, "zeroth", third),
             UnknownNameError,
-            "no stage 'zeroth'; its stages are first, second",
+            "No stage named 'zeroth' in the pipeline; its stages are first, second",
         ),
-        (lambda p: replace_fn(p, third, "third"), UnknownNameError, "no stage 'third'; its stages are first, second"),
-        (lambda p: remove_fn(p, "third"), UnknownNameError, "no stage 'third'; its stages are first, second"),
-        (lambda p: append_fn(p, partial(third)), ValueError, "pass name="),
-        (lambda p: append_fn(p, lambda x: x), ValueError, "pass name="),
+        (
+            lambda p: replace_fn(p, third, "third"),
+            UnknownNameError,
+            "No stage named 'third' in the pipeline; its stages are first, second",
+        ),
+        (
+            lambda p: remove_fn(p, "third"),
+            UnknownNameError,
+            "No stage named 'third' in the pipeline; its stages are first, second",
+        ),
+        (lambda p: append_fn(p, partial(third)), ValueError, "needs an explicit name; pass name="),
+        (lambda p: append_fn(p, lambda x: x), ValueError, "needs an explicit name; pass name="),
         (lambda p: append_fn(p, 3), ValueError, "a stage is a function, not 3"),
     ],
 )

@@ -1,0 +1,215 @@
+"""The scene as an object: a spec, what it compiles to, and whether it shows what the simulation has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import jax
+import mujoco
+from jax import Array
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from numpy.typing import NDArray
+
+from crazysim.drones.airframe import Airframe
+from crazysim.errors import ConfigError
+from crazysim.scene import build, contacts, mjx
+from crazysim.scene.draw import Marks
+from crazysim.scene.render import Viewer
+from crazysim.scene.sync import sync_one_world, sync_sim2mjx
+from crazysim.sim.data import SimData
+from crazysim.sim.settings import positive
+from crazysim.sim.sharding import place_scene, put
+
+LARGE_SWARM = 64
+"""From this many drones a world on, MJX checks two pairs per drone instead of every pair."""
+
+
+T = TypeVar("T")
+
+
+class Held(Generic[T]):
+    """An attribute of a simulation that its scene holds."""
+
+    def __init__(self, doc: str):
+        self.__doc__ = doc
+
+    def __set_name__(self, _owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, sim: Any, _owner: type) -> T:
+        return getattr(sim._scene, self._name) if sim is not None else self  # type: ignore[return-value]
+
+    def __set__(self, sim: Any, value: T) -> None:
+        setattr(sim._scene, self._name, value)
+
+
+class Scene:
+    """What MuJoCo holds of a simulation.
+
+    ``sync`` alone decides whether it is up to date; ``contacts`` and ``draw`` read what the last sync left. Nothing
+    is held per world before the first question.
+    """
+
+    spec: mujoco.MjSpec
+    """The scene to be edited; ``compile`` has an edit take effect."""
+    mj_model: mujoco.MjModel
+    """What the spec was compiled to."""
+    mj_data: mujoco.MjData
+    """The one world that was drawn last."""
+    drone_mocap_ids: list[int]
+    """Mocap id of each drone's body. (n_drones,)"""
+    max_geom_pairs: int
+    """Cap on the pairs MJX checks per kind of collision, from the next ``compile`` on; -1 for none."""
+    marks: Marks
+    """What is drawn over the next picture."""
+    viewer: Viewer | None
+    """What draws; made for the first picture."""
+
+    def __init__(
+        self,
+        xml_path: str | Path | None,
+        airframe: Airframe,
+        n_worlds: int,
+        n_drones: int,
+        freq: int,
+        device: jax.Device,
+        mesh: Mesh | None,
+    ):
+        """Build and compile the spec.
+
+        Args:
+            xml_path: A MJCF scene without drones; None for floor, light and sky.
+            airframe: What the drones look like.
+            n_worlds: Number of worlds.
+            n_drones: Number of drones in each.
+            freq: Physics steps per second, Hz.
+            device: Where the scene of all worlds lives.
+            mesh: Devices that it is spread over instead, if any.
+
+        Raises:
+            ConfigError: If the scene cannot be read or compiled.
+        """
+        self.n_worlds, self.n_drones, self.device, self.mesh = n_worlds, n_drones, device, mesh
+        self.max_geom_pairs = -1 if n_drones < LARGE_SWARM else 2 * n_drones
+        self.marks = Marks()
+        self.viewer = None
+        self.spec = build.build_spec(xml_path, airframe, n_drones, freq, self.max_geom_pairs)
+        self.compile()
+
+    def compile(self) -> None:
+        """Have the spec as it is now take effect; closes the viewer, and forgets where users moved bodies.
+
+        Raises:
+            ConfigError: If the spec does not compile or has lost a drone; the old scene stays then.
+        """
+        self.spec.numeric("max_geom_pairs").data = [self.max_geom_pairs]
+        mj_model = build.compile_spec(self.spec)
+        self.drone_mocap_ids = build.drone_mocap_ids(mj_model, self.n_drones)
+        self.close()
+        self.mj_model, self.mj_data = mj_model, mujoco.MjData(mj_model)
+        self._mjx_model: mjx.Model | None = None
+        self._mjx_data: mjx.Data | None = None
+        self.invalidate()
+
+    # All worlds, with MJX -----------------------------------------------------------------------------------
+
+    @property
+    def mjx_model(self) -> mjx.Model:
+        """The model on the device; made when first read."""
+        model = self._mjx_model
+        if model is None:
+            model = build.put_model(self.mj_model, self.device)
+            if self.mesh is not None:
+                model = jax.device_put(model, NamedSharding(self.mesh, PartitionSpec()))
+            self._mjx_model = model
+        return model
+
+    @property
+    def mjx_data(self) -> mjx.Data:
+        """The scene of every world, as it was last synced; made when first read, and returned as it is."""
+        if self._mjx_data is None:
+            self._mjx_data = self._place(build.make_data(self.mj_model, self.n_worlds, self.device))
+        return self._mjx_data
+
+    @mjx_data.setter
+    def mjx_data(self, mjx_data: mjx.Data) -> None:
+        self._mjx_data = self._place(build.check_poses(mjx_data, self.mj_model, self.n_worlds))
+        self.invalidate()
+
+    def shard(self, mesh: Mesh) -> None:
+        """Spread the worlds over devices; what is not yet made will be made there."""
+        self.mesh = mesh
+        self._mjx_model = None
+        if self._mjx_data is not None:
+            self.mjx_data = self._mjx_data
+
+    def _place(self, mjx_data: mjx.Data) -> mjx.Data:
+        return put(mjx_data, self.device) if self.mesh is None else place_scene(mjx_data, self.mesh)
+
+    # Up to date or not --------------------------------------------------------------------------------------
+
+    def invalidate(self) -> None:
+        """Have the next question sync: something has moved, or may have."""
+        self._synced = False
+
+    def sync(self, data: SimData, world: int | None = None) -> SimData:
+        """Bring the scene up to date: all of it, or ``mj_data`` with the one world that is to be drawn.
+
+        The only way to a fresh scene. A single world is drawn without touching the others; where there is only
+        one, or all are fresh already, that is the whole scene. Whether a sync is due is known on the host.
+
+        Returns:
+            The data, its flag set if the whole scene was synced.
+        """
+        if not self._synced and (world is None or (self.n_worlds == 1 and self._mjx_holds_it())):
+            data, self._mjx_data = sync_sim2mjx(data, self.mjx_data, self.mjx_model)
+            self._synced = True
+        if world is not None:
+            sync_one_world(data, self._mjx_data, world, self.mj_model, self.mj_data)
+        return data
+
+    def _mjx_holds_it(self) -> bool:
+        """Return whether contacts can be asked for; what MJX cannot hold can still be drawn."""
+        try:
+            return self.mjx_model is not None
+        except ConfigError:
+            return False
+
+    # Questions ----------------------------------------------------------------------------------------------
+
+    def contacts(self, body: str | None = None) -> Array:
+        """Return which contact slots, of one body or of all, touched at the last sync. (n_worlds, n_slots)
+
+        Raises:
+            UnknownNameError: If the scene has no such body.
+        """
+        if body is None:
+            return contacts.contact_flags(self.mjx_data)
+        return contacts.body_contact_flags(self.mjx_data, self.mj_model, body)
+
+    def draw(
+        self, mode: str, camera: int | str, cam_config: dict[str, Any] | None, width: int, height: int
+    ) -> NDArray | tuple[NDArray, NDArray] | None:
+        """Draw the world that was synced last, with the marks; ``Sim.render`` says what the arguments are."""
+        if self.viewer is None:
+            self.viewer = Viewer(self.mj_model, self.mj_data, self.marks.limit + self.mj_model.ngeom)
+        picture = self.viewer.render(mode, camera, cam_config, width, height, self.marks)
+        self.marks.clear()
+        return picture
+
+    @property
+    def max_visual_geom(self) -> int:
+        """Most marks that one picture takes."""
+        return self.marks.limit
+
+    @max_visual_geom.setter
+    def max_visual_geom(self, limit: int) -> None:
+        self.marks.limit = positive("max_visual_geom", limit)
+        self.close()
+
+    def close(self) -> None:
+        """Close the window and free what pictures needed; the next picture makes it anew."""
+        if self.viewer is not None:
+            self.viewer.close()
+            self.viewer = None
