@@ -26,6 +26,16 @@ from crazysim.engine.ir import Block, Element, constant, is_constant
 Elements = np.ndarray
 """An array of elements: of type object, whatever the elements are."""
 
+LOGIC = {
+    "lt": ("and", 0),
+    "gt": ("and", 1),
+    "le": ("or", 0),
+    "ge": ("or", 1),
+    "max": ("or", None),
+    "min": ("and", None),
+}
+"""Order of truth values as logic, and which operand is negated for it."""
+
 Rule = Callable[["Reader", Any, list[Elements]], Sequence[Elements]]
 RULES: dict[str, Rule] = {}
 
@@ -87,6 +97,9 @@ class Reader:
 
     def each(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:
         """Return an operation on every element; scalars stand for arrays of any shape."""
+        if op in LOGIC and args[0].size and args[0].reshape(-1)[0].dtype == bool:
+            op, negated = LOGIC[op]
+            args = [self.each("not", [x], bool) if k == negated else x for k, x in enumerate(args)]
         shape = np.broadcast_shapes(*(x.shape for x in args))
         rows = [np.broadcast_to(x, shape).reshape(-1) for x in args]
         if args[-1].size and isinstance(rows[-1][0], tuple):  # keys: both words alike
@@ -134,6 +147,20 @@ ELEMENTWISE: dict[str, tuple[str, ...]] = dict.fromkeys(
 @rule("convert_element_type")
 def _convert(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     return [r.each("convert_element_type", args, eqn.params["new_dtype"])]
+
+
+@rule("select_n")
+def _select_n(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """One of two cases by a bool; of more by a number, each against the next."""
+    which, *cases = args
+    dtype, kind = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
+    if kind == bool:
+        return [r.each("select_n", args, dtype)]
+    taken = cases[-1]
+    for k in range(len(cases) - 2, -1, -1):
+        here = r.each("le", [which, constants(k, kind)], bool)
+        taken = r.each("select_n", [here, taken, cases[k]], dtype)
+    return [taken]
 
 
 @rule("bitcast_convert_type")
@@ -277,7 +304,7 @@ def _cumulate(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     x = np.moveaxis(args[0], eqn.params["axis"], 0).copy()
     order = range(len(x))[::-1] if eqn.params["reverse"] else range(len(x))
     for last, i in itertools.pairwise(order):
-        x[i] = r.each(op, [np.asarray(x[last], object), np.asarray(x[i], object)], eqn.outvars[0].aval.dtype)
+        x[i] = r.each(op, [np.asarray(x[last], object), np.asarray(x[i], object)], eqn.outvars[0].aval.dtype)[()]
     return [np.moveaxis(x, 0, eqn.params["axis"])]
 
 
@@ -321,8 +348,8 @@ def _sort(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
                 swap = r.each("or", [swap, r.each("and", [tied, above], bool)], bool)
                 tied = r.each("and", [tied, equal], bool)
             for c, a, b, dtype in zip(columns, first, second, dtypes, strict=True):
-                c[i] = r.each("select_n", [swap, a, b], dtype)
-                c[i + 1] = r.each("select_n", [swap, b, a], dtype)
+                c[i] = r.each("select_n", [swap, a, b], dtype)[()]
+                c[i + 1] = r.each("select_n", [swap, b, a], dtype)[()]
     return [np.moveaxis(c, 0, axis) for c in columns]
 
 

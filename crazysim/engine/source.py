@@ -100,7 +100,7 @@ class Writer:
             return f"integer_pow({args[0]}, {dict(value.params)['y']})"
         if value.op == "round":
             even = int(dict(value.params)["rounding_method"]) == 1
-            return f"{'round_even' if even else 'round_away'}({args[0]})"
+            return f"{'round_even_' if even else 'round_away_'}({args[0]})"
         limit = _limit(value)
         if limit is not None:
             return f"{limit}({args[1]}, {args[2]})"

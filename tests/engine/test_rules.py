@@ -184,7 +184,9 @@ def loops(g):
 
 @case
 def loop_until(g):
-    x, n = jax.lax.while_loop(lambda c: (jnp.abs(c[0]) > 0.1) & (c[1] < 40), lambda c: (0.7 * c[0], c[1] + 1), (g.x[0], 0))
+    x, n = jax.lax.while_loop(
+        lambda c: (jnp.abs(c[0]) > 0.1) & (c[1] < 40), lambda c: (0.7 * c[0], c[1] + 1), (g.x[0], 0)
+    )
     count = jax.lax.fori_loop(0, g.i[1], lambda k, c: c + k, 0)
     return jnp.stack([x, n, count])
 
@@ -222,7 +224,9 @@ def small_systems(g):
 @case
 def nested_calls(g):
     inner = jax.jit(lambda x: jax.checkpoint(lambda y: jnp.sin(y) * y)(x))
-    return jnp.concatenate([inner(g.x), jax.nn.relu(g.x), jax.nn.softplus(g.x), jnp.linalg.norm(jax.jacfwd(inner)(g.x), axis=1)])
+    return jnp.concatenate(
+        [inner(g.x), jax.nn.relu(g.x), jax.nn.softplus(g.x), jnp.linalg.norm(jax.jacfwd(inner)(g.x), axis=1)]
+    )
 
 
 @case

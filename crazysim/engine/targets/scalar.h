@@ -84,7 +84,8 @@ F32_LIMITS
 LIMITS(f32)
 #endif
 LIMITS(f64) LIMITS(i32) LIMITS(u32)
-template <class T> FN T clamp_(T low, T x, T high) { return min_(max_(x, low), high); }
+#define CLAMP(T) FN T clamp_(T low, T x, T high) { return min_(max_(x, low), high); }
+CLAMP(f32) CLAMP(f64) CLAMP(i32) CLAMP(u32)
 COMMON(f32) COMMON(f64) COMMON(i32) COMMON(u32)
 FN b1 select_n_(b1 which, b1 no, b1 yes) { return which ? yes : no; }
 FN b1 eq_(b1 a, b1 b) { return a == b; }
@@ -102,7 +103,10 @@ FN f64 atan2_(f64 a, f64 b) { return atan2(a, b); }
 FN f32 pow_(f32 a, f32 b) { return powf(a, b); }
 FN f64 pow_(f64 a, f64 b) { return pow(a, b); }
 template <class T> FN T integer_pow_positive(T x, int y) { T p = 1; for (; y; y >>= 1, x = x * x) if (y & 1) p = p * x; return p; }
-template <class T> FN T integer_pow(T x, int y) { return y < 0 ? T(1) / integer_pow_positive(x, -y) : integer_pow_positive(x, y); }
+FN f32 integer_pow(f32 x, int y) { return y < 0 ? 1.0f / integer_pow_positive(x, -y) : integer_pow_positive(x, y); }
+FN i32 integer_pow(i32 x, int y) { return integer_pow_positive(x, y); }
+FN u32 integer_pow(u32 x, int y) { return integer_pow_positive(x, y); }
+FN f64 integer_pow(f64 x, int y) { return y < 0 ? 1.0 / integer_pow_positive(x, -y) : integer_pow_positive(x, y); }
 
 #define BITS(T) FN T and_(T a, T b) { return a & b; } FN T or_(T a, T b) { return a | b; } FN T xor_(T a, T b) { return a ^ b; }
 BITS(i32) BITS(u32)
@@ -119,11 +123,10 @@ FN i32 shift_right_logical_(i32 a, i32 b) { return u32(b) < 32 ? i32(u32(a) >> b
 FN i32 shift_right_arithmetic_(i32 a, i32 b) { return a >> (u32(b) < 32 ? b : 31); }
 FN u32 shift_right_arithmetic_(u32 a, u32 b) { return u32(shift_right_arithmetic_(i32(a), i32(b))); }
 
-template <class T> FN f32 to_f32(T x) { return f32(x); }
-template <class T> FN f64 to_f64(T x) { return f64(x); }
-template <class T> FN b1 to_b1(T x) { return x != T(0); }
-template <class T> FN i32 to_i32(T x) { return i32(x); }
-template <class T> FN u32 to_u32(T x) { return u32(x); }
+#define CONVERT(T) FN f32 to_f32(T x) { return f32(x); } FN f64 to_f64(T x) { return f64(x); } FN b1 to_b1(T x) { return x != T(0); }
+CONVERT(f32) CONVERT(f64) CONVERT(i32) CONVERT(u32) CONVERT(b1)
+#define TO_INTEGER(T) FN i32 to_i32(T x) { return i32(x); } FN u32 to_u32(T x) { return u32(x); }
+TO_INTEGER(i32) TO_INTEGER(u32) TO_INTEGER(b1)
 // From floating point: the nearest there is, and zero for NaN, as XLA has it.
 FN i32 to_i32(f64 x) { return x != x ? 0 : x >= 2147483647.0 ? 2147483647 : x <= -2147483648.0 ? -2147483647 - 1 : i32(x); }
 FN u32 to_u32(f64 x) { return x != x ? 0u : x >= 4294967295.0 ? 0xffffffffu : x <= 0.0 ? 0u : u32(x); }
