@@ -6,6 +6,8 @@ not is given ordinary arrays, and takes the step apart at its place.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -77,6 +79,9 @@ def _batch(program: Program, leaves: list[Any]) -> tuple[int, int]:
     drone = next(i for i, scope in enumerate(program.axes.scopes) if scope == "drone")
     return leaves[drone].shape[0], leaves[drone].shape[1]
 
+
+LONG = 256
+"""Steps from which on a gradient keeps few of their beginnings."""
 
 Constants = dict[int, list[Any]]
 """What has been computed before the first step, by the segment that needs it."""
@@ -169,7 +174,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
         for leaf, k in segment.reads:
             start.get((leaf, k % program.sizes(leaf)))
     if isinstance(n_steps, int):
-        carry, _ = jax.lax.scan(lambda c, _: (turn(c), None), carry, length=n_steps)
+        carry = repeat(turn, carry, n_steps)
     else:
         carry = jax.lax.fori_loop(0, n_steps, lambda _, c: turn(c), carry)
     end = Lanes(program, leaves)
@@ -178,6 +183,26 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
     for leaf, value in zip(by_array, carry[1], strict=True):
         end.set_array(leaf, value)
     return [end.array(i) for i in program.written], finite(program, end)
+
+
+def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
+    """Return what ``n`` turns make of a carry, for gradients that remember little.
+
+    Of a step only what it begins with is kept, and the rest computed again on the way back, which costs less than
+    fetching it from memory. From ``LONG`` steps on only every k-th beginning is kept, k being the root of n: the
+    memory of a gradient then grows with the root of the horizon, at the price of one more pass.
+    """
+    turn = jax.checkpoint(turn)
+
+    def turns(carry: Any, n: int) -> Any:
+        return jax.lax.scan(lambda c, _: (turn(c), None), carry, length=n)[0]
+
+    if n < LONG:
+        return turns(carry, n)
+    inner = math.isqrt(n)
+    whole = jax.checkpoint(lambda c: turns(c, inner))
+    carry, _ = jax.lax.scan(lambda c, _: (whole(c), None), carry, length=n // inner)
+    return turns(carry, n % inner)
 
 
 def _slots(program: Program, segment: Segment) -> list[Slot]:

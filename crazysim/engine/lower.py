@@ -491,11 +491,7 @@ def closed(jaxpr: Any) -> core.ClosedJaxpr:
 def _as_function(eqn: Any) -> Callable[..., Any]:
     """Return an operation as a function of arrays."""
 
-    def call(*args: Any) -> Any:
-        functions, params = eqn.primitive.get_bind_params(eqn.params)
-        return eqn.primitive.bind(*functions, *args, **params)
-
-    return call
+    return lambda *args: eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(eqn.params))
 
 
 def _inputs(r: Reader, like: Elements) -> Elements:

@@ -28,6 +28,9 @@ ENGINES = ("auto", "plain", "lanes", "fused")
 Steps = Callable[[list[Any], int | Array], tuple[list[Any], Array]]
 """Leaves and a number of steps to the written leaves and which worlds are finite."""
 
+Zeros = tuple[tuple[int, frozenset[int]], ...]
+"""Leaves with the elements of them that are zero."""
+
 
 class Plan(NamedTuple):
     """How data of one structure is stepped."""
@@ -78,20 +81,31 @@ class Step:
         self._plans: dict[Any, Plan] = {}
         self._zeros = _Zeros()
 
-    def __call__(self, data: SimData, n_steps: int | Array = 1) -> SimData:
-        """Return the data some steps later."""
+    def __call__(self, data: SimData, n_steps: int | Array = 1, zeros: Zeros | None = None) -> SimData:
+        """Return the data some steps later.
+
+        Args:
+            data: The simulation.
+            n_steps: How many steps.
+            zeros: What ``zeros`` returned for this data before it was traced: inside jit, parameters that are zero
+                cannot be told from others, and are computed with.
+        """
         leaves, treedef = jax.tree.flatten(data)
-        plan = self._plan(data, leaves, treedef)
+        plan = self._plan(data, leaves, treedef, zeros)
         step = plan.static if isinstance(n_steps, int) else plan.dynamic
         out = step([leaves[i] for i in plan.read], leaves[plan.flags[0]], n_steps)
         for i, value in zip((*plan.written, *plan.flags), out, strict=True):
             leaves[i] = value
         return treedef.unflatten(leaves)
 
-    def plan(self, data: SimData) -> Plan:
+    def plan(self, data: SimData, zeros: Zeros | None = None) -> Plan:
         """Return how this data is stepped."""
         leaves, treedef = jax.tree.flatten(data)
-        return self._plan(data, leaves, treedef)
+        return self._plan(data, leaves, treedef, zeros)
+
+    def zeros(self, data: SimData) -> Zeros:
+        """Return which elements of shared parameters are zero, for ``__call__``."""
+        return self._zeros(data, jax.tree.leaves(data))
 
     def lower(self, data: SimData, n_steps: int | Array = 1) -> Any:
         """Return the step lowered for this data, as ``jax.jit(...).lower`` does: to look at, or to compile ahead."""
@@ -104,8 +118,8 @@ class Step:
         plans = self._plans.values()
         return sum(p.dynamic._cache_size() + p.static._cache_size() for p in plans)  # type: ignore[attr-defined]
 
-    def _plan(self, data: SimData, leaves: list[Any], treedef: Any) -> Plan:
-        zeros = self._zeros(data, leaves)
+    def _plan(self, data: SimData, leaves: list[Any], treedef: Any, zeros: Zeros | None) -> Plan:
+        zeros = self._zeros(data, leaves) if zeros is None else zeros
         key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros)
         plan = self._plans.get(key)
         if plan is None:
@@ -122,7 +136,7 @@ class Step:
                 f"build the simulation with Sim(mesh=world_mesh(devices)), or call sim.shard(mesh)"
             )
 
-    def _make_plan(self, data: SimData, zeros: tuple[tuple[int, frozenset[int]], ...]) -> Plan:
+    def _make_plan(self, data: SimData, zeros: Zeros) -> Plan:
         names = {id(x): i for i, x in enumerate(jax.tree.leaves(data))}
         flags = names[id(data.core.nonfinite)], names[id(data.core.mjx_synced)]
         if self.engine == "plain":
@@ -222,10 +236,10 @@ class _Zeros:
 
     def __init__(self) -> None:
         self._arrays: Sequence[Any] = ()
-        self._found: tuple[tuple[int, frozenset[int]], ...] = ()
+        self._found: Zeros = ()
         self._shared: dict[Any, list[int]] = {}
 
-    def __call__(self, data: SimData, leaves: list[Any]) -> tuple[tuple[int, frozenset[int]], ...]:
+    def __call__(self, data: SimData, leaves: list[Any]) -> Zeros:
         places = self._places(data, leaves)
         arrays = [leaves[i] for i in places]
         if len(arrays) == len(self._arrays) and all(map(_is, arrays, self._arrays)):

@@ -20,6 +20,8 @@ from crazysim.dynamics import Dynamics
 from crazysim.dynamics.core import require_support
 from crazysim.engine import Step, build_reset, explain
 from crazysim.engine.plain import ResetFn
+from crazysim.engine.rollout import Keep, Policy, states_of
+from crazysim.engine.rollout import run as run_rollout
 from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
 from crazysim.scene.contacts import body_id
@@ -214,6 +216,42 @@ class Sim:
         if n_steps not in self._counts:
             self._counts[n_steps] = jnp.int32(n_steps)
         return self._counts[n_steps]
+
+    def rollout(
+        self,
+        policy: Policy,
+        params: Any = None,
+        n_control_steps: int = 1,
+        *,
+        keep: Keep = states_of,
+        every: int = 1,
+        progress: bool = False,
+    ) -> Any:
+        """Fly many control steps in one compiled call, and return what was kept on the way.
+
+        A control step asks the policy for a command, stages it, and steps until the next command is taken over.
+
+        Args:
+            policy: ``policy(params, data) -> command``, for all worlds at once; a function that stays the same object
+                is compiled once.
+            params: The policy's parameters, any tree of arrays.
+            n_control_steps: How many; a multiple of ``every``.
+            keep: ``keep(data)`` is what is kept after a control step, any tree of arrays.
+            every: Control steps from one that is kept to the next.
+            progress: Whether to show a bar, which needs tqdm.
+
+        Returns:
+            What ``keep`` returned, with time in front. (n_control_steps // every, ...)
+
+        Raises:
+            ValueError: If a number cannot be, or the policy returns a command of another shape.
+        """
+        data, kept = run_rollout(
+            self._step, self.data, policy, params, n_control_steps, progress, every,
+            n_substeps=self.freq // self.control_freq, keep=keep,
+        )  # fmt: skip
+        self._advance(data)
+        return kept
 
     def explain(self) -> str:
         """Return in a few lines which engine runs the step, what it fuses, and what it cannot fuse and why."""

@@ -1,0 +1,143 @@
+"""Rollouts: policy, commands and physics of many control steps in one compiled call."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from crazysim.control import Control
+from crazysim.engine.step import Step, Zeros
+from crazysim.errors import ConfigError
+from crazysim.sim import functional as F
+from crazysim.sim.data import SimData
+
+Policy = Callable[[Any, SimData], Any]
+"""Parameters and data to a command for every drone. (n_worlds, n_drones, k)"""
+Keep = Callable[[SimData], Any]
+"""Data to what is to be kept of it: any tree of arrays."""
+
+COMMANDS: dict[Control, Callable[[SimData, Any], SimData]] = {
+    Control.state: F.state_control,
+    Control.attitude: F.attitude_control,
+    Control.body_rate: F.body_rate_control,
+    Control.force_torque: F.force_torque_control,
+    Control.rotor_vel: F.rotor_vel_control,
+}
+
+
+def states_of(data: SimData) -> Any:
+    """Return what a rollout keeps if nothing else is asked for."""
+    return data.states
+
+
+def rollout(
+    step: Step,
+    data: SimData,
+    policy: Policy,
+    params: Any,
+    n_control_steps: int,
+    n_substeps: int,
+    keep: Keep = states_of,
+    every: int = 1,
+    zeros: Zeros | None = None,
+) -> tuple[SimData, Any]:
+    """Return the data after some control steps, and what was kept on the way.
+
+    A control step asks the policy for a command, stages it, and takes ``n_substeps`` physics steps. Pure: for use
+    inside jit, vmap and grad. What no step writes, parameters above all, is a constant of the loop.
+
+    Args:
+        step: From ``sim.build_step_fn()``.
+        data: Where it begins.
+        policy: ``policy(params, data) -> command``, for all worlds at once.
+        params: The policy's parameters.
+        n_control_steps: How many; a multiple of ``every``.
+        n_substeps: Physics steps of a control step.
+        keep: What is kept of the data after a control step.
+        every: Control steps from one that is kept to the next.
+        zeros: From ``step.zeros(data)``, if that was asked before ``data`` was traced.
+
+    Returns:
+        The data, and what was kept with time in front. (n_control_steps // every, ...)
+
+    Raises:
+        ConfigError: If a number is no positive int, or does not divide.
+        ValueError: If the policy returns a command of another shape.
+    """
+    for name, number in (("n_control_steps", n_control_steps), ("n_substeps", n_substeps), ("every", every)):
+        if type(number) is not int or number < 1:
+            raise ConfigError(f"{name} must be a positive int, not {number!r}")
+    if n_control_steps % every:
+        raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}")
+    zeros = step.zeros(data) if zeros is None else zeros
+    command = COMMANDS[data.controls.mode]
+    leaves, treedef = jax.tree.flatten(data)
+    plan = step.plan(data, zeros)
+    staged = next(i for i, x in enumerate(leaves) if x is _staged(data))
+    changed = sorted({*plan.written, *plan.flags, staged})
+
+    def control_step(carry: list[Any]) -> list[Any]:
+        data = unpack(carry)
+        after = jax.tree.leaves(step(command(data, policy(params, data)), n_substeps, zeros))
+        return [after[i] for i in changed]
+
+    def unpack(carry: list[Any]) -> SimData:
+        now = list(leaves)
+        for i, value in zip(changed, carry, strict=True):
+            now[i] = value
+        return treedef.unflatten(now)
+
+    def until_kept(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
+        carry, _ = jax.lax.scan(lambda c, _: (control_step(c), None), carry, length=every)
+        return carry, keep(unpack(carry))
+
+    carry, kept = jax.lax.scan(until_kept, [leaves[i] for i in changed], length=n_control_steps // every)
+    return unpack(carry), kept
+
+
+def _staged(data: SimData) -> Any:
+    """Return the leaf that a command goes to."""
+    if data.controls.mode == Control.rotor_vel:
+        return data.controls.rotor_vel
+    return getattr(data.controls, data.controls.mode.value).staged_cmd
+
+
+SETTINGS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")
+
+compiled = functools.partial(jax.jit, static_argnames=SETTINGS)(rollout)
+"""``rollout`` in one compiled call; only the carries of its loops are used again."""
+
+
+def run(
+    step: Step,
+    data: SimData,
+    policy: Policy,
+    params: Any,
+    n_control_steps: int,
+    progress: bool = False,
+    every: int = 1,
+    **settings: Any,
+) -> tuple[SimData, Any]:
+    """Return what ``rollout`` does, compiled; with ``progress`` in pieces, and a bar on the terminal.
+
+    No buffer is taken from the caller.
+    """
+    zeros = step.zeros(data)
+    if not progress:
+        return compiled(step, data, policy, params, n_control_steps, every=every, zeros=zeros, **settings)
+    from tqdm import tqdm
+
+    piece = max(n_control_steps // every // 100, 1) * every
+    pieces, rest = divmod(n_control_steps, piece)
+    kept = []
+    with tqdm(total=n_control_steps, unit="control steps") as bar:
+        for n in [piece] * pieces + [rest] * (rest > 0):
+            data, part = compiled(step, data, policy, params, n, every=every, zeros=zeros, **settings)
+            jax.block_until_ready(part)
+            kept.append(part)
+            bar.update(n)
+    return data, jax.tree.map(lambda *parts: jnp.concatenate(parts), *kept)
