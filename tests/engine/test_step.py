@@ -1,0 +1,436 @@
+"""The engines against each other: one source of physics, several ways to run it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import shared_sim
+
+from crazysim import ConfigError, Sim
+from crazysim.control import Control, command_size
+from crazysim.dynamics import Dynamics
+from crazysim.engine import ENGINES, Step, cuda, kernel, rollout
+from crazysim.engine.program import LARGEST_SWARM
+from crazysim.engine.step import explain
+from crazysim.pytree import PyTree, leaf
+from crazysim.sim import functional as F
+from crazysim.sim.pipeline import append_fn, insert_fn_before
+from crazysim.sim.random import drone_key
+from crazysim.sim.stage import stage
+
+FAST = ("lanes", "fused")
+SLOW = {"state": {"state_freq": 100}, "attitude": {"attitude_freq": 250}}
+PAIRS = [("first_principles", c.value) for c in Control] + [
+    (d.value, c) for d in Dynamics if d != Dynamics.first_principles for c in ("attitude", "state")
+]
+
+
+def scattered(sim, extreme=False, dtype=np.float32):
+    """Return the data with every drone in a state and under a command of its own, worlds out of phase."""
+    rng = np.random.default_rng(1)
+    shape = (sim.n_worlds, sim.n_drones)
+    far = 20.0 if extreme else 1.0
+    n_rotors = sim.data.states.rotor_vel.shape[-1]
+    quat = rng.normal(size=(*shape, 4))
+    rotors = 0.1 * rng.uniform(size=(*shape, n_rotors)) if "rotor" in sim.dynamics else None
+    rotors = rng.uniform(0, 22000, (*shape, n_rotors)) if sim.dynamics == Dynamics.first_principles else rotors
+    data = sim.data
+    states = data.states.replace(
+        pos=dtype(rng.uniform(-1, 2, (*shape, 3)) * [1, 1, far]),
+        quat=dtype(quat / np.linalg.norm(quat, axis=-1, keepdims=True)),
+        vel=dtype(far * rng.normal(size=(*shape, 3))),
+        ang_vel=dtype(far * rng.normal(size=(*shape, 3))),
+        force=dtype(0.1 * rng.normal(size=(*shape, 3))),
+        torque=dtype(1e-4 * rng.normal(size=(*shape, 3))),
+        **({} if rotors is None else {"rotor_vel": dtype(rotors)}),
+    )
+    core = data.core.replace(steps=jnp.asarray(rng.integers(0, 10, (sim.n_worlds, 1)), jnp.int32))
+    data = sim._place(data.replace(states=states, core=core))
+    size = command_size(sim.control, n_rotors)
+    command = far * 0.2 * rng.normal(size=(*shape, size))
+    if sim.control == Control.rotor_vel:
+        command = rng.uniform(-1000, 30000, (*shape, size))
+    elif sim.control != Control.state:
+        command[..., 0 if sim.control == Control.force_torque else 3] = rng.uniform(-0.1, 0.8, shape)
+    if sim.control == Control.force_torque:
+        command[..., 1:] *= 1e-2
+    return getattr(F, f"{sim.control.value}_control")(data, dtype(command))
+
+
+def drift(found, expected, ulp):
+    """Return how far two records of states are apart, in units in the last place of each field's size."""
+    out = {}
+    for name in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
+        a, b = (np.asarray(getattr(x.states, name), np.float64) for x in (found, expected))
+        assert np.isfinite(b).all()
+        size = np.maximum(np.abs(b).max(axis=-1, keepdims=True), 1e-30)
+        out[name] = float(np.max(np.abs(a - b) / size) / ulp)
+    return out
+
+
+# Rounding of one step, in units in the last place of the largest component of a field. A product and a sum may be one
+# rounding or two, and a division a product with the inverse; the derivative gains of the attitude controller multiply
+# what differs in a rate by 500 Hz and more before the allocation divides it down again.
+ULPS = {"pos": 4, "quat": 8, "vel": 64, "ang_vel": 512, "rotor_vel": 512}
+
+
+@pytest.mark.parametrize("extreme", [False, True], ids=["random", "extreme"])
+@pytest.mark.parametrize("dynamics, control", PAIRS)
+def test_one_step_agrees_with_plain(dynamics, control, extreme):
+    """7 worlds of 3 drones, 21 lanes: no multiple of a vector's or a block's length, so that tails are masked."""
+    sim = shared_sim(n_worlds=7, n_drones=3, dynamics=dynamics, control=control, **SLOW.get(control, {}))
+    data = scattered(sim, extreme)
+    expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(1))
+    for engine in FAST:
+        step = Step(sim.step_pipeline, engine)
+        assert step.plan(data).engine == engine
+        found = step(data, jnp.int32(1))
+        apart = drift(found, expected, 2.0**-23)
+        assert all(apart[name] <= ULPS[name] for name in apart), (engine, apart)
+        np.testing.assert_array_equal(found.core.steps, expected.core.steps)
+        np.testing.assert_array_equal(found.core.nonfinite, expected.core.nonfinite)
+        jax.tree.map(lambda x, y: (x.shape, x.dtype) == (y.shape, y.dtype) or pytest.fail(), found, expected)
+
+
+@pytest.mark.parametrize("dynamics, control, integrator", [
+    ("first_principles", "state", "rk4"), ("first_principles", "attitude", "symplectic_euler"),
+    ("so_rpy_rotor_drag", "attitude", "rk4"), ("first_principles", "rotor_vel", "euler"),
+])  # fmt: skip
+def test_long_runs_agree_in_float64(x64, dynamics, control, integrator):
+    """200 steps: what rounding differs in, 2e-16 a step, grows by the closed loop's gains to no more than 1e-9."""
+    sim = Sim(n_worlds=3, n_drones=2, dynamics=dynamics, control=control, integrator=integrator)
+    data = scattered(sim, dtype=np.float64)
+    expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(200))
+    for engine in FAST:
+        found = Step(sim.step_pipeline, engine)(data, jnp.int32(200))
+        for name in ("pos", "quat", "vel"):
+            a, b = getattr(found.states, name), getattr(expected.states, name)
+            assert a.dtype == np.float64
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=f"{engine} {name}")
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_parameter_of_each_drone_is_its_own(engine):
+    """Randomised parameters widen to lanes: each drone falls under its own gravity and flies with its own mass."""
+    sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
+    g = -9.81 * jnp.linspace(0.5, 1.5, 6).reshape(3, 2, 1) * jnp.array([0, 0, 1.0])
+    data = sim.data.replace(params=sim.data.params.replace(gravity_vec=g, drag_matrix=jnp.zeros((3, 3))))
+    data = data.replace(states=data.states.replace(pos=data.states.pos.at[..., 2].set(9.0)))
+    vel = Step(sim.step_pipeline, engine)(data, jnp.int32(10)).states.vel
+    np.testing.assert_allclose(vel[..., 2], 0.02 * g[..., 2], rtol=1e-5)  # ten roundings
+    assert len(np.unique(np.asarray(vel[..., 2]))) == 6
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_zeros_of_parameters_are_seen_anew_when_a_parameter_changes(engine):
+    """A diagonal inertia is computed with as one only as long as it is one."""
+    sim = shared_sim(n_worlds=1, n_drones=1, control="rotor_vel")
+    step = Step(sim.step_pipeline, engine)
+    data = sim.data.replace(states=sim.data.states.replace(
+        pos=sim.data.states.pos.at[..., 2].set(1.0), torque=jnp.asarray([[[1e-5, 0.0, 0.0]]])))  # fmt: skip
+    assert float(step(data, jnp.int32(1)).states.ang_vel[0, 0, 1]) == 0.0
+    J_inv = data.params.J_inv.at[1, 0].set(1e4)
+    coupled = data.replace(params=data.params.replace(J_inv=J_inv))
+    np.testing.assert_allclose(step(coupled, jnp.int32(1)).states.ang_vel[0, 0, 1], 0.002 * 1e4 * 1e-5, rtol=1e-5)
+    inside = jax.jit(lambda d: step(d, jnp.int32(1)))(coupled)
+    np.testing.assert_allclose(inside.states.ang_vel[0, 0, 1], 0.002 * 1e4 * 1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("engine", FAST)
+def test_a_nan_in_one_drone_stays_in_that_drone(engine):
+    sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
+    data = scattered(sim)
+    bad = data.replace(states=data.states.replace(vel=data.states.vel.at[1, 0].set(jnp.nan)))
+    step = Step(sim.step_pipeline, engine)
+    good, after = step(data, jnp.int32(5)), step(bad, jnp.int32(5))
+    np.testing.assert_array_equal(after.core.nonfinite[:, 0], [False, True, False])
+    for name in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
+        mine, theirs = np.asarray(getattr(after.states, name)), np.asarray(getattr(good.states, name))
+        keep = np.ones((3, 2), bool)
+        keep[1, 0] = False
+        np.testing.assert_array_equal(mine[keep], theirs[keep])
+
+
+# Stages of the user -------------------------------------------------------------------------------------------------
+
+
+class Gust(PyTree):
+    """A force that wanders."""
+
+    force: jax.Array = leaf("drone", 1)
+    """Force, world frame, N. (3,)"""
+    strength: jax.Array = leaf("world", 0)
+    """Size of its steps, N. ()"""
+
+
+@stage("drone")
+def gust(data):
+    """Let the force wander, with numbers of the drone's own."""
+    mine = data.plugins["gust"]
+    noise = jax.random.normal(drone_key(data, "gust"), (3,))
+    mine = mine.replace(force=0.9 * mine.force + mine.strength * noise)
+    states = data.states.replace(force=mine.force)
+    return data.replace(plugins=data.plugins | {"gust": mine}, states=states)
+
+
+@stage("world")
+def separation(data):
+    """Push drones of a world apart."""
+    apart = data.states.pos[:, None] - data.states.pos[None, :]
+    squared = jnp.sum(apart**2, axis=-1, keepdims=True) + 0.1
+    force = 1e-3 * jnp.sum(apart / squared, axis=1)
+    return data.replace(states=data.states.replace(force=force))
+
+
+def undeclared(data):
+    """Look at all drones of all worlds."""
+    mean = jnp.mean(data.states.pos, axis=(0, 1))
+    return data.replace(states=data.states.replace(torque=0 * data.states.torque + 1e-6 * mean))
+
+
+def with_stages(n_drones, *stages):
+    sim = Sim(n_worlds=3, n_drones=n_drones, control="attitude", rng_key=4)
+    shape = (3, n_drones)
+    record = Gust(jnp.zeros((*shape, 3)), jnp.linspace(0.001, 0.003, 3)[:, None])
+    sim.data = sim.data.replace(plugins={"gust": record})
+    for fn in stages:
+        insert_fn_before(sim.step_pipeline, "integration", fn)
+    return sim, scattered(sim)
+
+
+@pytest.mark.parametrize("stages, n_segments", [
+    ((gust,), 1), ((separation,), 3), ((undeclared,), 3), ((gust, separation, undeclared), 4),
+])  # fmt: skip
+def test_stages_of_the_user_mean_the_same_on_every_engine(stages, n_segments):
+    """A stage of one drone fuses; one of a world runs on lanes of worlds; an undeclared one splits the step."""
+    sim, data = with_stages(4, *stages)
+    expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(6))
+    for engine in FAST:
+        step = Step(sim.step_pipeline, engine)
+        plan = step.plan(data)
+        assert plan.engine == engine
+        assert len(plan.program.segments) == n_segments
+        for n in (jnp.int32(6), 6):
+            found = step(data, n)
+            for name in ("pos", "quat", "vel", "force", "torque"):
+                np.testing.assert_allclose(
+                    getattr(found.states, name), getattr(expected.states, name), rtol=2e-5, atol=2e-6, err_msg=name
+                )
+    text = explain(Step(sim.step_pipeline, "auto"), data)
+    assert ("'undeclared' is not fused: it is not declared for one drone or one world" in text) == (
+        undeclared in stages
+    )
+
+
+def test_a_stage_of_one_world_splits_a_large_swarm():
+    sim, data = with_stages(LARGEST_SWARM + 1, separation)
+    step = Step(sim.step_pipeline, "lanes")
+    assert f"written out for up to {LARGEST_SWARM} drones" in explain(step, data)
+    found, expected = step(data, jnp.int32(3)), Step(sim.step_pipeline, "plain")(data, jnp.int32(3))
+    np.testing.assert_allclose(found.states.vel, expected.states.vel, rtol=2e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("fn, words", [
+    (lambda d: d.replace(params=d.params.replace(mass=2 * d.params.mass)), "writes params.mass, which is shared"),
+    (lambda d: d.replace(core=d.core.replace(steps=d.core.steps + 1)), "writes core.steps, which is world"),
+    (lambda d: d.replace(states=d.states.replace(pos=d.states.pos[:2])), "of shape (3,) and type float32 into shape (2,)"),
+])  # fmt: skip
+@pytest.mark.parametrize("engine", ENGINES)
+def test_law_09_a_stage_writes_within_its_scope(engine, fn, words):
+    sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
+    with pytest.raises(ConfigError) as error:
+        Step(sim.step_pipeline | {"mine": stage("drone")(fn)}, engine)(sim.data, jnp.int32(1))
+    assert "stage 'mine'" in str(error.value)
+    assert words in str(error.value)
+
+
+def test_law_06_a_stage_is_traced_once(x64):
+    """Law 6: whatever is called afterwards."""
+    del x64
+    sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
+    for engine in FAST:
+        traces = []
+
+        def count(data, traces=traces):
+            traces.append(1)
+            return data.replace(states=data.states.replace(force=0.5 * data.states.force))
+
+        step = Step(sim.step_pipeline | {"count": stage("drone")(count)}, engine)
+        for n in (1, 2, 3):
+            step(sim.data, jnp.int32(n))
+        assert len(traces) == 1, engine
+
+
+# Transformations -----------------------------------------------------------------------------------------------------
+
+
+def loss(step, command, data, n):
+    after = step(F.attitude_control(data, command), n)
+    return jnp.sum(after.states.pos**2) + jnp.sum(after.states.vel * after.states.force)
+
+
+def test_gradients_equal_those_of_plain_in_float64(x64):
+    """Reverse and forward, to 1e-9 of the largest: 40 steps under the attitude controller, and 300 with few kept."""
+    sim = Sim(n_worlds=2, n_drones=2, control="attitude")
+    data = scattered(sim, dtype=np.float64)
+    command = data.controls.attitude.staged_cmd
+    steps = {engine: Step(sim.step_pipeline, engine) for engine in ("plain", *FAST)}
+    for n in (40, 300):
+        reverse = {e: jax.grad(lambda c, s=s, n=n: loss(s, c, data, n))(command) for e, s in steps.items()}
+        for engine in FAST:
+            scale = float(jnp.max(jnp.abs(reverse["plain"])))
+            assert scale > 1e-3
+            np.testing.assert_allclose(reverse[engine], reverse["plain"], rtol=1e-9, atol=1e-9 * scale, err_msg=engine)
+    forward = {e: jax.jvp(lambda c, s=s: loss(s, c, data, 40), (command,), (command,))[1] for e, s in steps.items()}
+    for engine in FAST:
+        np.testing.assert_allclose(forward[engine], forward["plain"], rtol=1e-9)
+
+
+def test_gradients_with_respect_to_parameters(x64):
+    """What is zero in an inertia has a derivative all the same."""
+    sim = Sim(n_worlds=2, n_drones=1, control="rotor_vel")
+    data = scattered(sim, dtype=np.float64)
+
+    data = data.replace(states=data.states.replace(pos=data.states.pos + 5.0))  # off the floor
+
+    def of(step, J):
+        return jnp.sum(step(data.replace(params=data.params.replace(J=J)), 20).states.ang_vel ** 2)
+
+    wanted = jax.grad(lambda J: of(Step(sim.step_pipeline, "plain"), J))(data.params.J)
+    assert float(jnp.abs(wanted[0, 1])) > 0
+    for engine in FAST:
+        found = jax.grad(lambda J, e=engine: of(Step(sim.step_pipeline, e), J))(data.params.J)
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * float(jnp.abs(wanted).max()))
+
+
+@pytest.mark.parametrize("engine", FAST)
+def test_vmap_over_commands_and_parameters_is_a_loop(engine):
+    sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
+    data, step = scattered(sim), Step(sim.step_pipeline, engine)
+    commands = data.controls.attitude.staged_cmd * jnp.linspace(0.5, 1.5, 4)[:, None, None, None]
+    masses = data.params.mass * jnp.linspace(0.9, 1.1, 4)[:, None]
+
+    def fly(command, mass):
+        ready = F.attitude_control(data.replace(params=data.params.replace(mass=mass)), command)
+        return step(ready, jnp.int32(7)).states
+
+    over_commands = jax.vmap(fly, (0, None))(commands, data.params.mass)
+    over_both = jax.jit(jax.vmap(fly))(commands, masses)
+    for k in range(4):
+        for name in ("pos", "vel"):
+            one = getattr(jax.jit(fly)(commands[k], data.params.mass), name)
+            np.testing.assert_allclose(getattr(over_commands, name)[k], one, rtol=1e-5, atol=1e-6)
+            one = getattr(jax.jit(fly)(commands[k], masses[k]), name)
+            np.testing.assert_allclose(getattr(over_both, name)[k], one, rtol=1e-5, atol=1e-6)
+
+
+# Rollouts ------------------------------------------------------------------------------------------------------------
+
+
+def hold(gain, data):
+    """Climb to one metre."""
+    thrust = 0.4258 + gain * (1.0 - data.states.pos[..., 2:]) - 0.2 * data.states.vel[..., 2:]
+    return jnp.concatenate([jnp.zeros_like(data.states.pos), thrust], axis=-1)
+
+
+def test_a_rollout_is_the_loop_it_stands_for():
+    """The same numbers, kept at the rate asked for, and the simulation goes on from the end."""
+    sim = Sim(n_worlds=3, n_drones=2, control="attitude", attitude_freq=100)
+    start, gain = sim.data, jnp.float32(0.3)
+    kept = sim.rollout(hold, gain, 40, keep=lambda d: {"z": d.states.pos[..., 2]}, every=10)
+    assert kept["z"].shape == (4, 3, 2)
+    step, data = sim.build_step_fn(), start
+    for k in range(1, 41):
+        data = step(F.attitude_control(data, hold(gain, data)), jnp.int32(5))
+        if k % 10 == 0:
+            np.testing.assert_allclose(kept["z"][k // 10 - 1], data.states.pos[..., 2], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(sim.data.states.pos, data.states.pos, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(sim.data.core.steps, np.full((3, 1), 200))
+    assert not start.states.pos.is_deleted()  # law 11
+    again = sim.rollout(hold, gain, 40, keep=lambda d: d.states.pos, every=20, progress=True)
+    assert again.shape == (2, 3, 2, 3)
+
+
+def test_a_rollout_has_a_gradient():
+    sim = Sim(n_worlds=1, n_drones=1, control="attitude", attitude_freq=100)
+    states = sim.data.states
+    data = sim.data.replace(states=states.replace(pos=states.pos + 0.5, rotor_vel=states.rotor_vel + 15800.0))
+    step = sim.build_step_fn()
+
+    def height(gain):
+        return rollout(step, data, hold, gain, 20, 5)[0].states.pos[0, 0, 2]
+
+    slope = float(jax.grad(height)(jnp.float32(0.3)))
+    central = float(height(jnp.float32(0.31)) - height(jnp.float32(0.29))) / 0.02
+    assert slope > 0.01
+    np.testing.assert_allclose(slope, central, rtol=2e-2)  # float32: 1e-7 m over 0.02
+
+
+@pytest.mark.parametrize("settings, words", [
+    ({"n_control_steps": 0}, "n_control_steps must be a positive int, not 0"),
+    ({"n_control_steps": 2.0}, "n_control_steps must be a positive int, not 2.0"),
+    ({"n_control_steps": 10, "every": 3}, "every=3 does not divide n_control_steps=10"),
+])  # fmt: skip
+def test_law_09_rollouts_refuse_what_cannot_be(settings, words):
+    sim = shared_sim(n_worlds=1, n_drones=1, control="attitude")
+    with pytest.raises(ConfigError, match=words):
+        sim.rollout(hold, jnp.float32(0.3), **settings)
+
+
+def test_law_09_a_policy_of_another_shape_is_told():
+    sim = shared_sim(n_worlds=2, n_drones=1, control="attitude")
+    with pytest.raises(ValueError, match=r"attitude command has shape \(2, 1, 3\); this simulation needs \(2, 1, 4\)"):
+        sim.rollout(lambda params, data: data.states.pos, None, 3)
+
+
+# Choice --------------------------------------------------------------------------------------------------------------
+
+
+def test_auto_takes_the_kernel_and_says_so():
+    sim = shared_sim(n_worlds=1, n_drones=1, control="state")
+    text = sim.explain()
+    assert text.startswith("engine: fused")
+    assert "fused, for one drone: state_controller, attitude_controller" in text
+    assert "compiled by" in text
+
+
+def test_without_a_compiler_auto_takes_lanes_and_says_why(monkeypatch):
+    monkeypatch.setattr("crazysim.engine.native.compiler", lambda: None)
+    sim = Sim(control="rotor_vel")
+    assert sim.explain().startswith("engine: lanes (no C++ compiler was found")
+    sim.step(2)
+    with pytest.raises(
+        ConfigError, match="engine 'fused' cannot run here: no C\\+\\+ compiler was found.*engine='lanes'"
+    ):
+        Sim(engine="fused")
+
+
+def test_law_09_an_engine_that_does_not_exist_is_refused():
+    with pytest.raises(ConfigError, match="engine 'warp' does not exist; choose one of auto, plain, lanes, fused"):
+        Sim(engine="warp")
+
+
+@pytest.mark.parametrize("dynamics, control", PAIRS)
+def test_every_pipeline_compiles_for_a_gpu(dynamics, control, tmp_path):
+    """NVRTC needs no GPU to compile for one."""
+    sim = shared_sim(n_worlds=2, n_drones=3, dynamics=dynamics, control=control, **SLOW.get(control, {}))
+    step = Step(sim.step_pipeline, "fused", "gpu")
+    plan = step.plan(sim.data)
+    assert plan.engine == "fused"
+    source = kernel.write(plan.program, "cuda")
+    text = cuda.ptx(source, cuda.DEFAULT_ARCHITECTURE)
+    assert ".entry advance(" in text
+    assert source.block % 3 == 0
+    leaves = jax.tree.leaves(sim.data)
+    values = [leaves[i] for i in plan.read]
+    lowered = plan.dynamic.trace(values, leaves[plan.flags[0]], jnp.int32(3)).lower(lowering_platforms=("cuda",))
+    assert cuda.TARGET in lowered.as_text()
+
+
+def test_appended_stages_are_seen_after_a_rebuild():
+    sim = Sim(n_worlds=2, n_drones=1, control="rotor_vel")
+    append_fn(sim.step_pipeline, undeclared)
+    assert "undeclared" not in sim.explain()
+    sim.build_step_fn()
+    assert "'undeclared' is not fused" in sim.explain()
+    sim.step(2)
