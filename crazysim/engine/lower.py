@@ -185,6 +185,12 @@ def _integer_pow(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     return [squared if y == 2 else r.each("mul", [squared, squared if y == 4 else args[0]], dtype)]
 
 
+@rule("one_minus_square")
+def _one_minus_square(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    dtype = eqn.outvars[0].aval.dtype
+    return [r.each("sub", [constants(1, dtype), r.each("mul", [args[0], args[0]], dtype)], dtype)]
+
+
 @rule("add_any")
 def _add_any(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     return [r.each("add", args, eqn.outvars[0].aval.dtype)]
@@ -392,9 +398,25 @@ def _call(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("custom_jvp_call")
 def _custom_jvp(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """A call that brings a derivative of its own, which is read when somebody asks for it."""
+    return _with_derivative(r, eqn, args, closed(eqn.params["call_jaxpr"]))
+
+
+@rule("call_hi_primitive")
+def _high_level(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """A primitive that is written in terms of others, from JAX 0.12 on."""
+    primitive = eqn.params["_prim"]
+
+    def expanded(*args: Any) -> list[Any]:
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, args)))
+
+    avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+    return _with_derivative(r, eqn, args, jax.make_jaxpr(expanded)(*avals))
+
+
+def _with_derivative(r: Reader, eqn: Any, args: list[Elements], called: core.ClosedJaxpr) -> list[Elements]:
+    """Read a call that brings a derivative of its own, which is read when somebody asks for it."""
     body = r.inner()
-    body.block.outputs = _flat(body.read(closed(eqn.params["call_jaxpr"]), [_inputs(body, x) for x in args]))
+    body.block.outputs = _flat(body.read(called, [_inputs(body, x) for x in args]))
 
     @functools.cache
     def slope() -> Block:
@@ -448,10 +470,13 @@ def _platform_index(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]
 
 @rule("scan")
 def _scan(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    p = eqn.params
-    n_consts, n_carry, length = p["num_consts"], p["num_carry"], p["length"]
-    fixed, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
+    p, length = eqn.params, eqn.params["length"]
     body = closed(p["jaxpr"])
+    # Versions of JAX name the groups differently; what is stacked over turns has one axis more outside.
+    n_carry = sum(o.aval.ndim == v.aval.ndim for o, v in zip(eqn.outvars, body.jaxpr.outvars, strict=True))
+    n_stacked = sum(o.aval.ndim > v.aval.ndim for o, v in zip(eqn.invars, body.jaxpr.invars, strict=True))
+    n_consts = len(eqn.invars) - n_carry - n_stacked
+    fixed, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
     if len(body.jaxpr.outvars) == n_carry and not xs and length > 1:
         inner = r.inner()
         inputs = [_inputs(inner, x) for x in carry]

@@ -1,6 +1,6 @@
 // How XLA calls the kernel: its foreign function interface, version and all.
 extern "C" __attribute__((visibility("default"))) XLA_FFI_Error* crazysim_advance(XLA_FFI_CallFrame* frame) {
-  for (XLA_FFI_Extension_Base* e = frame->extension_start; e != nullptr; e = e->next) {
+  for (auto* e = frame->extension_start; e != nullptr; e = e->next) {
     if (e->type != XLA_FFI_Extension_Metadata) continue;
     XLA_FFI_Metadata* metadata = ((XLA_FFI_Metadata_Extension*)e)->metadata;
     metadata->api_version.major_version = XLA_FFI_API_MAJOR;
