@@ -126,10 +126,7 @@ def _wrap(x: Expression) -> Expression:
 
 
 def _inverse_erf(x: Expression) -> Expression:
-    """Return the inverse of the error function: CasADi's is exact to six digits, and each step of Newton doubles them.
-
-    The rational approximation's own slope would be as inexact, and is not used.
-    """
+    """Return the inverse of the error function; CasADi has six digits, and each step of Newton doubles them."""
     ca = _casadi()
     y = ca.erfinv(x)
     for _ in range(2):
