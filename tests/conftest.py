@@ -43,6 +43,12 @@ def x64():
         yield
 
 
+@pytest.fixture(scope="session")
+def casadi():
+    """Return CasADi, or skip a test where it is not installed; CI forbids the skip."""
+    return pytest.importorskip("casadi")
+
+
 @pytest.fixture
 def rng():
     """Return a generator that gives the same numbers in every run."""

@@ -8,11 +8,25 @@ import pytest
 EXAMPLES = sorted((Path(__file__).parents[2] / "docs" / "examples").glob("*.py"))
 
 
+def fits(result):
+    """Check that a fit found every number to 2 in 1,000, and knows it; it begins 4 % off or more."""
+    assert len(result) == 7
+    for name, (found, true, sigma) in result.items():
+        assert abs(found - true) < min(4 * sigma, 2e-3 * true), name
+        assert sigma < 1e-3 * true, name
+
+
+CHECKS = {"fit_flight": fits}
+"""What is checked of an example beyond that it runs: of what its ``main`` returns."""
+
+
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_example_runs(path, capsys):
     spec = importlib.util.spec_from_file_location(f"example_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    module.main()
+    result = module.main()
+    if path.stem in CHECKS:
+        CHECKS[path.stem](result)
     assert capsys.readouterr().out.strip(), "an example prints its result"
     assert module.__doc__

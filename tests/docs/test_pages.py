@@ -14,6 +14,8 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 def test_page_runs(page, tmp_path, monkeypatch, opengl):
     monkeypatch.chdir(tmp_path)
     text = page.read_text()
+    if "import casadi" in text:
+        pytest.importorskip("casadi")
     namespace = {"__name__": "page"}
     for block in BLOCK.finditer(text):
         # Blank lines in front, so that a traceback shows the line of the page.

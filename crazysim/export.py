@@ -1,0 +1,210 @@
+"""A step of one drone for other tools: as a CasADi function, for acados and the like."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from crazysim.control import Control
+from crazysim.engine import symbolic
+from crazysim.engine.lower import NoRuleError
+from crazysim.engine.program import Program, Slot, is_key
+from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.sim.data import SimData
+from crazysim.sim.stage import Axes, Stage, as_stages
+
+if TYPE_CHECKING:
+    from crazysim.sim.sim import Sim
+
+STATES = ("states.pos", "states.quat", "states.vel", "states.ang_vel", "states.rotor_vel")
+"""What every state vector begins with: m, unit xyzw, m/s, rad/s, rpm (in ``so_rpy_rotor*`` N)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Vector:
+    """What the numbers of a vector are: fields of ``SimData``, one after the other, each in row-major order."""
+
+    sizes: Mapping[str, int]
+    """How many numbers each field has of one drone, in the vector's order. The names are paths in ``SimData``, and
+    the units those of the fields."""
+
+    def __len__(self) -> int:
+        """Return how many numbers there are."""
+        return sum(self.sizes.values())
+
+    def __getitem__(self, name: str) -> slice:
+        """Return where a field is.
+
+        Raises:
+            UnknownNameError: If it is not in the vector.
+        """
+        if name not in self.sizes:
+            raise UnknownNameError(f"{name!r} is not in this vector; it has {', '.join(self.sizes) or 'nothing'}")
+        names = list(self.sizes)
+        start = sum(self.sizes[n] for n in names[: names.index(name)])
+        return slice(start, start + self.sizes[name])
+
+    def of(self, data: SimData, world: int = 0, drone: int = 0) -> np.ndarray:
+        """Return the vector of one drone of a simulation. (len(self),)"""
+        axes, leaves = Axes(data), jax.tree.leaves(data)
+        parts = [_of_one(axes, leaves, axes.names.index(name), world, drone) for name in self.sizes]
+        return np.concatenate([np.zeros(0), *parts])
+
+
+@dataclasses.dataclass(frozen=True)
+class CasadiStep:
+    """A step of one drone as a CasADi function, and what its vectors are."""
+
+    function: Any
+    """``casadi.Function``: ``x_next = step(x, u)``, or ``step(x, u, p)`` if there are parameters."""
+    x: Vector
+    """State: position, attitude, velocity, body rates, rotor speeds, then what controllers and effects remember."""
+    u: Vector
+    """Command, as the setter of the simulation's level takes it."""
+    p: Vector
+    """Parameters that were asked for."""
+    dt: float
+    """Length of the step, s."""
+
+    def __call__(self, *args: Any) -> Any:
+        """Return the next state, for numbers or for symbols of CasADi."""
+        return self.function(*args)
+
+
+def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: int = 0) -> CasadiStep:
+    """Return a step of one drone as a CasADi function.
+
+    It is the step pipeline as it stands in ``sim.step_pipeline``, stages and effects of the user's included, read into
+    expressions operation by operation: the same numbers as ``sim.step`` gives in float64, to rounding. Whatever is
+    neither state, nor command, nor a parameter that was asked for is a constant, as the drone has it now. In a
+    simulation of float32 the constants are of that precision.
+
+    Args:
+        sim: The simulation.
+        parameters: Fields that become the vector ``p``, by their path in ``SimData``, such as ``"params.mass"`` or
+            ``"states.force"``.
+        world: World of the drone.
+        drone: Which drone of its world.
+
+    Raises:
+        ValueError: If a name or the drone does not exist, or the step is no program of one drone that CasADi could
+            have: the message names the stage and the reason.
+        ImportError: If CasADi is not installed.
+    """
+    try:
+        import casadi
+    except ImportError as error:
+        raise ImportError("CasADi is not installed; pip install 'crazysim[casadi]'") from error
+    data, stages = sim.data, as_stages(sim.step_pipeline)
+    if not (0 <= world < data.core.n_worlds and 0 <= drone < data.core.n_drones):
+        raise ConfigError(
+            f"there is no drone {drone} of world {world}: this simulation has {data.core.n_worlds} worlds of "
+            f"{data.core.n_drones} drones, counted from 0"
+        )
+    program = Program(stages, data)
+    axes, leaves = program.axes, program.leaves
+    command = _command_field(data)
+    state = [axes.names.index(name) for name in STATES]
+    given = [axes.names.index(command), *_parameter_leaves(program, parameters, command)]
+    symbols = {
+        leaf: casadi.SX.sym(axes.names[leaf], program.sizes(leaf)) for leaf in {*state, *given, *program.written}
+    }
+    constants: dict[int, Any] = {}
+
+    def before(slot: Slot) -> Any:
+        leaf, k = slot
+        if leaf in symbols:
+            return symbols[leaf][k]
+        if leaf not in constants:
+            constants[leaf] = casadi.SX(casadi.DM(_of_one(axes, leaves, leaf, world, drone)))
+        return constants[leaf][k]
+
+    after = _step(program, stages, data, before)
+    then = {
+        leaf: casadi.vertcat(*(after.get((leaf, k), symbol[k]) for k in range(symbol.numel())))
+        for leaf, symbol in symbols.items()
+    }
+    # What the state depends on from step to step belongs to it, and what that depends on in turn.
+    while memory := [
+        leaf
+        for leaf, symbol in symbols.items()
+        if leaf not in (*state, *given) and any(casadi.depends_on(then[known], symbol) for known in state)
+    ]:
+        state += memory
+    state = state[: len(STATES)] + sorted(state[len(STATES) :])
+    parts = {"x": state, "u": given[:1], "p": given[1:]}
+    names = [name for name, part in parts.items() if part]
+    arguments = [casadi.vertcat(*(symbols[leaf] for leaf in parts[name])) for name in names]
+    x_next = casadi.vertcat(*(then[leaf] for leaf in state))
+    return CasadiStep(
+        casadi.Function("step", arguments, [x_next], names, ["x_next"]),
+        *(Vector({axes.names[leaf]: program.sizes(leaf) for leaf in part}) for part in parts.values()),
+        dt=1 / data.core.freq,
+    )
+
+
+def _step(program: Program, stages: Sequence[Stage], data: SimData, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
+    """Return what a step writes, or say which stage stands in the way.
+
+    Raises:
+        ConfigError: If it cannot be exported.
+    """
+    for segment in program.segments:
+        if segment.scope != "drone":
+            why = segment.why or "it sees all drones of its world, and what is exported is the step of one"
+            raise _refusal(segment.stages[0], why)
+    if not program.segments:
+        return {}
+    try:
+        return symbolic.step(program.segments[0], before)
+    except NoRuleError as error:
+        for stage in stages:
+            try:
+                symbolic.step(Program([stage], data).segments[0], before)
+            except NoRuleError as reason:
+                raise _refusal(stage, str(reason)) from None
+        raise ConfigError(f"the step cannot be exported: {error}") from None
+
+
+def _refusal(stage: Stage, why: str) -> ConfigError:
+    return ConfigError(f"the step cannot be exported because of its stage {stage.__name__!r}: {why}")
+
+
+def _command_field(data: SimData) -> str:
+    mode = data.controls.mode
+    return "controls.rotor_vel" if mode == Control.rotor_vel else f"controls.{mode.value}.staged_cmd"
+
+
+def _parameter_leaves(program: Program, parameters: Sequence[str], command: str) -> list[int]:
+    """Return which leaves are asked for as parameters, or say why one cannot be.
+
+    Raises:
+        ConfigError: If a name does not exist, is there twice, or is no parameter of a step.
+    """
+    names = program.axes.names
+    if isinstance(parameters, str) or len(set(parameters)) < len(parameters):
+        raise ConfigError(f"parameters are a list of different names, not {parameters!r}")
+    free = [
+        name
+        for leaf, name in enumerate(names)
+        if name not in (*STATES, command)
+        and leaf not in program.written
+        and program.axes.scopes[leaf] in ("drone", "shared")
+        and jax.numpy.issubdtype(program.leaves[leaf].dtype, jax.numpy.floating)
+    ]
+    for name in parameters:
+        if name not in free:
+            raise UnknownNameError(f"{name!r} is no parameter of this step; what may be one is {', '.join(free)}")
+    return [names.index(name) for name in parameters]
+
+
+def _of_one(axes: Axes, leaves: Sequence[Any], leaf: int, world: int, drone: int) -> np.ndarray:
+    """Return the numbers that one drone has of a leaf, as float64. (size,)"""
+    x = leaves[leaf]
+    x = np.asarray(jax.random.key_data(x) if is_key(x) else x)
+    place = {"drone": (world, drone), "world": (world, 0)}.get(axes.scopes[leaf], ())
+    return x[place].astype(np.float64).reshape(-1)

@@ -1,0 +1,234 @@
+"""A step as CasADi has it is the step: at random states of every dynamics and command level, and its Jacobian."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import INTEGRATORS, PAIRS, hover_command, hover_rotor_state
+
+from crazysim import Sim
+from crazysim.effects import battery, downwash
+from crazysim.export import STATES, to_casadi
+from crazysim.sim.pipeline import append_fn, insert_fn_before
+from crazysim.sim.stage import Axes, stage
+
+pytestmark = pytest.mark.usefixtures("casadi", "x64")
+
+N_WORLDS, N_DRONES = 6, 2
+RK4 = [("first_principles", c, "rk4") for c in ("rotor_vel", "attitude", "state")] + [
+    ("so_rpy_rotor_drag", "attitude", "rk4"),
+    ("first_principles", "attitude", "symplectic_euler"),
+]
+assert all(integrator in INTEGRATORS for *_, integrator in RK4)
+
+
+def fields(data, names):
+    """Return the leaves of these names, in order."""
+    leaves = dict(zip(Axes(data).names, jax.tree.leaves(data), strict=True))
+    return [leaves[name] for name in names]
+
+
+def with_fields(data, changes):
+    """Return the data with other leaves, by name."""
+    leaves, treedef = jax.tree.flatten(data)
+    return treedef.unflatten([changes.get(name, x) for name, x in zip(Axes(data).names, leaves, strict=True)])
+
+
+def anywhere(sim, step):
+    """Return the simulation's data with every number of every drone's x and u drawn at random.
+
+    Some drones are on or under the floor, some rotors off, some commands beyond what the motors can give.
+    """
+    rng = np.random.default_rng(7)
+    hover, command = hover_rotor_state(sim.data)[0], hover_command(sim.data)
+    sizes = {"states.pos": 1.0, "states.quat": 1.0, "states.vel": 2.0, "states.ang_vel": 3.0, "states.rotor_vel": hover}
+    changes = {}
+    for name in (*step.x.sizes, *step.u.sizes):
+        (old,) = fields(sim.data, [name])
+        new = sizes.get(name, 0.1) * rng.normal(size=old.shape)
+        if name == "core.steps":
+            new = rng.integers(0, 10, old.shape)
+        elif name == "states.quat":
+            new /= np.linalg.norm(new, axis=-1, keepdims=True)
+        elif name in step.u.sizes or name == f"controls.{sim.control.value}.cmd":
+            new = command + np.where(command == 0, 0.2, 0.7 * command) * rng.normal(size=old.shape)
+        elif name == "states.rotor_vel":
+            new = np.abs(new)
+        changes[name] = jnp.asarray(new, old.dtype)
+    changes["states.pos"] = changes["states.pos"].at[:2, :, 2].set(jnp.asarray([[-0.001, -0.01], [-0.002, 0.0]]))
+    return with_fields(sim.data, changes)
+
+
+def compare(sim, step, data):
+    """Compare the exported step with the reference, drone by drone, each field to 1e-12 of its size."""
+    after = sim.build_step_fn()(data, 1)
+    for world in range(sim.n_worlds):
+        for drone in range(sim.n_drones):
+            place = world, drone
+            parts = [part.of(data, *place) for part in (step.x, step.u, step.p) if len(part)]
+            found = np.asarray(step(*parts)).ravel()
+            expected = step.x.of(after, *place)
+            assert len(found) == len(step.x)
+            for name in step.x.sizes:
+                a, b = found[step.x[name]], expected[step.x[name]]
+                scale = max(1.0, np.abs(b).max())
+                np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * scale, err_msg=f"{name} of {place}")
+
+
+@pytest.mark.parametrize(("dynamics", "control", "integrator"), [(*pair, "euler") for pair in PAIRS] + RK4)
+def test_the_exported_step_is_the_step(dynamics, control, integrator):
+    sim = Sim(N_WORLDS, N_DRONES, dynamics=dynamics, control=control, integrator=integrator, engine="plain")
+    step = to_casadi(sim)
+    assert step.function.name_in() == ["x", "u"]
+    assert list(step.x.sizes)[: len(STATES)] == list(STATES)
+    assert step.dt == 1 / sim.freq
+    compare(sim, step, anywhere(sim, step))
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "control", "integrator"),
+    [
+        ("first_principles", "attitude", "euler"),
+        ("first_principles", "rotor_vel", "rk4"),
+        ("so_rpy", "attitude", "euler"),
+    ],
+)
+def test_the_jacobian_is_that_of_jax(dynamics, control, integrator):
+    """At a state away from switches, in x and u."""
+    sim = Sim(dynamics=dynamics, control=control, integrator=integrator, engine="plain")
+    exported, step = to_casadi(sim), sim.build_step_fn()
+    rng = np.random.default_rng(1)
+    x = exported.x.of(sim.data) + 0.05 * rng.normal(size=len(exported.x))
+    x[exported.x["states.pos"]] = [0.1, 0.2, 1.0]
+    x[exported.x["states.quat"]] /= np.linalg.norm(x[exported.x["states.quat"]])
+    x[exported.x["states.rotor_vel"]] = hover_rotor_state(sim.data) * [0.9, 0.92, 0.94, 0.96]
+    u = hover_command(sim.data) * 1.02 + (0.01 if control == "attitude" else 0.0)
+
+    def advance(x, u):
+        changes = {name: x[exported.x[name]] for name in exported.x.sizes} | {next(iter(exported.u.sizes)): u}
+        data = with_fields(sim.data, {name: value[None, None] for name, value in changes.items()})
+        return jnp.concatenate([value[0, 0] for value in fields(step(data, 1), exported.x.sizes)])
+
+    expected = jax.jit(jax.jacfwd(advance, argnums=(0, 1)))(x, u)
+    found = exported.function.jacobian()(x, u, 0)
+    for a, b in zip(found, expected, strict=True):
+        largest = np.abs(b).max(axis=1, keepdims=True)  # of each number of the next state
+        assert (largest > 0).sum() >= 4
+        size = np.where(largest > 0, largest, 1.0)
+        np.testing.assert_allclose(np.asarray(a) / size, b / size, rtol=1e-10, atol=1e-11)
+
+
+@pytest.mark.parametrize(("dynamics", "control"), PAIRS)
+def test_the_jacobian_is_finite_in_hover_and_at_rest(dynamics, control):
+    sim = Sim(dynamics=dynamics, control=control)
+    exported = to_casadi(sim)
+    jacobian = exported.function.jacobian()
+    for height in (0.0, 1.0):
+        x = exported.x.of(sim.data)
+        x[2] = height
+        for u in (hover_command(sim.data), 0 * hover_command(sim.data)):
+            assert all(np.isfinite(np.asarray(part)).all() for part in jacobian(x, u, 0))
+
+
+def test_parameters_are_an_input():
+    sim = Sim(N_WORLDS, N_DRONES, control="rotor_vel", engine="plain")
+    names = ("states.force", "params.mass", "params.rpm2thrust")
+    step = to_casadi(sim, names)
+    assert step.function.name_in() == ["x", "u", "p"]
+    assert step.p.sizes == {"states.force": 3, "params.mass": 1, "params.rpm2thrust": 3}
+    rng = np.random.default_rng(2)
+    data = anywhere(sim, step)
+    changes = {
+        "states.force": jnp.asarray(rng.normal(size=(N_WORLDS, N_DRONES, 3))),
+        "params.mass": jnp.asarray(rng.uniform(0.02, 0.06, (N_WORLDS, N_DRONES, 1))),
+        "params.rpm2thrust": 1.1 * data.params.rpm2thrust,
+    }
+    compare(sim, step, with_fields(data, changes))
+
+
+def test_constants_are_those_of_the_drone_that_was_asked_for():
+    sim = Sim(2, 2, control="rotor_vel", engine="plain")
+    mass = jnp.asarray([[0.03, 0.04], [0.05, 0.06]])[..., None]
+    sim.data = with_fields(sim.data, {"params.mass": mass})
+    x, u = (part.of(sim.data) for part in (to_casadi(sim).x, to_casadi(sim).u))
+    x[2], x[13:] = 1.0, 15_000.0
+    climbs = [to_casadi(sim, world=w, drone=d)(x, u)[9] for w, d in ((0, 0), (1, 1))]
+    thrust = [(float(v) / to_casadi(sim).dt + 9.81) * m for v, m in zip(climbs, (0.03, 0.06), strict=True)]
+    np.testing.assert_allclose(thrust[0], thrust[1], rtol=1e-9)
+
+
+def test_stages_of_the_user_are_exported_with_their_memory():
+    """A battery, and a stage with a bounded loop and a branch, of one drone."""
+    sim = Sim(N_WORLDS, N_DRONES, control="rotor_vel", engine="plain")
+    battery.add(sim, capacity=0.35, resistance=0.1)
+
+    @stage("drone", when=lambda data: data.states.vel[2] > 0)
+    def brake(data):
+        vel = jax.lax.fori_loop(0, 3, lambda k, v: v * (1 - 1e-3 * k), data.states.vel)
+        return data.replace(states=data.states.replace(vel=jnp.where(vel[0] > 0, vel, 0.9 * vel)))
+
+    append_fn(sim.step_pipeline, brake)
+    step = to_casadi(sim)
+    assert set(step.x.sizes) > set(STATES), "a battery remembers its charge"
+    data = anywhere(sim, step)
+    charge = {name: x for name, x in zip(Axes(data).names, jax.tree.leaves(sim.data), strict=True) if "plugins" in name}
+    compare(sim, step, with_fields(data, charge))
+
+
+def undeclared(data):
+    return data.replace(states=data.states.replace(vel=0.99 * data.states.vel))
+
+
+@stage("drone")
+def gust(data):
+    return data.replace(states=data.states.replace(force=jax.random.normal(data.core.rng_key, (3,))))
+
+
+@stage("drone")
+def until(data):
+    vel = jax.lax.while_loop(lambda v: jnp.sum(v * v) > 1.0, lambda v: 0.9 * v, data.states.vel)
+    return data.replace(states=data.states.replace(vel=vel))
+
+
+@pytest.mark.parametrize(
+    ("fn", "words"),
+    [(undeclared, "not declared for one drone"), (gust, "random numbers"), (until, "until a condition fails")],
+)
+def test_a_stage_that_stands_in_the_way_is_named(fn, words):
+    sim = Sim(control="rotor_vel")
+    insert_fn_before(sim.step_pipeline, "integration", fn)
+    with pytest.raises(ValueError, match=f"(?s)'{fn.__name__}'.*{words}"):
+        to_casadi(sim)
+
+
+def test_a_stage_of_all_drones_of_a_world_is_named():
+    sim = Sim(n_drones=2, control="rotor_vel")
+    downwash.add(sim)
+    with pytest.raises(ValueError, match=r"(?s)'downwash'.*all drones of its world"):
+        to_casadi(sim)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"parameters": ["mass"]}, "'mass' is no parameter.*params.mass"),
+        ({"parameters": ["states.pos"]}, "'states.pos' is no parameter"),
+        ({"parameters": ["controls.rotor_vel"]}, "'controls.rotor_vel' is no parameter"),
+        ({"parameters": "params.mass"}, "a list of different names"),
+        ({"parameters": ["params.mass", "params.mass"]}, "a list of different names"),
+        ({"world": 1}, "no drone 0 of world 1"),
+        ({"drone": -1}, "no drone -1 of world 0"),
+    ],
+)
+def test_wrong_input_is_told(options, words):
+    with pytest.raises(ValueError, match=words):
+        to_casadi(Sim(control="rotor_vel"), **options)
+
+
+def test_a_vector_says_where_its_fields_are():
+    x = to_casadi(Sim(control="rotor_vel")).x
+    assert len(x) == 17
+    assert x["states.quat"] == slice(3, 7)
+    assert x["states.rotor_vel"] == slice(13, 17)
+    with pytest.raises(ValueError, match=r"'core.steps' is not in this vector; it has states.pos"):
+        x["core.steps"]
