@@ -11,25 +11,35 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
 def run(script, *arguments):
-    command = [sys.executable, BENCHMARKS / script, "--worlds", "4", "--controls", "rotor_vel", *arguments]
+    command = [sys.executable, BENCHMARKS / script, *arguments]
     out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     return [json.loads(line) for line in out.splitlines() if line.startswith("{")]
 
 
+SMALL = ["--worlds", "4", "--controls", "rotor_vel", "--integrators", "euler"]
+
+
+@pytest.fixture
+def benchmarks(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+
+
 def test_step_prints_a_line_with_its_machine():
-    (line,) = run("step.py", "--integrators", "euler", "--repeats", "2")
-    assert line["steps_per_s"] > 0
-    assert {"device", "cores", "jax", "python", "date"} <= line.keys()
+    lines = run("step.py", *SMALL, "--engine", "lanes", "plain", "--steps", "2", "10", "--repeats", "2")
+    assert [(line["engine"], line["n_steps"]) for line in lines] == [
+        ("lanes", 2), ("plain", 2), ("lanes", 10), ("plain", 10)
+    ]  # fmt: skip
+    assert all(line["steps_per_s"] > 0 for line in lines)
+    assert {"device", "processor", "cores", "jax", "python", "date", "crazysim"} <= lines[0].keys()
 
 
 def test_compile_prints_its_parts():
-    (line,) = run("compile.py", "--integrators", "euler")
+    (line,) = run("compile.py", *SMALL)
     assert line["compile_s"] > 0
     assert line["trace_s"] > 0
 
 
-def test_a_crashed_drone_is_no_figure(monkeypatch):
-    monkeypatch.syspath_prepend(BENCHMARKS)
+def test_a_crashed_drone_is_no_figure(benchmarks):
     import measure
 
     from crazysim import Sim
@@ -43,7 +53,47 @@ def test_a_crashed_drone_is_no_figure(monkeypatch):
     assert not measure.still_flies(sim)
 
 
+@pytest.mark.parametrize(("device", "n_calls"), [("cpu", 2), ("gpu", 20)])
+def test_a_batch_begins_where_the_one_before_began(benchmarks, device, n_calls):
+    import measure
+
+    from crazysim import Sim
+
+    flight = measure.Flight(Sim(engine="lanes"), "attitude", n_steps=50, device=device)
+    assert flight.calls == n_calls
+    ends = [(flight.seconds(), flight.sim.data.core.steps.item())[1] for _ in range(3)]
+    assert ends == [50 * n_calls] * 3
+
+
+def test_medians_take_turns(benchmarks):
+    import measure
+
+    order = []
+    values = iter([1.0, 10.0, 3.0, 30.0, 2.0, 20.0])
+
+    def take(name):
+        order.append(name)
+        return next(values)
+
+    assert measure.medians({"a": lambda: take("a"), "b": lambda: take("b")}, 3) == {"a": 2.0, "b": 20.0}
+    assert order == ["a", "b"] * 3
+
+
+def test_randomised_leaves_no_parameter_shared(benchmarks):
+    import jax
+    import step
+
+    from crazysim import Sim
+    from crazysim.pytree import scopes
+
+    sim = Sim(n_worlds=2, n_drones=3, engine="lanes")
+    step.randomised(sim)
+    assert set(jax.tree.leaves(scopes(sim.data.params))) == {"drone"}
+    assert "shared" not in jax.tree.leaves(scopes(sim.data.controls))
+    assert len(set(sim.data.params.mass.ravel().tolist())) == 6
+
+
 @pytest.mark.parametrize("script", ["step.py", "compile.py", "versus_crazyflow.py"])
 def test_every_script_explains_itself(script):
     out = subprocess.run([sys.executable, BENCHMARKS / script, "--help"], capture_output=True, text=True, check=True)
-    assert "--worlds" in out.stdout
+    assert "--device" in out.stdout
