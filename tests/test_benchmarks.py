@@ -93,6 +93,22 @@ def test_randomised_leaves_no_parameter_shared(benchmarks):
     assert len(set(sim.data.params.mass.ravel().tolist())) == 6
 
 
+def test_our_side_of_the_contest_runs_without_the_peer():
+    arguments = ["--only", "swarm", "--batch-worlds", "2", "--swarm", "3", "--engine", "lanes", "--repeats", "1"]
+    (line,) = run("versus_crazyflow.py", *arguments)
+    assert line["ratio"] > 0
+    assert (line["n_worlds"], line["n_drones"]) == (2, 3)
+
+
+def test_a_gradient_is_timed_like_a_flight(benchmarks):
+    import contestant
+
+    case = {"control": "attitude", "n_worlds": 2, "n_steps": 3, "engine": "lanes"}
+    gradient = contestant.build("crazysim", "gradient", case, "cpu")
+    assert gradient.seconds() > 0
+    gradient.require_flying()
+
+
 @pytest.mark.parametrize("script", ["step.py", "compile.py", "versus_crazyflow.py"])
 def test_every_script_explains_itself(script):
     out = subprocess.run([sys.executable, BENCHMARKS / script, "--help"], capture_output=True, text=True, check=True)
