@@ -93,6 +93,15 @@ def test_randomised_leaves_no_parameter_shared(benchmarks):
     assert len(set(sim.data.params.mass.ravel().tolist())) == 6
 
 
+def test_scaling_measures_both_series_and_draws_them(tmp_path):
+    picture = tmp_path / "scaling.png"
+    sizes = ["--most-worlds", "4", "--most-drones", "1", "--total", "4", "--steps", "10", "--repeats", "1"]
+    lines = run("scaling.py", "--engine", "lanes", "--controls", "rotor_vel", *sizes, "--plot", str(picture))
+    assert [(line["series"], line["n_worlds"]) for line in lines] == [("worlds", 1), ("worlds", 4), ("drones", 4)]
+    assert len({line["bytes_a_world"] for line in lines}) == 1
+    assert picture.stat().st_size > 1000
+
+
 def test_our_side_of_the_contest_runs_without_the_peer():
     arguments = ["--only", "swarm", "--batch-worlds", "2", "--swarm", "3", "--engine", "lanes", "--repeats", "1"]
     (line,) = run("versus_crazyflow.py", *arguments)
@@ -109,7 +118,7 @@ def test_a_gradient_is_timed_like_a_flight(benchmarks):
     gradient.require_flying()
 
 
-@pytest.mark.parametrize("script", ["step.py", "compile.py", "versus_crazyflow.py"])
+@pytest.mark.parametrize("script", ["step.py", "compile.py", "scaling.py", "versus_crazyflow.py"])
 def test_every_script_explains_itself(script):
     out = subprocess.run([sys.executable, BENCHMARKS / script, "--help"], capture_output=True, text=True, check=True)
     assert "--device" in out.stdout
