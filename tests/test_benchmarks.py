@@ -102,6 +102,58 @@ def test_scaling_measures_both_series_and_draws_them(tmp_path):
     assert picture.stat().st_size > 1000
 
 
+def test_limits_prints_a_floor_and_how_far_from_it(monkeypatch, benchmarks, capsys):
+    import limits
+
+    monkeypatch.setattr(limits, "BIG", {"cpu": 2**16})
+    monkeypatch.setattr(limits, "MANY", {"cpu": 64})
+    monkeypatch.setattr(
+        sys, "argv", ["limits.py", "--repeats", "1", "--controls", "rotor_vel", "--integrators", "euler"]
+    )
+    limits.main()
+    machine, line = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
+    assert machine["bytes_per_s"] > 0
+    assert machine["multiply_adds_per_s"] > 0
+    assert line["floor_s"] == max(line["arithmetic_s"], line["memory_s"]) > 0
+    assert line["ratio"] > 0
+
+
+def test_operations_are_counted_in_multiply_adds(benchmarks):
+    import limits
+    import numpy as np
+
+    from crazysim.engine.ir import Block
+
+    block = Block()
+    x, y = block.input(np.float32), block.input(np.float32)
+    product = block.add("mul", (x, y), np.float32)
+    total = block.add("add", (product, x), np.float32)
+    block.outputs = [total]
+    assert limits.operations(block, 1.0) == 1  # one multiply-add
+    block.outputs = [total, product]
+    assert limits.operations(block, 1.0) == 2  # the product is needed for itself
+    block.outputs = [block.add("sqrt", (total,), np.float32)]
+    assert limits.operations(block, 1.0) == 5
+
+    guarded = Block()
+    guarded.outputs = [guarded.add("max", (guarded.input(np.float32), np.float32(1)), np.float32)]
+    outer = Block()
+    outer.add("when", (outer.input(bool),), bool, (), (guarded,))
+    assert limits.operations(outer, 0.2) == pytest.approx(0.2)
+
+
+def test_the_work_of_a_step_is_what_its_data_and_stages_say(benchmarks):
+    import limits
+
+    from crazysim import Sim
+
+    each_step, _, n_bytes = limits.work(Sim(control="rotor_vel", engine="lanes"))
+    # Read: pos, quat, vel, ang_vel, force, torque, rotor speeds and their commands, steps; all written but the forces.
+    read = 3 + 4 + 3 + 3 + 3 + 3 + 4 + 4 + 1
+    assert n_bytes == 4 * (2 * read - 6)
+    assert limits.work(Sim(control="rotor_vel", integrator="rk4", engine="lanes"))[0] > 3 * each_step
+
+
 def test_our_side_of_the_contest_runs_without_the_peer():
     arguments = ["--only", "swarm", "--batch-worlds", "2", "--swarm", "3", "--engine", "lanes", "--repeats", "1"]
     (line,) = run("versus_crazyflow.py", *arguments)
@@ -118,7 +170,7 @@ def test_a_gradient_is_timed_like_a_flight(benchmarks):
     gradient.require_flying()
 
 
-@pytest.mark.parametrize("script", ["step.py", "compile.py", "scaling.py", "versus_crazyflow.py"])
+@pytest.mark.parametrize("script", ["step.py", "compile.py", "scaling.py", "limits.py", "versus_crazyflow.py"])
 def test_every_script_explains_itself(script):
     out = subprocess.run([sys.executable, BENCHMARKS / script, "--help"], capture_output=True, text=True, check=True)
     assert "--device" in out.stdout
