@@ -31,6 +31,7 @@ format: $(VENV)/installed
 benchmark: $(VENV)/installed
 	$(RUN) benchmarks/step.py
 	$(RUN) benchmarks/compile.py
+	$(RUN) benchmarks/limits.py
 	$(RUN) benchmarks/versus_crazyflow.py
 
 clean:

@@ -1,54 +1,60 @@
 """How long until the first step? Building, tracing and compiling apart, for each command level and integrator.
 
-python benchmarks/compile.py [--device cpu] [--worlds 1 1024 16384]
+Every case runs in a process of its own, so that each compiles everything anew. ``trace_s`` holds the C++ or CUDA
+compiler of ``fused``, which runs while the step is lowered.
+
+    python benchmarks/compile.py [--engine auto plain lanes fused] [--device gpu] [--worlds 1 1024 16384]
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import json
 import time
+from typing import Any
 
-import jax
 import jax.numpy as jnp
-from measure import hovering, report
+from measure import alone, engine_of, hovering, machine
 
-from crazysim import Sim
+from crazysim import Sim, __version__
+from crazysim.engine.step import ENGINES
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--engine", nargs="+", default=["auto"], choices=ENGINES)
     parser.add_argument("--worlds", type=int, nargs="+", default=[1, 1024, 16384])
     parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"])
     parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"])
     args = parser.parse_args()
-    for control in args.controls:
-        for integrator in args.integrators:
-            for n_worlds in args.worlds:
-                measure(control, integrator, n_worlds, args.device)
+    for case in itertools.product(args.controls, args.integrators, args.worlds, args.engine):
+        print(json.dumps(alone(measure, *case, args.device)), flush=True)
 
 
-def measure(control: str, integrator: str, n_worlds: int, device: str) -> None:
-    jax.clear_caches()
+def measure(control: str, integrator: str, n_worlds: int, engine: str, device: str) -> dict[str, Any]:
+    """Return the figures of one case."""
     begin = time.perf_counter()
-    sim = Sim(n_worlds=n_worlds, control=control, integrator=integrator, device=device)
+    sim = Sim(n_worlds=n_worlds, control=control, integrator=integrator, engine=engine, device=device)
     hovering(sim, control)
     built = time.perf_counter()
-    step = jax.jit(lambda data: sim.build_step_fn()(data, jnp.int32(1)))
-    lowered = step.lower(sim.data)
+    lowered = sim.build_step_fn().lower(sim.data, jnp.int32(1))
     traced = time.perf_counter()
-    compiled = lowered.compile()
+    lowered.compile()
     done = time.perf_counter()
-    jax.block_until_ready(compiled(sim.data))
-    report(
-        benchmark="compile",
-        control=control,
-        integrator=integrator,
-        n_worlds=n_worlds,
-        build_s=round(built - begin, 2),
-        trace_s=round(traced - built, 2),
-        compile_s=round(done - traced, 2),
-    )
+    return {
+        "benchmark": "compile",
+        "engine": engine_of(sim),
+        "control": control,
+        "integrator": integrator,
+        "n_worlds": n_worlds,
+        "build_s": round(built - begin, 2),
+        "trace_s": round(traced - built, 2),
+        "compile_s": round(done - traced, 2),
+        "crazysim": __version__,
+        **machine(device),
+    }
 
 
 if __name__ == "__main__":

@@ -1,53 +1,94 @@
-"""How many physics steps a second? One JSON line for each command level, integrator and number of worlds.
+"""How many physics steps a second? One JSON line for each engine, command level, integrator, size and steps a call.
 
-python benchmarks/step.py [--device cpu] [--worlds 1024 16384] [--controls attitude rotor_vel state]
+    python benchmarks/step.py [--engine auto plain lanes fused] [--device gpu] [--worlds 1024 16384] [--steps 10 100]
+
+Engines are timed in turns. ``compile_s`` of ``fused`` holds the kernel only where a process meets that kernel for the
+first time; ``scaling.py`` has every size in a process of its own. Other scripts: ``compile.py``, ``scaling.py``,
+``limits.py``, ``versus_crazyflow.py``.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 
-from measure import first_call, hovering, median_seconds, report, still_flies
+import jax
+import jax.numpy as jnp
+from measure import Flight, digits, engine_of, medians, report
 
-from crazysim import Sim
+from crazysim import Sim, __version__
+from crazysim.engine.step import ENGINES
+from crazysim.pytree import scopes
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--engine", nargs="+", default=["auto"], choices=ENGINES)
     parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384])
+    parser.add_argument("--drones", type=int, nargs="+", default=[1], help="drones a world")
     parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"])
     parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"])
-    parser.add_argument("--steps", type=int, default=100, help="physics steps a call")
+    parser.add_argument("--steps", type=int, nargs="+", default=[100], help="physics steps a call")
+    parser.add_argument("--randomised", action="store_true", help="parameters of its own for every drone")
+    parser.add_argument("--no-drag", action="store_true", help="a drag matrix of zeros")
     parser.add_argument("--repeats", type=int, default=7)
     args = parser.parse_args()
-    for control in args.controls:
-        for integrator in args.integrators:
-            for n_worlds in args.worlds:
-                measure(control, integrator, n_worlds, args.device, args.steps, args.repeats)
+    for case in itertools.product(args.controls, args.integrators, args.worlds, args.drones):
+        measure(args, *case)
 
 
-def measure(control: str, integrator: str, n_worlds: int, device: str, n_steps: int, repeats: int) -> None:
-    sim = Sim(n_worlds=n_worlds, control=control, integrator=integrator, device=device)
-    hovering(sim, control)
+def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: int, n_drones: int) -> None:
+    """Print a line for each engine and number of steps; one compilation serves every number."""
+    sims = {engine: build(args, engine, control, integrator, n_worlds, n_drones) for engine in args.engine}
+    compile_s: dict[str, float] = {}
+    for n_steps in args.steps:
+        flights = {engine: Flight(sim, control, n_steps, args.device) for engine, sim in sims.items()}
+        taken = medians({engine: flight.seconds for engine, flight in flights.items()}, args.repeats)
+        for engine, flight in flights.items():
+            flight.require_flying()
+            report(
+                args.device,
+                benchmark="step",
+                engine=engine_of(sims[engine]),
+                control=control,
+                integrator=integrator,
+                n_worlds=n_worlds,
+                n_drones=n_drones,
+                n_steps=n_steps,
+                randomised=args.randomised,
+                drag=not args.no_drag,
+                compile_s=compile_s.setdefault(engine, round(flight.first_s - taken[engine], 2)),
+                call_s=digits(taken[engine]),
+                steps_per_s=digits(n_worlds * n_drones * n_steps / taken[engine]),
+                crazysim=__version__,
+            )
 
-    def run() -> object:
-        sim.step(n_steps)
-        return sim.data.states.pos
 
-    first = first_call(run)
-    seconds = median_seconds({"step": run}, repeats)["step"]
-    if not still_flies(sim):
-        raise SystemExit(f"{control}, {integrator}: the drones do not fly any more; no figure")
-    report(
-        benchmark="step",
-        control=control,
-        integrator=integrator,
-        n_worlds=n_worlds,
-        n_steps=n_steps,
-        compile_s=round(first - seconds, 2),
-        steps_per_s=float(f"{n_worlds * n_steps / seconds:.3g}"),
-    )
+def build(args: argparse.Namespace, engine: str, control: str, integrator: str, n_worlds: int, n_drones: int) -> Sim:
+    """Return the simulation that was asked for."""
+    sim = Sim(n_worlds, n_drones, control=control, integrator=integrator, device=args.device, engine=engine)
+    if args.no_drag:
+        params = sim.data.params
+        sim.data = sim.data.replace(params=params.replace(drag_matrix=jnp.zeros_like(params.drag_matrix)))
+    if args.randomised:
+        randomised(sim)
+    return sim
+
+
+def randomised(sim: Sim, spread: float = 1e-4) -> None:
+    """Give every drone its own value of every parameter, so little off that all of them hover."""
+    batch, key = (sim.n_worlds, sim.n_drones), jax.random.key(0)
+
+    def own(scope: str, x: jax.Array) -> jax.Array:
+        if scope != "shared" or not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        return x * jax.random.uniform(key, (*batch, *x.shape), x.dtype, 1 - spread, 1 + spread)
+
+    data = sim.data
+    params = jax.tree.map(own, scopes(data.params), data.params)
+    controls = jax.tree.map(own, scopes(data.controls), data.controls)
+    sim.data = data.replace(params=params, controls=controls)
 
 
 if __name__ == "__main__":

@@ -1,70 +1,127 @@
 """Both programs in one run: crazysim here, Crazyflow 0.4.0 in an environment that this script makes.
 
-Each runs in a process of its own with the same JAX; the two are timed in turns, a call each, so that the noise of
-a shared machine meets both. Medians, and the ratio of medians, are printed.
+Each runs in a process of its own with the same JAX; the two are timed in turns, a batch each, so that the noise of
+a shared machine meets both. Medians, and the ratio of medians, are printed. What is compared:
 
-    python benchmarks/versus_crazyflow.py [--worlds 1024 16384] [--controls attitude rotor_vel]
+    first_step  from Sim(n_worlds=1) to its first step, in fresh processes
+    step        100 physics steps a call, for each command level, integrator and number of worlds
+    call        one step(1) of one world, for each command level
+    gradient    of 100 attitude steps by their commands, 1,024 worlds
+    swarm       64 drones in 1,024 worlds against as many single drones, ours only
+
+    python benchmarks/versus_crazyflow.py [--only step call] [--engine auto lanes] [--worlds 1024 16384]
+    python benchmarks/versus_crazyflow.py --device gpu --peer-python PATH/OF/python
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
+import functools
+import importlib.metadata
+import itertools
 import json
+import os
 import statistics
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
+import jax
+from measure import digits, medians
+
 HERE = Path(__file__).parent
 PEER = HERE.parent / ".cache" / "crazyflow"
-N_STEPS = 100
+CASES = ("first_step", "step", "call", "gradient", "swarm")
+LEVELS = ("rotor_vel", "force_torque", "body_rate", "attitude", "state")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", choices=CASES, default=CASES, help="what to compare")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384])
-    parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"])
+    parser.add_argument("--engine", nargs="+", default=["auto"], help="engines of crazysim")
+    parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384], help="of 'step'")
+    parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"], help="of 'step'")
+    parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"], help="of 'step'")
+    parser.add_argument("--batch-worlds", type=int, default=1024, help="worlds of 'gradient' and 'swarm'")
+    parser.add_argument("--swarm", type=int, default=64, help="drones a world of 'swarm'")
     parser.add_argument("--repeats", type=int, default=11)
     parser.add_argument("--peer-python", type=Path, help="interpreter that has Crazyflow 0.4.0; made if left out")
-    parser.add_argument("--worker", choices=["crazysim", "crazyflow"], help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.worker:
-        work(args.worker)
-        return
-    pythons = {"crazysim": sys.executable, "crazyflow": str(args.peer_python or peer_environment())}
-    first_steps(pythons, args.device)
+    pythons = {"crazysim": sys.executable}
+    if set(args.only) != {"swarm"}:
+        pythons["crazyflow"] = str(args.peer_python or peer_environment(args.device))
+    if "first_step" in args.only:
+        first_steps(pythons, args.device)
     workers = {name: Worker(python, name) for name, python in pythons.items()}
-    for control in args.controls:
-        for n_worlds in args.worlds:
-            compare(workers, control, n_worlds, args.device, args.repeats)
+    versus = Versus(workers, args.engine, args.device, args.repeats)
+    if "step" in args.only:
+        for control, integrator, n_worlds in itertools.product(args.controls, args.integrators, args.worlds):
+            versus.compare("step", control=control, integrator=integrator, n_worlds=n_worlds, n_steps=100)
+    if "call" in args.only:
+        for control in LEVELS:
+            versus.compare("call", control=control, integrator="euler", n_worlds=1, n_steps=1)
+    if "gradient" in args.only:
+        case = {"control": "attitude", "integrator": "euler", "n_worlds": args.batch_worlds, "n_steps": 100}
+        versus.compare("gradient", **case)
+    if "swarm" in args.only:
+        versus.swarm(args.batch_worlds, args.swarm)
     for worker in workers.values():
         worker.close()
 
 
-def compare(workers: dict[str, Worker], control: str, n_worlds: int, device: str, repeats: int) -> None:
-    """Print both programs' steps per second and compile time, and the ratios."""
-    first = {
-        name: worker.ask(do="build", control=control, n_worlds=n_worlds, device=device)["seconds"]
-        for name, worker in workers.items()
-    }
-    seconds: dict[str, list[float]] = {name: [] for name in workers}
-    for _ in range(repeats):
-        for name, worker in workers.items():
-            seconds[name].append(worker.ask(do="time")["seconds"])
-    for name, worker in workers.items():
-        if not worker.ask(do="flies")["flies"]:
-            raise SystemExit(f"{name}: the drones do not fly any more; no figure")
-    rate = {name: n_worlds * N_STEPS / statistics.median(times) for name, times in seconds.items()}
-    line = {"benchmark": "versus_crazyflow", "control": control, "integrator": "euler", "n_worlds": n_worlds}
-    for name in workers:
-        line[f"{name}_steps_per_s"] = float(f"{rate[name]:.3g}")
-        line[f"{name}_compile_s"] = round(first[name] - statistics.median(seconds[name]), 2)
-    line["ratio"] = round(rate["crazysim"] / rate["crazyflow"], 2)
-    print(json.dumps(line | workers["crazysim"].ask(do="machine")), flush=True)
+class Versus:
+    """Contests between engines of crazysim and the peer."""
+
+    def __init__(self, workers: dict[str, Worker], engines: list[str], device: str, repeats: int):
+        """Take the two programs."""
+        self.workers, self.engines, self.device, self.repeats = workers, engines, device, repeats
+        self.machine = workers["crazysim"].ask(do="machine", device=device)
+
+    def compare(self, benchmark: str, **case: Any) -> None:
+        """Print for each engine its steps per second and compile time, the peer's, and the ratio."""
+        ours, peer = self.workers["crazysim"], self.workers["crazyflow"]
+        contestants = {engine: (ours, case | {"engine": engine}) for engine in self.engines}
+        found = self._measure(benchmark, contestants | {"crazyflow": (peer, case)})
+        steps = case["n_worlds"] * case["n_steps"]
+        for engine in self.engines:
+            line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{benchmark}", "engine": engine, **case}
+            for name, (seconds, compile_s) in (("crazysim", found[engine]), ("crazyflow", found["crazyflow"])):
+                line[f"{name}_call_s"] = digits(seconds)
+                line[f"{name}_steps_per_s"] = digits(steps / seconds)
+                line[f"{name}_compile_s"] = round(compile_s, 2)
+            line["ratio"] = round(found["crazyflow"][0] / found[engine][0], 2)
+            print(json.dumps(line | self.machine), flush=True)
+
+    def swarm(self, n_worlds: int, n_drones: int) -> None:
+        """Print what drones that share worlds cost, against as many in worlds of their own."""
+        case = {"control": "attitude", "integrator": "euler", "n_steps": 100}
+        sizes = {"swarm": (n_worlds, n_drones), "single": (n_worlds * n_drones, 1)}
+        for engine in self.engines:
+            contestants = {
+                name: (self.workers["crazysim"], case | {"engine": engine, "n_worlds": worlds, "n_drones": drones})
+                for name, (worlds, drones) in sizes.items()
+            }
+            found = self._measure("step", contestants)
+            line = {"benchmark": "swarm", "engine": engine, **case, "n_worlds": n_worlds, "n_drones": n_drones}
+            for name, (seconds, compile_s) in found.items():
+                line[f"{name}_steps_per_s"] = digits(n_worlds * n_drones * case["n_steps"] / seconds)
+                line[f"{name}_compile_s"] = round(compile_s, 2)
+            line["ratio"] = round(found["single"][0] / found["swarm"][0], 2)
+            print(json.dumps(line | self.machine), flush=True)
+
+    def _measure(self, task: str, contestants: dict[str, tuple[Worker, Any]]) -> dict[str, tuple[float, float]]:
+        """Return the median seconds of a call, and those of compiling it, taken in turns."""
+        first = {
+            name: worker.ask(do="build", task=task, name=name, device=self.device, case=case)["seconds"]
+            for name, (worker, case) in contestants.items()
+        }
+        turns = {name: functools.partial(worker.time, name) for name, (worker, _) in contestants.items()}
+        seconds = medians(turns, self.repeats)
+        for name, (worker, _) in contestants.items():
+            worker.ask(do="end", name=name)
+        return {name: (seconds[name], first[name] - seconds[name]) for name in contestants}
 
 
 def first_steps(pythons: dict[str, str], device: str, repeats: int = 3) -> None:
@@ -75,7 +132,7 @@ def first_steps(pythons: dict[str, str], device: str, repeats: int = 3) -> None:
             worker = Worker(python, name)
             times[name].append(worker.ask(do="first_step", device=device))
             worker.close()
-    line: dict[str, Any] = {"benchmark": "first_step", "n_worlds": 1}
+    line: dict[str, Any] = {"benchmark": "versus_crazyflow/first_step", "n_worlds": 1}
     for name, runs in times.items():
         for key in runs[0]:
             line[f"{name}_{key}"] = round(statistics.median(run[key] for run in runs), 2)
@@ -87,8 +144,10 @@ class Worker:
 
     def __init__(self, python: str, name: str):
         """Start the process."""
-        command = [python, __file__, "--worker", name]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        command = [python, HERE / "contestant.py", name]
+        # Two processes on one GPU: each takes less than half of its memory, instead of three quarters.
+        env = {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.45"} | os.environ
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
         self._in, self._out = self._process.stdin, self._process.stdout
 
     def ask(self, **request: Any) -> dict[str, Any]:
@@ -100,60 +159,34 @@ class Worker:
                 return json.loads(line)
         raise SystemExit("a worker ended without an answer; its error stands above")
 
+    def time(self, name: str) -> float:
+        """Return the seconds of a call of what was built under a name."""
+        return self.ask(do="time", name=name)["seconds"]
+
     def close(self) -> None:
         """End the process."""
         self._in.close()
         self._process.wait()
 
 
-def work(package: str) -> None:
-    """Answer requests for one of the packages until standard input ends."""
-    begin = time.perf_counter()
-    module = importlib.import_module(f"{package}.sim")
-    import jax
-    from measure import first_call, hovering, machine, still_flies
-
-    import_s = time.perf_counter() - begin
-    sim: Any = None
-
-    def run() -> Any:
-        sim.step(N_STEPS)
-        return sim.data.states.pos
-
-    for line in sys.stdin:
-        request = json.loads(line)
-        answer: dict[str, Any] = {}
-        if request["do"] == "first_step":
-            begin = time.perf_counter()
-            sim = module.Sim(n_worlds=1, device=request["device"])
-            sim.step()
-            jax.block_until_ready(sim.data.states.pos)
-            answer = {"import_s": import_s, "to_first_step_s": time.perf_counter() - begin}
-        elif request["do"] == "build":
-            sim = module.Sim(n_worlds=request["n_worlds"], control=request["control"], device=request["device"])
-            hovering(sim, request["control"])
-            answer = {"seconds": first_call(run)}
-            first_call(run)  # the peer compiles a second time; that is in neither figure
-        elif request["do"] == "time":
-            answer = {"seconds": first_call(run)}
-        elif request["do"] == "flies":
-            answer = {"flies": still_flies(sim)}
-        elif request["do"] == "machine":
-            answer = machine()
-        print(json.dumps(answer), flush=True)
-
-
-def peer_environment() -> Path:
+def peer_environment(device: str) -> Path:
     """Return the interpreter of an environment with Crazyflow 0.4.0 and our JAX, made at first use."""
-    import jax
-
-    python = PEER / "bin" / "python"
+    folder = PEER if device == "cpu" else PEER.with_name(f"{PEER.name}-{device}")
+    python = folder / "bin" / "python"
     if not python.exists():
-        print(f"making an environment for Crazyflow 0.4.0 in {PEER} ...", file=sys.stderr)
-        subprocess.run([sys.executable, "-m", "venv", PEER], check=True)
-        packages = ["crazyflow==0.4.0", f"jax=={jax.__version__}"]
+        print(f"making an environment for Crazyflow 0.4.0 in {folder} ...", file=sys.stderr)
+        subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+        packages = ["crazyflow==0.4.0", f"jax{_extra(device)}=={jax.__version__}"]
         subprocess.run([python, "-m", "pip", "install", "--quiet", *packages], check=True)
     return python
+
+
+def _extra(device: str) -> str:
+    """Return the extra of JAX that this environment has for a device."""
+    if device == "cpu":
+        return ""
+    installed = {d.metadata["Name"] for d in importlib.metadata.distributions()}
+    return "[cuda13]" if "jax-cuda13-plugin" in installed else "[cuda12]"
 
 
 if __name__ == "__main__":

@@ -11,25 +11,35 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
 def run(script, *arguments):
-    command = [sys.executable, BENCHMARKS / script, "--worlds", "4", "--controls", "rotor_vel", *arguments]
+    command = [sys.executable, BENCHMARKS / script, *arguments]
     out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     return [json.loads(line) for line in out.splitlines() if line.startswith("{")]
 
 
+SMALL = ["--worlds", "4", "--controls", "rotor_vel", "--integrators", "euler"]
+
+
+@pytest.fixture
+def benchmarks(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+
+
 def test_step_prints_a_line_with_its_machine():
-    (line,) = run("step.py", "--integrators", "euler", "--repeats", "2")
-    assert line["steps_per_s"] > 0
-    assert {"device", "cores", "jax", "python", "date"} <= line.keys()
+    lines = run("step.py", *SMALL, "--engine", "lanes", "plain", "--steps", "2", "10", "--repeats", "2")
+    assert [(line["engine"], line["n_steps"]) for line in lines] == [
+        ("lanes", 2), ("plain", 2), ("lanes", 10), ("plain", 10)
+    ]  # fmt: skip
+    assert all(line["steps_per_s"] > 0 for line in lines)
+    assert {"device", "processor", "cores", "jax", "python", "date", "crazysim"} <= lines[0].keys()
 
 
 def test_compile_prints_its_parts():
-    (line,) = run("compile.py", "--integrators", "euler")
+    (line,) = run("compile.py", *SMALL)
     assert line["compile_s"] > 0
     assert line["trace_s"] > 0
 
 
-def test_a_crashed_drone_is_no_figure(monkeypatch):
-    monkeypatch.syspath_prepend(BENCHMARKS)
+def test_a_crashed_drone_is_no_figure(benchmarks):
     import measure
 
     from crazysim import Sim
@@ -43,7 +53,124 @@ def test_a_crashed_drone_is_no_figure(monkeypatch):
     assert not measure.still_flies(sim)
 
 
-@pytest.mark.parametrize("script", ["step.py", "compile.py", "versus_crazyflow.py"])
+@pytest.mark.parametrize(("device", "n_calls"), [("cpu", 2), ("gpu", 20)])
+def test_a_batch_begins_where_the_one_before_began(benchmarks, device, n_calls):
+    import measure
+
+    from crazysim import Sim
+
+    flight = measure.Flight(Sim(engine="lanes"), "attitude", n_steps=50, device=device)
+    assert flight.calls == n_calls
+    ends = [(flight.seconds(), flight.sim.data.core.steps.item())[1] for _ in range(3)]
+    assert ends == [50 * n_calls] * 3
+
+
+def test_medians_take_turns(benchmarks):
+    import measure
+
+    order = []
+    values = iter([1.0, 10.0, 3.0, 30.0, 2.0, 20.0])
+
+    def take(name):
+        order.append(name)
+        return next(values)
+
+    assert measure.medians({"a": lambda: take("a"), "b": lambda: take("b")}, 3) == {"a": 2.0, "b": 20.0}
+    assert order == ["a", "b"] * 3
+
+
+def test_randomised_leaves_no_parameter_shared(benchmarks):
+    import jax
+    import step
+
+    from crazysim import Sim
+    from crazysim.pytree import scopes
+
+    sim = Sim(n_worlds=2, n_drones=3, engine="lanes")
+    step.randomised(sim)
+    assert set(jax.tree.leaves(scopes(sim.data.params))) == {"drone"}
+    assert "shared" not in jax.tree.leaves(scopes(sim.data.controls))
+    assert len(set(sim.data.params.mass.ravel().tolist())) == 6
+
+
+def test_scaling_measures_both_series_and_draws_them(tmp_path):
+    picture = tmp_path / "scaling.png"
+    sizes = ["--most-worlds", "4", "--most-drones", "1", "--total", "4", "--steps", "10", "--repeats", "1"]
+    lines = run("scaling.py", "--engine", "lanes", "--controls", "rotor_vel", *sizes, "--plot", str(picture))
+    assert [(line["series"], line["n_worlds"]) for line in lines] == [("worlds", 1), ("worlds", 4), ("drones", 4)]
+    assert len({line["bytes_a_world"] for line in lines}) == 1
+    assert picture.stat().st_size > 1000
+
+
+def test_limits_prints_a_floor_and_how_far_from_it(monkeypatch, benchmarks, capsys):
+    import limits
+
+    monkeypatch.setattr(limits, "BIG", {"cpu": 2**16})
+    monkeypatch.setattr(limits, "MANY", {"cpu": 64})
+    monkeypatch.setattr(
+        sys, "argv", ["limits.py", "--repeats", "1", "--controls", "rotor_vel", "--integrators", "euler"]
+    )
+    limits.main()
+    machine, line = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
+    assert machine["bytes_per_s"] > 0
+    assert machine["multiply_adds_per_s"] > 0
+    assert line["floor_s"] == max(line["arithmetic_s"], line["memory_s"]) > 0
+    assert line["ratio"] > 0
+
+
+def test_operations_are_counted_in_multiply_adds(benchmarks):
+    import limits
+    import numpy as np
+
+    from crazysim.engine.ir import Block
+
+    block = Block()
+    x, y = block.input(np.float32), block.input(np.float32)
+    product = block.add("mul", (x, y), np.float32)
+    total = block.add("add", (product, x), np.float32)
+    block.outputs = [total]
+    assert limits.operations(block, 1.0) == 1  # one multiply-add
+    block.outputs = [total, product]
+    assert limits.operations(block, 1.0) == 2  # the product is needed for itself
+    block.outputs = [block.add("sqrt", (total,), np.float32)]
+    assert limits.operations(block, 1.0) == 5
+
+    guarded = Block()
+    guarded.outputs = [guarded.add("max", (guarded.input(np.float32), np.float32(1)), np.float32)]
+    outer = Block()
+    outer.add("when", (outer.input(bool),), bool, (), (guarded,))
+    assert limits.operations(outer, 0.2) == pytest.approx(0.2)
+
+
+def test_the_work_of_a_step_is_what_its_data_and_stages_say(benchmarks):
+    import limits
+
+    from crazysim import Sim
+
+    each_step, _, n_bytes = limits.work(Sim(control="rotor_vel", engine="lanes"))
+    # Read: pos, quat, vel, ang_vel, force, torque, rotor speeds and their commands, steps; all written but the forces.
+    read = 3 + 4 + 3 + 3 + 3 + 3 + 4 + 4 + 1
+    assert n_bytes == 4 * (2 * read - 6)
+    assert limits.work(Sim(control="rotor_vel", integrator="rk4", engine="lanes"))[0] > 3 * each_step
+
+
+def test_our_side_of_the_contest_runs_without_the_peer():
+    arguments = ["--only", "swarm", "--batch-worlds", "2", "--swarm", "3", "--engine", "lanes", "--repeats", "1"]
+    (line,) = run("versus_crazyflow.py", *arguments)
+    assert line["ratio"] > 0
+    assert (line["n_worlds"], line["n_drones"]) == (2, 3)
+
+
+def test_a_gradient_is_timed_like_a_flight(benchmarks):
+    import contestant
+
+    case = {"control": "attitude", "n_worlds": 2, "n_steps": 3, "engine": "lanes"}
+    gradient = contestant.build("crazysim", "gradient", case, "cpu")
+    assert gradient.seconds() > 0
+    gradient.require_flying()
+
+
+@pytest.mark.parametrize("script", ["step.py", "compile.py", "scaling.py", "limits.py", "versus_crazyflow.py"])
 def test_every_script_explains_itself(script):
     out = subprocess.run([sys.executable, BENCHMARKS / script, "--help"], capture_output=True, text=True, check=True)
-    assert "--worlds" in out.stdout
+    assert "--device" in out.stdout

@@ -1,0 +1,138 @@
+"""How does it scale? Steps per second, compile time and bytes, by number of worlds and by drones a world.
+
+One JSON line for each engine and size, of two series: ``worlds`` of one drone each, and ``drones`` a world, of which
+there are always as many in all. Every case runs in a process of its own, so that each compiles everything anew.
+``bytes_a_world`` are those of ``sim.data`` that belong to worlds and drones; what all share is not in it.
+
+    python benchmarks/scaling.py [--engine plain lanes fused] [--most-worlds 4194304] [--plot out/scaling.png]
+    python benchmarks/scaling.py --lines out/scaling.jsonl --plot out/scaling.png     # plots what was measured before
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+import jax
+from measure import Flight, alone, digits, engine_of, machine, medians
+
+from crazysim import Sim, __version__
+from crazysim.engine.step import ENGINES
+from crazysim.pytree import scopes
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--engine", nargs="+", default=["plain", "lanes", "fused"], choices=ENGINES)
+    parser.add_argument("--controls", nargs="+", default=["attitude"])
+    parser.add_argument("--integrator", default="euler")
+    parser.add_argument("--most-worlds", type=int, default=4**11, help="worlds grow from 1 by factors of 4 up to this")
+    parser.add_argument("--most-drones", type=int, default=256, help="drones a world grow likewise; 0 for none")
+    parser.add_argument("--total", type=int, default=65536, help="drones in all while drones a world grow")
+    parser.add_argument("--steps", type=int, default=100, help="physics steps a call")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--plot", type=Path, help="picture to write; needs matplotlib")
+    parser.add_argument("--lines", type=Path, help="plot the lines of this file, and measure nothing")
+    args = parser.parse_args()
+    lines = [json.loads(line) for line in args.lines.read_text().splitlines()] if args.lines else measured(args)
+    if args.plot:
+        plot(lines, args.plot)
+
+
+def measured(args: argparse.Namespace) -> list[dict[str, Any]]:
+    """Print and return a line for every case."""
+    sizes = [("worlds", n, 1) for n in powers_of_4(args.most_worlds)]
+    sizes += [("drones", max(args.total // n, 1), n) for n in powers_of_4(args.most_drones)]
+    lines = []
+    for control in args.controls:
+        for series, n_worlds, n_drones in sizes:
+            for engine in args.engine:
+                case = {"control": control, "integrator": args.integrator, "n_worlds": n_worlds, "n_drones": n_drones}
+                line = {"benchmark": "scaling", "series": series, "engine": engine, **case, "n_steps": args.steps}
+                try:
+                    line |= alone(measure, {**case, "engine": engine}, args.steps, args.device, args.repeats)
+                except (
+                    BrokenProcessPool,
+                    jax.errors.JaxRuntimeError,
+                ) as error:  # too large: the other sizes still count
+                    line |= {"error": f"{type(error).__name__}: {error}"[:200]}
+                print(json.dumps(line), flush=True)
+                lines.append(line)
+    return lines
+
+
+def powers_of_4(most: int) -> list[int]:
+    """Return 1, 4, 16 and so on, up to the most."""
+    return [4**k for k in range(most.bit_length()) if 4**k <= most]
+
+
+def measure(case: dict[str, Any], n_steps: int, device: str, repeats: int) -> dict[str, Any]:
+    """Return the figures of one case."""
+    sim = Sim(**case, device=device)
+    flight = Flight(sim, case["control"], n_steps, device)
+    taken = medians({"step": flight.seconds}, repeats)["step"]
+    flight.require_flying()
+    n_worlds, n_drones = case["n_worlds"], case["n_drones"]
+    return {
+        "engine": engine_of(sim),
+        "compile_s": round(flight.first_s - taken, 2),
+        "call_s": digits(taken),
+        "steps_per_s": digits(n_worlds * n_drones * n_steps / taken),
+        "bytes_a_world": bytes_a_world(sim),
+        "crazysim": __version__,
+        **machine(device),
+    }
+
+
+def bytes_a_world(sim: Sim) -> int:
+    """Return the bytes of ``sim.data`` that grow with the number of worlds, by world."""
+    pairs = zip(jax.tree.leaves(scopes(sim.data)), jax.tree.leaves(sim.data), strict=True)
+    return sum(x.nbytes for scope, x in pairs if scope in ("drone", "world")) // sim.n_worlds
+
+
+SERIES = {"worlds": ("n_worlds", "worlds of one drone"), "drones": ("n_drones", "drones a world")}
+MARKS = {"plain": ("#9a6a3a", "s"), "lanes": ("#2b7a78", "o"), "fused": ("#c1443c", "^"), "auto": ("#555555", "D")}
+
+
+def plot(lines: list[dict[str, Any]], path: Path) -> None:
+    """Draw steps per second and compile time over both series, both axes logarithmic, a line for each engine."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    lines = [line for line in lines if "steps_per_s" in line]
+    controls = list(dict.fromkeys(line["control"] for line in lines))
+    present = [series for series in SERIES if any(line["series"] == series for line in lines)]
+    quantities = {"steps_per_s": "drone steps per second", "compile_s": "compile time, s"}
+    figure, grid = plt.subplots(len(quantities), len(present), figsize=(5 * len(present), 7), squeeze=False)
+    for row, (quantity, label) in zip(grid, quantities.items(), strict=True):
+        for axes, series in zip(row, present, strict=True):
+            size, name = SERIES[series]
+            for engine, (colour, mark) in MARKS.items():
+                for control, style in zip(controls, ("-", "--", ":", "-.", (0, (1, 3))), strict=False):
+                    of = {"series": series, "engine": engine, "control": control}
+                    points = [(line[size], line[quantity]) for line in lines if line.items() >= of.items()]
+                    if points:
+                        title = engine if len(controls) == 1 else f"{engine}, {control}"
+                        axes.loglog(*zip(*points, strict=True), marker=mark, color=colour, ls=style, label=title)
+            axes.set(xlabel=name, ylabel=label)
+            axes.grid(alpha=0.3)
+    grid[0][0].legend()
+    first = lines[0]
+    machine_name = first["processor"] if first["device"] == "cpu" else first["device"]
+    figure.suptitle(f"{', '.join(controls)} command, {first['integrator']}, {first['n_steps']} steps a call; "
+                    f"{machine_name}, jax {first['jax']}")  # fmt: skip
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    print(f"wrote {path}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
