@@ -145,7 +145,7 @@ def _call(
     flags = jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)
     call = cuda.call if target == "cuda" else native.call
     *written, finite = call(source, n_lanes, count.reshape(1), inputs, [*outputs, flags])
-    return written, jnp.all(finite, axis=1, keepdims=True)
+    return written, finite if n_drones == 1 else jnp.all(finite, axis=1, keepdims=True)
 
 
 def _bare(x: Any) -> Array:

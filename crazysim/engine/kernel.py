@@ -61,9 +61,9 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
         NoRuleError: If an operation or a type has no source.
     """
     writer = Writer()
-    segments = [s for s in program.segments if s.scope != "batch"]
-    slots = dict.fromkeys(slot for s in segments for slot in _of_drone(program, s, [*s.reads, *s.constants]))
-    written = list(dict.fromkeys(slot for s in segments for slot in _of_drone(program, s, s.writes)))
+    (segment,) = program.segments
+    slots = dict.fromkeys([*segment.reads, *segment.constants])
+    written = segment.writes
     check = program.check
     slots.update(dict.fromkeys([*written, *(check.reads if check else [])]))
     inputs = tuple(sorted({leaf for leaf, _ in slots}))
@@ -73,7 +73,7 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
     slots.update(dict.fromkeys(whole))
 
     names = {slot: f"x{slot[0]}_{slot[1]}" for slot in slots}
-    late = _used_when_needed(segments, {*written, *(check.reads if check else [])})
+    late = _used_when_needed(segment, {*written, *(check.reads if check else [])})
     for slot in slots:
         if slot in late:
             names[slot] = _load(program, slot)
@@ -83,14 +83,19 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
         changes = slot in set(written)
         writer.line(f"auto {names[slot]} = {kind}_lanes({access});" if changes
                     else f"const auto {names[slot]} = {access};", 1)  # fmt: skip
-    before = [writer.block(s.before, [names[slot] for slot in s.constants], 1) if s.before else [] for s in segments]
+    constants = [names[slot] for slot in segment.constants]
+    before = writer.block(segment.before, constants, 1) if segment.before is not None else []
     writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
-    for segment, constants in zip(segments, before, strict=True):
-        _step(writer, program, segment, names, constants)
+    outs = writer.block(segment.block, [*(names[slot] for slot in segment.reads), *before], 2)
+    fresh = [writer.new() for _ in outs]
+    for name, out in zip(fresh, outs, strict=True):
+        writer.line(f"const auto {name} = {out};", 2)
+    for slot, name in zip(written, fresh, strict=True):
+        writer.line(f"{names[slot]} = {type_name(_dtype(program, slot))}_lanes({name});", 2)
     writer.line("}", 1)
     if check is not None:
         (fine,) = writer.block(check.block, [names[slot] for slot in check.reads], 1)
-        writer.line(f"STORE(finite, lane, b1_lanes({fine}))", 1)
+        writer.line(f"STORE(1, 1, finite, 0, b1_lanes({fine}))", 1)
     for slot in whole:
         writer.line(_store(program, slot, f"{type_name(_dtype(program, slot))}_lanes({names[slot]})"), 1)
 
@@ -104,34 +109,13 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
     return Kernel(text, inputs, outputs, n_drones, block)
 
 
-def _used_when_needed(segments: Sequence[Segment], needed: set[Slot]) -> set[Slot]:
+def _used_when_needed(segment: Segment, needed: set[Slot]) -> set[Slot]:
     """Return the constants that only stages below the step rate use: they are loaded there, and take no register."""
-    late: set[Slot] = set()
-    for segment in segments:
-        block = segment.block
-        now = {id(x) for v in block.values for x in v.args} | {id(x) for x in block.outputs}
-        late |= {slot for x, slot in zip(block.inputs, segment.reads, strict=False) if id(x) not in now}
-        needed |= {slot for x, slot in zip(block.inputs, segment.reads, strict=False) if id(x) in now}
-        needed |= set(segment.constants)
-    return late - needed
-
-
-def _of_drone(program: Program, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
-    """Return numbers of a world as numbers of its drones."""
-    if segment.scope == "drone":
-        return list(slots)
-    return [(leaf, k % program.sizes(leaf)) if program.axes.scopes[leaf] == "drone" else (leaf, k) for leaf, k in slots]
-
-
-def _step(writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str]) -> None:
-    writer.line("{", 2)
-    outs = writer.block(segment.block, [*(names[slot] for slot in segment.reads), *constants], 3)
-    fresh = [writer.new() for _ in outs]
-    for name, out in zip(fresh, outs, strict=True):
-        writer.line(f"const auto {name} = {out};", 3)
-    for slot, name in zip(segment.writes, fresh, strict=True):
-        writer.line(f"{names[slot]} = {type_name(_dtype(program, slot))}_lanes({name});", 3)
-    writer.line("}", 2)
+    block = segment.block
+    now = {id(x) for v in block.values for x in v.args} | {id(x) for x in block.outputs}
+    pairs = list(zip(block.inputs, segment.reads, strict=False))
+    needed = needed | {slot for x, slot in pairs if id(x) in now} | set(segment.constants)
+    return {slot for _, slot in pairs} - needed
 
 
 def _dtype(program: Program, slot: Slot) -> object:
@@ -145,32 +129,31 @@ def _kind(program: Program, leaf: int) -> str:
 
 def _load(program: Program, slot: Slot) -> str:
     leaf, k = slot
-    match program.axes.scopes[leaf]:
-        case "drone":
-            return f"LOAD(p{leaf}, lane * {program.sizes(leaf)} + {k})"
-        case "world":
-            return f"LOAD(p{leaf}, world * {program.sizes(leaf)} + {k})"
-    return f"p{leaf}[{k}]"
+    scope = program.axes.scopes[leaf]
+    if scope not in ("drone", "world"):
+        return f"p{leaf}[{k}]"
+    return f"LOAD({program.sizes(leaf)}, {_drones(program, leaf)}, p{leaf}, {k})"
 
 
 def _store(program: Program, slot: Slot, value: str) -> str:
     leaf, k = slot
-    if program.axes.scopes[leaf] == "world":
-        return f"STORE_WORLD(q{leaf}, world * {program.sizes(leaf)} + {k}, {value})"
-    return f"STORE(q{leaf}, lane * {program.sizes(leaf)} + {k}, {value})"
+    return f"STORE({program.sizes(leaf)}, {_drones(program, leaf)}, q{leaf}, {k}, {value})"
+
+
+def _drones(program: Program, leaf: int) -> int:
+    """Return how many lanes have the same number of a leaf."""
+    return program.n_drones if program.axes.scopes[leaf] == "world" else 1
 
 
 def _cuda(pointers: Sequence[str], body: str, n_drones: int, block: int) -> str:
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
     arguments = ", ".join([*scalars, *pointers, "b1* __restrict__ finite"])
     return f"""
-#define STORE_WORLD(p, index, value) if (active && lane % {n_drones} == 0) p[index] = value;
 extern "C" __global__ void __launch_bounds__({block}, {UNBOUNDED}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0];
   const int thread = blockIdx.x * {block} + threadIdx.x;
   const bool active = thread < n_lanes;
   const int lane = active ? thread : n_lanes - 1;
-  const int world = lane / {n_drones};
 {body}
 }}
 """
@@ -186,11 +169,6 @@ def _host(pointers: Sequence[str], body: str, n_drones: int, _block: int) -> str
     return f"""
 static void advance_block(int64_t first, int64_t n_lanes, int n_steps, {arguments}, b1* __restrict__ finite) {{
   const int n_active = n_lanes - first < W ? int(n_lanes - first) : W;
-  places lane, world;
-  for (int i = 0; i < W; ++i) {{
-    lane.at[i] = first + i < n_lanes ? first + i : n_lanes - 1;
-    world.at[i] = lane.at[i] / {n_drones};
-  }}
 {body}
 }}
 

@@ -19,7 +19,7 @@ from jax import Array
 
 from crazysim.engine.kernel import Kernel
 
-FLAGS = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-shared",
+FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-shared",
          "-fPIC", "-fvisibility=hidden", "-pthread", "-w")  # fmt: skip
 """Options of the compiler: contraction of multiply and add is allowed, nothing that forgets NaN is."""
 

@@ -76,6 +76,7 @@ class Program:
         self.axes, self.leaves = Axes(data), jax.tree.leaves(data)
         self.n_drones = data.core.n_drones
         self.zeros = zeros or {}
+        self.packed: tuple[int, ...] = ()
         self.segments: list[Segment] = []
         for stage in stages:
             self._add(stage)
@@ -108,6 +109,31 @@ class Program:
     def read(self) -> list[int]:
         """Numbers of the leaves that are read."""
         return sorted({i for s in self.segments for i in [*s.used, *(leaf for leaf, _ in [*s.reads, *s.constants])]})
+
+    def pack(self) -> None:
+        """Lay the numbers that all drones share one behind the other, as one more leaf behind the others.
+
+        A call of a compiled step costs by the number of its arrays. What some stage reads as an array stays one.
+        """
+        direct = {leaf for s in self.segments for leaf in s.used}
+        shared = [i for i in self.read if self.axes.scopes[i] == "shared" and i not in direct]
+        shared = [i for i in shared if i not in self.written and self.leaves[i].dtype == self.leaves[0].dtype]
+        places, size = {}, 0
+        for leaf in shared:
+            places[leaf] = size
+            size += self.sizes(leaf)
+        if not places:
+            return
+
+        def moved(slots: list[Slot]) -> list[Slot]:
+            return [(len(self.leaves), places[leaf] + k) if leaf in places else (leaf, k) for leaf, k in slots]
+
+        for segment in [*self.segments, *([self.check] if self.check else [])]:
+            segment.reads, segment.constants = moved(segment.reads), moved(segment.constants)
+        self.packed = tuple(places)
+        self.leaves.append(jax.ShapeDtypeStruct((size,), self.leaves[0].dtype))
+        self.axes.scopes.append("shared")
+        self.axes.names.append("packed")
 
     def part(self, k: int) -> Program:
         """Return one segment as a program of its own."""

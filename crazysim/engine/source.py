@@ -33,6 +33,7 @@ class Writer:
         """Begin with nothing written."""
         self.lines: list[str] = []
         self.names: dict[int, str] = {}
+        self.pairs: dict[str, str] = {}
         self._count = 0
 
     def new(self, prefix: str = "v") -> str:
@@ -51,8 +52,10 @@ class Writer:
             NoRuleError: If there is no source for an operation or a type.
         """
         self.names.update(zip(map(id, block.inputs), inputs, strict=True))
+        outside = dict(self.pairs)  # what is computed inside a block is not there outside
         for value in block.values:
             self._value(value, depth)
+        self.pairs = outside
         return [self.element(x) for x in block.outputs]
 
     def element(self, x: Element) -> str:
@@ -80,6 +83,14 @@ class Writer:
                 name = self.names[id(value)] = self.new()
                 self.line(f"auto {name}_0 = u32_lanes({args[2]}), {name}_1 = u32_lanes({args[3]});", depth)
                 self.line(f"threefry2x32({args[0]}, {args[1]}, {name}_0, {name}_1);", depth)
+                return
+            case "sin" | "cos":  # most of the work for one of the two is that for the other
+                if args[0] not in self.pairs:
+                    pair = self.pairs[args[0]] = self.new()
+                    kind = "auto" if isinstance(value.args[0], Value) else type_name(value.dtype)
+                    self.line(f"{kind} {pair}_0 = {args[0]}, {pair}_1 = {args[0]};", depth)
+                    self.line(f"sin_cos({args[0]}, {pair}_0, {pair}_1);", depth)
+                self.names[id(value)] = f"{self.pairs[args[0]]}_{'sin cos'.split().index(value.op)}"
                 return
             case "custom_jvp":  # the derivative is not asked for here
                 outs = self.block(value.blocks[0], args, depth)

@@ -43,6 +43,8 @@ class Plan(NamedTuple):
     """What it runs; None for ``plain``."""
     read: tuple[int, ...]
     """Leaves that go in."""
+    packed: tuple[int, ...]
+    """Leaves that go in as one array behind them."""
     written: tuple[int, ...]
     """Leaves that come out."""
     flags: tuple[int, int]
@@ -80,6 +82,7 @@ class Step:
         self.stages = as_stages(pipeline)
         self._plans: dict[Any, Plan] = {}
         self._zeros = _Zeros()
+        self._pack = _Pack()
 
     def __call__(self, data: SimData, n_steps: int | Array = 1, zeros: Zeros | None = None) -> SimData:
         """Return the data some steps later.
@@ -90,13 +93,23 @@ class Step:
             zeros: What ``zeros`` returned for this data before it was traced: inside jit, parameters that are zero
                 cannot be told from others, and are computed with.
         """
+        return self.advance(self.take_apart(data, zeros), n_steps).data()
+
+    def take_apart(self, data: SimData, zeros: Zeros | None = None) -> Apart:
+        """Return the data as a step wants it."""
         leaves, treedef = jax.tree.flatten(data)
         plan = self._plan(data, leaves, treedef, zeros)
+        packed = self._pack([leaves[i] for i in plan.packed]) if plan.packed else None
+        return Apart(leaves, treedef, plan, packed)
+
+    def advance(self, apart: Apart, n_steps: int | Array) -> Apart:
+        """Return the data some steps later, still apart."""
+        plan, leaves = apart.plan, list(apart.leaves)
         step = plan.static if isinstance(n_steps, int) else plan.dynamic
-        out = step([leaves[i] for i in plan.read], leaves[plan.flags[0]], n_steps)
+        out = step(*apart.inputs(), n_steps)
         for i, value in zip((*plan.written, *plan.flags), out, strict=True):
             leaves[i] = value
-        return treedef.unflatten(leaves)
+        return Apart(leaves, apart.treedef, plan, apart.packed)
 
     def plan(self, data: SimData, zeros: Zeros | None = None) -> Plan:
         """Return how this data is stepped."""
@@ -109,9 +122,9 @@ class Step:
 
     def lower(self, data: SimData, n_steps: int | Array = 1) -> Any:
         """Return the step lowered for this data, as ``jax.jit(...).lower`` does: to look at, or to compile ahead."""
-        plan, leaves = self.plan(data), jax.tree.leaves(data)
-        step = plan.static if isinstance(n_steps, int) else plan.dynamic
-        return step.lower([leaves[i] for i in plan.read], leaves[plan.flags[0]], n_steps)
+        apart = self.take_apart(data)
+        step = apart.plan.static if isinstance(n_steps, int) else apart.plan.dynamic
+        return step.lower(*apart.inputs(), n_steps)
 
     def _cache_size(self) -> int:
         """Return how many compilations there are; the tests of law 6 count them."""
@@ -148,6 +161,7 @@ class Step:
         split = [s for s in program.segments if s.scope == "batch"]
         if self.mesh is not None and split:
             return self._plain(data, flags, f"with a mesh every stage must be fused, and {_unfused(split[0])}")
+        program.pack()
         engine, why, run = "lanes", "it was asked for", functools.partial(lanes.steps, program)
         if self.engine in ("auto", "fused"):
             why = fused.missing(self.platform) or ""
@@ -160,7 +174,8 @@ class Step:
                     raise ConfigError(
                         f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'."
                     ) from None
-        return self._wrap(engine, why, program, tuple(program.read), tuple(program.written), flags, run, len(names))
+        read = (*program.read, *_needed(program))
+        return self._wrap(engine, why, program, read, tuple(program.written), flags, run, len(program.leaves))
 
     def _plain(self, data: SimData, flags: tuple[int, int], why: str) -> Plan:
         run, written = plain.build(self.stages, data, by_component=self.mesh is None)
@@ -180,17 +195,19 @@ class Step:
         n_leaves: int,
         shard: bool = True,
     ) -> Plan:
-        read = tuple(sorted({*read, *written, *(_needed(program) if program else ())}))
+        everything = tuple(sorted({*read, *written}))
+        packed = program.packed if program else ()
+        read = everything[:-1] if packed else everything  # what is packed is the last
 
         def advance(values: list[Any], nonfinite: Array, n_steps: int | Array) -> list[Any]:
             leaves: list[Any] = [None] * n_leaves
-            for i, value in zip(read, values, strict=True):
+            for i, value in zip(everything, values, strict=True):
                 leaves[i] = value
             out, fine = run(leaves, n_steps)
             return [*out, nonfinite | ~fine, jnp.asarray(False)]
 
         if self.mesh is None or not shard or program is None:
-            return Plan(engine, why, program, read, written, flags, *_jitted(advance))
+            return Plan(engine, why, program, read, packed, written, flags, *_jitted(advance))
         split, whole = PartitionSpec(WORLD_AXIS), PartitionSpec()
         axes = program.axes.scopes
         specs = [split if axes[i] in ("drone", "world") else whole for i in range(n_leaves)]
@@ -202,13 +219,53 @@ class Step:
             local = jax.shard_map(
                 lambda values, nonfinite, *count: advance(values, nonfinite, *(count or [n_steps])),
                 mesh=self.mesh,
-                in_specs=([specs[i] for i in read], split, *[whole for _ in count]),
+                in_specs=([specs[i] for i in everything], split, *[whole for _ in count]),
                 out_specs=outs,
                 check_vma=False,
             )
             return local(values, nonfinite, *count)
 
-        return Plan(engine, why, program, read, written, flags, *_jitted(spread))
+        return Plan(engine, why, program, read, packed, written, flags, *_jitted(spread))
+
+
+class Apart:
+    """Data taken apart for steps: who only steps on need not put it together in between."""
+
+    __slots__ = ("leaves", "packed", "plan", "treedef")
+
+    def __init__(self, leaves: list[Any], treedef: Any, plan: Plan, packed: Array | None):
+        """Hold the leaves, and what of them is packed."""
+        self.leaves, self.treedef, self.plan, self.packed = leaves, treedef, plan, packed
+
+    def data(self) -> SimData:
+        """Return the data put together."""
+        return self.treedef.unflatten(self.leaves)
+
+    def inputs(self) -> tuple[list[Any], Any]:
+        """Return what the compiled step is given besides the number of steps."""
+        values = [self.leaves[i] for i in self.plan.read]
+        if self.packed is not None:
+            values.append(self.packed)
+        return values, self.leaves[self.plan.flags[0]]
+
+
+class _Pack:
+    """Shared numbers one behind the other, made anew only when one of the arrays is another."""
+
+    def __init__(self) -> None:
+        self._arrays: Sequence[Any] = ()
+        self._packed: Any = None
+
+    def __call__(self, arrays: list[Any]) -> Array:
+        if any(isinstance(x, jax.core.Tracer) for x in arrays):
+            return _concatenated(arrays)
+        if len(arrays) != len(self._arrays) or not all(map(_is, arrays, self._arrays)):
+            self._arrays, self._packed = arrays, jax.jit(_concatenated)(arrays)
+        return self._packed
+
+
+def _concatenated(arrays: list[Any]) -> Array:
+    return jnp.concatenate([x.ravel() for x in arrays])
 
 
 def _jitted(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:

@@ -22,6 +22,7 @@ from crazysim.engine import Step, build_reset, explain
 from crazysim.engine.plain import ResetFn
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
+from crazysim.engine.step import Apart
 from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
 from crazysim.scene.contacts import body_id
@@ -116,6 +117,8 @@ class Sim:
         self._scene = Scene(xml_path, self.airframe, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
         self._seed = as_key(rng_key)
         self._counts: dict[int, Array] = {}
+        self._whole: SimData | None = None
+        self._apart: Apart | None = None
         self._cleared: Any = None
         self.build_data()
         self.build_default_data()
@@ -131,6 +134,17 @@ class Sim:
     def data(self) -> SimData:
         """Everything that changes. Assigning to it makes the scene stale, and clears ``core.mjx_synced``."""
         return self._data
+
+    @property
+    def _data(self) -> SimData:
+        """The data, put together when somebody wants it."""
+        if self._whole is None:
+            self._whole = self._apart.data()
+        return self._whole
+
+    @_data.setter
+    def _data(self, data: SimData) -> None:
+        self._whole, self._apart = data, None
 
     @data.setter
     def data(self, data: SimData) -> None:
@@ -209,7 +223,10 @@ class Sim:
     def step(self, n_steps: int = 1) -> None:
         """Advance every world by a number of physics steps; any number uses the same compilation."""
         n_steps = positive("n_steps", n_steps)
-        self._advance(self._step(self.data, self._count(n_steps)))
+        apart = self._step.take_apart(self._data) if self._apart is None else self._apart
+        self._apart, self._whole = self._step.advance(apart, self._count(n_steps)), None
+        self._cleared = self._apart.leaves[apart.plan.flags[1]]
+        self._scene.invalidate()
 
     def _count(self, n_steps: int) -> Array:
         """Return a number of steps where the step wants it; making a device's number anew costs more than a step."""
@@ -293,6 +310,8 @@ class Sim:
 
     def build_step_fn(self) -> Step:
         """Make the step pipeline as it is now take effect; return ``step(data, n_steps=1) -> data``, pure."""
+        if self._whole is not None or self._apart is not None:
+            self._data = self._data  # whole: it is taken apart for one step function
         self._step = Step(self.step_pipeline, self.engine, self.device.platform, self.mesh)
         return self._step
 

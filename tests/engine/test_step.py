@@ -421,9 +421,8 @@ def test_every_pipeline_compiles_for_a_gpu(dynamics, control, tmp_path):
     text = cuda.ptx(source, cuda.DEFAULT_ARCHITECTURE)
     assert ".entry advance(" in text
     assert source.block % 3 == 0
-    leaves = jax.tree.leaves(sim.data)
-    values = [leaves[i] for i in plan.read]
-    lowered = plan.dynamic.trace(values, leaves[plan.flags[0]], jnp.int32(3)).lower(lowering_platforms=("cuda",))
+    inputs = step.take_apart(sim.data).inputs()
+    lowered = plan.dynamic.trace(*inputs, jnp.int32(3)).lower(lowering_platforms=("cuda",))
     assert cuda.TARGET in lowered.as_text()
 
 

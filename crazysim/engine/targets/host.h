@@ -130,25 +130,24 @@ LANES1(V) V integer_pow(V x, int y) {
   return y < 0 ? one / p : p;
 }
 
-// Sine and cosine of float32 lanes: reduction by pi/2 in three parts (Cody and Waite), then the polynomials of
-// S. L. Moshier's Cephes library; beyond 8192 rad the reduction is left to the C library.
-FN void sincos(f32v x, f32v& s, f32v& c) {
-  const f32v turns = round_even_(x * 0.636619772367581343f);
-  const f32v r = ((x - turns * 1.5703125f) - turns * 4.837512969970703125e-4f) - turns * 7.54978995489188216e-8f;
-  const i32v q = __builtin_convertvector(turns, i32v);
+// As for single numbers; beyond 8192 rad one lane after the other.
+FN void sin_cos(f32v x, f32v& s, f32v& c) {
+  if (any(not_(lt_(abs_(x), 8192.0f)))) {
+    for (int i = 0; i < W; ++i) { f32 a, b; sin_cos(f32(x[i]), a, b); s[i] = a; c[i] = b; }
+    return;
+  }
+  const f32v n = round_even_(x * 0.636619772367581343f);
+  const f32v r = ((x - n * 1.5703125f) - n * 4.837512969970703125e-4f) - n * 7.54978995489188216e-8f;
+  const i32v quarter = __builtin_convertvector(n, i32v);
   const f32v z = r * r;
   const f32v a = r + r * z * (-1.6666654611e-1f + z * (8.3321608736e-3f + z * -1.9515295891e-4f));
   const f32v b = 1.0f - 0.5f * z + z * z * (4.166664568298827e-2f + z * (-1.388731625493765e-3f + z * 2.443315711809948e-5f));
-  const i32v odd = (q & 1) != 0;
+  const i32v odd = (quarter & 1) != 0;
   const f32v sine = odd ? b : a, cosine = odd ? a : b;
-  s = (q & 2) != 0 ? -sine : sine;
-  c = ((q + 1) & 2) != 0 ? -cosine : cosine;
+  s = (quarter & 2) != 0 ? -sine : sine;
+  c = ((quarter + 1) & 2) != 0 ? -cosine : cosine;
 }
-FN b1 is_large(f32v x) { return any(not_(lt_(abs_(x), 8192.0f))); }
-FN f32v sin_(f32v x) { f32v s, c; if (is_large(x)) return each<f32v>([](f32 t) { return sinf(t); }, x); sincos(x, s, c); return s; }
-FN f32v cos_(f32v x) { f32v s, c; if (is_large(x)) return each<f32v>([](f32 t) { return cosf(t); }, x); sincos(x, s, c); return c; }
-FN f64v sin_(f64v x) { return each<f64v>([](f64 t) { return sin(t); }, x); }
-FN f64v cos_(f64v x) { return each<f64v>([](f64 t) { return cos(t); }, x); }
+FN void sin_cos(f64v x, f64v& s, f64v& c) { for (int i = 0; i < W; ++i) { s[i] = sin(x[i]); c[i] = cos(x[i]); } }
 
 FN f32v to_f32(f32v x) { return x; }
 FN f32v to_f32(f64v x) { return __builtin_convertvector(x, f32v); }
@@ -168,20 +167,38 @@ template <class V> FN u32v bits_u32(V x) { return (u32v)x; }
 template <class V> FN i32v bits_i32(V x) { return (i32v)x; }
 template <class V> FN f32v bits_f32(V x) { return (f32v)x; }
 
-// Where each lane's numbers lie.
-struct places { int64_t at[W]; };
-FN places operator*(const places& p, int64_t size) { places r; for (int i = 0; i < W; ++i) r.at[i] = p.at[i] * size; return r; }
-FN places operator+(const places& p, int64_t k) { places r; for (int i = 0; i < W; ++i) r.at[i] = p.at[i] + k; return r; }
-template <class T> FN typename vec<T>::type LOAD(const T* p, const places& from) {
-  typename vec<T>::type x;
-  for (int i = 0; i < W; ++i) x[i] = p[from.at[i]];
+// A block's lanes lie one after the other, each with SIZE numbers, of which the one at K is meant; where there are
+// several drones a world, a number of the world is that of lane / DRONES. Lanes beyond the last repeat it.
+#define RARELY static __attribute__((noinline))
+template <class V, class T> RARELY V load_each(const T* p, int size, int drones, int64_t first, int n) {
+  V x;
+  for (int i = 0; i < W; ++i) x[i] = p[(first + (i < n ? i : n - 1)) / drones * size];
   return x;
 }
-FN b1v LOAD(const b1* p, const places& from) { b1v x; for (int i = 0; i < W; ++i) x.m[i] = -i32(p[from.at[i]]); return x; }
-template <class T, class V> FN void store(T* p, const places& to, int n, V x) { for (int i = 0; i < n; ++i) p[to.at[i]] = x[i]; }
-FN void store(b1* p, const places& to, int n, b1v x) { for (int i = 0; i < n; ++i) p[to.at[i]] = x.m[i] != 0; }
-#define STORE(p, to, value) store(p, to, n_active, value);
-#define STORE_WORLD(p, to, value) store(p, to, n_active, value);
+template <class T, class V> RARELY void store_each(T* p, int size, int drones, int64_t first, int n, V x) {
+  for (int i = 0; i < n; ++i) p[(first + i) / drones * size] = x[i];
+}
+template <int SIZE, int DRONES, class T> FN typename vec<T>::type load(const T* p, int64_t first, int n, int k) {
+  typedef typename vec<T>::type V;
+  if (DRONES > 1 || n < W) return load_each<V>(p + k, SIZE, DRONES, first, n);
+  V x;
+  const T* q = p + first * SIZE + k;
+  for (int i = 0; i < W; ++i) x[i] = q[i * SIZE];
+  return x;
+}
+template <int SIZE, int DRONES> FN b1v load(const b1* p, int64_t first, int n, int k) {
+  return {-load_each<i32v>(p + k, SIZE, DRONES, first, n)};
+}
+template <int SIZE, int DRONES, class T, class V> FN void store(T* p, int64_t first, int n, int k, V x) {
+  if (DRONES > 1 || n < W) return store_each(p + k, SIZE, DRONES, first, n, x);
+  T* q = p + first * SIZE + k;
+  for (int i = 0; i < W; ++i) q[i * SIZE] = x[i];
+}
+template <int SIZE, int DRONES> FN void store(b1* p, int64_t first, int n, int k, b1v x) {
+  store_each(p + k, SIZE, DRONES, first, n, -x.m);
+}
+#define LOAD(SIZE, DRONES, p, k) load<SIZE, DRONES>(p, first, n_active, k)
+#define STORE(SIZE, DRONES, p, k, value) store<SIZE, DRONES>(p, first, n_active, k, value);
 
 // Work that is worth it is shared between the cores, in whole blocks of lanes.
 template <class F> static void in_parallel(int64_t n_lanes, int n_steps, const F& run) {

@@ -37,14 +37,31 @@ FN i32 sign_(i32 x) { return (x > 0) - (x < 0); }
 FN b1 is_finite_(f32 x) { return fabsf(x) < f32_infinity(); }
 FN b1 is_finite_(f64 x) { return fabs(x) < f64_infinity(); }
 
-FN f64 sin_(f64 x) { return sin(x); }
-FN f64 cos_(f64 x) { return cos(x); }
-#ifdef F32_SINE
-F32_SINE
-#else
-FN f32 sin_(f32 x) { return sinf(x); }
-FN f32 cos_(f32 x) { return cosf(x); }
-#endif
+FN void sin_cos(f64 x, f64& s, f64& c) { s = sin(x); c = cos(x); }
+
+// Reduction by pi/2 in three parts (Cody and Waite), from 8192 rad on in float64, then the polynomials of
+// S. L. Moshier's Cephes library.
+FN void sin_cos(f32 x, f32& s, f32& c) {
+  i32 quarter;
+  f32 r;
+  if (fabsf(x) < 8192.0f) {
+    const f32 n = rintf(x * 0.636619772367581343f);
+    quarter = i32(n);
+    r = fmaf(n, -7.54978995489188216e-8f, fmaf(n, -4.837512969970703125e-4f, fmaf(n, -1.5703125f, x)));
+  } else {
+    const f64 n = rint(f64(x) * 0.63661977236758134308);
+    quarter = i32(n - 4.0 * floor(0.25 * n));
+    const f64 far = fma(n, -6.1232339957367658860e-17, fma(n, -1.5707963267948965580, f64(x)));
+    r = f32(fmin(fmax(far, -0.79), 0.79)) + (x - x);  // NaN and infinity give NaN
+  }
+  const f32 z = r * r;
+  const f32 a = fmaf(r * z, fmaf(z, fmaf(z, -1.9515295891e-4f, 8.3321608736e-3f), -1.6666654611e-1f), r);
+  const f32 p = fmaf(z, fmaf(z, 2.443315711809948e-5f, -1.388731625493765e-3f), 4.166664568298827e-2f);
+  const f32 b = fmaf(z * z, p, fmaf(z, -0.5f, 1.0f));
+  const f32 sine = quarter & 1 ? b : a, cosine = quarter & 1 ? a : b;
+  s = quarter & 2 ? -sine : sine;
+  c = (quarter + 1) & 2 ? -cosine : cosine;
+}
 
 // M. Giles, Approximating the erfinv function, GPU Computing Gems 2 (2010); one Newton step more for float64.
 FN f32 erf_inv_(f32 x) {
