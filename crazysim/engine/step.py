@@ -260,7 +260,8 @@ class _Pack:
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
             return _concatenated(arrays)
         if len(arrays) != len(self._arrays) or not all(map(_is, arrays, self._arrays)):
-            self._arrays, self._packed = arrays, jax.jit(_concatenated)(arrays)
+            with jax.ensure_compile_time_eval():  # also within somebody's trace: what is kept must be an array
+                self._arrays, self._packed = arrays, jax.jit(_concatenated)(arrays)
         return self._packed
 
 
