@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from crazysim.engine.kernel import Kernel
+from crazysim.engine.kernel import BLOCK, Kernel
 
 TARGET = "__gpu$xla.gpu.ptx"
 """What XLA calls a kernel that is given to it as PTX."""
@@ -55,8 +55,8 @@ def call(kernel: Kernel, n_lanes: int, count: Array, inputs: Sequence[Array], ou
         outputs: Shapes and types of what it writes.
     """
     kernel = fitted(kernel) if architecture() is not DEFAULT_ARCHITECTURE else kernel
-    n_blocks = -(-n_lanes // kernel.block)
-    launch = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1, "block_x": kernel.block, "block_y": 1, "block_z": 1}
+    n_blocks = -(-n_lanes // BLOCK)
+    launch = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1, "block_x": BLOCK, "block_y": 1, "block_z": 1}
     run = jax.ffi.ffi_call(TARGET, list(outputs))
     return list(
         run(

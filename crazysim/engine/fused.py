@@ -61,7 +61,7 @@ def describe(program: Program, platform: str) -> str:
         return f"kernel: compiled by {native.compiler()}"
     source = cuda.fitted(kernel.write(program, "cuda"))
     used = cuda.resources(source)
-    return f"kernel: {source.block} threads a block, {used.registers} registers, {used.spilled} bytes spilled"
+    return f"kernel: {kernel.BLOCK} threads a block, {used.registers} registers, {used.spilled} bytes spilled"
 
 
 def _over_batches(program: Program, run: Run) -> Run:

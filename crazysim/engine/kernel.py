@@ -30,10 +30,6 @@ class Kernel:
     """Leaves that it reads."""
     outputs: tuple[int, ...]
     """Leaves that it writes; behind them comes one bool per drone, whether it is finite."""
-    n_drones: int
-    """Drones of a world."""
-    block: int = BLOCK
-    """Threads of a block on a GPU: whole worlds."""
 
     def with_blocks(self, n: int) -> Kernel:
         """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
@@ -54,7 +50,7 @@ def epilogue(target: str) -> str:
     return resources.files("crazysim.engine").joinpath("targets", "host_call.h").read_text()
 
 
-def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
+def write(program: Program, target: str) -> Kernel:
     """Return the source of a program for ``cuda`` or ``host``.
 
     Raises:
@@ -101,12 +97,9 @@ def write(program: Program, target: str, block: int = BLOCK) -> Kernel:
 
     pointers = [f"const {_kind(program, i)}* __restrict__ p{i}" for i in inputs]
     pointers += [f"{_kind(program, i)}* __restrict__ q{i}" for i in outputs]
-    body = "\n".join(writer.lines)
-    n_drones = program.n_drones
-    block = max(block // n_drones, 1) * n_drones
     frame = {"cuda": _cuda, "host": _host}[target]
-    text = preamble(target) + frame(pointers, body, n_drones, block) + epilogue(target)
-    return Kernel(text, inputs, outputs, n_drones, block)
+    text = preamble(target) + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
+    return Kernel(text, inputs, outputs)
 
 
 def _used_when_needed(segment: Segment, needed: set[Slot]) -> set[Slot]:
@@ -145,13 +138,13 @@ def _drones(program: Program, leaf: int) -> int:
     return program.n_drones if program.axes.scopes[leaf] == "world" else 1
 
 
-def _cuda(pointers: Sequence[str], body: str, n_drones: int, block: int) -> str:
+def _cuda(pointers: Sequence[str], body: str) -> str:
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
     arguments = ", ".join([*scalars, *pointers, "b1* __restrict__ finite"])
     return f"""
-extern "C" __global__ void __launch_bounds__({block}, {UNBOUNDED}) advance({arguments}) {{
+extern "C" __global__ void __launch_bounds__({BLOCK}, {UNBOUNDED}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0];
-  const int thread = blockIdx.x * {block} + threadIdx.x;
+  const int thread = blockIdx.x * {BLOCK} + threadIdx.x;
   const bool active = thread < n_lanes;
   const int lane = active ? thread : n_lanes - 1;
 {body}
@@ -159,7 +152,7 @@ extern "C" __global__ void __launch_bounds__({block}, {UNBOUNDED}) advance({argu
 """
 
 
-def _host(pointers: Sequence[str], body: str, n_drones: int, _block: int) -> str:
+def _host(pointers: Sequence[str], body: str) -> str:
     arguments = ", ".join(pointers)
     kinds = [p.split("*")[0].removeprefix("const ") for p in pointers]
     n_in = sum(p.startswith("const") for p in pointers)

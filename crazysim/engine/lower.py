@@ -154,7 +154,7 @@ def _select_n(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     """One of two cases by a bool; of more by a number, each against the next."""
     which, *cases = args
     dtype, kind = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
-    if kind == bool:
+    if np.dtype(kind).kind == "b":
         return [r.each("select_n", args, dtype)]
     taken = cases[-1]
     for k in range(len(cases) - 2, -1, -1):
@@ -515,7 +515,6 @@ def closed(jaxpr: Any) -> core.ClosedJaxpr:
 
 def _as_function(eqn: Any) -> Callable[..., Any]:
     """Return an operation as a function of arrays."""
-
     return lambda *args: eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(eqn.params))
 
 

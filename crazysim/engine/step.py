@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -336,9 +337,29 @@ def explain(step: Step, data: SimData) -> str:
             lines.append(f"splits the step: {_unfused(segment)}")
         else:
             lines.append(f"fused, for one {segment.scope}: {names} ({_operations(segment)} operations)")
+    split = [s.stages[0].__name__ for s in plan.program.segments if s.scope == "batch"]
+    if split:
+        lines.append(_cost_of_split(step, data, split))
     if plan.engine == "fused":
         lines.append(fused.describe(plan.program, step.platform))
     return "\n".join(lines)
+
+
+def _cost_of_split(step: Step, data: SimData, split: list[str]) -> str:
+    """Return what stages that split the step cost, measured against the same step without them."""
+
+    def seconds(step: Step, n: int = 64) -> float:
+        jax.block_until_ready(step(data, jnp.int32(n)))  # compiled
+        begin = time.perf_counter()
+        jax.block_until_ready(step(data, jnp.int32(n)))
+        return (time.perf_counter() - begin) / n
+
+    rest = {s.__name__: s for s in step.stages if s.__name__ not in split}
+    whole, without = seconds(step), seconds(Step(rest, step.engine, step.platform, step.mesh))
+    return (
+        f"cost of the split, measured: a step takes {1e6 * whole:.0f} us, and {1e6 * without:.0f} us without "
+        f"{', '.join(split)}"
+    )
 
 
 def _unfused(segment: Segment) -> str:
