@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 
 from crazysim.engine import cuda, kernel, lanes, native
 from crazysim.engine.program import Program, is_key
@@ -45,11 +46,19 @@ def build(program: Program, platform: str) -> Callable[[list[Any], int | Array],
         def advance(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
             return batched(leaves, count)
 
-        @advance.defjvp
-        def _(primals: Any, tangents: Any) -> Any:
+        def slope(primals: Any, tangents: Any) -> Any:
             (values, _), (slopes, _) = primals, tangents
-            return jax.jvp(lambda x: lanes.steps(program, x, n_steps), (values,), (slopes,))
+            changing = [i for i, t in enumerate(slopes) if t is not None and not isinstance(t, SymbolicZero)]
 
+            def of(some: list[Any]) -> Any:
+                leaves = list(values)
+                for i, value in zip(changing, some, strict=True):
+                    leaves[i] = value
+                return lanes.steps(program, leaves, n_steps)
+
+            return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
+
+        advance.defjvp(slope, symbolic_zeros=True)  # what does not change has no derivative to be computed
         return advance(leaves, jnp.asarray(n_steps, jnp.int32))
 
     return steps

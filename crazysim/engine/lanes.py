@@ -192,7 +192,7 @@ def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
     fetching it from memory. From ``LONG`` steps on only every k-th beginning is kept, k being the root of n: the
     memory of a gradient then grows with the root of the horizon, at the price of one more pass.
     """
-    turn = jax.checkpoint(turn)
+    turn = jax.checkpoint(turn, prevent_cse=False)  # a scan keeps them apart anyway
 
     def turns(carry: Any, n: int) -> Any:
         return jax.lax.scan(lambda c, _: (turn(c), None), carry, length=n)[0]
@@ -200,7 +200,7 @@ def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
     if n < LONG:
         return turns(carry, n)
     inner = math.isqrt(n)
-    whole = jax.checkpoint(lambda c: turns(c, inner))
+    whole = jax.checkpoint(lambda c: turns(c, inner), prevent_cse=False)
     carry, _ = jax.lax.scan(lambda c, _: (whole(c), None), carry, length=n // inner)
     return turns(carry, n % inner)
 
