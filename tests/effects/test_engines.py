@@ -1,0 +1,58 @@
+"""Effects on every engine: fused with the physics, meaning what they mean plain, and absent until added."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import Sim, effects
+from crazysim.engine import Step, native
+
+EFFECTS = {
+    "wind": lambda sim: effects.wind.add(sim, velocity=[2.0, 0.5, 0.0], speed_20ft=5.0),
+    "downwash": lambda sim: effects.downwash.add(sim),
+    "battery": lambda sim: effects.battery.add(sim, capacity=0.25, resistance=0.05),
+    "motors": lambda sim: effects.motors.add(sim, rate=0.5),
+    "latency": lambda sim: effects.latency.add(sim, delay=2, max_delay=4),
+    "ground_effect": lambda sim: effects.ground_effect.add(sim),
+}
+
+
+@pytest.fixture(scope="module")
+def sim():
+    """Return a flight with every effect on."""
+    sim = Sim(n_worlds=3, n_drones=2, control="attitude", drone="cf2x_L250", rng_key=5)
+    for add in EFFECTS.values():
+        add(sim)
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(
+        pos=states.pos * 0.2 + jnp.asarray([0, 0, 1.0]), rotor_vel=states.rotor_vel + 14000.0))  # fmt: skip
+    sim.attitude_control(np.tile(np.float32([0.1, 0, 0, 0.32]), (3, 2, 1)))
+    return sim
+
+
+def test_every_effect_is_fused(sim):
+    segments = sim._step.plan(sim.data).program.segments
+    assert [s.why for s in segments if s.scope == "batch"] == []
+    fused = {stage.__name__ for s in segments for stage in s.stages}
+    assert {"wind", "downwash", "battery", "motors"} <= fused
+    assert [s.scope for s in segments] == ["drone", "world", "drone"]
+
+
+def test_effects_mean_the_same_on_every_engine(sim):
+    """20 steps, rounding grown by the controller's gains; random numbers are the same bits everywhere."""
+    expected = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(20))
+    still = Step(Sim(n_worlds=3, n_drones=2, control="attitude", drone="cf2x_L250").step_pipeline, "plain")(
+        sim.data, jnp.int32(20)
+    )
+    assert float(jnp.abs(expected.states.vel - still.states.vel).max()) > 1e-3
+    for engine in ("lanes", "fused") if native.compiler() else ("lanes",):
+        found = Step(sim.step_pipeline, engine)(sim.data, jnp.int32(20))
+        for name in ("pos", "quat", "vel"):
+            a, b = getattr(found.states, name), getattr(expected.states, name)
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5, err_msg=f"{engine} {name}")
+
+
+def test_an_effect_that_is_off_is_not_there():
+    sim = Sim(control="attitude")
+    assert sim.data.plugins == {}
+    assert not set(EFFECTS) & set(sim.step_pipeline)
