@@ -98,7 +98,8 @@ def write(program: Program, target: str) -> Kernel:
     pointers = [f"const {_kind(program, i)}* __restrict__ p{i}" for i in inputs]
     pointers += [f"{_kind(program, i)}* __restrict__ q{i}" for i in outputs]
     frame = {"cuda": _cuda, "host": _host}[target]
-    text = preamble(target) + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
+    widest = 8 if any(_kind(program, i) == "f64" for i in (*inputs, *outputs)) else 4
+    text = f"#define WIDEST {widest}\n" + preamble(target) + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
     return Kernel(text, inputs, outputs)
 
 

@@ -18,12 +18,13 @@ static inline unsigned bits_of_float(float x) { unsigned y; std::memcpy(&y, &x, 
 #include "scalar.h"
 
 #if defined(__AVX512F__)
-#define W 16
+#define BYTES 64
 #elif defined(__AVX__)
-#define W 8
+#define BYTES 32
 #else
-#define W 4
+#define BYTES 16
 #endif
+#define W (BYTES / WIDEST)  // lanes of a block: as many as the widest numbers leave room for in a vector register
 
 template <class T> struct vec { typedef T type __attribute__((vector_size(sizeof(T) * W))); };
 typedef vec<f32>::type f32v;
