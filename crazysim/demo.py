@@ -48,9 +48,8 @@ def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, fi
     sim = build(n_worlds, n_drones, device)
     chunk = flight(sim)
     n_chunks = round(seconds * FPS)
-    print(
-        f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}, {sim.explain().splitlines()[0]}"
-    )
+    engine = sim.explain().splitlines()[0]
+    print(f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
 
     begin = time.perf_counter()
     compiled = chunk.lower(sim.data).compile()
