@@ -13,6 +13,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
+from crazysim.engine import cuda
+
+cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
+
 # Compiling is most of the suite's time; what was compiled once, in any worker or run, is kept.
 CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
