@@ -19,7 +19,7 @@ Element = Any
 class Value:
     """One number that is computed at run time."""
 
-    __slots__ = ("args", "block", "blocks", "dtype", "op", "params")
+    __slots__ = ("args", "blocks", "dtype", "op", "params")
 
     def __init__(self, op: str, args: tuple[Element, ...], dtype: Any, params: tuple = (), blocks: tuple = ()):
         """Name an operation, its operands, its type, its settings and the blocks it contains."""
@@ -178,7 +178,6 @@ FOLDS: dict[str, Callable[..., Any]] = {
     "floor": np.floor,
     "ceil": np.ceil,
     "sqrt": np.sqrt,
-    "square": np.square,
     "max": np.maximum,
     "min": np.minimum,
     "eq": np.equal,

@@ -143,7 +143,7 @@ class Program:
 
     def sizes(self, leaf: int, scope: StageScope = "drone") -> int:
         """Return how many numbers one drone (or world) has of a leaf; a key is two words."""
-        aval = self.axes.of_one(self.leaves, scope)[leaf]
+        aval = self.axes.one_of(leaf, self.leaves[leaf], scope)
         return int(np.prod(aval.shape, dtype=int)) * (2 if is_key(aval) else 1)
 
     def _add(self, stage: Stage) -> None:

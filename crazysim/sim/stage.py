@@ -132,9 +132,12 @@ class Axes:
 
     def of_one(self, leaves: list[Any], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
         """Return what a stage is given, for each leaf of all worlds: its shape and type for one drone or world."""
+        return [self.one_of(i, x, scope) for i, x in enumerate(leaves)]
+
+    def one_of(self, i: int, x: Any, scope: StageScope) -> jax.ShapeDtypeStruct:
+        """Return the same for the leaf with number ``i``."""
         taken = {"drone": 2 if scope == "drone" else 1, "world": 2} if scope != "batch" else {}
-        pairs = zip(self.scopes, leaves, strict=True)
-        return [jax.ShapeDtypeStruct(jnp.shape(x)[taken.get(s, 0) :], x.dtype) for s, x in pairs]
+        return jax.ShapeDtypeStruct(jnp.shape(x)[taken.get(self.scopes[i], 0) :], x.dtype)
 
 
 def _over_worlds(stage: Stage, data: Any) -> Any:
