@@ -29,7 +29,7 @@ class Kernel:
     inputs: tuple[int, ...]
     """Leaves that it reads."""
     outputs: tuple[int, ...]
-    """Leaves that it writes; behind them comes one bool per drone, whether it is finite."""
+    """Leaves that it writes; behind them comes one bool per drone, whether its world is flagged."""
 
     def with_blocks(self, n: int) -> Kernel:
         """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
@@ -69,7 +69,9 @@ def write(program: Program, target: str) -> Kernel:
     slots.update(dict.fromkeys(whole))
 
     names = {slot: f"x{slot[0]}_{slot[1]}" for slot in slots}
-    late = _used_when_needed(segment, {*written, *(check.reads if check else [])})
+    checked = set(check.reads if check else [])
+    # What only the check needs is loaded there, behind the loop.
+    late = _used_when_needed(segment, {*written, *checked}) | (checked - {*segment.reads, *segment.constants, *whole})
     for slot in slots:
         if slot in late:
             names[slot] = _load(program, slot)
@@ -90,8 +92,8 @@ def write(program: Program, target: str) -> Kernel:
         writer.line(f"{names[slot]} = {type_name(_dtype(program, slot))}_lanes({name});", 2)
     writer.line("}", 1)
     if check is not None:
-        (fine,) = writer.block(check.block, [names[slot] for slot in check.reads], 1)
-        writer.line(f"STORE(1, 1, finite, 0, b1_lanes({fine}))", 1)
+        (flagged,) = writer.block(check.block, [names[slot] for slot in check.reads], 1)
+        writer.line(f"STORE(1, 1, flagged, 0, b1_lanes({flagged}))", 1)
     for slot in whole:
         writer.line(_store(program, slot, f"{type_name(_dtype(program, slot))}_lanes({names[slot]})"), 1)
 
@@ -141,7 +143,7 @@ def _drones(program: Program, leaf: int) -> int:
 
 def _cuda(pointers: Sequence[str], body: str) -> str:
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
-    arguments = ", ".join([*scalars, *pointers, "b1* __restrict__ finite"])
+    arguments = ", ".join([*scalars, *pointers, "b1* __restrict__ flagged"])
     return f"""
 extern "C" __global__ void __launch_bounds__({BLOCK}, {UNBOUNDED}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0];
@@ -161,7 +163,7 @@ def _host(pointers: Sequence[str], body: str) -> str:
                for k, kind in enumerate(kinds)]  # fmt: skip
     n_out = len(pointers) - n_in
     return f"""
-static void advance_block(int64_t first, int64_t n_lanes, int n_steps, {arguments}, b1* __restrict__ finite) {{
+static void advance_block(int64_t first, int64_t n_lanes, int n_steps, {arguments}, b1* __restrict__ flagged) {{
   const int n_active = n_lanes - first < W ? int(n_lanes - first) : W;
 {body}
 }}

@@ -149,7 +149,7 @@ def _run_batch(segment: Segment, lanes: Lanes) -> None:
 
 
 def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-    """Return the written leaves after some steps, and which worlds are finite. (n_worlds, 1)
+    """Return the written leaves after some steps, and which worlds are flagged as not finite. (n_worlds, 1)
 
     A step count that is a Python number makes a loop that can be differentiated.
     """
@@ -182,7 +182,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
         end.set(slot, value)
     for leaf, value in zip(by_array, carry[1], strict=True):
         end.set_array(leaf, value)
-    return [end.array(i) for i in program.written], finite(program, end)
+    return [end.array(i) for i in program.written], nonfinite(program, end)
 
 
 def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
@@ -212,11 +212,11 @@ def _slots(program: Program, segment: Segment) -> list[Slot]:
     return [(leaf, k % program.sizes(leaf)) for leaf, k in segment.writes]
 
 
-def finite(program: Program, lanes: Lanes) -> Array:
-    """Return which worlds have no NaN and no infinity in what is watched. (n_worlds, 1)"""
+def nonfinite(program: Program, lanes: Lanes) -> Array:
+    """Return which worlds were flagged before, or have a NaN or infinity in what is watched. (n_worlds, 1)"""
     check = program.check
     if check is None:
-        return jnp.ones((lanes.n_worlds, 1), bool)
-    (fine,) = xla.run(check.block, [lanes.get(slot) for slot in check.reads], lanes.shape)
-    fine = jnp.broadcast_to(fine, lanes.shape).reshape(lanes.n_worlds, lanes.n_drones)
-    return jnp.all(fine, axis=1, keepdims=True)
+        return jnp.zeros((lanes.n_worlds, 1), bool)
+    (flagged,) = xla.run(check.block, [lanes.get(slot) for slot in check.reads], lanes.shape)
+    flagged = jnp.broadcast_to(flagged, lanes.shape).reshape(lanes.n_worlds, lanes.n_drones)
+    return jnp.any(flagged, axis=1, keepdims=True)

@@ -93,7 +93,7 @@ class Program:
         for segment in self.segments:
             if segment.scope == "drone":
                 _hoist(segment, changing)
-        self.check = self._watch(watched(data)) if watched else None
+        self.check = self._watch(data.core.nonfinite, watched(data)) if watched else None
 
     @property
     def fused(self) -> bool:
@@ -197,8 +197,8 @@ class Program:
         traced = _Traced(Stage(stage, "batch", name=stage.__name__), self.axes, self.leaves)
         self.segments.append(Segment("batch", [stage], used=traced.used, written=traced.written, why=why, fn=traced.fn))
 
-    def _watch(self, watched: list[Any]) -> Segment:
-        """Return a program that tells whether all watched numbers of a drone are finite."""
+    def _watch(self, flag: Any, watched: list[Any]) -> Segment:
+        """Return a program that flags a drone: its world was flagged, or a watched number is not finite."""
         ids = {id(x) for x in watched}
         segment = Segment("drone", [])
         avals = self.axes.of_one(self.leaves, "drone")
@@ -207,7 +207,9 @@ class Program:
             if id(x) in ids and self.axes.scopes[i] == "drone":
                 for item in self._elements(segment, i, avals[i]).reshape(-1):
                     finite = segment.block.add("and", (finite, segment.block.add("is_finite", (item,), bool)), bool)
-        segment.block.outputs = [finite]
+        i = next(i for i, x in enumerate(self.leaves) if x is flag)
+        before = self._elements(segment, i, avals[i])[()]
+        segment.block.outputs = [segment.block.add("or", (before, segment.block.add("not", (finite,), bool)), bool)]
         _connect(segment)
         return segment
 

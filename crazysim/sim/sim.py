@@ -225,7 +225,7 @@ class Sim:
         n_steps = positive("n_steps", n_steps)
         apart = self._step.take_apart(self._data) if self._apart is None else self._apart
         self._apart, self._whole = self._step.advance(apart, self._count(n_steps)), None
-        self._cleared = self._apart.leaves[apart.plan.flags[1]]
+        self._cleared = self._apart.leaves[apart.plan.shown]
         self._scene.invalidate()
 
     def _count(self, n_steps: int) -> Array:

@@ -33,6 +33,7 @@ typedef vec<i32>::type i32v;
 typedef vec<u32>::type u32v;
 typedef vec<int64_t>::type i64v;
 struct b1v { i32v m; };  // all bits set where true
+template <> struct vec<b1> { typedef b1v type; };
 
 // How a type is lifted to lanes, and what one lane of it is.
 template <class T> struct is_lanes { static const bool value = false; };
