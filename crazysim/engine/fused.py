@@ -109,7 +109,7 @@ def _one_kernel(program: Program, target: str) -> Run:
 
 def _split(program: Program, target: str) -> Run:
     """Return the same for a step that some stage takes apart: a kernel for what is between such stages."""
-    parts = [program.part(k) for k in range(len(program.segments))]
+    parts = program.parts()
     kernels = [kernel.write(p, target) if p.fused else None for p in parts]
     written = program.written
 

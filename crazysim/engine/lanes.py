@@ -155,7 +155,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
     """
     start = Lanes(program, leaves)
     constants = prepare(program, start)
-    by_lanes = sorted({slot for s in program.segments for slot in _slots(program, s)})
+    by_lanes = sorted({slot for s in program.segments for slot in program.own(s, s.writes)})
     by_array = sorted({i for s in program.segments if s.scope == "batch" for i in s.written})
     by_lanes = [slot for slot in by_lanes if slot[0] not in by_array]
 
@@ -171,8 +171,8 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
 
     carry = [jnp.broadcast_to(start.get(slot), start.shape) for slot in by_lanes], [leaves[i] for i in by_array]
     for segment in program.segments:  # what is only read is taken apart once, outside the loop
-        for leaf, k in segment.reads:
-            start.get((leaf, k % program.sizes(leaf)))
+        for slot in program.own(segment, segment.reads):
+            start.get(slot)
     if isinstance(n_steps, int):
         carry = repeat(turn, carry, n_steps)
     else:
@@ -203,13 +203,6 @@ def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
     whole = jax.checkpoint(lambda c: turns(c, inner), prevent_cse=False)
     carry, _ = jax.lax.scan(lambda c, _: (whole(c), None), carry, length=n // inner)
     return turns(carry, n % inner)
-
-
-def _slots(program: Program, segment: Segment) -> list[Slot]:
-    """Return what a segment writes, as numbers of drones."""
-    if segment.scope != "world":
-        return segment.writes
-    return [(leaf, k % program.sizes(leaf)) for leaf, k in segment.writes]
 
 
 def nonfinite(program: Program, lanes: Lanes) -> Array:

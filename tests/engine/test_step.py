@@ -217,7 +217,7 @@ def with_stages(n_drones, *stages):
     ((gust,), 1), ((separation,), 3), ((undeclared,), 3), ((gust, separation, undeclared), 4),
 ])  # fmt: skip
 def test_stages_of_the_user_mean_the_same_on_every_engine(stages, n_segments):
-    """A stage of one drone fuses; one of a world runs on lanes of worlds; an undeclared one splits the step."""
+    """A stage of one drone or one world fuses; an undeclared one splits the step."""
     sim, data = with_stages(4, *stages)
     expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(6))
     for engine in FAST:
@@ -239,6 +239,20 @@ def test_stages_of_the_user_mean_the_same_on_every_engine(stages, n_segments):
     assert ("'undeclared' is not fused: it is not declared for one drone or one world" in text) == (
         undeclared in stages
     )
+
+
+@pytest.mark.parametrize("n_drones", [1, 3, LARGEST_SWARM])
+def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
+    """Worlds that fill a vector, and worlds that do not; more of them than one vector has."""
+    sim, data = with_stages(n_drones, separation)
+    step = Step(sim.step_pipeline, FAST[-1])
+    assert step.plan(data).program.fused
+    found, expected = step(data, jnp.int32(5)), Step(sim.step_pipeline, "plain")(data, jnp.int32(5))
+    assert n_drones == 1 or float(jnp.abs(found.states.force).max()) > 1e-4
+    for name in ("pos", "vel", "force"):
+        np.testing.assert_allclose(
+            getattr(found.states, name), getattr(expected.states, name), rtol=2e-5, atol=2e-6, err_msg=name
+        )
 
 
 def test_a_stage_of_one_world_splits_a_large_swarm():
