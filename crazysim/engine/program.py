@@ -152,7 +152,7 @@ class Program:
 
     def own(self, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
         """Return the slots of a segment as a drone counts them, which is how a segment of drones does."""
-        return slots if segment.scope == "drone" else [(leaf, k % self.sizes(leaf)) for leaf, k in slots]
+        return list(slots) if segment.scope == "drone" else [(leaf, k % self.sizes(leaf)) for leaf, k in slots]
 
     def sizes(self, leaf: int, scope: StageScope = "drone") -> int:
         """Return how many numbers one drone (or world) has of a leaf; a key is two words."""

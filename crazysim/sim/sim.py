@@ -122,6 +122,7 @@ class Sim:
         self._cleared: Any = None
         self.build_data()
         self.build_default_data()
+        self._scene.on_compile = self._adopt_scene
 
         self.step_pipeline: Pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator)
         self.reset_pipeline: Pipeline = {"reset": reset}
@@ -137,7 +138,8 @@ class Sim:
 
     @property
     def _data(self) -> SimData:
-        """The data, put together when somebody wants it."""
+        """The data, put together when somebody wants it, with what has been added to the scene."""
+        self._scene.settle()
         if self._whole is None:
             self._whole = self._apart.data()
         return self._whole
@@ -182,7 +184,7 @@ class Sim:
 
     def build_data(self) -> SimData:
         """Return new data at rest, as at construction, and make it the simulation's."""
-        self.data = SimData.create(
+        data = SimData.create(
             self.n_worlds,
             self.n_drones,
             self.dynamics,
@@ -193,7 +195,18 @@ class Sim:
             self._scene.drone_mocap_ids,
             self._seed,
         )
+        self.data = data.replace(objects=self._scene.objects(None))
         return self.data
+
+    @property
+    def default_data(self) -> SimData:
+        """What resets return to."""
+        self._scene.settle()
+        return self._default_data
+
+    @default_data.setter
+    def default_data(self, data: SimData) -> None:
+        self._default_data = data
 
     def build_default_data(self) -> SimData:
         """Make the data as it is now what resets return to, and return it."""
@@ -223,6 +236,7 @@ class Sim:
     def step(self, n_steps: int = 1) -> None:
         """Advance every world by a number of physics steps; any number uses the same compilation."""
         n_steps = positive("n_steps", n_steps)
+        self._scene.settle()
         apart = self._step.take_apart(self._data) if self._apart is None else self._apart
         self._apart, self._whole = self._step.advance(apart, self._count(n_steps)), None
         self._cleared = self._apart.leaves[apart.plan.shown]
@@ -322,6 +336,11 @@ class Sim:
 
     # Scene --------------------------------------------------------------------------------------------------
 
+    @property
+    def scene(self) -> Scene:
+        """What MuJoCo holds; ``scene.add`` adds objects."""
+        return self._scene
+
     spec = Held[mujoco.MjSpec]("The scene, to be edited; ``build_mjx`` has an edit take effect.")
     mj_model = Held[mujoco.MjModel]("What ``spec`` was compiled to.")
     mj_data = Held[mujoco.MjData]("The one world that was drawn last.")
@@ -352,10 +371,17 @@ class Sim:
             ConfigError: If the spec does not compile or has lost a drone; the old scene stays then.
         """
         self._scene.compile()
-        ids = jnp.asarray(self._scene.drone_mocap_ids, jnp.int32)
-        self.data = self.data.replace(core=self.data.core.replace(drone_mocap_ids=ids))
-        ids = self.data.core.drone_mocap_ids
-        self.default_data = self.default_data.replace(core=self.default_data.core.replace(drone_mocap_ids=ids))
+
+    def _adopt_scene(self) -> None:
+        """Have the data know what the scene holds now."""
+        ids = self._scene.drone_mocap_ids
+
+        def adopted(data: SimData) -> SimData:
+            core = data.core.replace(drone_mocap_ids=jnp.asarray(ids, jnp.int32))
+            return data.replace(core=core, objects=self._scene.objects(data.objects))
+
+        self.data = adopted(self.data)
+        self.default_data = self._place(adopted(self.default_data))
 
     def contacts(self, body: str | None = None) -> Array:
         """Return which contact slots touch, after bringing the scene up to date if anything has changed.
