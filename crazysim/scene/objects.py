@@ -226,7 +226,7 @@ def add_bodies(
         return
     if options:
         raise ConfigError(
-            f"{', '.join(options)} are settings of the primitives {', '.join(PRIMITIVES)}; MJCF has its own"
+            f"{', '.join(options)} : only the primitives {', '.join(PRIMITIVES)} have settings"
         )
     for name, where in zip(names, place, strict=True):
         source = _source(what)

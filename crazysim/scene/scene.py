@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
-from crazysim.scene import build, contacts, mjx
+from crazysim.scene import build, contacts, mjx, report, solids
 from crazysim.scene.draw import Marks
 from crazysim.scene.objects import IDENTITY, Handle, add_bodies, as_poses
 from crazysim.scene.render import Viewer
+from crazysim.scene.report import ContactReport
+from crazysim.scene.solids import Solids
 from crazysim.scene.sync import sync_one_world, sync_sim2mjx
 from crazysim.sim.data import Objects, SimData
 from crazysim.sim.settings import positive
@@ -162,6 +164,7 @@ class Scene:
         self._mj_model, self._mj_data = mj_model, mujoco.MjData(mj_model)
         self._mjx_model: mjx.Model | None = None
         self._mjx_data: mjx.Data | None = None
+        self._solids: Solids | None = None
         self.edited = False
         self.invalidate()
         if self.on_compile is not None:
@@ -284,6 +287,37 @@ class Scene:
         if body is None:
             return contacts.contact_flags(self.mjx_data)
         return contacts.body_contact_flags(self.mjx_data, self.mj_model, body)
+
+    @property
+    def solids(self) -> Solids:
+        """What drones can touch, as shapes; read anew after a compilation."""
+        self.settle()
+        if self._solids is None:
+            self._solids = solids.read(self._mj_model, self._movable())
+        return self._solids
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the objects that drones can touch, in the order of a contact report."""
+        return tuple(solid.name for solid in self.solids.objects)
+
+    def contact_fn(
+        self, objects: report.Objects = None, floor: bool = True, drones: bool = True
+    ) -> Callable[[SimData], ContactReport]:
+        """Return ``fn(data) -> ContactReport``, pure, for the scene as it is now.
+
+        It takes all worlds, or in a stage one world or one drone; a stage of one drone asks with ``drones=False``.
+        What is left out costs nothing.
+
+        Args:
+            objects: Handles, or names of bodies; None for all, () for none.
+            floor: Whether to report the floor: planes and height fields of the world itself.
+            drones: Whether to report the other drones of a world.
+
+        Raises:
+            ConfigError: If nothing is asked for, or an object is not there or is moved by hand.
+        """
+        return report.build(self.solids, objects, floor, drones)
 
     def draw(
         self, mode: str, camera: int | str, cam_config: dict[str, Any] | None, width: int, height: int

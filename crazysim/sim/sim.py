@@ -27,7 +27,9 @@ from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
 from crazysim.scene.contacts import body_id
 from crazysim.scene.draw import Marks
+from crazysim.scene.objects import Handle
 from crazysim.scene.render import Viewer
+from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Held, Scene
 from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim import functional as F
@@ -117,6 +119,7 @@ class Sim:
         self._scene = Scene(xml_path, self.airframe, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
         self._seed = as_key(rng_key)
         self._counts: dict[int, Array] = {}
+        self._reports: dict[Any, Any] = {}
         self._whole: SimData | None = None
         self._apart: Apart | None = None
         self._cleared: Any = None
@@ -402,6 +405,26 @@ class Sim:
             body_id(self.mj_model, body)  # a wrong name is told before anything is touched
         self._data = self._scene.sync(self._data)
         return self._scene.contacts(body)
+
+    def contact_report(self, objects: Objects = None, floor: bool = True, drones: bool = True) -> ContactReport:
+        """Return what each drone touches, and how far it is from the rest: floor, objects, other drones.
+
+        Pure JAX on the drones' poses: neither MuJoCo nor anything that was drawn takes part.
+
+        Args:
+            objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.
+            floor: Whether to report the floor.
+            drones: Whether to report the other drones of a world. What is left out costs nothing, and is None.
+
+        Raises:
+            ValueError: If nothing is asked for, or an object is not there or is moved by hand.
+        """
+        asked = objects if isinstance(objects, (Handle, str, type(None))) else tuple(objects)
+        key = (id(self._scene.solids), asked, floor, drones)
+        if key not in self._reports:
+            self._reports = {k: v for k, v in self._reports.items() if k[0] == key[0]}  # others are of an old scene
+            self._reports[key] = jax.jit(self._scene.contact_fn(asked, floor, drones))
+        return self._reports[key](self.data)
 
     def render(
         self,

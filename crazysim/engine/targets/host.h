@@ -62,9 +62,15 @@ FN i32v numbers() { i32v x; for (int i = 0; i < W; ++i) x[i] = i; return x; }
 // A number of the drone with number d of the same world.
 template <class V> FN V of_drone(V x, int d) {
   if (GROUP == 1) return x;
+  typename std::conditional<sizeof(x[0]) == 8, i64v, i32v>::type from;
+  for (int i = 0; i < W; ++i) { const int j = i / GROUP * GROUP + d; from[i] = j < W ? j : W - 1; }
+#if defined(__clang__)
   V y;
-  for (int i = 0; i < W; ++i) { const int j = i / GROUP * GROUP + d; y[i] = x[j < W ? j : W - 1]; }
+  for (int i = 0; i < W; ++i) y[i] = x[from[i]];
   return y;
+#else
+  return __builtin_shuffle(x, from);
+#endif
 }
 FN b1v of_drone(b1v x, int d) { return {of_drone(x.m, d)}; }
 
