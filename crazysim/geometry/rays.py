@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.geometry.distance import components
+from crazysim.geometry.points import components
 from crazysim.geometry.shapes import Shape
 from crazysim.rotation import safe_clip, safe_normalize, safe_sqrt
 

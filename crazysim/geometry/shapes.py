@@ -114,8 +114,8 @@ def hull(vertices: Any, faces: Any = None) -> Shape:
     out = float(np.max(v @ normals.T - offsets)) if len(offsets) else np.inf
     if out > 1e-4 * scale or (keep.all() and not _closed(triangles)):
         raise ConfigError(
-            f"faces that are not closed, or leave a vertex outside, by {out:.3g} m; needed are the triangles of the convex hull. Up to "
-            f"{LARGEST_SEARCH} vertices they are found without being given."
+            f"faces that are not closed, or leave a vertex outside, by {out:.3g} m; needed are the triangles of the "
+            f"convex hull. Up to {LARGEST_SEARCH} vertices they are found without being given."
         )
     # Triangles of one flat side share a plane; the offset is that of the outermost vertex, so that all are inside.
     planes = _distinct(normals)

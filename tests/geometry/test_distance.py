@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from oracle import SHAPES, distances, places, rotations, unit
+from oracle import DRONES, SHAPES, check_pair, check_slopes, distances, places, poses, rotations, unit
 
 from crazysim import ConfigError
 from crazysim.geometry import Shape
@@ -20,11 +20,6 @@ CLOSED = ("plane", "sphere", "capsule", "box", "cylinder")
 N = 2000
 
 
-def poses(rng, n=N):
-    """Return positions and attitudes, wxyz."""
-    return places(rng, n), unit(rng.normal(size=(n, 4)))
-
-
 def both_ways(found, expected, at_least=100):
     """Check signs, and that there is something to check: shapes apart, and overlapping ones."""
     assert np.sum(expected > 0) > at_least
@@ -34,12 +29,31 @@ def both_ways(found, expected, at_least=100):
 
 @pytest.mark.parametrize("kind", [*CLOSED, "ellipsoid"])
 def test_a_sphere_is_as_far_as_mujoco_has_it(x64, rng, kind):
-    drone, (pos, quat) = Shape("sphere", (0.1,)), poses(rng)
+    drone, (pos, quat) = DRONES["sphere"], poses(rng, N)
     found = np.asarray(distance(drone, SHAPES[kind], pos, rotations(quat)))
     expected = distances(drone, SHAPES[kind], pos, quat)
     both_ways(found, expected)
     known = expected > 0 if kind == "ellipsoid" else slice(None)  # MuJoCo's depths in an ellipsoid are rough
     np.testing.assert_allclose(found[known], expected[known], atol=1e-5)
+
+
+PAIRS = [
+    ("capsule", "plane"), ("capsule", "sphere"), ("capsule", "capsule"), ("capsule", "box"),
+    ("box", "plane"), ("box", "sphere"), ("box", "capsule"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("a, b", PAIRS)
+def test_closed_forms_of_two_shapes(x64, rng, a, b):
+    check_pair(DRONES[a], SHAPES[b], distance, rng, N, 1e-5)
+
+
+@pytest.mark.parametrize("a, b", PAIRS)
+def test_law_08_gradients_of_closed_forms_equal_central_differences(x64, rng, a, b):
+    by_pos, by_rot = check_slopes(DRONES[a], SHAPES[b], distance, rng, N)
+    # Across a crease, a difference may look like a distance's; there are few.
+    assert np.mean(np.max(np.abs(by_pos), axis=1) > 1e-4) < 0.005
+    assert np.mean(np.abs(by_rot) > 1e-4) < 0.02
 
 
 @pytest.mark.parametrize("axes", [(0.5, 0.3, 0.15), (0.3, 0.3, 0.3), (0.1, 0.1, 1.0), (1.0, 0.03, 1.0)])
