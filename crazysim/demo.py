@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -15,11 +14,13 @@ import numpy as np
 from jax import Array
 
 from crazysim.dynamics import first_principles
-from crazysim.scene.render import RenderError
+from crazysim.errors import RenderError
+from crazysim.pictures import Film, Flight, Recorder, View
+from crazysim.pictures.trail import COLORS
 from crazysim.sim import functional as F
 from crazysim.sim.data import SimData
 from crazysim.sim.sim import Sim
-from crazysim.sim.visualize import change_material, draw_line
+from crazysim.sim.visualize import change_material
 
 FPS = 25
 """Pictures, and checks for contacts, per second."""
@@ -29,7 +30,6 @@ SETTLED = 2.0
 """From here on the tracking error counts, s."""
 WIDTH, DEPTH = 1.4, 0.7
 """Half sizes of the figure eight, m."""
-COLORS = np.array([[0.90, 0.30, 0.20, 1], [0.15, 0.50, 0.85, 1], [0.20, 0.65, 0.35, 1], [0.85, 0.60, 0.10, 1]])
 POLE = """
 <mujoco><worldbody><body name="pole">
   <geom type="capsule" fromto="0 0 0.035 0 0 2" size="0.03" rgba="0.85 0.35 0.25 1"/>
@@ -38,7 +38,7 @@ POLE = """
 
 
 def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, film: bool = True) -> None:
-    """Fly, print figures, and write ``tracks.png`` and ``flight.mp4`` into a folder.
+    """Fly, print figures, and write ``flight.npz``, ``tracks.png`` and ``flight.mp4`` into a folder.
 
     Raises:
         ValueError: If an argument cannot be.
@@ -46,7 +46,7 @@ def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, fi
     if seconds < 1 / FPS:
         raise ValueError(f"--seconds is {seconds}; the flight must last at least {1 / FPS} s")
     sim = build(n_worlds, n_drones, device)
-    chunk = flight(sim)
+    chunk = chunk_of(sim)
     n_chunks = round(seconds * FPS)
     engine = sim.explain().splitlines()[0]
     print(f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
@@ -58,7 +58,8 @@ def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, fi
     sim.contacts()
     contacts_compile_s = time.perf_counter() - begin
 
-    poses, errors, touching = [], [], []
+    recorder = Recorder(sim, worlds=[0])
+    errors, touching = [], []
     step_s = contacts_s = 0.0
     for _ in progress(range(n_chunks), "flying"):
         begin = time.perf_counter()
@@ -68,16 +69,19 @@ def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, fi
         begin = time.perf_counter()
         touching.append(np.asarray(sim.contacts()))
         contacts_s += time.perf_counter() - begin
-        poses.append((np.asarray(data.states.pos[0]), np.asarray(data.states.quat[0])))
+        recorder.add()
         errors.append(np.asarray(error))
 
     n_steps = n_chunks * (sim.freq // FPS)
     report(np.concatenate(errors), np.stack(touching), n_steps * n_worlds * n_drones, step_s, contacts_s / n_chunks)
     print(f"compile time      {compile_s:.2f} s for the flight, {contacts_compile_s:.2f} s for contacts")
     out.mkdir(parents=True, exist_ok=True)
-    plot(sim, np.stack([pos for pos, _ in poses]), np.concatenate(errors), out / "tracks.png")
+    flight = recorder.flight()
+    flight.save(out / "flight.npz")
+    print(f"wrote {out / 'flight.npz'}")
+    plot(sim, flight.pos[:, 0], np.concatenate(errors), out / "tracks.png")
     if film:
-        record(sim, poses, out / "flight.mp4")
+        record(sim, flight, out / "flight.mp4")
 
 
 def build(n_worlds: int, n_drones: int, device: str) -> Sim:
@@ -134,7 +138,7 @@ def reference(time: Array, n_drones: int) -> Array:
     )
 
 
-def flight(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
+def chunk_of(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
     """Return a jitted function that flies 1 / FPS seconds: one setpoint per tick of the state controller.
 
     It returns the data and the distance from the setpoint, m, at every tick. (n_ticks, n_worlds, n_drones)
@@ -193,38 +197,24 @@ def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
     print(f"wrote {path}")
 
 
-def record(sim: Sim, poses: list[tuple[np.ndarray, np.ndarray]], path: Path) -> None:
+def record(sim: Sim, flight: Flight, path: Path) -> None:
     """Write world 0 as a film; say in one line if this machine cannot."""
-    try:
-        from imageio_ffmpeg import get_ffmpeg_exe
-
-        sim.render("rgb_array", width=64, height=48)
-    except ImportError:
-        print("no film: imageio-ffmpeg is not installed; pip install 'crazysim[demo]'")
-        return
-    except RenderError as error:
-        print(f"no film: {error}")
-        return
     for i in range(sim.n_drones):
         change_material(sim, "led_top", [i], rgba=COLORS[i % 4], emission=1.0)
-    trail = np.stack([pos for pos, _ in poses])
-    width, height = 960, 544
-    encode = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {FPS} -i - -pix_fmt yuv420p -crf 22 -y".split()
-    command = [get_ffmpeg_exe(), "-loglevel", "error", *encode, str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as ffmpeg:
-        for k in progress(range(len(poses)), "filming"):
-            pos, quat = poses[k]
-            states = sim.data.states
-            states = states.replace(pos=states.pos.at[0].set(pos), quat=states.quat.at[0].set(quat))
-            sim.data = sim.data.replace(states=states)
-            for i in range(sim.n_drones):
-                draw_line(sim, trail[max(0, k - FPS) : k + 1, i], rgba=COLORS[i % 4])
-            view = {"lookat": [0, 0, 0.9], "distance": 3.6, "azimuth": 110 + 0.12 * k, "elevation": -28}
-            picture = sim.render("rgb_array", cam_config=view, width=width, height=height)
-            ffmpeg.stdin.write(np.asarray(picture).tobytes())
-        ffmpeg.stdin.close()
+    view = View(width=960, height=544, trail=1.0, cam_config=turning)
+    try:
+        with Film(path, view, fps=FPS, progress=True) as film:
+            film.play(sim, flight)
+    except (ImportError, RenderError) as error:
+        print(f"no film: {error}")
+        return
     sim.close()
-    print(f"wrote {path}" if ffmpeg.returncode == 0 else f"no film: ffmpeg ended with code {ffmpeg.returncode}")
+    print(f"wrote {path}")
+
+
+def turning(time: float) -> dict[str, Any]:
+    """Return a free camera that goes slowly around the scene."""
+    return {"lookat": [0, 0, 0.9], "distance": 3.6, "azimuth": 110 + 3 * time, "elevation": -28}
 
 
 def progress(items: Iterable[Any], label: str) -> Iterable[Any]:

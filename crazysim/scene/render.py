@@ -59,8 +59,8 @@ class Viewer:
         bodies = renderer.scene.ngeom
         marks.write(renderer.scene)
         if mode == "rgb_array":
-            return renderer.render().copy()
-        color = renderer.render().copy() if mode == "rgbd_tuple" else None
+            return _picture(renderer, marks)
+        color = _picture(renderer, marks) if mode == "rgbd_tuple" else None
         renderer.scene.ngeom = bodies  # marks are paint: no distance is measured to them
         renderer.enable_depth_rendering()
         depth = renderer.render().copy()
@@ -103,7 +103,7 @@ class Viewer:
             # Buffers are made once per context; a larger picture than any before needs a context of its own.
             buffers.offwidth, buffers.offheight = max(buffers.offwidth, width), max(buffers.offheight, height)
             try:
-                renderer = mujoco.Renderer(self._model, height, width, max_geom=self._max_geom)
+                renderer = mujoco.Renderer(self._model, height, width, self._max_geom, font_scale(height))
             except Exception as error:  # the OpenGL bindings raise whatever they like
                 raise RenderError(
                     f"no OpenGL context could be made ({type(error).__name__}: {error}). On a machine without a "
@@ -114,6 +114,20 @@ class Viewer:
             if len(self._renderers) > MAX_SIZES:
                 self._renderers.pop(next(iter(self._renderers))).close()
         return self._renderers[width, height]
+
+
+def font_scale(height: int) -> mujoco.mjtFontScale:
+    """Return the size of MuJoCo's font at which text is as readable in a small picture as in a large one."""
+    return mujoco.mjtFontScale(int(np.clip(50 * (height // 240), 50, 300)))
+
+
+def _picture(renderer: mujoco.Renderer, marks: Marks) -> NDArray:
+    picture = renderer.render().copy()
+    if marks.has_text:  # the renderer knows no text: it is written over what is still in its buffer, and read again
+        marks.write_text(renderer._rect, renderer._mjr_context)
+        mujoco.mjr_readPixels(picture, None, renderer._rect, renderer._mjr_context)
+        picture = np.flipud(picture).copy() if renderer._gl_context else picture
+    return picture
 
 
 def _free(renderers: dict[tuple[int, int], mujoco.Renderer], windows: list[Window]) -> None:

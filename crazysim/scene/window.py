@@ -76,6 +76,7 @@ class Window:
         glfw.make_context_current(self._window)
         pixels = mujoco.MjrRect(0, 0, *glfw.get_framebuffer_size(self._window))
         mujoco.mjr_render(pixels, self._scene, self._context)
+        marks.write_text(pixels, self._context)
         glfw.swap_buffers(self._window)
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crazysim.errors import UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.draw import RED
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def draw_line(
     Args:
         sim: The simulation.
         points: World frame, m. (n, 3)
-        rgba: Colour, 0 to 1; red if left out. (4,)
+        rgba: Colour, 0 to 1, one or one per piece between two points; red if left out. (4,) or (n - 1, 4)
         start_size: Width at the first point, pixels.
         end_size: Width at the last point, pixels.
 
@@ -73,6 +73,59 @@ def draw_capsule(
     if first.shape != (3,) or last.shape != (3,):
         raise ValueError(f"the ends of a capsule must have shape (3,), got {first.shape} and {last.shape}")
     sim.marks.capsule(first, last, radius, RED if rgba is None else rgba, cylinder)
+
+
+def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:
+    """Write one line of text at a point into the next picture, in front of everything.
+
+    Args:
+        sim: The simulation.
+        point: Where its left end is, world frame, m. (3,)
+        text: ASCII, 99 letters at most.
+
+    Raises:
+        ValueError: If the point has another shape, or the text cannot be written.
+    """
+    at = np.asarray(point, dtype=float)
+    if at.shape != (3,):
+        raise ValueError(f"the point of a label must have shape (3,), got {at.shape}")
+    sim.marks.label(text, at)
+
+
+def draw_text(sim: Sim, text: str, corner: str = "top left") -> None:
+    """Write text into a corner of the next picture, below what was written there before.
+
+    Args:
+        sim: The simulation.
+        text: ASCII; may have several lines.
+        corner: ``"top left"``, ``"top right"``, ``"bottom left"`` or ``"bottom right"``.
+
+    Raises:
+        ValueError: If there is no such corner, or the text cannot be written.
+    """
+    sim.marks.text(text, corner)
+
+
+def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size: float = 0.02) -> None:
+    """Draw where the last state command wants each drone of a world, as a sphere, into the next picture.
+
+    Args:
+        sim: The simulation; its command level is ``state``.
+        world: Which world.
+        rgba: Colour, 0 to 1, one or one per drone; red if left out. (4,) or (n_drones, 4)
+        size: Radius, m.
+
+    Raises:
+        ValueError: If the simulation has another command level, or no such world.
+    """
+    if sim.data.controls.state is None:
+        raise ConfigError(
+            f"setpoints are the positions of state commands; this simulation has control={str(sim.control)!r}"
+        )
+    if not 0 <= world < sim.n_worlds:
+        raise ConfigError(f"world {world} does not exist; worlds go from 0 to {sim.n_worlds - 1}")
+    wanted = np.asarray(sim.data.controls.state.staged_cmd[world, :, :3], float)
+    sim.marks.points(wanted, RED if rgba is None else rgba, size)
 
 
 def change_material(
