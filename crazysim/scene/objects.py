@@ -225,9 +225,7 @@ def add_bodies(
                 body.add_geom(**geom)
         return
     if options:
-        raise ConfigError(
-            f"{', '.join(options)} : only the primitives {', '.join(PRIMITIVES)} have settings"
-        )
+        raise ConfigError(f"{', '.join(options)} : only the primitives {', '.join(PRIMITIVES)} have settings")
     for name, where in zip(names, place, strict=True):
         source = _source(what)
         body = spec.worldbody.add_body(name=name, mocap=mocap, **where)

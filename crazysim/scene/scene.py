@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
-from crazysim.scene import build, contacts, mjx, report, solids
+from crazysim.scene import build, contacts, depth, mjx, report, solids
 from crazysim.scene.draw import Marks
 from crazysim.scene.objects import IDENTITY, Handle, add_bodies, as_poses
+from crazysim.scene.rays import Hits
 from crazysim.scene.render import Viewer
 from crazysim.scene.report import ContactReport
 from crazysim.scene.solids import Solids
@@ -165,6 +166,7 @@ class Scene:
         self._mjx_model: mjx.Model | None = None
         self._mjx_data: mjx.Data | None = None
         self._solids: Solids | None = None
+        self._visible: Solids | None = None
         self.edited = False
         self.invalidate()
         if self.on_compile is not None:
@@ -300,6 +302,44 @@ class Scene:
     def object_names(self) -> tuple[str, ...]:
         """Names of the objects that drones can touch, in the order of a contact report."""
         return tuple(solid.name for solid in self.solids.objects)
+
+    @property
+    def visible(self) -> Solids:
+        """What cameras see, as shapes: a mesh as its convex hull, nothing that is more than half transparent."""
+        self.settle()
+        if self._visible is None:
+            self._visible = solids.read(self._mj_model, self._movable(), touching=False)
+        return self._visible
+
+    def depth_fn(
+        self,
+        camera: str | int = "fpv_cam",
+        width: int = 64,
+        height: int = 64,
+        drones: bool = True,
+        hide_own: bool = True,
+        along: depth.Along = "axis",
+    ) -> Callable[[SimData], Hits]:
+        """Return ``fn(data) -> Hits``, pure: what cameras see in all worlds, by casting a ray for each pixel.
+
+        The hits' ``distance`` is the picture (n_worlds, n_cameras, height, width) in m, with ``normal`` and ``number``
+        (what was hit) beside it; what is not used is not computed inside jit.
+
+        Args:
+            camera: ``fpv_cam`` or ``track_cam`` for those of all drones, then n_cameras is n_drones; or the name or id
+                of one camera.
+            width: Pixels.
+            height: Pixels.
+            drones: Whether drones are seen.
+            hide_own: Whether a drone's camera does not see that drone.
+            along: Whether to measure along the camera's ``axis``, as ``Sim.render`` does, or along the ``ray``.
+
+        Raises:
+            ConfigError: If the resolution cannot be, or the camera's place is not known to the data.
+            UnknownNameError: If there is no such camera.
+        """
+        cameras = depth.find_cameras(self.mj_model, camera, self._movable())
+        return depth.build(self.visible, cameras, width, height, drones, hide_own, along)
 
     def contact_fn(
         self, objects: report.Objects = None, floor: bool = True, drones: bool = True

@@ -73,7 +73,7 @@ def read(model: mujoco.MjModel, movable: Sequence[str], touching: bool = True) -
     if touching:
         first = [g for g in first if model.geom_contype[g] or model.geom_conaffinity[g]]
     else:
-        first = [g for g in first if model.geom_group[g] <= VISIBLE_GROUPS]
+        first = [g for g in first if model.geom_group[g] <= VISIBLE_GROUPS and _alpha(model, g) >= OPAQUE]
     of_drone = (3, 1)
     floor, bodies = [], dict[str, list[int]]()
     for g in sorted(set(range(model.ngeom)) - set(drone_geoms)):
@@ -81,7 +81,7 @@ def read(model: mujoco.MjModel, movable: Sequence[str], touching: bool = True) -
         if touching:
             meets = (of_drone[0] & model.geom_conaffinity[g]) or (of_drone[1] & model.geom_contype[g])
         else:
-            meets = model.geom_group[g] <= VISIBLE_GROUPS and _alpha(model, g) > 0
+            meets = model.geom_group[g] <= VISIBLE_GROUPS and _alpha(model, g) >= OPAQUE
         if not meets:
             continue
         if kind is None:
@@ -104,6 +104,8 @@ def read(model: mujoco.MjModel, movable: Sequence[str], touching: bool = True) -
 
 VISIBLE_GROUPS = 2
 """Last group of geoms that pictures show."""
+OPAQUE = 0.5
+"""How opaque a geom must be to be seen by rays."""
 
 
 def _root(model: mujoco.MjModel, geom: int) -> str:

@@ -26,6 +26,7 @@ from crazysim.engine.step import Apart
 from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
 from crazysim.scene.contacts import body_id
+from crazysim.scene.depth import Along
 from crazysim.scene.draw import Marks
 from crazysim.scene.objects import Handle
 from crazysim.scene.render import Viewer
@@ -119,7 +120,7 @@ class Sim:
         self._scene = Scene(xml_path, self.airframe, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
         self._seed = as_key(rng_key)
         self._counts: dict[int, Array] = {}
-        self._reports: dict[Any, Any] = {}
+        self._questions: dict[Any, Any] = {}
         self._whole: SimData | None = None
         self._apart: Apart | None = None
         self._cleared: Any = None
@@ -420,11 +421,40 @@ class Sim:
             ValueError: If nothing is asked for, or an object is not there or is moved by hand.
         """
         asked = objects if isinstance(objects, (Handle, str, type(None))) else tuple(objects)
-        key = (id(self._scene.solids), asked, floor, drones)
-        if key not in self._reports:
-            self._reports = {k: v for k, v in self._reports.items() if k[0] == key[0]}  # others are of an old scene
-            self._reports[key] = jax.jit(self._scene.contact_fn(asked, floor, drones))
-        return self._reports[key](self.data)
+        report = self._compiled("report", lambda: self._scene.contact_fn(asked, floor, drones), asked, floor, drones)
+        return report(self.data)
+
+    def depth(
+        self,
+        camera: str | int = "fpv_cam",
+        width: int = 64,
+        height: int = 64,
+        drones: bool = True,
+        hide_own: bool = True,
+        along: Along = "axis",
+    ) -> Array:
+        """Return what cameras of all worlds measure, m; see ``scene.depth_fn``. (n_worlds, n_cameras, height, width)
+
+        Infinite where nothing is hit.
+
+        Raises:
+            ValueError: If the camera does not exist, or the resolution cannot be.
+        """
+        settings = (camera, width, height, drones, hide_own, along)
+
+        def build() -> Any:
+            look = self._scene.depth_fn(*settings)
+            return lambda data: look(data).distance
+
+        return self._compiled("depth", build, *settings)(self.data)
+
+    def _compiled(self, question: str, build: Any, *settings: Any) -> Any:
+        """Return a question to the scene as it is now, compiled once for each setting."""
+        scene = id(self._scene.mj_model)
+        if (scene, question, *settings) not in self._questions:
+            self._questions = {k: v for k, v in self._questions.items() if k[0] == scene}
+            self._questions[scene, question, *settings] = jax.jit(build())
+        return self._questions[scene, question, *settings]
 
     def render(
         self,
