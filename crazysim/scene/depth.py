@@ -164,4 +164,5 @@ def _pose(camera: Camera, data: SimData) -> tuple[Array, Array]:
     at, quat = (x[:, camera.place] for x in held)
     if not camera.turns:
         return at + pos, jnp.broadcast_to(rot, (n, 3, 3))
-    return at + rotation.rotate(quat, pos), rotation.matrix(quat) @ rot
+    # Written out: a matrix product may be rounded to 10 bits on a GPU.
+    return at + rotation.rotate(quat, pos), jnp.stack([rotation.rotate(quat, rot[:, k]) for k in range(3)], axis=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -49,7 +50,7 @@ def add_range_finder(
 ) -> None:
     """Give every drone rays that measure distances, each in the step itself: ``data.plugins["range_finder"]``.
 
-    They start at the centre of mass and do not see their own drone.
+    They start at the centre of mass and do not see their own drone; others they see as the shapes that drones touch by.
 
     Args:
         sim: The simulation.
@@ -71,7 +72,8 @@ def add_range_finder(
     if not period:
         raise ConfigError(f"a range finder at {freq} Hz does not fit steps at {steps} Hz; take a divisor")
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
-    solids = sim.scene.visible
+    # The few rays of a range finder need no more of a drone than its outline.
+    solids = dataclasses.replace(sim.scene.visible, drone=sim.scene.solids.drone)
 
     def measure(data: SimData) -> SimData:
         mine, states = data.plugins[NAME], data.states

@@ -15,8 +15,8 @@ from crazysim.pytree import PyTree, static
 from crazysim.scene.solids import Part, Solids
 from crazysim.sim.data import SimData
 
-UNROLLED = 1
-"""Objects made alike up to which each is written out; more go through a loop, which compiles once."""
+UNROLLED = 16
+"""Shapes of objects made alike up to which each is written out; more go through a loop, which compiles once."""
 
 
 class Hits(PyTree):
@@ -115,7 +115,7 @@ def _met_by(
             best = _nearer(best, far, rotation.rotate(q, normal), number)
         return best
 
-    if len(some) <= UNROLLED:
+    if len(some) * len(parts) <= UNROLLED:
         for place, number in some:
             best = with_one(best, place, number)
         return best

@@ -159,7 +159,7 @@ def _to_group(own: Own, turned: Array | None, some: list[Solid], data: SimData) 
     pos, quat = objects.pos[..., run, :], objects.quat[..., run, :]
     rot = None
     if turned is not None:
-        rot = jnp.swapaxes(rotation.matrix(quat), -1, -2) @ turned[..., None, :, :]
+        rot = _product(jnp.swapaxes(rotation.matrix(quat), -1, -2), turned[..., None, :, :])
     gaps = []
     for mine, at in own:
         inside = rotation.rotate_inverse(quat, at[..., None, :] - pos)
@@ -182,10 +182,15 @@ def _gap(mine: Part, at: Array, turned: Array | None, part: Part) -> Array:
         columns = jnp.asarray(part.rot, at.dtype)
         x, y, z = (inside[..., k, None] * columns[k] for k in range(3))
         inside = x + y + z
-        rot = None if turned is None else columns.T @ turned
+        rot = None if turned is None else _product(columns.T, turned)
     if rot is not None and mine.rot is not None:
-        rot = rot @ jnp.asarray(mine.rot, at.dtype)
+        rot = _product(rot, jnp.asarray(mine.rot, at.dtype))
     return distance(mine.shape, part.shape, inside, jnp.eye(3) if rot is None else rot)
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Return ``a @ b`` of 3 x 3 matrices, written out: on a GPU a product may be rounded to 10 bits. (..., 3, 3)"""
+    return jnp.stack([rotation.matvec(a, b[..., k]) for k in range(3)], axis=-1)
 
 
 def _nearest(gaps: list[Array], pos: Array) -> Array:
@@ -214,8 +219,8 @@ def _to_drones(own: Own, turned: Array | None) -> tuple[Array, Array]:
                     gaps.append(distance(mine.shape, part.shape, apart, jnp.eye(3)))
                     continue
                 back = jnp.swapaxes(turned, -1, -2)[..., None, :, :, :]
-                inside = (back @ apart[..., None])[..., 0]
-                rot = back @ jnp.take(turned, some, axis=-3)[..., :, None, :, :]
+                inside = rotation.matvec(back, apart)
+                rot = _product(back, jnp.take(turned, some, axis=-3)[..., :, None, :, :])
                 gaps.append(distance(mine.shape, part.shape, inside, rot))
         gap = jnp.where(some[:, None] == numbers, jnp.inf, _nearest(gaps, own[0][1]))
         return jnp.min(gap, axis=-1), jnp.argmin(gap, axis=-1)
