@@ -1,0 +1,289 @@
+"""Contact response: floor and objects push, brake and bounce drones, instead of the floor that only stops them.
+
+Time stepping on velocities (Moreau 1988; the convex form of Todorov 2014): after a step, impulses at the places that
+touch turn the velocity into one that no longer approaches. What overlaps is pushed apart gently, in a time of its own,
+so that ground is soft and nothing is flung out. A drone is its collision box: each of its corners may touch, and the
+nearest place of the whole box to each object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.effects.core import install
+from crazysim.errors import ConfigError
+from crazysim.geometry import Shape, distance, point_distance
+from crazysim.pytree import PyTree, leaf
+from crazysim.scene.latch import SimulationWithScene
+from crazysim.scene.report import Objects, choose
+from crazysim.scene.solids import Part
+from crazysim.sim.data import SimData
+from crazysim.sim.pipeline import remove_fn
+from crazysim.sim.stage import Stage
+
+NAME = "contact_response"
+"""Name of the stage, and of its record in ``data.plugins``."""
+FLAT = ("plane", "box", "cylinder", "hfield")
+"""Kinds with faces, on which a drone stands by its corners."""
+SLOW = 0.1
+"""Approach below which nothing bounces, m/s: five steps of free fall at 500 Hz."""
+STIFFNESS = 300.0
+"""Penalty of the speed into a surface, in masses: a third of a percent of a bounce is lost, and float32 solves it."""
+STICKING = 1e-4
+"""Slip that counts as none, m/s."""
+FASTEST_PUSH = 0.25
+"""Speed at which overlapping bodies are parted at most, m/s."""
+
+
+class Response(PyTree):
+    """How surfaces answer."""
+
+    friction: Array = leaf("parameter", 1, (1,))
+    """Coulomb's coefficient between drone and surface. (1,)"""
+    restitution: Array = leaf("parameter", 1, (1,))
+    """Speed after a bounce over speed before. (1,)"""
+    softness: Array = leaf("parameter", 1, (1,))
+    """Time in which an overlap is pushed out, s. (1,)"""
+    impulse: Array = leaf("drone", 1)
+    """Impulse of all surfaces in the last step, world frame, N s. (3,)"""
+
+
+def add_contact_response(
+    sim: SimulationWithScene,
+    objects: Objects = None,
+    friction: float = 0.6,
+    restitution: float = 0.2,
+    softness: float = 0.03,
+    iterations: int = 8,
+) -> None:
+    """Let the floor and objects answer when a drone touches them; takes the place of ``clip_floor_pos``.
+
+    Drones do not push each other, and objects are not moved. A drone that stands on the floor has its centre half its
+    collision box above it.
+
+    Args:
+        sim: The simulation.
+        objects: Handles, or names of bodies; None for all there are now, () for the floor alone.
+        friction: Coulomb's coefficient.
+        restitution: Speed after a bounce over speed before, from 0 to 1.
+        softness: Time in which an overlap is pushed out, s; at least a few steps.
+        iterations: Of the solver, for points that touch at once.
+
+    Raises:
+        ConfigError: If it is there already, a number cannot be, or an object is not there or is moved by hand.
+    """
+    limits = {"friction": (friction, np.inf), "restitution": (restitution, 1), "softness": (softness, 10)}
+    for name, (value, most) in limits.items():
+        if not 0 <= value <= most:
+            raise ConfigError(f"{name} is {value}; it must be from 0 to {most}")
+    dt = 1 / sim.data.core.freq
+    if softness < 2 * dt:
+        raise ConfigError(f"softness is {softness} s; pushing out takes two steps at least, {2 * dt:.4g} s")
+    box = np.asarray(sim.airframe.value("shape.collision_box"), np.float64)
+    surfaces = _surfaces(sim, objects)
+
+    def respond(data: SimData) -> SimData:
+        return _respond(data, surfaces, box, iterations)
+
+    ones = jnp.ones(1)
+    record = Response(
+        friction=friction * ones,
+        restitution=restitution * ones,
+        softness=softness * ones,
+        impulse=jnp.zeros((sim.n_worlds, sim.n_drones, 3)),
+    )
+    install(sim, NAME, record, Stage(respond, "drone"), before="increment_steps")
+    if "clip_floor_pos" in sim.step_pipeline:
+        remove_fn(sim.step_pipeline, "clip_floor_pos")
+        sim.build_step_fn()
+
+
+class _Surface(NamedTuple):
+    """A part, and where it is."""
+
+    part: Part
+    place: int | None
+
+
+def _surfaces(sim: SimulationWithScene, objects: Objects) -> list[_Surface]:
+    solids = sim.scene.solids
+    found = [_Surface(part, None) for part in solids.floor]
+    for solid in choose(solids, objects):
+        found += [_Surface(part, solid.place) for part in solid.parts]
+    return found
+
+
+class _Touching(NamedTuple):
+    """Places that touch or may, in the drone's body frame."""
+
+    gap: Array
+    """Distance to the surface, m. (..., n)"""
+    normal: Array
+    """Out of the surface. (..., n, 3)"""
+    point: Array
+    """Where on the drone, from its centre of mass, m. (..., n, 3)"""
+    vel: Array
+    """How fast the surface moves, m/s. (..., n, 3)"""
+
+
+def _places(data: SimData, surfaces: list[_Surface], box: np.ndarray) -> _Touching:
+    pos, quat = data.states.pos, data.states.quat
+    dtype = pos.dtype
+    corners = jnp.asarray(box[:3] + box[3:] * np.array(list(product((-1, 1), repeat=3))), dtype)
+    shape, middle = Shape("box", tuple(box[3:].tolist())), jnp.asarray(box[:3], dtype)
+    turn = quat[..., None, :]
+    in_world = pos[..., None, :] + rotation.rotate(turn, corners)
+    found = []
+    for part, place in surfaces:
+        into, back, vel = _frame(data, part, place)
+        still = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(turn, vel[..., None, :])
+        if part.shape.kind in FLAT:
+            gap, pull = jax.vjp(lambda p, s=part.shape: point_distance(s, p), into(in_world, True))
+            normal = rotation.rotate_inverse(turn, back(pull(jnp.ones_like(gap))[0]))
+            found.append(_Touching(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
+        if part.shape.kind not in ("plane", "hfield"):
+            found.append(_nearest(data, part, into, shape, middle, still[..., :1, :]))
+    return _Touching(*(jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True))))
+
+
+def _nearest(data: SimData, part: Part, into: Callable, shape: Shape, middle: Array, vel: Array) -> _Touching:
+    """Return where the whole box comes nearest to a part.
+
+    The gap's slope by the drone's position is the normal, that by its attitude the lever: their product is all that
+    turns the drone, so the place along the normal matters to friction alone, and is taken on the box's face.
+    """
+    pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
+
+    def gap_at(move: Array, turned: Array) -> Array:
+        q = rotation.turn(quat, turned, normalize=False)
+        at = into(pos + move + rotation.rotate(q, middle), True)
+        columns = [into(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
+        return distance(shape, part.shape, at, jnp.stack(columns, axis=-1))
+
+    gap, pull = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
+    force, torque = pull(jnp.ones_like(gap))
+    normal = rotation.rotate_inverse(quat, force)
+    reach = jnp.sum(jnp.abs(normal) * jnp.asarray(shape.size, pos.dtype), axis=-1, keepdims=True)
+    point = rotation.cross(normal, torque) - reach * normal
+    return _Touching(gap, normal, point, jnp.broadcast_to(vel, normal.shape))
+
+
+def _frame(data: SimData, part: Part, place: int | None) -> tuple[Callable, Callable, Array | None]:
+    """Return what takes points and directions into a part's frame, directions back, and how fast it moves."""
+    dtype = data.states.pos.dtype
+    at = jnp.asarray(part.pos, dtype)
+    rot = None if part.rot is None else jnp.asarray(part.rot, dtype)
+    if place is None:
+        own_pos = own_quat = vel = None
+    else:
+        objects = data.objects
+        own_pos, own_quat, vel = (x[..., place, :] for x in (objects.pos, objects.quat, objects.vel))
+
+    def into(x: Array, is_point: bool) -> Array:
+        if own_quat is not None:
+            x = rotation.rotate_inverse(own_quat[..., None, :], x - own_pos[..., None, :] if is_point else x)
+        x = x - at if is_point else x
+        return x if rot is None else rotation.matvec(rot.T, x)
+
+    def back(x: Array) -> Array:
+        x = x if rot is None else rotation.matvec(rot, x)
+        return x if own_quat is None else rotation.rotate(own_quat[..., None, :], x)
+
+    return into, back, vel
+
+
+def _respond(data: SimData, surfaces: list[_Surface], box: np.ndarray, iterations: int) -> SimData:
+    """Return the data with the velocity after contact.
+
+    The velocity u = (vel, ang_vel) minimises the kinetic energy of the change, plus a stiff penalty for what goes into
+    a surface or slips on it; the penalty for slipping grows no faster than friction can pull (iteratively reweighted
+    least squares). Every iteration solves one linear system of six unknowns.
+    """
+    states, how, params = data.states, data.plugins[NAME], data.params
+    touching = _places(data, surfaces, box)
+    n, p, s = touching.normal, touching.point, touching.vel
+    active = touching.gap < 0
+    before = jnp.concatenate([rotation.rotate_inverse(states.quat, states.vel), states.ang_vel], axis=-1)
+    inertia = _inertia(params.mass, params.J)
+    stiff = STIFFNESS * params.mass
+    row = jnp.concatenate([n, rotation.cross(p, n)], axis=-1)
+    along = jnp.sum(n * s, axis=-1)
+
+    def slip(u: Array) -> tuple[Array, Array]:
+        """Return how fast each place goes out of its surface, and how it slips on it, m/s."""
+        vel = u[..., None, :3] + rotation.cross(u[..., None, 3:], p) - s
+        out = jnp.sum(vel * n, axis=-1)
+        return out, rotation.safe_norm(vel - out[..., None] * n)[..., 0]
+
+    approach = -slip(before)[0]
+    bounce = jnp.where(approach > SLOW, how.restitution * approach, 0.0)
+    wanted = jnp.maximum(bounce, jnp.minimum(-touching.gap / how.softness, FASTEST_PUSH))
+
+    def turn(k: Any, u: Array) -> Array:
+        out, aside = slip(u)
+        pressed = active & (out < wanted)
+        push = jnp.where(pressed, stiff * (wanted - out), 0.0)
+        w_n = jnp.where(pressed, stiff, 0.0)
+        # The first push is of the whole fall at every place: what friction may pull is known from the second on.
+        w_t = jnp.where(k == 0, 0.0, jnp.minimum(w_n, how.friction * push / (aside + STICKING)))
+        rest = w_n - w_t
+        steep = jnp.sum(rest[..., None, None] * row[..., None] * row[..., None, :], axis=-3)
+        matrix = inertia + _tangential(w_t, p) + steep
+        held = w_t[..., None] * jnp.concatenate([s, rotation.cross(p, s)], axis=-1)
+        driven = (rest * along + w_n * wanted)[..., None] * row
+        return _solve(matrix, rotation.matvec(inertia, before) + jnp.sum(held + driven, axis=-2))
+
+    after = jax.lax.fori_loop(0, iterations, turn, before)
+    after = jnp.where(jnp.any(active, axis=-1, keepdims=True), after, before)
+    impulse = params.mass * rotation.rotate(states.quat, after[..., :3] - before[..., :3])
+    states = states.replace(vel=rotation.rotate(states.quat, after[..., :3]), ang_vel=after[..., 3:])
+    return data.replace(states=states, plugins=data.plugins | {NAME: how.replace(impulse=impulse)})
+
+
+def _inertia(mass: Array, inertia: Array) -> Array:
+    """Return mass and moment of inertia as one matrix. (..., 6, 6)"""
+    zero = jnp.zeros_like(inertia)
+    upper = jnp.concatenate([mass[..., None] * jnp.eye(3, dtype=mass.dtype) + zero, zero], axis=-1)
+    return jnp.concatenate([upper, jnp.concatenate([zero, inertia], axis=-1)], axis=-2)
+
+
+def _tangential(weight: Array, p: Array) -> Array:
+    """Return the sum of ``weight * B^T B``, ``B`` from a body's velocity to that of its point ``p``. (..., 6, 6)"""
+    total = jnp.sum(weight, axis=-1)[..., None, None] * jnp.eye(3, dtype=p.dtype)
+    x, y, z = (jnp.sum(weight * p[..., k], axis=-1) for k in range(3))
+    o = jnp.zeros_like(x)
+    cross = jnp.stack([jnp.stack(r, axis=-1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
+    square = jnp.sum(weight * jnp.sum(p * p, axis=-1), axis=-1)[..., None, None] * jnp.eye(3, dtype=p.dtype)
+    turned = square - jnp.sum(weight[..., None, None] * p[..., None] * p[..., None, :], axis=-3)
+    upper = jnp.concatenate([total, -cross], axis=-1)
+    return jnp.concatenate([upper, jnp.concatenate([cross, turned], axis=-1)], axis=-2)
+
+
+def _solve(matrix: Array, b: Array) -> Array:
+    """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive, written out. (..., n)
+
+    Scaled to a unit diagonal first: mass and moments of inertia are four orders apart.
+    """
+    n = b.shape[-1]
+    scale = [jax.lax.rsqrt(matrix[..., k, k]) for k in range(n)]
+    a = [[matrix[..., i, j] * scale[i] * scale[j] for j in range(i + 1)] for i in range(n)]
+    y = [b[..., k] * scale[k] for k in range(n)]
+    low: list[list[Array]] = []
+    for i in range(n):
+        low.append([])
+        for j in range(i):
+            low[i].append((a[i][j] - sum(low[i][k] * low[j][k] for k in range(j))) / low[j][j])
+        low[i].append(jnp.sqrt(a[i][i] - sum(low[i][k] ** 2 for k in range(i))))
+    for i in range(n):
+        y[i] = (y[i] - sum(low[i][k] * y[k] for k in range(i))) / low[i][i]
+    for i in reversed(range(n)):
+        y[i] = (y[i] - sum(low[k][i] * y[k] for k in range(i + 1, n))) / low[i][i]
+    return jnp.stack([y[k] * scale[k] for k in range(n)], axis=-1)
