@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from crazysim.errors import ConfigError
-from crazysim.geometry.points import POINT_DISTANCE, Vector, components, larger, magnitude
+from crazysim.geometry.overlap import convex_distance
+from crazysim.geometry.points import POINT_DISTANCE, Components, components, larger, magnitude
 from crazysim.geometry.shapes import Shape
 from crazysim.rotation import safe_clip, safe_sqrt
 
@@ -65,7 +66,7 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
     if a.kind == "box" and b.kind == "capsule":
         middle, axis = components(_inverse(pos, rot)), components(rot[..., 2, :])
         return segment_to_box(middle, axis, b.size[1], a.size) - b.size[0]
-    raise NotImplementedError
+    return convex_distance(a, b, pos, rot) - (a.size[0] if a.kind == "capsule" else 0.0)
 
 
 def _inverse(pos: Array, rot: Array) -> Array:
@@ -82,7 +83,7 @@ def _reach(shape: Shape, direction: Array) -> Array:
     return shape.size[0] * x + shape.size[1] * y + shape.size[2] * z
 
 
-def segment_to_segment(middle: Vector, axis: Vector, half: float, other_half: float) -> Array:
+def segment_to_segment(middle: Components, axis: Components, half: float, other_half: float) -> Array:
     """Return the distance of a segment to one along z around the origin, m (Ericson 2005, section 5.1.9). (...)
 
     Of parallel segments any pair of nearest points will do, and of nearly parallel ones nearly any: no digit is lost.
@@ -104,7 +105,7 @@ def segment_to_segment(middle: Vector, axis: Vector, half: float, other_half: fl
     return safe_sqrt(x * x + y * y + (z - t) ** 2)
 
 
-def segment_to_box(middle: Vector, axis: Vector, half: float, box: tuple[float, ...]) -> Array:
+def segment_to_box(middle: Components, axis: Components, half: float, box: tuple[float, ...]) -> Array:
     """Return the signed distance of a segment to a box, m. (...)
 
     Outside, the squared distance of a point that runs along the segment has a slope that rises, in straight pieces
@@ -143,7 +144,7 @@ def segment_to_box(middle: Vector, axis: Vector, half: float, box: tuple[float, 
     return jnp.where((inside := _inside_box(middle, axis, half, box)) > 0, safe_sqrt(x * x + y * y + z * z), inside)
 
 
-def _inside_box(middle: Vector, axis: Vector, half: float, box: tuple[float, ...]) -> Array:
+def _inside_box(middle: Components, axis: Components, half: float, box: tuple[float, ...]) -> Array:
     """Return the largest gap of a segment and a box along the normals of their Minkowski difference, m. (...)"""
     c, u = [magnitude(p) for p in middle], [magnitude(d) for d in axis]
     faces = [p - h - half * d for p, h, d in zip(c, box, u, strict=True)]
@@ -157,7 +158,7 @@ def _inside_box(middle: Vector, axis: Vector, half: float, box: tuple[float, ...
     return out
 
 
-def _fixed(vector: Vector) -> Vector:
+def _fixed(vector: Components) -> Components:
     """Return a vector as a constant to derivatives. 3 of (...)"""
     x, y, z = vector
     return lax.stop_gradient(x), lax.stop_gradient(y), lax.stop_gradient(z)

@@ -117,12 +117,31 @@ def _ellipsoid_line(shape: Shape, origin: Array, direction: Array) -> Interval:
     return _ball(start, way, 1.0)
 
 
+def _planes(shape: Shape, v: Array) -> Array:
+    """Return the products of vectors with all normals of a mesh. (..., n_planes)"""
+    assert shape.normals is not None
+    x, y, z = (jnp.asarray(column, v.dtype) for column in shape.normals.T)
+    return x * v[..., :1] + y * v[..., 1:2] + z * v[..., 2:]
+
+
+def _mesh_line(shape: Shape, origin: Array, direction: Array) -> Interval:
+    """Return where a line is below all planes of a mesh (Kay and Kajiya 1986)."""
+    below = jnp.asarray(shape.offsets, origin.dtype) - _planes(shape, origin)
+    rises = _planes(shape, direction)
+    parallel = jnp.abs(rises) < PARALLEL
+    t = below / jnp.where(parallel, 1.0, rises)
+    near = jnp.max(jnp.where(~parallel & (rises < 0), t, -jnp.inf), axis=-1)
+    far = jnp.min(jnp.where(~parallel & (rises > 0), t, jnp.inf), axis=-1)
+    return near, far, (near <= far) & ~jnp.any(parallel & (below < 0), axis=-1)
+
+
 LINE = {
     "sphere": _sphere_line,
     "capsule": _capsule_line,
     "box": _box_line,
     "cylinder": _cylinder_line,
     "ellipsoid": _ellipsoid_line,
+    "mesh": _mesh_line,
 }
 
 
@@ -175,6 +194,12 @@ def _ellipsoid_normal(shape: Shape, point: Array) -> Array:
     return safe_normalize(jnp.stack(gradient, axis=-1), _up(point))
 
 
+def _mesh_normal(shape: Shape, point: Array) -> Array:
+    assert shape.normals is not None
+    above = _planes(shape, point) - jnp.asarray(shape.offsets, point.dtype)
+    return jnp.take(jnp.asarray(shape.normals, point.dtype), jnp.argmax(above, axis=-1), axis=0)
+
+
 NORMAL = {
     "plane": _plane_normal,
     "sphere": _sphere_normal,
@@ -182,4 +207,5 @@ NORMAL = {
     "box": _box_normal,
     "cylinder": _cylinder_normal,
     "ellipsoid": _ellipsoid_normal,
+    "mesh": _mesh_normal,
 }
