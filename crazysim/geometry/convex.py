@@ -14,19 +14,23 @@ among the normals that the body can have, in ``overlap``.
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from crazysim.geometry import support
 from crazysim.geometry.shapes import Shape
-from crazysim.geometry.support import corner, end, reach
-from crazysim.geometry.triangle import open_foot
+from crazysim.geometry.support import end
+from crazysim.geometry.triangle import foot, mean, open_foot
 from crazysim.geometry.vector import Vector, along, margin, select, unit
 
-SEPARATION_STEPS = 24
-"""Steps towards the nearest points of shapes apart: corners, of which polytopes need few and curved shapes more."""
 Best = tuple[Array, Vector]
 """The largest gap so far, m (...), and its direction."""
+Corner = tuple[Vector, list[Array]]
+"""A corner of the Minkowski difference, m, and which point of the segment or box it belongs to, in its frame, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,17 +48,26 @@ class Pair:
 
     def gap(self, n: Vector) -> Array:
         """Return the gap of the two along a unit direction from the other to this, m. (...)"""
-        out = self.place.dot(n) - reach(self.other, n)
+        out = self.place.dot(n) - support.reach(self.other, n)
         for edge, half in zip(self.edges, self.half, strict=True):
             out = out - half * jnp.abs(edge.dot(n))
         return out
 
-    def corner(self, n: Vector) -> Vector:
-        """Return the corner of the Minkowski difference that is nearest along a direction."""
-        point = self.place - corner(self.other, n)
-        for edge, half in zip(self.edges, self.half, strict=True):
-            point = point - edge * end(half, edge.dot(n))
+    def ends(self, n: Vector) -> list[Array]:
+        """Return which point of the segment or box is nearest along a direction, in its own frame, m. (...) each"""
+        return [-end(half, edge.dot(n)) for edge, half in zip(self.edges, self.half, strict=True)]
+
+    def at(self, ends: list[Array]) -> Vector:
+        """Return a point of the segment or box by its place in its own frame."""
+        point = self.place
+        for edge, x in zip(self.edges, ends, strict=True):
+            point = point + edge * x
         return point
+
+    def corner(self, n: Vector) -> Corner:
+        """Return the corner of the Minkowski difference that is nearest along a direction."""
+        ends = self.ends(n)
+        return self.at(ends) - support.corner(self.other, n), ends
 
     def consider(self, n: Vector, best: Best) -> Best:
         """Return the better of a direction and the best so far."""
@@ -67,29 +80,37 @@ def better(new: Best, old: Best) -> Best:
     return jnp.where(larger, new[0], old[0]), select(larger, new[1], old[1])
 
 
-def separate(pair: Pair) -> Best:
-    """Return the direction between the nearest points of two shapes, if they are apart.
+def separate(pair: Pair, n: Vector, steps: int) -> tuple[Best, list[Array]]:
+    """Return the direction between the nearest points of two shapes that are apart, and which point of the first it is.
 
-    A triangle of corners moves towards the origin: the next corner is the one nearest along the direction to the
-    triangle's nearest point, and of the three triangles with it the nearest is kept.
+    A triangle of corners of the Minkowski difference moves towards the origin: the next corner is the nearest along
+    the direction to the triangle's nearest point, and of the three triangles with it the nearest is kept.
+
+    Args:
+        pair: The shapes.
+        n: Direction to begin with.
+        steps: Number of corners to add.
     """
     up = along(2, pair.place.x)
-    n = unit(pair.place, up)
-    first = pair.corner(n)
 
-    def step(_: int, carry: tuple[Vector, ...]) -> tuple[Vector, ...]:
-        p, q, r, nearest, best = carry
+    def step(_: int, carry: Any) -> Any:
+        triangle, nearest, best = carry
         n = unit(nearest, up)
         new = pair.corner(n)
-        size, kept = nearest.dot(nearest), (p, q, r, nearest)
-        for b, c in ((p, q), (q, r), (r, p)):
-            foot = open_foot(new, b, c)
+        size = nearest.dot(nearest)
+        kept = (triangle, nearest)
+        for b, c in ((0, 1), (1, 2), (2, 0)):
+            tried = (new, triangle[b], triangle[c])
+            points = [point for point, _ in tried]
+            foot = mean(open_foot(*points), *points)
             square = foot.dot(foot)
             closer = square < size * (1 - margin(size.dtype))
-            kept = tuple(select(closer, x, y) for x, y in zip((new, b, c, foot), kept, strict=True))
+            kept = jax.tree.map(partial(jnp.where, closer), (tried, foot), kept)
             size = jnp.where(closer, square, size)
-        return (*kept, pair.consider(n, best))  # type: ignore[return-value]
+        return (*kept, pair.consider(n, best))
 
-    start = (first, first, first, first, (pair.gap(n), n))
-    *_, nearest, best = lax.fori_loop(0, SEPARATION_STEPS, step, start)  # type: ignore[arg-type]
-    return pair.consider(unit(nearest, up), best)
+    first = pair.corner(n)
+    triangle, nearest, best = lax.fori_loop(0, steps, step, ((first,) * 3, first[0], (pair.gap(n), n)))
+    shares = foot(*(point for point, _ in triangle))
+    ends = [sum(w * x for w, x in zip(shares, xs, strict=True)) for xs in zip(*(e for _, e in triangle), strict=True)]
+    return pair.consider(unit(nearest, up), best), ends

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from crazysim.geometry.shapes import Shape
-from crazysim.geometry.triangle import foot
+from crazysim.geometry.triangle import foot, mean
 from crazysim.geometry.vector import Vector, vector
 from crazysim.rotation import safe_clip, safe_sqrt
 
@@ -141,7 +141,8 @@ def triangles_distance(place: Vector, a: Vector, b: Vector, c: Vector) -> Array:
     """Return the distance of a point to the nearest of triangles, which are along the last axis of their corners."""
     fixed = lax.stop_gradient(place)
     fixed = Vector(fixed.x[..., None], fixed.y[..., None], fixed.z[..., None])
-    to = foot(a - fixed, b - fixed, c - fixed)
+    a, b, c = a - fixed, b - fixed, c - fixed
+    to = mean(foot(a, b, c), a, b, c)
     nearest = jnp.argmin(to.dot(to), axis=-1)
     is_nearest = jnp.arange(to.x.shape[-1]) == nearest[..., None]
     to = Vector(*(jnp.sum(jnp.where(is_nearest, v, 0.0), axis=-1) for v in (to.x, to.y, to.z)))
