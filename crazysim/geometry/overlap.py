@@ -22,7 +22,7 @@ from crazysim.geometry.vector import Vector, along, select, unit, vector
 
 SEPARATION_STEPS = 16
 """Steps towards the nearest points of shapes apart: corners, of which polytopes need few and curved shapes more."""
-TOUCH_STEPS = 12
+TOUCH_STEPS = 16
 """Steps that go on from the best direction, to where the shapes are nearest or touch."""
 PARTED = 0.02
 """How far shapes are parted for that, as a part of the moving one's half length."""

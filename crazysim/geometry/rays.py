@@ -5,12 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.geometry.fieldrays import PARALLEL, field_ray
 from crazysim.geometry.points import components
 from crazysim.geometry.shapes import Shape
 from crazysim.rotation import safe_clip, safe_normalize, safe_sqrt
-
-PARALLEL = 1e-12
-"""Component of a unit direction below which a ray counts as parallel: its inverse and its square fit float32."""
 
 Interval = tuple[Array, Array, Array]
 """Where a line enters a convex shape, where it leaves it, and whether it meets it at all."""
@@ -20,7 +18,7 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
     """Return how far rays go before they meet the surface, and the outward normal where they do.
 
     As MuJoCo's ``mj_ray`` has it: from inside a solid the ray meets the surface where it leaves, and the normal still
-    points outward; a plane is met from above only.
+    points outward; a plane is met from above only; a height field also at z = 0, where the box below its surface ends.
 
     Args:
         shape: The shape.
@@ -32,6 +30,8 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
         Unit normal in the frame of the shape, zero where it misses. (..., 3)
     """
     origin, direction = jnp.broadcast_arrays(origin, direction)
+    if shape.kind == "hfield":
+        return field_ray(shape, origin, direction)
     if shape.kind == "plane":
         t, hit = _plane(origin, direction)
     else:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from crazysim.geometry import Shape, distance, hull
+from crazysim.geometry import Shape, distance, hfield, hull
 
 SHAPES = {
     "plane": Shape("plane"),
@@ -14,6 +14,7 @@ SHAPES = {
     "box": Shape("box", (0.3, 0.5, 0.2)),
     "cylinder": Shape("cylinder", (0.4, 0.25)),
     "ellipsoid": Shape("ellipsoid", (0.5, 0.3, 0.15)),
+    "hfield": hfield(np.random.default_rng(6).uniform(0, 0.4, (6, 8)), (0.6, 0.5, 0.4, 0.2)),
     "mesh": hull(0.5 * np.random.default_rng(4).normal(size=(14, 3))),
 }
 
@@ -22,6 +23,8 @@ def geom(shape):
     """Return a shape as MuJoCo's XML; a mesh in its own frame, which MuJoCo would move to the centre of mass."""
     if shape.kind == "mesh":
         return '<geom type="mesh" mesh="mesh"/>'
+    if shape.kind == "hfield":
+        return '<geom type="hfield" hfield="field"/>'
     size = "0 0 1" if shape.kind == "plane" else " ".join(map(str, shape.size))
     return f'<geom type="{shape.kind}" size="{size}"/>'
 
@@ -32,7 +35,10 @@ def model(a, b):
     if b.kind == "mesh":
         vertices = " ".join(map(str, b.vertices.ravel()))
         asset = f'<asset><mesh name="mesh" vertex="{vertices}"/></asset>'
-    return mujoco.MjModel.from_xml_string(f"""
+    if b.kind == "hfield":
+        size, (n_rows, n_columns) = " ".join(map(str, b.size)), b.heights.shape
+        asset = f'<asset><hfield name="field" nrow="{n_rows}" ncol="{n_columns}" size="{size}"/></asset>'
+    m = mujoco.MjModel.from_xml_string(f"""
         <mujoco>
           <option ccd_iterations="500" ccd_tolerance="1e-10"/>
           {asset}
@@ -41,6 +47,9 @@ def model(a, b):
             <body mocap="true">{geom(a)}</body>
           </worldbody>
         </mujoco>""")
+    if b.kind == "hfield":
+        m.hfield_data[:] = b.heights.ravel() / b.size[2]
+    return m
 
 
 def distances(a, b, pos, quat):
