@@ -11,6 +11,8 @@ import numpy as np
 from jax import Array, lax
 
 from crazysim.geometry.shapes import Shape
+from crazysim.geometry.triangle import foot, mean
+from crazysim.geometry.vector import Vector, vector
 from crazysim.rotation import safe_clip, safe_sqrt
 
 ELLIPSOID_STEPS = 12
@@ -18,11 +20,11 @@ ELLIPSOID_STEPS = 12
 times another, rounding where it is ten times another."""
 
 
-Vector = tuple[Array, Array, Array]
+Components = tuple[Array, Array, Array]
 """The three components of vectors. 3 of (...)"""
 
 
-def components(x: Array) -> Vector:
+def components(x: Array) -> Components:
     """Return the three components of vectors. 3 of (...)"""
     return x[..., 0], x[..., 1], x[..., 2]
 
@@ -75,21 +77,31 @@ def _cylinder(shape: Shape, point: Array) -> Array:
 
 
 def _ellipsoid(shape: Shape, point: Array) -> Array:
-    """Return the distance to an ellipsoid, by its foot of the perpendicular. (...)
+    """Return the distance to the plane that touches the ellipsoid where the point is nearest. (...)
+
+    Its normal n known to an error e, the distance ``(n.p - |a n|) / |n|`` is known to e^2.
+    """
+    normal = ellipsoid_normal(shape, components(point))
+    along = sum(n * p for n, p in zip(normal, components(point), strict=True))
+    support = jnp.sqrt(sum((a * n) ** 2 for a, n in zip(shape.size, normal, strict=True)))
+    return (along - support) / jnp.sqrt(sum(n * n for n in normal))
+
+
+def ellipsoid_normal(shape: Shape, point: Components) -> Components:
+    """Return the normal of an ellipsoid where it is nearest to a point, of any length. 3 of (...)
 
     The foot of p has the normal w_i = p_i / (t + a_i^2), where t solves |a w| = 1 (Eberly 2013, Distance from a Point
     to an Ellipse, an Ellipsoid, or a Hyperellipsoid). 1 / |a w| is concave in t, so Newton's steps from below never
-    pass the root (Conn, Gould and Toint 2000, section 7.3.3). With w known to an error e, the distance of p to the
-    plane that touches with that normal, ``(w.p - |a w|) / |w|``, is known to e^2.
+    pass the root (Conn, Gould and Toint 2000, section 7.3.3).
 
     What is solved for is s = t + min(a)^2, which is small where the point is near the middle and w would be lost.
     """
     axes = np.asarray(shape.size)
     gaps = (axes**2 - axes.min() ** 2).tolist()
     # A point of the middle plane has two feet: it is moved aside by less than a rounding error.
-    aside = (2 * float(jnp.finfo(point.dtype).eps) * axes).tolist()
-    point_ = [p + jnp.where(p < 0, -e, e) for p, e in zip(components(point), aside, strict=True)]
-    scaled = [a * p for a, p in zip(shape.size, point_, strict=True)]
+    aside = (2 * float(jnp.finfo(point[0].dtype).eps) * axes).tolist()
+    moved = [p + jnp.where(p < 0, -e, e) for p, e in zip(point, aside, strict=True)]
+    scaled = [a * p for a, p in zip(shape.size, moved, strict=True)]
 
     def newton(s: Array, scaled: list[Array]) -> Array:
         inverse = [1 / (s + gap) for gap in gaps]
@@ -104,10 +116,38 @@ def _ellipsoid(shape: Shape, point: Array) -> Array:
         start = larger(start, jnp.abs(x) - gap)
     s = lax.fori_loop(0, ELLIPSOID_STEPS - 1, lambda _, s: newton(s, fixed), start)
     s = newton(s, scaled)  # the last step carries the derivative of the root
-    w = [p / (s + gap) for p, gap in zip(point_, gaps, strict=True)]
-    along = sum(n * p for n, p in zip(w, components(point), strict=True))
-    support = jnp.sqrt(sum((a * n) ** 2 for a, n in zip(shape.size, w, strict=True)))
-    return (along - support) / jnp.sqrt(sum(n * n for n in w))
+    x, y, z = (p / (s + gap) for p, gap in zip(moved, gaps, strict=True))
+    return x, y, z
+
+
+def _mesh(shape: Shape, point: Array) -> Array:
+    """Return the distance to the nearest triangle outside, to the nearest plane inside. (...)
+
+    Where the nearest triangle is, a small move of the point does not move what is nearest on it, to first order.
+    """
+    assert shape.vertices is not None
+    assert shape.faces is not None
+    assert shape.normals is not None
+    assert shape.offsets is not None
+    place = vector(point)
+    nx, ny, nz = (jnp.asarray(column, point.dtype) for column in shape.normals.T)
+    planes = nx * place.x[..., None] + ny * place.y[..., None] + nz * place.z[..., None]
+    inside = jnp.max(planes - jnp.asarray(shape.offsets, point.dtype), axis=-1)
+    corners = [Vector(*jnp.asarray(shape.vertices[shape.faces[:, k]].T, point.dtype)) for k in range(3)]
+    return jnp.where(inside > 0, triangles_distance(place, *corners), inside)
+
+
+def triangles_distance(place: Vector, a: Vector, b: Vector, c: Vector) -> Array:
+    """Return the distance of a point to the nearest of triangles, which are along the last axis of their corners."""
+    fixed = lax.stop_gradient(place)
+    fixed = Vector(fixed.x[..., None], fixed.y[..., None], fixed.z[..., None])
+    a, b, c = a - fixed, b - fixed, c - fixed
+    to = mean(foot(a, b, c), a, b, c)
+    nearest = jnp.argmin(to.dot(to), axis=-1)
+    is_nearest = jnp.arange(to.x.shape[-1]) == nearest[..., None]
+    to = Vector(*(jnp.sum(jnp.where(is_nearest, v, 0.0), axis=-1) for v in (to.x, to.y, to.z)))
+    away = place - lax.stop_gradient(place) - to
+    return safe_sqrt(away.dot(away))
 
 
 POINT_DISTANCE = {
@@ -117,4 +157,5 @@ POINT_DISTANCE = {
     "box": _box,
     "cylinder": _cylinder,
     "ellipsoid": _ellipsoid,
+    "mesh": _mesh,
 }

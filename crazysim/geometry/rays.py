@@ -5,12 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.geometry.fieldrays import PARALLEL, field_ray
 from crazysim.geometry.points import components
 from crazysim.geometry.shapes import Shape
 from crazysim.rotation import safe_clip, safe_normalize, safe_sqrt
-
-PARALLEL = 1e-12
-"""Component of a unit direction below which a ray counts as parallel: its inverse and its square fit float32."""
 
 Interval = tuple[Array, Array, Array]
 """Where a line enters a convex shape, where it leaves it, and whether it meets it at all."""
@@ -20,7 +18,7 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
     """Return how far rays go before they meet the surface, and the outward normal where they do.
 
     As MuJoCo's ``mj_ray`` has it: from inside a solid the ray meets the surface where it leaves, and the normal still
-    points outward; a plane is met from above only.
+    points outward; a plane is met from above only; a height field also at z = 0, where the box below its surface ends.
 
     Args:
         shape: The shape.
@@ -32,6 +30,8 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
         Unit normal in the frame of the shape, zero where it misses. (..., 3)
     """
     origin, direction = jnp.broadcast_arrays(origin, direction)
+    if shape.kind == "hfield":
+        return field_ray(shape, origin, direction)
     if shape.kind == "plane":
         t, hit = _plane(origin, direction)
     else:
@@ -117,12 +117,31 @@ def _ellipsoid_line(shape: Shape, origin: Array, direction: Array) -> Interval:
     return _ball(start, way, 1.0)
 
 
+def _planes(shape: Shape, v: Array) -> Array:
+    """Return the products of vectors with all normals of a mesh. (..., n_planes)"""
+    assert shape.normals is not None
+    x, y, z = (jnp.asarray(column, v.dtype) for column in shape.normals.T)
+    return x * v[..., :1] + y * v[..., 1:2] + z * v[..., 2:]
+
+
+def _mesh_line(shape: Shape, origin: Array, direction: Array) -> Interval:
+    """Return where a line is below all planes of a mesh (Kay and Kajiya 1986)."""
+    below = jnp.asarray(shape.offsets, origin.dtype) - _planes(shape, origin)
+    rises = _planes(shape, direction)
+    parallel = jnp.abs(rises) < PARALLEL
+    t = below / jnp.where(parallel, 1.0, rises)
+    near = jnp.max(jnp.where(~parallel & (rises < 0), t, -jnp.inf), axis=-1)
+    far = jnp.min(jnp.where(~parallel & (rises > 0), t, jnp.inf), axis=-1)
+    return near, far, (near <= far) & ~jnp.any(parallel & (below < 0), axis=-1)
+
+
 LINE = {
     "sphere": _sphere_line,
     "capsule": _capsule_line,
     "box": _box_line,
     "cylinder": _cylinder_line,
     "ellipsoid": _ellipsoid_line,
+    "mesh": _mesh_line,
 }
 
 
@@ -175,6 +194,12 @@ def _ellipsoid_normal(shape: Shape, point: Array) -> Array:
     return safe_normalize(jnp.stack(gradient, axis=-1), _up(point))
 
 
+def _mesh_normal(shape: Shape, point: Array) -> Array:
+    assert shape.normals is not None
+    above = _planes(shape, point) - jnp.asarray(shape.offsets, point.dtype)
+    return jnp.take(jnp.asarray(shape.normals, point.dtype), jnp.argmax(above, axis=-1), axis=0)
+
+
 NORMAL = {
     "plane": _plane_normal,
     "sphere": _sphere_normal,
@@ -182,4 +207,5 @@ NORMAL = {
     "box": _box_normal,
     "cylinder": _cylinder_normal,
     "ellipsoid": _ellipsoid_normal,
+    "mesh": _mesh_normal,
 }

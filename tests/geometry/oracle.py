@@ -1,9 +1,11 @@
 """C MuJoCo's answers to the same questions, one sample after the other, and samples to ask."""
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from crazysim.geometry import Shape
+from crazysim.geometry import Shape, distance, hfield, hull
 
 SHAPES = {
     "plane": Shape("plane"),
@@ -12,25 +14,42 @@ SHAPES = {
     "box": Shape("box", (0.3, 0.5, 0.2)),
     "cylinder": Shape("cylinder", (0.4, 0.25)),
     "ellipsoid": Shape("ellipsoid", (0.5, 0.3, 0.15)),
+    "hfield": hfield(np.random.default_rng(6).uniform(0, 0.4, (6, 8)), (0.6, 0.5, 0.4, 0.2)),
+    "mesh": hull(0.5 * np.random.default_rng(4).normal(size=(14, 3))),
 }
 
 
 def geom(shape):
-    """Return a shape as MuJoCo's XML."""
+    """Return a shape as MuJoCo's XML; a mesh in its own frame, which MuJoCo would move to the centre of mass."""
+    if shape.kind == "mesh":
+        return '<geom type="mesh" mesh="mesh"/>'
+    if shape.kind == "hfield":
+        return '<geom type="hfield" hfield="field"/>'
     size = "0 0 1" if shape.kind == "plane" else " ".join(map(str, shape.size))
     return f'<geom type="{shape.kind}" size="{size}"/>'
 
 
 def model(a, b):
     """Return a model of shape ``b``, which is geom 0 and stays, and shape ``a``, which moves."""
-    return mujoco.MjModel.from_xml_string(f"""
+    asset = ""
+    if b.kind == "mesh":
+        vertices = " ".join(map(str, b.vertices.ravel()))
+        asset = f'<asset><mesh name="mesh" vertex="{vertices}"/></asset>'
+    if b.kind == "hfield":
+        size, (n_rows, n_columns) = " ".join(map(str, b.size)), b.heights.shape
+        asset = f'<asset><hfield name="field" nrow="{n_rows}" ncol="{n_columns}" size="{size}"/></asset>'
+    m = mujoco.MjModel.from_xml_string(f"""
         <mujoco>
           <option ccd_iterations="500" ccd_tolerance="1e-10"/>
+          {asset}
           <worldbody>
             {geom(b)}
             <body mocap="true">{geom(a)}</body>
           </worldbody>
         </mujoco>""")
+    if b.kind == "hfield":
+        m.hfield_data[:] = b.heights.ravel() / b.size[2]
+    return m
 
 
 def distances(a, b, pos, quat):
@@ -132,49 +151,72 @@ def poses(rng, n):
     return places(rng, n), unit(quat)
 
 
-def check_pair(a, b, distance, rng, n, tolerance):
+def judge(a, b):
+    """Return the function of all poses that gives distances, and their gradients by position and by rotation."""
+
+    def total(pos, rot):
+        out = distance(a, b, pos, rot)
+        return jnp.sum(out), out
+
+    of_sum = jax.jit(jax.value_and_grad(total, (0, 1), has_aux=True))
+
+    def answer(pos, rot):
+        (_, value), slopes = of_sum(pos, rot)
+        return tuple(map(np.asarray, (value, *slopes)))
+
+    return answer
+
+
+def check_pair(a, b, rng, n, apart=1e-5, shallow=1e-6, deep=1e-6):
     """Check distances of shapes apart against MuJoCo's, depths against a search of directions, and all signs."""
     pos, quat = poses(rng, n)
-    rot = rotations(quat)
-    found, expected = np.asarray(distance(a, b, pos, rot)), distances(a, b, pos, quat)
-    apart = expected > 0
-    counts = np.sum(apart), np.sum(~apart), np.sum(np.abs(expected) < 0.02)
+    rot, answer = rotations(quat), judge(a, b)
+    (found, by_pos, _), expected = answer(pos, rot), distances(a, b, pos, quat)
+    is_apart = expected > 0
+    counts = np.sum(is_apart), np.sum(~is_apart), np.sum(np.abs(expected) < 0.02)
     assert min(counts) > 0.01 * n, counts
-    np.testing.assert_array_equal(found > 0, apart)
-    np.testing.assert_allclose(found[apart], expected[apart], atol=tolerance)
-    inside = np.flatnonzero(~apart)[:200]
-    if b.kind == "plane":
-        depth = -expected[inside]
-    else:
-        depth = overlaps(a, b, pos[inside], rot[inside], rng)
-    # The search misses the least depth by up to a millimetre; no depth may be below it.
-    slack = 1e-9 if tolerance < 1e-4 else tolerance
-    assert np.max(-found[inside] - depth) < slack
-    assert np.max(depth + found[inside]) < 1e-3
+    np.testing.assert_array_equal(found > 0, is_apart)
+    np.testing.assert_allclose(found[is_apart], expected[is_apart], atol=apart)
+    inside = np.flatnonzero(~is_apart)[:200]
+    depth = -expected[inside] if b.kind == "plane" else overlaps(a, b, pos[inside], rot[inside], rng)
+    # No translation that the search found may be shorter, and ours must part the shapes, or all but.
+    limit = np.where(depth < 0.05, shallow, deep)
+    assert np.all(-found[inside] - depth < limit), np.max(-found[inside] - depth)
+    parted = pos[inside] + by_pos[inside] * (1e-5 - found[inside, None])
+    assert np.min(distances(a, b, parted, quat[inside])) > 0
 
 
-def check_slopes(a, b, distance, rng, n):
-    """Check that gradients equal central differences where these are those of a distance, and are finite."""
-    import jax
-    import jax.numpy as jnp
-
+def check_slopes(a, b, rng, n):
+    """Return by what gradients miss central differences where these are those of a distance; all must be finite."""
     pos, quat = poses(rng, n)
-    rot, h = rotations(quat), 1e-6
+    rot, answer, h = rotations(quat), judge(a, b), 1e-6
     spin = unit(rng.normal(size=(n, 3)))
     cross = np.zeros((n, 3, 3))
     cross[:, [2, 0, 1], [1, 2, 0]], cross[:, [1, 2, 0], [2, 0, 1]] = spin, -spin
-    total = lambda p, r: jnp.sum(distance(a, b, p, r))  # noqa: E731
-    by_pos, by_rot = map(np.asarray, jax.jit(jax.grad(total, (0, 1)))(pos, rot))
+    _, by_pos, by_rot = answer(pos, rot)
     assert np.isfinite(by_pos).all()
     assert np.isfinite(by_rot).all()
     np.testing.assert_array_less(np.linalg.norm(by_pos, axis=1), 1 + 1e-6)
-    steps = h * np.eye(3)[:, None]
-    there, back = (np.asarray(distance(a, b, pos + s * steps, rot)) for s in (1, -1))
-    differences = np.moveaxis(there - back, 0, -1) / (2 * h)
-    smooth = np.abs(np.linalg.norm(differences, axis=1) - 1) < 1e-3
-    there, back = (np.asarray(distance(a, b, pos, rot + s * h * cross @ rot)) for s in (1, -1))
+    sides = np.array([[answer(pos + s * h * e, rot)[0] for e in np.eye(3)] for s in (1, -1)])
+    differences = (sides[0] - sides[1]).T / (2 * h)
+    there, back = (answer(pos, rot + s * h * cross @ rot)[0] for s in (1, -1))
     turning = (there - back) / (2 * h)
+    smooth = np.abs(np.linalg.norm(differences, axis=1) - 1) < 1e-3
     assert np.mean(smooth) > 0.8
     turned = smooth & (np.arange(n) >= n // 5)  # where axes are parallel the distance has a crease
     by_turn = np.sum(by_rot * (cross @ rot), axis=(1, 2))
-    return by_pos[smooth] - differences[smooth], by_turn[turned] - turning[turned]
+    return np.abs(by_pos[smooth] - differences[smooth]).max(axis=1), np.abs(by_turn[turned] - turning[turned])
+
+
+def check_finite(a, b, dtype):
+    """Check that distances and gradients are numbers with centres, faces and edges in line, and far away."""
+    size = np.asarray([*b.size, 0.3, 0.3, 0.3])[:3]
+    grid = np.stack(np.meshgrid(*[[-1.0, 0.0, 0.5, 1.0, 1e4]] * 3), axis=-1).reshape(-1, 3)
+    turns = np.array([[1, 0, 0, 0], [1, 1, 0, 0], [0, 1, 1, 0], [1, 1, 1, 1], [1, 1e-4, 0, 0]], float)
+    reach = size + np.asarray([*a.size, 0.1, 0.1])[:3]
+    pos = np.concatenate([np.repeat(grid * scale, len(turns), axis=0) for scale in (size, reach)])
+    rot = np.tile(rotations(unit(turns)), (2 * len(grid), 1, 1))
+    with jax.enable_x64(dtype == np.float64):
+        for x in judge(a, b)(pos.astype(dtype), rot.astype(dtype)):
+            assert x.dtype == dtype
+            assert np.isfinite(x).all()

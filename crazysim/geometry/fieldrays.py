@@ -1,0 +1,141 @@
+"""Rays to a height field, from cell to cell."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from crazysim.geometry.heightfield import height, spacing
+from crazysim.geometry.shapes import Shape
+from crazysim.geometry.vector import Vector, select, unit, vector
+
+PARALLEL = 1e-12
+"""Component of a unit direction below which a ray counts as parallel: its inverse and its square fit float32."""
+
+Hit = tuple[Array, Vector]
+"""How far a ray goes, m (...), infinite where it misses, and the outward normal of the plane it ends on."""
+
+
+def field_ray(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Array]:
+    """Return how far rays go before they meet the ground, and its outward normal there.
+
+    MuJoCo's height field is a box up to z = 0 with the surface above it and walls between; so is this. From inside a
+    ray ends on the surface, on a wall, or at z = 0, also where the ground goes on below.
+
+    Args:
+        shape: The height field.
+        origin: Where rays start, in its frame, m. (..., 3)
+        direction: Their unit directions. (..., 3)
+
+    Returns:
+        Distance, m, infinite where it misses. (...)
+        Unit normal, zero where it misses. (..., 3)
+    """
+    o, d = vector(lax.stop_gradient(origin)), vector(lax.stop_gradient(direction))
+    t, n = _nearer(_nearer(_base(shape, o, d), _walls(shape, o, d)), _surface(shape, o, d))
+    hit = jnp.isfinite(t)
+    # What is met is flat there: the rest of the way changes with both ends of the ray as that to a plane.
+    reached = o + d * jnp.where(hit, t, 0.0)
+    o, d = vector(origin), vector(direction)
+    across = n.dot(d)
+    safe = hit & (jnp.abs(across) > PARALLEL)
+    moving = n.dot(reached - o) / jnp.where(safe, across, 1.0)
+    exact = jnp.where(safe, moving + lax.stop_gradient(t - moving), t)
+    normal = jnp.stack([n.x, n.y, n.z], axis=-1)
+    return jnp.where(hit, exact, jnp.inf), jnp.where(hit[..., None], normal, 0.0)
+
+
+def _nearer(a: Hit, b: Hit) -> Hit:
+    return jnp.where(a[0] < b[0], a[0], b[0]), select(a[0] < b[0], a[1], b[1])
+
+
+def _faces(half: tuple[float, float], o: Vector, d: Vector) -> list[tuple[Array, Vector, Array, Array]]:
+    """Return for the planes of the four walls: how far, outward normal, and the two places along the wall and z."""
+    zero = jnp.zeros_like(o.x)
+    out = []
+    for side in (-1.0, 1.0):
+        for k, (p, v, h) in enumerate(((o.x, d.x, half[0]), (o.y, d.y, half[1]))):
+            crosses = jnp.abs(v) > PARALLEL
+            t = (side * h - p) / jnp.where(crosses, v, 1.0)
+            n = Vector(zero + side, zero, zero) if k == 0 else Vector(zero, zero + side, zero)
+            along = o.y + t * d.y if k == 0 else o.x + t * d.x
+            within = crosses & (t >= 0) & (jnp.abs(along) <= half[1 - k])
+            out.append((jnp.where(within, t, jnp.inf), n, o.x + t * d.x, o.y + t * d.y))
+    return out
+
+
+def _base(shape: Shape, o: Vector, d: Vector) -> Hit:
+    """Return where rays meet the box below z = 0."""
+    x_half, y_half, _, base = shape.size
+    zero = jnp.zeros_like(o.x)
+    hit = (zero + jnp.inf, Vector(zero, zero, zero))
+    for t, n, _, _ in _faces((x_half, y_half), o, d):
+        z = o.z + jnp.where(jnp.isfinite(t), t, 0.0) * d.z
+        hit = _nearer((jnp.where((z <= 0) & (z >= -base), t, jnp.inf), n), hit)
+    crosses = jnp.abs(d.z) > PARALLEL
+    for level, up in ((0.0, 1.0), (-base, -1.0)):
+        t = (level - o.z) / jnp.where(crosses, d.z, 1.0)
+        within = crosses & (t >= 0) & (jnp.abs(o.x + t * d.x) <= x_half) & (jnp.abs(o.y + t * d.y) <= y_half)
+        hit = _nearer((jnp.where(within, t, jnp.inf), Vector(zero, zero, zero + up)), hit)
+    return hit
+
+
+def _walls(shape: Shape, o: Vector, d: Vector) -> Hit:
+    """Return where rays meet the walls between z = 0 and the surface."""
+    zero = jnp.zeros_like(o.x)
+    hit = (zero + jnp.inf, Vector(zero, zero, zero))
+    for t, n, x, y in _faces(shape.size[:2], o, d):  # type: ignore[arg-type]
+        z = o.z + jnp.where(jnp.isfinite(t), t, 0.0) * d.z
+        x, y = jnp.clip(x, -shape.size[0], shape.size[0]), jnp.clip(y, -shape.size[1], shape.size[1])
+        hit = _nearer((jnp.where((z >= 0) & (z <= height(shape, x, y, o)), t, jnp.inf), n), hit)
+    return hit
+
+
+def _surface(shape: Shape, o: Vector, d: Vector) -> Hit:
+    """Return where rays meet the triangles, by going through the cells that they pass over, in order."""
+    assert shape.heights is not None
+    n_rows, n_columns = shape.heights.shape
+    heights = jnp.asarray(shape.heights, o.x.dtype)
+    side_x, side_y = spacing(shape)
+    # In cells: the place of the origin and the way per metre.
+    u, v = (o.x + shape.size[0]) / side_x, (o.y + shape.size[1]) / side_y
+    du, dv = d.x / side_x, d.y / side_y
+    start = jnp.zeros_like(o.x)
+    for p, step, n in ((u, du, n_columns - 1), (v, dv, n_rows - 1)):
+        moves = jnp.abs(step) > PARALLEL
+        enters = (jnp.where(step > 0, 0.0, float(n)) - p) / jnp.where(moves, step, 1.0)
+        start = jnp.where(moves & (enters > start), enters, start)
+    column = jnp.clip(jnp.floor(u + start * du), 0, n_columns - 2).astype(jnp.int32)
+    row = jnp.clip(jnp.floor(v + start * dv), 0, n_rows - 2).astype(jnp.int32)
+    slack = 1e-5 if o.x.dtype == jnp.float32 else 1e-10
+
+    def cell(_: int, carry: tuple[Array, Array, Hit]) -> tuple[Array, Array, Hit]:
+        column, row, hit = carry
+        inside = (column >= 0) & (column <= n_columns - 2) & (row >= 0) & (row <= n_rows - 2)
+        i, j = jnp.clip(row, 0, n_rows - 2), jnp.clip(column, 0, n_columns - 2)
+        a, b, c, e = heights[i, j], heights[i, j + 1], heights[i + 1, j + 1], heights[i + 1, j]
+        x, y = u - j.astype(u.dtype), v - i.astype(v.dtype)
+        for rise_x, rise_y, right in ((b - a, c - b, 1.0), (c - e, e - a, -1.0)):
+            # How high the ray is above the triangle's plane, and how fast it sinks towards it.
+            above, sinks = o.z - a - rise_x * x - rise_y * y, rise_x * du + rise_y * dv - d.z
+            meets = jnp.abs(sinks) > PARALLEL
+            t = above / jnp.where(meets, sinks, 1.0)
+            at_x, at_y = x + t * du, y + t * dv
+            on = (at_x >= -slack) & (at_x <= 1 + slack) & (at_y >= -slack) & (at_y <= 1 + slack)
+            on = on & (right * (at_x - at_y) >= -slack) & meets & inside & (t >= 0)
+            n = Vector(-rise_x / side_x, -rise_y / side_y, jnp.ones_like(t))
+            hit = _nearer((jnp.where(on, t, jnp.inf), n), hit)
+        # On to the neighbour whose border is nearer.
+        right, up = du > 0, dv > 0
+        moves_x, moves_y = jnp.abs(du) > PARALLEL, jnp.abs(dv) > PARALLEL
+        t_x = jnp.where(moves_x, (jnp.where(right, 1.0, 0.0) - x) / jnp.where(moves_x, du, 1.0), jnp.inf)
+        t_y = jnp.where(moves_y, (jnp.where(up, 1.0, 0.0) - y) / jnp.where(moves_y, dv, 1.0), jnp.inf)
+        by_x = t_x <= t_y
+        column = jnp.where(inside & by_x, column + jnp.where(right, 1, -1), column)
+        row = jnp.where(inside & ~by_x, row + jnp.where(up, 1, -1), row)
+        return column, row, hit
+
+    zero = jnp.zeros_like(o.x)
+    none = (zero + jnp.inf, Vector(zero, zero, zero + 1))
+    _, _, (t, n) = lax.fori_loop(0, n_rows + n_columns - 2, cell, (column, row, none))
+    return t, unit(n, n)

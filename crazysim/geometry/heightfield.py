@@ -1,0 +1,155 @@
+"""Distances and rays of a height field: the solid below triangles over a grid, with walls and a bottom.
+
+The triangles looked at are those of the cells near a point, however large the grid. They are found by numbers that
+are known at run time only, which the project's own engine reads up to 64 of: on larger grids it runs as plain XLA.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from crazysim.geometry.points import larger, triangles_distance
+from crazysim.geometry.segments import segment_to_box
+from crazysim.geometry.shapes import Shape
+from crazysim.geometry.vector import Vector, vector
+from crazysim.rotation import safe_clip, safe_sqrt
+
+
+def spacing(shape: Shape) -> tuple[float, float]:
+    """Return the sides of a cell along x and y, m."""
+    assert shape.heights is not None
+    n_rows, n_columns = shape.heights.shape
+    return 2 * shape.size[0] / (n_columns - 1), 2 * shape.size[1] / (n_rows - 1)
+
+
+def field_distance(shape: Shape, point: Array, reach: float = 0.0) -> Array:
+    """Return the signed distance of a point to the ground, m. (...)
+
+    Looked at are the cell below the point and all within ``reach`` of it, one at least: up to there, below zero as
+    above, the distance is exact; a larger one is that to the nearest of these cells, an upper bound. Its sign is
+    always right.
+
+    Args:
+        shape: The height field.
+        point: Points in its frame, m. (..., 3)
+        reach: Up to which distance it is exact, m; never less than a side of a cell.
+    """
+    place = vector(point)
+    x_half, y_half, _, base = shape.size
+    grid = corners(shape, place, reach)
+    surface = triangles_distance(place, *triangles(grid))
+    # Beside and below the solid, and inside it, its walls and its bottom count too.
+    qx, qy = safe_clip(place.x, -x_half, x_half), safe_clip(place.y, -y_half, y_half)
+    below = place.z < height(shape, lax.stop_gradient(qx), lax.stop_gradient(qy), place)
+    dx, dy, dz = place.x - qx, place.y - qy, larger(-base - place.z, 0.0)
+    beside = safe_sqrt(dx * dx + dy * dy + dz * dz)
+    wall = larger(larger(place.x - x_half, -x_half - place.x), larger(place.y - y_half, -y_half - place.y))
+    wall = larger(wall, -base - place.z)
+    inside = larger(-surface, wall)
+    return jnp.where(below, jnp.where(wall < 0, inside, beside), surface)
+
+
+def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array) -> Array:
+    """Return the signed distance of a box, or of a segment, to the ground, m. (...)
+
+    Apart, the nearest points are a corner of the box and a point of the ground, or a point of the box and one on an
+    edge of the ground: exact up to the diagonal of the box and beyond it an upper bound. Overlapping, the depth is
+    that of the deepest corner, or what parts the box from the deepest edge, whichever is more: it is not the shortest
+    translation out of all triangles at once.
+
+    Args:
+        half: Half lengths of the box, m; zeros for a segment. 3 numbers
+        shape: The height field.
+        pos: Position of the centre of the box in the frame of the field, m. (..., 3)
+        rot: Rotation matrix from the frame of the box to that of the field. (..., 3, 3)
+    """
+    size = math.sqrt(sum(h * h for h in half))
+    signs = np.stack(np.meshgrid(*[[-1.0, 1.0] if h else [0.0] for h in half], indexing="ij"), axis=-1).reshape(-1, 3)
+    ends = jnp.asarray(signs * np.asarray(half), pos.dtype)
+    tips = pos[..., None, :] + sum(rot[..., None, :, k] * ends[:, k, None] for k in range(3))
+    out = jnp.min(field_distance(shape, tips, size), axis=-1)
+    grid = corners(shape, vector(lax.stop_gradient(pos)), 2 * size)
+    axes = [vector(rot[..., k]) for k in range(3)]
+    place = vector(pos)
+    for a, b in edges(grid):
+        middle, along = (a + b) * 0.5, b - a
+        length = jnp.sqrt(along.dot(along))
+        away = Vector(*(m - p[..., None] for m, p in ((middle.x, place.x), (middle.y, place.y), (middle.z, place.z))))
+        wide = [Vector(axis.x[..., None], axis.y[..., None], axis.z[..., None]) for axis in axes]
+        x, y, z = (away.dot(axis) for axis in wide)
+        u, v, w = (along.dot(axis) / length for axis in wide)
+        out = jnp.where((d := jnp.min(segment_to_box((x, y, z), (u, v, w), 0.5 * length, half), axis=-1)) < out, d, out)
+    return out
+
+
+def corners(shape: Shape, place: Vector, reach: float) -> Vector:
+    """Return the corners of the cells within reach of a point, which carry no derivative. (..., n_y + 1, n_x + 1)"""
+    assert shape.heights is not None
+    heights = shape.heights
+    starts, counts = [], []
+    for position, half, side, n in (
+        (place.y, shape.size[1], spacing(shape)[1], heights.shape[0] - 1),
+        (place.x, shape.size[0], spacing(shape)[0], heights.shape[1] - 1),
+    ):
+        around = max(1, math.ceil(reach / side))
+        count = min(n, 2 * around + 1)
+        cell = jnp.floor((lax.stop_gradient(position) + half) / side).astype(jnp.int32)
+        starts.append(jnp.clip(cell - around, 0, n - count))
+        counts.append(count + 1)
+    rows = starts[0][..., None, None] + jnp.arange(counts[0])[:, None]
+    columns = starts[1][..., None, None] + jnp.arange(counts[1])
+    rows, columns = jnp.broadcast_arrays(rows, columns)
+    dtype = place.x.dtype
+    side_x, side_y = spacing(shape)
+    z = jnp.asarray(heights, dtype)[rows, columns]
+    return Vector(columns.astype(dtype) * side_x - shape.size[0], rows.astype(dtype) * side_y - shape.size[1], z)
+
+
+def triangles(grid: Vector) -> tuple[Vector, Vector, Vector]:
+    """Return the corners of both triangles of every cell, in a row. 3 of (..., n_triangles)"""
+
+    def part(rows: slice, columns: slice) -> list[Array]:
+        return [v[..., rows, columns].reshape(*v.shape[:-2], -1) for v in (grid.x, grid.y, grid.z)]
+
+    low, high = slice(None, -1), slice(1, None)
+    a, b, c, d = part(low, low), part(low, high), part(high, high), part(high, low)
+
+    def join(p: list[Array], q: list[Array]) -> Vector:
+        return Vector(*(jnp.concatenate(pair, axis=-1) for pair in zip(p, q, strict=True)))
+
+    return join(a, a), join(b, c), join(c, d)
+
+
+def edges(grid: Vector) -> list[tuple[Vector, Vector]]:
+    """Return the ends of the edges along x, along y and along the diagonals of cells. 3 of (..., n_edges)"""
+    every, low, high = slice(None), slice(None, -1), slice(1, None)
+
+    def part(rows: slice, columns: slice) -> Vector:
+        return Vector(*(v[..., rows, columns].reshape(*v.shape[:-2], -1) for v in (grid.x, grid.y, grid.z)))
+
+    pairs = (((every, low), (every, high)), ((low, every), (high, every)), ((low, low), (high, high)))
+    return [(part(*a), part(*b)) for a, b in pairs]
+
+
+def height(shape: Shape, x: Array, y: Array, like: Vector) -> Array:
+    """Return the height of the surface at places within the field, m. (...)"""
+    grid_x, grid_y, along_x, along_y, origin = plane_at(shape, x, y, like)
+    return origin + along_x * grid_x + along_y * grid_y
+
+
+def plane_at(shape: Shape, x: Array, y: Array, like: Vector) -> tuple[Array, Array, Array, Array, Array]:
+    """Return where in its cell a place is, 0 to 1, the rises of its triangle along the cell, and its start, m. (...)"""
+    assert shape.heights is not None
+    heights = jnp.asarray(shape.heights, like.x.dtype)
+    side_x, side_y = spacing(shape)
+    u, v = (x + shape.size[0]) / side_x, (y + shape.size[1]) / side_y
+    column = jnp.clip(jnp.floor(u), 0, heights.shape[1] - 2).astype(jnp.int32)
+    row = jnp.clip(jnp.floor(v), 0, heights.shape[0] - 2).astype(jnp.int32)
+    u, v = u - column.astype(u.dtype), v - row.astype(v.dtype)
+    a, b, c, d = (heights[row + i, column + j] for i, j in ((0, 0), (0, 1), (1, 1), (1, 0)))
+    right = u > v
+    return u, v, jnp.where(right, b - a, c - d), jnp.where(right, c - b, d - a), a

@@ -1,0 +1,93 @@
+"""Distances of segments: to another segment, and to a box."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from crazysim.geometry.points import Components, larger, magnitude
+from crazysim.rotation import safe_clip, safe_sqrt
+
+PARALLEL = 1e-12
+"""Square of a sine below which two directions count as parallel."""
+
+
+def segment_to_segment(middle: Components, axis: Components, half: float, other_half: float) -> Array:
+    """Return the distance of a segment to one along z around the origin, m (Ericson 2005, section 5.1.9). (...)
+
+    Of parallel segments any pair of nearest points will do, and of nearly parallel ones nearly any: no digit is lost.
+
+    Args:
+        middle: Its middle, m. 3 of (...)
+        axis: Its unit direction. 3 of (...)
+        half: Its half length, m.
+        other_half: Half length of the other, m.
+    """
+    (cx, cy, cz), (x, y, z) = map(_fixed, (middle, axis))
+    across = x * x + y * y
+    s = -(cx * x + cy * y) / jnp.where(across > PARALLEL, across, 1.0)
+    s = safe_clip(jnp.where(across > PARALLEL, s, 0.0), -half, half)
+    t = safe_clip(cz + s * z, -other_half, other_half)
+    s = safe_clip(t * z - (cx * x + cy * y + cz * z), -half, half)
+    # The nearest points of lines are where a small move of either changes nothing: they may count as fixed.
+    x, y, z = (c + s * a for c, a in zip(middle, axis, strict=True))
+    return safe_sqrt(x * x + y * y + (z - t) ** 2)
+
+
+def segment_to_box(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
+    """Return the signed distance of a segment to a box, m. (...)
+
+    Outside, the squared distance of a point that runs along the segment has a slope that rises, in straight pieces
+    between the places where it passes a side's plane; the root lies between the last place of negative and the first
+    of positive slope. Inside, the shortest way out is along a normal of one of the faces of the two bodies' Minkowski
+    difference: the box's own, and those across one of its edges and the segment (Gottschalk 1996).
+
+    Args:
+        middle: Middle of the segment in the frame of the box, m. 3 of (...)
+        axis: Its unit direction. 3 of (...)
+        half: Its half length, m.
+        box: Half lengths of the box, m.
+    """
+    c, u = _fixed(middle), _fixed(axis)
+
+    def slope(t: Array) -> Array:
+        at = [p + t * d for p, d in zip(c, u, strict=True)]
+        return sum(d * (p - jnp.clip(p, -h, h)) for d, p, h in zip(u, at, box, strict=True))  # type: ignore[return-value]
+
+    low, high = 0 * c[0] - half, 0 * c[0] + half
+    low_slope, high_slope = slope(low), slope(high)
+    for p, d, h in zip(c, u, box, strict=True):
+        crosses = d * d > PARALLEL
+        inverse = 1 / jnp.where(crosses, d, 1.0)
+        for side in (-h, h):
+            t = jnp.where(crosses, jnp.clip((side - p) * inverse, -half, half), 0.0)
+            here = slope(t)
+            falls, rises = (here <= 0) & (t > low), (here >= 0) & (t < high)
+            low, low_slope = jnp.where(falls, t, low), jnp.where(falls, here, low_slope)
+            high, high_slope = jnp.where(rises, t, high), jnp.where(rises, here, high_slope)
+    rise = high_slope - low_slope
+    between = (low_slope < 0) & (high_slope > 0)
+    t = low + (high - low) * jnp.where(between, -low_slope / jnp.where(between, rise, 1.0), 0.0)
+    t = jnp.where(high_slope < 0, high, t)
+    x, y, z = (larger(magnitude(p + t * d) - h, 0.0) for p, d, h in zip(middle, axis, box, strict=True))
+    return jnp.where((inside := _inside_box(middle, axis, half, box)) > 0, safe_sqrt(x * x + y * y + z * z), inside)
+
+
+def _inside_box(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
+    """Return the largest gap of a segment and a box along the normals of their Minkowski difference, m. (...)"""
+    c, u = [magnitude(p) for p in middle], [magnitude(d) for d in axis]
+    faces = [p - h - half * d for p, h, d in zip(c, box, u, strict=True)]
+    out = larger(larger(faces[0], faces[1]), faces[2])
+    for i, j in ((1, 2), (2, 0), (0, 1)):
+        square = axis[i] * axis[i] + axis[j] * axis[j]
+        crosses = square > PARALLEL
+        gap = magnitude(middle[j] * axis[i] - middle[i] * axis[j]) - box[i] * u[j] - box[j] * u[i]
+        gap = gap / safe_sqrt(jnp.where(crosses, square, 1.0))
+        out = jnp.where(crosses & (gap > out), gap, out)
+    return out
+
+
+def _fixed(vector: Components) -> Components:
+    """Return a vector as a constant to derivatives. 3 of (...)"""
+    x, y, z = vector
+    return lax.stop_gradient(x), lax.stop_gradient(y), lax.stop_gradient(z)

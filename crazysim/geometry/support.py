@@ -1,0 +1,105 @@
+"""How far convex shapes reach along a direction, and their farthest corners.
+
+A corner is chosen by the sign of a number that is often zero but for rounding: two sides are parallel, or a face looks
+back along the direction. A compiler that computes such a number twice, rounded differently, would mix two corners into
+a point outside the shape. So within a small angle of a tie the corner runs from one to the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from crazysim.geometry.shapes import Shape
+from crazysim.geometry.vector import Vector
+
+
+def sharpness(dtype: jnp.dtype) -> float:
+    """Return one over the angle, rad, within which two corners count as equally far; far above rounding."""
+    return 1e3 if dtype == jnp.float32 else 1e7
+
+
+def end(half: float, along: Array) -> Array:
+    """Return which end of a segment lies along a direction, by its component, m. (...)"""
+    return half * jnp.clip(along * sharpness(along.dtype), -1.0, 1.0)
+
+
+def reach(shape: Shape, n: Vector) -> Array:
+    """Return how far a shape reaches along a unit direction from its origin, m. (...)"""
+    return REACH[shape.kind](shape, n)
+
+
+def corner(shape: Shape, n: Vector) -> Vector:
+    """Return the point of a shape that is farthest along a direction, or nearly."""
+    return CORNER[shape.kind](shape, n)
+
+
+def _box_reach(shape: Shape, n: Vector) -> Array:
+    a, b, c = shape.size
+    return a * jnp.abs(n.x) + b * jnp.abs(n.y) + c * jnp.abs(n.z)
+
+
+def _box_corner(shape: Shape, n: Vector) -> Vector:
+    a, b, c = shape.size
+    return Vector(end(a, n.x), end(b, n.y), end(c, n.z))
+
+
+def _cylinder_reach(shape: Shape, n: Vector) -> Array:
+    radius, half = shape.size
+    square = n.x * n.x + n.y * n.y
+    return radius * jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0) + half * jnp.abs(n.z)
+
+
+def _cylinder_corner(shape: Shape, n: Vector) -> Vector:
+    radius, half = shape.size
+    square = n.x * n.x + n.y * n.y
+    tie = 1 / sharpness(square.dtype) ** 2
+    scale = radius * lax.rsqrt(jnp.where(square > tie, square, tie))
+    return Vector(n.x * scale, n.y * scale, end(half, n.z))
+
+
+def _ellipsoid_reach(shape: Shape, n: Vector) -> Array:
+    a, b, c = shape.size
+    return jnp.sqrt((a * n.x) ** 2 + (b * n.y) ** 2 + (c * n.z) ** 2)
+
+
+def _ellipsoid_corner(shape: Shape, n: Vector) -> Vector:
+    a, b, c = shape.size
+    scale = 1 / _ellipsoid_reach(shape, n)
+    return Vector(a * a * scale * n.x, b * b * scale * n.y, c * c * scale * n.z)
+
+
+def _mesh_products(shape: Shape, n: Vector) -> tuple[Array, list[Array]]:
+    assert shape.vertices is not None
+    x, y, z = (jnp.asarray(column, n.x.dtype) for column in shape.vertices.T)
+    return x * n.x[..., None] + y * n.y[..., None] + z * n.z[..., None], [x, y, z]
+
+
+def _mesh_reach(shape: Shape, n: Vector) -> Array:
+    return jnp.max(_mesh_products(shape, n)[0], axis=-1)
+
+
+def _mesh_corner(shape: Shape, n: Vector) -> Vector:
+    """Return the farthest corner, or a mean of those that tie: it takes no index."""
+    products, columns = _mesh_products(shape, n)
+    assert shape.vertices is not None
+    behind = jnp.max(products, axis=-1, keepdims=True) - products
+    weight = jnp.clip(1 - behind * (sharpness(behind.dtype) / float(abs(shape.vertices).max())), 0.0, 1.0)
+    share = 1 / jnp.sum(weight, axis=-1)
+    return Vector(*(jnp.sum(weight * v, axis=-1) * share for v in columns))
+
+
+REACH: dict[str, Callable[[Shape, Vector], Array]] = {
+    "box": _box_reach,
+    "cylinder": _cylinder_reach,
+    "ellipsoid": _ellipsoid_reach,
+    "mesh": _mesh_reach,
+}
+CORNER: dict[str, Callable[[Shape, Vector], Vector]] = {
+    "box": _box_corner,
+    "cylinder": _cylinder_corner,
+    "ellipsoid": _ellipsoid_corner,
+    "mesh": _mesh_corner,
+}

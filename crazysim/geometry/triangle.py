@@ -1,0 +1,58 @@
+"""The point of a triangle that is nearest to the origin."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.geometry.vector import Vector, margin
+
+THIN = 1e-10
+"""Square of the sine below which a triangle has no normal: what float32 leaves of it is rounding."""
+
+
+Weights = tuple[Array, Array, Array]
+"""Shares of three corners in a point of their triangle, which add up to one. 3 of (...)"""
+
+
+def mean(weights: Weights, a: Vector, b: Vector, c: Vector) -> Vector:
+    """Return the point of a triangle that has these shares of its corners: rounding never leaves the triangle."""
+    u, v, w = weights
+    return a * u + b * v + c * w
+
+
+def foot(a: Vector, b: Vector, c: Vector) -> Weights:
+    """Return the point of a triangle nearest to the origin, by its shares of the corners."""
+    t = _along(b, c - b)
+    on_third, rest = (jnp.zeros_like(t), 1 - t, t), open_foot(a, b, c)
+    return _nearer(on_third, rest, a, b, c)
+
+
+def open_foot(a: Vector, b: Vector, c: Vector) -> Weights:
+    """Return the same, unless it is on the side from ``b`` to ``c``."""
+    ab, ac = b - a, c - a
+    s, t = _along(a, ab), _along(a, ac)
+    on_side = _nearer((1 - t, jnp.zeros_like(t), t), (1 - s, s, jnp.zeros_like(s)), a, b, c)
+    normal = ab.cross(ac)
+    u, v, w = normal.dot(b.cross(c)), normal.dot(c.cross(a)), normal.dot(a.cross(b))
+    inside = (u > 0) & (v > 0) & (w > 0) & (normal.dot(normal) > THIN * ab.dot(ab) * ac.dot(ac))
+    share = 1 / jnp.where(inside, u + v + w, 1.0)
+    return _choose(inside, (u * share, v * share, w * share), on_side)
+
+
+def _along(a: Vector, side: Vector) -> Array:
+    """Return how far along the segment from ``a`` to ``a + side`` the origin is nearest, from 0 to 1. (...)"""
+    square = side.dot(side)
+    return jnp.clip(-a.dot(side) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
+
+
+def _nearer(new: Weights, old: Weights, a: Vector, b: Vector, c: Vector) -> Weights:
+    """Return which of two points is nearer to the origin; of two that tie, the old."""
+    p, q = mean(new, a, b, c), mean(old, a, b, c)
+    square = q.dot(q)
+    return _choose(p.dot(p) < square * (1 - margin(square.dtype)), new, old)
+
+
+def _choose(condition: Array, new: Weights, old: Weights) -> Weights:
+    u, v, w = (jnp.where(condition, x, y) for x, y in zip(new, old, strict=True))
+    return u, v, w

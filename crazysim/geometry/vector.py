@@ -1,0 +1,83 @@
+"""A vector as its three components, each an array of any shape.
+
+Without an axis of length three there is nothing but element-wise arithmetic, which fuses, and no small sum over an
+axis: XLA for the CPU, as of JAX 0.10.1, gave wrong float32 numbers for such sums inside the loops of ``convex``.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from crazysim.pytree import PyTree
+
+
+class Vector(PyTree):
+    """A vector in components."""
+
+    x: Array
+    """(...)"""
+    y: Array
+    """(...)"""
+    z: Array
+    """(...)"""
+
+    def __add__(self, other: Vector) -> Vector:
+        """Return the sum."""
+        return Vector(self.x + other.x, self.y + other.y, self.z + other.z)
+
+    def __sub__(self, other: Vector) -> Vector:
+        """Return the difference."""
+        return Vector(self.x - other.x, self.y - other.y, self.z - other.z)
+
+    def __neg__(self) -> Vector:
+        """Return the opposite."""
+        return Vector(-self.x, -self.y, -self.z)
+
+    def __mul__(self, factor: Array | float) -> Vector:
+        """Return the vector times a number. (...)"""
+        return Vector(self.x * factor, self.y * factor, self.z * factor)
+
+    def dot(self, other: Vector) -> Array:
+        """Return the scalar product. (...)"""
+        return self.x * other.x + self.y * other.y + self.z * other.z
+
+    def cross(self, other: Vector) -> Vector:
+        """Return the vector product."""
+        return Vector(
+            self.y * other.z - self.z * other.y,
+            self.z * other.x - self.x * other.z,
+            self.x * other.y - self.y * other.x,
+        )
+
+
+def vector(x: Array) -> Vector:
+    """Return vectors from their arrays. (..., 3)"""
+    return Vector(x[..., 0], x[..., 1], x[..., 2])
+
+
+def along(axis: int, like: Array) -> Vector:
+    """Return the unit vector along an axis, for as many as a number has. (...)"""
+    zero = jnp.zeros_like(like)
+    return Vector(*(zero + 1 if k == axis else zero for k in range(3)))
+
+
+def select(condition: Array, a: Vector, b: Vector) -> Vector:
+    """Return one vector where a condition holds, elsewhere another."""
+    return Vector(*(jnp.where(condition, p, q) for p, q in ((a.x, b.x), (a.y, b.y), (a.z, b.z))))
+
+
+def unit(v: Vector, otherwise: Vector, least: float = 0.0) -> Vector:
+    """Return a vector scaled to length one, or another where its squared length is not above the least."""
+    square = v.dot(v)
+    long = square > least
+    return select(long, v * lax.rsqrt(jnp.where(long, square, 1.0)), otherwise)
+
+
+def margin(dtype: jnp.dtype) -> float:
+    """Return by which part a number must exceed another to count as larger, however each of them was rounded.
+
+    A compiler may compute a comparison for each component of a selected vector anew, and round it differently: of two
+    vectors that tie it would make a mixture.
+    """
+    return 1e-5 if dtype == jnp.float32 else 1e-12
