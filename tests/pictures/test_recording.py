@@ -25,10 +25,13 @@ def build(n_worlds=3, **options):
 
 @pytest.fixture(scope="module")
 def sim():
-    """Its balls are 0, 1 and 2 m east."""
+    """Its balls are 0, 1 and 2 m east, and rolled."""
     sim = build()
     k = sim.mj_model.body("ball").mocapid.item()
-    sim.mjx_data = sim.mjx_data.replace(mocap_pos=sim.mjx_data.mocap_pos.at[:, k, 0].set(jnp.arange(3.0)))
+    sim.mjx_data = sim.mjx_data.replace(
+        mocap_pos=sim.mjx_data.mocap_pos.at[:, k, 0].set(jnp.arange(3.0)),
+        mocap_quat=sim.mjx_data.mocap_quat.at[:, k].set(jnp.asarray(np.roll(ROLL[1], 1))),
+    )
     return sim
 
 
@@ -58,6 +61,7 @@ def test_it_has_what_was_flown(flight):
     np.testing.assert_allclose(flight.quat[:, 0, 1], ROLL, atol=1e-7)
     assert (flight.pos[:, 1, 1] != flight.pos[:, 0, 1]).any()
     np.testing.assert_allclose(flight.body_pos[:, :, 0], [[[2, 0, 0.3], [0, 0, 0.3]]] * 2, atol=1e-7)
+    np.testing.assert_allclose(flight.body_quat, np.broadcast_to(ROLL[1], (2, 2, 1, 4)), atol=1e-7)
     np.testing.assert_allclose(flight.setpoint[:, 0, 0, 0], [0.1, 0.2], atol=1e-7)
     assert (flight.index(0), flight.index(2)) == (1, 0)
 
@@ -130,6 +134,9 @@ def test_another_simulation_is_put_where_the_flight_was(flight, opengl):
     np.testing.assert_allclose(other.data.states.pos[2, 1], [0.5, 0, 1.5])
     np.testing.assert_allclose(other.time[:, 0], [0.25, 0, 0.25], atol=2e-3)
     np.testing.assert_allclose(other.data.controls.state.staged_cmd[2, 0, :3], 0.15, atol=1e-6)
+    k = other.mj_model.body("ball").mocapid.item()
+    np.testing.assert_allclose(other.mjx_data.mocap_pos[2, k], [2, 0, 0.3], atol=1e-6)
+    np.testing.assert_allclose(other.mjx_data.mocap_quat[2, k], np.roll(ROLL[1], 1), atol=1e-6)
     above = {"lookat": [2, 0, 0.3], "distance": 2.0, "azimuth": 90, "elevation": -89}
     for world, seen in ((2, True), (0, False)):
         picture = View(worlds=world, width=64, height=48, cam_config=above).picture(other).astype(int)
