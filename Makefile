@@ -16,7 +16,7 @@ demo: $(VENV)/installed
 	$(RUN) -m crazysim demo
 
 test: $(VENV)/installed
-	$(RUN) -m pytest -n 2 $(TESTS)
+	$(RUN) -m pytest -n 2 --dist loadgroup $(TESTS)
 
 check: $(VENV)/installed
 	$(VENV)/bin/ruff format --check .

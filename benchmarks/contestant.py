@@ -31,6 +31,9 @@ def main(package: str) -> None:
                 sim.step()
                 jax.block_until_ready(sim.data.states.pos)
                 answer = {"import_s": import_s, "to_first_step_s": time.perf_counter() - begin}
+            case "memory":
+                sim = scene(module, package, request["n_worlds"], request["n_drones"], request["device"])
+                answer = {"bytes": memory(sim, package)}
             case "build":
                 made = build(package, request["task"], request["case"], request["device"])
                 timed[request["name"]], answer = made, {"seconds": made.first_s}
@@ -47,6 +50,8 @@ def build(package: str, task: str, case: dict[str, Any], device: str) -> Any:
     """Return what is to be timed: a flight, or its gradient."""
     from measure import Flight
 
+    if task in QUESTIONS:
+        return Question(package, task, case, device)
     settings = dict(case)
     n_steps = settings.pop("n_steps")
     sim = importlib.import_module(f"{package}.sim").Sim(**settings, device=device)
@@ -89,6 +94,90 @@ class Gradient:
         slope = self._grad(self._cmd)
         if not (jnp.all(jnp.isfinite(slope)) and jnp.any(slope != 0)):
             raise SystemExit("the gradient is zero or not finite; no figure")
+
+
+OBJECTS = {
+    "box": ('<geom type="box" size="0.1 0.1 0.1"/>', [[3, 0, 1], [4, 0, 1], [3, 3, 1], [4, 4, 1]]),
+    "pole": ('<geom type="capsule" size="0.02 0.8"/>', [[3, 1, 1], [3, 2, 1]]),
+    "ball": ('<geom type="sphere" size="0.1"/>', [[2, 0, 1.1], [-3, 2, 1]]),
+}
+"""Eight objects that can be moved, none in the way of the drones: what they are, and where."""
+QUESTIONS = ("contacts", "depth", "swarm_build")
+
+
+def scene(module: Any, package: str, n_worlds: int, n_drones: int, device: str) -> Any:
+    """Return hovering drones among the objects, which each program is given in its own way."""
+    import mujoco
+    from measure import hovering
+
+    sim = module.Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude", device=device)
+    for name, (geom, places) in OBJECTS.items():
+        text = f'<mujoco><worldbody><body name="{name}">{geom}</body></worldbody></mujoco>'
+        if package == "crazysim":
+            sim.scene.add(mujoco.MjSpec.from_string(text).body(name), name, count=len(places), pos=places)
+            continue
+        frame = sim.spec.worldbody.add_frame()
+        for k, place in enumerate(places):
+            spec = mujoco.MjSpec.from_string(text)
+            body = frame.attach_body(spec.body(name), "", f":{k}")
+            body.pos, body.mocap = place, True
+    if package != "crazysim":
+        sim.build_mjx()
+    hovering(sim, "attitude")
+    return sim
+
+
+def memory(sim: Any, package: str) -> int:
+    """Return the bytes that live on the device after a question about contacts."""
+    import jax
+
+    sim.step()
+    jax.block_until_ready(sim.contact_report() if package == "crazysim" else sim.contacts())
+    return sum(x.nbytes for x in jax.live_arrays())
+
+
+class Question:
+    """A question about the scene after a step, timed without the step; or building a swarm."""
+
+    def __init__(self, package: str, task: str, case: dict[str, Any], device: str):
+        """Build the scene, and ask once."""
+        self._module, self._case, self._device = importlib.import_module(f"{package}.sim"), case, device
+        self._task, self._sim = task, None
+        if task != "swarm_build":
+            self._sim = scene(self._module, package, case["n_worlds"], case["n_drones"], device)
+        if task == "contacts":
+            self._ask = lambda: self._sim.contact_report() if package == "crazysim" else self._sim.contacts()
+        elif package == "crazysim":
+            self._ask = lambda: self._sim.depth("fpv_cam:0", 64, 64)
+        else:
+            depth = importlib.import_module("crazyflow.sim.sensors.depth")
+            self._ask = lambda: depth.render_depth(self._sim, camera=1, resolution=(64, 64))
+        self.first_s = self.seconds()
+
+    def seconds(self) -> float:
+        """Return the seconds of an answer."""
+        import jax
+
+        if self._task == "swarm_build":
+            begin = time.perf_counter()
+            self._sim = self._module.Sim(n_drones=self._case["n_drones"], device=self._device)
+            return time.perf_counter() - begin
+        self._sim.step()
+        jax.block_until_ready(self._sim.data.states.pos)
+        begin = time.perf_counter()
+        jax.block_until_ready(self._ask())
+        return time.perf_counter() - begin
+
+    def require_flying(self) -> None:
+        """Refuse a figure of drones that lie on the floor.
+
+        Raises:
+            SystemExit: If they do.
+        """
+        from measure import still_flies
+
+        if self._task != "swarm_build" and not still_flies(self._sim):
+            raise SystemExit("a drone has crashed; no figure")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,10 @@ a shared machine meets both. Medians, and the ratio of medians, are printed. Wha
     call        one step(1) of one world, for each command level
     gradient    of 100 attitude steps by their commands, 1,024 worlds
     swarm       64 drones in 1,024 worlds against as many single drones, ours only
+    contacts    asking for contacts after a step, 4,096 worlds of 4 drones with 8 objects
+    depth       64 x 64 depth of 1,024 worlds with 8 objects
+    swarm_build Sim(n_drones=1024)
+    memory      bytes a world after a question about contacts, of one drone and four, with 8 objects
 
     python benchmarks/versus_crazyflow.py [--only step call] [--engine auto lanes] [--worlds 1024 16384]
     python benchmarks/versus_crazyflow.py --device gpu --peer-python PATH/OF/python
@@ -32,7 +36,7 @@ from measure import digits, medians
 
 HERE = Path(__file__).parent
 PEER = HERE.parent / ".cache" / "crazyflow"
-CASES = ("first_step", "step", "call", "gradient", "swarm")
+CASES = ("first_step", "step", "call", "gradient", "swarm", "contacts", "depth", "swarm_build", "memory")
 LEVELS = ("rotor_vel", "force_torque", "body_rate", "attitude", "state")
 
 
@@ -67,6 +71,15 @@ def main() -> None:
         versus.compare("gradient", **case)
     if "swarm" in args.only:
         versus.swarm(args.batch_worlds, args.swarm)
+    for task, case in (
+        ("contacts", {"n_worlds": 4096, "n_drones": 4, "n_steps": 1}),
+        ("depth", {"n_worlds": 1024, "n_drones": 1, "n_steps": 1}),
+        ("swarm_build", {"n_worlds": 1, "n_drones": 1024, "n_steps": 1}),
+    ):
+        if task in args.only:
+            versus.question(task, **case)
+    if "memory" in args.only:
+        versus.memory()
     for worker in workers.values():
         worker.close()
 
@@ -92,6 +105,29 @@ class Versus:
                 line[f"{name}_steps_per_s"] = digits(steps / seconds)
                 line[f"{name}_compile_s"] = round(compile_s, 2)
             line["ratio"] = round(found["crazyflow"][0] / found[engine][0], 2)
+            print(json.dumps(line | self.machine), flush=True)
+
+    def question(self, task: str, **case: Any) -> None:
+        """Print what an answer takes in either program."""
+        found = self._measure(task, {name: (worker, case) for name, worker in self.workers.items()})
+        line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{task}", **case}
+        for name, (seconds, compile_s) in found.items():
+            line[f"{name}_s"] = digits(seconds)
+            line[f"{name}_compile_s"] = round(compile_s, 2)
+        line["ratio"] = round(found["crazyflow"][0] / found["crazysim"][0], 2)
+        print(json.dumps(line | self.machine), flush=True)
+
+    def memory(self, few: int = 64, many: int = 1088) -> None:
+        """Print the bytes that a world more takes, after a question about contacts."""
+        for n_drones in (1, 4):
+            line: dict[str, Any] = {"benchmark": "versus_crazyflow/memory", "n_drones": n_drones}
+            for name, worker in self.workers.items():
+                first, last = (
+                    worker.ask(do="memory", n_worlds=n, n_drones=n_drones, device=self.device)["bytes"]
+                    for n in (few, many)
+                )
+                line[f"{name}_bytes_per_world"] = round((last - first) / (many - few))
+            line["ratio"] = round(line["crazysim_bytes_per_world"] / line["crazyflow_bytes_per_world"], 4)
             print(json.dumps(line | self.machine), flush=True)
 
     def swarm(self, n_worlds: int, n_drones: int) -> None:

@@ -30,6 +30,9 @@ OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false"
 BLOCKS_AT_ONCE = (8, 6)
 """How many blocks of 64 threads are tried to fit: 128 or 168 registers for each thread."""
 
+WARP = 32
+"""Threads that can look at each other's registers."""
+
 DEFAULT_ARCHITECTURE = "compute_90"
 """What is compiled for where there is no GPU to ask."""
 
@@ -55,7 +58,10 @@ def call(kernel: Kernel, n_lanes: int, count: Array, inputs: Sequence[Array], ou
         outputs: Shapes and types of what it writes.
     """
     kernel = fitted(kernel) if architecture() is not DEFAULT_ARCHITECTURE else kernel
-    n_blocks = -(-n_lanes // BLOCK)
+    of_block = (
+        BLOCK // WARP * (WARP // kernel.group * kernel.group)
+    )  # groups that a warp has no room for go to the next
+    n_blocks = -(-n_lanes // of_block)
     launch = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1, "block_x": BLOCK, "block_y": 1, "block_z": 1}
     run = jax.ffi.ffi_call(TARGET, list(outputs))
     return list(

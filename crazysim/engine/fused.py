@@ -13,9 +13,10 @@ from jax.custom_derivatives import SymbolicZero
 
 from crazysim.engine import cuda, kernel, lanes, native
 from crazysim.engine.program import Program, is_key
+from crazysim.sim.stage import with_leaves
 
 Run = Callable[[list[Any], Array], tuple[list[Any], Array]]
-"""Leaves and a number of steps to the written leaves and which worlds are finite."""
+"""Leaves and a number of steps to the written leaves and which worlds are flagged as not finite."""
 
 
 def missing(platform: str) -> str | None:
@@ -51,10 +52,7 @@ def build(program: Program, platform: str) -> Callable[[list[Any], int | Array],
             changing = [i for i, t in enumerate(slopes) if t is not None and not isinstance(t, SymbolicZero)]
 
             def of(some: list[Any]) -> Any:
-                leaves = list(values)
-                for i, value in zip(changing, some, strict=True):
-                    leaves[i] = value
-                return lanes.steps(program, leaves, n_steps)
+                return lanes.steps(program, with_leaves(values, changing, some), n_steps)
 
             return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
 
@@ -97,8 +95,8 @@ def _over_batches(program: Program, run: Run) -> Run:
             return x.reshape(-1, *x.shape[2:])
 
         joined = [join(x, b) if o and x is not None else x for x, b, o in zip(leaves, batched, own, strict=True)]
-        written, finite = run(joined, count)
-        apart = [x.reshape(size, -1, *x.shape[1:]) for x in (*written, finite)]
+        written, flagged = run(joined, count)
+        apart = [x.reshape(size, -1, *x.shape[1:]) for x in (*written, flagged)]
         return (apart[:-1], apart[-1]), out_batched
 
     return call
@@ -111,34 +109,26 @@ def _one_kernel(program: Program, target: str) -> Run:
 
 def _split(program: Program, target: str) -> Run:
     """Return the same for a step that some stage takes apart: a kernel for what is between such stages."""
-    parts = [program.part(k) for k in range(len(program.segments))]
+    parts = program.parts()
     kernels = [kernel.write(p, target) if p.fused else None for p in parts]
     written = program.written
 
     def turn(leaves: list[Any]) -> list[Any]:
-        leaves = list(leaves)
         for part, source in zip(parts, kernels, strict=True):
             if source is not None:
                 out, _ = _call(part, source, leaves, jnp.asarray(1, jnp.int32), target)
             else:
                 out, _ = lanes.steps(part, leaves, 1)
-            for i, value in zip(part.written, out, strict=True):
-                leaves[i] = value
+            leaves = with_leaves(leaves, part.written, out)
         return leaves
 
     def run(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
         def body(_: Any, values: list[Any]) -> list[Any]:
-            full = list(leaves)
-            for i, value in zip(written, values, strict=True):
-                full[i] = value
-            after = turn(full)
+            after = turn(with_leaves(leaves, written, values))
             return [after[i] for i in written]
 
         out = jax.lax.fori_loop(0, count, body, [leaves[i] for i in written])
-        full = list(leaves)
-        for i, value in zip(written, out, strict=True):
-            full[i] = value
-        return out, lanes.finite(program, lanes.Lanes(program, full))
+        return out, lanes.nonfinite(program, lanes.Lanes(program, with_leaves(leaves, written, out)))
 
     return run
 
@@ -153,8 +143,8 @@ def _call(
     outputs = [jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in source.outputs]
     flags = jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)
     call = cuda.call if target == "cuda" else native.call
-    *written, finite = call(source, n_lanes, count.reshape(1), inputs, [*outputs, flags])
-    return written, finite if n_drones == 1 else jnp.all(finite, axis=1, keepdims=True)
+    *written, flagged = call(source, n_lanes, count.reshape(1), inputs, [*outputs, flags])
+    return written, flagged if n_drones == 1 else jnp.any(flagged, axis=1, keepdims=True)
 
 
 def _bare(x: Any) -> Array:

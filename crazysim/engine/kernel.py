@@ -29,7 +29,9 @@ class Kernel:
     inputs: tuple[int, ...]
     """Leaves that it reads."""
     outputs: tuple[int, ...]
-    """Leaves that it writes; behind them comes one bool per drone, whether it is finite."""
+    """Leaves that it writes; behind them comes one bool per drone, whether its world is flagged."""
+    group: int = 1
+    """Drones next to each other that must be in one warp or vector, for they look at each other's numbers."""
 
     def with_blocks(self, n: int) -> Kernel:
         """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
@@ -57,41 +59,36 @@ def write(program: Program, target: str) -> Kernel:
         NoRuleError: If an operation or a type has no source.
     """
     writer = Writer()
-    (segment,) = program.segments
-    slots = dict.fromkeys([*segment.reads, *segment.constants])
-    written = segment.writes
-    check = program.check
-    slots.update(dict.fromkeys([*written, *(check.reads if check else [])]))
-    inputs = tuple(sorted({leaf for leaf, _ in slots}))
+    segments, check = program.segments, program.check
+    checked = check.reads if check else []
+    written = dict.fromkeys(slot for s in segments for slot in program.own(s, s.writes))
+    inside = dict.fromkeys(slot for s in segments for slot in [*program.own(s, s.reads), *s.constants])
     outputs = tuple(sorted({leaf for leaf, _ in written}))
     # A leaf of which some numbers are written goes out whole.
     whole = [(leaf, k) for leaf in outputs for k in range(program.sizes(leaf))]
-    slots.update(dict.fromkeys(whole))
+    slots = dict.fromkeys([*inside, *written, *checked, *whole])
+    inputs = tuple(sorted({leaf for leaf, _ in slots}))
 
     names = {slot: f"x{slot[0]}_{slot[1]}" for slot in slots}
-    late = _used_when_needed(segment, {*written, *(check.reads if check else [])})
     for slot in slots:
-        if slot in late:
-            names[slot] = _load(program, slot)
-            continue
-        kind = type_name(_dtype(program, slot))
-        access = _load(program, slot)
-        changes = slot in set(written)
-        writer.line(f"auto {names[slot]} = {kind}_lanes({access});" if changes
-                    else f"const auto {names[slot]} = {access};", 1)  # fmt: skip
-    constants = [names[slot] for slot in segment.constants]
-    before = writer.block(segment.before, constants, 1) if segment.before is not None else []
+        kind, access = type_name(_dtype(program, slot)), _load(program, slot)
+        if slot in written:
+            writer.line(f"auto {names[slot]} = {kind}_lanes({access});", 1)
+        elif slot not in whole and _is_late(program, slot):
+            names[slot] = access
+        else:
+            writer.line(f"const auto {names[slot]} = {access};", 1)
+    constants = [
+        writer.block(s.before, [names[slot] for slot in s.constants], 1) if s.before is not None else []
+        for s in segments
+    ]
     writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
-    outs = writer.block(segment.block, [*(names[slot] for slot in segment.reads), *before], 2)
-    fresh = [writer.new() for _ in outs]
-    for name, out in zip(fresh, outs, strict=True):
-        writer.line(f"const auto {name} = {out};", 2)
-    for slot, name in zip(written, fresh, strict=True):
-        writer.line(f"{names[slot]} = {type_name(_dtype(program, slot))}_lanes({name});", 2)
+    for segment, before in zip(segments, constants, strict=True):
+        _advance(writer, program, segment, names, before)
     writer.line("}", 1)
     if check is not None:
-        (fine,) = writer.block(check.block, [names[slot] for slot in check.reads], 1)
-        writer.line(f"STORE(1, 1, finite, 0, b1_lanes({fine}))", 1)
+        (flagged,) = writer.block(check.block, [names[slot] for slot in checked], 1)
+        writer.line(f"STORE(1, 1, flagged, 0, b1_lanes({flagged}))", 1)
     for slot in whole:
         writer.line(_store(program, slot, f"{type_name(_dtype(program, slot))}_lanes({names[slot]})"), 1)
 
@@ -99,17 +96,57 @@ def write(program: Program, target: str) -> Kernel:
     pointers += [f"{_kind(program, i)}* __restrict__ q{i}" for i in outputs]
     frame = {"cuda": _cuda, "host": _host}[target]
     widest = 8 if any(_kind(program, i) == "f64" for i in (*inputs, *outputs)) else 4
-    text = f"#define WIDEST {widest}\n" + preamble(target) + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
-    return Kernel(text, inputs, outputs)
+    defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n"
+    text = defines + preamble(target) + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
+    return Kernel(text, inputs, outputs, program.group)
 
 
-def _used_when_needed(segment: Segment, needed: set[Slot]) -> set[Slot]:
-    """Return the constants that only stages below the step rate use: they are loaded there, and take no register."""
-    block = segment.block
-    now = {id(x) for v in block.values for x in v.args} | {id(x) for x in block.outputs}
-    pairs = list(zip(block.inputs, segment.reads, strict=False))
-    needed = needed | {slot for x, slot in pairs if id(x) in now} | set(segment.constants)
-    return {slot for _, slot in pairs} - needed
+def _advance(
+    writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str]
+) -> None:
+    """Write what a segment does in a step."""
+    own = program.own(segment, segment.reads)
+    inputs = [names[slot] for slot in own]
+    if segment.scope == "world":  # a drone's numbers are asked of the lane that has them
+        for k, (leaf, number) in enumerate(segment.reads):
+            if program.axes.scopes[leaf] == "drone":
+                name = writer.new()
+                writer.line(f"const auto {name} = of_drone({inputs[k]}, {number // program.sizes(leaf)});", 2)
+                inputs[k] = name
+    outs = writer.block(segment.block, [*inputs, *constants], 2)
+    fresh = [writer.new() for _ in outs]
+    for name, out in zip(fresh, outs, strict=True):
+        writer.line(f"const auto {name} = {out};", 2)
+    for (leaf, number), slot, new in zip(segment.writes, program.own(segment, segment.writes), fresh, strict=True):
+        kind, name = type_name(_dtype(program, slot)), names[slot]
+        if (
+            segment.scope == "world" and program.axes.scopes[leaf] == "drone"
+        ):  # every lane has them all, and keeps its own
+            mine = f"eq_(own, i32({number // program.sizes(leaf)}))"
+            writer.line(f"{name} = select_n_({mine}, {name}, {kind}_lanes({new}));", 2)
+        else:
+            writer.line(f"{name} = {kind}_lanes({new});", 2)
+
+
+def _is_late(program: Program, slot: Slot) -> bool:
+    """Return whether only stages below the step rate, or the check behind the loop, need a number that never changes.
+
+    It is loaded there, and takes no register.
+    """
+    check = program.check
+    in_check = check is not None and slot in check.reads
+    in_blocks = False
+    for segment in program.segments:
+        if slot in segment.constants:
+            return False
+        block = segment.block
+        now = {id(x) for v in block.values for x in v.args} | {id(x) for x in block.outputs}
+        for x, read in zip(block.inputs, program.own(segment, segment.reads), strict=False):
+            if read == slot:
+                if segment.scope == "world" or id(x) in now:
+                    return False
+                in_blocks = True
+    return in_blocks != in_check
 
 
 def _dtype(program: Program, slot: Slot) -> object:
@@ -141,13 +178,15 @@ def _drones(program: Program, leaf: int) -> int:
 
 def _cuda(pointers: Sequence[str], body: str) -> str:
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
-    arguments = ", ".join([*scalars, *pointers, "b1* __restrict__ finite"])
+    arguments = ", ".join([*scalars, *pointers, "b1* __restrict__ flagged"])
     return f"""
 extern "C" __global__ void __launch_bounds__({BLOCK}, {UNBOUNDED}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0];
   const int thread = blockIdx.x * {BLOCK} + threadIdx.x;
-  const bool active = thread < n_lanes;
-  const int lane = active ? thread : n_lanes - 1;
+  const int wanted = thread / 32 * LANES + thread % 32;
+  const bool active = thread % 32 < LANES && wanted < n_lanes;
+  const int lane = wanted < n_lanes ? wanted : n_lanes - 1;
+  const int own = lane % GROUP;
 {body}
 }}
 """
@@ -161,8 +200,9 @@ def _host(pointers: Sequence[str], body: str) -> str:
                for k, kind in enumerate(kinds)]  # fmt: skip
     n_out = len(pointers) - n_in
     return f"""
-static void advance_block(int64_t first, int64_t n_lanes, int n_steps, {arguments}, b1* __restrict__ finite) {{
-  const int n_active = n_lanes - first < W ? int(n_lanes - first) : W;
+static void advance_block(int64_t first, int64_t n_lanes, int n_steps, {arguments}, b1* __restrict__ flagged) {{
+  const int n_active = n_lanes - first < LANES ? int(n_lanes - first) : LANES;
+  const i32v own = numbers() % GROUP;
 {body}
 }}
 
@@ -170,7 +210,7 @@ static void advance(XLA_FFI_Buffer** in, XLA_FFI_Buffer** out) {{
   const int64_t n_lanes = *(int*)in[0]->data;
   const int n_steps = *(int*)in[1]->data;
   const auto run = [=](int64_t begin, int64_t end) {{
-    for (int64_t first = begin; first < end; first += W)
+    for (int64_t first = begin; first < end; first += LANES)
       advance_block(first, n_lanes, n_steps, {", ".join(buffers)}, (b1*)out[{n_out}]->data);
   }};
   in_parallel(n_lanes, n_steps, run);

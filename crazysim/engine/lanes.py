@@ -149,13 +149,13 @@ def _run_batch(segment: Segment, lanes: Lanes) -> None:
 
 
 def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-    """Return the written leaves after some steps, and which worlds are finite. (n_worlds, 1)
+    """Return the written leaves after some steps, and which worlds are flagged as not finite. (n_worlds, 1)
 
     A step count that is a Python number makes a loop that can be differentiated.
     """
     start = Lanes(program, leaves)
     constants = prepare(program, start)
-    by_lanes = sorted({slot for s in program.segments for slot in _slots(program, s)})
+    by_lanes = sorted({slot for s in program.segments for slot in program.own(s, s.writes)})
     by_array = sorted({i for s in program.segments if s.scope == "batch" for i in s.written})
     by_lanes = [slot for slot in by_lanes if slot[0] not in by_array]
 
@@ -171,8 +171,8 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
 
     carry = [jnp.broadcast_to(start.get(slot), start.shape) for slot in by_lanes], [leaves[i] for i in by_array]
     for segment in program.segments:  # what is only read is taken apart once, outside the loop
-        for leaf, k in segment.reads:
-            start.get((leaf, k % program.sizes(leaf)))
+        for slot in program.own(segment, segment.reads):
+            start.get(slot)
     if isinstance(n_steps, int):
         carry = repeat(turn, carry, n_steps)
     else:
@@ -182,7 +182,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
         end.set(slot, value)
     for leaf, value in zip(by_array, carry[1], strict=True):
         end.set_array(leaf, value)
-    return [end.array(i) for i in program.written], finite(program, end)
+    return [end.array(i) for i in program.written], nonfinite(program, end)
 
 
 def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
@@ -205,18 +205,11 @@ def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
     return turns(carry, n % inner)
 
 
-def _slots(program: Program, segment: Segment) -> list[Slot]:
-    """Return what a segment writes, as numbers of drones."""
-    if segment.scope != "world":
-        return segment.writes
-    return [(leaf, k % program.sizes(leaf)) for leaf, k in segment.writes]
-
-
-def finite(program: Program, lanes: Lanes) -> Array:
-    """Return which worlds have no NaN and no infinity in what is watched. (n_worlds, 1)"""
+def nonfinite(program: Program, lanes: Lanes) -> Array:
+    """Return which worlds were flagged before, or have a NaN or infinity in what is watched. (n_worlds, 1)"""
     check = program.check
     if check is None:
-        return jnp.ones((lanes.n_worlds, 1), bool)
-    (fine,) = xla.run(check.block, [lanes.get(slot) for slot in check.reads], lanes.shape)
-    fine = jnp.broadcast_to(fine, lanes.shape).reshape(lanes.n_worlds, lanes.n_drones)
-    return jnp.all(fine, axis=1, keepdims=True)
+        return jnp.zeros((lanes.n_worlds, 1), bool)
+    (flagged,) = xla.run(check.block, [lanes.get(slot) for slot in check.reads], lanes.shape)
+    flagged = jnp.broadcast_to(flagged, lanes.shape).reshape(lanes.n_worlds, lanes.n_drones)
+    return jnp.any(flagged, axis=1, keepdims=True)

@@ -13,7 +13,7 @@ from jax.extend.core import jaxpr_as_fun
 
 from crazysim.sim.data import SimData
 from crazysim.sim.pipeline import Pipeline
-from crazysim.sim.stage import Axes, Stage
+from crazysim.sim.stage import Axes, Stage, with_leaves
 from crazysim.sim.stages import finite
 
 ResetFn = Callable[..., SimData]
@@ -34,8 +34,8 @@ def build(
             XLA gathers whatever a layout is asked for.
 
     Returns:
-        Leaves and a number of steps to the written leaves and which worlds are finite (n_worlds, 1); the numbers of
-        the written leaves.
+        Leaves and a number of steps to the written leaves and which worlds are flagged as not finite (n_worlds, 1);
+        the numbers of the written leaves.
     """
     axes = Axes(data)
     by_component = by_component and all(stage.batched for stage in stages)  # not every operation of XLA takes layouts
@@ -54,10 +54,7 @@ def build(
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         def turn(values: list[Any]) -> list[Any]:
-            full = list(leaves)
-            for i, value in zip(written, values, strict=True):
-                full[i] = value
-            after = step(*full)
+            after = step(*with_leaves(leaves, written, values))
             return [after[i] for i in written]
 
         start = [leaves[i] for i in written]
@@ -65,10 +62,8 @@ def build(
             out, _ = jax.lax.scan(lambda x, _: (turn(x), None), start, length=n_steps)
         else:
             out = jax.lax.fori_loop(0, n_steps, lambda _, x: turn(x), start)
-        full = list(leaves)
-        for i, value in zip(written, out, strict=True):
-            full[i] = value
-        return out, finite(axes.treedef.unflatten(full))
+        data = axes.treedef.unflatten(with_leaves(leaves, written, out))
+        return out, data.core.nonfinite | ~finite(data)
 
     return steps, written
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -93,12 +94,17 @@ class Program:
         for segment in self.segments:
             if segment.scope == "drone":
                 _hoist(segment, changing)
-        self.check = self._watch(watched(data)) if watched else None
+        self.check = self._watch(data.core.nonfinite, watched(data)) if watched else None
 
     @property
     def fused(self) -> bool:
-        """Whether all of it is one program on the numbers of one drone."""
-        return len(self.segments) == 1 and self.segments[0].scope == "drone"
+        """Whether all of it is written out, so that one kernel can run it."""
+        return all(segment.scope != "batch" for segment in self.segments)
+
+    @property
+    def group(self) -> int:
+        """How many drones look at each other's numbers: those of a world, if some segment is of worlds."""
+        return self.n_drones if any(segment.scope == "world" for segment in self.segments) else 1
 
     @property
     def written(self) -> list[int]:
@@ -135,11 +141,18 @@ class Program:
         self.axes.scopes.append("shared")
         self.axes.names.append("packed")
 
-    def part(self, k: int) -> Program:
-        """Return one segment as a program of its own."""
-        part = copy.copy(self)
-        part.segments, part.check = [self.segments[k]], None
-        return part
+    def parts(self) -> list[Program]:
+        """Return programs that run one after the other: segments that one kernel can run, and those that none can."""
+        parts = []
+        for _, segments in itertools.groupby(self.segments, lambda s: id(s) if s.scope == "batch" else 0):
+            part = copy.copy(self)
+            part.segments, part.check = list(segments), None
+            parts.append(part)
+        return parts
+
+    def own(self, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
+        """Return the slots of a segment as a drone counts them, which is how a segment of drones does."""
+        return list(slots) if segment.scope == "drone" else [(leaf, k % self.sizes(leaf)) for leaf, k in slots]
 
     def sizes(self, leaf: int, scope: StageScope = "drone") -> int:
         """Return how many numbers one drone (or world) has of a leaf; a key is two words."""
@@ -197,8 +210,8 @@ class Program:
         traced = _Traced(Stage(stage, "batch", name=stage.__name__), self.axes, self.leaves)
         self.segments.append(Segment("batch", [stage], used=traced.used, written=traced.written, why=why, fn=traced.fn))
 
-    def _watch(self, watched: list[Any]) -> Segment:
-        """Return a program that tells whether all watched numbers of a drone are finite."""
+    def _watch(self, flag: Any, watched: list[Any]) -> Segment:
+        """Return a program that flags a drone: its world was flagged, or a watched number is not finite."""
         ids = {id(x) for x in watched}
         segment = Segment("drone", [])
         avals = self.axes.of_one(self.leaves, "drone")
@@ -207,7 +220,9 @@ class Program:
             if id(x) in ids and self.axes.scopes[i] == "drone":
                 for item in self._elements(segment, i, avals[i]).reshape(-1):
                     finite = segment.block.add("and", (finite, segment.block.add("is_finite", (item,), bool)), bool)
-        segment.block.outputs = [finite]
+        i = next(i for i, x in enumerate(self.leaves) if x is flag)
+        before = self._elements(segment, i, avals[i])[()]
+        segment.block.outputs = [segment.block.add("or", (before, segment.block.add("not", (finite,), bool)), bool)]
         _connect(segment)
         return segment
 

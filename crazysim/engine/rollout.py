@@ -14,6 +14,7 @@ from crazysim.engine.step import Step, Zeros
 from crazysim.errors import ConfigError
 from crazysim.sim import functional as F
 from crazysim.sim.data import SimData
+from crazysim.sim.stage import with_leaves
 
 Policy = Callable[[Any, SimData], Any]
 """Parameters and data to a command for every drone. (n_worlds, n_drones, k)"""
@@ -78,7 +79,7 @@ def rollout(
     leaves, treedef = jax.tree.flatten(data)
     plan = step.plan(data, zeros)
     staged = next(i for i, x in enumerate(leaves) if x is _staged(data))
-    changed = sorted({*plan.written, *plan.flags, staged})
+    changed = sorted({*plan.written, plan.shown, staged})
 
     def control_step(carry: list[Any]) -> list[Any]:
         data = unpack(carry)
@@ -86,10 +87,7 @@ def rollout(
         return [after[i] for i in changed]
 
     def unpack(carry: list[Any]) -> SimData:
-        now = list(leaves)
-        for i, value in zip(changed, carry, strict=True):
-            now[i] = value
-        return treedef.unflatten(now)
+        return treedef.unflatten(with_leaves(leaves, changed, carry))
 
     def until_kept(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
         carry, _ = jax.lax.scan(lambda c, _: (control_step(c), None), carry, length=every)

@@ -21,13 +21,13 @@ from crazysim.pytree import check_axes, scopes
 from crazysim.sim.data import SimData
 from crazysim.sim.pipeline import Pipeline
 from crazysim.sim.sharding import WORLD_AXIS
-from crazysim.sim.stage import as_stages
+from crazysim.sim.stage import as_stages, with_leaves
 
 ENGINES = ("auto", "plain", "lanes", "fused")
 """What ``engine=`` may be."""
 
 Steps = Callable[[list[Any], int | Array], tuple[list[Any], Array]]
-"""Leaves and a number of steps to the written leaves and which worlds are finite."""
+"""Leaves and a number of steps to the written leaves and which worlds are flagged as not finite."""
 
 Zeros = tuple[tuple[int, frozenset[int]], ...]
 """Leaves with the elements of them that are zero."""
@@ -48,8 +48,8 @@ class Plan(NamedTuple):
     """Leaves that go in as one array behind them."""
     written: tuple[int, ...]
     """Leaves that come out."""
-    flags: tuple[int, int]
-    """Leaves of the two flags: that a world is not finite, that the scene is fresh."""
+    shown: int
+    """Leaf that is false after a step: whether the scene shows this data."""
     dynamic: Callable[..., Any]
     """The compiled step, for a number of steps that is an array."""
     static: Callable[..., Any]
@@ -84,6 +84,7 @@ class Step:
         self._plans: dict[Any, Plan] = {}
         self._zeros = _Zeros()
         self._pack = _Pack()
+        self._unshown: Any = None
 
     def __call__(self, data: SimData, n_steps: int | Array = 1, zeros: Zeros | None = None) -> SimData:
         """Return the data some steps later.
@@ -105,12 +106,22 @@ class Step:
 
     def advance(self, apart: Apart, n_steps: int | Array) -> Apart:
         """Return the data some steps later, still apart."""
-        plan, leaves = apart.plan, list(apart.leaves)
+        plan = apart.plan
         step = plan.static if isinstance(n_steps, int) else plan.dynamic
-        out = step(*apart.inputs(), n_steps)
-        for i, value in zip((*plan.written, *plan.flags), out, strict=True):
-            leaves[i] = value
+        out = step(apart.inputs(), n_steps)
+        leaves = with_leaves(apart.leaves, plan.written, out)
+        leaves[plan.shown] = self._false(leaves[plan.shown])
         return Apart(leaves, apart.treedef, plan, apart.packed)
+
+    def _false(self, before: Any) -> Any:
+        """Return a flag that is false, where the flag before is; the same array again costs no call."""
+        if before is self._unshown:
+            return before
+        traced = isinstance(before, jax.core.Tracer)
+        flag = jnp.asarray(False) if traced else jax.device_put(np.False_, getattr(before, "sharding", None))
+        if not isinstance(flag, jax.core.Tracer):
+            self._unshown = flag
+        return flag
 
     def plan(self, data: SimData, zeros: Zeros | None = None) -> Plan:
         """Return how this data is stepped."""
@@ -125,7 +136,7 @@ class Step:
         """Return the step lowered for this data, as ``jax.jit(...).lower`` does: to look at, or to compile ahead."""
         apart = self.take_apart(data)
         step = apart.plan.static if isinstance(n_steps, int) else apart.plan.dynamic
-        return step.lower(*apart.inputs(), n_steps)
+        return step.lower(apart.inputs(), n_steps)
 
     def _cache_size(self) -> int:
         """Return how many compilations there are; the tests of law 6 count them."""
@@ -151,17 +162,15 @@ class Step:
             )
 
     def _make_plan(self, data: SimData, zeros: Zeros) -> Plan:
-        names = {id(x): i for i, x in enumerate(jax.tree.leaves(data))}
-        flags = names[id(data.core.nonfinite)], names[id(data.core.mjx_synced)]
         if self.engine == "plain":
-            return self._plain(data, flags, "it was asked for")
+            return self._plain(data, "it was asked for")
         undeclared = [s.__name__ for s in self.stages if s.scope == "batch"]
         if self.mesh is not None and undeclared:
-            return self._plain(data, flags, f"with a mesh every stage must be declared, and {undeclared[0]!r} is not")
+            return self._plain(data, f"with a mesh every stage must be declared, and {undeclared[0]!r} is not")
         program = Program(self.stages, data, dict(zeros), _watched)
         split = [s for s in program.segments if s.scope == "batch"]
         if self.mesh is not None and split:
-            return self._plain(data, flags, f"with a mesh every stage must be fused, and {_unfused(split[0])}")
+            return self._plain(data, f"with a mesh every stage must be fused, and {_unfused(split[0])}")
         program.pack()
         engine, why, run = "lanes", "it was asked for", functools.partial(lanes.steps, program)
         if self.engine in ("auto", "fused"):
@@ -176,57 +185,58 @@ class Step:
                         f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'."
                     ) from None
         read = (*program.read, *_needed(program))
-        return self._wrap(engine, why, program, read, tuple(program.written), flags, run, len(program.leaves))
+        return self._wrap(engine, why, data, program, read, tuple(program.written), run, len(program.leaves))
 
-    def _plain(self, data: SimData, flags: tuple[int, int], why: str) -> Plan:
+    def _plain(self, data: SimData, why: str) -> Plan:
         run, written = plain.build(self.stages, data, by_component=self.mesh is None)
         everything = tuple(range(len(jax.tree.leaves(data))))
         # XLA spreads what is plain over a mesh by itself.
-        return self._wrap("plain", why, None, everything, tuple(written), flags, run, len(everything), shard=False)
+        return self._wrap("plain", why, data, None, everything, tuple(written), run, len(everything), shard=False)
 
     def _wrap(
         self,
         engine: str,
         why: str,
+        data: SimData,
         program: Program | None,
         read: tuple[int, ...],
         written: tuple[int, ...],
-        flags: tuple[int, int],
         run: Steps,
         n_leaves: int,
         shard: bool = True,
     ) -> Plan:
+        numbers = {id(x): i for i, x in enumerate(jax.tree.leaves(data))}
+        nonfinite, shown = numbers[id(data.core.nonfinite)], numbers[id(data.core.mjx_synced)]
         everything = tuple(sorted({*read, *written}))
+        written = (*written, nonfinite)
         packed = program.packed if program else ()
         read = everything[:-1] if packed else everything  # what is packed is the last
 
-        def advance(values: list[Any], nonfinite: Array, n_steps: int | Array) -> list[Any]:
-            leaves: list[Any] = [None] * n_leaves
-            for i, value in zip(everything, values, strict=True):
-                leaves[i] = value
-            out, fine = run(leaves, n_steps)
-            return [*out, nonfinite | ~fine, jnp.asarray(False)]
+        def advance(values: list[Any], n_steps: int | Array) -> list[Any]:
+            leaves = with_leaves([None] * n_leaves, everything, values)
+            out, flagged = run(leaves, n_steps)
+            return [*out, flagged]
 
         if self.mesh is None or not shard or program is None:
-            return Plan(engine, why, program, read, packed, written, flags, *_jitted(advance))
+            return Plan(engine, why, program, read, packed, written, shown, *_jitted(advance))
         split, whole = PartitionSpec(WORLD_AXIS), PartitionSpec()
         axes = program.axes.scopes
         specs = [split if axes[i] in ("drone", "world") else whole for i in range(n_leaves)]
-        outs = [*(specs[i] for i in written), split, whole]
+        outs = [specs[i] for i in written]
 
-        def spread(values: list[Any], nonfinite: Array, n_steps: int | Array) -> list[Any]:
+        def spread(values: list[Any], n_steps: int | Array) -> list[Any]:
             known = isinstance(n_steps, int)
             count = [] if known else [n_steps]
             local = jax.shard_map(
-                lambda values, nonfinite, *count: advance(values, nonfinite, *(count or [n_steps])),
+                lambda values, *count: advance(values, *(count or [n_steps])),
                 mesh=self.mesh,
-                in_specs=([specs[i] for i in everything], split, *[whole for _ in count]),
+                in_specs=([specs[i] for i in everything], *[whole for _ in count]),
                 out_specs=outs,
                 check_vma=False,
             )
-            return local(values, nonfinite, *count)
+            return local(values, *count)
 
-        return Plan(engine, why, program, read, packed, written, flags, *_jitted(spread))
+        return Plan(engine, why, program, read, packed, written, shown, *_jitted(spread))
 
 
 class Apart:
@@ -242,12 +252,12 @@ class Apart:
         """Return the data put together."""
         return self.treedef.unflatten(self.leaves)
 
-    def inputs(self) -> tuple[list[Any], Any]:
+    def inputs(self) -> list[Any]:
         """Return what the compiled step is given besides the number of steps."""
         values = [self.leaves[i] for i in self.plan.read]
         if self.packed is not None:
             values.append(self.packed)
-        return values, self.leaves[self.plan.flags[0]]
+        return values
 
 
 class _Pack:
@@ -272,7 +282,7 @@ def _concatenated(arrays: list[Any]) -> Array:
 
 def _jitted(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Return the function compiled for any number of steps, and for a number that is known."""
-    return jax.jit(advance), jax.jit(lambda values, flag, n: advance(values, flag, n), static_argnums=2)
+    return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
 
 def _watched(data: SimData) -> list[Any]:

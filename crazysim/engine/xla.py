@@ -12,7 +12,7 @@ from jax import Array, lax
 from jax.extend.random import threefry2x32_p
 
 from crazysim.engine.ir import Block, Element, Value
-from crazysim.engine.lower import ELEMENTWISE
+from crazysim.engine.rules.elementwise import ELEMENTWISE
 
 
 def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: dict[int, Any] | None = None) -> list[Any]:

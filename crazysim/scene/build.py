@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import jax
@@ -114,7 +114,7 @@ def _add_part(body: mujoco.MjsBody, part: Part, i: int) -> None:
         geom.fromto = [*part.pos, *part.end]
     if part.touches:
         geom.name, geom.group, geom.condim, geom.rgba = f"{part.name}:{i}", 3, 1, (0.5, 0.5, 0.5, 0.3)
-        geom.contype = geom.conaffinity = int(part.name == "col_sphere")
+        _set_touching(geom, part.name == "col_sphere")
     else:
         geom.group, geom.contype, geom.conaffinity = 2, 0, 0
         geom.material = f"{part.material}:{i}" if part.material in LED_MATERIALS else part.material
@@ -125,7 +125,12 @@ def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:
     for i in range(n_drones):
         for kind in ("col_sphere", "col_box"):
             geom = spec.geom(f"{kind}:{i}")
-            geom.contype = geom.conaffinity = int((kind == "col_box") == enable)
+            _set_touching(geom, (kind == "col_box") == enable)
+
+
+def _set_touching(geom: mujoco.MjsGeom, touches: bool) -> None:
+    """Let a geom of a drone touch the scene, other drones, and what only drones touch (bit 2), or nothing."""
+    geom.contype, geom.conaffinity = (3, 1) if touches else (0, 0)
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -195,16 +200,16 @@ def check_poses(mjx_data: mjx.Data, mj_model: mujoco.MjModel, n_worlds: int) -> 
     return mjx_data.replace(**changes)
 
 
-def drone_mocap_ids(mj_model: mujoco.MjModel, n_drones: int) -> list[int]:
-    """Return the mocap id of each drone's body.
+def mocap_ids(mj_model: mujoco.MjModel, names: Iterable[str]) -> list[int]:
+    """Return the mocap ids of bodies.
 
     Raises:
         ConfigError: If the scene has lost one of them.
     """
     ids = []
-    for i in range(n_drones):
-        body = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, f"drone:{i}")
+    for name in names:
+        body = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name)
         if body < 0 or mj_model.body_mocapid[body] < 0:
-            raise ConfigError(f"the scene has no mocap body 'drone:{i}'; an edit of sim.spec must leave the drones")
+            raise ConfigError(f"the scene has no mocap body {name!r}; edits of sim.spec must leave it")
         ids.append(int(mj_model.body_mocapid[body]))
     return ids

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import jax
+import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import NDArray
 
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
-from crazysim.scene import build, contacts, mjx
+from crazysim.scene import build, contacts, depth, mjx, report, solids
 from crazysim.scene.draw import Marks
+from crazysim.scene.objects import IDENTITY, Handle, add_bodies, as_poses
+from crazysim.scene.rays import Hits
 from crazysim.scene.render import Viewer
+from crazysim.scene.report import ContactReport
+from crazysim.scene.solids import Solids
 from crazysim.scene.sync import sync_one_world, sync_sim2mjx
-from crazysim.sim.data import SimData
+from crazysim.sim.data import Objects, SimData
 from crazysim.sim.settings import positive
 from crazysim.sim.sharding import place_scene, put
 
@@ -53,12 +60,6 @@ class Scene:
 
     spec: mujoco.MjSpec
     """The scene to be edited; ``compile`` has an edit take effect."""
-    mj_model: mujoco.MjModel
-    """What the spec was compiled to."""
-    mj_data: mujoco.MjData
-    """The one world that was drawn last."""
-    drone_mocap_ids: list[int]
-    """Mocap id of each drone's body. (n_drones,)"""
     max_geom_pairs: int
     """Cap on the pairs MJX checks per kind of collision, from the next ``compile`` on; -1 for none."""
     marks: Marks
@@ -95,28 +96,128 @@ class Scene:
         self.marks = Marks()
         self.viewer = None
         self.spec = build.build_spec(xml_path, airframe, n_drones, freq, self.max_geom_pairs)
+        self.handles: list[Handle] = []
+        self._starts: list[tuple[NDArray, NDArray]] = []
+        self.on_compile: Callable[[], None] | None = None
         self.compile()
 
+    def add(
+        self,
+        what: Any,
+        name: str | None = None,
+        *,
+        count: int = 1,
+        pos: Any = (0.0, 0.0, 0.0),
+        quat: Any = IDENTITY,
+        mocap: bool = True,
+        **options: Any,
+    ) -> Handle:
+        """Add objects to the scene, and return the handle that they are moved and asked for by.
+
+        The scene is compiled anew at the next use, once for all that was added since the last.
+
+        Args:
+            what: ``"gate"``, ``"box"``, ``"pole"``, ``"sphere"``, ``"wall"`` or ``"landing_pad"``; or the path of an
+                MJCF file, MJCF text, an ``MjSpec``, or a body of one.
+            name: The bodies are called ``name:0``, ``name:1``, ...; None for the primitive's or the file's name.
+            count: How many.
+            pos: Where they are, world frame, m, at the start of every world. (3,), (count, 3) or (n_worlds, count, 3)
+            quat: Their attitudes, body to world, xyzw. The same shapes with 4
+            mocap: Whether they can be moved, in each world for itself; else they stand at ``pos`` in all worlds.
+            **options: Settings of a primitive: lengths in m, ``rgba``. ``crazysim.scene.objects`` lists them.
+
+        Raises:
+            ConfigError: If a name is taken, MJCF does not compile (with the compiler's words), or a setting cannot be.
+        """
+        name = _name(what) if name is None else name
+        numbers = tuple(range(positive("count", count)))
+        taken = sorted({body.name for body in self.spec.bodies} & {name, *(f"{name}:{k}" for k in numbers)})
+        if taken or name == "drone":
+            raise ConfigError(f"the scene has a body {(taken or ['drone:0'])[0]!r} already; choose another name=")
+        n_worlds = self.n_worlds if mocap else None
+        poses = [
+            np.broadcast_to(np.asarray(as_poses(x, what, count, size, n_worlds)), (n_worlds or 1, count, size))
+            for x, what, size in ((pos, "pos", 3), (quat, "quat", 4))
+        ]
+        poses[1] = poses[1] / np.linalg.norm(poses[1], axis=-1, keepdims=True)
+        names = [f"{name}:{k}" for k in numbers]
+        add_bodies(self.spec, what, names, poses[0][0], poses[1][0], mocap, options)
+        first = sum(len(handle.places) for handle in self.handles)
+        handle = Handle(name, numbers, tuple(first + k for k in numbers) if mocap else ())
+        self.handles.append(handle)
+        if mocap:
+            self._starts.append((poses[0], poses[1]))
+        self.edited = True
+        return handle
+
     def compile(self) -> None:
-        """Have the spec as it is now take effect; closes the viewer, and forgets where users moved bodies.
+        """Have the spec as it is now take effect; closes the viewer, and forgets where users moved bodies by hand.
 
         Raises:
             ConfigError: If the spec does not compile or has lost a drone; the old scene stays then.
         """
         self.spec.numeric("max_geom_pairs").data = [self.max_geom_pairs]
         mj_model = build.compile_spec(self.spec)
-        self.drone_mocap_ids = build.drone_mocap_ids(mj_model, self.n_drones)
+        drones = [f"drone:{i}" for i in range(self.n_drones)]
+        self._drone_ids = build.mocap_ids(mj_model, drones)
+        self._object_ids = build.mocap_ids(mj_model, self._movable())
         self.close()
-        self.mj_model, self.mj_data = mj_model, mujoco.MjData(mj_model)
+        self._mj_model, self._mj_data = mj_model, mujoco.MjData(mj_model)
         self._mjx_model: mjx.Model | None = None
         self._mjx_data: mjx.Data | None = None
+        self._solids: Solids | None = None
+        self._visible: Solids | None = None
+        self.edited = False
         self.invalidate()
+        if self.on_compile is not None:
+            self.on_compile()
+
+    def settle(self) -> None:
+        """Compile, if something was added since."""
+        if self.edited:
+            self.compile()
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """What the spec was compiled to."""
+        self.settle()
+        return self._mj_model
+
+    @property
+    def mj_data(self) -> mujoco.MjData:
+        """The one world that was drawn last."""
+        self.settle()
+        return self._mj_data
+
+    @property
+    def drone_mocap_ids(self) -> list[int]:
+        """Mocap id of each drone's body. (n_drones,)"""
+        self.settle()
+        return self._drone_ids
+
+    def objects(self, before: Objects | None) -> Objects | None:
+        """Return the record of the movable objects: those of one before where they are, new ones at their start."""
+        if not self._starts:
+            return None
+        pos, quat = (jnp.asarray(np.concatenate(xs, axis=1), float)[:, None] for xs in zip(*self._starts, strict=True))
+        vel = jnp.zeros_like(pos)
+        if before is not None:
+            n = len(before.names)
+            pos, quat, vel = (
+                jnp.concatenate([old.astype(new.dtype), new[..., n:, :]], axis=-2)
+                for old, new in ((before.pos, pos), (before.quat, quat), (before.vel, vel))
+            )
+        return Objects(pos, quat, vel, jnp.asarray(self._object_ids, jnp.int32), self._movable())
+
+    def _movable(self) -> tuple[str, ...]:
+        return tuple(body for handle in self.handles if handle.movable for body in handle.bodies)
 
     # All worlds, with MJX -----------------------------------------------------------------------------------
 
     @property
     def mjx_model(self) -> mjx.Model:
         """The model on the device; made when first read."""
+        self.settle()
         model = self._mjx_model
         if model is None:
             model = build.put_model(self.mj_model, self.device)
@@ -128,6 +229,7 @@ class Scene:
     @property
     def mjx_data(self) -> mjx.Data:
         """The scene of every world, as it was last synced; made when first read, and returned as it is."""
+        self.settle()
         if self._mjx_data is None:
             self._mjx_data = self._place(build.make_data(self.mj_model, self.n_worlds, self.device))
         return self._mjx_data
@@ -188,6 +290,75 @@ class Scene:
             return contacts.contact_flags(self.mjx_data)
         return contacts.body_contact_flags(self.mjx_data, self.mj_model, body)
 
+    @property
+    def solids(self) -> Solids:
+        """What drones can touch, as shapes; read anew after a compilation."""
+        self.settle()
+        if self._solids is None:
+            self._solids = solids.read(self._mj_model, self._movable())
+        return self._solids
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the objects that drones can touch, in the order of a contact report."""
+        return tuple(solid.name for solid in self.solids.objects)
+
+    @property
+    def visible(self) -> Solids:
+        """What cameras see, as shapes: a mesh as its convex hull, nothing that is more than half transparent."""
+        self.settle()
+        if self._visible is None:
+            self._visible = solids.read(self._mj_model, self._movable(), touching=False)
+        return self._visible
+
+    def depth_fn(
+        self,
+        camera: str | int = "fpv_cam",
+        width: int = 64,
+        height: int = 64,
+        drones: bool = True,
+        hide_own: bool = True,
+        along: depth.Along = "axis",
+    ) -> Callable[[SimData], Hits]:
+        """Return ``fn(data) -> Hits``, pure: what cameras see in all worlds, by casting a ray for each pixel.
+
+        The hits' ``distance`` is the picture (n_worlds, n_cameras, height, width) in m, with ``normal`` and ``number``
+        (what was hit) beside it; what is not used is not computed inside jit.
+
+        Args:
+            camera: ``fpv_cam`` or ``track_cam`` for those of all drones, then n_cameras is n_drones; or the name or id
+                of one camera.
+            width: Pixels.
+            height: Pixels.
+            drones: Whether drones are seen.
+            hide_own: Whether a drone's camera does not see that drone.
+            along: Whether to measure along the camera's ``axis``, as ``Sim.render`` does, or along the ``ray``.
+
+        Raises:
+            ConfigError: If the resolution cannot be, or the camera's place is not known to the data.
+            UnknownNameError: If there is no such camera.
+        """
+        cameras = depth.find_cameras(self.mj_model, camera, self._movable())
+        return depth.build(self.visible, cameras, width, height, drones, hide_own, along)
+
+    def contact_fn(
+        self, objects: report.Objects = None, floor: bool = True, drones: bool = True
+    ) -> Callable[[SimData], ContactReport]:
+        """Return ``fn(data) -> ContactReport``, pure, for the scene as it is now.
+
+        It takes all worlds, or in a stage one world or one drone; a stage of one drone asks with ``drones=False``.
+        What is left out costs nothing.
+
+        Args:
+            objects: Handles, or names of bodies; None for all, () for none.
+            floor: Whether to report the floor: planes and height fields of the world itself.
+            drones: Whether to report the other drones of a world.
+
+        Raises:
+            ConfigError: If nothing is asked for, or an object is not there or is moved by hand.
+        """
+        return report.build(self.solids, objects, floor, drones)
+
     def draw(
         self, mode: str, camera: int | str, cam_config: dict[str, Any] | None, width: int, height: int
     ) -> NDArray | tuple[NDArray, NDArray] | None:
@@ -213,3 +384,12 @@ class Scene:
         if self.viewer is not None:
             self.viewer.close()
             self.viewer = None
+
+
+def _name(what: Any) -> str:
+    """Return what objects are called that are given no name."""
+    if isinstance(what, mujoco.MjsBody):
+        return what.name or "object"
+    if isinstance(what, mujoco.MjSpec):
+        return what.modelname or "object"
+    return Path(what).stem if isinstance(what, Path) or (isinstance(what, str) and "<" not in what) else "object"

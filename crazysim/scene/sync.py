@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -18,19 +20,19 @@ COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAML
 def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
     """Return the data with its flag set, and the scene as the data has it.
 
-    Writes the drones' poses to their mocap bodies, and computes the transforms of all bodies, the cameras and
-    lights, and the contacts. Mocap bodies that are no drones stay where ``mjx_data`` has them.
+    Writes the poses of drones and of objects with handles, and computes the transforms of all bodies, the cameras and
+    lights, and the contacts. Other mocap bodies stay where ``mjx_data`` has them.
 
     Args:
         data: The simulation. Quaternions are xyzw here and wxyz in MuJoCo.
         mjx_data: The scene of every world.
         mjx_model: The model, shared by all worlds.
     """
-    ids = data.core.drone_mocap_ids
-    mjx_data = mjx_data.replace(
-        mocap_pos=mjx_data.mocap_pos.at[:, ids].set(data.states.pos),
-        mocap_quat=mjx_data.mocap_quat.at[:, ids].set(jnp.roll(data.states.quat, 1, axis=-1)),
-    )
+    for ids, pos, quat in _poses(data):
+        mjx_data = mjx_data.replace(
+            mocap_pos=mjx_data.mocap_pos.at[:, ids].set(pos),
+            mocap_quat=mjx_data.mocap_quat.at[:, ids].set(jnp.roll(quat, 1, axis=-1)),
+        )
 
     def of_world(world: mjx.Data) -> mjx.Data:
         world = mjx.kinematics(_carry_children(mjx_model, world), world)
@@ -41,6 +43,14 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
 
     mjx_data = jax.vmap(of_world)(mjx_data)
     return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
+
+
+def _poses(data: SimData) -> list[tuple[Any, Any, Any]]:
+    """Return mocap ids, positions and attitudes of what the simulation owns: drones, and objects with handles."""
+    owned = [(data.core.drone_mocap_ids, data.states.pos, data.states.quat)]
+    if data.objects is not None:
+        owned.append((data.objects.mocap_ids, data.objects.pos[:, 0], data.objects.quat[:, 0]))
+    return owned
 
 
 def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
@@ -74,9 +84,9 @@ def sync_one_world(
         mj_data.mocap_pos[:] = mjx_data.mocap_pos[world]
         mj_data.mocap_quat[:] = mjx_data.mocap_quat[world]
         mj_data.qpos[:] = mjx_data.qpos[world]
-    ids = np.asarray(data.core.drone_mocap_ids)
-    mj_data.mocap_pos[ids] = data.states.pos[world]
-    mj_data.mocap_quat[ids] = np.roll(data.states.quat[world], 1, axis=-1)
+    for ids, pos, quat in _poses(data):
+        mj_data.mocap_pos[np.asarray(ids)] = pos[world]
+        mj_data.mocap_quat[np.asarray(ids)] = np.roll(quat[world], 1, axis=-1)
     mujoco.mj_kinematics(mj_model, mj_data)
     mujoco.mj_comPos(mj_model, mj_data)
     mujoco.mj_camlight(mj_model, mj_data)

@@ -244,6 +244,21 @@ class SimCore(PyTree):
         )
 
 
+class Objects(PyTree):
+    """Movable objects of the scene: each world has them where it likes. ``sim.scene.add`` makes them."""
+
+    pos: Array = leaf("world", 2)
+    """Positions of their frames, world frame, m. (n_worlds, 1, n_objects, 3)"""
+    quat: Array = leaf("world", 2)
+    """Attitudes, body to world, unit, xyzw. (n_worlds, 1, n_objects, 4)"""
+    vel: Array = leaf("world", 2)
+    """Velocities that contacts feel, world frame, m/s; they move nothing. (n_worlds, 1, n_objects, 3)"""
+    mocap_ids: Array = leaf("shared", 1)
+    """MuJoCo mocap ids of their bodies. (n_objects,)"""
+    names: tuple[str, ...] = static()
+    """Names of their bodies."""
+
+
 class SimData(PyTree):
     """The whole simulation: what a step takes and returns."""
 
@@ -258,6 +273,8 @@ class SimData(PyTree):
     plugins: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Whatever stages of the user keep. Records (``PyTree``) declare the scope of their leaves and are reset with
     their world; bare arrays are opaque, and no reset touches them."""
+    objects: Objects | None = None
+    """Movable objects of the scene; None where there are none."""
 
     @staticmethod
     def create(

@@ -26,8 +26,11 @@ from crazysim.engine.step import Apart
 from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
 from crazysim.scene.contacts import body_id
+from crazysim.scene.depth import Along
 from crazysim.scene.draw import Marks
+from crazysim.scene.objects import Handle
 from crazysim.scene.render import Viewer
+from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Held, Scene
 from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim import functional as F
@@ -117,11 +120,13 @@ class Sim:
         self._scene = Scene(xml_path, self.airframe, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
         self._seed = as_key(rng_key)
         self._counts: dict[int, Array] = {}
+        self._questions: dict[Any, Any] = {}
         self._whole: SimData | None = None
         self._apart: Apart | None = None
         self._cleared: Any = None
         self.build_data()
         self.build_default_data()
+        self._scene.on_compile = self._adopt_scene
 
         self.step_pipeline: Pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator)
         self.reset_pipeline: Pipeline = {"reset": reset}
@@ -137,7 +142,8 @@ class Sim:
 
     @property
     def _data(self) -> SimData:
-        """The data, put together when somebody wants it."""
+        """The data, put together when somebody wants it, with what has been added to the scene."""
+        self._scene.settle()
         if self._whole is None:
             self._whole = self._apart.data()
         return self._whole
@@ -182,7 +188,7 @@ class Sim:
 
     def build_data(self) -> SimData:
         """Return new data at rest, as at construction, and make it the simulation's."""
-        self.data = SimData.create(
+        data = SimData.create(
             self.n_worlds,
             self.n_drones,
             self.dynamics,
@@ -193,7 +199,18 @@ class Sim:
             self._scene.drone_mocap_ids,
             self._seed,
         )
+        self.data = data.replace(objects=self._scene.objects(None))
         return self.data
+
+    @property
+    def default_data(self) -> SimData:
+        """What resets return to."""
+        self._scene.settle()
+        return self._default_data
+
+    @default_data.setter
+    def default_data(self, data: SimData) -> None:
+        self._default_data = data
 
     def build_default_data(self) -> SimData:
         """Make the data as it is now what resets return to, and return it."""
@@ -223,9 +240,10 @@ class Sim:
     def step(self, n_steps: int = 1) -> None:
         """Advance every world by a number of physics steps; any number uses the same compilation."""
         n_steps = positive("n_steps", n_steps)
+        self._scene.settle()
         apart = self._step.take_apart(self._data) if self._apart is None else self._apart
         self._apart, self._whole = self._step.advance(apart, self._count(n_steps)), None
-        self._cleared = self._apart.leaves[apart.plan.flags[1]]
+        self._cleared = self._apart.leaves[apart.plan.shown]
         self._scene.invalidate()
 
     def _count(self, n_steps: int) -> Array:
@@ -322,6 +340,11 @@ class Sim:
 
     # Scene --------------------------------------------------------------------------------------------------
 
+    @property
+    def scene(self) -> Scene:
+        """What MuJoCo holds; ``scene.add`` adds objects."""
+        return self._scene
+
     spec = Held[mujoco.MjSpec]("The scene, to be edited; ``build_mjx`` has an edit take effect.")
     mj_model = Held[mujoco.MjModel]("What ``spec`` was compiled to.")
     mj_data = Held[mujoco.MjData]("The one world that was drawn last.")
@@ -352,10 +375,17 @@ class Sim:
             ConfigError: If the spec does not compile or has lost a drone; the old scene stays then.
         """
         self._scene.compile()
-        ids = jnp.asarray(self._scene.drone_mocap_ids, jnp.int32)
-        self.data = self.data.replace(core=self.data.core.replace(drone_mocap_ids=ids))
-        ids = self.data.core.drone_mocap_ids
-        self.default_data = self.default_data.replace(core=self.default_data.core.replace(drone_mocap_ids=ids))
+
+    def _adopt_scene(self) -> None:
+        """Have the data know what the scene holds now."""
+        ids = self._scene.drone_mocap_ids
+
+        def adopted(data: SimData) -> SimData:
+            core = data.core.replace(drone_mocap_ids=jnp.asarray(ids, jnp.int32))
+            return data.replace(core=core, objects=self._scene.objects(data.objects))
+
+        self.data = adopted(self.data)
+        self.default_data = self._place(adopted(self.default_data))
 
     def contacts(self, body: str | None = None) -> Array:
         """Return which contact slots touch, after bringing the scene up to date if anything has changed.
@@ -376,6 +406,55 @@ class Sim:
             body_id(self.mj_model, body)  # a wrong name is told before anything is touched
         self._data = self._scene.sync(self._data)
         return self._scene.contacts(body)
+
+    def contact_report(self, objects: Objects = None, floor: bool = True, drones: bool = True) -> ContactReport:
+        """Return what each drone touches, and how far it is from the rest: floor, objects, other drones.
+
+        Pure JAX on the drones' poses: neither MuJoCo nor anything that was drawn takes part.
+
+        Args:
+            objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.
+            floor: Whether to report the floor.
+            drones: Whether to report the other drones of a world. What is left out costs nothing, and is None.
+
+        Raises:
+            ValueError: If nothing is asked for, or an object is not there or is moved by hand.
+        """
+        asked = objects if isinstance(objects, (Handle, str, type(None))) else tuple(objects)
+        report = self._compiled("report", lambda: self._scene.contact_fn(asked, floor, drones), asked, floor, drones)
+        return report(_seen(self.data))
+
+    def depth(
+        self,
+        camera: str | int = "fpv_cam",
+        width: int = 64,
+        height: int = 64,
+        drones: bool = True,
+        hide_own: bool = True,
+        along: Along = "axis",
+    ) -> Array:
+        """Return what cameras of all worlds measure, m; see ``scene.depth_fn``. (n_worlds, n_cameras, height, width)
+
+        Infinite where nothing is hit.
+
+        Raises:
+            ValueError: If the camera does not exist, or the resolution cannot be.
+        """
+        settings = (camera, width, height, drones, hide_own, along)
+
+        def build() -> Any:
+            look = self._scene.depth_fn(*settings)
+            return lambda data: look(data).distance
+
+        return self._compiled("depth", build, *settings)(_seen(self.data))
+
+    def _compiled(self, question: str, build: Any, *settings: Any) -> Any:
+        """Return a question to the scene as it is now, compiled once for each setting."""
+        scene = id(self._scene.mj_model)
+        if (scene, question, *settings) not in self._questions:
+            self._questions = {k: v for k, v in self._questions.items() if k[0] == scene}
+            self._questions[scene, question, *settings] = jax.jit(build())
+        return self._questions[scene, question, *settings]
 
     def render(
         self,
@@ -410,6 +489,18 @@ class Sim:
     def close(self) -> None:
         """Close the window and free what pictures needed."""
         self._scene.close()
+
+
+def _seen(data: SimData) -> SimData:
+    """Return what questions about poses look at: a compiled call costs by the number of its arrays."""
+    states = data.states.replace(vel=None, ang_vel=None, rotor_vel=None, force=None, torque=None)
+    core = data.core.replace(**dict.fromkeys(CLOCK))
+    objects = data.objects if data.objects is None else data.objects.replace(vel=None, mocap_ids=None)
+    return data.replace(states=states, controls=None, params=None, plugins={}, core=core, objects=objects)
+
+
+CLOCK = ("steps", "episode", "nonfinite", "world_id", "drone_id", "drone_mocap_ids", "rng_key", "mjx_synced")
+"""What of the core is an array."""
 
 
 def use_box_collision(sim: Sim, enable: bool = True) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import jax
@@ -140,6 +140,14 @@ class Axes:
         return jax.ShapeDtypeStruct(jnp.shape(x)[taken.get(self.scopes[i], 0) :], x.dtype)
 
 
+def with_leaves(leaves: Sequence[Any], numbers: Sequence[int], values: Sequence[Any]) -> list[Any]:
+    """Return a list of leaves in which those of some numbers are replaced."""
+    out = list(leaves)
+    for i, value in zip(numbers, values, strict=True):
+        out[i] = value
+    return out
+
+
 def _over_worlds(stage: Stage, data: Any) -> Any:
     """Return the data after ``stage.one`` in every world, and for every drone if that is what it is for."""
     leaves, axes = jax.tree.leaves(data), Axes(data)
@@ -157,6 +165,5 @@ def _over_worlds(stage: Stage, data: Any) -> Any:
     out = jax.vmap(each, (over_worlds,))(
         [x[:, 0] if s == "world" else x for s, x in zip(axes.scopes, leaves, strict=True)]
     )
-    for i, value in zip(written, out, strict=True):
-        leaves[i] = value[:, None] if axes.scopes[i] == "world" else value
-    return axes.treedef.unflatten(leaves)
+    new = [x[:, None] if axes.scopes[i] == "world" else x for i, x in zip(written, out, strict=True)]
+    return axes.treedef.unflatten(with_leaves(leaves, written, new))

@@ -13,6 +13,7 @@ from crazysim.engine import Step, native
 from crazysim.pytree import PyTree, leaf
 from crazysim.sim.stage import stage
 
+pytestmark = pytest.mark.xdist_group("rules")  # in one worker, so that each engine compiles once
 N_WORLDS, N_DRONES = 7, 3  # 21 lanes: not a multiple of any vector's or block's length
 
 

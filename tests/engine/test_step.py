@@ -162,6 +162,12 @@ class Gust(PyTree):
     """Force, world frame, N. (3,)"""
     strength: jax.Array = leaf("world", 0)
     """Size of its steps, N. ()"""
+    on: jax.Array = leaf("world", 0)
+    """Whether it blows. ()"""
+    met: jax.Array = leaf("drone", 0)
+    """Whether it has been strong. ()"""
+    count: jax.Array = leaf("drone", 0)
+    """How often it was. ()"""
 
 
 @stage("drone")
@@ -169,7 +175,9 @@ def gust(data):
     """Let the force wander, with numbers of the drone's own."""
     mine = data.plugins["gust"]
     noise = jax.random.normal(drone_key(data, "gust"), (3,))
-    mine = mine.replace(force=0.9 * mine.force + mine.strength * noise)
+    force = jnp.where(mine.on, 0.9 * mine.force + mine.strength * noise, 0.0)
+    strong = force[0] > 0.001
+    mine = mine.replace(force=force, met=mine.met | strong, count=mine.count + strong)
     states = data.states.replace(force=mine.force)
     return data.replace(plugins=data.plugins | {"gust": mine}, states=states)
 
@@ -192,7 +200,13 @@ def undeclared(data):
 def with_stages(n_drones, *stages):
     sim = Sim(n_worlds=3, n_drones=n_drones, control="attitude", rng_key=4)
     shape = (3, n_drones)
-    record = Gust(jnp.zeros((*shape, 3)), jnp.linspace(0.001, 0.003, 3)[:, None])
+    record = Gust(
+        jnp.zeros((*shape, 3)),
+        jnp.linspace(0.001, 0.003, 3)[:, None],
+        jnp.array([[True], [False], [True]]),
+        jnp.zeros(shape, bool),
+        jnp.zeros(shape, jnp.int32),
+    )
     sim.data = sim.data.replace(plugins={"gust": record})
     for fn in stages:
         insert_fn_before(sim.step_pipeline, "integration", fn)
@@ -203,7 +217,7 @@ def with_stages(n_drones, *stages):
     ((gust,), 1), ((separation,), 3), ((undeclared,), 3), ((gust, separation, undeclared), 4),
 ])  # fmt: skip
 def test_stages_of_the_user_mean_the_same_on_every_engine(stages, n_segments):
-    """A stage of one drone fuses; one of a world runs on lanes of worlds; an undeclared one splits the step."""
+    """A stage of one drone or one world fuses; an undeclared one splits the step."""
     sim, data = with_stages(4, *stages)
     expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(6))
     for engine in FAST:
@@ -217,10 +231,28 @@ def test_stages_of_the_user_mean_the_same_on_every_engine(stages, n_segments):
                 np.testing.assert_allclose(
                     getattr(found.states, name), getattr(expected.states, name), rtol=2e-5, atol=2e-6, err_msg=name
                 )
+            for name in ("met", "count"):
+                now = getattr(found.plugins["gust"], name)
+                np.testing.assert_array_equal(now, getattr(expected.plugins["gust"], name))
+            assert (gust in stages) == bool(now.any())
     text = explain(Step(sim.step_pipeline, "auto"), data)
     assert ("'undeclared' is not fused: it is not declared for one drone or one world" in text) == (
         undeclared in stages
     )
+
+
+@pytest.mark.parametrize("n_drones", [1, 3, LARGEST_SWARM])
+def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
+    """Worlds that fill a vector, and worlds that do not; more of them than one vector has."""
+    sim, data = with_stages(n_drones, separation)
+    step = Step(sim.step_pipeline, FAST[-1])
+    assert step.plan(data).program.fused
+    found, expected = step(data, jnp.int32(5)), Step(sim.step_pipeline, "plain")(data, jnp.int32(5))
+    assert n_drones == 1 or float(jnp.abs(found.states.force).max()) > 1e-4
+    for name in ("pos", "vel", "force"):
+        np.testing.assert_allclose(
+            getattr(found.states, name), getattr(expected.states, name), rtol=2e-5, atol=2e-6, err_msg=name
+        )
 
 
 def test_a_stage_of_one_world_splits_a_large_swarm():
@@ -428,7 +460,7 @@ def test_every_pipeline_compiles_for_a_gpu(dynamics, control):
     text = cuda.ptx(source, cuda.DEFAULT_ARCHITECTURE)
     assert ".entry advance(" in text
     inputs = step.take_apart(sim.data).inputs()
-    lowered = plan.dynamic.trace(*inputs, jnp.int32(3)).lower(lowering_platforms=("cuda",))
+    lowered = plan.dynamic.trace(inputs, jnp.int32(3)).lower(lowering_platforms=("cuda",))
     assert cuda.TARGET in lowered.as_text()
 
 

@@ -1,4 +1,5 @@
-// A lane is a thread.
+// A lane is a thread; of a warp's, as many are used as make whole groups.
+#define LANES (32 / GROUP * GROUP)
 #define FN static __device__ __forceinline__
 #define RSQRTF(x) rsqrtf(x)
 #define BITS_F32(x) __uint_as_float(x)
@@ -18,6 +19,10 @@ FN f64 f64_lanes(f64 x) { return x; }
 FN i32 i32_lanes(i32 x) { return x; }
 FN u32 u32_lanes(u32 x) { return x; }
 FN b1 b1_lanes(b1 x) { return x; }
+
+// A number of the drone with number d of the same world.
+template <class T> FN T of_drone(T x, int d) { return GROUP == 1 ? x : __shfl_sync(0xffffffffu, x, threadIdx.x % 32 / GROUP * GROUP + d); }
+FN b1 of_drone(b1 x, int d) { return of_drone(i32(x), d) != 0; }
 
 #define LOAD(SIZE, DRONES, p, k) p[lane / DRONES * SIZE + k]
 #define STORE(SIZE, DRONES, p, k, value) if (active && lane % DRONES == 0) p[lane / DRONES * SIZE + k] = value;

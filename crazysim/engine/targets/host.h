@@ -24,7 +24,10 @@ static inline unsigned bits_of_float(float x) { unsigned y; std::memcpy(&y, &x, 
 #else
 #define BYTES 16
 #endif
-#define W (BYTES / WIDEST)  // lanes of a block: as many as the widest numbers leave room for in a vector register
+// Lanes of a block: as many as the widest numbers leave room for in a vector register, but at least one group; of
+// them, as many are used as make whole groups.
+#define W (BYTES / WIDEST > GROUP ? BYTES / WIDEST : GROUP <= 2 ? 2 : GROUP <= 4 ? 4 : 8)
+#define LANES (W / GROUP * GROUP)
 
 template <class T> struct vec { typedef T type __attribute__((vector_size(sizeof(T) * W))); };
 typedef vec<f32>::type f32v;
@@ -33,6 +36,7 @@ typedef vec<i32>::type i32v;
 typedef vec<u32>::type u32v;
 typedef vec<int64_t>::type i64v;
 struct b1v { i32v m; };  // all bits set where true
+template <> struct vec<b1> { typedef b1v type; };
 
 // How a type is lifted to lanes, and what one lane of it is.
 template <class T> struct is_lanes { static const bool value = false; };
@@ -53,6 +57,22 @@ template <class T> FN f64v f64_lanes(T x) { return lift(x); }
 template <class T> FN i32v i32_lanes(T x) { return lift(x); }
 template <class T> FN u32v u32_lanes(T x) { return lift(x); }
 template <class T> FN b1v b1_lanes(T x) { return lift(x); }
+
+FN i32v numbers() { i32v x; for (int i = 0; i < W; ++i) x[i] = i; return x; }
+// A number of the drone with number d of the same world.
+template <class V> FN V of_drone(V x, int d) {
+  if (GROUP == 1) return x;
+  typename std::conditional<sizeof(x[0]) == 8, i64v, i32v>::type from;
+  for (int i = 0; i < W; ++i) { const int j = i / GROUP * GROUP + d; from[i] = j < W ? j : W - 1; }
+#if defined(__clang__)
+  V y;
+  for (int i = 0; i < W; ++i) y[i] = x[from[i]];
+  return y;
+#else
+  return __builtin_shuffle(x, from);
+#endif
+}
+FN b1v of_drone(b1v x, int d) { return {of_drone(x.m, d)}; }
 
 FN b1v mask(i32v m) { return {m}; }
 FN b1v mask(i64v m) { return {__builtin_convertvector(m, i32v)}; }
@@ -171,24 +191,24 @@ template <class V> FN f32v bits_f32(V x) { return (f32v)x; }
 // A block's lanes lie one after the other, each with SIZE numbers, of which the one at K is meant; where there are
 // several drones a world, a number of the world is that of lane / DRONES. Lanes beyond the last repeat it.
 #define RARELY static __attribute__((noinline))
-template <class V, class T> RARELY V load_each(const T* p, int size, int drones, int64_t first, int n) {
-  V x;
+template <class V, class T> RARELY void load_each(V& x, const T* p, int size, int drones, int64_t first, int n) {
   for (int i = 0; i < W; ++i) x[i] = p[(first + (i < n ? i : n - 1)) / drones * size];
-  return x;
 }
-template <class T, class V> RARELY void store_each(T* p, int size, int drones, int64_t first, int n, V x) {
+template <class T, class V> RARELY void store_each(T* p, int size, int drones, int64_t first, int n, const V& x) {
   for (int i = 0; i < n; ++i) p[(first + i) / drones * size] = x[i];
 }
 template <int SIZE, int DRONES, class T> FN typename vec<T>::type load(const T* p, int64_t first, int n, int k) {
   typedef typename vec<T>::type V;
-  if (DRONES > 1 || n < W) return load_each<V>(p + k, SIZE, DRONES, first, n);
   V x;
+  if (DRONES > 1 || n < W) { load_each(x, p + k, SIZE, DRONES, first, n); return x; }
   const T* q = p + first * SIZE + k;
   for (int i = 0; i < W; ++i) x[i] = q[i * SIZE];
   return x;
 }
 template <int SIZE, int DRONES> FN b1v load(const b1* p, int64_t first, int n, int k) {
-  return {-load_each<i32v>(p + k, SIZE, DRONES, first, n)};
+  i32v x;
+  load_each(x, p + k, SIZE, DRONES, first, n);
+  return {-x};
 }
 template <int SIZE, int DRONES, class T, class V> FN void store(T* p, int64_t first, int n, int k, V x) {
   if (DRONES > 1 || n < W) return store_each(p + k, SIZE, DRONES, first, n, x);
@@ -203,10 +223,10 @@ template <int SIZE, int DRONES> FN void store(b1* p, int64_t first, int n, int k
 
 // Work that is worth it is shared between the cores, in whole blocks of lanes.
 template <class F> static void in_parallel(int64_t n_lanes, int n_steps, const F& run) {
-  const int64_t n_blocks = (n_lanes + W - 1) / W, n_cores = std::thread::hardware_concurrency();
+  const int64_t n_blocks = (n_lanes + LANES - 1) / LANES, n_cores = std::thread::hardware_concurrency();
   const int64_t n_threads = std::min(n_cores, n_blocks * n_steps / 512);
   std::vector<std::thread> threads;
-  const auto bound = [=](int64_t k) { return std::min(n_lanes, n_blocks * k / std::max<int64_t>(n_threads, 1) * W); };
+  const auto bound = [=](int64_t k) { return std::min(n_lanes, n_blocks * k / std::max<int64_t>(n_threads, 1) * LANES); };
   for (int64_t k = 1; k < n_threads; ++k) threads.emplace_back(run, bound(k), bound(k + 1));
   run(0, bound(1));
   for (auto& t : threads) t.join();

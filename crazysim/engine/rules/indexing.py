@@ -1,4 +1,4 @@
-"""Rules of the reader (``lower``) for indexing by a runtime number, small linear algebra, and random numbers."""
+"""Rules for indexing: a known index moves elements, one that is known at run time selects among all."""
 
 from __future__ import annotations
 
@@ -6,39 +6,12 @@ import itertools
 from collections.abc import Iterable
 from typing import Any
 
-import jax
 import numpy as np
-from jax.extend.random import threefry_prng_impl
 from jax.lax import GatherScatterMode
 
 from crazysim.engine.ir import Element, constant, is_constant
-from crazysim.engine.lower import (
-    UNROLL,
-    Elements,
-    NoRuleError,
-    Reader,
-    constants,
-    move_many,
-    pack,
-    rule,
-    run_now,
-)
-
-LARGEST_SYSTEM = 6
-"""Largest matrix that is factorised; beyond it the written-out arithmetic is longer than a drone's step."""
-
-
-def known(x: Elements) -> bool:
-    """Return whether all elements are constants."""
-    return all(map(is_constant, x.reshape(-1)))
-
-
-def values(x: Elements) -> np.ndarray:
-    """Return known elements as numbers."""
-    return np.array([int(item) for item in x.reshape(-1)], np.int32).reshape(x.shape)
-
-
-# Indexing -----------------------------------------------------------------------------------------------------------
+from crazysim.engine.lower import UNROLL, Elements, NoRuleError, Reader, constants, pack, rule
+from crazysim.engine.rules.movement import move_many, run_now
 
 
 @rule("dynamic_slice")
@@ -216,164 +189,11 @@ def _scatter(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     return [out]
 
 
-# Small linear algebra ------------------------------------------------------------------------------------------------
+def known(x: Elements) -> bool:
+    """Return whether all elements are constants."""
+    return all(map(is_constant, x.reshape(-1)))
 
 
-def _check_size(eqn: Any, n: int) -> None:
-    if n > LARGEST_SYSTEM:
-        raise NoRuleError(f"primitive {eqn.primitive.name!r} of size {n}; written out are up to {LARGEST_SYSTEM}")
-
-
-def _matrices(x: Elements) -> list[Elements]:
-    return list(x.reshape(-1, *x.shape[-2:]))
-
-
-@rule("cholesky")
-def _cholesky(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    n, dtype = args[0].shape[-1], eqn.outvars[0].aval.dtype
-    _check_size(eqn, n)
-    zero = constant(0, dtype)
-    out = []
-    for a in _matrices(args[0]):
-        low = np.full((n, n), zero, object)
-        for j in range(n):
-            for i in range(j, n):
-                rest = a[i, j]
-                for k in range(j):
-                    rest = r.one("sub", rest, r.one("mul", low[i, k], low[j, k]))
-                low[i, j] = r.block.add("sqrt", (rest,), dtype) if i == j else r.one("div", rest, low[j, j])
-        out.append(low)
-    return [pack([x for low in out for x in low.reshape(-1)], args[0].shape)]
-
-
-@rule("triangular_solve")
-def _triangular_solve(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    p = eqn.params
-    _check_size(eqn, args[0].shape[-1])
-    out = []
-    for a, b in zip(_matrices(args[0]), _matrices(args[1]), strict=True):
-        a = a.T if p["transpose_a"] else a
-        lower = p["lower"] != p["transpose_a"]
-        if not p["left_side"]:  # x a = b is a' x' = b'
-            a, b, lower = a.T, b.T, not lower
-        x = _substitute(r, a, b, lower, p["unit_diagonal"])
-        out.append(x if p["left_side"] else x.T)
-    return [pack([e for x in out for e in x.reshape(-1)], args[1].shape)]
-
-
-def _substitute(r: Reader, a: Elements, b: Elements, lower: bool, unit: bool) -> Elements:
-    n, x = len(a), np.empty(b.shape, object)
-    order = list(range(n)) if lower else list(range(n))[::-1]
-    for column in range(b.shape[1]):
-        for done, i in enumerate(order):
-            rest = b[i, column]
-            for k in order[:done]:
-                rest = r.one("sub", rest, r.one("mul", a[i, k], x[k, column]))
-            x[i, column] = rest if unit else r.one("div", rest, a[i, i])
-    return x
-
-
-@rule("lu")
-def _lu(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Gauss with the largest pivot of each column, rows exchanged by selection."""
-    n, m = args[0].shape[-2:]
-    if n != m:
-        raise NoRuleError("primitive 'lu' of a matrix that is not square")
-    _check_size(eqn, n)
-    factors, all_pivots, permutations = [], [], []
-    for a in _matrices(args[0]):
-        a = a.copy()
-        rows = np.array([constant(i, np.int32) for i in range(n)], object)
-        pivots = []
-        for j in range(n):
-            pivot, largest = constant(j, np.int32), r.one("abs", a[j, j])
-            for i in range(j + 1, n):
-                size = r.one("abs", a[i, j])
-                wins = r.one("gt", size, largest, dtype=bool)
-                pivot = r.one("select_n", wins, pivot, constant(i, np.int32))
-                largest = r.one("select_n", wins, largest, size)
-            pivots.append(pivot)
-            for i in range(j + 1, n):
-                here = r.one("eq", pivot, constant(i, np.int32), dtype=bool)
-                for x in (*a.T, rows):  # every column, and the list of rows
-                    x[i], x[j] = r.one("select_n", here, x[i], x[j]), r.one("select_n", here, x[j], x[i])
-            for i in range(j + 1, n):
-                a[i, j] = r.one("div", a[i, j], a[j, j])
-                for k in range(j + 1, n):
-                    a[i, k] = r.one("sub", a[i, k], r.one("mul", a[i, j], a[j, k]))
-        factors.append(a)
-        all_pivots.append(pivots)
-        permutations.append(rows)
-    shape = args[0].shape
-    return [
-        pack([x for a in factors for x in a.reshape(-1)], shape),
-        pack([x for pivots in all_pivots for x in pivots], shape[:-1]),
-        pack([x for rows in permutations for x in rows], shape[:-1]),
-    ]
-
-
-# Random numbers -------------------------------------------------------------------------------------------------------
-
-
-@rule("random_wrap")
-def _random_wrap(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    words = args[0].reshape(-1, 2)
-    _check_generator(eqn.params["impl"])
-    return [pack([(a, b) for a, b in words], args[0].shape[:-1])]
-
-
-@rule("random_unwrap")
-def _random_unwrap(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    return [_words(args[0])]
-
-
-def _words(keys: Elements) -> Elements:
-    return pack([word for key in keys.reshape(-1) for word in key], (*keys.shape, 2))
-
-
-def _check_generator(impl: Any) -> None:
-    if getattr(impl, "name", str(impl)) != threefry_prng_impl.name:
-        raise NoRuleError(f"a random generator other than JAX's default, {threefry_prng_impl.name}: {impl}")
-
-
-@rule("random_fold_in", "random_split", "random_bits", "random_seed")
-def _random(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Follow what JAX's own generator does with the words of a key: integer arithmetic around one cipher."""
-    name, p, impl = eqn.primitive.name, eqn.params, threefry_prng_impl
-    keys = name != "random_seed"
-    if keys:
-        _check_generator(eqn.invars[0].aval.dtype._impl)
-    single = {
-        "random_fold_in": lambda key, data: impl.fold_in(key, data),
-        "random_split": lambda key: impl.split(key, p["shape"]),
-        "random_bits": lambda key: impl.random_bits(key, p["bit_width"], p["shape"]),
-        "random_seed": lambda seed: impl.seed(seed),
-    }[name]
-    shape = np.broadcast_shapes(*(x.shape for x in args))
-    columns = [np.broadcast_to(x, shape).reshape(-1) for x in args]
-    outs = []
-    for items in zip(*columns, strict=True):
-        inputs = [pack(list(x), (2,)) if isinstance(x, tuple) else pack([x], ()) for x in items]
-        avals = [jax.ShapeDtypeStruct(x.shape, x.reshape(-1)[0].dtype) for x in inputs]
-        outs.append(r.read(jax.make_jaxpr(single)(*avals), inputs)[0])
-    aval = eqn.outvars[0].aval
-    flat = [x for out in outs for x in out.reshape(-1)]
-    if name == "random_bits":
-        return [pack(flat, aval.shape)]
-    return [pack(list(zip(flat[::2], flat[1::2], strict=True)), aval.shape)]
-
-
-@rule("threefry2x32")
-def _threefry(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    shape = np.broadcast_shapes(*(x.shape for x in args))
-    rows = [np.broadcast_to(x, shape).reshape(-1) for x in args]
-    first, second = [], []
-    for words in zip(*rows, strict=True):
-        if all(map(is_constant, words)):
-            a, b = (np.uint32(x) for x in run_now(eqn, [np.asarray(w) for w in words]))
-        else:
-            both = r.block.add("threefry2x32", words, np.uint32)
-            a, b = (r.block.add("item", (both,), np.uint32, (("index", i),)) for i in (0, 1))
-        first.append(a)
-        second.append(b)
-    return [pack(first, shape), pack(second, shape)]
+def values(x: Elements) -> np.ndarray:
+    """Return known elements as numbers."""
+    return np.array([int(item) for item in x.reshape(-1)], np.int32).reshape(x.shape)

@@ -1,0 +1,5 @@
+"""What each primitive of JAX means for single numbers; importing this fills the reader's table (``lower``)."""
+
+from crazysim.engine.rules import control_flow, elementwise, indexing, linalg, movement, random, reductions
+
+__all__ = ["control_flow", "elementwise", "indexing", "linalg", "movement", "random", "reductions"]

@@ -1,0 +1,170 @@
+"""Rules for calls, which are followed, for branches, which become selections, and for loops, which stay loops."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from crazysim.engine.ir import Block, Element, constant, is_constant
+from crazysim.engine.lower import UNROLL, Elements, NoRuleError, Reader, constants, pack, rule
+
+
+@rule("jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_lin", "run_state")
+def _call(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    return r.read(closed(eqn.params.get("jaxpr") or eqn.params["call_jaxpr"]), args)
+
+
+@rule("custom_jvp_call")
+def _custom_jvp(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    return _with_derivative(r, eqn, args, closed(eqn.params["call_jaxpr"]))
+
+
+@rule("call_hi_primitive")
+def _high_level(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """A primitive that is written in terms of others, from JAX 0.12 on."""
+    primitive = eqn.params["_prim"]
+
+    def expanded(*args: Any) -> list[Any]:
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, args)))
+
+    avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+    return _with_derivative(r, eqn, args, jax.make_jaxpr(expanded)(*avals))
+
+
+def _with_derivative(r: Reader, eqn: Any, args: list[Elements], called: core.ClosedJaxpr) -> list[Elements]:
+    """Read a call that brings a derivative of its own, which is read when somebody asks for it."""
+    body = r.inner()
+    body.block.outputs = _flat(body.read(called, [_inputs(body, x) for x in args]))
+
+    @functools.cache
+    def slope() -> Block:
+        """Return the program from operands and their changes to the changes of the results."""
+        single = _as_function(eqn)
+        avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+        traced = jax.make_jaxpr(lambda x, dx: jax.jvp(single, x, dx)[1])(avals, avals)
+        reader = Reader(Block())
+        inputs = [_inputs(reader, x) for x in (*args, *args)]
+        reader.block.outputs = _flat(reader.read(traced, inputs))
+        return reader.block
+
+    return _results(r, "custom_jvp", eqn, _flat(args), (body.block,), (("slope", slope),))
+
+
+@rule("custom_linear_solve")
+def _linear_solve(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
+    n_before = lengths.matvec + lengths.vecmat
+    solve = args[n_before : n_before + lengths.solve]
+    n_all = n_before + lengths.solve + lengths.transpose_solve
+    return r.read(closed(jaxprs.solve), [*solve, *args[n_all:]])
+
+
+@rule("cond")
+def _cond(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Both branches are computed, and one is taken: lanes differ in which."""
+    which, *operands = args
+    branches = [closed(b) for b in eqn.params["branches"]]
+    index = which[()]
+    if is_constant(index):
+        return r.read(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
+    outs = [r.read(b, operands) for b in branches]
+    results = []
+    for k, v in enumerate(eqn.outvars):
+        taken = outs[-1][k]
+        for i in range(len(branches) - 2, -1, -1):
+            here = r.one("le", index, constant(i, index.dtype), dtype=bool)
+            taken = r.each("select_n", [pack([here], ()), taken, outs[i][k]], v.aval.dtype)
+        results.append(taken)
+    return results
+
+
+@rule("platform_index")
+def _platform_index(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Of code that is written for several platforms, what serves all of them, else what serves the CPU."""
+    platforms = list(eqn.params["platforms"])
+    cpu = next((k for k, names in enumerate(platforms) if names is not None and "cpu" in names), 0)
+    return [constants(platforms.index(None) if None in platforms else cpu, np.int32)]
+
+
+@rule("scan")
+def _scan(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    p, length = eqn.params, eqn.params["length"]
+    body = closed(p["jaxpr"])
+    # Versions of JAX name the groups differently; what is stacked over turns has one axis more outside.
+    n_carry = sum(o.aval.ndim == v.aval.ndim for o, v in zip(eqn.outvars, body.jaxpr.outvars, strict=True))
+    n_stacked = sum(o.aval.ndim > v.aval.ndim for o, v in zip(eqn.invars, body.jaxpr.invars, strict=True))
+    n_consts = len(eqn.invars) - n_carry - n_stacked
+    fixed, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
+    if len(body.jaxpr.outvars) == n_carry and not xs and length > 1:
+        inner = r.inner()
+        inputs = [_inputs(inner, x) for x in carry]
+        inner.block.outputs = _flat(inner.read(body, [*fixed, *inputs]))
+        return _results(r, "loop", eqn, _flat(carry), (inner.block,), (("length", length),))
+    if length > UNROLL:
+        raise NoRuleError(
+            f"primitive 'scan' with inputs or outputs for each of {length} turns; written out are {UNROLL}"
+        )
+    stacked: list[list[Elements]] = []
+    for i in range(length)[::-1] if p["reverse"] else range(length):
+        outs = r.read(body, [*fixed, *carry, *(np.asarray(x[i], object) for x in xs)])
+        carry = outs[:n_carry]
+        stacked.append(outs[n_carry:])
+    if p["reverse"]:
+        stacked.reverse()
+    ys = [np.stack([turn[k] for turn in stacked]) for k in range(len(body.jaxpr.outvars) - n_carry)]
+    return [*carry, *ys]
+
+
+@rule("while")
+def _while(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    p = eqn.params
+    n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
+    cond_fixed, body_fixed, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
+    test, body = r.inner(), r.inner()
+    test.block.outputs = _flat(test.read(closed(p["cond_jaxpr"]), [*cond_fixed, *(_inputs(test, x) for x in carry)]))
+    body.block.outputs = _flat(body.read(closed(p["body_jaxpr"]), [*body_fixed, *(_inputs(body, x) for x in carry)]))
+    return _results(r, "while", eqn, _flat(carry), (test.block, body.block))
+
+
+def closed(jaxpr: Any) -> core.ClosedJaxpr:
+    """Return a jaxpr in closed form, whichever form it has."""
+    return jaxpr if isinstance(jaxpr, core.ClosedJaxpr) else core.ClosedJaxpr(jaxpr, ())
+
+
+def _as_function(eqn: Any) -> Callable[..., Any]:
+    """Return an operation as a function of arrays."""
+    return lambda *args: eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(eqn.params))
+
+
+def _inputs(r: Reader, like: Elements) -> Elements:
+    def new(x: Any) -> Any:
+        return tuple(map(new, x)) if isinstance(x, tuple) else r.block.input(x.dtype)
+
+    return pack([new(x) for x in like.reshape(-1)], like.shape)
+
+
+def _flat(arrays: Sequence[Elements]) -> list[Element]:
+    """Return single elements in a row; a key is two words."""
+    items = [x for array in arrays for x in array.reshape(-1)]
+    return [word for x in items for word in (x if isinstance(x, tuple) else (x,))]
+
+
+def _results(
+    r: Reader, op: str, eqn: Any, args: list[Element], blocks: tuple[Block, ...], params: tuple = ()
+) -> list[Elements]:
+    """Return the results of an operation that has many."""
+    whole = r.block.add(op, tuple(args), bool, params, blocks)
+    out, k = [], 0
+    for v in eqn.outvars:
+        is_key = jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.prng_key)
+        size = int(np.prod(v.aval.shape)) * (2 if is_key else 1)
+        dtype = np.uint32 if is_key else v.aval.dtype
+        items = [r.block.add("item", (whole,), dtype, (("index", k + i),)) for i in range(size)]
+        out.append(pack(list(zip(items[::2], items[1::2], strict=True)) if is_key else items, v.aval.shape))
+        k += size
+    return out

@@ -1,0 +1,76 @@
+"""The rule for what moves elements and computes nothing: run on their numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from crazysim.engine.lower import Elements, Reader, constants, pack, rule
+
+MOVEMENT = (
+    "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "split", "unstack",
+    "concatenate", "stack", "pad", "tile",
+)  # fmt: skip
+
+
+@rule(*MOVEMENT)
+def _move(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    return move_many(eqn, args) if eqn.primitive.multiple_results else [move(eqn, args)]
+
+
+def move(eqn: Any, args: list[Elements]) -> Elements:
+    """Return what a primitive that only moves elements makes of them."""
+    p, x = eqn.params, args[0]
+    match eqn.primitive.name:
+        case "reshape" if p.get("dimensions") is None:
+            return x.reshape(eqn.outvars[0].aval.shape)
+        case "squeeze" | "expand_dims":
+            return x.reshape(eqn.outvars[0].aval.shape)
+        case "transpose":
+            return x.transpose(p["permutation"])
+        case "slice":
+            strides = p["strides"] or (1,) * x.ndim
+            return x[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
+        case "broadcast_in_dim":
+            shape = [1] * len(p["shape"])
+            for size, axis in zip(x.shape, p["broadcast_dimensions"], strict=True):
+                shape[axis] = size
+            return np.broadcast_to(x.reshape(shape), p["shape"])
+        case "concatenate":
+            return np.concatenate(args, axis=p["dimension"])
+        case "stack":
+            return np.stack(args, axis=p["axis"])
+    return move_many(eqn, args)[0]
+
+
+def move_many(eqn: Any, args: list[Elements], fixed: Sequence[Any] = ()) -> list[Elements]:
+    """Return what a primitive that only moves elements makes of them, by running it on their numbers.
+
+    Args:
+        eqn: The operation.
+        args: The arrays that are moved.
+        fixed: Operands behind them that say where to: indices that are known.
+    """
+    numbers, elements = [], []
+    for x in args:
+        numbers.append(np.arange(len(elements), len(elements) + x.size, dtype=np.int32).reshape(x.shape))
+        elements.extend(x.reshape(-1))
+    params = {"fill_value": 0} if eqn.primitive.name == "gather" else {}  # never used: all places are inside
+    places = run_now(eqn, [*numbers, *fixed], **params)
+    return [pack([elements[i] for i in p.reshape(-1)], p.shape) for p in places]
+
+
+def run_now(eqn: Any, args: Sequence[Any], **params: Any) -> list[np.ndarray]:
+    """Return the results of an operation on known numbers."""
+    with jax.ensure_compile_time_eval(), jax.default_device(jax.local_devices(backend="cpu")[0]):
+        out = eqn.primitive.bind(*(jax.numpy.asarray(x) for x in args), **(eqn.params | params))
+        return [np.asarray(x) for x in (out if eqn.primitive.multiple_results else [out])]
+
+
+@rule("iota", "iota_2x32_shape")
+def _iota(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+    outs = run_now(eqn, [])
+    return [constants(x, x.dtype) for x in outs]

@@ -1,0 +1,185 @@
+"""Where rays first meet the surface of a shape, and its normal there: what a depth camera sees."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.geometry.points import components
+from crazysim.geometry.shapes import Shape
+from crazysim.rotation import safe_clip, safe_normalize, safe_sqrt
+
+PARALLEL = 1e-12
+"""Component of a unit direction below which a ray counts as parallel: its inverse and its square fit float32."""
+
+Interval = tuple[Array, Array, Array]
+"""Where a line enters a convex shape, where it leaves it, and whether it meets it at all."""
+
+
+def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Array]:
+    """Return how far rays go before they meet the surface, and the outward normal where they do.
+
+    As MuJoCo's ``mj_ray`` has it: from inside a solid the ray meets the surface where it leaves, and the normal still
+    points outward; a plane is met from above only.
+
+    Args:
+        shape: The shape.
+        origin: Where rays start, in the frame of the shape, m. (..., 3)
+        direction: Their unit directions. (..., 3)
+
+    Returns:
+        Distance along the ray, m, infinite where it misses. (...)
+        Unit normal in the frame of the shape, zero where it misses. (..., 3)
+    """
+    origin, direction = jnp.broadcast_arrays(origin, direction)
+    if shape.kind == "plane":
+        t, hit = _plane(origin, direction)
+    else:
+        near, far, meets = LINE[shape.kind](shape, origin, direction)
+        hit = meets & (far >= 0)
+        t = jnp.where(near >= 0, near, far)
+    # Where it misses, nothing may come of the rest, in gradients either.
+    t = jnp.where(hit, t, 0.0)
+    normal = NORMAL[shape.kind](shape, origin + t[..., None] * direction)
+    return jnp.where(hit, t, jnp.inf), jnp.where(hit[..., None], normal, 0.0)
+
+
+def _plane(origin: Array, direction: Array) -> tuple[Array, Array]:
+    height, down = origin[..., 2], -direction[..., 2]
+    hit = (down > PARALLEL) & (height >= 0)
+    return height / jnp.where(hit, down, 1.0), hit
+
+
+def slab(origin: Array, direction: Array, half: Array | float) -> Interval:
+    """Return where a line is between two planes at ``-half`` and ``half``, by components across them. 3 of (...)"""
+    parallel = jnp.abs(direction) < PARALLEL
+    inverse = 1 / jnp.where(parallel, PARALLEL, direction)
+    a, b = (-half - origin) * inverse, (half - origin) * inverse
+    return jnp.where(a < b, a, b), jnp.where(a < b, b, a), ~parallel | (jnp.abs(origin) <= half)
+
+
+def both(p: Interval, q: Interval) -> Interval:
+    """Return where a line is in two convex shapes at once."""
+    near, far = jnp.where(p[0] > q[0], p[0], q[0]), jnp.where(p[1] < q[1], p[1], q[1])
+    return near, far, p[2] & q[2] & (near <= far)
+
+
+def either(p: Interval, q: Interval) -> Interval:
+    """Return where a line is in the union of two shapes, if it is convex along the line."""
+    near = jnp.where(p[2] & (~q[2] | (p[0] < q[0])), p[0], q[0])
+    far = jnp.where(p[2] & (~q[2] | (p[1] > q[1])), p[1], q[1])
+    return near, far, p[2] | q[2]
+
+
+def _ball(origin: list[Array], direction: list[Array], radius: float) -> Interval:
+    """Return where a line is in a ball, or in a cylinder if two components are given.
+
+    The distance of the line to the centre is that of its nearest point: the usual discriminant cancels far away.
+    """
+    square = sum(d * d for d in direction)
+    parallel = square < PARALLEL
+    square = jnp.where(parallel, 1.0, square)
+    middle = -sum(o * d for o, d in zip(origin, direction, strict=True)) / square
+    closest = [o + middle * d for o, d in zip(origin, direction, strict=True)]
+    rest = radius * radius - sum(c * c for c in closest)
+    half = safe_sqrt(rest / square)
+    outside = sum(o * o for o in origin) > radius * radius
+    half = jnp.where(parallel, 1 / PARALLEL, half)
+    return middle - half, middle + half, jnp.where(parallel, ~outside, rest >= 0)
+
+
+def _sphere_line(shape: Shape, origin: Array, direction: Array) -> Interval:
+    return _ball(list(components(origin)), list(components(direction)), shape.size[0])
+
+
+def _capsule_line(shape: Shape, origin: Array, direction: Array) -> Interval:
+    radius, half = shape.size
+    (x, y, z), d = components(origin), list(components(direction))
+    out = both(_ball([x, y], d[:2], radius), slab(z, d[2], half))
+    for end in (-half, half):
+        out = either(out, _ball([x, y, z - end], d, radius))
+    return out
+
+
+def _box_line(shape: Shape, origin: Array, direction: Array) -> Interval:
+    x, y, z = (slab(o, d, h) for o, d, h in zip(components(origin), components(direction), shape.size, strict=True))
+    return both(both(x, y), z)
+
+
+def _cylinder_line(shape: Shape, origin: Array, direction: Array) -> Interval:
+    radius, half = shape.size
+    (x, y, z), (u, v, w) = components(origin), components(direction)
+    return both(_ball([x, y], [u, v], radius), slab(z, w, half))
+
+
+def _ellipsoid_line(shape: Shape, origin: Array, direction: Array) -> Interval:
+    start, way = ([x / a for x, a in zip(components(v), shape.size, strict=True)] for v in (origin, direction))
+    return _ball(start, way, 1.0)
+
+
+LINE = {
+    "sphere": _sphere_line,
+    "capsule": _capsule_line,
+    "box": _box_line,
+    "cylinder": _cylinder_line,
+    "ellipsoid": _ellipsoid_line,
+}
+
+
+# Normals of surface points -------------------------------------------------------------------------------------------
+
+
+def _up(like: Array) -> Array:
+    """Return the unit vector along z, for as many points. (..., 3)"""
+    zero = jnp.zeros_like(like[..., 0])
+    return jnp.stack([zero, zero, zero + 1], axis=-1)
+
+
+def _plane_normal(_: Shape, point: Array) -> Array:
+    return _up(point)
+
+
+def _sphere_normal(_: Shape, point: Array) -> Array:
+    return safe_normalize(point, _up(point))
+
+
+def _capsule_normal(shape: Shape, point: Array) -> Array:
+    x, y, z = components(point)
+    half = shape.size[1]
+    return safe_normalize(jnp.stack([x, y, z - safe_clip(z, -half, half)], axis=-1), _up(point))
+
+
+def _box_normal(shape: Shape, point: Array) -> Array:
+    """Return the normal of the side that a point of the surface is least inside of. (..., 3)"""
+    x, y, z = (jnp.abs(p) - h for p, h in zip(components(point), shape.size, strict=True))
+    of_x = (x >= y) & (x >= z)
+    of_y = ~of_x & (y >= z)
+    sides = jnp.stack([of_x, of_y, ~of_x & ~of_y], axis=-1)
+    return jnp.where(sides, jnp.where(point < 0, -1.0, 1.0), 0.0)
+
+
+def _cylinder_normal(shape: Shape, point: Array) -> Array:
+    radius, half = shape.size
+    x, y, z = components(point)
+    zero = jnp.zeros_like(z)
+    rho = safe_sqrt(x * x + y * y)
+    of_side = rho - radius > jnp.abs(z) - half
+    safe = jnp.where(of_side, rho, 1.0)
+    side = jnp.stack([x / safe, y / safe, zero], axis=-1)
+    cap = jnp.stack([zero, zero, jnp.where(z < 0, -1.0, 1.0)], axis=-1)
+    return jnp.where(of_side[..., None], side, cap)
+
+
+def _ellipsoid_normal(shape: Shape, point: Array) -> Array:
+    gradient = [x / (a * a) for x, a in zip(components(point), shape.size, strict=True)]
+    return safe_normalize(jnp.stack(gradient, axis=-1), _up(point))
+
+
+NORMAL = {
+    "plane": _plane_normal,
+    "sphere": _sphere_normal,
+    "capsule": _capsule_normal,
+    "box": _box_normal,
+    "cylinder": _cylinder_normal,
+    "ellipsoid": _ellipsoid_normal,
+}

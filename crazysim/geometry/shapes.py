@@ -1,0 +1,195 @@
+"""Shapes: what a drone or an obstacle is made of, as constants that a program is compiled with."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from crazysim.errors import ConfigError
+
+SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4}
+"""Every kind, and how many numbers its size has."""
+LARGEST_SEARCH = 64
+"""Most vertices whose hull is found by trying every triangle."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Shape:
+    """A solid in a frame of its own. It is static: compared and hashed by content, a new one recompiles.
+
+    Sizes are MuJoCo's, half lengths in m:
+
+    - ``plane``: none; all that lies below z = 0.
+    - ``sphere``: radius.
+    - ``capsule``, ``cylinder``: radius, half length of the axis, which is z; a capsule's caps come on top.
+    - ``box``: half lengths along x, y and z.
+    - ``ellipsoid``: semi-axes along x, y and z.
+    - ``mesh``: none; the convex hull of its vertices. Made by ``hull``.
+    - ``hfield``: half extents along x and y, largest height, depth of the ground below z = 0. Made by ``hfield``.
+
+    Raises:
+        ConfigError: If the kind is unknown or the size is no size of that kind.
+    """
+
+    kind: str
+    """One of ``SIZES``."""
+    size: tuple[float, ...] = ()
+    """Size in the kind's convention, m; what comes beyond its numbers, as in MuJoCo's ``geom_size``, is left out."""
+    vertices: np.ndarray | None = None
+    """Corners of a mesh's hull, m. (n_vertices, 3)"""
+    faces: np.ndarray | None = None
+    """Triangles of the hull as numbers of vertices, counter-clockwise from outside. (n_faces, 3)"""
+    normals: np.ndarray | None = None
+    """Unit outward normals of the hull's planes, each once. (n_planes, 3)"""
+    offsets: np.ndarray | None = None
+    """Distances of these planes from the origin along their normals, m. (n_planes,)"""
+    heights: np.ndarray | None = None
+    """Heights of a height field on its grid, rows along y and columns along x, m. (n_rows, n_columns)"""
+
+    def __post_init__(self) -> None:
+        """Check kind and size, and keep the size as plain numbers."""
+        if self.kind not in SIZES:
+            raise ConfigError(f"a shape of kind {self.kind!r}; there are {', '.join(SIZES)}")
+        needed = SIZES[self.kind]
+        given = np.asarray(self.size, np.float64).reshape(-1)
+        size = given[:needed]
+        if len(size) < needed or not np.all(np.isfinite(size)) or not np.all(size > 0):
+            raise ConfigError(
+                f"a {self.kind} of size {tuple(given.tolist())}; needed are {needed} positive, finite numbers, in m"
+            )
+        for name, kind, maker in (("vertices", "mesh", "hull"), ("heights", "hfield", "hfield")):
+            if self.kind == kind and getattr(self, name) is None:
+                raise ConfigError(f"a {kind} without {name}; make it with geometry.{maker}")
+        object.__setattr__(self, "size", tuple(size.tolist()))
+
+    def _content(self) -> tuple[Any, ...]:
+        arrays = (self.vertices, self.faces, self.normals, self.offsets, self.heights)
+        return (self.kind, self.size, *(None if a is None else (a.shape, a.tobytes()) for a in arrays))
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the other is a shape of the same content."""
+        return isinstance(other, Shape) and self._content() == other._content()
+
+    def __hash__(self) -> int:
+        """Return a hash of the content."""
+        return hash(self._content())
+
+
+def hull(vertices: Any, faces: Any = None) -> Shape:
+    """Return a convex mesh.
+
+    Args:
+        vertices: Corners, m; without ``faces`` their convex hull is taken. (n_vertices, 3)
+        faces: Triangles of the convex hull as numbers of vertices, in any order of turning; needed beyond 64 vertices.
+            MuJoCo's compiled model holds them. (n_faces, 3)
+
+    Raises:
+        ConfigError: If the vertices span no volume, or the faces are not those of their convex hull.
+    """
+    v = np.asarray(vertices, np.float64)
+    if v.ndim != 2 or v.shape[1] != 3 or len(v) < 4 or not np.all(np.isfinite(v)):
+        raise ConfigError(f"vertices of shape {v.shape}; needed are four or more finite points, (n_vertices, 3)")
+    scale = float(np.max(np.ptp(v, axis=0)))
+    spread = np.linalg.svd(v - v.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(v))
+    if spread <= 1e-9 * scale:
+        raise ConfigError(f"{len(v)} vertices that lie in one plane; a mesh needs a volume")
+    triangles = _search(v, 1e-9 * scale) if faces is None else np.asarray(faces)
+    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
+        raise ConfigError(f"faces of shape {triangles.shape}, {triangles.dtype}; needed are integers, (n_faces, 3)")
+    if triangles.min() < 0 or triangles.max() >= len(v):
+        raise ConfigError(f"faces that name vertices {triangles.min()} to {triangles.max()}; there are {len(v)}")
+    a, b, c = (v[triangles[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    area = np.linalg.norm(normals, axis=1)
+    # Slivers have no normal of their own; their neighbours close the hull.
+    keep = area > 1e-12 * scale * scale
+    triangles, normals = triangles[keep], normals[keep] / area[keep, None]
+    outward = np.sum(normals * (v[triangles[:, 0]] - v.mean(axis=0)), axis=1) > 0
+    normals = np.where(outward[:, None], normals, -normals)
+    triangles = np.where(outward[:, None], triangles, triangles[:, ::-1])
+    offsets = np.sum(normals * v[triangles[:, 0]], axis=1)
+    out = float(np.max(v @ normals.T - offsets)) if len(offsets) else np.inf
+    if out > 1e-4 * scale or (keep.all() and not _closed(triangles)):
+        raise ConfigError(
+            f"faces that are not closed, or leave a vertex outside, by {out:.3g} m; needed are the triangles of the "
+            f"convex hull. Up to {LARGEST_SEARCH} vertices they are found without being given."
+        )
+    # Triangles of one flat side share a plane; the offset is that of the outermost vertex, so that all are inside.
+    planes = _distinct(normals)
+    offsets = np.max(v @ planes.T, axis=0)
+    used, places = np.unique(triangles, return_inverse=True)
+    return Shape("mesh", (), *map(_constant, (v[used], places.reshape(-1, 3), planes, offsets)))
+
+
+def hfield(heights: Any, size: Sequence[float]) -> Shape:
+    """Return the ground below a surface of triangles over a rectangular grid, two to a cell.
+
+    The diagonal of a cell joins its corners of least and of largest x and y, as in MuJoCo.
+
+    Args:
+        heights: Heights of the surface, rows along y and columns along x, m. (n_rows, n_columns)
+        size: Half extents along x and y, largest height, depth of the ground below z = 0, m. (4,)
+
+    Raises:
+        ConfigError: If there are fewer than two rows or columns, or a height is not within zero and the largest.
+    """
+    h = np.asarray(heights, np.float64)
+    if h.ndim != 2 or min(h.shape) < 2:
+        raise ConfigError(f"heights of shape {h.shape}; needed are two or more rows and columns")
+    shape = Shape("hfield", tuple(size), heights=_constant(h))
+    if not np.all(np.isfinite(h)) or h.min() < 0 or h.max() > shape.size[2] * (1 + 1e-6):
+        raise ConfigError(f"heights from {h.min()} to {h.max()} m; needed are heights within 0 and {shape.size[2]}")
+    return shape
+
+
+def _search(v: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return triangles of a convex hull: all whose plane has no vertex above. Flat sides are cut as a fan."""
+    if len(v) > LARGEST_SEARCH:
+        raise ConfigError(
+            f"{len(v)} vertices without faces; their hull is found for up to {LARGEST_SEARCH}. Pass faces, the "
+            f"triangles of the convex hull."
+        )
+    i, j, k = np.array([(i, j, k) for i in range(len(v)) for j in range(i) for k in range(j)]).T
+    normals = np.cross(v[j] - v[i], v[k] - v[i])
+    length = np.linalg.norm(normals, axis=1)
+    flat = length <= tolerance * np.max(np.ptp(v, axis=0))
+    normals = normals / np.where(flat, 1.0, length)[:, None]
+    above = v @ normals.T - np.sum(normals * v[i], axis=1)
+    low, high = above.min(axis=0) >= -tolerance, above.max(axis=0) <= tolerance
+    out = normals[(low | high) & ~flat] * np.where(low[(low | high) & ~flat], -1.0, 1.0)[:, None]
+    triangles: list[tuple[int, int, int]] = []
+    for normal in _distinct(out):
+        along = v @ normal
+        side = np.flatnonzero(along >= along.max() - 2 * tolerance)
+        axis = np.eye(3)[np.argmin(np.abs(normal))]
+        x = np.cross(normal, axis)
+        middle = v[side] - v[side].mean(axis=0)
+        angle = np.arctan2(middle @ np.cross(normal, x), middle @ x)
+        side = side[np.argsort(angle)]
+        triangles += [(side[0], side[n], side[n + 1]) for n in range(1, len(side) - 1)]
+    return np.array(triangles, np.int64).reshape(-1, 3)
+
+
+def _closed(triangles: np.ndarray) -> bool:
+    """Return whether every edge is run through once each way."""
+    edges = {(t[k], t[(k + 1) % 3]) for t in triangles.tolist() for k in range(3)}
+    return len(edges) == 3 * len(triangles) and all((b, a) in edges for a, b in edges)
+
+
+def _distinct(normals: np.ndarray) -> np.ndarray:
+    """Return unit vectors that differ by more than rounding. (n, 3) -> (m, 3)"""
+    kept: list[np.ndarray] = []
+    for n in normals:
+        if not kept or np.min(np.linalg.norm(np.asarray(kept) - n, axis=1)) > 1e-6:
+            kept.append(n)
+    return np.asarray(kept).reshape(-1, 3)
+
+
+def _constant(x: np.ndarray) -> np.ndarray:
+    """Return a copy that nobody can write."""
+    x = np.array(x)
+    x.setflags(write=False)
+    return x

@@ -1,0 +1,81 @@
+"""Shapes: equal by content, checked when they are made, and a hull that holds all its vertices."""
+
+import numpy as np
+import pytest
+
+from crazysim import ConfigError
+from crazysim.geometry import Shape, hfield, hull
+
+CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+
+
+def test_shapes_are_equal_by_content():
+    assert Shape("box", (1, 2, 3)) == Shape("box", np.array([1.0, 2.0, 3.0]))
+    assert hash(Shape("sphere", (0.5, 0, 0))) == hash(Shape("sphere", (0.5,)))  # as MuJoCo has it in geom_size
+    assert Shape("capsule", (1, 2)) != Shape("cylinder", (1, 2))
+    heights = np.array([[0.0, 0.1], [0.2, 0.3]])
+    one, same, other = (hfield(h, (1, 1, 0.5, 0.1)) for h in (heights, heights.copy(), heights + 0.1))
+    assert one == same
+    assert hash(one) == hash(same)
+    assert one != other
+    assert hull(CUBE) == hull(CUBE.copy())
+    assert hull(CUBE) != hull(2 * CUBE)
+
+
+def test_a_shape_does_not_change_with_the_array_it_was_made_of():
+    vertices = CUBE.copy()
+    shape = hull(vertices)
+    vertices[:] = 0
+    np.testing.assert_array_equal(shape.vertices, CUBE)
+    with pytest.raises(ValueError, match="read-only"):
+        shape.vertices[0, 0] = 1
+
+
+def test_hull_of_a_cube():
+    shape = hull([*CUBE, [0, 0, 0], [0.5, 0.2, 0.1]])
+    assert shape.vertices.shape == (8, 3)
+    assert shape.faces.shape == (12, 3)
+    assert {tuple(n) for n in np.round(shape.normals, 9) + 0.0} == {
+        tuple(s * e) for s in (1, -1) for e in np.eye(3) + 0
+    }
+    np.testing.assert_allclose(shape.offsets, 1)
+
+
+@pytest.mark.parametrize("n", [4, 12, 40])
+def test_a_hull_is_closed_and_holds_its_vertices(rng, n):
+    vertices = rng.normal(size=(n, 3))
+    shape = hull(vertices)
+    assert np.max(vertices @ shape.normals.T - shape.offsets) < 1e-12
+    np.testing.assert_allclose(np.linalg.norm(shape.normals, axis=1), 1)
+    corners = shape.vertices[shape.faces]
+    # Divergence theorem: outward triangles of a closed surface add up to nothing, and to the volume.
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(area.sum(axis=0), 0, atol=1e-12)
+    assert np.sum(area * corners[:, 0]) > 0
+    assert len(shape.vertices) - 1.5 * len(shape.faces) + len(shape.faces) == 2  # Euler
+    turned = shape.faces[:, [0, 2, 1]]
+    assert set(map(tuple, np.round(hull(shape.vertices, turned).normals, 9))) == set(
+        map(tuple, np.round(shape.normals, 9))
+    )
+
+
+@pytest.mark.parametrize("make, message", [
+    (lambda: Shape("torus", (1, 1)), "torus.*plane, sphere"),
+    (lambda: Shape("box", (1, 2)), r"box of size \(1.0, 2.0\); needed are 3"),
+    (lambda: Shape("sphere", (0,)), "positive"),
+    (lambda: Shape("sphere", (np.nan,)), "finite"),
+    (lambda: Shape("mesh"), "mesh without vertices"),
+    (lambda: Shape("hfield", (1, 1, 1, 1)), "hfield without heights"),
+    (lambda: hull(CUBE[:3]), r"shape \(3, 3\)"),
+    (lambda: hull(CUBE * [1, 1, 0]), "one plane"),
+    (lambda: hull(np.random.default_rng(0).normal(size=(65, 3))), "65 vertices without faces"),
+    (lambda: hull(CUBE, [[0, 1, 8]]), "0 to 8; there are 8"),
+    (lambda: hull(CUBE, [[0.0, 1, 2]]), "integers"),
+    (lambda: hull(CUBE, [[0, 3, 5]]), "needed are the triangles of the convex hull"),
+    (lambda: hull(CUBE, hull(CUBE).faces[1:]), "not closed"),
+    (lambda: hfield(np.zeros((1, 5)), (1, 1, 1, 1)), r"\(1, 5\)"),
+    (lambda: hfield(np.full((2, 5), 2.0), (1, 1, 1, 1)), "from 2.0 to 2.0"),
+])  # fmt: skip
+def test_law_09_wrong_input_is_told_at_once(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()

@@ -1,0 +1,220 @@
+"""Depth cameras and range finders against geometry worked out by hand, C MuJoCo's rays and its depth pictures."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.scene.depth import pixel_directions
+from crazysim.scene.range_finder import RANGER, add_range_finder
+
+WIDTH, HEIGHT, FOVY = 24, 16, 70.0
+
+
+def placed(sim, pos, quat=None):
+    """Put drones at positions (n_worlds, n_drones, 3), level unless a quaternion is given."""
+    states = sim.data.states.replace(pos=jnp.asarray(pos, jnp.float32))
+    if quat is not None:
+        states = states.replace(quat=jnp.asarray(quat, jnp.float32))
+    sim.data = sim.data.replace(states=states)
+
+
+def looks(width=WIDTH, height=HEIGHT, fovy=FOVY):
+    """Return where the pixels of a level drone's camera look, world frame: ahead is x, right is -y."""
+    d = pixel_directions(fovy, width, height)
+    return np.stack([-d[..., 2], -d[..., 0], d[..., 1]], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def room():
+    """Two worlds of two drones before a wall, a ball and, hidden in one world, a box that moves."""
+    sim = Sim(n_worlds=2, n_drones=2, control="attitude")
+    sim.scene.add("wall", pos=[3, 0, 0], length=20, height=20, mocap=False)
+    ball = sim.scene.add("sphere", pos=[1.5, 0.2, 1.1], radius=0.2)
+    box = sim.scene.add("box", pos=[0, 0, -50], size=(0.2, 0.4, 0.3))
+    placed(sim, [[[0, 0, 1], [0.5, -0.3, 1]]] * 2)
+    return sim, ball, box
+
+
+def test_a_wall_a_floor_and_a_ball_are_where_they_are(room):
+    sim, _, _ = room
+    eye = np.asarray(sim.airframe.value("shape.fpv_camera")) + [0, 0, 1]
+    d = looks()
+    with np.errstate(divide="ignore"):
+        wall = (3 - 0.025 - eye[0]) / d[..., 0]
+        floor = np.where(d[..., 2] < 0, -eye[2] / d[..., 2], np.inf)
+    to = np.array([1.5, 0.2, 1.1]) - eye
+    along = d @ to
+    under = 0.2**2 - (to @ to - along**2)
+    ball = np.where(under > 0, along - np.sqrt(np.maximum(under, 0)), np.inf)
+    expected = np.minimum(np.minimum(wall, floor), ball)
+    hits = jax.jit(sim.scene.depth_fn("fpv_cam:0", WIDTH, HEIGHT, drones=False, along="ray"))(sim.data)
+    np.testing.assert_allclose(hits.distance[0, 0], expected, rtol=1e-5)
+    which = np.stack([floor, wall, ball]).argmin(axis=0)
+    names = np.array(hits.names)[np.asarray(hits.number[0, 0])]
+    np.testing.assert_array_equal(names, np.array(["floor", "wall:0", "sphere:0"])[which])
+    assert set(which.ravel()) == {0, 1, 2}
+    normal = np.asarray(hits.normal[0, 0])
+    np.testing.assert_allclose(normal[which == 0], np.broadcast_to([0, 0, 1.0], normal[which == 0].shape), atol=1e-6)
+    np.testing.assert_allclose(normal[which == 1], np.broadcast_to([-1.0, 0, 0], normal[which == 1].shape), atol=1e-6)
+    at = eye + d * expected[..., None]
+    np.testing.assert_allclose(normal[which == 2], ((at - [1.5, 0.2, 1.1]) / 0.2)[which == 2], atol=1e-4)
+
+
+def test_depth_along_the_axis_of_a_wall_is_one_number(room):
+    sim, _, _ = room
+    depth = sim.depth("fpv_cam", WIDTH, HEIGHT, drones=False)
+    assert depth.shape == (2, 2, HEIGHT, WIDTH)
+    eye = np.asarray(sim.airframe.value("shape.fpv_camera"))[0]
+    np.testing.assert_allclose(depth[:, 0, 0], 3 - 0.025 - eye, rtol=1e-5)  # the upper row sees only the wall
+    np.testing.assert_allclose(depth[:, 1, 0], 3 - 0.025 - eye - 0.5, rtol=1e-5)
+
+
+def test_objects_are_seen_where_they_are_in_each_world(room):
+    sim, _, box = room
+    data = box.set_pose(sim.data, np.array([[[1.0, 0, 1.0]], [[0, 0, -50.0]]]))
+    hits = jax.jit(sim.scene.depth_fn("fpv_cam:0", WIDTH, HEIGHT))(data)
+    seen = np.asarray(hits.number == hits.names.index("box:0")).reshape(2, -1).sum(axis=1)
+    assert seen[0] > 20
+    assert seen[1] == 0
+
+
+def test_a_drone_sees_others_and_not_itself(room):
+    """The second drone flies before the first, off to the right; it sees nobody."""
+    sim, _, _ = room
+    look = jax.jit(sim.scene.depth_fn("fpv_cam", 96, 64))
+    hits = look(sim.data)
+    first = hits.names.index("drone:0")
+    assert not (hits.number[:, 1] >= first).any()
+    others = np.asarray(hits.number[0, 0] == first + 1)
+    assert not (hits.number[:, 0] == first).any()
+    assert 4 < others.sum() < 400
+    assert np.argwhere(others)[:, 1].min() > 48, "what is at -y is in the right half"
+    own = jax.jit(sim.scene.depth_fn("track_cam", 96, 64, hide_own=False))(sim.data)
+    assert (own.number[0, 0] == first).sum() > 8
+    assert not (jax.jit(sim.scene.depth_fn("track_cam", 96, 64))(sim.data).number[0, 0] == first).any()
+
+
+@pytest.mark.usefixtures("opengl")
+@pytest.mark.parametrize("camera", ["fpv_cam:0", "track_cam:1"])
+def test_depth_is_that_of_the_picture(room, camera):
+    """MuJoCo's renderer, at any attitude; but for edges, and for what is half transparent, they are the same."""
+    sim, _, box = room
+    before = sim.data
+    rng = np.random.default_rng(2)
+    quat = [0, 0, 0, 1] + 0.2 * rng.normal(size=(2, 2, 4))
+    placed(sim, np.asarray(sim.data.states.pos), quat / np.linalg.norm(quat, axis=-1, keepdims=True))
+    sim.data = box.set_pose(sim.data, [1.0, -0.4, 0.8], [0.1, 0.2, 0.3, 0.9])
+    for world in range(2):
+        picture = sim.render("depth_array", world, camera, width=96, height=64)
+        depth = np.asarray(sim.depth(camera, 96, 64, hide_own=False)[world, 0])
+        both = np.isfinite(depth) & (picture < 50)
+        assert both.mean() > 0.5
+        wrong = np.abs(depth - picture)[both] > 0.01 * picture[both]
+        assert wrong.mean() < 0.1
+        assert np.median(np.abs(depth - picture)[both]) < 1e-3
+    sim.data = before
+
+
+def test_cameras_of_a_user_on_the_world_and_on_an_object(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text("""<mujoco><worldbody><geom name="floor" type="plane" size="0 0 1"/>
+      <camera name="down" pos="0 0 2" fovy="40"/></worldbody></mujoco>""")
+    sim = Sim(n_worlds=2, xml_path=path)
+    tower = sim.scene.add(
+        "<mujoco><worldbody><geom type='sphere' size='.05'/><camera name='eye' fovy='40'/></worldbody></mujoco>",
+        "tower", pos=np.array([[[5, 0, 1.0]], [[5, 0, 3.0]]]),
+    )  # fmt: skip
+    np.testing.assert_allclose(sim.depth("down", 4, 4, drones=False), 2.0, rtol=1e-5)
+    seen = sim.depth("tower:0/eye", 4, 4)  # from within its ball, whose surface is where it leaves it
+    np.testing.assert_allclose(seen, 0.05, rtol=0.1)
+    sim.data = tower.set_pose(sim.data, [5, 0, 0.02])
+    assert (sim.depth("tower:0/eye", 4, 4)[:, 0, 1:3, 1:3] < 0.03).all()
+
+
+def test_the_slope_of_depth_is_the_way_to_the_wall(room):
+    sim, _, _ = room
+    look = sim.scene.depth_fn("fpv_cam:0", 4, 4, drones=False)
+
+    def middle(x):
+        pos = sim.data.states.pos + jnp.array([1.0, 0, 0]) * x
+        return look(sim.data.replace(states=sim.data.states.replace(pos=pos))).distance[0, 0, 0, 3]
+
+    assert float(jax.grad(middle)(0.0)) == pytest.approx(-1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("engine", ["plain", "auto"])
+def test_a_range_finder_measures_in_the_step(engine):
+    sim = Sim(n_worlds=2, n_drones=2, control="attitude", engine=engine)
+    sim.scene.add("wall", pos=[2, 0, 0], length=8, height=8)
+    sim.scene.add("sphere", pos=[0, 1.2, 1.0], radius=0.2)
+    add_range_finder(sim, max_range=3.0, drones=True)
+    placed(sim, [[[0, 0, 1], [0, -1, 1]], [[1, 0, 2], [1, -0.5, 5]]], np.tile([0, 0, 0, 1.0], (2, 2, 1)))
+    sim.step()
+    found = np.asarray(sim.data.plugins["range_finder"].distance)
+    names = list(RANGER)
+    z = np.asarray(sim.data.states.pos)[..., 2]
+    np.testing.assert_allclose(found[..., names.index("down")], np.minimum(z, 3.0), atol=1e-4)
+    np.testing.assert_allclose(found[..., names.index("front")], [[1.975, 1.975], [0.975, 0.975]], atol=1e-4)
+    np.testing.assert_allclose(found[..., names.index("back")], 3.0)
+    np.testing.assert_allclose(found[0, 0, names.index("left")], 1.0, atol=1e-4)
+    assert found[0, 0, names.index("right")] < 1.0  # the other drone
+    assert found[1, 0, names.index("right")] == 3.0
+    assert "not fused" not in sim.explain()
+
+
+def test_a_range_finder_measures_at_its_rate():
+    sim = Sim(control="attitude")
+    add_range_finder(sim, [[0, 0, -2]], freq=50)
+    placed(sim, [[[0, 0, 1]]])
+    sim.step(10)
+    first = float(sim.data.plugins["range_finder"].distance[0, 0, 0])
+    sim.step(9)
+    assert first == pytest.approx(1.0, abs=1e-2)
+    assert float(sim.data.plugins["range_finder"].distance[0, 0, 0]) == pytest.approx(
+        float(sim.data.states.pos[0, 0, 2]), abs=0.05
+    )
+
+
+def test_law_09_what_cannot_be_seen_is_refused(room):
+    sim, _, _ = room
+    for act, words in (
+        (lambda: sim.depth("nose"), "no camera 'nose'; it has track_cam, fpv_cam"),
+        (lambda: sim.depth(99), "no camera 99"),
+        (lambda: sim.depth("fpv_cam", 0, 4), "0 x 4 pixels cannot be"),
+        (lambda: sim.depth("fpv_cam", 4, 4.5), "4 x 4.5 pixels cannot be"),
+        (lambda: sim.depth("fpv_cam", 4, 4, along="z"), "along='ray'"),
+        (lambda: add_range_finder(sim, [[0, 0, 0]]), "none of them zero"),
+        (lambda: add_range_finder(sim, max_range=0), "must be positive"),
+        (lambda: add_range_finder(sim, freq=333), "take a divisor"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            act()
+        assert words in str(error.value)
+
+
+def test_rays_are_those_of_c_mujoco(room, rng):
+    """Many rays in all directions, at what moves, stands, and lies around."""
+    from crazysim.scene.rays import cast
+
+    sim, _, box = room
+    data = box.set_pose(sim.data, [-1.0, 0.3, 1.2], [0.3, -0.1, 0.5, 0.7])
+    n = 400
+    origin, direction = rng.uniform([-2, -2, 0.2], [2, 2, 2], (n, 3)), rng.normal(size=(n, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    rays = (jnp.asarray(np.tile(x, (2, 1, 1)), jnp.float32) for x in (origin, direction))
+    hits = cast(sim.scene.visible, data, *rays, drones=False)
+    sim._scene.sync(data, 0)
+    group = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # drones are in groups 2 and 3
+    geom = np.zeros(1, np.int32)
+    met = 0
+    for k in range(n):
+        far = mujoco.mj_ray(sim.mj_model, sim.mj_data, origin[k], direction[k], group, 1, -1, geom, None)
+        if far < 0:
+            assert not np.isfinite(hits.distance[0, k])
+        else:
+            met += 1
+            assert float(hits.distance[0, k]) == pytest.approx(far, rel=1e-4, abs=1e-4)
+    assert 100 < met < n

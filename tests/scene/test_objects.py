@@ -1,0 +1,219 @@
+"""Objects with handles: their poses live in SimData, and the scene is compiled when it is next used."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.scene import build
+from crazysim.scene.objects import PRIMITIVES
+from crazysim.sim.stage import stage
+
+TOWER = """
+<mujoco>
+  <asset><mesh name="tip" vertex="0 0 0.3  0.1 0 0  -0.1 0.1 0  -0.1 -0.1 0"/></asset>
+  <worldbody><body name="base">
+    <geom type="cylinder" size="0.1 0.2"/>
+    <body pos="0 0 0.2"><geom type="mesh" mesh="tip"/></body>
+  </body></worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def course():
+    """Three worlds with two gates that move, a pole that stands, and a tower that moves."""
+    sim = Sim(n_worlds=3, n_drones=2, control="attitude")
+    gates = sim.scene.add("gate", count=2, pos=[[1, 0, 1], [2, 0, 1]])
+    pole = sim.scene.add("pole", pos=[0, 1, 0], mocap=False)
+    tower = sim.scene.add(TOWER, "tower", pos=np.array([[[0, 0, z]] for z in (1.0, 2.0, 3.0)]))
+    return sim, gates, pole, tower
+
+
+def test_a_handle_stays_valid_when_more_is_added(course):
+    sim, gates, _, tower = course
+    assert sim.data.objects.names == ("gate:0", "gate:1", "tower:0")
+    np.testing.assert_allclose(gates.pose(sim.data)[0], np.tile([[1, 0, 1], [2, 0, 1]], (3, 1, 1)))
+    np.testing.assert_allclose(tower.pose(sim.data)[0][:, 0, 2], [1, 2, 3])
+    data = gates[1].set_pose(sim.data, [5, 5, 5])
+    more = sim.scene.add("sphere", f"ball-{len(sim.scene.handles)}", pos=[7, 0, 0])
+    data2 = sim.data
+    np.testing.assert_allclose(more.pose(data2)[0], np.tile([[7, 0, 0]], (3, 1, 1)))
+    np.testing.assert_allclose(gates[1].pose(data)[0][0], [[5, 5, 5]])
+    np.testing.assert_allclose(tower.pose(data2)[0][:, 0, 2], [1, 2, 3])
+
+
+def test_everything_is_compiled_once_at_the_next_use(monkeypatch):
+    sim, compiled = Sim(), []
+    real = build.compile_spec
+    monkeypatch.setattr(build, "compile_spec", lambda spec: (compiled.append(1), real(spec))[1])
+    for k in range(4):
+        sim.scene.add("box", f"box-{k}")
+    assert not compiled
+    sim.step()
+    assert sim.mj_model.body("box-3:0").id > 0
+    assert len(compiled) == 1
+
+
+def test_poses_are_those_that_mujoco_has(course, rng):
+    """In a picture's world and in MJX, quaternions converted, parts that hang on an object moved along."""
+    sim, gates, _, tower = course
+    pos, quat = rng.normal(size=(3, 2, 3)), rng.normal(size=(3, 2, 4))
+    sim.data = tower.set_pose(gates.set_pose(sim.data, pos, quat), pos[:, :1] + 1, quat[:, 1:])
+    quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+    sim.data = sim._scene.sync(sim.data)
+    model = sim.mj_model
+    for world in range(3):
+        sim._scene.sync(sim.data, world)
+        for found in (sim.mj_data, jax.tree.map(lambda x, w=world: x[w], sim.mjx_data)):
+            for k in range(2):
+                body = model.body(f"gate:{k}").id
+                np.testing.assert_allclose(found.xpos[body], pos[world, k], atol=1e-6)
+                np.testing.assert_allclose(found.xquat[body], np.roll(quat[world, k], 1), atol=1e-6)
+            tip = next(g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH)
+            own = mujoco.MjData(model)
+            own.mocap_pos[model.body("tower:0").mocapid] = pos[world, 0] + 1
+            own.mocap_quat[model.body("tower:0").mocapid] = np.roll(quat[world, 1], 1)
+            mujoco.mj_kinematics(model, own)
+            np.testing.assert_allclose(found.geom_xpos[tip], own.geom_xpos[tip], atol=2e-6)
+
+
+def test_a_reset_brings_objects_back_and_a_mask_only_its_worlds(course):
+    sim, gates, _, _ = course
+    start = np.asarray(gates.pose(sim.default_data)[0])
+    sim.data = gates.set_pose(sim.data, [9, 9, 9])
+    sim.reset(np.array([True, False, True]))
+    now = np.asarray(gates.pose(sim.data)[0])
+    np.testing.assert_array_equal(now[[0, 2]], start[[0, 2]])
+    np.testing.assert_array_equal(now[1], 9.0)
+
+
+def test_set_pose_is_pure_masked_and_differentiable(course):
+    sim, gates, _, _ = course
+    data = sim.data
+    moved = jax.jit(lambda d, z: gates.set_pose(d, jnp.zeros((2, 3)) + z, mask=jnp.array([True, False, False])))(
+        data, 4.0
+    )
+    np.testing.assert_allclose(gates.pose(moved)[0][0], 4.0)
+    np.testing.assert_array_equal(gates.pose(moved)[0][1:], gates.pose(data)[0][1:])
+    slope = jax.grad(lambda z: jnp.sum(gates.set_pose(data, jnp.zeros(3) + z).objects.pos ** 2))(2.0)
+    assert slope == pytest.approx(2 * 2.0 * 3 * 2 * 3)  # d/dz of z^2 over 3 worlds, 2 gates, 3 components
+
+
+def test_a_stage_of_one_world_moves_them_on_every_engine():
+    ends = []
+    for engine in ("plain", "auto"):
+        sim = Sim(n_worlds=2, n_drones=2, control="attitude", engine=engine)
+        pad = sim.scene.add("landing_pad", pos=np.array([[[0, 0, 0.5]], [[1, 0, 0.5]]]))
+
+        @stage("world")
+        def drift(data, pad=pad):
+            pos, _ = pad.pose(data)
+            return pad.set_pose(data, pos + jnp.array([0.001, 0, 0]), vel=jnp.array([0.5, 0, 0]))
+
+        sim.step_pipeline["drift"] = drift
+        sim.build_step_fn()
+        sim.step(100)
+        ends.append(pad.pose(sim.data)[0])
+        assert "fused" in sim.explain() or engine == "plain"
+        np.testing.assert_allclose(sim.data.objects.vel, np.broadcast_to([0.5, 0, 0], (2, 1, 1, 3)))
+    np.testing.assert_allclose(ends[0][:, 0, 0], [0.1, 1.1], atol=1e-5)
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("what", PRIMITIVES)
+def test_every_primitive_is_there_and_touched_by_drones_only(what):
+    sim = Sim()
+    sim.scene.add(what, pos=[0, 0, 0.3], rgba=(1, 0, 0, 1))
+    model = sim.mj_model
+    geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body(f"{what}:0").id]
+    assert geoms
+    drone, floor = model.geom("col_sphere:0").id, model.geom("floor").id
+    kind, aff = model.geom_contype, model.geom_conaffinity
+    for g in geoms:
+        assert (kind[drone] & aff[g]) | (kind[g] & aff[drone])
+        assert not (kind[floor] & aff[g]) | (kind[g] & aff[floor])
+        np.testing.assert_allclose(model.geom_rgba[g], (1, 0, 0, 1))
+
+
+BAD = {
+    "taken": (lambda s: s.scene.add("gate"), "has a body 'gate:0' already"),
+    "drone": (lambda s: s.scene.add("box", "drone"), "has a body 'drone:0' already"),
+    "unknown": (lambda s: s.scene.add("tree"), "no object and no file 'tree'; objects are gate, box"),
+    "mjcf": (
+        lambda s: s.scene.add("<mujoco><worldbody><geom type='box'/></worldbody></mujoco>", "q"),
+        "size 0 must be",
+    ),
+    "text": (lambda s: s.scene.add("<mujoco><worldbody>", "q"), "does not compile"),
+    "what": (lambda s: s.scene.add(3, "q"), "an object cannot be 3"),
+    "setting": (lambda s: s.scene.add("box", "q", length=3), "Its settings: size="),
+    "size": (lambda s: s.scene.add("sphere", "q", radius=-1), "every length must be positive"),
+    "mjcf setting": (lambda s: s.scene.add(TOWER, "q", radius=1), "only the primitives"),
+    "count": (lambda s: s.scene.add("box", "q", count=0), "count"),
+    "pos": (lambda s: s.scene.add("box", "q", count=2, pos=[[0, 0]]), "needed is one of (3,), (2, 3), (1, 2, 3)"),
+    "stand": (lambda s: s.scene.add("gate", "q", stand=0.1), "lower bar"),
+    "pole": (lambda s: s.scene.add("pole", "q", height=0.1, radius=0.1), "higher than it is thick"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_law_09_what_cannot_be_added_is_refused(name):
+    act, words = BAD[name]
+    sim = Sim()
+    sim.scene.add("gate")
+    with pytest.raises(ConfigError) as error:
+        act(sim)
+    assert words in str(error.value)
+    sim.step()  # and the simulation goes on
+
+
+def test_law_09_a_pose_that_cannot_be_is_refused(course):
+    sim, gates, pole, _ = course
+    for act, words in (
+        (lambda: gates.set_pose(sim.data, [0, 0]), "shape (2,); needed is one of (3,), (2, 3), (3, 2, 3)"),
+        (lambda: gates.set_pose(sim.data, [0, 0, np.nan]), "finite numbers"),
+        (lambda: gates.set_pose(sim.data, None, [0, 0, 0, 0]), "not all zero"),
+        (lambda: gates.set_pose(sim.data, "here"), "needed are numbers"),
+        (lambda: pole.set_pose(sim.data, [0, 0, 0]), "mocap=False"),
+        (lambda: gates.set_pose(Sim().data, [0, 0, 0]), "of another simulation"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            act()
+        assert words in str(error.value)
+
+
+def test_a_scene_loads_whole_with_mesh_texture_and_height_field(tmp_path):
+    """A user's own MJCF, its files beside it, with objects added on top."""
+    (tmp_path / "hill.png").write_bytes(_png(np.arange(16, dtype=np.uint8).reshape(4, 4) * 16))
+    scene = tmp_path / "scene.xml"
+    scene.write_text("""
+    <mujoco><asset>
+      <hfield name="hill" size="2 2 0.5 0.1" file="hill.png"/>
+      <mesh name="rock" vertex="0 0 0.3  0.2 0 0  -0.2 0.2 0  -0.2 -0.2 0"/>
+      <texture name="paint" type="2d" file="hill.png"/><material name="paint" texture="paint"/>
+    </asset><worldbody>
+      <geom name="ground" type="hfield" hfield="hill"/>
+      <body name="rock" pos="1 1 1"><geom type="mesh" mesh="rock" material="paint"/></body>
+    </worldbody></mujoco>""")
+    sim = Sim(xml_path=scene, n_worlds=2)
+    sim.scene.add("gate", pos=[0, 0, 2])
+    assert sim.scene.object_names == ("rock", "gate:0")
+    report = sim.contact_report()
+    assert np.isfinite(report.object_distance).all()
+    assert np.isfinite(report.floor_distance).all()
+
+
+def _png(pixels):
+    """Return a picture as the bytes of a PNG file."""
+    import struct
+    import zlib
+
+    def chunk(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    height, width = pixels.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")

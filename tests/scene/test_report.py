@@ -1,0 +1,215 @@
+"""The contact report against C MuJoCo's distances, and inside the step."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.engine import Step
+from crazysim.scene.latch import latch_contacts
+from crazysim.scene.report import CHUNK
+from crazysim.sim.sim import use_box_collision
+from crazysim.sim.stage import stage
+
+N_WORLDS, N_DRONES = 40, 3
+SPHERE = 1e-5
+"""Between a sphere and what has a closed form: float32 at a few metres, m."""
+
+
+def course():
+    """Return a simulation among one object of every kind, some that move and some that stand, and the handles."""
+    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude")
+    handles = {
+        "gate": sim.scene.add("gate", count=2, pos=[[1, 0, 1], [2, 0, 1]], stand=1.0),
+        "pole": sim.scene.add("pole", count=2, pos=[[0, 1, 0], [1, 1, 0]], mocap=False),
+        "box": sim.scene.add("box", count=2),
+        "pad": sim.scene.add("landing_pad", "pad", pos=[-1, 0, 0.3]),
+        "ball": sim.scene.add("sphere", "ball", pos=[-1, -1, 1]),
+        "egg": sim.scene.add(
+            "<mujoco><worldbody><geom type='ellipsoid' size='.3 .2 .1'/></worldbody></mujoco>", "egg", pos=[0, 0, 1]
+        ),
+    }
+    return sim, handles
+
+
+@pytest.fixture(scope="module")
+def flown(request):
+    """Return the course with drones and boxes anywhere, in close quarters."""
+    sim, handles = course()
+    rng = np.random.default_rng(5)
+    pos = rng.uniform([-1.5, -1.5, 0], [2.5, 1.5, 1.8], (N_WORLDS, N_DRONES, 3))
+    pos[:8, 1] = pos[:8, 0] + rng.normal(scale=0.08, size=(8, 3))  # drones that overlap
+    quat = rng.normal(size=(N_WORLDS, N_DRONES, 4))
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    states = sim.data.states.replace(pos=jnp.asarray(pos, jnp.float32), quat=jnp.asarray(quat, jnp.float32))
+    sim.data = sim.data.replace(states=states)
+    near = pos[:, :2] + rng.normal(scale=0.2, size=(N_WORLDS, 2, 3))
+    sim.data = handles["box"].set_pose(sim.data, near, rng.normal(size=(N_WORLDS, 2, 4)))
+    return sim, handles
+
+
+def oracle(sim, world, names, geom):
+    """Return distances of each drone to the floor, to every object and to the nearest drone, by C MuJoCo."""
+    sim._scene.sync(sim.data, world)
+    model, data = sim.mj_model, sim.mj_data
+    root = model.body_rootid[model.geom_bodyid]
+
+    def gap(a, b):
+        return mujoco.mj_geomDistance(model, data, a, b, 100.0, None)
+
+    own = [model.geom(f"{geom}:{i}").id for i in range(sim.n_drones)]
+    floor = [gap(model.geom("floor").id, g) for g in own]
+    objects = [[min(gap(g, o) for o in np.flatnonzero(root == model.body(n).id)) for n in names] for g in own]
+    drones = [[gap(a, b) if a != b else np.inf for b in own] for a in own]
+    return np.array(floor), np.array(objects), np.array(drones)
+
+
+def test_every_distance_is_that_of_c_mujoco(flown):
+    sim, _ = flown
+    report = sim.contact_report()
+    for world in range(N_WORLDS):
+        floor, objects, drones = oracle(sim, world, report.object_names, "col_sphere")
+        np.testing.assert_allclose(report.floor_distance[world], floor, atol=SPHERE)
+        np.testing.assert_allclose(report.object_distance[world], objects, atol=SPHERE)
+        np.testing.assert_allclose(report.drone_distance[world], drones.min(axis=-1), atol=SPHERE)
+        np.testing.assert_array_equal(report.nearest_drone[world], drones.argmin(axis=-1))
+        np.testing.assert_array_equal(report.nearest_object[world], objects.argmin(axis=-1))
+    for touches, gap in (
+        (report.floor, report.floor_distance),
+        (report.objects, report.object_distance),
+        (report.drones, report.drone_distance),
+    ):
+        np.testing.assert_array_equal(touches, gap < 0)
+        assert 2 < int(touches.sum()) < touches.size - 2, "both answers must be there"
+    np.testing.assert_array_equal(report.any, report.floor | report.drones | report.objects.any(axis=-1))
+
+
+def test_nothing_of_mujoco_is_made_for_it(flown):
+    sim, _ = flown
+    sim.contact_report()
+    assert sim._scene._mjx_data is None
+
+
+def test_boxes_of_drones_are_taken_when_they_touch_by_boxes():
+    sim = Sim(n_worlds=2, control="attitude")
+    sim.scene.add("box", pos=[0, 0, 1.0], size=(1, 1, 1))
+    half = np.asarray(sim.airframe.value("shape.collision_box"))[5]
+    at = np.float32([[[0, 0, 1.5 + half + 0.01]], [[0, 0, 1.5 + half - 0.01]]])
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(at)))
+    np.testing.assert_array_equal(sim.contact_report().objects[:, 0, 0], [True, True])  # the sphere is taller
+    use_box_collision(sim)
+    offset = float(np.asarray(sim.airframe.value("shape.collision_box"))[2])
+    np.testing.assert_allclose(sim.contact_report().object_distance[:, 0, 0], [0.01 + offset, offset - 0.01], atol=1e-5)
+
+
+def test_filters_leave_out_what_is_not_asked_for(flown):
+    sim, handles = flown
+    all_of_it, some = sim.contact_report(), sim.contact_report(handles["box"], floor=False, drones=False)
+    assert some.object_names == ("box:0", "box:1")
+    assert some.floor is None
+    assert some.drone_distance is None
+    columns = [all_of_it.object_names.index(n) for n in some.object_names]
+    np.testing.assert_allclose(some.object_distance, all_of_it.object_distance[..., columns], atol=1e-6)
+    one = sim.contact_report(("box:1", handles["pad"]), drones=False)
+    assert one.object_names == ("box:1", "pad:0")
+    assert sim.contact_report((), drones=False).objects is None
+
+
+def test_one_drone_one_world_and_all_worlds_get_the_same(flown):
+    sim, _ = flown
+    everything = sim.contact_report()
+    of_world = sim.scene.contact_fn()
+    alone = sim.scene.contact_fn(drones=False)
+    seen = {}
+
+    @stage("world")
+    def world(data):
+        report = of_world(data)
+        return data.replace(states=data.states.replace(force=jnp.stack(
+            [report.drone_distance, report.floor_distance, report.object_distance[:, 1]], axis=-1)))  # fmt: skip
+
+    @stage("drone")
+    def drone(data):
+        report = alone(data)
+        return data.replace(states=data.states.replace(torque=report.object_distance[:3]))
+
+    for engine in ("plain", "auto"):
+        seen = Step({"world": world, "drone": drone}, engine)(sim.data, 1).states
+        expected = jnp.stack(
+            [everything.drone_distance, everything.floor_distance, everything.object_distance[..., 1]], axis=-1
+        )
+        np.testing.assert_allclose(seen.force, expected, atol=1e-5)
+        np.testing.assert_allclose(seen.torque, everything.object_distance[..., :3], atol=1e-5)
+
+
+def test_the_distance_has_the_slope_of_the_way_to_the_object(flown):
+    sim, handles = flown
+    contacts = sim.scene.contact_fn(handles["ball"], floor=False, drones=False)
+
+    def gap(pos):
+        return contacts(sim.data.replace(states=sim.data.states.replace(pos=pos))).object_distance
+
+    slope = jax.grad(lambda pos: jnp.sum(gap(pos)))(sim.data.states.pos)
+    np.testing.assert_allclose(np.linalg.norm(slope, axis=-1), 1.0, atol=1e-4)
+
+
+def test_large_swarms_are_asked_piece_by_piece():
+    n = CHUNK + 9
+    sim = Sim(n_worlds=2, n_drones=n, control="attitude")
+    rng = np.random.default_rng(1)
+    pos = jnp.asarray(rng.uniform(0, 3, (2, n, 3)), jnp.float32)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    report = sim.contact_report(())
+    centres = np.asarray(pos, np.float64) + np.asarray(sim.airframe.value("shape.collision_sphere"))[:3]
+    apart = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1) + 1e9 * np.eye(n)
+    radius = float(np.asarray(sim.airframe.value("shape.collision_sphere"))[3])
+    np.testing.assert_allclose(report.drone_distance, apart.min(axis=-1) - 2 * radius, atol=SPHERE)
+    np.testing.assert_array_equal(report.nearest_drone, apart.argmin(axis=-1))
+
+
+@pytest.mark.parametrize("engine", ["plain", "auto"])
+def test_contacts_are_latched_at_the_step_they_begin(engine):
+    """Drones fly past a pole in the first world and into it in the second; the third stands still next to another."""
+    sim = Sim(n_worlds=3, n_drones=2, control="rotor_vel", engine=engine)
+    pole = sim.scene.add("pole", pos=[0.5, 0, 0], height=3.0, radius=0.02)
+    latch_contacts(sim, pole, floor=False)
+    pos = np.float32([[[0, 0.5, 1], [5, 0, 1]], [[0, 0, 1], [5, 0, 1]], [[0, 5, 1], [0, 5.1, 1]]])
+    vel = np.float32([[[1, 0, 0], [0, 0, 0]], [[1, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 0]]])
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos), vel=jnp.asarray(vel)))
+    apart, seen = sim.data, []
+    for _ in range(250):
+        sim.step()
+        seen.append(np.asarray(sim.contact_report(pole, floor=False).any))
+    seen = np.array(seen)
+    sim.data = apart
+    sim.step(250)
+    touched = sim.data.plugins["contacts"]
+    np.testing.assert_array_equal(touched.first, np.where(seen.any(axis=0), seen.argmax(axis=0) + 1, -1))
+    np.testing.assert_array_equal(touched.objects[..., 0], [[False, False], [True, False], [False, False]])
+    np.testing.assert_array_equal(touched.drones, [[False, False], [False, False], [True, True]])
+    assert touched.first[2].tolist() == [1, 1]
+    assert touched.any.tolist() == [[False, False], [True, False], [True, True]]
+    sim.reset(np.array([False, True, False]))
+    assert sim.data.plugins["contacts"].any.tolist() == [[False, False], [False, False], [True, True]]
+
+
+def test_law_09_what_cannot_be_asked_is_refused():
+    sim = Sim(n_worlds=1)
+    body = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><body name='rock'><geom type='sphere' size='.1'/></body></worldbody></mujoco>"
+    ).body("rock")
+    sim.spec.worldbody.add_frame().attach_body(body, "", "").mocap = True
+    sim.build_mjx()
+    with pytest.raises(ConfigError, match="'rock' is moved by hand"):
+        sim.contact_report()
+    sim.contact_report((), drones=False)
+    with pytest.raises(ConfigError, match="no object 'tree'"):
+        sim.contact_report("tree")
+    with pytest.raises(ConfigError, match="report of nothing"):
+        sim.contact_report((), floor=False, drones=False)
+    with pytest.raises(ConfigError, match="does not see the others"):
+        jax.eval_shape(
+            Step({"mine": stage("drone")(lambda d: (sim.scene.contact_fn(())(d), d)[1])}, "lanes"), sim.data, 1
+        )
