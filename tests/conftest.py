@@ -53,6 +53,12 @@ def casadi():
     return pytest.importorskip("casadi")
 
 
+@pytest.fixture(scope="session")
+def viser():
+    """Return viser, or skip a test where it is not installed; CI forbids the skip."""
+    return pytest.importorskip("viser")
+
+
 @pytest.fixture
 def rng():
     """Return a generator that gives the same numbers in every run."""

@@ -9,6 +9,7 @@ from imageio_ffmpeg import get_ffmpeg_exe
 
 from crazysim import demo
 from crazysim.__main__ import main
+from crazysim.pictures import Flight
 
 
 def test_without_a_command_it_lists_what_there_is(capsys):
@@ -30,6 +31,9 @@ def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
     error_cm = float(out.split("tracking error")[1].split("cm")[0])
     assert 0.1 < error_cm < 20  # the cascade lags some centimetres behind; a crashed drone would be metres off
     assert (tmp_path / "tracks.png").read_bytes().startswith(b"\x89PNG")
+    flight = Flight.load(tmp_path / "flight.npz")
+    assert flight.pos.shape == (75, 1, 4, 3)
+    assert np.ptp(flight.pos[:, 0, :, 0], axis=0).min() > 1, "every drone has crossed the scene"
     film = tmp_path / "flight.mp4"
     decode = [get_ffmpeg_exe(), "-loglevel", "error", "-i", film, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)

@@ -97,23 +97,15 @@ class Flight:
             raise ConfigError(f"{path} is no recording; its name must end with .npz")
         if not path.parent.is_dir():
             raise ConfigError(f"{path} cannot be written: there is no folder {path.parent}")
-        arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shapes"}
         shapes = self.shapes
-        np.savez_compressed(
-            path,
-            format=FORMAT,
-            **arrays,
-            shape_kind=np.array([KINDS.index(shape.kind) for shape in shapes], int),
-            **{
-                f"shape_{name}": np.array([getattr(shape, name) for shape in shapes]).reshape(len(shapes), -1)
-                for name in ("size", "rgba", "mocap", "pos", "quat")
-            },
-            **{
-                f"shape_{name}": np.concatenate([getattr(shape, name) for shape in shapes] or [np.zeros((0, 3))])
-                for name in ("vertices", "faces")
-            },
-            shape_n=np.array([(len(shape.vertices), len(shape.faces)) for shape in shapes], int).reshape(-1, 2),
-        )
+        arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shapes"}
+        arrays["shape_kind"] = np.array([KINDS.index(shape.kind) for shape in shapes], int)
+        for name in ("size", "rgba", "mocap", "pos", "quat"):
+            arrays[f"shape_{name}"] = np.array([getattr(shape, name) for shape in shapes]).reshape(len(shapes), -1)
+        for name in ("vertices", "faces"):  # of all meshes one after the other
+            arrays[f"shape_{name}"] = np.concatenate([np.zeros((0, 3)), *(getattr(shape, name) for shape in shapes)])
+        arrays["shape_n"] = np.array([(len(shape.vertices), len(shape.faces)) for shape in shapes], int).reshape(-1, 2)
+        np.savez_compressed(path, format=FORMAT, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Flight:

@@ -14,8 +14,9 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 def test_page_runs(page, tmp_path, monkeypatch, opengl):
     monkeypatch.chdir(tmp_path)
     text = page.read_text()
-    if "import casadi" in text:
-        pytest.importorskip("casadi")
+    for package, sign in (("casadi", "import casadi"), ("viser", "from crazysim.pictures.web")):
+        if sign in text:
+            pytest.importorskip(package)
     namespace = {"__name__": "page"}
     for block in BLOCK.finditer(text):
         # Blank lines in front, so that a traceback shows the line of the page.

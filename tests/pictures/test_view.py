@@ -66,11 +66,12 @@ def test_each_tile_shows_its_world(sim):
     picture = grid.picture(sim)
     assert picture.shape == (2 * HEIGHT + 4, 2 * WIDTH + 4, 3)
     assert picture.dtype == np.uint8
-    for k, world in enumerate(worlds):
-        np.testing.assert_allclose(dark(picture[grid.tile(k)]), pixel(PLACES[world]), atol=1.5)
-        np.testing.assert_array_equal(
-            picture[grid.tile(k)], sim.render("rgb_array", world, "down", None, WIDTH, HEIGHT)
-        )
+    upper, lower, left, right = slice(HEIGHT), slice(HEIGHT + 4, None), slice(WIDTH), slice(WIDTH + 4, None)
+    for k, tile in enumerate([(upper, left), (upper, right), (lower, left), (lower, right)]):
+        np.testing.assert_allclose(dark(picture[tile]), pixel(PLACES[worlds[k]]), atol=1.5)
+        alone = sim.render("rgb_array", worlds[k], "down", None, WIDTH, HEIGHT)
+        np.testing.assert_array_equal(picture[tile], alone)
+        np.testing.assert_array_equal(picture[grid.tile(k)], alone)
     assert (picture[HEIGHT : HEIGHT + 4] == 40).all()
     assert (picture[:, WIDTH : WIDTH + 4] == 40).all()
 

@@ -7,7 +7,15 @@ from cases import ABOVE, FOVY
 
 from crazysim.scene.draw import Marks
 from crazysim.sim import Sim
-from crazysim.sim.visualize import change_material, draw_capsule, draw_line, draw_points
+from crazysim.sim.visualize import (
+    change_material,
+    draw_capsule,
+    draw_label,
+    draw_line,
+    draw_points,
+    draw_setpoints,
+    draw_text,
+)
 
 HEIGHT, WIDTH = 180, 240
 FOCAL = 0.5 * HEIGHT / np.tan(np.deg2rad(FOVY / 2))
@@ -133,6 +141,74 @@ def test_drawing_draws_no_random_numbers(sim):
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
 
 
+# Text and setpoints ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("corner", ["top left", "top right", "bottom left", "bottom right"])
+def test_text_is_in_its_corner_and_nowhere_else(sim, corner):
+    """Two lines, written one after the other, change pixels of one corner only, some of them to bright letters."""
+    plain = shoot(sim)
+    draw_text(sim, "height", corner)
+    draw_text(sim, "1.4 m", corner)
+    written = shoot(sim)
+    rows, columns = np.nonzero((written != plain).any(-1))
+    down, right = corner.startswith("bottom"), corner.endswith("right")
+    assert (rows > HEIGHT / 2).all() == down
+    assert (rows < HEIGHT / 2).all() != down
+    assert (columns > WIDTH / 2).all() == right
+    assert (columns < WIDTH / 2).all() != right
+    assert 24 < np.ptp(rows) < 60, "two lines of 10 to 20 pixels"
+    letters = written[rows.min() : rows.max(), columns.min() : columns.max()].min(-1) > 230
+    assert 30 < letters.sum() < 0.4 * letters.size
+    np.testing.assert_array_equal(shoot(sim), plain)
+
+
+def test_text_is_not_in_depth_and_is_beside_it(sim):
+    plain = sim.render("depth_array", camera="down", width=WIDTH, height=HEIGHT)
+    draw_text(sim, "depth")
+    color, depth = sim.render("rgbd_tuple", camera="down", width=WIDTH, height=HEIGHT)
+    assert (color[:40, :80].min(-1) > 230).sum() > 20
+    np.testing.assert_array_equal(depth, plain)
+
+
+def test_a_label_stands_at_its_point(sim):
+    """Letters begin at the point, wherever that is in the picture, and are bright on a dark outline."""
+    plain = shoot(sim)
+    for east, north in ((-0.3, 0.3), (0.2, -0.2)):
+        draw_label(sim, [east, north, 1.0], "gate 3")
+        x, y = seen_at((shoot(sim) != plain).any(-1))
+        assert len(x) > 100
+        assert abs(y.mean() - north) < 0.05
+        assert abs(x.mean() - east) < 0.2
+    np.testing.assert_array_equal(shoot(sim), plain)
+
+
+def test_a_line_may_change_its_colour(sim):
+    """Each piece has its own colour: the first green, the second blue."""
+    draw_line(sim, [[-0.4, 0.3, 1], [0, 0.3, 1], [0.4, 0.3, 1]], rgba=[GREEN, BLUE])
+    picture = shoot(sim)
+    (green, _), (blue, _) = seen_at(of_colour(picture, GREEN)), seen_at(of_colour(picture, BLUE))
+    np.testing.assert_allclose([green.min(), green.max()], [-0.4, 0], atol=0.02)
+    np.testing.assert_allclose([blue.min(), blue.max()], [0, 0.4], atol=0.02)
+
+
+def test_setpoints_are_where_the_last_command_of_a_world_is(opengl, plain_scene):
+    sim = Sim(n_worlds=2, n_drones=2, control="state", xml_path=plain_scene)
+    command = np.zeros((2, 2, 16))
+    command[..., 12] = 1
+    command[1, :, :3] = [[0.2, 0.3, 1.0], [-0.2, -0.3, 1.0]]
+    sim.state_control(command)
+    draw_setpoints(sim, world=1, rgba=[GREEN, BLUE], size=0.05)
+    picture = shoot(sim, world=1)
+    for rgba, (east, north, _) in zip((GREEN, BLUE), command[1, :, :3], strict=True):
+        x, y = seen_at(of_colour(picture, rgba))
+        np.testing.assert_allclose([x.mean(), y.mean()], [east, north], atol=0.01)
+        np.testing.assert_allclose(len(x) / FOCAL**2, np.pi * 0.05**2, rtol=0.15)
+    with pytest.raises(ValueError, match="world 2 does not exist"):
+        draw_setpoints(sim, world=2)
+    sim.close()
+
+
 # LEDs -----------------------------------------------------------------------------------------------------------
 
 
@@ -195,6 +271,14 @@ def test_the_lower_led_is_seen_from_below(opengl):
         (lambda sim: draw_capsule(sim, [0, 0], [1, 1]), r"shape \(3,\), got \(2,\) and \(2,\)"),
         (lambda sim: draw_capsule(sim, np.zeros((2, 3)), [1, 1, 1]), r"shape \(3,\), got \(2, 3\)"),
         (lambda sim: draw_points(sim, np.zeros((4, 3)), rgba=[1, 0]), "broadcast|shape"),
+        (lambda sim: draw_text(sim, "x", "middle"), "no corner 'middle'; its corners are top left"),
+        (lambda sim: draw_text(sim, ""), "text must be a string with something in it"),
+        (lambda sim: draw_text(sim, 3), "text must be a string"),
+        (lambda sim: draw_text(sim, "5 µm"), "ASCII letters only; '5 µm' has 'µ'"),
+        (lambda sim: draw_label(sim, [0, 0, 0], "x" * 100), "99 letters at most, got 100"),
+        (lambda sim: draw_label(sim, [0, 0, 0], "two\nlines"), "a label is one line"),
+        (lambda sim: draw_label(sim, [0, 0], "x"), r"shape \(3,\), got \(2,\)"),
+        (lambda sim: draw_setpoints(sim), "control='attitude'"),
         (lambda sim: draw_points(sim, np.zeros((20_000, 3))), "10000 marks at most"),
         (
             lambda sim: change_material(sim, "led_top", [2], rgba=RED),
@@ -214,6 +298,7 @@ def test_what_cannot_be_drawn_is_told_and_leaves_no_mark(sim, draw, message):
     with pytest.raises(ValueError, match=message):
         draw(sim)
     assert len(sim.marks) == 0
+    assert not sim.marks.has_text
 
 
 def test_the_limit_of_marks_can_be_raised():

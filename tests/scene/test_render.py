@@ -307,8 +307,9 @@ def screen_pixels(path):
 WINDOW = textwrap.dedent("""
     import sys
     import numpy as np
+    from crazysim.pictures import View
     from crazysim.sim import Sim
-    from crazysim.sim.visualize import draw_points
+    from crazysim.sim.visualize import draw_points, draw_text
 
     def wait(word):
         print(word, flush=True)
@@ -325,7 +326,8 @@ WINDOW = textwrap.dedent("""
     picture = sim.render("rgb_array", width=64, height=48)
     assert picture.shape == (48, 64, 3) and picture.std() > 1
     draw_points(sim, [[-0.3, 0, 0.05]], rgba=[0, 0, 1, 1], size=0.05)
-    sim.render(**shot, world=1, cam_config=view)
+    draw_text(sim, "the blue one", "bottom right")
+    View(worlds=1, width=400, height=300, cam_config=view, text="world {world}").show(sim)
     wait("blue")
     sim.render(**shot | {"width": 200, "height": 150}, camera="track_cam:0")
     sim.close()
@@ -370,7 +372,11 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
         assert red.sum() > 100
         assert not blue.any()
         assert np.nonzero(red)[1].mean() > lit[1].mean() + 20, "x is right in a view from above"
-        _, red, blue = seen("blue")
+        second, red, blue = seen("blue")
+        for picture, written in ((first, False), (second, True)):
+            shown = picture[lit[0].min() : lit[0].max() + 1, lit[1].min() : lit[1].max() + 1]
+            for corner in (shown[-40:, -150:], shown[:40, :100]):
+                assert ((corner.max(-1) < 150).sum() > 500) == written, "letters stand on a dark ground"
         assert blue.sum() > 100
         assert not red.any(), "marks are for one picture only"
         assert np.nonzero(blue)[1].mean() < lit[1].mean() - 20
