@@ -102,7 +102,7 @@ class Film:
         """Take a whole recorded flight, and return how many frames that made.
 
         Args:
-            sim: A simulation like the one that was recorded; afterwards it is where it was.
+            sim: A simulation like the one that was recorded; afterwards its data is what it was.
             flight: The flight.
 
         Raises:

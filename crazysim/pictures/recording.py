@@ -153,14 +153,20 @@ def put(sim: Sim, flight: Flight, time: float) -> None:
         pos=data.states.pos.at[worlds].set(now["pos"]), quat=data.states.quat.at[worlds].set(now["quat"])
     )
     core = data.core.replace(steps=data.core.steps.at[worlds].set(round(time * sim.freq)))
-    controls = data.controls
+    controls, objects = data.controls, data.objects
     if controls.state is not None and now["setpoint"].size:
         wanted = controls.state.staged_cmd.at[worlds, :, :3].set(now["setpoint"])
         controls = controls.replace(state=controls.state.replace(staged_cmd=wanted))
-    sim.data = data.replace(states=states, core=core, controls=controls)
+    if objects is not None:
+        which = np.searchsorted(flight.body_ids, np.asarray(objects.mocap_ids))
+        objects = objects.replace(
+            pos=objects.pos.at[worlds, 0].set(now["body_pos"][:, which]),
+            quat=objects.quat.at[worlds, 0].set(now["body_quat"][:, which]),
+        )
+    sim.data = data.replace(states=states, core=core, controls=controls, objects=objects)
     body_pos, body_quat = _bodies(sim, worlds.tolist())
-    if not (np.allclose(body_pos, now["body_pos"]) and np.allclose(body_quat, now["body_quat"])):
-        ids = np.ix_(worlds, _body_ids(sim))
+    if not (np.allclose(body_pos, now["body_pos"], atol=1e-6) and np.allclose(body_quat, now["body_quat"], atol=1e-6)):
+        ids = np.ix_(worlds, _body_ids(sim))  # bodies that were attached by hand, whose poses the scene has
         sim.mjx_data = sim.mjx_data.replace(
             mocap_pos=sim.mjx_data.mocap_pos.at[ids].set(now["body_pos"]),
             mocap_quat=sim.mjx_data.mocap_quat.at[ids].set(np.roll(now["body_quat"], 1, axis=-1)),
@@ -184,11 +190,12 @@ def _body_ids(sim: Sim) -> NDArray:
 
 def _scene(sim: Sim, worlds: list[int]) -> dict[str, Any]:
     """Return what a flight has that does not change."""
+    ids = _body_ids(sim)  # first, as it has a scene that was edited compiled
     sim._data = sim._scene.sync(sim._data, worlds[0])
     return {
         "worlds": np.array(worlds),
         "drone_ids": np.asarray(sim.data.core.drone_mocap_ids),
-        "body_ids": _body_ids(sim),
+        "body_ids": ids,
         "shapes": shapes_of(sim.mj_model, sim.mj_data),
     }
 

@@ -145,6 +145,32 @@ def test_another_simulation_is_put_where_the_flight_was(flight, opengl):
     other.close()
 
 
+def test_objects_with_handles_are_recorded_and_put_back():
+    """A box that is moved through its handle is where it was in each world, in a new simulation too."""
+
+    def build():
+        sim = Sim(n_worlds=2)
+        return sim, sim.scene.add("box", count=2, pos=[1.0, 0, 0.5])
+
+    sim, boxes = build()
+    recorder = Recorder(sim)
+    for k in range(2):
+        pos = [[[k, w, 0.5], [2, k, 1]] for w in range(2)]
+        sim.data = boxes.set_pose(sim.data, pos=pos, quat=ROLL[k])
+        core = sim.data.core.replace(steps=jnp.full_like(sim.data.core.steps, 500 * k))
+        sim.data = sim.data.replace(core=core)
+        recorder.add()
+    flight = recorder.flight()
+    np.testing.assert_allclose(flight.body_pos[1], [[[1, 0, 0.5], [2, 1, 1]], [[1, 1, 0.5], [2, 1, 1]]], atol=1e-6)
+    np.testing.assert_allclose(flight.body_quat[1], np.broadcast_to(ROLL[1], (2, 2, 4)), atol=1e-6)
+    other, its_boxes = build()
+    put(other, flight, 0.5)
+    pos, quat = its_boxes.pose(other.data)
+    np.testing.assert_allclose(pos, flight.at(0.5)["body_pos"], atol=1e-6)
+    np.testing.assert_allclose(quat, flight.at(0.5)["body_quat"], atol=1e-6)
+    np.testing.assert_allclose(pos[:, 0, 0], 0.5, atol=1e-6)
+
+
 def test_a_reset_does_not_turn_the_recording_back(sim):
     recorder = Recorder(sim, worlds=[0])
     data = sim.data
