@@ -3,7 +3,7 @@
 Time stepping on velocities (Moreau 1988; the convex form of Todorov 2014): after a step, impulses at the places that
 touch turn the velocity into one that no longer approaches. What overlaps is pushed apart gently, in a time of its own,
 so that ground is soft and nothing is flung out. A drone is its collision box: each of its corners may touch, and the
-nearest place of the whole box to each object.
+nearest place to each object of its upper and of its lower plate.
 """
 
 from __future__ import annotations
@@ -39,6 +39,8 @@ STIFFNESS = 300.0
 """Penalty of the speed into a surface, in masses: a third of a percent of a bounce is lost, and float32 solves it."""
 STICKING = 1e-4
 """Slip that counts as none, m/s."""
+THIN = 0.05
+"""Share of the height of a drone's box that its upper and lower plates have; both touch what leans along its side."""
 FASTEST_PUSH = 0.25
 """Speed at which overlapping bodies are parted at most, m/s."""
 
@@ -138,7 +140,8 @@ def _places(data: SimData, surfaces: list[_Surface], box: np.ndarray) -> _Touchi
     pos, quat = data.states.pos, data.states.quat
     dtype = pos.dtype
     corners = jnp.asarray(box[:3] + box[3:] * np.array(list(product((-1, 1), repeat=3))), dtype)
-    shape, middle = Shape("box", tuple(box[3:].tolist())), jnp.asarray(box[:3], dtype)
+    plate = Shape("box", (*box[3:5].tolist(), THIN * box[5]))
+    middles = [jnp.asarray(box[:3] + np.array([0, 0, side * (1 - THIN) * box[5]]), dtype) for side in (-1, 1)]
     turn = quat[..., None, :]
     in_world = pos[..., None, :] + rotation.rotate(turn, corners)
     found = []
@@ -150,15 +153,15 @@ def _places(data: SimData, surfaces: list[_Surface], box: np.ndarray) -> _Touchi
             normal = rotation.rotate_inverse(turn, back(pull(jnp.ones_like(gap))[0]))
             found.append(_Touching(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
         if part.shape.kind not in ("plane", "hfield"):
-            found.append(_nearest(data, part, into, shape, middle, still[..., :1, :]))
+            found += [_nearest(data, part, into, plate, middle, still[..., :1, :]) for middle in middles]
     return _Touching(*(jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True))))
 
 
 def _nearest(data: SimData, part: Part, into: Callable, shape: Shape, middle: Array, vel: Array) -> _Touching:
-    """Return where the whole box comes nearest to a part.
+    """Return where a plate comes nearest to a part.
 
     The gap's slope by the drone's position is the normal, that by its attitude the lever: their product is all that
-    turns the drone, so the place along the normal matters to friction alone, and is taken on the box's face.
+    turns the drone, so the place along the normal matters to friction alone, and is taken on the plate's face.
     """
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
@@ -203,9 +206,11 @@ def _frame(data: SimData, part: Part, place: int | None) -> tuple[Callable, Call
 def _respond(data: SimData, surfaces: list[_Surface], box: np.ndarray, iterations: int) -> SimData:
     """Return the data with the velocity after contact.
 
-    The velocity u = (vel, ang_vel) minimises the kinetic energy of the change, plus a stiff penalty for what goes into
-    a surface or slips on it; the penalty for slipping grows no faster than friction can pull (iteratively reweighted
-    least squares). Every iteration solves one linear system of six unknowns.
+    First compression: the velocity u = (vel, ang_vel) that minimises the kinetic energy of the change, plus a stiff
+    penalty for what goes into a surface or slips on it; the penalty for slipping grows no faster than friction can
+    pull (iteratively reweighted least squares). Every iteration solves one linear system of six unknowns. Then
+    restitution: a share of the normal impulses again (Poisson). Energy that friction and bounces at several places make
+    of nothing (Kane 1984), or places that push against each other, is taken away.
     """
     states, how, params = data.states, data.plugins[NAME], data.params
     touching = _places(data, surfaces, box)
@@ -223,9 +228,8 @@ def _respond(data: SimData, surfaces: list[_Surface], box: np.ndarray, iteration
         out = jnp.sum(vel * n, axis=-1)
         return out, rotation.safe_norm(vel - out[..., None] * n)[..., 0]
 
-    approach = -slip(before)[0]
-    bounce = jnp.where(approach > SLOW, how.restitution * approach, 0.0)
-    wanted = jnp.maximum(bounce, jnp.minimum(-touching.gap / how.softness, FASTEST_PUSH))
+    fast = active & (-slip(before)[0] > SLOW)
+    wanted = jnp.where(fast, 0.0, jnp.minimum(-touching.gap / how.softness, FASTEST_PUSH))
 
     def turn(k: Any, u: Array) -> Array:
         out, aside = slip(u)
@@ -242,6 +246,17 @@ def _respond(data: SimData, surfaces: list[_Surface], box: np.ndarray, iteration
         return _solve(matrix, rotation.matvec(inertia, before) + jnp.sum(held + driven, axis=-2))
 
     after = jax.lax.fori_loop(0, iterations, turn, before)
+    push = jnp.where(active, stiff * jnp.maximum(wanted - slip(after)[0], 0.0), 0.0)
+    after = after + how.restitution * _solve(inertia, jnp.sum(jnp.where(fast, push, 0.0)[..., None] * row, axis=-2))
+    # Energy is counted as seen from the surfaces that push.
+    total = jnp.sum(push, axis=-1, keepdims=True)
+    moves = jnp.sum(push[..., None] * s, axis=-2) / jnp.where(total > 0, total, 1.0)
+    seen = jnp.concatenate([moves, jnp.zeros_like(moves)], axis=-1)
+    had, has = (rotation.dot(u - seen, rotation.matvec(inertia, u - seen)) for u in (before, after))
+    most = had + params.mass * FASTEST_PUSH**2
+    after = jnp.where(
+        has > most, seen + (after - seen) * rotation.safe_sqrt(most / jnp.where(has > 0, has, 1.0)), after
+    )
     after = jnp.where(jnp.any(active, axis=-1, keepdims=True), after, before)
     impulse = params.mass * rotation.rotate(states.quat, after[..., :3] - before[..., :3])
     states = states.replace(vel=rotation.rotate(states.quat, after[..., :3]), ang_vel=after[..., 3:])
