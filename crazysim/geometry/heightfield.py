@@ -75,15 +75,15 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
     grid = corners(shape, vector(lax.stop_gradient(pos)), 2 * size)
     axes = [vector(rot[..., k]) for k in range(3)]
     place = vector(pos)
-    for a, b in edges(grid):
-        middle, along = (a + b) * 0.5, b - a
-        length = jnp.sqrt(along.dot(along))
-        away = Vector(*(m - p[..., None] for m, p in ((middle.x, place.x), (middle.y, place.y), (middle.z, place.z))))
-        wide = [Vector(axis.x[..., None], axis.y[..., None], axis.z[..., None]) for axis in axes]
-        x, y, z = (away.dot(axis) for axis in wide)
-        u, v, w = (along.dot(axis) / length for axis in wide)
-        out = jnp.where((d := jnp.min(segment_to_box((x, y, z), (u, v, w), 0.5 * length, half), axis=-1)) < out, d, out)
-    return out
+    a, b = edges(grid)
+    middle, along = (a + b) * 0.5, b - a
+    length = jnp.sqrt(along.dot(along))
+    away = Vector(*(m - p[..., None] for m, p in ((middle.x, place.x), (middle.y, place.y), (middle.z, place.z))))
+    wide = [Vector(axis.x[..., None], axis.y[..., None], axis.z[..., None]) for axis in axes]
+    x, y, z = (away.dot(axis) for axis in wide)
+    u, v, w = (along.dot(axis) / length for axis in wide)
+    of_edges = jnp.min(segment_to_box((x, y, z), (u, v, w), 0.5 * length, half), axis=-1)
+    return jnp.where(of_edges < out, of_edges, out)
 
 
 def corners(shape: Shape, place: Vector, reach: float) -> Vector:
@@ -124,15 +124,15 @@ def triangles(grid: Vector) -> tuple[Vector, Vector, Vector]:
     return join(a, a), join(b, c), join(c, d)
 
 
-def edges(grid: Vector) -> list[tuple[Vector, Vector]]:
-    """Return the ends of the edges along x, along y and along the diagonals of cells. 3 of (..., n_edges)"""
+def edges(grid: Vector) -> tuple[Vector, Vector]:
+    """Return the ends of the edges along x, along y and along the diagonals of cells, in a row. 2 of (..., n_edges)"""
     every, low, high = slice(None), slice(None, -1), slice(1, None)
 
-    def part(rows: slice, columns: slice) -> Vector:
-        return Vector(*(v[..., rows, columns].reshape(*v.shape[:-2], -1) for v in (grid.x, grid.y, grid.z)))
+    def join(*parts: tuple[slice, slice]) -> Vector:
+        columns = ([v[..., i, j].reshape(*v.shape[:-2], -1) for i, j in parts] for v in (grid.x, grid.y, grid.z))
+        return Vector(*(jnp.concatenate(column, axis=-1) for column in columns))
 
-    pairs = (((every, low), (every, high)), ((low, every), (high, every)), ((low, low), (high, high)))
-    return [(part(*a), part(*b)) for a, b in pairs]
+    return join((every, low), (low, every), (low, low)), join((every, high), (high, every), (high, high))
 
 
 def height(shape: Shape, x: Array, y: Array, like: Vector) -> Array:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -22,7 +23,7 @@ from crazysim.geometry.vector import Vector, along, select, unit, vector
 
 SEPARATION_STEPS = 16
 """Steps towards the nearest points of shapes apart: corners, of which polytopes need few and curved shapes more."""
-TOUCH_STEPS = 16
+TOUCH_STEPS = 24
 """Steps that go on from the best direction, to where the shapes are nearest or touch."""
 PARTED = 0.02
 """How far shapes are parted for that, as a part of the moving one's half length."""
@@ -40,7 +41,8 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
 
     Of shapes of up to a few metres, apart or overlapping by little, it errs by less than 1e-3 m. Two boxes overlap
     exactly, by the 15 normals of the separating axis theorem (Gottschalk 1996); in deep overlap with another shape the
-    depth is an upper bound, that of the best direction found. The gradient is that of the nearest points along it.
+    depth is an upper bound, that of the best direction found. The gradient is that of the
+    nearest points; deep in a curved shape its direction errs by some hundredths.
 
     Args:
         a: A box, or a capsule, whose core counts, without its radius.
@@ -70,19 +72,30 @@ def overlap(pair: Pair, is_box: bool, best: Best) -> Best:
     b, edges = pair.other, pair.edges
     own = [along(k, pair.place.x) for k in range(3)]
     sides = {"box": own, "cylinder": own[2:]}.get(b.kind, [])
-    for n in [*(edges if is_box else []), *sides]:
-        best = pair.consider(-n, pair.consider(n, best))
+    faces = [*(edges if is_box else []), *sides]
     if b.kind == "box":
-        for edge in edges:
-            for axis in own:
-                n = unit(edge.cross(axis), axis, THIN)
-                best = pair.consider(-n, pair.consider(n, best))
+        faces += [unit(edge.cross(axis), axis, THIN) for edge in edges for axis in own]
+    if faces:
+        n = _stack([*faces, *(-n for n in faces)])
+        best = _best_of((pair.gap(n), n), best)
+    if b.kind == "box":
         return best
     if b.kind == "mesh":
         best = better(_best_face(pair), best)
-    for edge in [*edges, *sides]:
-        best = better(_best_across(pair, edge), best)
+    best = _best_of(_best_across(pair, _stack([*edges, *sides])), best)
     return _best_at_ends(pair, best) if b.kind == "ellipsoid" else best
+
+
+def _stack(vectors: list[Vector]) -> Vector:
+    """Return vectors along a new first axis, so that what is done to all of them is written once."""
+    return Vector(*(jnp.stack(xs) for xs in zip(*((v.x, v.y, v.z) for v in vectors), strict=True)))
+
+
+def _best_of(tried: Best, best: Best) -> Best:
+    """Return the best of directions along the first axis, and of the best so far."""
+    for k in range(tried[0].shape[0]):
+        best = better(jax.tree.map(lambda x, k=k: x[k], tried), best)
+    return best
 
 
 def _best_face(pair: Pair) -> Best:

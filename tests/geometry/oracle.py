@@ -1,5 +1,7 @@
 """C MuJoCo's answers to the same questions, one sample after the other, and samples to ask."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -151,6 +153,7 @@ def poses(rng, n):
     return places(rng, n), unit(quat)
 
 
+@functools.cache
 def judge(a, b):
     """Return the function of all poses that gives distances, and their gradients by position and by rotation."""
 
@@ -186,14 +189,17 @@ def check_pair(a, b, rng, n, apart=1e-5, shallow=1e-6, deep=1e-6):
     assert np.min(distances(a, b, parted, quat[inside])) > 0
 
 
-def check_slopes(a, b, rng, n):
-    """Return by what gradients miss central differences where these are those of a distance; all must be finite."""
+def check_slopes(a, b, rng, n, deepest=-np.inf):
+    """Return by what gradients miss central differences where these are those of a distance; all must be finite.
+
+    Those of shapes that overlap by more than ``-deepest`` are left out.
+    """
     pos, quat = poses(rng, n)
     rot, answer, h = rotations(quat), judge(a, b), 1e-6
     spin = unit(rng.normal(size=(n, 3)))
     cross = np.zeros((n, 3, 3))
     cross[:, [2, 0, 1], [1, 2, 0]], cross[:, [1, 2, 0], [2, 0, 1]] = spin, -spin
-    _, by_pos, by_rot = answer(pos, rot)
+    value, by_pos, by_rot = answer(pos, rot)
     assert np.isfinite(by_pos).all()
     assert np.isfinite(by_rot).all()
     np.testing.assert_array_less(np.linalg.norm(by_pos, axis=1), 1 + 1e-6)
@@ -202,14 +208,18 @@ def check_slopes(a, b, rng, n):
     there, back = (answer(pos, rot + s * h * cross @ rot)[0] for s in (1, -1))
     turning = (there - back) / (2 * h)
     smooth = np.abs(np.linalg.norm(differences, axis=1) - 1) < 1e-3
-    assert np.mean(smooth) > 0.8
+    smooth = smooth & (value > deepest)
+    assert np.mean(smooth) > 0.4
     turned = smooth & (np.arange(n) >= n // 5)  # where axes are parallel the distance has a crease
     by_turn = np.sum(by_rot * (cross @ rot), axis=(1, 2))
     return np.abs(by_pos[smooth] - differences[smooth]).max(axis=1), np.abs(by_turn[turned] - turning[turned])
 
 
-def check_finite(a, b, dtype):
-    """Check that distances and gradients are numbers with centres, faces and edges in line, and far away."""
+def check_finite(a, b, dtype, n):
+    """Check that distances and gradients are numbers with centres, faces and edges in line, and far away.
+
+    Of as many poses as another test asks for, so that nothing is compiled anew; 1,250 of them differ.
+    """
     size = np.asarray([*b.size, 0.3, 0.3, 0.3])[:3]
     grid = np.stack(np.meshgrid(*[[-1.0, 0.0, 0.5, 1.0, 1e4]] * 3), axis=-1).reshape(-1, 3)
     turns = np.array([[1, 0, 0, 0], [1, 1, 0, 0], [0, 1, 1, 0], [1, 1, 1, 1], [1, 1e-4, 0, 0]], float)
@@ -217,6 +227,6 @@ def check_finite(a, b, dtype):
     pos = np.concatenate([np.repeat(grid * scale, len(turns), axis=0) for scale in (size, reach)])
     rot = np.tile(rotations(unit(turns)), (2 * len(grid), 1, 1))
     with jax.enable_x64(dtype == np.float64):
-        for x in judge(a, b)(pos.astype(dtype), rot.astype(dtype)):
+        for x in judge(a, b)(np.resize(pos, (n, 3)).astype(dtype), np.resize(rot, (n, 3, 3)).astype(dtype)):
             assert x.dtype == dtype
             assert np.isfinite(x).all()

@@ -4,65 +4,70 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import DRONES, SHAPES, check_finite, check_pair, check_slopes, poses, rotations
+from oracle import DRONES, SHAPES, check_finite, check_pair, check_slopes, judge, poses, rotations
 
 from crazysim.geometry import Shape, distance, hull
 from crazysim.geometry.shapes import SIZES
 
 PAIRS = [(a, b) for a in ("capsule", "box") for b in ("cylinder", "ellipsoid", "mesh")] + [("box", "box")]
 N = 2000
-DEEP = {"ellipsoid": 1e-2}
+DEEP = {("capsule", "ellipsoid"): 1e-2}
 """How much longer than the shortest a translation out of deep overlap may be, m."""
 
 
 @pytest.mark.parametrize("a, b", PAIRS)
 def test_convex_pairs(x64, rng, a, b):
-    check_pair(DRONES[a], SHAPES[b], rng, N, apart=1e-6, shallow=1e-3, deep=DEEP.get(b, 1e-3))
+    check_pair(DRONES[a], SHAPES[b], rng, N, apart=1e-6, shallow=1e-3, deep=DEEP.get((a, b), 1e-3))
 
 
-@pytest.mark.parametrize("a, b", [("capsule", "mesh"), ("box", "cylinder"), ("box", "box")])
+@pytest.mark.parametrize("a, b", PAIRS)
 def test_law_08_gradients_equal_central_differences(x64, rng, a, b):
-    by_pos, by_rot = check_slopes(DRONES[a], SHAPES[b], rng, N)
-    assert np.mean(by_pos > 1e-3) < 0.005
-    assert np.mean(by_rot > 1e-3) < 0.02
+    by_pos, by_rot = check_slopes(DRONES[a], SHAPES[b], rng, N, deepest=-0.05)
+    # A direction is known to the root of what a distance is; of parallel faces any point may be the nearest.
+    assert np.mean(by_pos > 5e-3) < 0.005
+    assert np.mean(by_rot > 5e-3) < 0.02
 
 
-@pytest.mark.parametrize("a, b", [("capsule", "ellipsoid"), ("box", "mesh"), ("box", "box"), ("box", "cylinder")])
-def test_law_07_no_nan_and_float32_errs_by_little(rng, a, b):
-    check_finite(DRONES[a], SHAPES[b], np.float32)
+@pytest.mark.parametrize("a, b", PAIRS)
+def test_law_07_no_nan(a, b):
+    check_finite(DRONES[a], SHAPES[b], np.float64, N)
+
+
+@pytest.mark.parametrize("a, b", [("box", "cylinder")])
+def test_float32_errs_by_little(rng, a, b):
+    check_finite(DRONES[a], SHAPES[b], np.float32, N)
     pos, quat = poses(rng, N)
     rot = rotations(quat)
-    of = jax.jit(lambda p, r: distance(DRONES[a], SHAPES[b], p, r))
-    found = np.asarray(of(np.float32(pos), np.float32(rot)))
+    found, *_ = judge(DRONES[a], SHAPES[b])(np.float32(pos), np.float32(rot))
     with jax.enable_x64(True):
-        exact = np.asarray(of(pos, rot))
-    assert np.max(np.abs(found - exact) / (1 + np.linalg.norm(pos, axis=1))) < 1e-3
-    clear = np.abs(exact) > 1e-5 * (1 + np.linalg.norm(pos, axis=1))
+        exact, *_ = judge(DRONES[a], SHAPES[b])(pos, rot)
+    size = 1 + np.linalg.norm(pos, axis=1)
+    assert np.max(np.abs(found - exact) / size) < 1e-3
+    clear = np.abs(exact) > 2e-5 * size
     np.testing.assert_array_equal(found[clear] > 0, exact[clear] > 0)
 
 
 def test_law_01_one_drone_then_many(x64, rng):
-    pos, quat = poses(rng, 6)
-    rot = rotations(quat)
-    for b in ("cylinder", "mesh"):
-        of = jax.jit(lambda p, r, b=b: distance(DRONES["box"], SHAPES[b], p, r))
-        many = of(pos.reshape(2, 3, 3), rot.reshape(2, 3, 3, 3))
-        assert many.shape == (2, 3)
-        np.testing.assert_allclose(np.ravel(many), [of(p, r) for p, r in zip(pos, rot, strict=True)], atol=1e-6)
+    pos, quat = poses(rng, N)
+    rot, pair = rotations(quat), (DRONES["capsule"], SHAPES["mesh"])
+    many, one = judge(*pair)(pos, rot)[0], jax.jit(lambda p, r: distance(*pair, p, r))
+    for i in range(0, N, 200):
+        np.testing.assert_allclose(many[i], one(pos[i], rot[i]), atol=1e-6)
+    shape = jax.eval_shape(lambda p, r: distance(*pair, p, r), jnp.zeros((2, 4, 3)), jnp.zeros((2, 4, 3, 3)))
+    assert shape.shape == (2, 4)
 
 
 def test_a_box_as_a_mesh_is_as_far_as_the_box(x64, rng):
-    """The two take different ways: a closed form or 15 normals, and faces and circles of a hull."""
+    """The two take different ways: a closed form, and faces and circles of a hull."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * SHAPES["box"].size
     pos, quat = poses(rng, 500)
     rot = rotations(quat)
-    for a in DRONES.values():
-        of = jax.jit(lambda b, a=a: distance(a, b, pos, rot), static_argnums=0)
-        as_box, as_mesh = np.asarray(of(SHAPES["box"])), np.asarray(of(hull(corners)))
-        assert np.sum(as_box < 0) > 50
-        near = as_box > -0.05
-        np.testing.assert_allclose(as_mesh[near], as_box[near], atol=1e-5)
-        assert np.max(as_mesh - as_box) < 1e-5  # no bound is above the truth
+    of = jax.jit(lambda b: distance(DRONES["capsule"], b, pos, rot), static_argnums=0)
+    as_box, as_mesh = np.asarray(of(SHAPES["box"])), np.asarray(of(hull(corners)))
+    assert np.sum(as_box < 0) > 50
+    near = as_box > -0.05
+    np.testing.assert_allclose(as_mesh[near], as_box[near], atol=1e-5)
+    assert np.max(as_mesh - as_box) < 1e-5  # no bound is above the truth
 
 
 def test_every_kind_has_a_distance():

@@ -59,7 +59,7 @@ def test_law_08_gradients_of_closed_forms_equal_central_differences(x64, rng, a,
 @pytest.mark.parametrize("a, b", PAIRS)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_law_07_no_nan_in_two_shapes(a, b, dtype):
-    check_finite(DRONES[a], SHAPES[b], dtype)
+    check_finite(DRONES[a], SHAPES[b], dtype, N)
 
 
 @pytest.mark.parametrize("axes", [(0.5, 0.3, 0.15), (0.3, 0.3, 0.3), (0.1, 0.1, 1.0), (1.0, 0.03, 1.0)])
