@@ -102,18 +102,19 @@ def kinetic(data):
     return 0.5 * mass * (vel**2).sum(-1) + 0.5 * np.einsum("...i,ij,...j", ang, inertia, ang)
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.6])
-def test_a_contact_creates_no_energy(rng, friction):
-    """Of drones that overlap floor, wall, pole or pad in any way, at any speed, with every restitution.
+def test_a_contact_creates_no_energy(rng):
+    """Of drones that overlap floor, wall, pole or pad in any way, at any speed, with every restitution and friction.
 
     What is allowed is what parting an overlap at its fastest takes, a whole drone's motion at 0.25 m/s, and rounding.
     """
     n = 1000
     course = [("wall", {"pos": [0.6, 0, 0]}), ("pole", {"pos": [0, 0.5, 0]}), ("landing_pad", {"pos": [-0.6, 0, 0.2]})]
-    sim = without_air(n, course, friction=friction)
+    sim = without_air(n, course)
     how = sim.data.plugins["contact_response"]
     spread = jnp.asarray(np.linspace(0, 1, n)[:, None, None], jnp.float32)
-    sim.data = sim.data.replace(plugins={"contact_response": how.replace(restitution=spread)})
+    sim.data = sim.data.replace(
+        plugins={"contact_response": how.replace(restitution=spread, friction=2 * spread[::-1] ** 2)}
+    )
     quat = rng.normal(size=(n, 1, 4))
     places = np.array([[0, 0, 0.03], [0.56, 0, 0.5], [0, 0.48, 0.5], [-0.6, 0, 0.22]])[rng.integers(0, 4, n)]
     throw(
@@ -123,7 +124,7 @@ def test_a_contact_creates_no_energy(rng, friction):
         vel=2 * rng.normal(size=(n, 1, 3)),
         ang_vel=10 * rng.normal(size=(n, 1, 3)),
     )
-    after = Step({"contact_response": sim.step_pipeline["contact_response"]}, "lanes")(sim.data, jnp.int32(1))
+    after = Step({"contact_response": sim.step_pipeline["contact_response"]})(sim.data, jnp.int32(1))
     before, now = kinetic(sim.data)[:, 0], kinetic(after)[:, 0]
     touched = np.abs(np.asarray(after.plugins["contact_response"].impulse)).sum(axis=(1, 2)) > 0
     assert touched.sum() > n // 2
@@ -168,9 +169,8 @@ def test_it_bounces_off_a_wall_and_a_pole():
     assert x[1] > -1 + 0.015 + 0.07
 
 
-@pytest.mark.parametrize("engine", ["plain", "auto"])
-def test_it_lands_on_a_moving_pad_and_rides_along(engine):
-    sim = Sim(control="rotor_vel", engine=engine)
+def test_it_lands_on_a_moving_pad_and_rides_along():
+    sim = Sim(control="rotor_vel")
     pad = sim.scene.add("landing_pad", pos=[0, 0, 0.5], radius=0.4)
     add_contact_response(sim, friction=0.8)
     speed = 0.3
@@ -238,8 +238,8 @@ def test_the_landing_place_has_a_gradient():
 def test_engines_agree_and_the_impulse_is_told():
     ends = []
     for engine in ("plain", "lanes", "auto"):
-        sim = without_air(2, [("box", {"pos": [0.3, 0, 0.1]})], engine=engine)
-        throw(sim, pos=[[[0, 0, 0.1]], [[0.3, 0.05, 0.5]]], vel=[[[0.5, 0, 0]], [[0, 0, 0]]])
+        sim = without_air(2, engine=engine)
+        throw(sim, pos=[[[0, 0, 0.1]], [[0.3, 0.05, 0.06]]], vel=[[[0.5, 0, 0]], [[0, 0, 0]]])
         sim.step(60)
         ends.append(sim.data)
     for other in ends[1:]:
