@@ -138,8 +138,8 @@ def _mesh(shape: Shape, point: Array) -> Array:
 def plane_distance(normals: np.ndarray, offsets: np.ndarray, place: Vector) -> Array:
     """Return the signed distance of a point to the plane it is highest above, m. (...)
 
-    The plane is chosen, and then its distance taken: the gradient of the largest of many products under ``vmap`` is
-    wrong in XLA for the CPU, as of JAX 0.10.1.
+    The plane is chosen, and then its distance taken: the gradient of the largest of all these products, in a step
+    under ``vmap``, lacked a component with XLA for the CPU of JAX 0.10.1.
     """
     fixed = lax.stop_gradient(place)
     columns = [jnp.asarray(column, place.x.dtype) for column in (*normals.T, offsets)]
