@@ -25,7 +25,7 @@ from crazysim.geometry import support
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.support import end
 from crazysim.geometry.triangle import foot, mean, open_foot
-from crazysim.geometry.vector import Vector, along, margin, select, unit
+from crazysim.geometry.vector import Vector, along, margin, select, stack, unit
 
 Best = tuple[Array, Vector]
 """The largest gap so far, m (...), and its direction."""
@@ -99,18 +99,22 @@ def separate(pair: Pair, n: Vector, steps: int) -> tuple[Best, list[Array]]:
         new = pair.corner(n)
         size = nearest.dot(nearest)
         kept = (triangle, nearest)
-        for b, c in ((0, 1), (1, 2), (2, 0)):
-            tried = (new, triangle[b], triangle[c])
-            points = [point for point, _ in tried]
-            foot = mean(open_foot(*points), *points)
-            square = foot.dot(foot)
-            closer = square < size * (1 - margin(size.dtype))
-            kept = jax.tree.map(partial(jnp.where, closer), (tried, foot), kept)
-            size = jnp.where(closer, square, size)
+        p, q, r = (point for point, _ in triangle)
+        b, c = stack([p, q, r]), stack([q, r, p])
+        feet = mean(open_foot(new[0], b, c), new[0], b, c)
+        squares = feet.dot(feet)
+        for k in range(3):
+            closer = squares[k] < size * (1 - margin(size.dtype))
+            tried = ((new, triangle[k], triangle[(k + 1) % 3]), feet[k])
+            kept = jax.tree.map(partial(jnp.where, closer), tried, kept)
+            size = jnp.where(closer, squares[k], size)
         return (*kept, pair.consider(n, best))
 
     first = pair.corner(n)
     triangle, nearest, best = lax.fori_loop(0, steps, step, ((first,) * 3, first[0], (pair.gap(n), n)))
     shares = foot(*(point for point, _ in triangle))
-    ends = [sum(w * x for w, x in zip(shares, xs, strict=True)) for xs in zip(*(e for _, e in triangle), strict=True)]
+    ends = [
+        jnp.asarray(sum(w * x for w, x in zip(shares, xs, strict=True)))
+        for xs in zip(*(e for _, e in triangle), strict=True)
+    ]
     return pair.consider(unit(nearest, up), best), ends

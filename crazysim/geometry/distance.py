@@ -23,8 +23,8 @@ DRONE_KINDS = ("sphere", "capsule", "box")
 def point_distance(shape: Shape, point: Array) -> Array:
     """Return the signed distance of a point to the surface of a shape, m, negative inside. (...)
 
-    Exact for plane, sphere, capsule, box and cylinder (Ericson 2005, section 5.1); for an ellipsoid by Newton steps,
-    of which there are enough.
+    Exact for plane, sphere, capsule, box and cylinder (Ericson 2005, section 5.1) and for a mesh; for an ellipsoid by
+    Newton steps, of which there are enough; for a height field up to the side of a cell, see ``field_distance``.
 
     Args:
         shape: The shape.
@@ -38,8 +38,10 @@ def point_distance(shape: Shape, point: Array) -> Array:
 def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
     """Return the signed distance of two shapes, m: of their nearest points, or minus how deep they overlap. (...)
 
-    The depth is the length of the shortest translation that parts them. First derivatives are exact where there are
-    any; in second ones, of what is no sphere, the nearest points stay where they are on their shapes.
+    The depth is the length of the shortest translation that parts them. Exact for spheres, and for capsules and boxes
+    with a plane, sphere, capsule or, a capsule, with a box; for the rest see ``convex_distance`` and, for height
+    fields, ``drone_to_field``. First derivatives are those of the nearest points; in second ones, of what is no
+    sphere, these points stay where they are on their shapes.
 
     Args:
         a: The drone's shape: a sphere, a capsule or a box.

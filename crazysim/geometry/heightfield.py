@@ -1,7 +1,8 @@
 """Distances and rays of a height field: the solid below triangles over a grid, with walls and a bottom.
 
 The triangles looked at are those of the cells near a point, however large the grid. They are found by numbers that
-are known at run time only, which the project's own engine reads up to 64 of: on larger grids it runs as plain XLA.
+are known at run time only. The project's own engine has these written out, for grids of up to 64 heights; with more,
+a stage runs as plain XLA.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -19,7 +18,7 @@ from crazysim.geometry.convex import Best, Pair, better, separate
 from crazysim.geometry.points import ellipsoid_normal
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.triangle import THIN
-from crazysim.geometry.vector import Vector, along, select, unit, vector
+from crazysim.geometry.vector import Vector, along, select, stack, unit, vector
 
 SEPARATION_STEPS = 16
 """Steps towards the nearest points of shapes apart: corners, of which polytopes need few and curved shapes more."""
@@ -76,25 +75,20 @@ def overlap(pair: Pair, is_box: bool, best: Best) -> Best:
     if b.kind == "box":
         faces += [unit(edge.cross(axis), axis, THIN) for edge in edges for axis in own]
     if faces:
-        n = _stack([*faces, *(-n for n in faces)])
+        n = stack([*faces, *(-n for n in faces)])
         best = _best_of((pair.gap(n), n), best)
     if b.kind == "box":
         return best
     if b.kind == "mesh":
         best = better(_best_face(pair), best)
-    best = _best_of(_best_across(pair, _stack([*edges, *sides])), best)
+    best = _best_of(_best_across(pair, stack([*edges, *sides])), best)
     return _best_at_ends(pair, best) if b.kind == "ellipsoid" else best
-
-
-def _stack(vectors: list[Vector]) -> Vector:
-    """Return vectors along a new first axis, so that what is done to all of them is written once."""
-    return Vector(*(jnp.stack(xs) for xs in zip(*((v.x, v.y, v.z) for v in vectors), strict=True)))
 
 
 def _best_of(tried: Best, best: Best) -> Best:
     """Return the best of directions along the first axis, and of the best so far."""
     for k in range(tried[0].shape[0]):
-        best = better(jax.tree.map(lambda x, k=k: x[k], tried), best)
+        best = better((tried[0][k], tried[1][k]), best)
     return best
 
 

@@ -1,7 +1,7 @@
 """A vector as its three components, each an array of any shape.
 
 Without an axis of length three there is nothing but element-wise arithmetic, which fuses, and no small sum over an
-axis: XLA for the CPU, as of JAX 0.10.1, gave wrong float32 numbers for such sums inside the loops of ``convex``.
+axis for a compiler to arrange anew.
 """
 
 from __future__ import annotations
@@ -38,6 +38,10 @@ class Vector(PyTree):
         """Return the vector times a number. (...)"""
         return Vector(self.x * factor, self.y * factor, self.z * factor)
 
+    def __getitem__(self, k: int) -> Vector:
+        """Return one of stacked vectors."""
+        return Vector(self.x[k], self.y[k], self.z[k])
+
     def dot(self, other: Vector) -> Array:
         """Return the scalar product. (...)"""
         return self.x * other.x + self.y * other.y + self.z * other.z
@@ -54,6 +58,11 @@ class Vector(PyTree):
 def vector(x: Array) -> Vector:
     """Return vectors from their arrays. (..., 3)"""
     return Vector(x[..., 0], x[..., 1], x[..., 2])
+
+
+def stack(vectors: list[Vector]) -> Vector:
+    """Return vectors along a new first axis, so that what is done to all of them is written once."""
+    return Vector(*(jnp.stack(xs) for xs in zip(*((v.x, v.y, v.z) for v in vectors), strict=True)))
 
 
 def along(axis: int, like: Array) -> Vector:

@@ -97,11 +97,14 @@ def test_float32_errs_by_rounding_only(rng, kind):
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_law_01_one_drone_then_many(x64, rng, kind):
-    points = places(rng, 12).reshape(3, 4, 3)
+    points = (0.5 * rng.uniform(-1, 1, (3, 4, 3))).astype(np.float32).astype(float)
     many = point_distance(SHAPES[kind], points)
     assert many.shape == (3, 4)
     one = [[point_distance(SHAPES[kind], points[i, j]) for j in range(4)] for i in range(3)]
     np.testing.assert_allclose(many, one, rtol=1e-12, atol=1e-14)
+    slope = jax.grad(lambda p: point_distance(SHAPES[kind], p))
+    mapped = jax.jit(jax.vmap(jax.vmap(slope)))(jnp.asarray(points, jnp.float32))
+    np.testing.assert_allclose(mapped, jax.vmap(jax.vmap(slope))(points), atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", SHAPES)

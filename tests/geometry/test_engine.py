@@ -9,11 +9,12 @@ from oracle import SHAPES
 
 from crazysim import rotation
 from crazysim.engine import Step, native
-from crazysim.geometry import Shape, distance
+from crazysim.geometry import Shape, distance, hull
 from crazysim.sim.stage import stage
 
 FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
 SPHERE = Shape("sphere", (0.1,))
+BODIES = SHAPES | {"mesh": hull([[0.4, 0, 0], [-0.3, 0.3, 0], [-0.2, -0.4, 0.1], [0, 0.1, 0.5], [0.1, 0, -0.3]])}
 
 
 def watched(a, kinds):
@@ -23,8 +24,8 @@ def watched(a, kinds):
     @stage("drone")
     def watch(data):
         s = data.states
-        found = [distance(a, SHAPES[kind], s.pos, rotation.matrix(s.quat)) for kind in kinds]
-        slope = jax.grad(lambda p: distance(a, SHAPES[kinds[0]], p, rotation.matrix(s.quat)))(s.pos)
+        found = [distance(a, BODIES[kind], s.pos, rotation.matrix(s.quat)) for kind in kinds]
+        slope = jax.grad(lambda p: distance(a, BODIES[kinds[0]], p, rotation.matrix(s.quat)))(s.pos)
         return data.replace(states=s.replace(force=jnp.stack(found), torque=slope))
 
     rng = np.random.default_rng(3)
@@ -38,6 +39,7 @@ def watched(a, kinds):
 
 @pytest.mark.parametrize("a, kinds", [
     (SPHERE, ("plane", "sphere", "capsule")), (SPHERE, ("ellipsoid", "box", "cylinder")),
+    (SPHERE, ("mesh", "plane", "plane")),
 ])  # fmt: skip
 def test_engines_agree(a, kinds):
     pipeline, data = watched(a, kinds)
