@@ -156,6 +156,7 @@ def test_boxes_touch_where_c_mujoco_says_so():
 def test_a_body_filters_its_own_slots(crowd, body):
     """Asking for a body keeps the slots of its geoms and clears the others, in every world."""
     sim = crowd[0]
+    sim.contacts()  # which geoms a slot is of, the first sync says
     contact = sim.mjx_data._impl.contact
     bodies = sim.mj_model.geom_bodyid[np.stack([contact.geom1, contact.geom2])]
     of_body = (bodies == sim.mj_model.body(body).id).any(0)
