@@ -191,7 +191,7 @@ def _frame(data: SimData, part: Part, place: int | None) -> tuple[Callable, Call
         own_pos, own_quat, vel = (x[..., place, :] for x in (objects.pos, objects.quat, objects.vel))
 
     def into(x: Array, is_point: bool) -> Array:
-        if own_quat is not None:
+        if own_quat is not None and own_pos is not None:
             x = rotation.rotate_inverse(own_quat[..., None, :], x - own_pos[..., None, :] if is_point else x)
         x = x - at if is_point else x
         return x if rot is None else rotation.matvec(rot.T, x)
