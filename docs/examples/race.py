@@ -38,7 +38,7 @@ def build() -> Sim:
     gates = sim.scene.add("gate", count=N_GATES, width=OPENING, height=OPENING)
     poles = sim.scene.add("pole", count=N_GATES, height=2.0)
 
-    def place(data, default_data, mask=None):
+    def place(data, _default_data, mask=None):
         """Stand the gates around a circle, each turned and moved a little, and a pole beside the way to each."""
         keys = jax.vmap(lambda key: jax.random.split(key, 3))(world_keys(data, "course"))
         draw = lambda k, low, high, *shape: jax.vmap(  # noqa: E731
