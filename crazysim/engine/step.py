@@ -167,7 +167,9 @@ class Step:
         undeclared = [s.__name__ for s in self.stages if s.scope == "batch"]
         if self.mesh is not None and undeclared:
             return self._plain(data, f"with a mesh every stage must be declared, and {undeclared[0]!r} is not")
-        program = Program(self.stages, data, dict(zeros), _watched)
+        kinds = jax.tree.leaves(scopes(data))
+        # Zeros that were told may be of data in which a parameter, one per drone by now, was still shared.
+        program = Program(self.stages, data, {i: some for i, some in zeros if kinds[i] == "shared"}, _watched)
         split = [s for s in program.segments if s.scope == "batch"]
         if self.mesh is not None and split:
             return self._plain(data, f"with a mesh every stage must be fused, and {_unfused(split[0])}")

@@ -1,0 +1,113 @@
+"""What an action means: an affine map from [-1, 1] to commands with units, for each command level."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.control import COMMAND_FIELDS, Control
+from crazysim.drones import Airframe
+from crazysim.dynamics import first_principles, fitted
+from crazysim.errors import ConfigError
+from crazysim.rotation import safe_clip
+from crazysim.sim.data import SimParams
+
+TILT = np.pi / 4
+"""Largest roll and pitch that an action commands, rad."""
+YAW = np.pi / 2
+"""Largest yaw that an action commands, rad."""
+RATES = (10.0, 10.0, 4.0)
+"""Largest body rates that an action commands, rad/s."""
+REACH = (2.0, 2.0, 1.0)
+"""Farthest position setpoint from 1 m above the origin, m."""
+
+
+class Actions:
+    """``command = centre + scale * action``, with the action clipped to [-1, 1].
+
+    A zero action is the command under which the nominal drone hovers, level and at yaw zero; at the state level that
+    is 1 m above the origin.
+
+    | Level | Action | Command at -1, 0, 1 |
+    | --- | --- | --- |
+    | ``attitude`` | roll, pitch; yaw; collective thrust | -45, 0, 45 deg; -90, 0, 90 deg; see below |
+    | ``body_rate`` | rates about x, y; z; collective thrust | -10, 0, 10 rad/s; -4, 0, 4 rad/s; see below |
+    | ``force_torque`` | collective thrust; body torque | see below; a quarter of what the rotors can do either way |
+    | ``rotor_vel`` | speed of each rotor | twice hover less the largest, hover, the largest, rpm |
+    | ``state`` | position setpoint | 2 m to either side, 1 m down and up, of 1 m above the origin |
+
+    Collective thrust goes from twice hover less the most (motors off below zero), over hover, to the most of all
+    rotors, N.
+    """
+
+    def __init__(self, centre: np.ndarray, scale: np.ndarray, control: Control):
+        """Take the map, in the units of the command level. (k,) each
+
+        Raises:
+            ConfigError: If the two have not the same shape (k,).
+        """
+        self.centre, self.scale, self.control = np.asarray(centre, float), np.asarray(scale, float), control
+        if self.centre.shape != self.scale.shape or self.centre.ndim != 1:
+            raise ConfigError(
+                f"centre and scale of actions have shapes {self.centre.shape} and {self.scale.shape}; needed is (k,)"
+            )
+
+    @property
+    def size(self) -> int:
+        """Numbers in an action."""
+        return len(self.centre)
+
+    def command(self, action: Array) -> Array:
+        """Return the command of an action, in the units of the command level. (..., k) -> (..., n)"""
+        dtype = action.dtype
+        command = self.centre.astype(dtype) + self.scale.astype(dtype) * safe_clip(action, -1.0, 1.0)
+        if self.control != Control.state:
+            return command
+        rest = jnp.zeros((*command.shape[:-1], 13), dtype).at[..., 9].set(1.0)
+        return jnp.concatenate([command, rest], axis=-1)
+
+    def __str__(self) -> str:
+        """Return the level and what an action of -1 and 1 commands."""
+        what = COMMAND_FIELDS[self.control]
+        return f"{self.control.value} ({what}): {self.centre - self.scale} to {self.centre + self.scale}"
+
+
+def actions_of(airframe: Airframe, params: SimParams, control: Control, tilt: float = TILT) -> Actions:
+    """Return the usual map of a command level; see ``Actions``.
+
+    Args:
+        airframe: What the rotors can do.
+        params: Shared parameters of the nominal drone, which say what makes it hover.
+        control: Command level.
+        tilt: Largest roll and pitch of the attitude level, rad.
+    """
+    n_rotors = airframe.n_rotors
+    each = float(airframe.value("rotors.thrust_max", ()))
+    hover = float(hover_thrust(params)[0])
+    span = n_rotors * each - hover
+    if control == Control.attitude:
+        return Actions(np.array([0, 0, 0, hover]), np.array([tilt, tilt, YAW, span]), control)
+    if control == Control.body_rate:
+        return Actions(np.array([0, 0, 0, hover]), np.array([*RATES, span]), control)
+    if control == Control.state:
+        return Actions(np.array([0, 0, 1.0]), np.array(REACH), control)
+    if control == Control.force_torque:
+        arms = np.array([airframe.arm, airframe.arm, float(airframe.value("controller.thrust2torque", ()))])
+        most = each / 2 * arms * np.abs(airframe.mixing_matrix).sum(axis=-1)
+        return Actions(np.array([hover, 0, 0, 0]), np.array([span, *most / 4]), control)
+    assert isinstance(params, first_principles.Params)  # fitted models take no rotor commands
+    centre = np.asarray(first_principles.hover_rotor_vel(params))
+    return Actions(centre, np.broadcast_to(np.asarray(params.rotor_vel_max), centre.shape) - centre, control)
+
+
+def hover_thrust(params: SimParams) -> Array:
+    """Return the collective thrust command under which a drone hovers, N. (..., 1)"""
+    gravity = params.gravity_vec
+    weight = params.mass * jnp.sqrt(jnp.sum(gravity * gravity, axis=-1, keepdims=True))
+    return (weight - params.acc_coef) / params.cmd_f_coef if isinstance(params, fitted.Params) else weight
+
+
+def hover_rotors(params: SimParams) -> Array:
+    """Return ``states.rotor_vel`` in hover: rpm, or the thrust, N, in fitted models. (..., n_rotors) or (..., 1)"""
+    return hover_thrust(params) if isinstance(params, fitted.Params) else first_principles.hover_rotor_vel(params)

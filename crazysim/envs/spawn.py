@@ -1,0 +1,66 @@
+"""Where episodes begin: random numbers for every world, and drones that are flying already."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from crazysim.envs.actions import hover_rotors
+from crazysim.sim.data import SimData
+
+
+def uniform(keys: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
+    """Return random numbers for every world, evenly from a range.
+
+    One call for all that a world needs costs less than several.
+
+    Args:
+        keys: One random key per world. (n_worlds,)
+        shape: Shape of one world's numbers.
+        low: Lower ends; anything that broadcasts to the shape.
+        high: Upper ends.
+
+    Returns:
+        (n_worlds, *shape)
+    """
+    x = jax.vmap(lambda key: jax.random.uniform(key, shape))(keys)
+    return low + x * (jnp.asarray(high, x.dtype) - jnp.asarray(low, x.dtype))
+
+
+def flying(data: SimData, pos: ArrayLike, quat: Array | None = None, vel: ArrayLike = 0.0, ang_vel: ArrayLike = 0.0) -> SimData:
+    """Return the data with drones in the air, their rotors turning as in hover.
+
+    Args:
+        data: The simulation.
+        pos: Positions, world frame, m. (n_worlds, n_drones, 3)
+        quat: Attitudes, xyzw; None for level. (n_worlds, n_drones, 4)
+        vel: Velocities, world frame, m/s; broadcasts to (n_worlds, n_drones, 3).
+        ang_vel: Angular velocities, body frame, rad/s; likewise.
+    """
+    s, controls = data.states, data.controls
+    level = jnp.array([0.0, 0.0, 0.0, 1.0], s.quat.dtype)
+    ang_vel = jnp.broadcast_to(ang_vel, s.ang_vel.shape)
+    states = s.replace(
+        pos=jnp.broadcast_to(pos, s.pos.shape),
+        quat=jnp.broadcast_to(level if quat is None else quat, s.quat.shape),
+        vel=jnp.broadcast_to(vel, s.vel.shape),
+        ang_vel=ang_vel,
+        rotor_vel=jnp.broadcast_to(hover_rotors(data.params), s.rotor_vel.shape),
+    )
+    # The controllers' derivative terms would else see a jump of the angular velocity at their first tick.
+    for level_name in ("attitude", "body_rate"):
+        ctrl = getattr(controls, level_name)
+        if ctrl is not None and ctrl.prev_ang_vel is not None:
+            controls = controls.replace(**{level_name: ctrl.replace(prev_ang_vel=ang_vel)})
+    return data.replace(states=states, controls=controls)
+
+
+def any_attitude(x: Array) -> Array:
+    """Return attitudes spread evenly over all rotations from three numbers in [0, 1] (Shoemake 1992). (..., 4)"""
+    a, b, c = x[..., 0], 2 * jnp.pi * x[..., 1], 2 * jnp.pi * x[..., 2]
+    low, high = jnp.sqrt(1 - a), jnp.sqrt(a)
+    return jnp.stack([low * jnp.sin(b), low * jnp.cos(b), high * jnp.sin(c), high * jnp.cos(c)], axis=-1)

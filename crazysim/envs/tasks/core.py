@@ -1,0 +1,70 @@
+"""What tasks have in common: a goal that is part of the data, the usual observations, and the edge of the arena."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.effects.core import Simulation, install
+from crazysim.pytree import PyTree, leaf
+from crazysim.sim.data import SimData
+
+NAME = "task"
+"""Name of a task's record in ``data.plugins``."""
+FLOOR = 0.02
+"""Height of the centre below which a drone has crashed, m."""
+
+
+class Goal(PyTree):
+    """Where a drone is to be."""
+
+    pos: Array = leaf("drone", 1)
+    """Position, world frame, m. (n_worlds, n_drones, 3)"""
+    vel: Array = leaf("drone", 1)
+    """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
+
+
+def install_goal(sim: Simulation) -> None:
+    """Give every drone a goal, ``data.plugins["task"]``, at the origin and at rest."""
+    install(sim, NAME, Goal(jnp.zeros_like(sim.data.states.pos), jnp.zeros_like(sim.data.states.pos)))
+
+
+def goal_of(data: SimData) -> Goal:
+    """Return the goals."""
+    return data.plugins[NAME]
+
+
+def with_goal(data: SimData, pos: ArrayLike, vel: ArrayLike = 0.0) -> SimData:
+    """Return the data with other goals, (n_worlds, n_drones, 3) each."""
+    pos = jnp.broadcast_to(pos, data.states.pos.shape)
+    return data.replace(plugins=data.plugins | {NAME: Goal(pos, jnp.broadcast_to(vel, pos.shape))})
+
+
+def state_of(data: SimData) -> dict[str, Array]:
+    """Return position, m, attitude as the nine entries of its matrix, velocity, m/s, body rates, rad/s."""
+    s = data.states
+    turned = rotation.matrix(s.quat)
+    return {
+        "pos": s.pos,
+        "rot": turned.reshape(*turned.shape[:-2], 9),
+        "vel": s.vel,
+        "ang_vel": s.ang_vel,
+    }
+
+
+def away(data: SimData) -> Array:
+    """Return the distance from the goal, m. (n_worlds, n_drones)"""
+    return rotation.safe_norm(goal_of(data).pos - data.states.pos)[..., 0]
+
+
+def on_floor(data: SimData) -> Array:
+    """Return which drones are on the floor, or below. (n_worlds, n_drones)"""
+    return data.states.pos[..., 2] < FLOOR
+
+
+def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
+    """Return which drones are on the floor, too high, or too far from the z axis. (n_worlds, n_drones)"""
+    pos = data.states.pos
+    return on_floor(data) | (pos[..., 2] > height) | jnp.any(jnp.abs(pos[..., :2]) > half_width, axis=-1)

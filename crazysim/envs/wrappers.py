@@ -1,0 +1,307 @@
+"""What is put around an environment; every wrapper is an environment again, and keeps its own in ``state.memory``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import StrEnum
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.envs.actions import Actions
+from crazysim.envs.env import Env, EnvState, Obs, Task
+from crazysim.errors import ConfigError
+from crazysim.pytree import map_batched, scopes, select_worlds
+from crazysim.sim.data import SimData
+from crazysim.sim.random import drone_keys, world_keys
+from crazysim.sim.settings import positive
+from crazysim.sim.sim import Sim
+
+
+class Wrapper:
+    """An environment as it is; wrappers change what they are about."""
+
+    name: str = ""
+    """Name of what it remembers, in ``state.memory``."""
+
+    def __init__(self, env: Env):
+        """Take the environment to put it around.
+
+        Raises:
+            ConfigError: If that begins episodes by itself, which a wrapper around it would not notice.
+        """
+        if isinstance(env, AutoReset):
+            raise ConfigError(f"{type(self).__name__} goes inside of AutoReset, which is the outermost wrapper")
+        self.env = env
+        self.name = self.name or type(self).__name__
+
+    @property
+    def sim(self) -> Sim:
+        """The simulation that the environment was made from."""
+        return self.env.sim
+
+    @property
+    def task(self) -> Task:
+        """What is to be done."""
+        return self.env.task
+
+    @property
+    def actions(self) -> Actions:
+        """What an action means."""
+        return self.env.actions
+
+    @property
+    def n_substeps(self) -> int:
+        """Physics steps in one environment step."""
+        return self.env.n_substeps
+
+    @property
+    def max_steps(self) -> int:
+        """Environment steps in one episode."""
+        return self.env.max_steps
+
+    def reset(self, key: Array) -> EnvState:
+        """Return all worlds at the beginning of an episode."""
+        return self.env.reset(key)
+
+    def restart(self, state: EnvState, mask: Array) -> EnvState:
+        """Return the state with new episodes in the worlds of a mask. (n_worlds,)"""
+        return self.env.restart(state, mask)
+
+    def step(self, state: EnvState, action: Array) -> EnvState:
+        """Return the state one environment step later. (n_worlds, n_drones, k)"""
+        return self.env.step(state, action)
+
+    def recall(self, state: EnvState) -> Any:
+        """Return what this wrapper remembers."""
+        return state.memory[self.name]
+
+    def remember(self, state: EnvState, memory: Any, **changes: Any) -> EnvState:
+        """Return the state with what this wrapper is to remember."""
+        return state.replace(memory=state.memory | {self.name: memory}, **changes)
+
+
+class AutoresetMode(StrEnum):
+    """When a new episode begins; the words are Gymnasium's."""
+
+    next_step = "NextStep"
+    """With the step after the last, which heeds no action and gives no reward."""
+    same_step = "SameStep"
+    """At the end of the last step itself; the last observation is in ``info["final_obs"]``."""
+    disabled = "Disabled"
+    """When the user says so."""
+
+
+class AutoReset(Wrapper):
+    """Begin a new episode where one is over; the outermost of all wrappers."""
+
+    def __init__(self, env: Env, mode: AutoresetMode | str = AutoresetMode.same_step):
+        """Take the environment, and when to begin."""
+        super().__init__(env)
+        self.mode = AutoresetMode(mode)
+
+    def reset(self, key: Array) -> EnvState:
+        """Return all worlds at the beginning of an episode."""
+        state = self.env.reset(key)
+        return self._with_final(state, state.obs) if self.mode == AutoresetMode.same_step else state
+
+    def step(self, state: EnvState, action: Array) -> EnvState:
+        """Return the state one step later, new episodes begun."""
+        if self.mode == AutoresetMode.disabled:
+            return self.env.step(state, action)
+        if self.mode == AutoresetMode.next_step:
+            return self.env.restart(self.env.step(state, action), state.done)
+        state = self.env.step(state, action)
+        begun = self.env.restart(state, state.done)
+        # The new episodes' observations, and the last step's reward and end.
+        kept = {"reward": state.reward, "terminated": state.terminated, "truncated": state.truncated}
+        info = begun.info | {name: state.info[name] for name in ("nonfinite", "error") if name in state.info}
+        return self._with_final(begun.replace(info=info, **kept), state.obs)
+
+    @staticmethod
+    def _with_final(state: EnvState, obs: Obs) -> EnvState:
+        return state.replace(info=state.info | {"final_obs": obs})
+
+
+class EpisodeStatistics(Wrapper):
+    """Tell return and length of the episodes that end: ``info["episode_return"]``, ``info["episode_length"]``.
+
+    Both are zero in worlds whose episode goes on.
+    """
+
+    def reset(self, key: Array) -> EnvState:
+        """Return all worlds at the beginning of an episode."""
+        state = self.env.reset(key)
+        sums = {"return": jnp.zeros_like(state.reward), "length": jnp.zeros_like(state.truncated, jnp.int32)}
+        info = {"episode_return": sums["return"], "episode_length": sums["length"]}
+        return self.remember(state, sums, info=state.info | info)
+
+    def restart(self, state: EnvState, mask: Array) -> EnvState:
+        """Return the state with new episodes in the worlds of a mask. (n_worlds,)"""
+        sums = jax.tree.map(lambda x: select_worlds(mask, jnp.zeros((), x.dtype), x), self.recall(state))
+        return self.remember(self.env.restart(state, mask), sums)
+
+    def step(self, state: EnvState, action: Array) -> EnvState:
+        """Return the state one step later."""
+        before = self.recall(state)
+        state = self.env.step(state, action)
+        sums = {"return": before["return"] + state.reward, "length": before["length"] + 1}
+        told = jax.tree.map(lambda x: select_worlds(state.done, x, jnp.zeros((), x.dtype)), sums)
+        info = {"episode_return": told["return"], "episode_length": told["length"]}
+        left = jax.tree.map(lambda x: select_worlds(state.done, jnp.zeros((), x.dtype), x), sums)
+        return self.remember(state, left, info=state.info | info)
+
+
+class Observe(Wrapper):
+    """Change what is observed: ``fn(obs, data) -> obs``, a pure function without a memory.
+
+    ``Observe(env, lambda obs, data: {"vector": flatten(obs)})`` makes one array of all.
+    """
+
+    def __init__(self, env: Env, fn: Callable[[Obs, SimData], Obs]):
+        """Take the environment, and what becomes of its observations."""
+        super().__init__(env)
+        self.fn = fn
+
+    def reset(self, key: Array) -> EnvState:
+        """Return all worlds at the beginning of an episode."""
+        return self._changed(self.env.reset(key))
+
+    def restart(self, state: EnvState, mask: Array) -> EnvState:
+        """Return the state with new episodes in the worlds of a mask. (n_worlds,)"""
+        return self._changed(self.env.restart(state, mask))
+
+    def step(self, state: EnvState, action: Array) -> EnvState:
+        """Return the state one step later."""
+        return self._changed(self.env.step(state, action))
+
+    def _changed(self, state: EnvState) -> EnvState:
+        return state.replace(obs=self.fn(state.obs, state.data))
+
+
+class ObservationNoise(Observe):
+    """Add normal noise to observations, other in every step, the same for the same seed and world."""
+
+    def __init__(self, env: Env, std: dict[str, float]):
+        """Take the environment, and standard deviations by name of what is observed, in its unit.
+
+        Raises:
+            ConfigError: If nothing of that name is observed, when the environment is first reset.
+        """
+        super().__init__(env, self._noisy)
+        self.std = dict(std)
+
+    def _noisy(self, obs: Obs, data: SimData) -> Obs:
+        if missing := set(self.std) - set(obs):
+            raise ConfigError(f"nothing observed is called {', '.join(sorted(missing))}; there are {', '.join(obs)}")
+        keys = drone_keys(data, "observation noise")
+        noisy = dict(obs)
+        for i, (name, std) in enumerate(sorted(self.std.items())):
+            own = jax.vmap(jax.vmap(lambda key, i=i: jax.random.fold_in(key, i)))(keys)
+            shape, dtype = obs[name].shape[2:], obs[name].dtype
+            noise = jax.vmap(jax.vmap(lambda key, s=shape, d=dtype: jax.random.normal(key, s, d)))(own)
+            noisy[name] = obs[name] + std * noise
+        return noisy
+
+
+class FrameStack(Wrapper):
+    """Observe the last few observations, the oldest first, one behind the other in the last axis."""
+
+    def __init__(self, env: Env, n: int):
+        """Take the environment, and how many observations are seen at once."""
+        super().__init__(env)
+        self.n = positive("n", n)
+
+    def reset(self, key: Array) -> EnvState:
+        """Return all worlds at the beginning of an episode, its first observation seen as often as needed."""
+        state = self.env.reset(key)
+        return self._stacked(state, jax.tree.map(self._repeated, state.obs))
+
+    def restart(self, state: EnvState, mask: Array) -> EnvState:
+        """Return the state with new episodes in the worlds of a mask. (n_worlds,)"""
+        old = self.recall(state)
+        state = self.env.restart(state, mask)
+        new = jax.tree.map(self._repeated, state.obs)
+        return self._stacked(state, jax.tree.map(lambda x, y: select_worlds(mask, x, y), new, old))
+
+    def step(self, state: EnvState, action: Array) -> EnvState:
+        """Return the state one step later."""
+        old = self.recall(state)
+        state = self.env.step(state, action)
+        frames = jax.tree.map(lambda x, y: jnp.concatenate([y[..., 1:, :], x[..., None, :]], axis=-2), state.obs, old)
+        return self._stacked(state, frames)
+
+    def _repeated(self, x: Array) -> Array:
+        return jnp.repeat(x[..., None, :], self.n, axis=-2)
+
+    def _stacked(self, state: EnvState, frames: Obs) -> EnvState:
+        return self.remember(state, frames, obs=jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1), frames))
+
+
+class ActionDelay(Wrapper):
+    """Have actions take effect some environment steps late; until the first arrives, hover (action zero)."""
+
+    def __init__(self, env: Env, n: int):
+        """Take the environment, and by how many steps."""
+        super().__init__(env)
+        self.n = positive("n", n)
+
+    def reset(self, key: Array) -> EnvState:
+        """Return all worlds at the beginning of an episode."""
+        state = self.env.reset(key)
+        return self.remember(state, jnp.repeat(jnp.zeros_like(state.action)[:, None], self.n, axis=1))
+
+    def restart(self, state: EnvState, mask: Array) -> EnvState:
+        """Return the state with new episodes in the worlds of a mask. (n_worlds,)"""
+        queue = select_worlds(mask, jnp.zeros((), state.action.dtype), self.recall(state))
+        return self.remember(self.env.restart(state, mask), queue)
+
+    def step(self, state: EnvState, action: Array) -> EnvState:
+        """Return the state one step later."""
+        queue = self.recall(state)
+        state = self.env.step(state, queue[:, 0])
+        return self.remember(state, jnp.concatenate([queue[:, 1:], action[:, None].astype(queue.dtype)], axis=1))
+
+
+class Randomize(Wrapper):
+    """Begin every episode with other data: masses, motors, whatever a function draws.
+
+    ``fn(data, keys) -> data`` is given one key per world, (n_worlds,). Parameters that it changes are one per drone:
+    they are named in ``params``. It goes directly around the environment.
+    """
+
+    def __init__(self, env: Env, fn: Callable[[SimData, Array], SimData], params: tuple[str, ...] = ()):
+        """Take the environment, what randomises it, and the parameters that it randomises.
+
+        Raises:
+            ConfigError: If the model has no such parameter, or there is another wrapper in between.
+        """
+        super().__init__(env)
+        if isinstance(env, Wrapper):
+            raise ConfigError(f"Randomize goes directly around the environment, not around {type(env).__name__}")
+        known = vars(env.sim.data.params)
+        if missing := [name for name in params if known.get(name) is None]:
+            raise ConfigError(
+                f"{env.sim.dynamics.value} has no parameter {', '.join(missing)}; it has {', '.join(known)}"
+            )
+        self.fn, self.params = fn, tuple(params)
+
+    def reset(self, key: Array) -> EnvState:
+        """Return all worlds at the beginning of an episode."""
+        state = self.env.reset(key)
+        data, shape = state.data, (self.sim.n_worlds, self.sim.n_drones)
+        shared = {name: getattr(data.params, name) for name in self.params}
+        shared = {k: x for k, x in shared.items() if getattr(scopes(data.params), k) == "shared"}
+        params = data.params.replace(**{k: jnp.broadcast_to(x, (*shape, *x.shape)) for k, x in shared.items()})
+        return self._randomized(state.replace(data=data.replace(params=params)), None)
+
+    def restart(self, state: EnvState, mask: Array) -> EnvState:
+        """Return the state with new episodes in the worlds of a mask. (n_worlds,)"""
+        return self._randomized(self.env.restart(state, mask), mask)
+
+    def _randomized(self, state: EnvState, mask: Array | None) -> EnvState:
+        drawn = self.fn(state.data, world_keys(state.data, "randomize"))
+        data = map_batched(lambda x, new: select_worlds(mask, new, x), state.data, drawn)
+        return state.replace(data=data, obs=self.task.observe(data))

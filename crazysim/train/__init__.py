@@ -1,0 +1,1 @@
+"""Training policies: environments in, policies out."""

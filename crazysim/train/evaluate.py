@@ -1,0 +1,63 @@
+"""How good a policy is, judged by flights from starts that it has not trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.envs.env import Env
+
+HELD_OUT = 0x5EED
+"""Seed of the starts that policies are judged by; training seeds are folded away from it."""
+
+
+@partial(jax.jit, static_argnames=("env",))
+def fly(env: Env, policy: Callable[[Any], Array], key: Array) -> dict[str, Array]:
+    """Return what one episode of every world gives.
+
+    Returns:
+        ``error`` at the end of every step (n_steps, n_worlds, n_drones); ``over``, whether an episode had ended by
+        then because of what happened (n_steps, n_worlds); ``reward`` summed up to that (n_worlds, n_drones).
+    """
+
+    def step(carry: Any, _: None) -> Any:
+        state, over, total = carry
+        state = env.step(state, policy(state.obs))
+        total = total + jnp.where(over[:, None], 0.0, state.reward)
+        over = over | state.terminated
+        return (state, over, total), (state.info["error"], over)
+
+    state = env.reset(key)
+    carry = (state, jnp.zeros_like(state.terminated), jnp.zeros_like(state.reward))
+    (_, _, total), (error, over) = jax.lax.scan(step, carry, length=env.max_steps)
+    return {"error": error, "over": over, "reward": total}
+
+
+def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None) -> dict[str, float]:
+    """Return how often a policy succeeds: the error stays below the task's tolerance to the episode's end.
+
+    Args:
+        env: The environment, without automatic resets; each world is one start.
+        policy: Observations to actions.
+        key: Of the starts; None for those that are held out.
+
+    Returns:
+        ``success`` (share of drones), ``crashed`` (share of worlds), ``error`` (mean over the last ``task.hold``
+        seconds of what did not crash, m), ``reward`` (mean sum of an episode).
+    """
+    flown = fly(env, policy, jax.random.key(HELD_OUT) if key is None else key)
+    last = max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
+    over = flown["over"][-1]
+    settled = jnp.all(flown["error"][-last:] < env.task.tolerance, axis=0) & ~over[:, None]
+    error = jnp.where(over[None, :, None], jnp.nan, flown["error"][-last:])
+    return {
+        "success": float(settled.mean()),
+        "crashed": float(over.mean()),
+        "error": float(jnp.nanmean(error)),
+        "reward": float(flown["reward"].mean()),
+    }

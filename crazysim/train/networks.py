@@ -1,0 +1,86 @@
+"""Small networks as plain arrays: a list of layers, each a weight matrix and a bias."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.pytree import PyTree
+
+Layers = list[tuple[Array, Array]]
+"""Weights (n_in, n_out) and biases (n_out,), first layer first."""
+
+
+def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
+    """Return layers with orthogonal weights and zero biases.
+
+    Args:
+        key: Random key.
+        sizes: Numbers of inputs, of neurons in each hidden layer, of outputs.
+        last_scale: Scale of the last layer's weights; small for a policy, so that it begins near its zero action.
+    """
+    keys = jax.random.split(key, len(sizes) - 1)
+    scales = [np.sqrt(2.0)] * (len(sizes) - 2) + [last_scale]
+    pairs = zip(keys, itertools.pairwise(sizes), scales, strict=True)
+    return [(jax.nn.initializers.orthogonal(scale)(k, pair), jnp.zeros(pair[1])) for k, pair, scale in pairs]
+
+
+def mlp(layers: Layers, x: Array) -> Array:
+    """Return the outputs, tanh between layers. (..., n_in) -> (..., n_out)"""
+    for weight, bias in layers[:-1]:
+        x = jnp.tanh(x @ weight + bias)
+    weight, bias = layers[-1]
+    return x @ weight + bias
+
+
+def flatten(obs: dict[str, Array]) -> Array:
+    """Return named observations one behind the other, by name. (..., n_obs)"""
+    return jnp.concatenate([obs[name] for name in sorted(obs)], axis=-1)
+
+
+class RunningStats(PyTree):
+    """Mean and variance of what has been seen (Chan, Golub, LeVeque 1979)."""
+
+    mean: Array
+    """(k,)"""
+    var: Array
+    """(k,)"""
+    count: Array
+    """How many were seen. ()"""
+
+    @staticmethod
+    def create(size: int) -> RunningStats:
+        """Return the statistics of nothing: mean zero, variance one."""
+        return RunningStats(jnp.zeros(size), jnp.ones(size), jnp.asarray(1e-4))
+
+    def update(self, x: Array) -> RunningStats:
+        """Return the statistics with a batch more. (..., k)"""
+        x = x.reshape(-1, x.shape[-1])
+        n, mean, var = x.shape[0], x.mean(axis=0), x.var(axis=0)
+        total = self.count + n
+        delta = mean - self.mean
+        spread = self.var * self.count + var * n + delta * delta * self.count * n / total
+        return RunningStats(self.mean + delta * n / total, spread / total, total)
+
+    def normalize(self, x: Array) -> Array:
+        """Return numbers of mean zero and variance one, at most ten. (..., k)"""
+        return jnp.clip((x - self.mean) / jnp.sqrt(self.var + 1e-6), -10.0, 10.0)
+
+
+class Policy(PyTree):
+    """A policy as it is flown, evaluated and exported: statistics of its inputs, and layers."""
+
+    stats: RunningStats
+    """What its inputs are normalised with."""
+    layers: Any
+    """``Layers`` from observations to actions."""
+
+    def __call__(self, obs: dict[str, Array]) -> Array:
+        """Return the action for observations, without noise. (..., n_obs) -> (..., n_actions)"""
+        return jnp.tanh(mlp(self.layers, self.stats.normalize(flatten(obs))))
