@@ -31,7 +31,9 @@ def uniform(keys: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
     return low + x * (jnp.asarray(high, x.dtype) - jnp.asarray(low, x.dtype))
 
 
-def flying(data: SimData, pos: ArrayLike, quat: Array | None = None, vel: ArrayLike = 0.0, ang_vel: ArrayLike = 0.0) -> SimData:
+def flying(
+    data: SimData, pos: ArrayLike, quat: Array | None = None, vel: ArrayLike = 0.0, ang_vel: ArrayLike = 0.0
+) -> SimData:
     """Return the data with drones in the air, their rotors turning as in hover.
 
     Args:
