@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from crazysim.errors import RenderError
 
@@ -37,16 +39,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
     replay.add_argument("--port", type=int, default=8080, help="where the page is served; 0 for any free port")
     replay.add_argument("--host", default="127.0.0.1", help="who may see it; 0.0.0.0 for everyone")
     replay.add_argument("--export", type=Path, metavar="FILE", help="write the page into this .html, and serve nothing")
+    _add_training(commands)
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help()
         return 0
     try:
-        {"demo": _demo, "replay": _replay}[options.command](options)
+        COMMANDS[options.command](options)
     except (ValueError, ImportError, RenderError) as error:
         print(f"crazysim: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 130
     return 0
+
+
+def _add_training(commands: Any) -> None:
+    """Add what has to do with policies."""
+    shown = {"formatter_class": argparse.ArgumentDefaultsHelpFormatter}
+    train = commands.add_parser("train", help="train a policy; keep checkpoint, curve, policy and film", **shown)
+    train.add_argument("task", help="hover, track, recover, race and so on; 'list' shows all")
+    train.add_argument("--algorithm", help="ppo or apg; what suits the task if left out")
+    train.add_argument("--seed", type=int, default=0, help="of everything random")
+    train.add_argument("--worlds", type=int, help="worlds that are flown at once; what suits the task if left out")
+    train.add_argument("--iterations", type=int, help="rounds of flying and learning")
+    train.add_argument("--out", type=Path, help="folder of the run; out/TASK if left out")
+    train.add_argument("--resume", action="store_true", help="go on from the checkpoint in that folder")
+    train.add_argument("--device", default="cpu", help="where to train: cpu, gpu")
+    train.add_argument(
+        "--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation"
+    )
+    train.add_argument("--config", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the algorithm")
+    train.add_argument("--no-film", action="store_true", help="make no film")
+    judge = commands.add_parser("evaluate", help="fly a trained policy from held-out starts", **shown)
+    judge.add_argument("folder", type=Path, help="folder of the run")
+    judge.add_argument("--worlds", type=int, default=1000, help="number of starts")
+    judge.add_argument("--seed", type=int, help="other starts than the held-out ones")
+    export = commands.add_parser("export", help="write a trained policy as ONNX or as a C header", **shown)
+    export.add_argument("folder", type=Path, help="folder of the run")
+    export.add_argument("--onnx", type=Path, metavar="FILE", help="an .onnx file")
+    export.add_argument("--c", type=Path, metavar="FILE", help="a .h file, which needs nothing but math.h")
+    render = commands.add_parser("render", help="film a trained policy", **shown)
+    render.add_argument("folder", type=Path, help="folder of the run")
+    render.add_argument("--film", type=Path, metavar="FILE", help=".mp4 or .gif; policy.mp4 in the folder if left out")
+    render.add_argument("--worlds", type=int, default=4, help="worlds side by side")
+    render.add_argument("--seed", type=int, default=1, help="of the starts")
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -65,6 +102,94 @@ def _replay(options: argparse.Namespace) -> None:
     else:
         export(flight, options.export, options.world)
         print(f"wrote {options.export}")
+
+
+def _pairs(texts: Sequence[str]) -> dict[str, Any]:
+    """Return NAME=VALUE as a dict; a value is what JSON reads, else a word."""
+    pairs = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ValueError(f"{text!r} is no NAME=VALUE")
+        try:
+            pairs[name] = json.loads(value)
+        except ValueError:
+            pairs[name] = value
+    return pairs
+
+
+def _train(options: argparse.Namespace) -> None:
+    from crazysim.envs.registry import TASKS
+
+    if options.task == "list":
+        for name, entry in TASKS.items():
+            print(f"{name:12} {(entry.maker.__doc__ or '').splitlines()[0].removeprefix('Return the task of ')}")
+        return
+    from crazysim.train.run import CHECKPOINT, Settings, train
+    from crazysim.train.show import film, plot_curve, read_curve
+
+    config = _pairs(options.config) | ({} if options.iterations is None else {"iterations": options.iterations})
+    place = {} if options.device == "cpu" else {"device": options.device}
+    settings = Settings.create(
+        options.task, options.algorithm, options.seed, options.worlds, _pairs(options.set) | place, config
+    )
+    folder = options.out or Path("out") / options.task
+    result = train(settings, folder, options.resume)
+    print(f"wrote {folder / CHECKPOINT}, {folder / 'policy.npz'}")
+    try:
+        plot_curve({options.task: read_curve(folder)}, folder / "curve.png")
+        print(f"wrote {folder / 'curve.png'}")
+        if not options.no_film:
+            film(settings.environment(4), result.policy, folder / "policy.mp4", progress=True)
+            print(f"wrote {folder / 'policy.mp4'}")
+    except (ImportError, RenderError) as error:
+        print(f"no curve or film: {error}")
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    import jax
+
+    from crazysim.train.evaluate import evaluate
+    from crazysim.train.run import load_policy
+
+    policy, settings, _ = load_policy(options.folder)
+    env = settings.environment(options.worlds)
+    figures = evaluate(env, policy, None if options.seed is None else jax.random.key(options.seed))
+    print(f"{settings.task}, {options.worlds:,} starts: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
+
+
+def _export(options: argparse.Namespace) -> None:
+    from crazysim.train.export import to_c, to_onnx
+    from crazysim.train.run import load_policy
+
+    if options.onnx is None and options.c is None:
+        raise ValueError("say what to write: --onnx FILE, --c FILE, or both")
+    policy, _, meta = load_policy(options.folder)
+    for path, write in ((options.onnx, to_onnx), (options.c, to_c)):
+        if path is not None:
+            write(policy, path, meta)
+            print(f"wrote {path}")
+
+
+def _render(options: argparse.Namespace) -> None:
+    from crazysim.train.run import load_policy
+    from crazysim.train.show import film
+
+    policy, settings, _ = load_policy(options.folder)
+    path = options.film or options.folder / "policy.mp4"
+    film(settings.environment(options.worlds), policy, path, options.worlds, options.seed, progress=True)
+    print(f"wrote {path}")
+
+
+COMMANDS = {
+    "demo": _demo,
+    "replay": _replay,
+    "train": _train,
+    "evaluate": _evaluate,
+    "export": _export,
+    "render": _render,
+}
+"""What each command runs."""
 
 
 if __name__ == "__main__":

@@ -61,7 +61,8 @@ class Actions:
     def command(self, action: Array) -> Array:
         """Return the command of an action, in the units of the command level. (..., k) -> (..., n)"""
         dtype = action.dtype
-        command = self.centre.astype(dtype) + self.scale.astype(dtype) * safe_clip(action, -1.0, 1.0)
+        centre, scale = jnp.asarray(self.centre, dtype), jnp.asarray(self.scale, dtype)
+        command = centre + scale * safe_clip(action, -1.0, 1.0)
         if self.control != Control.state:
             return command
         rest = jnp.zeros((*command.shape[:-1], 13), dtype).at[..., 9].set(1.0)

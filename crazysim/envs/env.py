@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -43,6 +43,10 @@ class Task:
     """How far a drone is from what it is asked to do, m unless the task says otherwise. (n_worlds, n_drones)"""
     info: Callable[[SimData], dict[str, Array]] = lambda data: {}  # noqa: ARG005
     """What else is told of an episode. (n_worlds, ...) each"""
+    target: Callable[[SimData], Array] | None = None
+    """Where a drone is to be, for pictures, m. (n_worlds, n_drones, 3)"""
+    camera: Mapping[str, Any] | None = None
+    """From where pictures are taken: lookat, distance, azimuth, elevation."""
     seconds: float = 5.0
     """Length of an episode, s."""
     tolerance: float = 0.05
@@ -211,7 +215,8 @@ class DroneEnv:
         default = _like(self._default, data)
         data = self._reset(data, default, mask)
         spawned = self.task.spawn(data, world_keys(data, f"spawn {self.task.name}"))
-        return map_batched(lambda x, new: select_worlds(mask, new, x), data, spawned)
+        # Numbers of Python's are weakly typed; a state of another type would have the next step compiled anew.
+        return map_batched(lambda x, new: select_worlds(mask, new.astype(x.dtype), x), data, spawned)
 
     def _info(self, data: SimData, lost: Array) -> dict[str, Array]:
         return {"nonfinite": lost, "error": self.task.error(data)} | self.task.info(data)

@@ -48,6 +48,8 @@ class View:
     """Colour of trails and setpoints, one or one per drone; None for colours that tell drones apart."""
     text: str | None = None
     """Text at the top left of each world, in which ``{world}`` and ``{time}`` are filled in; ASCII."""
+    draw: Callable[[Sim, int], None] | None = None
+    """``draw(sim, world)`` draws more over a world, with what ``crazysim.sim.visualize`` has."""
     columns: int | None = None
     """Worlds in a row; None for a grid as wide as high."""
     border: int = 2
@@ -162,6 +164,8 @@ class View:
             self._trail.draw(sim.marks, k, self.rgba)
         if self.setpoints:
             draw_setpoints(sim, self.worlds[k], colors_of(sim.n_drones, self.rgba))
+        if self.draw is not None:
+            self.draw(sim, self.worlds[k])
         if self.text is not None:
             draw_text(sim, _fill(self.text, self.worlds[k], time))
 

@@ -97,7 +97,7 @@ def init(env: Env, config: Config, key: Array) -> Learner:
     n_obs, n_actions = flatten(state.obs).shape[-1], env.actions.size
     policy = init_mlp(k_policy, (n_obs, *config.hidden, n_actions), 0.01)
     value = init_mlp(k_value, (n_obs, *config.hidden, 1), 1.0)
-    log_std = jnp.full(n_actions, jnp.log(config.init_std))
+    log_std = jnp.full(n_actions, jnp.log(config.init_std), policy[0][0].dtype)
     optimizer = _optimizer(config).init((policy, log_std, value))
     stats = RunningStats.create(n_obs).update(flatten(state.obs))
     return Learner(policy, log_std, value, optimizer, stats, key, state, jnp.int32(0))

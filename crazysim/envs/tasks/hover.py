@@ -55,4 +55,5 @@ def hover(sim: Simulation, reach: float = 1.0, seconds: float = 5.0, tolerance: 
 
     settings = {"reach": reach, "seconds": seconds, "tolerance": tolerance}
     return Task("hover", spawn, observe, reward, terminated, away, seconds=seconds, tolerance=tolerance,
-                settings=settings)  # fmt: skip
+                settings=settings, target=lambda data: goal_of(data).pos,
+                camera={"lookat": (0, 0, 1.2), "distance": 4.5, "elevation": -20})  # fmt: skip

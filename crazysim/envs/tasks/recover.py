@@ -54,4 +54,5 @@ def recover(
 
     settings = {"speed": speed, "spin": spin, "seconds": seconds, "tolerance": tolerance}
     return Task("recover", spawn, observe, reward, terminated, away, seconds=seconds, tolerance=tolerance,
-                settings=settings)  # fmt: skip
+                settings=settings, target=lambda data: goal_of(data).pos,
+                camera={"lookat": (0, 0, 2.5), "distance": 9.0, "elevation": -15})  # fmt: skip

@@ -97,4 +97,5 @@ def track(
 
     settings = {"n_samples": n_samples, "spacing": spacing, "seconds": seconds, "tolerance": tolerance}
     return Task("track", spawn, observe, reward, terminated, error, seconds=seconds, tolerance=tolerance, hold=5.0,
-                settings=settings)  # fmt: skip
+                settings=settings, target=lambda data: where(time(data))[0],
+                camera={"lookat": (0, 0, 0.9), "distance": 3.5, "elevation": -30})  # fmt: skip
