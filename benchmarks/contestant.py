@@ -50,6 +50,8 @@ def build(package: str, task: str, case: dict[str, Any], device: str) -> Any:
     """Return what is to be timed: a flight, or its gradient."""
     from measure import Flight
 
+    if task == "gym":
+        return GymSteps(package, case, device)
     if task in QUESTIONS:
         return Question(package, task, case, device)
     settings = dict(case)
@@ -94,6 +96,52 @@ class Gradient:
         slope = self._grad(self._cmd)
         if not (jnp.all(jnp.isfinite(slope)) and jnp.any(slope != 0)):
             raise SystemExit("the gradient is zero or not finite; no figure")
+
+
+class GymSteps:
+    """Steps of a Gymnasium vector environment that reaches a position: the same drone, model, rates and autoreset."""
+
+    def __init__(self, package: str, case: dict[str, Any], device: str):
+        """Make it, and step a few times, which compiles."""
+        import gymnasium
+        import jax
+        import numpy as np
+
+        importlib.import_module(f"{package}.envs")
+        settings = {"num_envs": case["n_worlds"], "freq": case["freq"], "dynamics": "so_rpy", "device": device}
+        if package == "crazysim":
+            settings |= {"drone": "cf2x_L250", "seconds": 10.0}  # what the peer's has
+        self._env = gymnasium.make_vec({"crazysim": "crazysim/Hover-v0"}.get(package, "DroneReachPos-v0"), **settings)
+        # Near hover: no world falls on the floor, so that resets are as rare as they are in use.
+        box = self._env.single_action_space
+        action = np.zeros(4) if package == "crazysim" else np.array([0, 0, 0, 0.0319 * 9.81])
+        action = np.clip(action, box.low, box.high).astype(np.float32)
+        self._action = jax.device_put(np.tile(action, (case["n_worlds"], 1)), jax.devices(device)[0])
+        self._steps = case["n_steps"]
+        self._env.reset(seed=0)
+        self.first_s = self.seconds()
+        self.seconds()
+
+    def seconds(self) -> float:
+        """Return the seconds of some steps, waited for at the end."""
+        import jax
+
+        begin = time.perf_counter()
+        for _ in range(self._steps):
+            self._out = self._env.step(self._action)
+        jax.block_until_ready(self._out[:4])
+        return time.perf_counter() - begin
+
+    def require_flying(self) -> None:
+        """Refuse a figure of drones that crash all the time.
+
+        Raises:
+            SystemExit: If they do.
+        """
+        import numpy as np
+
+        if np.mean(np.asarray(self._out[2])) > 0.1:
+            raise SystemExit("more than a tenth of the worlds ends with every step; no figure")
 
 
 OBJECTS = {

@@ -11,6 +11,7 @@ a shared machine meets both. Medians, and the ratio of medians, are printed. Wha
     contacts    asking for contacts after a step, 4,096 worlds of 4 drones with 8 objects
     depth       64 x 64 depth of 1,024 worlds with 8 objects
     swarm_build Sim(n_drones=1024)
+    gym         steps of the Gymnasium environments that reach a position, 4,096 worlds, 50 Hz of 500
     memory      bytes a world after a question about contacts, of one drone and four, with 8 objects
 
     python benchmarks/versus_crazyflow.py [--only step call] [--engine auto lanes] [--worlds 1024 16384]
@@ -36,7 +37,7 @@ from measure import digits, medians
 
 HERE = Path(__file__).parent
 PEER = HERE.parent / ".cache" / "crazyflow"
-CASES = ("first_step", "step", "call", "gradient", "swarm", "contacts", "depth", "swarm_build", "memory")
+CASES = ("first_step", "step", "call", "gradient", "swarm", "contacts", "depth", "swarm_build", "gym", "memory")
 LEVELS = ("rotor_vel", "force_torque", "body_rate", "attitude", "state")
 
 
@@ -50,6 +51,7 @@ def main() -> None:
     parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"], help="of 'step'")
     parser.add_argument("--batch-worlds", type=int, default=1024, help="worlds of 'gradient' and 'swarm'")
     parser.add_argument("--swarm", type=int, default=64, help="drones a world of 'swarm'")
+    parser.add_argument("--gym-worlds", type=int, default=4096, help="worlds of 'gym'")
     parser.add_argument("--repeats", type=int, default=11)
     parser.add_argument("--peer-python", type=Path, help="interpreter that has Crazyflow 0.4.0; made if left out")
     args = parser.parse_args()
@@ -78,6 +80,8 @@ def main() -> None:
     ):
         if task in args.only:
             versus.question(task, **case)
+    if "gym" in args.only:
+        versus.question("gym", n_worlds=args.gym_worlds, n_drones=1, n_steps=100, freq=50)
     if "memory" in args.only:
         versus.memory()
     for worker in workers.values():

@@ -13,10 +13,10 @@ from jax import Array
 
 from crazysim.engine.rollout import COMMANDS
 from crazysim.envs.actions import Actions, actions_of
+from crazysim.envs.random import episode_keys
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, map_batched, scopes, select_worlds
 from crazysim.sim.data import SimData
-from crazysim.sim.random import world_keys
 from crazysim.sim.settings import positive
 from crazysim.sim.sharding import shard
 from crazysim.sim.sim import Sim
@@ -214,7 +214,7 @@ class DroneEnv:
     def _begin(self, data: SimData, mask: Array | None) -> SimData:
         default = _like(self._default, data)
         data = self._reset(data, default, mask)
-        spawned = self.task.spawn(data, world_keys(data, f"spawn {self.task.name}"))
+        spawned = self.task.spawn(data, episode_keys(data, f"spawn {self.task.name}"))
         # Numbers of Python's are weakly typed; a state of another type would have the next step compiled anew.
         return map_batched(lambda x, new: select_worlds(mask, new.astype(x.dtype), x), data, spawned)
 

@@ -1,34 +1,13 @@
-"""Where episodes begin: random numbers for every world, and drones that are flying already."""
+"""Where episodes begin: drones that are flying already."""
 
 from __future__ import annotations
 
-from typing import Any
-
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
 from crazysim.envs.actions import hover_rotors
 from crazysim.sim.data import SimData
-
-
-def uniform(keys: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
-    """Return random numbers for every world, evenly from a range.
-
-    One call for all that a world needs costs less than several.
-
-    Args:
-        keys: One random key per world. (n_worlds,)
-        shape: Shape of one world's numbers.
-        low: Lower ends; anything that broadcasts to the shape.
-        high: Upper ends.
-
-    Returns:
-        (n_worlds, *shape)
-    """
-    x = jax.vmap(lambda key: jax.random.uniform(key, shape))(keys)
-    return low + x * (jnp.asarray(high, x.dtype) - jnp.asarray(low, x.dtype))
 
 
 def flying(

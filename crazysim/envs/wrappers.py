@@ -12,10 +12,11 @@ from jax import Array
 
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import Env, EnvState, Obs, Task
+from crazysim.envs.random import episode_keys
 from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, scopes, select_worlds
 from crazysim.sim.data import SimData
-from crazysim.sim.random import drone_keys, world_keys
+from crazysim.sim.random import drone_keys
 from crazysim.sim.settings import positive
 from crazysim.sim.sim import Sim
 
@@ -302,6 +303,6 @@ class Randomize(Wrapper):
         return self._randomized(self.env.restart(state, mask), mask)
 
     def _randomized(self, state: EnvState, mask: Array | None) -> EnvState:
-        drawn = self.fn(state.data, world_keys(state.data, "randomize"))
+        drawn = self.fn(state.data, episode_keys(state.data, "randomize"))
         data = map_batched(lambda x, new: select_worlds(mask, new, x), state.data, drawn)
         return state.replace(data=data, obs=self.task.observe(data))

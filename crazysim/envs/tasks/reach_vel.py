@@ -9,7 +9,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.effects.core import Simulation
 from crazysim.envs.env import Task
-from crazysim.envs.spawn import flying, uniform
+from crazysim.envs.random import uniform
+from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.core import goal_of, install_goal, on_floor, state_of, with_goal
 from crazysim.sim.data import SimData
 

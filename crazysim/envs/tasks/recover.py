@@ -8,7 +8,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.effects.core import Simulation
 from crazysim.envs.env import Task
-from crazysim.envs.spawn import any_attitude, flying, uniform
+from crazysim.envs.random import uniform
+from crazysim.envs.spawn import any_attitude, flying
 from crazysim.envs.tasks.core import away, goal_of, install_goal, out_of_bounds, state_of, with_goal
 from crazysim.sim.data import SimData
 

@@ -9,7 +9,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.effects.core import Simulation, install
 from crazysim.envs.env import Task
-from crazysim.envs.spawn import flying, uniform
+from crazysim.envs.random import uniform
+from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.core import NAME, on_floor, state_of
 from crazysim.envs.trajectories import Trajectory, figure_eight
 from crazysim.pytree import PyTree, leaf

@@ -1,0 +1,92 @@
+"""Steps of environments per second: random actions, and a policy, in one compiled rollout with automatic resets.
+
+    python benchmarks/envs.py [--device gpu] [--tasks hover race] [--worlds 4096 1048576]
+
+A step of an environment is ten of physics, at 50 Hz of 500. Worlds that crash begin anew, as in training; the share of
+worlds that end with a step is printed with every figure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from measure import digits, engine_of, medians, report
+
+import crazysim.envs as envs
+from crazysim.train.networks import Policy, RunningStats, flatten, init_mlp
+
+SIZES = {"cpu": (1024, 16384), "gpu": (4096, 65536, 1048576)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--tasks", nargs="+", default=["hover"], help="of crazysim.envs.TASKS")
+    parser.add_argument("--worlds", type=int, nargs="+", help="numbers of worlds")
+    parser.add_argument("--steps", type=int, default=50, help="environment steps a call")
+    parser.add_argument("--repeats", type=int, default=7)
+    args = parser.parse_args()
+    for task in args.tasks:
+        for n_worlds in args.worlds or SIZES["cpu" if args.device == "cpu" else "gpu"]:
+            rollouts(task, n_worlds, args.steps, args.device, args.repeats)
+
+
+def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int) -> None:
+    """Print the rates of both kinds of rollout."""
+    base = envs.make(task, n_worlds, device=device)
+    env = envs.AutoReset(base)
+    place = base.sim.device
+    start = jax.jit(env.reset)(jax.device_put(jax.random.key(0), place))
+    n_obs = flatten(start.obs).shape[-1]
+    policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base.actions.size), 0.01))
+    policy = jax.device_put(policy, place)
+
+    def flown(act: Any) -> Any:
+        def step(carry: Any, _: None) -> Any:
+            state, key = carry
+            key, now = jax.random.split(key)
+            state = env.step(state, act(state, now))
+            return (state, key), (state.reward.mean(), state.done.mean())
+
+        return jax.jit(lambda carry: jax.lax.scan(step, carry, length=n_steps))
+
+    acts = {
+        "random": lambda state, key: jax.random.uniform(key, state.action.shape, minval=-0.3, maxval=0.3),
+        "policy": lambda state, key: policy(state.obs) + 0.1 * jax.random.normal(key, state.action.shape),
+    }
+    for name, act in acts.items():
+        carry = (start, jax.device_put(jax.random.key(2), place))
+        begin = time.perf_counter()
+        run = flown(act).lower(carry).compile()
+        compile_s = time.perf_counter() - begin
+        carry, _ = run(carry)
+        last: list[Any] = [carry]
+
+        def measure(run: Any = run, last: list[Any] = last) -> float:
+            jax.block_until_ready(last[0])
+            begin = time.perf_counter()
+            last[0], last[1:] = (out := run(last[0]))[0], [out[1]]
+            jax.block_until_ready(last)
+            return time.perf_counter() - begin
+
+        seconds = medians({name: measure}, repeats)[name]
+        report(
+            device,
+            benchmark="envs",
+            task=task,
+            actions=name,
+            n_worlds=n_worlds,
+            n_steps=n_steps,
+            engine=engine_of(base.sim),
+            compile_s=round(compile_s, 2),
+            env_steps_per_s=digits(n_worlds * base.sim.n_drones * n_steps / seconds),
+            ended=digits(float(jnp.mean(last[1][1]))),
+        )
+
+
+if __name__ == "__main__":
+    main()
