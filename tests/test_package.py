@@ -31,6 +31,7 @@ def test_public_names_are_sorted_and_exist():
 @pytest.mark.parametrize(
     "path", ["sim.Sim", "sim.data.SimData", "sim.functional.state_control", "sim.pipeline.append_fn",
              "sim.sim.sync_sim2mjx", "sim.sim.use_box_collision", "sim.visualize.draw_line", "sim.sharding.world_mesh",
+             "sim.sensors.depth.render_depth",
              "control.Control", "dynamics.Dynamics", "drones.Drone",
              "dynamics.supported_drones", "dynamics.supported_dynamics", "exception.ConfigError"],
 )  # fmt: skip

@@ -16,7 +16,15 @@ def fits(result):
         assert sigma < 1e-3 * true, name
 
 
-CHECKS = {"fit_flight": fits}
+def races(result):
+    """Check that three laps were flown in every world, and nothing was hit."""
+    passed, hit = result
+    assert passed.shape == hit.shape == (16,)
+    assert passed.min() >= 12
+    assert not hit.any()
+
+
+CHECKS = {"fit_flight": fits, "race": races}
 """What is checked of an example beyond that it runs: of what its ``main`` returns."""
 
 

@@ -8,7 +8,7 @@ import pytest
 from cases import ABOVE, FOVY
 
 from crazysim.errors import ConfigError
-from crazysim.pictures import View
+from crazysim.pictures import View, pictures_of
 from crazysim.sim import Sim
 from crazysim.sim.visualize import draw_points
 
@@ -116,6 +116,38 @@ def test_what_a_user_drew_waits_when_a_picture_fails(sim):
 
 
 # Cameras --------------------------------------------------------------------------------------------------------
+
+
+def test_a_batch_holds_a_picture_of_each_world_in_the_order_asked_for(sim):
+    batch = pictures_of(sim, [2, 0, 3], "down", width=WIDTH, height=HEIGHT)
+    assert batch.shape == (3, HEIGHT, WIDTH, 3)
+    assert batch.dtype == np.uint8
+    for picture, world in zip(batch, (2, 0, 3), strict=True):
+        np.testing.assert_allclose(dark(picture), pixel(PLACES[world]), atol=2)
+    every = pictures_of(sim, camera="down", width=WIDTH, height=HEIGHT)
+    np.testing.assert_array_equal(every[[2, 0, 3]], batch)
+    free = {"lookat": [0, 0, 0], "distance": ABOVE, "azimuth": 90, "elevation": -90}
+    draw_points(sim, np.array([[0, 0, 0.5]]), rgba=RED, size=0.05)
+    marked = pictures_of(sim, [1, 1], cam_config=free, width=WIDTH, height=HEIGHT)
+    for picture in marked:
+        rows, columns = np.nonzero(of_colour(picture, RED))
+        np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [HEIGHT / 2, WIDTH / 2], atol=1)
+    assert not of_colour(pictures_of(sim, [1], "down"), RED).any()
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"worlds": []}, "worlds is empty"),
+        ({"worlds": [4]}, "world 4 does not exist"),
+        ({"height": 0}, "height"),
+        ({"width": 1.5}, "width"),
+        ({"camera": "nose"}, "no camera 'nose'"),
+    ],
+)
+def test_law_09_a_batch_that_cannot_be_is_told(sim, wrong, message):
+    with pytest.raises(ConfigError, match=message):
+        pictures_of(sim, **wrong)
 
 
 def test_a_camera_that_follows_keeps_each_worlds_drone_in_its_middle(sim):

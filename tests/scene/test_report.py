@@ -169,6 +169,27 @@ def test_large_swarms_are_asked_piece_by_piece():
     np.testing.assert_array_equal(report.nearest_drone, apart.argmin(axis=-1))
 
 
+def test_a_swarm_of_4096_finds_the_two_that_touch_without_quadratic_memory():
+    n, rows = 4096, 64
+    sim = Sim(n_drones=n, control="attitude")
+    assert sim.mj_model.nmocap == n
+    k = np.arange(n)
+    pos = np.stack([0.5 * (k % rows), 0.5 * (k // rows), np.ones(n)], axis=-1)
+    pos[4000] = pos[7] + [0.1, 0.0, 0.05]
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos[None], jnp.float32)))
+    contacts = jax.jit(sim.scene.contact_fn(())).lower(sim.data).compile()
+    assert contacts.memory_analysis().temp_size_in_bytes < n * n, "less than a byte for each pair"
+    report = contacts(sim.data)
+    np.testing.assert_array_equal(np.flatnonzero(report.drones[0]), [7, 4000])
+    np.testing.assert_array_equal(report.nearest_drone[0, [7, 4000]], [4000, 7])
+    radius = np.asarray(sim.airframe.value("shape.collision_sphere"))[3]
+    gap = np.hypot(0.1, 0.05) - 2 * radius
+    np.testing.assert_allclose(report.drone_distance[0, [7, 4000]], gap, atol=SPHERE)
+    others = np.delete(np.asarray(report.drone_distance[0]), [4000, 7, 8])
+    np.testing.assert_allclose(others, 0.5 - 2 * radius, atol=SPHERE)
+    assert not report.floor.any()
+
+
 @pytest.mark.parametrize("engine", ["plain", "auto"])
 def test_contacts_are_latched_at_the_step_they_begin(engine):
     """Drones fly past a pole in the first world and into it in the second; the third stands still next to another."""

@@ -1,0 +1,55 @@
+"""Depth in the manner of Crazyflow, against geometry worked out by hand."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.scene.depth import pixel_directions
+from crazysim.sim.sensors.depth import render_depth
+
+
+@pytest.fixture(scope="module")
+def sim():
+    """Two worlds in which two level drones hover at different heights, far from each other."""
+    sim = Sim(n_worlds=2, n_drones=2, control="attitude")
+    pos = jnp.array([[[0, 0, 1.0], [0, -9, 1]], [[0, 0, 2.0], [0, -9, 1]]])
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    return sim
+
+
+def test_depth_is_along_the_ray_and_minus_one_at_the_sky(sim):
+    width, height = 30, 20
+    depth = np.asarray(render_depth(sim, "fpv_cam:0", (width, height)))
+    assert depth.shape == (2, height, width)
+    down = -pixel_directions(70.0, width, height)[..., 1]
+    eye = sim.airframe.value("shape.fpv_camera")[2] + np.array([1.0, 2.0])[:, None, None]
+    expected = np.where(down > 0, eye / np.where(down > 0, down, 1), -1.0)
+    np.testing.assert_allclose(depth, expected, rtol=1e-5)
+    assert (depth == -1).mean() == 0.5
+
+
+def test_camera_0_follows_the_first_drone_and_sees_45_degrees(sim):
+    camera = sim.mj_model.camera(0)
+    assert camera.name == "track_cam:0"
+    assert camera.fovy == 45
+    alone, all_seen = (np.asarray(render_depth(sim, resolution=(64, 64), include_drone=x)) for x in (False, True))
+    drone = all_seen != alone
+    np.testing.assert_array_equal(np.asarray(render_depth(sim, 0, (64, 64))), alone)
+    assert 10 < drone[0].sum() < 1000
+    away = np.linalg.norm(np.asarray(camera.pos))  # how far the camera stands from the drone
+    np.testing.assert_allclose(all_seen[drone], away, atol=0.1)
+
+
+def test_law_09_what_cannot_be_seen_is_refused(sim):
+    for act, words in (
+        (lambda: render_depth(sim, "nose"), "no camera 'nose'"),
+        (lambda: render_depth(sim, 4), "no camera 4"),
+        (lambda: render_depth(sim, "fpv_cam"), "'fpv_cam' are 2 cameras; name one, such as 'fpv_cam:0'"),
+        (lambda: render_depth(sim, resolution=64), "resolution is 64; needed are a width and a height"),
+        (lambda: render_depth(sim, resolution=(64,)), "resolution is (64,)"),
+        (lambda: render_depth(sim, resolution=(0, 4)), "0 x 4 pixels cannot be"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            act()
+        assert words in str(error.value)
