@@ -108,8 +108,8 @@ def checked(track: Track, n_drones: int, jitter: float, random: bool) -> Track:
         if np.any(apart < room + jitter):
             k = int(np.argwhere(apart < room + jitter)[0, 1])
             raise ConfigError(
-                f"{what} {k} of the track is {apart.min():.2f} m from a start, where {room + jitter:.2f} m in the plane "
-                f"are needed; move it, or Track(start=...)"
+                f"{what} {k} of the track is {apart.min():.2f} m from a start, where {room + jitter:.2f} m are needed in "
+                f"the plane; move it, or Track(start=...)"
             )
     if np.any(starts < low + [0.2, 0.2, 0.2]) or np.any(starts > high - 0.2):
         raise ConfigError(
@@ -158,7 +158,7 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
     first = middle - size * (np.array([n_x, n_y]) - 1) / 2
 
     cell = ranks(cells, n + 1)
-    flat = first + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
+    flat = jnp.asarray(first) + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
     shift = IN_CELL * (2 * within.reshape(-1, n, 2) - 1)
     gates = flat[:, 1:] + shift
     start = jnp.concatenate([flat[:, 0], jnp.full_like(flat[:, 0, :1], START_HEIGHT)], axis=-1)
@@ -168,7 +168,7 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
     quat = rotation.from_rpy(jnp.stack([0 * yaw, 0 * yaw, yaw], axis=-1))
 
     corner = ranks(corners, track.n_obstacles)
-    poles = first - size / 2 + size * jnp.stack([corner % (n_x + 1), corner // (n_x + 1)], axis=-1)
+    poles = jnp.asarray(first - size / 2) + size * jnp.stack([corner % (n_x + 1), corner // (n_x + 1)], axis=-1)
     return start, _raised(gates, track.gates_pos), quat, _raised(poles, track.obstacles_pos)
 
 

@@ -55,15 +55,15 @@ def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None)
 
     Returns:
         ``success`` (share of drones), ``crashed`` (share of worlds that ended before their time and not all of whose
-        drones succeeded), ``error`` (mean over the last ``task.hold`` seconds of what did not crash, m), ``reward``
-        (mean sum of an episode).
+        drones succeeded), ``error`` (mean over the last ``task.hold`` seconds of what did not crash, m; at the
+        end alone of a task that tells when it is done), ``reward`` (mean sum of an episode).
     """
     flown = fly(env, policy, jax.random.key(HELD_OUT) if key is None else key)
     last = max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
     over = flown["over"][-1]
     settled = jnp.all(flown["error"][-last:] < env.task.tolerance, axis=0) & ~over[:, None]
     if env.task.succeeded is not None:
-        settled = flown["succeeded"]
+        last, settled = 1, flown["succeeded"]
     crashed = over & ~jnp.all(settled, axis=-1)
     error = jnp.where(crashed[None, :, None], jnp.nan, flown["error"][-last:])
     return {

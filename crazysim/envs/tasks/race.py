@@ -254,8 +254,8 @@ def collisions(sim: SimulationWithScene, ignored: Callable[[SimData], Array]) ->
         # Only for the question: each that is out is so far away that it touches nothing, and no other that is out.
         far = 1000.0 * (1 + np.arange(len(out)))[:, None] * np.array([0.0, 0.0, 1.0])
         elsewhere = jnp.where(out[:, None], far.astype(s.pos.dtype), s.pos)
-        hit = contacts(data.replace(states=s.replace(pos=elsewhere))).drones
-        new = record.replace(disabled=record.disabled | (hit & ~out))
+        hit = contacts(data.replace(states=s.replace(pos=elsewhere))).any & ~out
+        new = record.replace(disabled=record.disabled | hit)
         return data.replace(plugins=data.plugins | {NAME: new})
 
     return collide
@@ -322,10 +322,10 @@ def observe(data: SimData, sensor_range: float = SENSOR_RANGE) -> dict[str, Arra
     (gates_pos, gates_quat), poles = gates_of(data), obstacles_of(data)
     seen_gates, seen_obstacles = visited(data, sensor_range)
     n_gates, n_obstacles = seen_gates.shape[-1], seen_obstacles.shape[-1]
-    if record.nominal_pos is not None:
-        said = record.nominal_pos
+    said, turned_so = record.nominal_pos, record.nominal_quat
+    if said is not None and turned_so is not None:
         gates_pos = jnp.where(seen_gates[..., None], gates_pos, said[..., :n_gates, :])
-        gates_quat = jnp.where(seen_gates[..., None], gates_quat, record.nominal_quat)
+        gates_quat = jnp.where(seen_gates[..., None], gates_quat, turned_so)
         poles = jnp.where(seen_obstacles[..., None], poles, said[..., n_gates:, :])
     turned = rotation.matrix(s.quat)
 
