@@ -108,8 +108,8 @@ def checked(track: Track, n_drones: int, jitter: float, random: bool) -> Track:
         if np.any(apart < room + jitter):
             k = int(np.argwhere(apart < room + jitter)[0, 1])
             raise ConfigError(
-                f"{what} {k} of the track is {apart.min():.2f} m from a start, where {room + jitter:.2f} m are needed in "
-                f"the plane; move it, or Track(start=...)"
+                f"{what} {k} of the track is {apart.min():.2f} m from a start, where {room + jitter:.2f} m are needed "
+                f"in the plane; move it, or Track(start=...)"
             )
     if np.any(starts < low + [0.2, 0.2, 0.2]) or np.any(starts > high - 0.2):
         raise ConfigError(
