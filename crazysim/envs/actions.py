@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -10,6 +11,7 @@ from crazysim.control import COMMAND_FIELDS, Control
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles, fitted
 from crazysim.errors import ConfigError
+from crazysim.pytree import scopes
 from crazysim.rotation import safe_clip
 from crazysim.sim.data import SimParams
 
@@ -79,10 +81,11 @@ def actions_of(airframe: Airframe, params: SimParams, control: Control, tilt: fl
 
     Args:
         airframe: What the rotors can do.
-        params: Shared parameters of the nominal drone, which say what makes it hover.
+        params: Parameters, which say what makes a drone hover; where each drone has its own, the first counts.
         control: Command level.
         tilt: Largest roll and pitch of the attitude level, rad.
     """
+    params = jax.tree.map(lambda scope, x: x[0, 0] if scope == "drone" else x, scopes(params), params)
     n_rotors = airframe.n_rotors
     each = float(airframe.value("rotors.thrust_max", ()))
     hover = float(hover_thrust(params)[0])

@@ -47,6 +47,10 @@ class Task:
     """Where a drone is to be, for pictures, m. (n_worlds, n_drones, 3)"""
     camera: Mapping[str, Any] | None = None
     """From where pictures are taken: lookat, distance, azimuth, elevation."""
+    mark: Callable[[SimData], SimData] = lambda data: data
+    """What is noted where an environment step begins, for rewards of what changes in it."""
+    succeeded: Callable[[SimData], Array] | None = None
+    """Whether it is done, for tasks that end with that; None where the error must stay small. (n_worlds, n_drones)"""
     seconds: float = 5.0
     """Length of an episode, s."""
     tolerance: float = 0.05
@@ -197,7 +201,7 @@ class DroneEnv:
                 f"(n_worlds, n_drones, {self.actions.size}): {self.actions}"
             )
         action = action.astype(state.action.dtype)
-        data = COMMANDS[self.actions.control](state.data, self.actions.command(action))
+        data = COMMANDS[self.actions.control](self.task.mark(state.data), self.actions.command(action))
         data = self._step(data, self.n_substeps, self._zeros)
         lost = data.core.nonfinite[:, 0]
         reward = self.task.reward(data, action, state.action)

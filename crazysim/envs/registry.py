@@ -11,6 +11,7 @@ from typing import Any
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv, Task
 from crazysim.envs.tasks.hover import hover
+from crazysim.envs.tasks.race import race
 from crazysim.envs.tasks.reach_vel import reach_vel
 from crazysim.envs.tasks.recover import recover
 from crazysim.envs.tasks.track import track
@@ -37,6 +38,8 @@ TASKS: dict[str, Entry] = {
     "reach_vel": Entry(reach_vel, "crazysim/ReachVel-v0"),
     "recover": Entry(recover, "crazysim/Recover-v0"),
     "track": Entry(track, "crazysim/Track-v0"),
+    "race": Entry(race, "crazysim/Race-v0"),
+    "multi_race": Entry(race, "crazysim/MultiRace-v0", n_drones=2),
 }
 """Every task, by name."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
@@ -68,3 +69,36 @@ def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
     """Return which drones are on the floor, too high, or too far from the z axis. (n_worlds, n_drones)"""
     pos = data.states.pos
     return on_floor(data) | (pos[..., 2] > height) | jnp.any(jnp.abs(pos[..., :2]) > half_width, axis=-1)
+
+
+def pick(x: Array, number: Array) -> Array:
+    """Return the entry of each drone's own number: a choice among all, which costs less than looking one up.
+
+    Args:
+        x: Entries. (..., n, k)
+        number: Which of the n. (...)
+
+    Returns:
+        (..., k)
+    """
+    chosen = number[..., None, None] == np.arange(x.shape[-2])[:, None]
+    return jnp.sum(jnp.where(chosen, x, 0), axis=-2)
+
+
+def nearest(distance: Array, x: Array, n: int) -> Array:
+    """Return the entries of the least distances, nearest first.
+
+    Args:
+        distance: Distances, m. (..., m)
+        x: What is to be sorted by them. (..., m, k)
+        n: How many are wanted, at most m.
+
+    Returns:
+        (..., n, k)
+    """
+    out = []
+    for _ in range(n):
+        first = jnp.argmin(distance, axis=-1)
+        out.append(pick(x, first))
+        distance = jnp.where(first[..., None] == np.arange(x.shape[-2]), jnp.inf, distance)
+    return jnp.stack(out, axis=-2)

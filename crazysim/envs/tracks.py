@@ -1,0 +1,193 @@
+"""Race courses: where gates, obstacles and starts are, as given or drawn at random."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.errors import ConfigError
+
+CELL = (1.0, 1.2)
+"""Size of the cells that a random course spreads its gates over, along x and y, m."""
+MARGIN = (0.5, 0.3)
+"""Distance of the cells from the limits of the arena, m."""
+IN_CELL = 0.05
+"""Most of each component of a gate's distance from the middle of its cell, m."""
+TURN = 1.0
+"""Most that a gate of a random course is turned from the way that leads to it, rad."""
+START_SPACING = 0.4
+"""Distance of the starts of one world, m."""
+START_HEIGHT = 0.4
+"""Height of the starts of a random course, m."""
+
+Points = Sequence[Sequence[float]]
+
+
+@dataclass(frozen=True)
+class Track:
+    """A course. Its usual numbers are those of lsy_drone_racing's levels 0 to 2; the start is in the air here."""
+
+    gates_pos: Points = ((0.5, 0.25, 0.7), (1.05, 0.75, 1.2), (-1.0, -0.25, 0.7), (0.0, -0.75, 1.2))
+    """Middle of each gate's opening, in the order they are to be passed, m. (n_gates, 3)"""
+    gates_rpy: Points = ((0, 0, -0.78), (0, 0, 2.35), (0, 0, 3.14), (0, 0, 0))
+    """Roll, pitch and yaw of each gate, rad; it is passed along its x axis. (n_gates, 3)"""
+    obstacles_pos: Points = ((0.0, 0.75, 1.55), (1.0, 0.25, 1.55), (-1.5, -0.25, 1.55), (-0.5, -0.75, 1.55))
+    """Upper end of each upright pole, m. (n_obstacles, 3)"""
+    start: Sequence[float] = (-1.5, 0.75, 0.4)
+    """Middle of the starts of all drones, m. (3,)"""
+    low: Sequence[float] = (-2.5, -1.5, 0.0)
+    """Lower limits of the arena, m. (3,)"""
+    high: Sequence[float] = (2.5, 1.5, 2.0)
+    """Upper limits of the arena, m. (3,)"""
+
+    @property
+    def n_gates(self) -> int:
+        """Number of gates."""
+        return len(self.gates_pos)
+
+    @property
+    def n_obstacles(self) -> int:
+        """Number of obstacles."""
+        return len(self.obstacles_pos)
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Cells along x and y that a random course has room for."""
+        room = (np.asarray(self.high) - np.asarray(self.low))[:2] - 2 * np.array(MARGIN)
+        n_x, n_y = np.floor(room / CELL + 1e-6).astype(int)
+        return int(n_x), int(n_y)
+
+    def settings(self) -> dict[str, Any]:
+        """Return the numbers as nested lists, as they are written into checkpoints."""
+        return {name: np.asarray(value, float).tolist() for name, value in asdict(self).items()}
+
+
+def checked(track: Track, n_drones: int, jitter: float, random: bool) -> Track:
+    """Return a track that can be flown from its starts.
+
+    Args:
+        track: The track.
+        n_drones: Drones in a world.
+        jitter: Farthest that drones, gates and obstacles together are moved from their places in the plane, m.
+        random: Whether gates and obstacles are placed at random.
+
+    Raises:
+        ConfigError: If a shape or number cannot be, a start is too near to a gate, to an obstacle or to the arena's
+            limits, or a random course finds no room.
+    """
+    shapes = {"gates_pos": (-1, 3), "gates_rpy": (len(track.gates_pos), 3), "obstacles_pos": (-1, 3)}
+    for name, shape in (shapes | {"start": (3,), "low": (3,), "high": (3,)}).items():
+        value = np.asarray(getattr(track, name), float)
+        good = value.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, value.shape, strict=True))
+        if not good or not value.size or not np.all(np.isfinite(value)):
+            needed = str(shape).replace("-1", "n")
+            raise ConfigError(f"the track's {name} has shape {value.shape}; needed are finite numbers, {needed}")
+    low, high = np.asarray(track.low, float), np.asarray(track.high, float)
+    if np.any(high <= low):
+        raise ConfigError(f"the track's arena reaches from {low} to {high}; every upper limit must be the larger")
+    if random:
+        n_x, n_y = track.grid
+        if n_x * n_y < track.n_gates + 1 or (n_x + 1) * (n_y + 1) < track.n_obstacles:
+            raise ConfigError(
+                f"a random course of {track.n_gates} gates and {track.n_obstacles} obstacles has no room: the arena "
+                f"takes {n_x} x {n_y} cells of {CELL[0]} x {CELL[1]} m, and start and gates take one each. Set wider "
+                f"limits with Track(low=..., high=...), or use fewer."
+            )
+        if n_drones > 8:
+            raise ConfigError(f"{n_drones} drones; a random course has room for 8 at its start. Use level 0, 1 or 2.")
+        return track
+    starts = np.asarray(track.start) + start_offsets(n_drones)
+    for what, points, room in (("gate", track.gates_pos, 0.45), ("obstacle", track.obstacles_pos, 0.15)):
+        apart = np.linalg.norm((starts[:, None] - np.asarray(points)[None])[..., :2], axis=-1)
+        if np.any(apart < room + jitter):
+            k = int(np.argwhere(apart < room + jitter)[0, 1])
+            raise ConfigError(
+                f"{what} {k} of the track is {apart.min():.2f} m from a start, where {room + jitter:.2f} m are needed "
+                f"in the plane; move it, or Track(start=...)"
+            )
+    if np.any(starts < low + [0.2, 0.2, 0.2]) or np.any(starts > high - 0.2):
+        raise ConfigError(
+            f"a start of the {n_drones} drones around {tuple(track.start)} is not 0.2 m within the limits of the arena "
+            f"or over the floor; move Track(start=...), or set wider limits low= and high="
+        )
+    return track
+
+
+def start_offsets(n_drones: int) -> np.ndarray:
+    """Return where drones begin around the start: in layers of two by two, a single drone in the middle, m.
+
+    Returns:
+        (n_drones, 3)
+    """
+    k = np.arange(n_drones)
+    offsets = START_SPACING * np.stack([k // 2 % 2, k % 2, k // 4], axis=-1)
+    middle = START_SPACING * np.array([n_drones > 2, n_drones > 1, 0]) / 2
+    return offsets - middle
+
+
+def n_random(track: Track) -> int:
+    """Return how many random numbers a random course takes."""
+    n_x, n_y = track.grid
+    return n_x * n_y + (n_x + 1) * (n_y + 1) + 3 * track.n_gates
+
+
+def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
+    """Return a course drawn at random: start and gates in cells of their own, obstacles in corners of cells.
+
+    So none stands in another's way, whatever is drawn. Heights are the track's. A gate faces the way that leads to it
+    from the one before, give or take a radian.
+
+    Args:
+        track: Heights, numbers and limits.
+        x: Random numbers from 0 to 1. (n_worlds, n_random)
+
+    Returns:
+        Start (n_worlds, 3), positions of gates (n_worlds, n_gates, 3), their attitudes, xyzw (n_worlds, n_gates, 4),
+        positions of obstacles (n_worlds, n_obstacles, 3).
+    """
+    n, (n_x, n_y) = track.n_gates, track.grid
+    cells, corners, within, turns = jnp.split(x, np.cumsum([n_x * n_y, (n_x + 1) * (n_y + 1), 2 * n]), axis=-1)
+    middle = (np.asarray(track.low)[:2] + np.asarray(track.high)[:2]) / 2
+    size = np.array(CELL)
+    first = middle - size * (np.array([n_x, n_y]) - 1) / 2
+
+    cell = ranks(cells, n + 1)
+    flat = jnp.asarray(first) + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
+    shift = IN_CELL * (2 * within.reshape(-1, n, 2) - 1)
+    gates = flat[:, 1:] + shift
+    start = jnp.concatenate([flat[:, 0], jnp.full_like(flat[:, 0, :1], START_HEIGHT)], axis=-1)
+
+    way = gates - jnp.concatenate([flat[:, :1], gates[:, :-1]], axis=1)
+    yaw = jnp.arctan2(way[..., 1], way[..., 0]) + TURN * (2 * turns - 1)
+    quat = rotation.from_rpy(jnp.stack([0 * yaw, 0 * yaw, yaw], axis=-1))
+
+    corner = ranks(corners, track.n_obstacles)
+    poles = jnp.asarray(first - size / 2) + size * jnp.stack([corner % (n_x + 1), corner // (n_x + 1)], axis=-1)
+    return start, _raised(gates, track.gates_pos), quat, _raised(poles, track.obstacles_pos)
+
+
+def ranks(x: Array, n: int) -> Array:
+    """Return how many of some numbers are smaller than each of the first ``n``: as good as a draw without replacement.
+
+    Args:
+        x: Random numbers, at least ``n``. (..., m)
+        n: How many are wanted.
+
+    Returns:
+        Different whole numbers from 0 to m - 1. (..., n)
+    """
+    # Numbers of equal value count by their place, so that no two get one rank.
+    earlier = np.arange(x.shape[-1])[None] < np.arange(n)[:, None]
+    mine, others = x[..., :n, None], x[..., None, :]
+    return jnp.sum((others < mine) | ((others == mine) & earlier), axis=-1)
+
+
+def _raised(flat: Array, points: Points) -> Array:
+    height = np.asarray(points, float)[:, 2:].astype(flat.dtype)
+    return jnp.concatenate([flat, jnp.broadcast_to(height, (*flat.shape[:-1], 1))], axis=-1)

@@ -1,0 +1,318 @@
+"""The race: its rules, its levels, what is seen of the course, and its courses."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim, rotation
+from crazysim.envs import DroneEnv, make
+from crazysim.envs.tasks import race as task
+from crazysim.envs.tracks import Track, ranks
+from crazysim.sim.random import world_keys
+from crazysim.train.evaluate import evaluate
+
+TRACK = Track()
+CASES = {
+    # Gate, place in its frame, m, forwards or backwards, gates passed before.
+    "forwards": (0, (-0.01, 0.1, -0.1), 2.0, 0),
+    "backwards": (0, (0.01, 0.0, 0.0), -2.0, 0),
+    "beside": (0, (-0.01, 0.45, 0.0), 2.0, 0),
+    "above": (0, (-0.01, 0.0, 0.6), 2.0, 0),
+    "another": (1, (-0.01, 0.0, 0.0), 2.0, 0),
+    "last": (3, (-0.01, 0.0, 0.0), 2.0, 3),
+    "not there yet": (0, (-0.2, 0.0, 0.0), 2.0, 0),
+    "frame": (0, (-0.01, 0.22, 0.0), 2.0, 0),
+    "post": (0, (-0.01, 0.0, -0.45), 2.0, 0),
+    "obstacle": (None, (0.05, 0.75, 1.0), 0.0, 0),
+    "floor": (None, (-2.0, 0.0, 0.06), 0.0, 0),
+    "outside": (None, (2.51, 0.0, 1.0), 0.0, 0),
+    "over the top": (None, (0.0, 0.0, 2.01), 0.0, 0),
+}
+"""One world each."""
+
+
+def environment(n_worlds, n_drones=1, **options):
+    """Return an environment."""
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
+    return DroneEnv(sim, task.race(sim, **options))
+
+
+def put(state, pos, vel=0.0, **changes):
+    """Return the state with drones elsewhere, and other numbers in the race's record."""
+    data = state.data
+    pos = jnp.broadcast_to(jnp.asarray(pos, jnp.float32), data.states.pos.shape)
+    vel = jnp.broadcast_to(jnp.asarray(vel, jnp.float32), pos.shape)
+    record = data.plugins["task"].replace(last_pos=pos, **changes)
+    states = data.states.replace(pos=pos, vel=vel, quat=jnp.zeros_like(data.states.quat).at[..., 3].set(1.0))
+    return state.replace(data=data.replace(states=states, plugins=data.plugins | {"task": record}))
+
+
+@pytest.fixture(scope="module")
+def raced():
+    """Return the environment of all cases, their names to worlds, the state before, and that one step later."""
+    env = environment(len(CASES))
+    pos, vel = np.zeros((len(CASES), 1, 3)), np.zeros((len(CASES), 1, 3))
+    passed = np.zeros((len(CASES), 1), np.int32)
+    for world, (gate, at, speed, before) in enumerate(CASES.values()):
+        passed[world] = before
+        pos[world] = at
+        if gate is not None:
+            quat = rotation.from_rpy(jnp.asarray(TRACK.gates_rpy[gate], jnp.float32))
+            pos[world] = np.asarray(TRACK.gates_pos[gate]) + rotation.rotate(quat, jnp.asarray(at))
+            vel[world] = speed * rotation.rotate(quat, jnp.array([1.0, 0.0, 0.0]))
+    before = put(jax.jit(env.reset)(jax.random.key(0)), pos, vel, passed=jnp.asarray(passed))
+    step = jax.jit(env.step)
+    return env, {name: k for k, name in enumerate(CASES)}, before, step(before, before.action), step
+
+
+def test_only_crossing_the_next_gate_forwards_within_its_opening_passes_it(raced):
+    _, world, before, after, _ = raced
+    new = np.asarray(after.data.plugins["task"].passed - before.data.plugins["task"].passed)[:, 0]
+    assert {name for name, k in world.items() if new[k]} == {"forwards", "last"}
+    assert after.obs["target_gate"][world["forwards"], 0, 0] == 1
+    assert after.obs["target_gate"][world["last"], 0, 0] == -1
+
+
+def test_contacts_and_the_edge_of_the_arena_disable_and_end(raced):
+    _, world, _, after, _ = raced
+    disabled = np.asarray(after.info["disabled"])[:, 0]
+    hit = {"frame", "post", "obstacle", "floor", "outside", "over the top"}
+    assert {name for name, k in world.items() if disabled[k]} == hit
+    ended = np.asarray(after.terminated)
+    assert {name for name, k in world.items() if ended[k]} == hit | {"last"}
+    assert not np.any(after.truncated)
+
+
+def test_the_last_gate_ends_the_race_as_a_success(raced):
+    env, world, _, after, _ = raced
+    assert {name for name, k in world.items() if env.task.succeeded(after.data)[k, 0]} == {"last"}
+    assert after.info["error"][world["last"], 0] == 0
+    assert after.info["gates_passed"][world["last"], 0] == 4
+
+
+def test_rewards_count_way_gates_and_crashes_once(raced):
+    _, world, _, after, step = raced
+    reward = np.asarray(after.reward)[:, 0]
+    moved = 2.0 * 0.02  # m in one step, to the gate at twice a metre
+    np.testing.assert_allclose(reward[world["not there yet"]], 2 * moved, atol=0.01)
+    assert reward[world["forwards"]] > 1.9
+    assert reward[world["obstacle"]] < -4.9
+    sparse = np.asarray(task.sparse(after.data, None, None))[:, 0]
+    assert sparse[world["forwards"]] == 1
+    assert sparse[world["obstacle"]] == -1
+    assert sparse[world["not there yet"]] == sparse[world["backwards"]] == 0
+    again = step(after, after.action)
+    assert again.reward[world["obstacle"], 0] == 0
+    assert again.reward[world["last"], 0] == 0
+    assert again.terminated[world["obstacle"]]
+
+
+def test_an_episode_is_truncated_when_its_time_is_over(raced):
+    env, world, before, _, step = raced
+    core = before.data.core
+    late = core.replace(steps=jnp.full_like(core.steps, (env.max_steps - 1) * env.n_substeps))
+    after = step(before.replace(data=before.data.replace(core=late)), before.action)
+    assert np.all(after.truncated)
+    assert not after.terminated[world["not there yet"]]
+
+
+def test_observations_in_the_drones_frame_are_those_of_the_course(raced):
+    _, world, before, after, _ = raced
+    k = world["forwards"]
+    s = after.data.states
+    corners = np.asarray(after.obs["gate_corners"][k, 0]).reshape(2, 4, 3)
+    # The forwards one is on its way to gate 1 now, after which comes gate 2.
+    for corner, gate in zip(corners, (1, 2), strict=True):
+        middle = s.pos[k, 0] + rotation.rotate(s.quat[k, 0], jnp.asarray(corner.mean(axis=0)))
+        np.testing.assert_allclose(middle, TRACK.gates_pos[gate], atol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(corner - corner.mean(axis=0), axis=-1), 0.225 * np.sqrt(2), atol=1e-5)
+    near = np.asarray(before.data.states.pos[world["obstacle"], 0])
+    poles = np.asarray(after.obs["obstacles_near"][world["obstacle"], 0]).reshape(2, 3)
+    np.testing.assert_allclose(poles[0], [-0.05, 0, 0], atol=2e-3)
+    assert np.linalg.norm(poles[1]) > 0.5, near
+
+
+def test_drones_out_of_the_race_do_not_matter_to_others():
+    env = environment(4, n_drones=2)
+    at = np.broadcast_to([[-1.5, 0.6, 1.0], [-1.5, 0.65, 1.0]], (4, 2, 3)).copy()
+    at[3, 1] += [0.5, 0, 0]
+    passed = jnp.array([[0, 0], [0, 0], [4, 0], [4, 0]])
+    disabled = jnp.array([[False, False], [True, False], [False, False], [False, True]])
+    step = jax.jit(env.step)
+    state = put(jax.jit(env.reset)(jax.random.key(0)), at, passed=passed, disabled=disabled)
+    after = step(state, state.action)
+    #           both collide     one is out already      one has finished      one finished, one out
+    expected = [[True, True], [True, False], [False, False], [False, True]]
+    np.testing.assert_array_equal(after.info["disabled"], expected)
+    np.testing.assert_array_equal(after.terminated, [True, False, False, True])
+    assert np.all(np.asarray(after.reward)[1:, 0] == 0)
+    assert np.linalg.norm(after.obs["drones_near"][2, 0]) > 0.04  # the one that flies on is seen by the other
+    np.testing.assert_array_equal(after.obs["drones_near"][2, 1], 0)  # and does not see the one that has finished
+    assert env.task.reward(after.data, state.action, state.action).shape == (4, 2)
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Return for each level the environment and what it draws for many worlds."""
+    out = {}
+    for level, n_worlds, n_drones in ((0, 64, 1), (1, 64, 2), (2, 2048, 1), (3, 2048, 2)):
+        env = environment(n_worlds, n_drones, level=level)
+        data = env.sim.default_data
+        spawned = jax.jit(env.task.spawn)(data, world_keys(data, "spawn"))
+        out[level] = env, spawned
+    return out
+
+
+def test_levels_draw_what_they_say(drawn):
+    varies = {}
+    for level, (_, data) in drawn.items():
+        shared = data.params.mass.ndim == 1
+        record = data.plugins["task"]
+        varies[level] = (
+            bool(np.ptp(data.states.pos[:, 0], axis=0).min() > 0.05),
+            not shared and bool(np.ptp(data.params.mass) > 0.005),
+            bool(np.ptp(data.objects.pos[:, 0], axis=0).max() > 0.05),
+            record.nominal_pos is not None and bool(np.ptp(record.nominal_pos[:, 0], axis=0).max() > 0.05),
+        )
+    assert varies == {
+        0: (True, False, False, False),
+        1: (True, True, False, False),
+        2: (True, True, True, False),
+        3: (True, True, True, True),
+    }
+
+
+def test_drawn_inertias_have_their_inverses_and_masses_their_range(drawn):
+    env, data = drawn[1]
+    product = np.einsum("...ij,...jk->...ik", data.params.J, data.params.J_inv)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-5)
+    mass = np.asarray(data.params.mass) / 0.0434
+    assert 1 - task.MASS <= mass.min() < 0.95
+    assert 1.05 < mass.max() <= 1 + task.MASS
+    assert not np.allclose(data.params.mass[:, 0], data.params.mass[:, 1])
+    np.testing.assert_allclose(env.actions.centre[3], 0.0434 * 9.81, rtol=1e-3)  # hover is the nominal drone's
+
+
+def test_level_two_moves_gates_as_far_as_it_says(drawn):
+    _, data = drawn[2]
+    moved = np.asarray(data.objects.pos[:, 0, :4]) - np.asarray(TRACK.gates_pos)
+    assert np.all(np.abs(moved) <= np.array(task.GATE_JITTER[:3]) + 1e-6)
+    assert np.all(np.abs(moved).max(axis=(0, 1)) > 0.9 * np.array(task.GATE_JITTER[:3]))
+    np.testing.assert_allclose(np.linalg.norm(data.objects.quat, axis=-1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("level", [2, 3])
+def test_starts_are_clear_of_contact(drawn, level):
+    env, data = drawn[level]
+    env.sim.data = data
+    report = env.sim.contact_report()
+    assert not np.any(report.any)
+    assert report.object_distance.min() > 0.1
+    assert level != 3 or report.drone_distance.min() > 0.01
+
+
+def test_random_courses_leave_room_between_gates_and_poles(drawn):
+    _, data = drawn[3]
+    pos = np.asarray(data.objects.pos[:, 0, :, :2])
+    gates, poles = pos[:, :4], pos[:, 4:]
+    apart = np.linalg.norm(gates[:, :, None] - gates[:, None], axis=-1) + 9 * np.eye(4)
+    assert apart.min() > 0.55
+    assert np.linalg.norm(gates[:, :, None] - poles[:, None], axis=-1).min() > 0.3
+    assert np.all(np.abs(pos) < np.array(TRACK.high[:2]) - 0.05)
+    used = np.unique(np.round(np.asarray(data.plugins["task"].nominal_pos[:, 0, :4, 0]) / 1.0 - 0.5), axis=0)
+    assert len(used) > 100
+
+
+def test_poses_are_nominal_until_the_drone_was_near(drawn):
+    env, data = drawn[2]
+    gate = np.asarray(data.objects.pos[:, :, 0])
+    observe = jax.jit(env.task.observe)
+    said, far = np.asarray(TRACK.gates_pos[0]), np.array([-2.0, 1.0, 1.0])
+
+    def at(data, pos):
+        return data.replace(states=data.states.replace(pos=jnp.broadcast_to(jnp.asarray(pos, jnp.float32), gate.shape)))
+
+    def seen(data):
+        obs = observe(data)
+        return np.asarray(obs["gates_pos"][..., :3]), np.asarray(obs["gates_visited"][..., 0])
+
+    observed, visited = seen(at(data, far))
+    np.testing.assert_allclose(observed, np.broadcast_to(said, observed.shape), atol=1e-6)
+    assert not visited.any()
+    # High over the gate is near too: distances are in the plane.
+    near = at(data, gate + [0.6, 0.3, 0.5])
+    observed, visited = seen(near)
+    np.testing.assert_allclose(observed, gate, atol=1e-6)
+    assert visited.all()
+    observed, _ = seen(at(data, gate + [0.6, 0.4, 0.0]))
+    np.testing.assert_allclose(observed, np.broadcast_to(said, observed.shape), atol=1e-6)
+    observed, visited = seen(at(jax.jit(env.task.mark)(near), far))
+    np.testing.assert_allclose(observed, gate, atol=1e-6)
+    assert visited.all()
+
+
+def test_the_same_key_gives_the_same_course_in_any_world(drawn):
+    env, data, spawn = *drawn[1], jax.jit(drawn[1][0].task.spawn)
+    keys = world_keys(env.sim.default_data, "spawn")
+    again, other = spawn(env.sim.default_data, keys), spawn(env.sim.default_data, jnp.roll(keys, 1))
+    for name in ("pos", "quat"):
+        np.testing.assert_array_equal(getattr(again.states, name), getattr(data.states, name))
+        np.testing.assert_array_equal(getattr(other.states, name)[1:], getattr(data.states, name)[:-1])
+    np.testing.assert_array_equal(other.params.mass[1:], data.params.mass[:-1])
+    assert not np.allclose(other.params.mass, data.params.mass)
+
+
+def test_way_leads_around_a_gate_from_behind():
+    ahead = task.way(jnp.array([[-1.0, 0.0, 0.0], [-3.0, 4.0, 0.0], [0.5, 0.0, 0.0], [0.3, 0.9, 0.0]]))
+    expected = [1.0, 5.0, np.hypot(0.5, 0.45) + 0.45, np.hypot(0.3, 0.45) + 0.45]
+    np.testing.assert_allclose(ahead, expected, rtol=1e-6)
+
+
+def test_ranks_are_a_draw_without_replacement():
+    x = jnp.array([[0.5, 0.5, 0.1, 0.9, 0.5], [0.9, 0.8, 0.7, 0.6, 0.5]])
+    np.testing.assert_array_equal(ranks(x, 5), [[1, 2, 0, 4, 3], [4, 3, 2, 1, 0]])
+    np.testing.assert_array_equal(ranks(x, 2), [[1, 2], [4, 3]])
+
+
+def test_a_given_track_is_flown_and_judged():
+    """Two gates in a row, and a drone that is thrown through both."""
+    track = Track(
+        gates_pos=[(-1, 0, 1), (0.0, 0, 1)], gates_rpy=[(0, 0, 0)] * 2, obstacles_pos=[(1, 1, 1.5)], start=(-2, 0, 1)
+    )
+    env = environment(3, track=track, seconds=1.2)
+    spawn = env.task.spawn
+
+    def thrown(data, keys):
+        data = spawn(data, keys)
+        vel = jnp.array([3.0, 0.0, 0.0])[None, None] * jnp.array([1.0, 1.0, -1.0])[:, None, None]
+        pos = jnp.broadcast_to(jnp.array([-1.5, 0.0, 1.0]), vel.shape)
+        record = data.plugins["task"].replace(last_pos=pos)
+        states = data.states.replace(pos=pos, vel=vel, quat=jnp.zeros_like(data.states.quat).at[..., 3].set(1.0))
+        return data.replace(states=states, plugins=data.plugins | {"task": record})
+
+    env.task = dataclasses.replace(env.task, spawn=thrown)
+    judged = evaluate(env, jax.tree_util.Partial(lambda obs: jnp.zeros((3, 1, 4))))
+    np.testing.assert_allclose(judged["success"], 2 / 3, rtol=1e-6)
+    np.testing.assert_allclose(judged["crashed"], 1 / 3, rtol=1e-6)
+    assert judged["error"] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"level": 4}, "level is 4"),
+        ({"track": Track(gates_rpy=[(0, 0, 0)])}, "gates_rpy has shape"),
+        ({"track": Track(start=(0.3, 0.25, 0.7))}, "gate 0 of the track is"),
+        ({"track": Track(obstacles_pos=[(-1.5, 0.7, 1.5)])}, "obstacle 0 of the track is"),
+        ({"track": Track(start=(-2.4, 0.75, 0.4))}, "within the limits"),
+        ({"track": Track(low=(3, 0, 0))}, "upper limit"),
+        ({"track": Track(low=(-1, -1, 0), high=(1, 1, 2)), "level": 3}, "has no room"),
+        ({"n_drones": 9, "level": 3}, "room for 8"),
+    ],
+)
+def test_what_cannot_be_raced_is_told(options, message):
+    with pytest.raises(ConfigError, match=message):
+        make("race", 1, **options)
