@@ -12,7 +12,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.effects.core import install
 from crazysim.envs.env import Task
-from crazysim.envs.spawn import flying, uniform
+from crazysim.envs.random import uniform
+from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.core import NAME, nearest, pick
 from crazysim.envs.tracks import Track, checked, n_random, random_course, start_offsets
 from crazysim.errors import ConfigError
