@@ -148,7 +148,8 @@ def avoid(
         dtype = data.states.pos.dtype
         pos, quat = (x[..., places, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
         inside = rotation.rotate_inverse(quat, data.states.pos[..., None, :] - pos) - middle.astype(dtype)
-        ways = rotation.safe_clip(inside, -size.astype(dtype), size.astype(dtype)) - inside
+        reach = jnp.asarray(size, dtype)
+        ways = rotation.safe_clip(inside, -reach, reach) - inside
         far = rotation.safe_norm(ways)
         gap = far - thick[:, None].astype(dtype)
         ways = rotation.rotate(quat, ways) * (gap / jnp.where(far > 1e-3, far, 1))

@@ -72,10 +72,9 @@ def land(sim: SimulationWithScene, speed: float = 0.0, radius: float = RADIUS, s
     Raises:
         ConfigError: If speed or radius cannot be.
     """
-    if not (0 <= speed < 10):
-        raise ConfigError(f"speed is {speed!r}; a pad has 0 (it stands) to 10 m/s")
-    if not (0.05 <= radius <= 0.5):
-        raise ConfigError(f"radius is {radius!r}; a pad has 0.05 to 0.5 m")
+    for name, value, low, high in (("speed", speed, 0.0, 10.0), ("radius", radius, 0.05, 0.5)):
+        if not isinstance(value, (int, float)) or not low <= value <= high:
+            raise ConfigError(f"{name} is {value!r}; a pad has from {low} to {high} (m/s, and m)")
     n_drones = sim.n_drones
     middle = np.concatenate([SPACING * grid_2d(n_drones), np.full((n_drones, 1), HEIGHT)], axis=-1)
     pads = sim.scene.add("landing_pad", "pad", count=n_drones, pos=middle, radius=radius)
