@@ -17,7 +17,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, scopes, select_worlds
 from crazysim.sim.data import SimData
 from crazysim.sim.random import drone_keys
-from crazysim.sim.settings import positive
+from crazysim.sim.settings import member, positive
 from crazysim.sim.sim import Sim
 from crazysim.sim.stage import Axes
 
@@ -101,9 +101,13 @@ class AutoReset(Wrapper):
     """Begin a new episode where one is over; the outermost of all wrappers."""
 
     def __init__(self, env: Env, mode: AutoresetMode | str = AutoresetMode.same_step):
-        """Take the environment, and when to begin."""
+        """Take the environment, and when to begin.
+
+        Raises:
+            ConfigError: If there is no such mode.
+        """
         super().__init__(env)
-        self.mode = AutoresetMode(mode)
+        self.mode = member(AutoresetMode, "mode", mode)
 
     def reset(self, key: Array) -> EnvState:
         """Return all worlds at the beginning of an episode."""
