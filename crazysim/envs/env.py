@@ -162,7 +162,7 @@ class DroneEnv:
         action = jnp.zeros((*shape, self.actions.size), zeros.dtype)
         if self.sim.mesh is not None:
             data = shard(data, self.sim.mesh)
-        return EnvState(data, self.task.observe(data), zeros, over, over, action, self._info(data, over), {})
+        return EnvState(data, observed(self.task, data), zeros, over, over, action, told(self.task, data), {})
 
     def restart(self, state: EnvState, mask: Array) -> EnvState:
         """Return the state with new episodes in some worlds.
@@ -175,12 +175,12 @@ class DroneEnv:
         over = state.terminated & ~mask
         return state.replace(
             data=data,
-            obs=self.task.observe(data),
+            obs=observed(self.task, data),
             reward=select_worlds(mask, jnp.zeros((), state.reward.dtype), state.reward),
             terminated=over,
             truncated=state.truncated & ~mask,
             action=select_worlds(mask, jnp.zeros((), state.action.dtype), state.action),
-            info=state.info | self._info(data, data.core.nonfinite[:, 0]),
+            info=state.info | told(self.task, data),
         )
 
     def step(self, state: EnvState, action: Array) -> EnvState:
@@ -195,24 +195,19 @@ class DroneEnv:
         Raises:
             ValueError: If the action has another shape.
         """
-        if action.shape != state.action.shape:
-            raise ValueError(
-                f"action has shape {action.shape}; this environment needs {state.action.shape} = "
-                f"(n_worlds, n_drones, {self.actions.size}): {self.actions}"
-            )
-        action = action.astype(state.action.dtype)
+        action = fitting(action, state, self.actions)
         data = COMMANDS[self.actions.control](self.task.mark(state.data), self.actions.command(action))
         data = self._step(data, self.n_substeps, self._zeros)
         lost = data.core.nonfinite[:, 0]
-        reward = self.task.reward(data, action, state.action)
+        reward = jnp.asarray(self.task.reward(data, action, state.action), state.reward.dtype)
         return state.replace(
             data=data,
-            obs=jax.tree.map(lambda x: select_worlds(lost, jnp.zeros((), x.dtype), x), self.task.observe(data)),
+            obs=observed(self.task, data),
             reward=select_worlds(lost, jnp.zeros((), reward.dtype), reward),
             terminated=self.task.terminated(data) | lost,
             truncated=data.core.steps[:, 0] >= self.max_steps * self.n_substeps,
             action=action,
-            info=state.info | self._info(data, lost),
+            info=state.info | told(self.task, data),
         )
 
     def _begin(self, data: SimData, mask: Array | None) -> SimData:
@@ -220,10 +215,32 @@ class DroneEnv:
         data = self._reset(data, default, mask)
         spawned = self.task.spawn(data, episode_keys(data, f"spawn {self.task.name}"))
         # Numbers of Python's are weakly typed; a state of another type would have the next step compiled anew.
-        return map_batched(lambda x, new: select_worlds(mask, new.astype(x.dtype), x), data, spawned)
+        return map_batched(lambda x, new: select_worlds(mask, jnp.asarray(new, x.dtype), x), data, spawned)
 
-    def _info(self, data: SimData, lost: Array) -> dict[str, Array]:
-        return {"nonfinite": lost, "error": self.task.error(data)} | self.task.info(data)
+
+def observed(task: Task, data: SimData) -> Obs:
+    """Return what a policy is told: zeros in worlds that are not finite. (n_worlds, n_drones, k) each"""
+    lost = data.core.nonfinite[:, 0]
+    return jax.tree.map(lambda x: select_worlds(lost, jnp.zeros((), x.dtype), x), task.observe(data))
+
+
+def told(task: Task, data: SimData) -> dict[str, Array]:
+    """Return what else is told: which worlds are not finite, the error, and what the task adds."""
+    return {"nonfinite": data.core.nonfinite[:, 0], "error": task.error(data)} | task.info(data)
+
+
+def fitting(action: Array, state: EnvState, actions: Actions) -> Array:
+    """Return an action in the type of the state's, or say which shape it must have.
+
+    Raises:
+        ValueError: If it has another shape.
+    """
+    if jnp.shape(action) != state.action.shape:
+        raise ValueError(
+            f"action has shape {jnp.shape(action)}; this environment needs {state.action.shape} = "
+            f"(n_worlds, n_drones, {actions.size}): {actions}"
+        )
+    return jnp.asarray(action, state.action.dtype)
 
 
 def _compact(data: SimData) -> SimData:

@@ -16,7 +16,7 @@ from crazysim.envs.env import DroneEnv, Env, EnvState
 from crazysim.envs.registry import TASKS, make
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError
-from crazysim.sim.settings import as_mask
+from crazysim.sim.settings import as_mask, member
 from crazysim.sim.stage import with_leaves
 
 RENDER_MODES = ("rgb_array", "human")
@@ -56,7 +56,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             raise ConfigError(f"render_mode is {render_mode!r}; it must be None or one of {', '.join(RENDER_MODES)}")
         if isinstance(env, AutoReset):
             raise ConfigError("give the environment without AutoReset, and say autoreset_mode= here")
-        mode = GymnasiumMode(autoreset_mode)
+        mode = member(GymnasiumMode, "autoreset_mode", autoreset_mode)
         self.env = AutoReset(env, AutoresetMode(mode.value))
         self.sim, self.render_mode = env.sim, render_mode
         self._worlds, self._size = tuple(render_worlds), render_size

@@ -11,14 +11,15 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.envs.actions import Actions
-from crazysim.envs.env import Env, EnvState, Obs, Task
+from crazysim.envs.env import Env, EnvState, Obs, Task, fitting, observed, told
 from crazysim.envs.random import episode_keys
 from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, scopes, select_worlds
 from crazysim.sim.data import SimData
 from crazysim.sim.random import drone_keys
-from crazysim.sim.settings import positive
+from crazysim.sim.settings import member, positive
 from crazysim.sim.sim import Sim
+from crazysim.sim.stage import Axes
 
 
 class Wrapper:
@@ -90,7 +91,8 @@ class AutoresetMode(StrEnum):
     next_step = "NextStep"
     """With the step after the last, which heeds no action and gives no reward."""
     same_step = "SameStep"
-    """At the end of the last step itself; the last observation is in ``info["final_obs"]``."""
+    """At the end of the last step itself: ``obs`` is of the new episode, reward and ``info`` are of that step, and the
+    last observation is in ``info["final_obs"]``."""
     disabled = "Disabled"
     """When the user says so."""
 
@@ -99,9 +101,13 @@ class AutoReset(Wrapper):
     """Begin a new episode where one is over; the outermost of all wrappers."""
 
     def __init__(self, env: Env, mode: AutoresetMode | str = AutoresetMode.same_step):
-        """Take the environment, and when to begin."""
+        """Take the environment, and when to begin.
+
+        Raises:
+            ConfigError: If there is no such mode.
+        """
         super().__init__(env)
-        self.mode = AutoresetMode(mode)
+        self.mode = member(AutoresetMode, "mode", mode)
 
     def reset(self, key: Array) -> EnvState:
         """Return all worlds at the beginning of an episode."""
@@ -116,10 +122,9 @@ class AutoReset(Wrapper):
             return self.env.restart(self.env.step(state, action), state.done)
         state = self.env.step(state, action)
         begun = self.env.restart(state, state.done)
-        # The new episodes' observations, and the last step's reward and end.
+        # The new episodes' observations, and what the last step gave: its reward, its end, and what is told of it.
         kept = {"reward": state.reward, "terminated": state.terminated, "truncated": state.truncated}
-        info = begun.info | {name: state.info[name] for name in ("nonfinite", "error") if name in state.info}
-        return self._with_final(begun.replace(info=info, **kept), state.obs)
+        return self._with_final(begun.replace(info=state.info, **kept), state.obs)
 
     @staticmethod
     def _with_final(state: EnvState, obs: Obs) -> EnvState:
@@ -141,16 +146,19 @@ class EpisodeStatistics(Wrapper):
 
     def restart(self, state: EnvState, mask: Array) -> EnvState:
         """Return the state with new episodes in the worlds of a mask. (n_worlds,)"""
-        sums = jax.tree.map(lambda x: select_worlds(mask, jnp.zeros((), x.dtype), x), self.recall(state))
-        return self.remember(self.env.restart(state, mask), sums)
+        ended = {name: state.info[name] for name in ("episode_return", "episode_length")}
+        old = (self.recall(state), ended)
+        sums, ended = jax.tree.map(lambda x: select_worlds(mask, jnp.zeros((), x.dtype), x), old)
+        state = self.env.restart(state, mask)
+        return self.remember(state, sums, info=state.info | ended)
 
     def step(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one step later."""
         before = self.recall(state)
         state = self.env.step(state, action)
         sums = {"return": before["return"] + state.reward, "length": before["length"] + 1}
-        told = jax.tree.map(lambda x: select_worlds(state.done, x, jnp.zeros((), x.dtype)), sums)
-        info = {"episode_return": told["return"], "episode_length": told["length"]}
+        ended = jax.tree.map(lambda x: select_worlds(state.done, x, jnp.zeros((), x.dtype)), sums)
+        info = {"episode_return": ended["return"], "episode_length": ended["length"]}
         left = jax.tree.map(lambda x: select_worlds(state.done, jnp.zeros((), x.dtype), x), sums)
         return self.remember(state, left, info=state.info | info)
 
@@ -261,9 +269,9 @@ class ActionDelay(Wrapper):
 
     def step(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one step later."""
-        queue = self.recall(state)
+        queue, action = self.recall(state), fitting(action, state, self.actions)
         state = self.env.step(state, queue[:, 0])
-        return self.remember(state, jnp.concatenate([queue[:, 1:], action[:, None].astype(queue.dtype)], axis=1))
+        return self.remember(state, jnp.concatenate([queue[:, 1:], action[:, None]], axis=1))
 
 
 class Randomize(Wrapper):
@@ -304,5 +312,21 @@ class Randomize(Wrapper):
 
     def _randomized(self, state: EnvState, mask: Array | None) -> EnvState:
         drawn = self.fn(state.data, episode_keys(state.data, "randomize"))
-        data = map_batched(lambda x, new: select_worlds(mask, new, x), state.data, drawn)
-        return state.replace(data=data, obs=self.task.observe(data))
+        self._check(state.data, drawn)
+        data = map_batched(lambda x, new: select_worlds(mask, jnp.asarray(new, x.dtype), x), state.data, drawn)
+        return state.replace(data=data, obs=observed(self.task, data), info=state.info | told(self.task, data))
+
+    def _check(self, data: SimData, drawn: SimData) -> None:
+        """Check that nothing was drawn that all worlds share, and that would be lost.
+
+        Raises:
+            ConfigError: If so, with its name.
+        """
+        axes = Axes(data)
+        leaves = zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(drawn), strict=True)
+        shared = [name for name, scope, x, new in leaves if scope in ("shared", "whole") and new is not x]
+        if shared:
+            raise ConfigError(
+                f"{', '.join(shared)} cannot be randomised: all worlds share it. Name parameters that are to be one "
+                f"per drone in params=, as in Randomize(env, fn, params=('mass',))"
+            )

@@ -13,6 +13,8 @@ from jax import Array
 
 from crazysim.pytree import PyTree
 
+CLIP, EPSILON = 10.0, 1e-6
+"""Largest normalised observation, and what is added to a variance before the root is taken."""
 Layers = list[tuple[Array, Array]]
 """Weights (n_in, n_out) and biases (n_out,), first layer first."""
 
@@ -70,7 +72,7 @@ class RunningStats(PyTree):
 
     def normalize(self, x: Array) -> Array:
         """Return numbers of mean zero and variance one, at most ten. (..., k)"""
-        return jnp.clip((x - self.mean) / jnp.sqrt(self.var + 1e-6), -10.0, 10.0)
+        return jnp.clip((x - self.mean) / jnp.sqrt(self.var + EPSILON), -CLIP, CLIP)
 
 
 class Policy(PyTree):

@@ -23,6 +23,7 @@ from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train.evaluate import evaluate
+from crazysim.train.export import describe
 from crazysim.train.networks import Policy, RunningStats
 
 ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg}
@@ -214,16 +215,7 @@ def train(
 
 def save_policy(path: Path, policy: Policy, env: DroneEnv, settings: Settings) -> None:
     """Write a policy, with what its inputs and outputs mean."""
-    shapes = jax.eval_shape(env.reset, jax.random.key(0)).obs
-    meta = _meta(settings) | {
-        "observations": {name: shapes[name].shape[-1] for name in sorted(shapes)},
-        "actions": {
-            "level": env.actions.control.value,
-            "centre": env.actions.centre.tolist(),
-            "scale": env.actions.scale.tolist(),
-        },
-    }
-    checkpoint.save(path, policy, meta)
+    checkpoint.save(path, policy, _meta(settings) | describe(env))
 
 
 def load_policy(folder: str | Path) -> tuple[Policy, Settings, dict[str, Any]]:

@@ -1,0 +1,74 @@
+"""What tests of environments share: environments compiled once, states near an episode's end, parts of a state."""
+
+import collections
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from crazysim.envs import TASKS, make
+from crazysim.envs.wrappers import Wrapper
+from crazysim.pytree import map_batched
+
+quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+"""``jax.jit`` that compiles in half the time."""
+
+
+class Compiled(Wrapper):
+    """An environment whose functions are compiled once, for tests that call them from Python."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.traces = collections.Counter()
+        """How often Python ran each of the functions."""
+        for name in ("reset", "restart", "step"):
+            setattr(self, name, quick(self._counted(name, getattr(env, name))))
+
+    def _counted(self, name, fn):
+        def counted(*args):
+            self.traces[name] += 1
+            return fn(*args)
+
+        return counted
+
+
+@functools.cache
+def compiled(name="hover", n_worlds=4):
+    """Return a compiled environment of a task with its usual settings."""
+    return Compiled(make(name, n_worlds))
+
+
+def random_action(state, seed=0):
+    """Return actions beyond both ends of what is heeded, on the host. (n_worlds, n_drones, k)"""
+    return np.random.default_rng(seed).uniform(-1.2, 1.2, state.action.shape).astype(np.float32)
+
+
+def one_step_to_go(env, state, mask):
+    """Return the state with the clock of some worlds set to one step before the time runs out."""
+    core = state.data.core
+    steps = jnp.where(jnp.asarray(mask)[:, None], (env.max_steps - 1) * env.n_substeps, core.steps)
+    return state.replace(data=state.data.replace(core=core.replace(steps=steps.astype(core.steps.dtype))))
+
+
+def kind(tree):
+    """Return structure, shapes and types of a tree, weak types told apart."""
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [(x.shape, x.dtype, getattr(x, "weak_type", False)) for x in leaves]
+
+
+def of_worlds(state, mask, but=()):
+    """Return the part of a state that belongs to some worlds, without some of its fields."""
+    data = map_batched(lambda x: x[mask], state.data)
+    rest = {name: x for name, x in vars(state).items() if name not in ("data", *but)}
+    return data, jax.tree.map(lambda x: x[mask], rest)
+
+
+def obs_of(state, mask):
+    """Return what is observed of some worlds."""
+    return jax.tree.map(lambda x: x[mask], state.obs)
+
+
+def entries():
+    """Return the names of all tasks."""
+    return list(TASKS)

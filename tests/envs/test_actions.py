@@ -1,0 +1,121 @@
+"""What an action means: an affine map with units, whose zero makes every airframe hover."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import LEVELS, PAIRS
+
+from crazysim import ConfigError, Control, Drone, Dynamics, load_airframe
+from crazysim.dynamics import first_principles, fitted, supported_dynamics
+from crazysim.envs import Actions, actions_of
+from crazysim.envs.actions import RATES, REACH, TILT, YAW, hover_thrust
+
+CASES = [
+    (drone, dynamics, control)
+    for drone in Drone
+    for dynamics, control in PAIRS
+    if dynamics in supported_dynamics(drone)
+]
+LEVEL = jnp.array([0.0, 0.0, 0.0, 1.0])
+STILL = jnp.zeros(3)
+
+
+def params_of(airframe, dynamics):
+    if dynamics == "first_principles":
+        return first_principles.Params.create(airframe)
+    return fitted.Params.create(airframe, Dynamics(dynamics))
+
+
+@pytest.mark.parametrize(("drone", "dynamics", "control"), CASES)
+def test_a_zero_action_is_the_command_that_hovers(drone, dynamics, control):
+    """The derivatives of a level drone at rest vanish under it: checked in the equations of motion themselves."""
+    params = params_of(load_airframe(drone), dynamics)
+    actions = actions_of(load_airframe(drone), params, Control(control))
+    command = actions.command(jnp.zeros(actions.size))
+    if control == "state":
+        np.testing.assert_array_equal(command, [0, 0, 1, *np.zeros(9), 1, 0, 0, 0])
+        return
+    if control == "rotor_vel":
+        rotor_vel = command
+        command_of_motors = command
+    elif dynamics == "first_principles":
+        thrust = command[0 if control == "force_torque" else 3]
+        np.testing.assert_array_equal(np.delete(command, 0 if control == "force_torque" else 3), np.zeros(3))
+        np.testing.assert_allclose(thrust, 9.81 * params.mass[0], rtol=1e-6)
+        rotor_vel = command_of_motors = first_principles.hover_rotor_vel(params)
+    else:
+        rotor_vel, command_of_motors = command[3:], command
+    model = first_principles.dynamics if dynamics == "first_principles" else fitted.dynamics
+    slopes = model(STILL, LEVEL, STILL, STILL, command_of_motors, rotor_vel, params=params)
+    vel, acc, ang_acc, rotor_acc = map(np.asarray, slopes)
+    np.testing.assert_array_equal(vel, np.zeros(3))
+    np.testing.assert_allclose(acc, np.zeros(3), atol=2e-5)
+    np.testing.assert_allclose(ang_acc, np.zeros(3), atol=1e-3)
+    np.testing.assert_allclose(rotor_acc / np.abs(rotor_vel).max(), np.zeros_like(rotor_acc), atol=1e-4)
+
+
+@pytest.mark.parametrize("control", LEVELS)
+def test_the_map_is_affine_and_ends_at_one(control):
+    airframe = load_airframe("cf21B_500")
+    actions = actions_of(airframe, first_principles.Params.create(airframe), Control(control))
+    n = 3 if control == "state" else 4
+    assert actions.size == n
+
+    def at(x):
+        return np.asarray(actions.command(jnp.full(n, x)))[:n]
+
+    np.testing.assert_allclose(at(0.5), (at(0.0) + at(1.0)) / 2, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(at(-1.0), 2 * at(0.0) - at(1.0), rtol=1e-6, atol=1e-4)
+    np.testing.assert_array_equal(at(1.7), at(1.0))
+    np.testing.assert_array_equal(at(-9.0), at(-1.0))
+    most = 4 * airframe.value("rotors.thrust_max", ())
+    ends = {
+        "state": np.array([0, 0, 1]) + REACH,
+        "attitude": [TILT, TILT, YAW, most],
+        "body_rate": [*RATES, most],
+        "force_torque": [most, *at(1.0)[1:]],
+        "rotor_vel": np.broadcast_to(first_principles.Params.create(airframe).rotor_vel_max, 4),
+    }[control]
+    np.testing.assert_allclose(at(1.0), ends, rtol=1e-6)
+
+
+def test_torques_at_one_are_a_quarter_of_what_the_rotors_can_do():
+    """Roll: two rotors at full thrust on an arm of 3.5 cm, two off."""
+    airframe = load_airframe("cf21B_500")
+    actions = actions_of(airframe, first_principles.Params.create(airframe), Control.force_torque)
+    each = airframe.value("rotors.thrust_max", ())
+    np.testing.assert_allclose(actions.scale[1:3], 2 * each * airframe.arm / 4, rtol=1e-6)
+    assert 0 < actions.scale[3] < actions.scale[1]
+
+
+def test_any_leading_axes_and_gradients_everywhere():
+    airframe = load_airframe("cf21B_500")
+    actions = actions_of(airframe, first_principles.Params.create(airframe), Control.attitude)
+    action = np.random.default_rng(0).uniform(-1.5, 1.5, (3, 2, 4)).astype(np.float32)
+    commands = actions.command(jnp.asarray(action))
+    assert (commands.shape, commands.dtype) == ((3, 2, 4), jnp.float32)
+    np.testing.assert_array_equal(commands[1, 1], actions.command(jnp.asarray(action[1, 1])))
+    for x in (-2.0, -1.0, 0.0, 1.0, 2.0):
+        slope = jax.jacobian(actions.command)(jnp.full(4, x))
+        assert np.isfinite(slope).all()
+        assert not (slope - jnp.diag(jnp.diag(slope))).any()
+    np.testing.assert_allclose(jnp.diag(jax.jacobian(actions.command)(jnp.zeros(4))), actions.scale, rtol=1e-6)
+
+
+def test_an_action_says_what_it_is():
+    airframe = load_airframe("cf21B_500")
+    actions = actions_of(airframe, first_principles.Params.create(airframe), Control.attitude, tilt=0.1)
+    assert "attitude" in str(actions)
+    assert "0.1" in str(actions)
+
+
+def test_a_map_of_two_lengths_is_refused():
+    with pytest.raises(ConfigError, match=r"\(3,\) and \(4,\); needed is \(k,\)"):
+        Actions(np.zeros(3), np.ones(4), Control.attitude)
+
+
+def test_hover_thrust_takes_parameters_of_every_drone():
+    params = first_principles.Params.create(load_airframe("cf21B_500"))
+    masses = jnp.array([[[0.03]], [[0.06]]])
+    np.testing.assert_allclose(hover_thrust(params.replace(mass=masses)), 9.81 * masses, rtol=1e-6)

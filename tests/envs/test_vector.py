@@ -1,0 +1,243 @@
+"""Tasks as Gymnasium's vector environments: modes of resets, seeds, wrong input, pictures, NumPy users."""
+
+import itertools
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import trees_equal
+
+from crazysim import ConfigError
+from crazysim.envs import AutoReset, DroneVectorEnv, make
+from crazysim.envs.vector import make_vector
+
+pytestmark = pytest.mark.xdist_group("env hover")
+MODES = ("NextStep", "SameStep", "Disabled")
+N_STEPS = 5
+"""Length of an episode, steps."""
+ID = "crazysim/Hover-v0"
+
+
+@pytest.fixture(scope="module")
+def envs():
+    """Three worlds with short episodes, in every mode, over one functional environment."""
+    short = make("hover", 3, seconds=N_STEPS / 50)
+    return {mode: DroneVectorEnv(short, mode) for mode in MODES}
+
+
+@pytest.fixture(scope="module", params=MODES)
+def env(envs, request):
+    return envs[request.param]
+
+
+@pytest.fixture(scope="module")
+def next_step(envs):
+    return envs["NextStep"]
+
+
+def zeros(env):
+    return np.zeros(env.action_space.shape, np.float32)
+
+
+def run(env, n):
+    """Return the results of n steps from a fixed beginning."""
+    env.reset(seed=1)
+    return [env.step(zeros(env)) for _ in range(n)]
+
+
+def test_an_episode_takes_its_time_in_every_mode(env):
+    results = run(env, N_STEPS + 2)
+    ends = np.stack([truncated for _, _, _, truncated, _ in results])
+    expected = np.zeros((N_STEPS + 2, 3), bool)
+    expected[N_STEPS - 1 :] = env.metadata["autoreset_mode"].value == "Disabled"
+    expected[N_STEPS - 1] = True
+    np.testing.assert_array_equal(ends, expected)
+    assert not np.stack([terminated for _, _, terminated, _, _ in results]).any()
+
+
+def test_next_step_gives_no_reward_for_the_step_that_begins(next_step):
+    results = run(next_step, N_STEPS + 2)
+    rewards = np.stack([reward for _, reward, _, _, _ in results])
+    np.testing.assert_array_equal(rewards[N_STEPS], np.zeros(3))
+    assert (rewards[[*range(N_STEPS), N_STEPS + 1]] != 0).all()
+    jumps = [np.abs(a[0]["pos"] - b[0]["pos"]).max() for a, b in itertools.pairwise(results)]
+    assert np.argmax(jumps) == N_STEPS - 1
+    assert jumps[N_STEPS - 1] > 10 * max(jumps[: N_STEPS - 1])
+    assert "final_obs" not in results[-1][4]
+
+
+def test_same_step_tells_the_last_observation(envs):
+    env = envs["SameStep"]
+    results = run(env, N_STEPS + 1)
+    disabled = run(envs["Disabled"], N_STEPS)
+    obs, reward, _, _, info = results[N_STEPS - 1]
+    np.testing.assert_array_equal(info["_final_obs"], np.ones(3, bool))
+    assert trees_equal(info["final_obs"], disabled[-1][0])
+    np.testing.assert_array_equal(reward, disabled[-1][1])
+    assert not np.allclose(obs["pos"], info["final_obs"]["pos"])
+    assert not results[N_STEPS][4]["_final_obs"].any()
+
+
+def test_disabled_resets_those_of_a_mask(envs):
+    env, mask = envs["Disabled"], np.array([True, False, True])
+    last = run(env, N_STEPS + 1)[-1][0]
+    obs, _ = env.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(obs["pos"][1], last["pos"][1])
+    assert (np.abs(obs["pos"] - last["pos"]).max(axis=-1)[mask] > 1e-3).all()
+    _, _, _, truncated, _ = env.step(zeros(env))
+    np.testing.assert_array_equal(truncated, ~mask)
+
+
+def test_seeds(next_step):
+    first, _ = next_step.reset(seed=3)
+    again, _ = next_step.reset(seed=3)
+    on, _ = next_step.reset()
+    assert trees_equal(first, again)
+    assert not np.allclose(on["pos"], first["pos"])
+    next_step.reset(seed=3)
+    assert trees_equal(next_step.reset()[0], on), "what comes after a seed follows from it"
+    assert len(np.unique(first["pos"][:, 0])) == 3, "worlds differ"
+    assert trees_equal(next_step.reset(seed=np.int64(3))[0], first)
+
+
+def test_one_dispatch_a_step_and_arrays_stay_where_they_are(next_step):
+    next_step.reset(seed=0)
+    action = jnp.zeros(next_step.action_space.shape)
+    next_step.step(action)
+    with jax.transfer_guard("disallow"):
+        obs, reward, terminated, truncated, info = next_step.step(action)
+    assert all(isinstance(x, jax.Array) for x in jax.tree.leaves((obs, reward, terminated, truncated, info)))
+    traces = next_step._advance._cache_size()
+    for given in (zeros(next_step), zeros(next_step).astype(np.float64), zeros(next_step).tolist()):
+        next_step.step(given)
+    assert next_step._advance._cache_size() <= traces + 1  # NumPy comes in by another door than JAX, and is traced once
+
+
+@pytest.mark.parametrize(
+    ("action", "error", "message"),
+    [
+        (np.zeros((3, 5)), ValueError, r"shape \(3, 5\); needed is \(3, 4\)"),
+        (jnp.zeros((2, 4)), ValueError, r"shape \(2, 4\); needed is \(3, 4\)"),
+        (np.zeros(4), ValueError, r"shape \(4,\); needed is \(3, 4\)"),
+        (
+            np.array([[0.0] * 4, [np.nan] * 4, [0, 0, 0, np.inf]]),
+            ConfigError,
+            r"NaN or infinite in world\(s\) \[1, 2\]",
+        ),
+    ],
+)
+def test_wrong_actions(next_step, action, error, message):
+    next_step.reset(seed=0)
+    with pytest.raises(error, match=message):
+        next_step.step(action)
+
+
+def test_an_action_of_the_device_that_is_not_finite_ends_its_world(next_step):
+    """Looking at it would stall the device; the world says so itself."""
+    next_step.reset(seed=0)
+    obs, reward, terminated, _, info = next_step.step(jnp.zeros((3, 4)).at[1].set(jnp.nan))
+    np.testing.assert_array_equal(terminated, [False, True, False])
+    np.testing.assert_array_equal(info["nonfinite"], [False, True, False])
+    assert not obs["pos"][1].any()
+    assert float(reward[1]) == 0.0
+    assert np.isfinite(jax.tree.leaves(next_step.step(zeros(next_step))[0])[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"seed": [1, 2, 3]}, ConfigError, "one integer seeds all worlds"),
+        ({"seed": 1.5}, ConfigError, "one integer seeds all worlds"),
+        ({"options": {"colour": 1}}, ConfigError, "no option colour; it has reset_mask"),
+        ({"options": {"reset_mask": [True]}}, ValueError, r"shape \(1,\)"),
+        ({"options": {"reset_mask": np.ones(3)}}, ValueError, "needed are .* bool"),
+        ({"seed": 1, "options": {"reset_mask": np.ones(3, bool)}}, ConfigError, "a seed is one for all worlds"),
+    ],
+)
+def test_wrong_resets(next_step, kwargs, error, message):
+    next_step.reset(seed=0)
+    with pytest.raises(error, match=message):
+        next_step.reset(**kwargs)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"render_mode": "ascii"}, "render_mode is 'ascii'; it must be None or one of rgb_array, human"),
+        ({"autoreset_mode": "sometimes"}, "autoreset_mode is 'sometimes'; it must be one of 'NextStep'"),
+        ({"color": "red"}, "task 'hover' has no option 'color'"),
+        ({"n_world": 2}, "did you mean n_worlds"),
+        ({"freq": 300}, "the environment's freq of 300 Hz does not divide the simulation's 500 Hz"),
+    ],
+)
+def test_wrong_settings(kwargs, message):
+    with pytest.raises(ConfigError, match=message):
+        gymnasium.make_vec(ID, num_envs=2, **kwargs)
+
+
+def test_a_task_that_does_not_exist():
+    with pytest.raises(ConfigError, match="task 'hoover' does not exist; there are hover"):
+        make("hoover")
+
+
+def test_what_comes_before_a_reset_is_refused():
+    env = make_vector("hover", 1)
+    with pytest.raises(ConfigError, match="reset"):
+        env.step(np.zeros((1, 4)))
+    with pytest.raises(ConfigError, match="render_mode='rgb_array'"):
+        env.render()
+    with pytest.raises(ConfigError, match="without AutoReset, and say autoreset_mode="):
+        DroneVectorEnv(AutoReset(env.env.env))
+
+
+@pytest.mark.usefixtures("opengl")
+def test_pictures_show_the_drone_as_it_is():
+    env = gymnasium.make_vec(ID, num_envs=3, render_mode="rgb_array", max_episode_steps=7)
+    assert env.metadata["render_fps"] == 50
+    assert env.unwrapped.env.max_steps == 7
+    env.reset(seed=0)
+    (picture,) = env.render()
+    assert (picture.shape, picture.dtype) == ((480, 640, 3), np.uint8)
+    assert picture.std() > 5
+    for _ in range(6):
+        env.step(np.ones(env.action_space.shape))
+    (later,) = env.render()
+    assert (later != picture).any(), "the drone has moved"
+    env.close()
+    wide = DroneVectorEnv(env.unwrapped.env.env, render_mode="rgb_array", render_worlds=(2, 0), render_size=(64, 48))
+    wide.reset(seed=0)
+    pictures = wide.render()
+    assert [p.shape for p in pictures] == [(48, 64, 3)] * 2
+    assert (pictures[0] != pictures[1]).any()
+    wide.close()
+
+
+def test_numpy_users_go_through_gymnasiums_wrappers(envs):
+    pytest.importorskip("array_api_compat")
+    wrappers = gymnasium.wrappers.vector
+    env = wrappers.RecordEpisodeStatistics(wrappers.JaxToNumpy(envs["NextStep"]))
+    obs, info = env.reset(seed=0)
+    assert all(type(x) is np.ndarray for x in jax.tree.leaves((obs, info)))
+    returns = np.zeros(3)
+    for _ in range(N_STEPS):
+        obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        returns += reward
+        assert obs in env.observation_space
+    assert all(type(x) is np.ndarray for x in (reward, terminated, truncated))
+    np.testing.assert_array_equal(info["episode"]["l"], [N_STEPS] * 3)
+    np.testing.assert_allclose(info["episode"]["r"], returns, rtol=1e-5)
+
+
+def test_several_drones_have_an_axis_and_share_their_mean_reward():
+    env = make_vector("hover", 2, n_drones=3)
+    assert env.single_action_space.shape == (3, 4)
+    assert env.single_observation_space["pos"].shape == (3, 3)
+    obs, _ = env.reset(seed=0)
+    assert jax.tree.map(np.asarray, obs) in env.observation_space
+    _, reward, terminated, _, info = env.step(env.action_space.sample())
+    assert (reward.shape, terminated.shape, info["error"].shape) == ((2,), (2,), (2, 3))
+    np.testing.assert_allclose(reward, env.state.reward.mean(axis=1), rtol=1e-6)
+    with pytest.raises(ValueError, match=r"needed is \(2, 3, 4\)"):
+        env.step(np.zeros((2, 4)))

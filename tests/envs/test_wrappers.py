@@ -1,0 +1,247 @@
+"""What every wrapper does, in numbers, and what wrappers may not be put around."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import trees_equal
+from env_cases import compiled, of_worlds, one_step_to_go, quick, random_action
+
+from crazysim import ConfigError
+from crazysim.envs import (
+    ActionDelay,
+    AutoReset,
+    EpisodeStatistics,
+    FrameStack,
+    ObservationNoise,
+    Observe,
+    Randomize,
+    make,
+)
+from crazysim.envs.actions import hover_rotors
+from crazysim.train.networks import flatten
+
+pytestmark = pytest.mark.xdist_group("env hover")
+FIRST = np.array([True, False, False, False])
+
+
+@pytest.fixture(scope="module")
+def env():
+    return compiled("hover", 4)
+
+
+def steps(env, state, n, seed=0):
+    """Return the states of n random steps."""
+    out = []
+    for i in range(n):
+        state = env.step(state, random_action(state, seed + i))
+        out.append(state)
+    return out
+
+
+def test_nothing_goes_around_automatic_resets(env):
+    auto = AutoReset(env)
+    for around in (EpisodeStatistics, AutoReset, lambda e: FrameStack(e, 2), lambda e: Randomize(e, lambda d, k: d)):
+        with pytest.raises(ConfigError, match="inside of AutoReset, which is the outermost"):
+            around(auto)
+
+
+def test_a_wrapper_passes_on_what_it_is_about(env):
+    wrapped = FrameStack(EpisodeStatistics(env), 2)
+    for name in ("sim", "task", "actions", "n_substeps", "max_steps"):
+        assert getattr(wrapped, name) is getattr(env, name)
+
+
+@pytest.mark.parametrize("n", [0, -1, 1.5, True, "2"])
+def test_lengths_are_positive_whole_numbers(env, n):
+    for wrapper in (FrameStack, ActionDelay):
+        with pytest.raises(ConfigError, match="positive whole number"):
+            wrapper(env, n)
+
+
+def test_an_unknown_mode_names_those_there_are(env):
+    with pytest.raises(ConfigError, match="'NextStep', 'SameStep', 'Disabled'"):
+        AutoReset(env, "sometimes")
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_episode_statistics(env, mode):
+    auto = AutoReset(EpisodeStatistics(env), mode)
+    begun = auto.reset(jax.random.key(0))
+    assert not begun.info["episode_length"].any()
+    one, two = steps(auto, begun, 2)
+    last = auto.step(one_step_to_go(env, two, FIRST), random_action(begun, 7))
+    np.testing.assert_array_equal(last.done, FIRST)
+    np.testing.assert_array_equal(last.info["episode_length"], [3, 0, 0, 0])
+    total = one.reward + two.reward + last.reward
+    np.testing.assert_allclose(last.info["episode_return"], total * FIRST[:, None], rtol=1e-5)
+    after = auto.step(last, random_action(begun, 8))
+    if mode == "Disabled":  # the episode goes on and ends again
+        np.testing.assert_array_equal(after.info["episode_length"], [1, 0, 0, 0])
+        again = auto.restart(after, jnp.asarray(FIRST))
+        assert not again.info["episode_length"].any()
+        np.testing.assert_array_equal(again.memory["EpisodeStatistics"]["length"], [0, 4, 4, 4])
+    else:
+        assert not after.info["episode_length"].any()
+        assert not after.info["episode_return"].any()
+        begins = 0 if mode == "NextStep" else 1
+        np.testing.assert_array_equal(after.memory["EpisodeStatistics"]["length"], [begins, 4, 4, 4])
+
+
+def test_observe_changes_what_is_seen_at_all_times(env):
+    wrapped = Observe(env, lambda obs, data: {"all": flatten(obs), "clock": data.core.steps[..., None]})
+    state = wrapped.reset(jax.random.key(0))
+    plain = env.reset(jax.random.key(0))
+    for _ in range(2):
+        assert set(state.obs) == {"all", "clock"}
+        names = ("ang_vel", "difference_to_goal", "pos", "rot", "vel")
+        np.testing.assert_array_equal(state.obs["all"], np.concatenate([plain.obs[n] for n in names], axis=-1))
+        np.testing.assert_array_equal(state.obs["clock"][:, 0, 0], state.data.core.steps[:, 0])
+        state, plain = wrapped.step(state, random_action(plain)), env.step(plain, random_action(plain))
+    state, plain = wrapped.restart(state, jnp.asarray(FIRST)), env.restart(plain, jnp.asarray(FIRST))
+    assert trees_equal(state.obs["all"], flatten(plain.obs))
+
+
+def test_noise_is_as_large_as_said_and_reproducible(env):
+    std = {"pos": 0.1, "vel": 0.01}
+    wrapped = ObservationNoise(env, std)
+    noisy, plain = quick(wrapped._noisy), env.reset(jax.random.key(0))
+    seen = {name: [] for name in plain.obs}
+    for state in (plain, *steps(env, plain, 60)):
+        obs = noisy(state.obs, state.data)
+        for name, values in seen.items():
+            values.append(np.asarray(obs[name] - state.obs[name]))
+    for name, values in seen.items():
+        noise = np.stack(values)  # (61, 4, 1, k)
+        if name not in std:
+            assert not noise.any(), name
+            continue
+        np.testing.assert_allclose(noise.std(), std[name], rtol=0.1)
+        np.testing.assert_allclose(noise.mean(), 0.0, atol=0.15 * std[name])
+        flat = noise.reshape(len(noise), -1)
+        apart = np.abs(np.corrcoef(flat, rowvar=False) - np.eye(flat.shape[1]))
+        assert apart.max() < 0.6, "worlds and axes have noise of their own"
+    ratio = np.stack(seen["pos"]) / np.stack(seen["vel"])
+    assert ratio.std() > 1, "every observation has noise of its own"
+    again = wrapped.reset(jax.random.key(0))
+    assert trees_equal(again.obs, wrapped.reset(jax.random.key(0)).obs)
+    assert not trees_equal(again.obs["pos"], wrapped.reset(jax.random.key(1)).obs["pos"])
+    assert trees_equal(again.data, plain.data), "the world knows nothing of it"
+    one = wrapped.restart(again, jnp.asarray(FIRST))
+    assert trees_equal(one.obs["pos"][1:], again.obs["pos"][1:]), "nobody else is seen anew"
+
+
+def test_noise_of_what_is_not_seen_is_refused(env):
+    with pytest.raises(ConfigError, match="nothing observed is called colour; there are ang_vel"):
+        ObservationNoise(env, {"pos": 0.1, "colour": 0.1}).reset(jax.random.key(0))
+
+
+def test_frames_are_stacked_oldest_first(env):
+    wrapped = FrameStack(env, 3)
+    state, plain = wrapped.reset(jax.random.key(0)), env.reset(jax.random.key(0))
+    seen = [plain.obs] * 3
+    for i in range(4):
+        for name, x in state.obs.items():
+            np.testing.assert_array_equal(x, np.concatenate([frame[name] for frame in seen[-3:]], axis=-1))
+        state, plain = wrapped.step(state, random_action(plain, i)), env.step(plain, random_action(plain, i))
+        seen.append(plain.obs)
+    anew = wrapped.restart(state, jnp.asarray(FIRST))
+    first = env.restart(plain, jnp.asarray(FIRST)).obs["pos"][0]
+    np.testing.assert_array_equal(anew.obs["pos"][0], np.tile(first, 3))
+    assert trees_equal(of_worlds(anew, ~FIRST), of_worlds(state, ~FIRST))
+
+
+def test_actions_arrive_late(env):
+    delayed = ActionDelay(env, 2)
+    state, plain = delayed.reset(jax.random.key(0)), env.reset(jax.random.key(0))
+    sent = [np.zeros_like(plain.action)] * 2
+    for i in range(4):
+        sent.append(random_action(plain, i))
+        state, plain = delayed.step(state, sent[-1]), env.step(plain, sent[i])
+        assert trees_equal(state.data, plain.data)
+        np.testing.assert_array_equal(state.action, sent[i])
+    state, plain = delayed.restart(state, jnp.asarray(FIRST)), env.restart(plain, jnp.asarray(FIRST))
+    sent.append(random_action(plain, 9))
+    for i in (4, 5):
+        action = np.array(sent[i])
+        action[0] = 0  # what the old episode had sent is forgotten
+        state, plain = delayed.step(state, sent[6]), env.step(plain, action)
+        np.testing.assert_array_equal(state.action, action)
+        assert trees_equal(state.data, plain.data)
+
+
+def test_a_wrong_action_is_told_by_every_wrapper(env):
+    for wrapped in (env, ActionDelay(env, 2)):
+        state = wrapped.reset(jax.random.key(0))
+        with pytest.raises(ValueError, match=r"shape \(4, 4\); this environment needs \(4, 1, 4\)"):
+            wrapped.step(state, jnp.zeros((4, 4)))
+
+
+def heavier(data, keys):
+    """Draw masses between 1 and 2 times the usual, one for every drone of a world."""
+    draw = jax.vmap(lambda key: jax.random.uniform(key, (data.core.n_drones, 1), minval=1.0, maxval=2.0))
+    return data.replace(params=data.params.replace(mass=0.0434 * draw(keys)))
+
+
+@pytest.fixture(scope="module")
+def randomized(env):
+    return Randomize(env.env, heavier, params=("mass",))
+
+
+@pytest.fixture(scope="module")
+def heavy(randomized):
+    return quick(randomized.reset)(jax.random.key(0))
+
+
+def test_randomised_parameters_are_one_per_drone(env, heavy):
+    mass = np.asarray(heavy.data.params.mass)
+    assert mass.shape == (4, 1, 1)
+    assert ((mass >= 0.0434) & (mass <= 0.0868)).all()
+    assert len(np.unique(mass)) == 4
+    assert heavy.data.params.J.shape == (3, 3), "what is not named stays shared"
+    assert trees_equal(heavy.data.states, env.reset(jax.random.key(0)).data.states)
+
+
+def test_a_heavy_drone_sinks_under_the_action_that_hovers(env, randomized, heavy):
+    """Its acceleration is that of the weight which the thrust of the nominal drone leaves."""
+    step = quick(randomized.step)
+    level = heavy.data.states.quat.at[:].set(jnp.array([0.0, 0, 0, 1]))
+    still = jnp.zeros_like(heavy.data.states.vel)
+    hover = jnp.broadcast_to(hover_rotors(env.sim.data.params), heavy.data.states.rotor_vel.shape)
+    states = heavy.data.states.replace(quat=level, vel=still, ang_vel=still, rotor_vel=hover)
+    state = step(heavy.replace(data=heavy.data.replace(states=states)), jnp.zeros_like(heavy.action))
+    mass = np.asarray(heavy.data.params.mass)[:, 0, 0]
+    np.testing.assert_allclose(state.data.states.vel[:, 0, 2], -9.81 * (1 - 0.0434 / mass) * 0.02, rtol=0.02)
+
+
+def test_only_worlds_that_begin_anew_are_randomised_anew(randomized, heavy):
+    new = quick(randomized.restart)(heavy, jnp.asarray(FIRST))
+    assert new.data.params.mass[0] != heavy.data.params.mass[0]
+    assert trees_equal(of_worlds(new, ~FIRST), of_worlds(heavy, ~FIRST))
+
+
+def test_randomisation_does_not_depend_on_the_number_of_worlds(heavy):
+    """Law 10."""
+    two = Randomize(make("hover", 2), heavier, params=("mass",)).reset(jax.random.key(0))
+    np.testing.assert_allclose(two.data.params.mass, heavy.data.params.mass[:2], rtol=1e-6)
+
+
+def test_observations_and_errors_are_those_of_what_was_drawn(env):
+    """A function may move drones, too."""
+
+    def lifted(data, keys):
+        return data.replace(states=data.states.replace(pos=data.states.pos + jnp.array([0.0, 0.0, 0.5])))
+
+    state = quick(Randomize(env.env, lifted).reset)(jax.random.key(0))
+    np.testing.assert_array_equal(state.obs["pos"], state.data.states.pos)
+    distance = np.linalg.norm(state.obs["difference_to_goal"], axis=-1)
+    np.testing.assert_allclose(state.info["error"], distance, rtol=1e-5)
+
+
+def test_what_cannot_be_randomised_is_told(env):
+    with pytest.raises(ConfigError, match="has no parameter colour; it has mass"):
+        Randomize(env.env, heavier, params=("mass", "colour"))
+    with pytest.raises(ConfigError, match="directly around the environment, not around FrameStack"):
+        Randomize(FrameStack(env, 2), heavier)
+    with pytest.raises(ConfigError, match=r"params.mass cannot be randomised: all worlds share it.*params="):
+        Randomize(env.env, heavier).reset(jax.random.key(0))

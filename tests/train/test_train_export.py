@@ -1,0 +1,150 @@
+"""Policies as ONNX and as C: the same actions as JAX gives, and in words what the numbers are."""
+
+import ctypes
+import json
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError
+from crazysim.envs import make
+from crazysim.train.export import describe, to_c, to_onnx
+from crazysim.train.networks import Policy, RunningStats, init_mlp
+
+FLAGS = ("-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+
+
+@pytest.fixture(scope="module")
+def meta():
+    return describe(make("hover", 1))
+
+
+@pytest.fixture(scope="module")
+def policy(meta):
+    """Weights of a usual size, and inputs whose mean and variance differ by orders of magnitude."""
+    rng, n = np.random.default_rng(0), sum(meta["observations"].values())
+    layers = init_mlp(jax.random.key(0), (n, 64, 32, 4), 1.0)
+    layers = [(w, jnp.asarray(rng.normal(size=b.shape), jnp.float32)) for w, b in layers]
+    mean, var = rng.normal(size=n), np.exp(rng.normal(scale=2.0, size=n))
+    var[0] = 0.0  # an observation that never changed
+    return Policy(RunningStats(*(jnp.asarray(x, jnp.float32) for x in (mean, var, 1e4))), layers)
+
+
+@pytest.fixture(scope="module")
+def flights(meta, policy):
+    """Observations, among them some far outside of what was seen, and the actions that JAX gives."""
+    rng = np.random.default_rng(1)
+    n = sum(meta["observations"].values())
+    x = rng.normal(size=(500, n)) * np.exp(rng.normal(scale=2.0, size=(500, 1)))
+    x = np.array(x * np.sqrt(policy.stats.var) + policy.stats.mean, np.float32)
+    x[0] = 1e6
+    ends = np.cumsum(list(meta["observations"].values()))[:-1]
+    named = dict(zip(meta["observations"], np.split(x, ends, axis=-1), strict=True))
+    actions = np.asarray(policy({name: jnp.asarray(v) for name, v in reversed(named.items())}))
+    assert 0.3 < np.abs(actions).mean() < 0.95  # neither zero nor saturated
+    return x, actions
+
+
+def compiled(path, folder, name="policy"):
+    """Return the function of a header, as a C compiler makes it."""
+    source, library = folder / "use.c", folder / "use.so"
+    source.write_text(
+        f'#include "{path}"\nvoid fly(int n, const float *obs, float *action);\n'
+        f"void fly(int n, const float *obs, float *action)\n"
+        f"{{ for (int i = 0; i < n; ++i) {name}(obs + 21 * i, action + 4 * i); }}\n"
+    )
+    cc = shutil.which("cc") or shutil.which("gcc") or "cc"
+    subprocess.run([cc, "-std=c99", *FLAGS, "-shared", "-fPIC", source, "-o", library, "-lm"], check=True)
+    fly = ctypes.CDLL(str(library)).fly
+
+    def actions(obs):
+        out = np.empty((len(obs), 4), np.float32)
+        pointers = (x.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for x in (np.ascontiguousarray(obs), out))
+        fly(len(obs), *pointers)
+        return out
+
+    return actions
+
+
+def test_c_gives_the_actions_of_jax(tmp_path, policy, meta, flights):
+    obs, actions = flights
+    path = to_c(policy, tmp_path / "policy.h", meta)
+    np.testing.assert_allclose(compiled(path, tmp_path)(obs), actions, atol=5e-6)
+
+
+def test_the_header_may_have_another_name_and_serves_cpp(tmp_path, policy, meta, flights):
+    obs, actions = flights
+    path = to_c(policy, str(tmp_path / "hover.h"), meta, name="hover_v2")
+    np.testing.assert_allclose(compiled(path, tmp_path, "hover_v2")(obs[:9]), actions[:9], atol=5e-6)
+    both = tmp_path / "both.cpp"
+    both.write_text(f'#include "{to_c(policy, tmp_path / "policy.h", meta)}"\n#include "{path}"\n#include "{path}"\n'
+                    "void fly(const float *x, float *a) { policy(x, a); hover_v2(x, a); }\n")  # fmt: skip
+    subprocess.run(["g++", "-std=c++11", *FLAGS, "-fsyntax-only", both], check=True)
+
+
+def test_the_header_says_what_its_numbers_are(tmp_path, policy, meta):
+    text = to_c(policy, tmp_path / "policy.h", meta).read_text()
+    assert "[0..2] ang_vel: angular velocity, body frame, rad/s" in text
+    assert "[3..5] difference_to_goal: goal less position, world frame, m" in text
+    assert "[9..17] rot" in text
+    assert "[18..20] vel" in text
+    assert "level attitude" in text
+    assert "[0] roll, rad = 0 + 0.785398163 * action[0]" in text
+    assert "[3] collective thrust, N = 0.42575404 + " in text
+    assert text.count("#include") == 1
+
+
+def test_onnx_gives_the_actions_of_jax(tmp_path, policy, meta, flights):
+    runtime = pytest.importorskip("onnxruntime")
+    obs, actions = flights
+    path = to_onnx(policy, tmp_path / "policy.onnx", meta)
+    assert path.stat().st_size < 40_000
+    session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    (x,), (y,) = session.get_inputs(), session.get_outputs()
+    assert (x.name, x.shape, x.type) == ("observation", ["batch", 21], "tensor(float)")
+    assert (y.name, y.shape, y.type) == ("action", ["batch", 4], "tensor(float)")
+    np.testing.assert_allclose(session.run(None, {"observation": obs})[0], actions, atol=5e-6)
+    np.testing.assert_allclose(session.run(None, {"observation": obs[:1]})[0], actions[:1], atol=5e-6)
+    told = session.get_modelmeta().custom_metadata_map
+    assert json.loads(told["observations"]) == meta["observations"]
+    assert list(json.loads(told["observations"])) == ["ang_vel", "difference_to_goal", "pos", "rot", "vel"]
+    assert told["level"] == "attitude"
+    assert json.loads(told["units"])[0] == "roll, rad"
+    np.testing.assert_allclose(json.loads(told["centre"]), [0, 0, 0, 0.42575404], rtol=1e-6)
+    assert len(json.loads(told["scale"])) == 4
+
+
+def test_every_command_level_is_explained(tmp_path, policy, meta):
+    for level, unit in {"body_rate": "rate about x, rad/s", "rotor_vel": "speed of rotor 0, rpm",
+                        "force_torque": "collective thrust, N"}.items():  # fmt: skip
+        other = meta | {"actions": meta["actions"] | {"level": level}}
+        assert f"[0] {unit} = " in to_c(policy, tmp_path / "policy.h", other).read_text()
+
+
+@pytest.mark.parametrize("write", [to_c, to_onnx])
+def test_a_policy_of_another_meaning_or_of_none_is_refused(tmp_path, policy, meta, write):
+    path = tmp_path / "policy"
+    more = meta | {"observations": meta["observations"] | {"wind": 3}}
+    with pytest.raises(ConfigError, match=r"takes 21 numbers and gives 4; these observations are 24 .*wind 3"):
+        write(policy, path, more)
+    broken = [(w, b.at[0].set(jnp.nan)) for w, b in policy.layers]
+    with pytest.raises(ConfigError, match="NaN or infinite; its training has diverged"):
+        write(policy.replace(layers=broken), path, meta)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("name", ["", "2fast", "fly away", "a-b", "é"])
+def test_a_name_that_is_none_in_c_is_refused(tmp_path, policy, meta, name):
+    with pytest.raises(ConfigError, match="no name of a function in C"):
+        to_c(policy, tmp_path / "policy.h", meta, name)
+
+
+def test_without_onnx_the_way_to_it_is_told(tmp_path, policy, meta, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ImportError, match=r"pip install 'crazysim\[onnx\]'"):
+        to_onnx(policy, tmp_path / "policy.onnx", meta)
