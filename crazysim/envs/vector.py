@@ -14,6 +14,7 @@ from jax import Array
 
 from crazysim.envs.env import DroneEnv, Env, EnvState
 from crazysim.envs.registry import TASKS, make
+from crazysim.envs.rollout import bare
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError
 from crazysim.sim.settings import as_mask, member
@@ -106,7 +107,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         else:
             number = seed if seed is not None else int(self.np_random.integers(2**31))
             state = self._begin(jax.random.key(int(number)))
-        self._carried, self._told = _bare(state), self._tell(state)
+        self._carried, self._told = _unseen(state), self._tell(state)
         return self._told[0], self._told[2]
 
     @property
@@ -150,7 +151,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
     def _step(self, carried: EnvState, actions: Array) -> tuple[EnvState, Any]:
         state = self.env.step(carried, jnp.asarray(actions).reshape(carried.action.shape))
-        return _bare(state), self._tell(state)
+        return _unseen(state), self._tell(state)
 
     def _tell(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
         """Return observations, rewards and infos as Gymnasium has them."""
@@ -193,9 +194,9 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self.sim.close()
 
 
-def _bare(state: EnvState) -> EnvState:
+def _unseen(state: EnvState) -> EnvState:
     """Return a state without what no step reads."""
-    return state.replace(obs={}, reward=None, info={})
+    return bare(state).replace(obs={})
 
 
 class _Advance:

@@ -47,7 +47,9 @@ class Recipe:
 
 
 RECIPES: dict[str, Recipe] = {
-    "hover": Recipe(config={"iterations": 100}),
+    "hover": Recipe(config={"iterations": 80}),
+    "recover": Recipe(config={"iterations": 300}),
+    "race": Recipe(n_worlds=4096, config={"iterations": 600, "entropy": 0.01, "init_std": 0.7}, evaluate_every=60),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 160}),
 }
 """What is known to work, by task; every other task begins with ``Recipe()``."""
@@ -183,6 +185,7 @@ def train(
         rounds = int(learner.iteration)
         seconds = before + time.perf_counter() - begin
         point = {"round": rounds, "env_steps": rounds * per_round, "seconds": seconds, **figures}
+        point["compile_seconds"] = compile_s
         curve.append(point)
         save_policy(folder / POLICY, learner.as_policy(), base, settings)
         (folder / CURVE).write_text(json.dumps(curve, indent=1))
@@ -203,7 +206,6 @@ def train(
         say(f"interrupted after round {int(learner.iteration)}; its checkpoint is {path}; --resume goes on from there")
         raise
     point = keep(learner)
-    point["compile_seconds"] = compile_s
     say(
         f"success {point['success']:.1%} of {evaluation_worlds:,} held-out starts (error below "
         f"{base.task.tolerance:g} for the last {base.task.hold:g} s), mean error {point['error']:.4f}, crashed "

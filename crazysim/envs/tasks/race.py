@@ -381,13 +381,13 @@ def way(pos: Array) -> Array:
 
 
 def dense(data: SimData, action: Array, last_action: Array) -> Array:
-    """Twice the way gained, m, and 2 for each gate, less what is spent on turning and jerky actions; -5 if disabled."""
+    """Twice the way gained, m, and 2 for each gate, less what is spent on turning and jerky actions; -2 if disabled."""
     record = race_of(data)
     spin = jnp.sum(jnp.square(data.states.ang_vel), axis=-1)
     jerk = jnp.sum(jnp.square(action - last_action), axis=-1)
     gained = record.to_go_before - to_go(data)
     gates = record.passed - record.passed_before
-    paid = 2.0 * gained + 2.0 * gates - 0.001 * spin - 0.01 * jerk - 5.0 * record.disabled
+    paid = 2.0 * gained + 2.0 * gates - 0.001 * spin - 0.01 * jerk - 2.0 * record.disabled
     return jnp.where(record.out_before, 0, paid)
 
 
