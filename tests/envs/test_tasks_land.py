@@ -112,7 +112,7 @@ def test_a_moving_pad_moves_in_the_data_at_its_speed(moving):
 
 
 def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes():
-    env = environment(2, speed=0.3, seconds=3.0)
+    env = environment(2, speed=SPEED, seconds=3.0)
     spawn = env.task.spawn
 
     def above(data, keys):

@@ -99,7 +99,7 @@ def test_rewards_count_way_gates_and_crashes_once(raced):
     moved = 2.0 * 0.02  # m in one step, to the gate at twice a metre
     np.testing.assert_allclose(reward[world["not there yet"]], 2 * moved, atol=0.01)
     assert reward[world["forwards"]] > 1.9
-    assert reward[world["obstacle"]] < -4.9
+    assert reward[world["obstacle"]] < -1.9
     sparse = np.asarray(task.sparse(after.data, None, None))[:, 0]
     assert sparse[world["forwards"]] == 1
     assert sparse[world["obstacle"]] == -1
