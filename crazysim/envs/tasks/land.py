@@ -109,8 +109,8 @@ def land(sim: SimulationWithScene, speed: float = 0.0, radius: float = RADIUS, s
         """Tell at the first touch whether it is a landing."""
         own, s, report = data.plugins[NAME], data.states, contacts(data)
         pos, vel = pad(data, data.core.steps + 1)
-        assert report.objects is not None
-        assert report.floor is not None
+        if report.objects is None or report.floor is None:
+            raise TypeError("report.objects, report.floor: None, where the kind has one")
         mine = np.arange(n_drones) == data.core.drone_id
         on_pad, elsewhere = jnp.any(report.objects & mine), jnp.any(report.objects & ~mine) | report.floor
         apart, past = s.pos - pos, s.vel - vel
