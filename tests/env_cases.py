@@ -6,6 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from crazysim.envs import TASKS, make
 from crazysim.envs.wrappers import Wrapper
@@ -69,6 +70,7 @@ def obs_of(state, mask):
     return jax.tree.map(lambda x: x[mask], state.obs)
 
 
-def entries():
-    """Return the names of all tasks."""
-    return list(TASKS)
+def entries(makers_once=False):
+    """Return the names of all tasks, or one for each function that makes them, each with a worker of its own."""
+    names = {TASKS[name].maker: name for name in reversed(TASKS)}.values() if makers_once else TASKS
+    return [pytest.param(name, marks=pytest.mark.xdist_group(f"env {name}")) for name in names]

@@ -21,7 +21,7 @@ ENDS = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
 
 
-@pytest.fixture(scope="module", params=[pytest.param(n, marks=pytest.mark.xdist_group(f"env {n}")) for n in entries()])
+@pytest.fixture(scope="module", params=entries())
 def name(request):
     return request.param
 
@@ -237,6 +237,7 @@ def test_a_world_that_is_lost_ends_alone(env, begun):
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((after.obs, after.reward, after.info["error"])))
 
 
+@pytest.mark.parametrize("name", entries(makers_once=True), indirect=True)
 def test_the_gradient_of_the_reward_is_finite(name, begun, flown):
     """Law 7, for actions and states, at the beginning of an episode and where random flight leads.
 
