@@ -91,7 +91,7 @@ def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
         return -gains.mean(), (state, raw, figures)
 
     grads, (state, raw, figures) = jax.grad(loss, has_aux=True)(learner.policy)
-    norm = optax.global_norm(grads)
+    norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
     updates, optimizer = _optimizer(config).update(grads, learner.optimizer, learner.policy)
     new = (optax.apply_updates(learner.policy, updates), optimizer)
     policy, optimizer = jax.tree.map(

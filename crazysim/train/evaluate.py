@@ -11,13 +11,25 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.envs.env import Env
+from crazysim.pytree import PyTree, static
 
 HELD_OUT = 0x5EED
 """Seed of the starts that policies are judged by; training seeds are folded away from it."""
 
 
+class _Fixed(PyTree):
+    """A policy that is a function of its own, and nothing to be traced."""
+
+    fn: Callable[[Any], Array] = static()
+    """Observations to actions."""
+
+    def __call__(self, obs: Any) -> Array:
+        """Return the actions."""
+        return self.fn(obs)
+
+
 @partial(jax.jit, static_argnames=("env",))
-def fly(env: Env, policy: Callable[[Any], Array], key: Array) -> dict[str, Array]:
+def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
     """Return what one episode of every world gives.
 
     Returns:
@@ -50,7 +62,7 @@ def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None)
 
     Args:
         env: The environment, without automatic resets; each world is one start.
-        policy: Observations to actions.
+        policy: Observations to actions: what training gave, or any function.
         key: Of the starts; None for those that are held out.
 
     Returns:
@@ -58,7 +70,9 @@ def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None)
         drones succeeded), ``error`` (mean over the last ``task.hold`` seconds of what did not crash, m; at the
         end alone of a task that tells when it is done), ``reward`` (mean sum of an episode).
     """
-    flown = fly(env, policy, jax.random.key(HELD_OUT) if key is None else key)
+    flown = fly(
+        env, policy if isinstance(policy, PyTree) else _Fixed(policy), jax.random.key(HELD_OUT) if key is None else key
+    )
     last = max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
     over = flown["over"][-1]
     settled = jnp.all(flown["error"][-last:] < env.task.tolerance, axis=0) & ~over[:, None]

@@ -1,0 +1,213 @@
+"""Trainings as runs: they learn, resume bit for bit, refuse what does not fit, and say where they are."""
+
+import dataclasses
+import json
+import re
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError
+from crazysim.__main__ import main
+from crazysim.envs import AutoReset, DroneEnv, make
+from crazysim.errors import UnknownNameError
+from crazysim.train import apg, checkpoint, ppo
+from crazysim.train import run as runs
+from crazysim.train.evaluate import evaluate
+from crazysim.train.run import CHECKPOINT, POLICY, Settings, load_policy, train
+
+SMALL = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (16, 16)}
+
+
+def settings(iterations=4, **changes):
+    config = {**SMALL, "iterations": iterations}
+    given = {"task": "hover", "n_worlds": 8, "options": {"seconds": 0.4}, "config": config} | changes
+    return Settings.create(**given)
+
+
+def quiet(*_):
+    pass
+
+
+def trained(folder, chosen, **options):
+    return train(chosen, folder, evaluation_worlds=8, say=quiet, progress=False, **options)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run of four rounds without an interruption."""
+    folder = tmp_path_factory.mktemp("run") / "whole"
+    return trained(folder, settings())
+
+
+def frames(path):
+    """Return a film's pictures. (n, height, width, 3)"""
+    import imageio_ffmpeg
+
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-vf", "scale=480:360", "-"]
+    ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
+    done = subprocess.run([ffmpeg, "-loglevel", "error", "-i", str(path), *raw], capture_output=True, check=True)
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, 360, 480, 3).astype(int)
+
+
+def arrays(folder):
+    with np.load(folder / CHECKPOINT) as file:
+        return {name: file[name] for name in file.files if name != checkpoint.META}
+
+
+def test_an_interrupted_run_goes_on_bit_for_bit(whole, tmp_path, monkeypatch):
+    """Law of resuming: an interrupt after two of four rounds leaves what the whole run has after four."""
+    shown, real = [0], runs._bar
+
+    def interrupting(*args):
+        class Bar:
+            def __enter__(self):
+                return self.show
+
+            def __exit__(self, *_):
+                return False
+
+            def show(self, *_):
+                shown[0] += 1
+                if shown[0] == 2:
+                    raise KeyboardInterrupt
+
+        return Bar()
+
+    said = []
+    monkeypatch.setattr(runs, "_bar", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        train(settings(), tmp_path, evaluation_worlds=8, say=said.append, progress=False)
+    assert str(tmp_path / CHECKPOINT) in said[-1]
+    assert "--resume" in said[-1]
+    monkeypatch.setattr(runs, "_bar", real)
+    trained(tmp_path, settings(), resume=True)
+    mine, others = arrays(tmp_path), arrays(whole.folder)
+    assert mine.keys() == others.keys()
+    for name, x in mine.items():
+        np.testing.assert_array_equal(x, others[name], err_msg=name)
+    assert [p["round"] for p in json.loads((tmp_path / "curve.json").read_text())][-1] == 4
+
+
+def test_rounds_change_the_policy_and_seeds_differ(whole, tmp_path):
+    other = trained(tmp_path, settings(seed=1))
+    first, second = (jax.tree.leaves(r.policy.layers) for r in (whole, other))
+    assert all(np.any(a != b) for a, b in zip(first[::2], second[::2], strict=True))
+
+
+def test_what_does_not_fit_is_refused_with_what_differs(whole, tmp_path):
+    with pytest.raises(ConfigError, match=r"there is a run in .* already.*--resume.*--out"):
+        trained(whole.folder, settings())
+    with pytest.raises(ConfigError, match="made with seed = 0, and now it is 5"):
+        trained(whole.folder, settings(seed=5), resume=True)
+    with pytest.raises(ConfigError, match="made with config"):
+        trained(whole.folder, settings(iterations=9), resume=True)
+    with pytest.raises(ConfigError, match=r"no checkpoint.*crazysim train"):
+        trained(tmp_path / "nothing", settings(), resume=True)
+    with pytest.raises(UnknownNameError, match="algorithm 'sac' does not exist; there are ppo, apg"):
+        settings(algorithm="sac")
+    with pytest.raises(UnknownNameError, match="task 'juggle' does not exist; there are hover"):
+        settings(task="juggle")
+    with pytest.raises(ConfigError, match="ppo has no setting learning_speed; it has iterations"):
+        settings(config={"learning_speed": 1})
+
+
+def test_a_checkpoint_of_another_version_or_of_rubbish_is_refused(whole, tmp_path):
+    meta = checkpoint.read_meta(whole.folder / CHECKPOINT)
+    learner = {"x": np.zeros(2, np.float32)}
+    checkpoint.save(tmp_path / CHECKPOINT, learner, meta | {"crazysim": "0.0.1"})
+    with pytest.raises(ConfigError, match=r"of crazysim 0\.0\.1, and this is"):
+        trained(tmp_path, settings(), resume=True)
+    (tmp_path / POLICY).write_bytes(b"nothing")
+    with pytest.raises(ConfigError, match="is no checkpoint of crazysim"):
+        load_policy(tmp_path)
+    with pytest.raises(ConfigError, match="holds other arrays"):
+        checkpoint.load(tmp_path / CHECKPOINT, {"y": np.zeros(2, np.float32)})
+    with pytest.raises(ConfigError, match=r"holds \['x'\] as float32 \(2,\); needed is float32 \(3,\)"):
+        checkpoint.load(tmp_path / CHECKPOINT, {"x": np.zeros(3, np.float32)})
+
+
+def test_a_policy_comes_back_as_it_was(whole):
+    policy, chosen, meta = load_policy(whole.folder)
+    assert chosen == settings()
+    assert sum(meta["observations"].values()) == policy.layers[0][0].shape[0]
+    for a, b in zip(jax.tree.leaves(policy), jax.tree.leaves(whole.policy), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_evaluation_judges_by_metres_and_seconds():
+    """A policy of zeros hovers where it began, and so fails unless its goal is there."""
+    env = make("hover", 16, seconds=2.0, reach=1.0)
+    idle = lambda obs: jnp.zeros((16, 1, 4))  # noqa: E731
+    found = evaluate(env, idle)
+    assert found["success"] == 0
+    assert 0.3 < found["error"] < 3
+    assert found["crashed"] < 1
+    easy = make("hover", 16, seconds=2.0, reach=1e-3, tolerance=2.0)
+    assert evaluate(easy, idle)["success"] == 1
+
+
+def test_ppo_finds_the_action_that_pays():
+    """Where half a unit of each action pays most, thirty rounds bring the policy there from zero."""
+    base = make("hover", 128, freq=500, seconds=0.1)
+    pays = dataclasses.replace(base.task, reward=lambda data, action, last: -jnp.sum((action - 0.5) ** 2, axis=-1))
+    env = AutoReset(DroneEnv(base.sim, pays, freq=500))
+    config = ppo.Config(iterations=30, n_steps=16, minibatches=4, hidden=(16,), init_std=0.3, discount=0.5)
+    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
+    assert np.abs(learner.as_policy()(learner.env.obs)).max() < 0.1
+    for _ in range(config.iterations):
+        learner, _ = ppo.iterate(learner, env, config)
+    action = np.asarray(learner.as_policy()(learner.env.obs))
+    assert np.abs(action.mean(axis=(0, 1)) - 0.5).max() < 0.1
+    assert float(jnp.exp(learner.log_std).max()) < 0.3
+
+
+def test_analytic_gradients_follow_the_eight():
+    """Sixty gradients of 32 worlds more than halve the distance from the trajectory."""
+    config = apg.Config(iterations=60)
+    env = make("track", 32)
+    learner = jax.jit(apg.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
+    errors = []
+    for _ in range(config.iterations):
+        learner, figures = apg.iterate(learner, env, config)
+        errors.append(float(figures["error"]))
+        assert np.isfinite(float(figures["gradient"]))
+    assert np.mean(errors[-5:]) < 0.5 * np.mean(errors[:5])
+
+
+def test_the_command_line_trains_judges_and_exports(tmp_path, capsys):
+    folder = str(tmp_path / "hover")
+    few = [f"{k}={json.dumps(v)}" for k, v in SMALL.items()]
+    done = main(["train", "hover", "--worlds", "8", "--iterations", "2", "--set", "seconds=0.4", "--out", folder,
+                 "--no-film", "--config", *few])  # fmt: skip
+    out = capsys.readouterr().out
+    assert done == 0
+    assert re.search(r"success \d+\.\d% of 1,000 held-out starts", out)
+    assert (tmp_path / "hover" / "curve.png").stat().st_size > 5000
+    assert main(["evaluate", folder, "--worlds", "8"]) == 0
+    assert "hover, 8 starts: success" in capsys.readouterr().out
+    assert main(["export", folder, "--c", str(tmp_path / "p.h")]) == 0
+    assert "void policy(" in (tmp_path / "p.h").read_text()
+    assert main(["export", folder]) == 2
+    assert "--onnx FILE, --c FILE" in capsys.readouterr().err
+    assert main(["train", "list"]) == 0
+    assert "reaching a random point and hovering" in capsys.readouterr().out
+    assert main(["train", "hover", "--set", "secnds=1", "--out", str(tmp_path / "x")]) == 2
+    assert "did you mean seconds?" in capsys.readouterr().err
+
+
+def test_a_film_shows_the_drone_and_its_goal(whole, tmp_path):
+    """The goal's green is in the picture, and drones move from the first frame to the last."""
+    from crazysim.train.show import TARGET_COLOR, film
+
+    env = settings().environment(2)
+    path = tmp_path / "film.gif"
+    assert film(env, whole.policy, path, worlds=1) == 11
+    pictures = frames(path)
+    green = (pictures[0][..., 1] - pictures[0][..., 0] > 40) & (pictures[0][..., 1] - pictures[0][..., 2] > 20)
+    assert TARGET_COLOR[1] > TARGET_COLOR[0]
+    assert green.sum() > 20
+    assert np.abs(pictures[-1] - pictures[0]).max() > 60
