@@ -176,8 +176,12 @@ class DroneParallelEnv(ParallelEnv):
 
     def _of_agents(self, tree: Any) -> dict[str, Any]:
         """Return for each agent what is its own, (1, n_drones, ...), and what the world has as a whole, (1,)."""
-        rows = enumerate(self.possible_agents)
-        return {agent: jax.tree.map(lambda x, i=i: x[0, i] if x.ndim > 1 else x[0], tree) for i, agent in rows}
+
+        def own(x: Any, i: int) -> Any:
+            # A copy: what comes from JAX cannot be written to.
+            return (x[0, i] if x.ndim > 1 else x[0]).copy()
+
+        return {agent: jax.tree.map(lambda x, i=i: own(x, i), tree) for i, agent in enumerate(self.possible_agents)}
 
 
 def make_parallel(task: str, render_mode: str | None = None, **options: Any) -> DroneParallelEnv:

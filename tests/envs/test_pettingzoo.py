@@ -1,6 +1,6 @@
 """PettingZoo's own tests of a parallel environment, and what they do not ask."""
 
-import subprocess
+import importlib
 import sys
 
 import numpy as np
@@ -57,6 +57,7 @@ def test_every_drone_has_its_own(env):
     obs, info = env.reset(seed=0)
     assert env.agents == env.possible_agents == ["drone_0", "drone_1"]
     assert all(obs[agent] in env.observation_space(agent) for agent in env.agents)
+    assert all(x.flags.writeable for agent in env.agents for x in obs[agent].values())
     assert not np.allclose(obs["drone_0"]["pos"], obs["drone_1"]["pos"])
     state = env.now
     for i, agent in enumerate(env.agents):
@@ -124,7 +125,15 @@ def test_pictures(functional):
     env.close()
 
 
-def test_without_pettingzoo_the_way_to_it_is_told():
-    code = "import sys; sys.modules['pettingzoo'] = None; import crazysim.envs.pettingzoo"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "ImportError: crazysim.envs.pettingzoo needs PettingZoo; pip install 'crazysim[pettingzoo]'" in done.stderr
+@pytest.mark.parametrize(
+    ("module", "package", "way"),
+    [
+        ("crazysim.envs.pettingzoo", "pettingzoo", r"needs PettingZoo; pip install 'crazysim\[pettingzoo\]'"),
+        ("crazysim.envs.sb3", "stable_baselines3", "needs Stable-Baselines3; pip install stable-baselines3"),
+    ],
+)
+def test_without_a_package_the_way_to_it_is_told(monkeypatch, module, package, way):
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    with pytest.raises(ImportError, match=way):
+        importlib.import_module(module)
