@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from measure import digits, engine_of, medians, report
 
 import crazysim.envs as envs
+from crazysim.envs.rollout import bare
 from crazysim.train.networks import Policy, RunningStats, flatten, init_mlp
 
 SIZES = {"cpu": (1024, 16384), "gpu": (4096, 65536, 1048576)}
@@ -46,20 +47,21 @@ def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int) 
     policy = jax.device_put(policy, place)
 
     def flown(act: Any) -> Any:
-        def step(carry: Any, _: None) -> Any:
+        def run(carry: Any) -> Any:
             state, key = carry
             key, now = jax.random.split(key)
-            state = env.step(state, act(state, now))
-            return (state, key), (state.reward.mean(), state.done.mean())
+            figures = lambda state: (state.reward.mean(), state.done.mean())  # noqa: E731
+            state, kept = envs.rollout(env, state, act, now, n_steps, figures)
+            return (state, key), kept
 
-        return jax.jit(lambda carry: jax.lax.scan(step, carry, length=n_steps))
+        return jax.jit(run)
 
     acts = {
         "random": lambda state, key: jax.random.uniform(key, state.action.shape, minval=-0.3, maxval=0.3),
         "policy": lambda state, key: policy(state.obs) + 0.1 * jax.random.normal(key, state.action.shape),
     }
     for name, act in acts.items():
-        carry = (start, jax.device_put(jax.random.key(2), place))
+        carry = (bare(start), jax.device_put(jax.random.key(2), place))
         begin = time.perf_counter()
         run = flown(act).lower(carry).compile()
         compile_s = time.perf_counter() - begin

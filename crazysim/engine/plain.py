@@ -86,7 +86,10 @@ def _settle(axes: Axes, stage: Stage, before: SimData, after: SimData, by_compon
 
 
 def build_reset(pipeline: Pipeline) -> ResetFn:
-    """Return ``reset(data, default_data, mask=None) -> data``, pure, for the stages as they are now."""
+    """Return ``reset(data, default_data, mask=None) -> data``, pure, for the stages as they are now.
+
+    What a compiled call returns as it came is copied: for use within another, ``reset.__wrapped__`` is not compiled.
+    """
     stages = tuple(pipeline.items())
 
     @jax.jit

@@ -6,6 +6,7 @@ Importing this module registers every task with Gymnasium, as ``crazysim/Hover-v
 from crazysim.envs.actions import Actions, actions_of
 from crazysim.envs.env import DroneEnv, Env, EnvState, Task
 from crazysim.envs.registry import TASKS, make
+from crazysim.envs.rollout import rollout
 from crazysim.envs.vector import DroneVectorEnv, register
 from crazysim.envs.wrappers import (
     ActionDelay,
@@ -38,4 +39,5 @@ __all__ = [
     "Task",
     "actions_of",
     "make",
+    "rollout",
 ]

@@ -100,7 +100,8 @@ def actions_of(airframe: Airframe, params: SimParams, control: Control, tilt: fl
         arms = np.array([airframe.arm, airframe.arm, float(airframe.value("controller.thrust2torque", ()))])
         most = each / 2 * arms * np.abs(airframe.mixing_matrix).sum(axis=-1)
         return Actions(np.array([hover, 0, 0, 0]), np.array([span, *most / 4]), control)
-    assert isinstance(params, first_principles.Params)  # fitted models take no rotor commands
+    if isinstance(params, fitted.Params):
+        raise ConfigError("fitted models take no rotor commands; use dynamics='first_principles'")
     centre = np.asarray(first_principles.hover_rotor_vel(params))
     return Actions(centre, np.broadcast_to(np.asarray(params.rotor_vel_max), centre.shape) - centre, control)
 

@@ -90,16 +90,30 @@ class EnvState(PyTree):
 class Env(Protocol):
     """What every environment offers, wrapped or not. All three functions are pure, for jit, scan, vmap and grad."""
 
-    sim: Sim
-    """The simulation it was made from; it is drawn with, and does not advance."""
-    task: Task
-    """What is to be done."""
-    actions: Actions
-    """What an action means."""
-    n_substeps: int
-    """Physics steps in one environment step."""
-    max_steps: int
-    """Environment steps in one episode."""
+    @property
+    def sim(self) -> Sim:
+        """The simulation it was made from; it is drawn with, and does not advance."""
+        ...
+
+    @property
+    def task(self) -> Task:
+        """What is to be done."""
+        ...
+
+    @property
+    def actions(self) -> Actions:
+        """What an action means."""
+        ...
+
+    @property
+    def n_substeps(self) -> int:
+        """Physics steps in one environment step."""
+        ...
+
+    @property
+    def max_steps(self) -> int:
+        """Environment steps in one episode."""
+        ...
 
     def reset(self, key: Array) -> EnvState:
         """Return all worlds at the beginning of an episode."""
@@ -141,7 +155,7 @@ class DroneEnv:
         self.actions = actions_of(sim.airframe, sim.data.params, sim.control) if actions is None else actions
         self.n_substeps = sim.freq // freq
         self.max_steps = round(task.seconds * freq)
-        self._step, self._reset = sim.build_step_fn(), sim.build_reset_fn()
+        self._step, self._reset = sim.build_step_fn(), sim.build_reset_fn().__wrapped__
         self._zeros = self._step.zeros(sim.data)
         self._default = _compact(sim.default_data)
 
@@ -199,7 +213,7 @@ class DroneEnv:
         data = COMMANDS[self.actions.control](self.task.mark(state.data), self.actions.command(action))
         data = self._step(data, self.n_substeps, self._zeros)
         lost = data.core.nonfinite[:, 0]
-        reward = jnp.asarray(self.task.reward(data, action, state.action), state.reward.dtype)
+        reward = jnp.asarray(self.task.reward(data, action, state.action), action.dtype)
         return state.replace(
             data=data,
             obs=observed(self.task, data),

@@ -10,10 +10,13 @@ from typing import Any
 
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv, Task
+from crazysim.envs.tasks.avoid import avoid
 from crazysim.envs.tasks.hover import hover
+from crazysim.envs.tasks.land import land
 from crazysim.envs.tasks.race import race
 from crazysim.envs.tasks.reach_vel import reach_vel
 from crazysim.envs.tasks.recover import recover
+from crazysim.envs.tasks.swarm import swarm
 from crazysim.envs.tasks.track import track
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.sim.sim import Sim
@@ -38,8 +41,11 @@ TASKS: dict[str, Entry] = {
     "reach_vel": Entry(reach_vel, "crazysim/ReachVel-v0"),
     "recover": Entry(recover, "crazysim/Recover-v0"),
     "track": Entry(track, "crazysim/Track-v0"),
+    "land": Entry(land, "crazysim/Land-v0"),
     "race": Entry(race, "crazysim/Race-v0"),
     "multi_race": Entry(race, "crazysim/MultiRace-v0", n_drones=2),
+    "avoid": Entry(avoid, "crazysim/Avoid-v0"),
+    "swarm": Entry(swarm, "crazysim/Swarm-v0", n_drones=4),
 }
 """Every task, by name."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -14,9 +14,11 @@ from jax import Array
 
 from crazysim.envs.env import DroneEnv, Env, EnvState
 from crazysim.envs.registry import TASKS, make
+from crazysim.envs.rollout import bare
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError
 from crazysim.sim.settings import as_mask, member
+from crazysim.sim.stage import with_leaves
 
 RENDER_MODES = ("rgb_array", "human")
 """What ``render_mode`` may be besides None."""
@@ -68,9 +70,11 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self._single = env.sim.n_drones == 1
         self._begin = jax.jit(self.env.reset)
         self._again = jax.jit(self.env.restart)
-        self._advance = jax.jit(self._step)
-        self.state: EnvState | None = None
+        self._advance = _Advance(self._step)
+        self._carried: EnvState | None = None
+        self._told: Any = None
         shapes = jax.eval_shape(self.env.reset, jax.random.key(0))
+        self._of_drone = {k for k, v in shapes.info.items() if k != "final_obs" and v.ndim > 1}
         self.single_observation_space = gymnasium.spaces.Dict(
             {name: self._box(x, np.inf) for name, x in shapes.obs.items()}
         )
@@ -95,15 +99,28 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
                 f"the seed is {seed!r}; one integer seeds all worlds, each of which draws its own numbers"
             )
         super().reset(seed=None if seed is None else int(seed))
-        if mask is not None and self.state is not None:
+        before = self.state
+        if mask is not None and before is not None:
             if seed is not None:
                 raise ConfigError("a seed is one for all worlds; reset them all with it, or leave it out with a mask")
-            state = self._again(self.state, mask)
+            state = self._again(before, mask)
         else:
             number = seed if seed is not None else int(self.np_random.integers(2**31))
             state = self._begin(jax.random.key(int(number)))
-        self.state = state
-        return self._of_drones(state.obs), self._info(state)
+        self._carried, self._told = _unseen(state), self._tell(state)
+        return self._told[0], self._told[2]
+
+    @property
+    def state(self) -> EnvState | None:
+        """The functional environment's state, each drone with the reward of its world; None before the first reset."""
+        if self._carried is None:
+            return None
+        obs, reward, info = self._told
+        n = (self.num_envs, self.sim.n_drones)
+        info = {k: v for k, v in info.items() if not k.endswith("final_obs")}
+        info = {k: v.reshape(*n, *v.shape[1:]) if self._single and k in self._of_drone else v for k, v in info.items()}
+        obs = {k: v.reshape(*n, -1) for k, v in obs.items()}
+        return self._carried.replace(obs=obs, reward=jnp.broadcast_to(reward[:, None], n), info=info)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Advance all worlds.
@@ -115,7 +132,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             ConfigError: If the environment was not reset, or actions of the host are not finite.
             ValueError: If they have another shape.
         """
-        if self.state is None:
+        if self._carried is None:
             raise ConfigError("the environment must be reset before its first step: call reset()")
         if not isinstance(actions, jax.Array):
             actions = np.asarray(actions, np.float32)
@@ -126,23 +143,27 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
                 raise ConfigError(f"the action is NaN or infinite in world(s) {worlds.tolist()}")
         elif actions.shape != self.action_space.shape:
             raise ValueError(f"actions have shape {actions.shape}; needed is {self.action_space.shape}")
-        self.state, out = self._advance(self.state, actions)
-        obs, reward, terminated, truncated, info = out
+        self._carried, self._told = self._advance(self._carried, actions)
+        obs, reward, info = self._told
         if self.render_mode == "human":
             self.render()
-        return obs, reward, terminated, truncated, info
+        return obs, reward, self._carried.terminated, self._carried.truncated, info
 
-    def _step(self, state: EnvState, actions: Array) -> tuple[EnvState, Any]:
-        state = self.env.step(state, jnp.asarray(actions).reshape(state.action.shape))
+    def _step(self, carried: EnvState, actions: Array) -> tuple[EnvState, Any]:
+        state = self.env.step(carried, jnp.asarray(actions).reshape(carried.action.shape))
+        return _unseen(state), self._tell(state)
+
+    def _tell(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
+        """Return observations, rewards and infos as Gymnasium has them."""
         reward = state.reward[:, 0] if self._single else jnp.mean(state.reward, axis=1)
-        return state, (self._of_drones(state.obs), reward, state.terminated, state.truncated, self._info(state))
+        return self._of_drones(state.obs), reward, self._info(state)
 
     def _of_drones(self, tree: Any) -> Any:
         """Return arrays of drones without the drones' axis where there is one drone."""
         return jax.tree.map(lambda x: x[:, 0], tree) if self._single else tree
 
     def _info(self, state: EnvState) -> dict[str, Any]:
-        info = {k: self._of_drones(v) if v.ndim > 1 else v for k, v in state.info.items() if k != "final_obs"}
+        info = {k: self._of_drones(v) if k in self._of_drone else v for k, v in state.info.items() if k != "final_obs"}
         if "final_obs" in state.info:
             info |= {"final_obs": self._of_drones(state.info["final_obs"]), "_final_obs": state.done}
         return info
@@ -171,6 +192,53 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         """Close the window."""
         del kwargs
         self.sim.close()
+
+
+def _unseen(state: EnvState) -> EnvState:
+    """Return a state without what no step reads."""
+    return bare(state).replace(obs={})
+
+
+class _Advance:
+    """A compiled ``fn(state, actions) -> state, out`` that returns what of the state it writes, and copies nothing.
+
+    What a compiled call returns as it came is copied, and an array costs more than the arithmetic on it here.
+    """
+
+    def __init__(self, fn: Callable[[EnvState, Any], tuple[EnvState, Any]]):
+        """Take the function."""
+        self._fn, self._key = fn, None
+        self._compiled: Any = None
+        self._written: list[int] = []
+        self._out: Any = None
+
+    def __call__(self, state: EnvState, actions: Any) -> tuple[EnvState, Any]:
+        """Return the state after the actions, and what else there is."""
+        leaves, treedef = jax.tree.flatten(state)
+        key = (treedef, [(x.shape, x.dtype) for x in leaves])
+        if key != self._key:
+            self._prepare(leaves, treedef, actions)
+            self._key = key
+        values = self._compiled(leaves, actions)
+        n = len(self._written)
+        after = with_leaves(leaves, self._written, values[:n])
+        return treedef.unflatten(after), self._out.unflatten(values[n:])
+
+    def _prepare(self, leaves: list[Any], treedef: Any, actions: Any) -> None:
+        """Find out what is written, and compile that."""
+
+        def flat(leaves: list[Any], actions: Any) -> list[Any]:
+            state, out = self._fn(treedef.unflatten(leaves), actions)
+            after, same = jax.tree.flatten(state)
+            if same != treedef:
+                raise ConfigError(f"a step changed the structure of the state: {treedef} became {same}")
+            values, self._out = jax.tree.flatten(out)
+            return [*after, *values]
+
+        jaxpr = jax.make_jaxpr(flat)(leaves, actions).jaxpr
+        self._written = [i for i in range(len(leaves)) if jaxpr.outvars[i] is not jaxpr.invars[i]]
+        kept = [*self._written, *range(len(leaves), len(jaxpr.outvars))]
+        self._compiled = jax.jit(lambda leaves, actions: [flat(leaves, actions)[i] for i in kept])
 
 
 def make_vector(

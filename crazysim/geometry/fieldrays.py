@@ -93,7 +93,8 @@ def _walls(shape: Shape, o: Vector, d: Vector) -> Hit:
 
 def _surface(shape: Shape, o: Vector, d: Vector) -> Hit:
     """Return where rays meet the triangles, by going through the cells that they pass over, in order."""
-    assert shape.heights is not None
+    if shape.heights is None:
+        raise TypeError("shape.heights: None, where the kind has one")
     n_rows, n_columns = shape.heights.shape
     heights = jnp.asarray(shape.heights, o.x.dtype)
     side_x, side_y = spacing(shape)

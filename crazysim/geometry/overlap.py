@@ -95,8 +95,8 @@ def _best_of(tried: Best, best: Best) -> Best:
 def _best_face(pair: Pair) -> Best:
     """Return the best of the normals of a mesh."""
     normals, offsets = pair.other.normals, pair.other.offsets
-    assert normals is not None
-    assert offsets is not None
+    if normals is None or offsets is None:
+        raise TypeError("normals, offsets: None, where the kind has one")
     x, y, z = (jnp.asarray(column, pair.place.x.dtype) for column in normals.T)
 
     def products(v: Vector) -> Array:

@@ -125,10 +125,8 @@ def _mesh(shape: Shape, point: Array) -> Array:
 
     Where the nearest triangle is, a small move of the point does not move what is nearest on it, to first order.
     """
-    assert shape.vertices is not None
-    assert shape.faces is not None
-    assert shape.normals is not None
-    assert shape.offsets is not None
+    if shape.vertices is None or shape.faces is None or shape.normals is None or shape.offsets is None:
+        raise TypeError("shape.vertices, shape.faces, shape.normals, shape.offsets: None, where the kind has one")
     place = vector(point)
     inside = plane_distance(shape.normals, shape.offsets, place)
     corners = [Vector(*jnp.asarray(shape.vertices[shape.faces[:, k]].T, point.dtype)) for k in range(3)]

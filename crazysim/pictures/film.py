@@ -143,7 +143,7 @@ class Film:
             for _ in range(n_frames):
                 self._ffmpeg.stdin.write(pixels.tobytes())
         except OSError:
-            self._end()
+            self._end(self._ffmpeg)
         self.n_frames += n_frames
         if self._bar is not None:
             self._bar.update(n_frames)
@@ -158,13 +158,12 @@ class Film:
         if self._bar is not None:
             self._bar.close()
         if self._ffmpeg is not None:
-            self._end()
+            self._end(self._ffmpeg)
         elif not self.n_frames:
             raise ConfigError(f"nothing was recorded, so there is no {self.path}; call film.add(sim) between steps")
 
-    def _end(self) -> None:
-        ffmpeg, self._ffmpeg = self._ffmpeg, None
-        assert ffmpeg is not None
+    def _end(self, ffmpeg: subprocess.Popen[bytes]) -> None:
+        self._ffmpeg = None
         with contextlib.suppress(OSError):
             ffmpeg.stdin.close()
         message = ffmpeg.stderr.read().decode(errors="replace").strip()

@@ -12,6 +12,7 @@ import optax
 from jax import Array
 
 from crazysim.envs.env import Env, EnvState
+from crazysim.envs.rollout import bare
 from crazysim.pytree import PyTree
 from crazysim.train.networks import Layers, Policy, RunningStats, flatten, init_mlp, mlp
 
@@ -64,7 +65,7 @@ class Learner(PyTree):
     key: Array
     """Random key."""
     env: EnvState
-    """Where the worlds are."""
+    """Where the worlds are, without reward and info."""
     iteration: Array
     """Rounds done. ()"""
 
@@ -100,7 +101,7 @@ def init(env: Env, config: Config, key: Array) -> Learner:
     log_std = jnp.full(n_actions, jnp.log(config.init_std), policy[0][0].dtype)
     optimizer = _optimizer(config).init((policy, log_std, value))
     stats = RunningStats.create(n_obs).update(flatten(state.obs))
-    return Learner(policy, log_std, value, optimizer, stats, key, state, jnp.int32(0))
+    return Learner(policy, log_std, value, optimizer, stats, key, bare(state), jnp.int32(0))
 
 
 @partial(jax.jit, static_argnames=("env", "config"))
@@ -119,7 +120,7 @@ def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
 def _fly(learner: Learner, env: Env, config: Config, key: Array) -> tuple[EnvState, Sample, Array, dict[str, Array]]:
     """Return where the worlds are after a round, its samples, and observations as they came."""
 
-    def step(state: EnvState, key: Array) -> tuple[EnvState, tuple[Sample, Array, Array, Array]]:
+    def step(state: EnvState, key: Array) -> tuple[EnvState, tuple[Sample, Array, Any]]:
         raw = flatten(state.obs)
         obs = learner.stats.normalize(raw)
         mean, value = jnp.tanh(mlp(learner.policy, obs)), mlp(learner.value, obs)[..., 0]
@@ -130,14 +131,16 @@ def _fly(learner: Learner, env: Env, config: Config, key: Array) -> tuple[EnvSta
         reward = state.reward + config.discount * jnp.where(out_of_time, to_come, 0.0)
         over = jnp.broadcast_to(state.done[:, None], reward.shape)
         sample = Sample(obs, action, _log_prob(mean, learner.log_std, action), value, reward, over)
-        return state, (sample, raw, state.reward, state.terminated)
+        return bare(state), (sample, raw, (state.reward.mean(), state.terminated, state.info["error"].mean()))
 
-    state, (samples, raw, reward, crashed) = jax.lax.scan(step, learner.env, jax.random.split(key, config.n_steps))
+    state, (samples, raw, (reward, crashed, error)) = jax.lax.scan(
+        step, learner.env, jax.random.split(key, config.n_steps)
+    )
     over = samples.over.any(axis=-1)
     figures = {
         "reward": reward.mean(),
         "crashed": crashed.sum() / jnp.maximum(over.sum(), 1),
-        "error": state.info["error"].mean(),
+        "error": error.mean(),
     }
     return state, samples, raw, figures
 

@@ -7,6 +7,7 @@ import itertools
 import json
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,8 +48,10 @@ class Recipe:
 
 
 RECIPES: dict[str, Recipe] = {
-    "hover": Recipe(config={"iterations": 100}),
-    "track": Recipe("apg", n_worlds=64, config={"iterations": 160}),
+    "hover": Recipe(config={"iterations": 80}),
+    "recover": Recipe(config={"iterations": 300}),
+    "race": Recipe(n_worlds=4096, config={"iterations": 600, "entropy": 0.01, "init_std": 0.7}, evaluate_every=60),
+    "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
 }
 """What is known to work, by task; every other task begins with ``Recipe()``."""
 
@@ -155,18 +158,32 @@ def train(
     env = base if algorithm is apg else AutoReset(base)
     judge = settings.environment(evaluation_worlds)
     key = jax.random.fold_in(jax.random.key(settings.seed), 1)
+    curve = []
     if resume:
         _require_same(path, settings)
-        learner = checkpoint.load(path, jax.eval_shape(lambda k: algorithm.init(env, config, k), key))
-        learner = jax.device_put(learner, base.sim.device)
         curve = json.loads((folder / CURVE).read_text())
-    else:
-        if path.exists():
-            raise ConfigError(
-                f"there is a run in {folder} already; go on with it with --resume, or choose another folder with --out"
-            )
-        learner = jax.jit(lambda k: algorithm.init(env, config, k))(jax.device_put(key, base.sim.device))
-        curve = []
+    elif path.exists():
+        raise ConfigError(
+            f"there is a run in {folder} already; go on with it with --resume, or choose another folder with --out"
+        )
+    shapes = jax.eval_shape(lambda k: algorithm.init(env, config, k), key)
+
+    def start() -> tuple[Any, dict[str, float]]:
+        if resume:
+            learner = jax.device_put(checkpoint.load(path, shapes), base.sim.device)
+        else:
+            learner = jax.jit(lambda k: algorithm.init(env, config, k))(jax.device_put(key, base.sim.device))
+        return learner, evaluate(judge, learner.as_policy())
+
+    def compile_round() -> tuple[Any, float]:
+        compiling = time.perf_counter()
+        return algorithm.iterate.lower(_placed(shapes, base.sim.device), env, config).compile(), (
+            time.perf_counter() - compiling
+        )
+
+    with ThreadPoolExecutor(2) as pool:  # each compiles for seconds, mostly on one core
+        starting, rounds = pool.submit(start), pool.submit(compile_round)
+        (learner, figures), (step, compile_s) = starting.result(), rounds.result()
     done, before = int(learner.iteration), curve[-1]["seconds"] if curve else 0.0
     per_round = settings.n_worlds * base.sim.n_drones * config.n_steps
     say(
@@ -174,21 +191,21 @@ def train(
         f"steps in {settings.n_worlds:,} worlds, {base.sim.control.value} commands, "
         f"{base.sim.explain().splitlines()[0]}" + (f"; goes on after round {done}" if done else "")
     )
-    compiling = time.perf_counter()
-    step = algorithm.iterate.lower(learner, env, config).compile()
-    compile_s = time.perf_counter() - compiling
 
-    def keep(learner: Any) -> dict[str, float]:
-        figures = evaluate(judge, learner.as_policy())
+    def keep(learner: Any, figures: dict[str, float] | None = None) -> dict[str, float]:
+        figures = figures or evaluate(judge, learner.as_policy())
         rounds = int(learner.iteration)
         seconds = before + time.perf_counter() - begin
         point = {"round": rounds, "env_steps": rounds * per_round, "seconds": seconds, **figures}
+        point["compile_seconds"] = compile_s
         curve.append(point)
         save_policy(folder / POLICY, learner.as_policy(), base, settings)
         (folder / CURVE).write_text(json.dumps(curve, indent=1))
         checkpoint.save(path, learner, _meta(settings))
         return point
 
+    if not resume:
+        keep(learner, figures)
     every = RECIPES.get(settings.task, Recipe()).evaluate_every
     try:
         with _bar(config.iterations, done, progress) as show:
@@ -203,7 +220,6 @@ def train(
         say(f"interrupted after round {int(learner.iteration)}; its checkpoint is {path}; --resume goes on from there")
         raise
     point = keep(learner)
-    point["compile_seconds"] = compile_s
     say(
         f"success {point['success']:.1%} of {evaluation_worlds:,} held-out starts (error below "
         f"{base.task.tolerance:g} for the last {base.task.hold:g} s), mean error {point['error']:.4f}, crashed "
@@ -211,6 +227,12 @@ def train(
         f"compiling"
     )
     return Result(folder, point, learner.as_policy())
+
+
+def _placed(shapes: Any, device: jax.Device) -> Any:
+    """Return shapes of arrays that are on a device."""
+    place = jax.sharding.SingleDeviceSharding(device)
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), shapes)
 
 
 def save_policy(path: Path, policy: Policy, env: DroneEnv, settings: Settings) -> None:

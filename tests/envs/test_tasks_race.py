@@ -99,7 +99,7 @@ def test_rewards_count_way_gates_and_crashes_once(raced):
     moved = 2.0 * 0.02  # m in one step, to the gate at twice a metre
     np.testing.assert_allclose(reward[world["not there yet"]], 2 * moved, atol=0.01)
     assert reward[world["forwards"]] > 1.9
-    assert reward[world["obstacle"]] < -4.9
+    assert reward[world["obstacle"]] < -1.9
     sparse = np.asarray(task.sparse(after.data, None, None))[:, 0]
     assert sparse[world["forwards"]] == 1
     assert sparse[world["obstacle"]] == -1
@@ -151,7 +151,6 @@ def test_drones_out_of_the_race_do_not_matter_to_others():
     assert np.all(np.asarray(after.reward)[1:, 0] == 0)
     assert np.linalg.norm(after.obs["drones_near"][2, 0]) > 0.04  # the one that flies on is seen by the other
     np.testing.assert_array_equal(after.obs["drones_near"][2, 1], 0)  # and does not see the one that has finished
-    assert env.task.reward(after.data, state.action, state.action).shape == (4, 2)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from crazysim import Sim, load_airframe
 from crazysim.sim.data import SimControls, create_params
 from crazysim.sim.integration import advance
 from crazysim.sim.pipeline import replace_fn
+from crazysim.sim.stage import stage
 
 FOLDER = Path(__file__).parent
 FILES = sorted(path.stem for path in FOLDER.glob("*.npz"))
@@ -63,7 +64,7 @@ def fly(stem, variant, as_the_peer=True):
     )
     if integrator == "rk4" and as_the_peer:
         deriv_fn = sim.step_pipeline["integration"].fn.keywords["deriv_fn"]
-        replace_fn(sim.step_pipeline, partial(peers_rk4, deriv_fn=deriv_fn), "integration")
+        replace_fn(sim.step_pipeline, stage("drone")(partial(peers_rk4, deriv_fn=deriv_fn)), "integration")
     step = sim.build_step_fn()
 
     def stacked(shared):

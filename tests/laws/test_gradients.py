@@ -34,7 +34,7 @@ def flight(dynamics, control, n_steps=100):
         "quat": jnp.asarray([0.02, -0.03, 0.05, 1.0]),
         "vel": jnp.asarray([0.1, 0.2, -0.1]),
         "ang_vel": jnp.asarray([0.1, -0.2, 0.1]),
-        "rotor_vel": jnp.full(n, 0.98 * hover),
+        "rotor_vel": jnp.full(n, 0.98 * hover, float),  # as what is added to it, or all is compiled twice
         "command": jnp.asarray(COMMANDS[control], dtype=float),
     }
 
@@ -58,14 +58,14 @@ def test_gradient_equals_central_differences(dynamics, control, x64):
     over a gradient of order one: 1e-6 leaves room for both.
     """
     loss, start = flight(dynamics, control)
-    value = jax.jit(loss)
-    gradient = jax.jit(jax.grad(loss))(start)
+    both = jax.jit(jax.value_and_grad(loss))  # one program for all
+    gradient = both(start)[1]
     rng = np.random.default_rng(0)
     compared = 0
     for name, x in start.items():
         direction = jnp.asarray(rng.normal(size=x.shape)) * jnp.maximum(jnp.abs(x), 0.1)
         h = 1e-6
-        ahead, behind = (value(start | {name: x + sign * h * direction}) for sign in (1, -1))
+        ahead, behind = (both(start | {name: x + sign * h * direction})[0] for sign in (1, -1))
         numeric = float(ahead - behind) / (2 * h)
         analytic = float(jnp.sum(gradient[name] * direction))
         assert np.isfinite(analytic), name

@@ -13,10 +13,13 @@ import pytest
 from cases import LEVELS, PAIRS, shared_sim, with_params, with_states
 
 from crazysim import ConfigError, Control, PyTree, Sim
+from crazysim.engine import Step
+from crazysim.engine.step import ENGINES
 from crazysim.pytree import scopes
 from crazysim.sim.data import SimData
 
 SIZES = [(n, m) for n in (1, 2, 3, 4) for m in (1, 2, 3, 4)]
+EQUAL, UNEQUAL = ([size for size in SIZES if (size[0] == size[1]) == same] for same in (True, False))
 
 
 def resized(sim, n_worlds, n_drones):
@@ -50,14 +53,17 @@ def signature(tree):
 def test_a_step_keeps_every_shape_and_type(dynamics, control):
     """Law 2: whatever the numbers of worlds and drones, equal ones included, parameters shared or one per drone."""
     sim = shared_sim(dynamics=dynamics, control=control)
-    step = sim.build_step_fn()
-    # Every size for one pair; the others, whose stages are batched alike, with equal numbers only.
-    for n_worlds, n_drones in SIZES if control == "attitude" else SIZES[::5]:
-        data = resized(sim, n_worlds, n_drones)
-        if (n_worlds + n_drones) % 2 == 0:
-            data = per_drone(data)
-        after = jax.eval_shape(lambda d: step(d, 1), data)
-        assert signature(after) == signature(data), (n_worlds, n_drones)
+    # Every size for one pair; the others, whose stages are batched alike, share them out, equal numbers included.
+    k = PAIRS.index((dynamics, control))
+    sizes = EQUAL + UNEQUAL if k == 0 else [EQUAL[k % 4], UNEQUAL[k % 12]]
+    for engine in ENGINES[:3] if k == 0 else ("plain", "lanes"):
+        step = Step(sim.step_pipeline, engine)
+        for n_worlds, n_drones in sizes if engine == "plain" else sizes[:2]:
+            data = resized(sim, n_worlds, n_drones)
+            if (n_worlds + n_drones) % 2 == 0:
+                data = per_drone(data)
+            after = jax.eval_shape(lambda d, step=step: step(d, 1), data)
+            assert signature(after) == signature(data), (engine, n_worlds, n_drones)
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)

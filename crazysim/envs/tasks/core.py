@@ -10,7 +10,10 @@ from jax.typing import ArrayLike
 from crazysim import rotation
 from crazysim.effects.core import Simulation, install
 from crazysim.pytree import PyTree, leaf
+from crazysim.scene.latch import SimulationWithScene
 from crazysim.sim.data import SimData
+from crazysim.sim.pipeline import insert_fn_before
+from crazysim.sim.stage import stage
 
 NAME = "task"
 """Name of a task's record in ``data.plugins``."""
@@ -102,3 +105,48 @@ def nearest(distance: Array, x: Array, n: int) -> Array:
         out.append(pick(x, first))
         distance = jnp.where(first[..., None] == np.arange(x.shape[-2]), jnp.inf, distance)
     return jnp.stack(out, axis=-2)
+
+
+def check_collisions(sim: SimulationWithScene) -> None:
+    """Have drones that touch each other disabled at every step, in the task's record, before its own stage.
+
+    Of drones that the record has as ``out`` nothing is noticed: they are neither disabled nor do they disable others.
+    The record needs leaves ``disabled`` and ``out``, (n_worlds, n_drones) each.
+    """
+    if sim.n_drones == 1:
+        return
+    contacts = sim.scene.contact_fn((), floor=False)
+
+    @stage("world")
+    def collide(data: SimData) -> SimData:
+        record, s = data.plugins[NAME], data.states
+        out = record.out
+        # Only for the question: each that is out is so far away that it touches nothing, and no other that is out.
+        far = 1000.0 * (1 + np.arange(len(out)))[:, None] * np.array([0.0, 0.0, 1.0])
+        elsewhere = jnp.where(out[:, None], far.astype(s.pos.dtype), s.pos)
+        hit = contacts(data.replace(states=s.replace(pos=elsewhere))).any & ~out
+        new = record.replace(disabled=record.disabled | hit)
+        return data.replace(plugins=data.plugins | {NAME: new})
+
+    insert_fn_before(sim.step_pipeline, NAME, collide, f"{NAME}_collisions")
+    sim.build_step_fn()
+
+
+def others_near(data: SimData, n: int, counts: Array | None = None) -> tuple[Array, Array]:
+    """Return where the nearest other drones are relative to each, m, and their relative velocities, m/s.
+
+    Args:
+        data: The simulation.
+        n: How many are wanted; less where there are fewer.
+        counts: Which drones are to be seen; None for all. What is not there is zero. (n_worlds, n_drones)
+
+    Returns:
+        (n_worlds, n_drones, n, 3) each
+    """
+    s = data.states
+    n_drones = s.pos.shape[1]
+    seen = ~np.eye(n_drones, dtype=bool) if counts is None else counts[:, None] & ~np.eye(n_drones, dtype=bool)
+    apart, passing = (jnp.where(seen[..., None], x[:, None] - x[:, :, None], 0) for x in (s.pos, s.vel))
+    far = jnp.where(seen, jnp.sum(apart * apart, axis=-1), jnp.inf)
+    found = nearest(far, jnp.concatenate([apart, passing], axis=-1), min(n, n_drones - 1))
+    return found[..., :3], found[..., 3:]

@@ -14,13 +14,12 @@ from crazysim.effects.core import install
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.core import NAME, nearest, pick
+from crazysim.envs.tasks.core import NAME, check_collisions, nearest, others_near, pick
 from crazysim.envs.tracks import Track, checked, n_random, random_course, start_offsets
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, static
 from crazysim.scene.latch import SimulationWithScene
 from crazysim.sim.data import SimData
-from crazysim.sim.pipeline import insert_fn_before
 from crazysim.sim.stage import stage
 
 OPENING = 0.45
@@ -199,8 +198,10 @@ def race(
         error=to_next_gate,
         info=info,
         mark=mark,
+        target=lambda data: _next_gate(data)[0],
         succeeded=lambda data: race_of(data).finished,
         seconds=seconds,
+        camera={"lookat": (0, 0, 0.7), "distance": 6.0, "elevation": -40},
         settings={"level": level, "sensor_range": sensor_range, "seconds": seconds, "track": course.settings()},
     )
 
@@ -240,26 +241,7 @@ def _install(sim: SimulationWithScene, gates: Any, obstacles: Any, course: Track
         return data.replace(plugins=data.plugins | {NAME: new})
 
     install(sim, NAME, record, advance, before="increment_steps")
-    if sim.n_drones > 1:
-        insert_fn_before(sim.step_pipeline, NAME, collisions(sim, lambda data: race_of(data).out), f"{NAME}_collisions")
-        sim.build_step_fn()
-
-
-def collisions(sim: SimulationWithScene, ignored: Callable[[SimData], Array]) -> Any:
-    """Return the stage that disables drones which touch each other, but none that touches an ignored one."""
-    contacts = sim.scene.contact_fn((), floor=False)
-
-    @stage("world")
-    def collide(data: SimData) -> SimData:
-        record, s, out = data.plugins[NAME], data.states, ignored(data)
-        # Only for the question: each that is out is so far away that it touches nothing, and no other that is out.
-        far = 1000.0 * (1 + np.arange(len(out)))[:, None] * np.array([0.0, 0.0, 1.0])
-        elsewhere = jnp.where(out[:, None], far.astype(s.pos.dtype), s.pos)
-        hit = contacts(data.replace(states=s.replace(pos=elsewhere))).any & ~out
-        new = record.replace(disabled=record.disabled | hit)
-        return data.replace(plugins=data.plugins | {NAME: new})
-
-    return collide
+    check_collisions(sim)
 
 
 def passes(data: SimData) -> Array:
@@ -357,13 +339,8 @@ def observe(data: SimData, sensor_range: float = SENSOR_RANGE) -> dict[str, Arra
         "gate_corners": jnp.concatenate(corners, axis=-2),
         "obstacles_near": in_body(nearest(far, to_poles, min(2, n_obstacles))),
     }
-    n_drones = s.pos.shape[1]
-    if n_drones > 1:
-        apart = s.pos[:, None] - s.pos[:, :, None]
-        counts = ~record.out[:, None] & ~np.eye(n_drones, dtype=bool)
-        far = jnp.where(counts, jnp.sum(apart * apart, axis=-1), jnp.inf)
-        others = nearest(far, jnp.where(counts[..., None], apart, 0), min(2, n_drones - 1))
-        obs["drones_near"] = in_body(others)
+    if s.pos.shape[1] > 1:
+        obs["drones_near"] = in_body(others_near(data, 2, ~record.out)[0])
     shape = s.pos.shape[:2]
     return {
         name: jnp.broadcast_to(x, (*shape, *x.shape[2:])).reshape(*shape, -1).astype(s.pos.dtype)
@@ -404,13 +381,13 @@ def way(pos: Array) -> Array:
 
 
 def dense(data: SimData, action: Array, last_action: Array) -> Array:
-    """Twice the way gained, m, and 2 for each gate, less what is spent on turning and jerky actions; -5 if disabled."""
+    """Twice the way gained, m, and 2 for each gate, less what is spent on turning and jerky actions; -2 if disabled."""
     record = race_of(data)
     spin = jnp.sum(jnp.square(data.states.ang_vel), axis=-1)
     jerk = jnp.sum(jnp.square(action - last_action), axis=-1)
     gained = record.to_go_before - to_go(data)
     gates = record.passed - record.passed_before
-    paid = 2.0 * gained + 2.0 * gates - 0.001 * spin - 0.01 * jerk - 5.0 * record.disabled
+    paid = 2.0 * gained + 2.0 * gates - 0.001 * spin - 0.01 * jerk - 2.0 * record.disabled
     return jnp.where(record.out_before, 0, paid)
 
 

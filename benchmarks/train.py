@@ -1,0 +1,70 @@
+"""Trainings that users can trust: several seeds a task, judged by held-out starts, with wall time.
+
+    python benchmarks/train.py [--device gpu] [--tasks hover recover track race] [--seeds 0 1 2 3 4] [--out out/train]
+
+Each training is a process of its own, as ``crazysim train`` is: import, building, compilation and evaluation are part
+of its time. One JSON line each; with ``--plot FILE`` the learning curves of all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from measure import digits, report
+
+from crazysim.train.show import plot_curve, read_curve
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--tasks", nargs="+", default=["hover", "recover", "track", "race"])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--out", type=Path, default=Path("out/train"), help="folder of the runs")
+    parser.add_argument("--plot", type=Path, help="picture of the learning curves")
+    parser.add_argument("--only-plot", action="store_true", help="train nothing, plot what is there")
+    args = parser.parse_args()
+    curves = {}
+    for task in args.tasks:
+        for seed in args.seeds:
+            folder = args.out / f"{task}-{args.device}-{seed}"
+            if not args.only_plot:
+                train(task, seed, folder, args.device)
+            curves[f"{task}, {seed}"] = read_curve(folder)
+    if args.plot is not None:
+        plot_curve(curves, args.plot)
+
+
+def train(task: str, seed: int, folder: Path, device: str) -> None:
+    """Train in a process of its own, and print how it went."""
+    command = [sys.executable, "-m", "crazysim", "train", task, "--seed", str(seed), "--out", str(folder), "--no-film"]
+    begin = time.perf_counter()
+    done = subprocess.run([*command, "--device", device], capture_output=True, text=True)
+    wall_s = time.perf_counter() - begin
+    if done.returncode:
+        raise SystemExit(f"training {task} failed: {done.stderr[-2000:]}")
+    curve = read_curve(folder)
+    point = curve[-1]
+    solved = next((p["seconds"] for p in curve if p["success"] >= 0.95), None)
+    report(
+        device,
+        benchmark="train",
+        task=task,
+        seed=seed,
+        success=round(point["success"], 4),
+        crashed=round(point["crashed"], 4),
+        error=digits(point["error"]) if point["error"] == point["error"] else None,
+        env_steps=point["env_steps"],
+        seconds=digits(point["seconds"]),
+        compile_seconds=digits(point["compile_seconds"]),
+        seconds_to_95_percent=None if solved is None else digits(solved),
+        wall_s=digits(wall_s),
+    )
+
+
+if __name__ == "__main__":
+    main()

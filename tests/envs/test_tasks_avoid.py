@@ -1,0 +1,124 @@
+"""Flying through a field: what stands where, what is seen of it, hits and arrivals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim, rotation
+from crazysim.envs import DroneEnv, make
+from crazysim.envs.tasks.avoid import CELL, HEIGHT, IN_CELL, avoid
+
+N_WORLDS = 2048
+
+
+@pytest.fixture(scope="module")
+def begun():
+    """Return the environment, two drones in every world, the state where episodes begin, and the step."""
+    sim = Sim(n_worlds=N_WORLDS, n_drones=2, control="attitude")
+    env = DroneEnv(sim, avoid(sim))
+    return env, jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
+
+
+def put(state, pos, **changes):
+    """Return the state with drones elsewhere, at rest and level."""
+    data, s = state.data, state.data.states
+    pos = jnp.broadcast_to(jnp.asarray(pos, jnp.float32), s.pos.shape)
+    states = s.replace(pos=pos, vel=0 * s.vel, ang_vel=0 * s.ang_vel, quat=jnp.zeros_like(s.quat).at[..., 3].set(1.0))
+    record = data.plugins["task"].replace(**changes)
+    return state.replace(data=data.replace(states=states, plugins=data.plugins | {"task": record}))
+
+
+def test_starts_and_goals_are_clear_of_contact(begun):
+    env, state, _ = begun
+    data = state.data
+    env.sim.data = data
+    report = env.sim.contact_report()
+    assert not np.any(report.any)
+    assert report.object_distance.min() > 0.2
+    assert report.drone_distance.min() > 0.05
+    env.sim.data = put(state, data.plugins["task"].goal).data
+    report = env.sim.contact_report()
+    assert not np.any(report.any)
+    assert report.object_distance.min() > 0.2
+
+
+def test_obstacles_stand_elsewhere_in_every_world_and_leave_room(begun):
+    _, state, _ = begun
+    pos = np.asarray(state.data.objects.pos[:, 0])
+    apart = np.linalg.norm(pos[:, :, None, :2] - pos[:, None, :, :2], axis=-1) + 9 * np.eye(12)
+    assert apart.min() >= CELL - 2 * IN_CELL - 1e-5
+    assert np.all(np.ptp(pos[..., :2], axis=0) > 2.5)
+    np.testing.assert_allclose(rotation.z_axis(state.data.objects.quat)[..., 2], 1, atol=1e-5)
+    poles, boxes = pos[:, :8, 2], pos[:, 8:, 2]
+    np.testing.assert_array_equal(poles, 0)
+    assert boxes.min() > 0.15
+    assert boxes.max() < HEIGHT - 0.15
+    assert np.ptp(boxes) > 1
+
+
+def test_what_is_seen_are_the_nearest_points_of_the_nearest_obstacles(begun):
+    env, state, _ = begun
+    rng = np.random.default_rng(0)
+    inside = put(state, rng.uniform([-1.6, -2, 0.2], [1.6, 2, 1.8], (N_WORLDS, 2, 3))).data
+    env.sim.data = inside
+    gaps = np.sort(np.asarray(env.sim.contact_report().object_distance), axis=-1)[..., :4]
+    ways = np.asarray(jax.jit(env.task.observe)(inside)["obstacles_near"]).reshape(N_WORLDS, 2, 4, 3)
+    # A report measures from the ball around the drone, 2 cm above its centre, which the ways begin at.
+    far = np.linalg.norm(ways, axis=-1) - 0.086
+    outside = gaps > 0.05
+    assert outside.mean() > 0.5
+    assert np.abs(far - gaps)[outside].max() < 0.021
+    # A short step along a way leads there: nearer by as much.
+    length = np.maximum(np.linalg.norm(ways[:, :, 0], axis=-1, keepdims=True), 0.01)
+    ahead = inside.states.pos + 0.1 * ways[:, :, 0] / length
+    env.sim.data = inside.replace(states=inside.states.replace(pos=ahead))
+    nearer = np.asarray(env.sim.contact_report().object_distance).min(axis=-1)
+    assert np.abs(gaps[..., 0] - nearer - 0.1)[gaps[..., 0] > 0.15].max() < 0.022
+
+
+def test_hits_disable_and_arriving_is_a_success(begun):
+    env, state, step = begun
+    goal, obstacles = np.asarray(state.data.plugins["task"].goal), np.asarray(state.data.objects.pos[:, 0])
+    free = np.array([-2.4, 0.0, 1.0])
+    pos = np.broadcast_to([free, free + [0, 0.8, 0]], (N_WORLDS, 2, 3)).copy()
+    pos[0] = goal[0]
+    pos[1, 0] = goal[1, 0]
+    pos[2, 0] = obstacles[2, 0] + [0.1, 0, 1.0]  # a pole
+    pos[3, 0] = obstacles[3, 9]  # within a box
+    pos[4, 0, 2] = 0.05  # the floor
+    pos[5, 0, 2] = 2.01
+    pos[6, 0, 0] = -3.0
+    pos[7, 0] = pos[7, 1] + [0.1, 0, 0]  # another drone
+    pos[8, 0] = pos[8, 1] + [0.1, 0, 0]  # one that is out
+    disabled = np.zeros((N_WORLDS, 2), bool)
+    disabled[8, 0] = True
+    after = step(put(state, pos, disabled=jnp.asarray(disabled)), state.action)
+    expected = np.zeros((N_WORLDS, 2), bool)
+    expected[2:9, 0] = True
+    expected[7, 1] = True
+    np.testing.assert_array_equal(after.info["disabled"], expected)
+    arrived = np.asarray(env.task.succeeded(after.data))
+    np.testing.assert_array_equal(np.argwhere(arrived), [[0, 0], [0, 1], [1, 0]])
+    np.testing.assert_array_equal(np.flatnonzero(after.terminated), [0, 7])
+    reward = np.asarray(after.reward)
+    assert np.all(reward[0] > 9)
+    assert np.all(reward[2:8, 0] < -9)
+    assert reward[8, 0] == 0
+    np.testing.assert_array_equal(after.obs["drones_near"][8, 1], 0)
+    assert np.linalg.norm(after.obs["drones_near"][9, 1]) > 0.7
+
+
+def test_time_ends_an_episode(begun):
+    env, state, step = begun
+    core = state.data.core
+    late = core.replace(steps=jnp.full_like(core.steps, (env.max_steps - 1) * env.n_substeps))
+    after = step(state.replace(data=state.data.replace(core=late)), state.action)
+    assert np.all(after.truncated)
+    assert not np.any(after.terminated)
+
+
+@pytest.mark.parametrize("options", [{"n_poles": -1}, {"n_poles": 0, "n_boxes": 0}, {"n_seen": 0}, {"n_boxes": 1.5}])
+def test_what_cannot_be_a_field_is_told(options):
+    with pytest.raises(ConfigError, match="whole numbers"):
+        make("avoid", 1, **options)

@@ -1,0 +1,144 @@
+"""Landing: pads that move, what counts as landed, and what as crashed."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim, rotation
+from crazysim.envs import DroneEnv, make
+from crazysim.envs.tasks.land import land
+from crazysim.sim.random import world_keys
+from crazysim.train.evaluate import evaluate
+
+N_SPAWNS, SPEED = 2048, 0.5
+CONTACT = 0.066
+"""Height of the centre of mass over a level pad that the drone touches, m: radius 0.086 less 0.02."""
+CASES = {
+    # Place over the pad's middle, m, velocity relative to the pad, m/s, tilt, rad.
+    "soft": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.3), 0.0),
+    "edge": ((0.24, 0.0, CONTACT + 0.003), (0, 0, -0.3), 0.0),
+    "fast": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.7), 0.0),
+    "sliding": ((0.0, 0.0, CONTACT + 0.003), (0.6, 0, -0.3), 0.0),
+    "tilted": ((0.0, 0.0, CONTACT - 0.001), (0, 0, -0.3), 0.45),
+    "rim": ((0.27, 0.0, CONTACT - 0.02), (0, 0, -0.3), 0.0),
+    "below": ((0.0, 0.0, -0.1), (0, 0, 0.0), 0.0),
+    "floor": ((0.6, 0.0, -0.135), (0, 0, -0.1), 0.0),
+    "far": ((0.0, 1.5, 0.5), (0, 0, 0.0), 0.0),
+    "high": ((0.0, 0.0, 2.31), (0, 0, 0.0), 0.0),
+    "hover": ((0.0, 0.0, 0.3), (0, 0, 0.0), 0.0),
+}
+"""One world each."""
+
+
+def environment(n_worlds, n_drones=1, **options):
+    """Return an environment."""
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
+    return DroneEnv(sim, land(sim, **options))
+
+
+@pytest.fixture(scope="module")
+def still():
+    """Return the environment of all cases, their names to worlds, the state before, after a step, and the step."""
+    env, step = environment(len(CASES)), None
+    state = jax.jit(env.reset)(jax.random.key(0))
+    offset, vel, tilt = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
+    quat = rotation.from_rpy(jnp.stack([jnp.asarray(tilt), 0 * tilt, 0 * tilt], axis=-1))
+    pad = np.array([0.0, 0.0, 0.2], np.float32)
+    states = state.data.states.replace(pos=jnp.asarray(pad + offset)[:, None], vel=vel[:, None], quat=quat[:, None])
+    before = state.replace(data=state.data.replace(states=states))
+    step = jax.jit(env.step)
+    return env, {name: k for k, name in enumerate(CASES)}, before, step(before, before.action), step
+
+
+def test_landed_is_who_touches_the_pad_softly_upright_and_within_it(still):
+    env, world, _, after, _ = still
+    landed = np.asarray(env.task.succeeded(after.data))[:, 0]
+    assert {name for name, k in world.items() if landed[k]} == {"soft", "edge"}
+
+
+def test_every_other_touch_and_flying_away_is_a_crash(still):
+    _, world, _, after, _ = still
+    crashed = np.asarray(after.info["crashed"])[:, 0]
+    assert {name for name, k in world.items() if crashed[k]} == set(CASES) - {"soft", "edge", "hover"}
+    np.testing.assert_array_equal(after.terminated, [name != "hover" for name in CASES])
+
+
+def test_landing_pays_and_crashing_costs_once(still):
+    _, world, _, after, step = still
+    reward = np.asarray(after.reward)[:, 0]
+    assert reward[world["soft"]] > 9
+    assert reward[world["fast"]] < -9
+    assert abs(reward[world["hover"]]) < 0.1
+    again = step(after, after.action)
+    np.testing.assert_array_equal(np.asarray(again.reward)[:, 0] == 0, [name != "hover" for name in CASES])
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """Return the environment of pads that move, two drones a world, and a beginning."""
+    env = environment(N_SPAWNS, 2, speed=SPEED)
+    data = env.sim.default_data
+    return env, jax.jit(env.task.spawn)(data, world_keys(data, "spawn"))
+
+
+def test_starts_are_clear_of_contact_and_pads_on_their_circles(moving):
+    env, data = moving
+    env.sim.data = data
+    report = env.sim.contact_report()
+    assert not np.any(report.any)
+    assert report.object_distance.min() > 0.3
+    assert report.drone_distance.min() > 0.3
+    radius = np.linalg.norm(data.objects.pos[:, 0, :, :2] - np.array([[-0.0, 0], [0, 0]]), axis=-1)
+    assert np.ptp(radius) > 0.3
+    assert np.all(np.asarray(data.plugins["task"].rate)[..., 0].min(axis=0) < 0)
+
+
+def test_a_moving_pad_moves_in_the_data_at_its_speed(moving):
+    env, data = moving
+    env.sim.data = data
+    steps = 5
+    env.sim.step(steps)
+    after = env.sim.data
+    moved = np.linalg.norm(after.objects.pos - data.objects.pos, axis=-1)
+    np.testing.assert_allclose(moved, SPEED * steps / 500, rtol=1e-2)
+    np.testing.assert_allclose(np.linalg.norm(after.objects.vel, axis=-1), SPEED, rtol=1e-4)
+    along = (after.objects.pos - data.objects.pos) * 500 / steps
+    np.testing.assert_allclose(along, after.objects.vel, atol=0.01)
+    seen = env.task.observe(after)["difference_to_pad"] + after.states.pos
+    np.testing.assert_allclose(seen, after.objects.pos[:, 0], atol=1e-5)
+
+
+def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes():
+    env = environment(2, speed=SPEED, seconds=3.0)
+    spawn = env.task.spawn
+
+    def above(data, keys):
+        """Begin over the pad, with its velocity; the second world upside down."""
+        data = spawn(data, keys)
+        pos = data.objects.pos + jnp.array([0.0, 0.0, 0.35])
+        quat = jnp.array([[[0.0, 0, 0, 1]], [[1.0, 0, 0, 0]]])
+        return data.replace(states=data.states.replace(pos=pos[:, 0], vel=data.objects.vel[:, 0], quat=quat))
+
+    def follow(obs):
+        """Hold the pad's velocity and sink with 0.3 m/s."""
+        ahead = 6 * obs["difference_to_pad_vel"] + 4 * obs["difference_to_pad"] * jnp.array([1, 1, 0])
+        down = 0.8 * (obs["difference_to_pad_vel"][..., 2:] - 0.3)
+        roll, pitch = -ahead[..., 1:2] / 9.81, ahead[..., :1] / 9.81
+        return jnp.concatenate([roll / (jnp.pi / 4), pitch / (jnp.pi / 4), 0 * roll, down], axis=-1)
+
+    env.task = dataclasses.replace(env.task, spawn=above)
+    judged = evaluate(env, jax.tree_util.Partial(follow))
+    assert judged["success"] == judged["crashed"] == 0.5
+    assert judged["error"] < 0.27
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"speed": -1}, "speed is -1"), ({"radius": 2.0}, "radius is 2"), ({"speed": "x"}, "speed")],
+)
+def test_what_cannot_be_landed_on_is_told(options, message):
+    with pytest.raises(ConfigError, match=message):
+        make("land", 1, **options)

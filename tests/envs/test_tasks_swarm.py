@@ -1,0 +1,126 @@
+"""A swarm: slots, starts, separation and what ends an episode."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.envs import DroneEnv, make
+from crazysim.envs.tasks.swarm import separation, swarm
+from crazysim.sim.random import world_keys
+
+N_WORLDS, N_DRONES = 2048, 4
+
+
+@pytest.fixture(scope="module")
+def begun():
+    """Return the environment, the state where episodes begin, and the step."""
+    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude")
+    env = DroneEnv(sim, swarm(sim))
+    return env, jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
+
+
+def put(state, pos):
+    """Return the state with drones elsewhere, at rest and level."""
+    data, s = state.data, state.data.states
+    states = s.replace(
+        pos=jnp.asarray(pos, jnp.float32),
+        vel=0 * s.vel,
+        ang_vel=0 * s.ang_vel,
+        quat=jnp.zeros_like(s.quat).at[..., 3].set(1.0),
+    )
+    return state.replace(data=data.replace(states=states))
+
+
+def test_separation_is_that_of_an_ellipsoid_longer_in_z():
+    pos = jnp.array([[0.0, 0, 1], [0.24, 0, 1], [0, -0.48, 1], [0, 0, 2.2]])
+    np.testing.assert_allclose(separation(pos), [1, 1, 2, 2], rtol=1e-6)
+    np.testing.assert_allclose(separation(pos[np.array([0, 3])]), [2, 2], rtol=1e-6)
+    at_one_point = jax.jit(jax.grad(lambda p: separation(p).sum()))(jnp.zeros((2, 3)))
+    assert np.all(np.isfinite(at_one_point))
+
+
+def test_starts_are_clear_and_places_are_exchanged(begun):
+    env, state, _ = begun
+    data = state.data
+    env.sim.data = data
+    report = env.sim.contact_report()
+    assert not np.any(report.any)
+    assert separation(data.states.pos).min() > 1.5
+    goal = np.asarray(data.plugins["task"].goal)
+    # A goal is the place of another drone, and everyone has one of its own.
+    far = np.linalg.norm(goal[:, :, None] - np.asarray(data.states.pos)[:, None], axis=-1)
+    whose = far.argmin(axis=-1)
+    assert far.min(axis=-1).max() < 0.1 * np.sqrt(3) + 1e-5
+    assert not np.any(whose == np.arange(N_DRONES))
+    np.testing.assert_array_equal(np.sort(whose, axis=-1), np.broadcast_to(np.arange(N_DRONES), whose.shape))
+    assert set((whose[:, 0]).tolist()) == {1, 2, 3}
+    np.testing.assert_allclose(state.info["error"], np.linalg.norm(goal - data.states.pos, axis=-1), rtol=1e-5)
+
+
+def test_coming_too_near_ends_and_costs(begun):
+    _, state, step = begun
+    goal = np.asarray(state.data.plugins["task"].goal)
+    pos = goal.copy()
+    pos[1, 1] = pos[1, 0] + [0.2, 0, 0]  # beside each other
+    pos[2, 1] = pos[2, 0] + [0, 0, 0.5]  # above: too near in the downwash
+    pos[3, 1] = pos[3, 0] + [0.5, 0, 0]  # beside, far enough
+    pos[4, 2, 2] = 0.01
+    pos[5, 3, 0] = 2.5
+    pos[6, 0] = pos[6, 1] + [0.2, 0, 0]
+    after = step(put(state, pos), state.action)
+    np.testing.assert_array_equal(np.flatnonzero(after.terminated), [1, 2, 4, 5, 6])
+    assert np.all(np.asarray(after.info["separation"])[1:3, :2] < 1)
+    reward = np.asarray(after.reward)
+    assert np.all(reward[0] > 1.3)
+    assert np.all(reward[1:3, :2] < -9)
+    assert reward[1, 2] > 1  # whom the two did not come near is not to blame
+    assert np.all(np.asarray(after.info["error"])[0] < 0.03)
+    ways = np.asarray(after.obs["drones_near"]).reshape(N_WORLDS, N_DRONES, 3, 3)
+    np.testing.assert_allclose(ways[1, 0, 0], [0.2, 0, 0], atol=0.01)
+    assert np.all(np.diff(np.linalg.norm(ways, axis=-1), axis=-1) > -1e-6)
+
+
+def test_separation_is_kept_at_every_physics_step(begun):
+    _, state, step = begun
+    # One flies past another at 40 m/s within one environment step: too near only in between.
+    pos = np.asarray(state.data.plugins["task"].goal).copy()
+    pos[0, 0], pos[0, 1] = [-0.4, 0, 1.2], [0.0, 0.05, 1.2]
+    pos[0, 2:] = [[0, 1.5, 1.2], [0, -1.5, 1.2]]
+    fast = put(state, pos)
+    vel = fast.data.states.vel.at[0, 0].set(jnp.array([40.0, 0, 0]))
+    after = step(fast.replace(data=fast.data.replace(states=fast.data.states.replace(vel=vel))), state.action)
+    assert separation(after.data.states.pos)[0].min() > 1
+    assert after.terminated[0]
+
+
+def test_a_formation_is_what_drones_are_sent_to():
+    formation = [(0, 0, 1), (0.5, 0, 1), (0, 0.5, 1), (0, 0, 2)]
+    sim = Sim(n_worlds=64, n_drones=N_DRONES, control="attitude")
+    env = DroneEnv(sim, swarm(sim, formation, strict=False))
+    data = jax.jit(env.task.spawn)(sim.default_data, world_keys(sim.default_data, "spawn"))
+    np.testing.assert_allclose(data.plugins["task"].goal, np.broadcast_to(formation, (64, 4, 3)))
+    close = data.states.pos.at[:, 1].set(data.states.pos[:, 0] + 0.1)
+    near = data.replace(states=data.states.replace(pos=close))
+    near = near.replace(plugins={"task": near.plugins["task"].replace(closest=jnp.zeros((64, 4)))})
+    assert not np.any(env.task.terminated(near))
+    zeros, reward = jnp.zeros((64, 4, 4)), jax.jit(env.task.reward)
+    calm, crowded = reward(data, zeros, zeros), reward(near, zeros, zeros)
+    assert np.all(np.asarray(crowded - calm)[:, 0] < -2)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n_drones": 1}, "two drones at least"),
+        ({"formation": [(0, 0, 1)]}, "shape"),
+        ({"formation": [(0, 0, 1), (1, 0, 1), (0, 1, 1), (0, 0, 1.5)]}, r"places \[0, 3\]"),
+        ({"formation": [(0, 0, 0.1), (1, 0, 1), (0, 1, 1), (2, 0, 1.5)]}, "0.2 m over the floor"),
+        ({"formation": "abc"}, "needed is an array"),
+        ({"n_seen": 0}, "n_seen"),
+    ],
+)
+def test_what_cannot_be_a_swarm_is_told(options, message):
+    with pytest.raises(ConfigError, match=message):
+        make("swarm", 1, **options)
