@@ -42,7 +42,7 @@ class Task:
     error: Callable[[SimData], Array]
     """How far a drone is from what it is asked to do, m unless the task says otherwise. (n_worlds, n_drones)"""
     info: Callable[[SimData], dict[str, Array]] = lambda data: {}  # noqa: ARG005
-    """What else is told of an episode. (n_worlds, ...) each"""
+    """What else is told of an episode. (n_worlds,) or (n_worlds, n_drones, ...) each"""
     target: Callable[[SimData], Array] | None = None
     """Where a drone is to be, for pictures, m. (n_worlds, n_drones, 3)"""
     camera: Mapping[str, Any] | None = None
@@ -77,7 +77,7 @@ class EnvState(PyTree):
     action: Array
     """The action that led here; zeros where an episode begins. (n_worlds, n_drones, k)"""
     info: dict[str, Any]
-    """What else there is to tell. (n_worlds, ...) each"""
+    """What else there is to tell. (n_worlds,) or (n_worlds, n_drones, ...) each"""
     memory: dict[str, Any]
     """What wrappers remember, each under its name."""
 

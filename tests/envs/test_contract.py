@@ -70,7 +70,7 @@ def test_shapes_and_types_are_those_of_the_spaces(env, begun):
         for flag in (state.terminated, state.truncated, state.info["nonfinite"]):
             assert (flag.shape, flag.dtype) == ((N_WORLDS,), bool)
         assert state.info["error"].shape == state.reward.shape
-        assert all(x.shape[0] == N_WORLDS for x in jax.tree.leaves(state.info))
+        assert {x.shape[:2] for x in state.info.values()} <= {(N_WORLDS,), (N_WORLDS, env.sim.n_drones)}
     space = spaces.single_action_space
     assert space.shape == (env.actions.size,) if single else (env.sim.n_drones, env.actions.size)
     np.testing.assert_array_equal([space.low, space.high], [-np.ones(space.shape), np.ones(space.shape)])

@@ -1,0 +1,217 @@
+"""Environments for Stable-Baselines3: its ``VecEnv`` over all worlds at once, NumPy in and out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.envs.env import Env, EnvState, Obs
+from crazysim.envs.vector import RENDER_MODES
+from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
+from crazysim.errors import ConfigError
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError as error:
+    raise ImportError("crazysim.envs.sb3 needs Stable-Baselines3; pip install stable-baselines3") from error
+
+
+class DroneVecEnv(VecEnv):
+    """Stable-Baselines3's vector environment over a functional one: an environment of its is a world of ours.
+
+    A new episode begins within the step that ends one. The infos of worlds whose episode ended have, as those of
+    ``Monitor`` and of ``DummyVecEnv``: ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` with ``r``, ``l``
+    and ``t``, and also ``error`` and ``nonfinite``; the infos of others are empty. With several drones the reward is
+    their mean, and observations and actions are those of all, drone after drone.
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        dict_obs: bool = False,
+        render_mode: str | None = None,
+        render_worlds: Sequence[int] = (0,),
+        render_size: tuple[int, int] = (640, 480),
+    ):
+        """Take the functional environment, without automatic resets.
+
+        Args:
+            env: The environment.
+            dict_obs: Whether observations are named, for ``MultiInputPolicy``; else they are one vector, by name one
+                behind the other, for ``MlpPolicy``.
+            render_mode: What ``render`` does: ``"rgb_array"`` returns a picture, ``"human"`` draws the first of the
+                worlds into a window.
+            render_worlds: Which worlds are drawn.
+            render_size: Width and height of a picture, pixels.
+
+        Raises:
+            ConfigError: If there is no such mode, or the environment begins episodes by itself.
+        """
+        if render_mode not in (None, *RENDER_MODES):
+            raise ConfigError(f"render_mode is {render_mode!r}; it must be None or one of {', '.join(RENDER_MODES)}")
+        if isinstance(env, AutoReset):
+            raise ConfigError(
+                "give the environment without AutoReset: new episodes begin as Stable-Baselines3 wants it"
+            )
+        self.env, self.sim, self.dict_obs = AutoReset(EpisodeStatistics(env)), env.sim, dict_obs
+        self._mode, self._worlds, self._size = render_mode, tuple(render_worlds), render_size
+        self._begin, self._advance = jax.jit(self._first), jax.jit(self._next)
+        self._generator, _ = gymnasium.utils.seeding.np_random()
+        self._actions: np.ndarray | None = None
+        self._since = time.time()
+        self.state: EnvState | None = None
+        _, obs = jax.eval_shape(self._first, jax.random.key(0))
+        spaces: dict[str, gymnasium.Space] = {
+            name: gymnasium.spaces.Box(-np.inf, np.inf, x.shape[1:], np.float32) for name, x in obs.items()
+        }
+        size = env.sim.n_drones * env.actions.size
+        super().__init__(
+            env.sim.n_worlds,
+            gymnasium.spaces.Dict(spaces) if dict_obs else spaces["all"],
+            gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32),
+        )
+
+    def reset(self) -> Any:
+        """Begin new episodes in all worlds, with the seed that ``seed`` was given last, if it was not used yet."""
+        seed = self._seeds[0]
+        number = seed if seed is not None else int(self._generator.integers(2**31))
+        if seed is not None:
+            self._generator, _ = gymnasium.utils.seeding.np_random(seed)
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._actions, self._since = None, time.time()
+        self.state, obs = self._begin(jax.random.key(number))
+        return self._out(jax.device_get(obs))
+
+    def step_async(self, actions: Any) -> None:
+        """Take the actions of the next step, (num_envs, k).
+
+        Raises:
+            ConfigError: If there was no reset, or they are not finite.
+            ValueError: If they have another shape.
+        """
+        if self.state is None:
+            raise ConfigError("the environment must be reset before its first step: call reset()")
+        actions = np.asarray(actions, np.float32)
+        needed = (self.num_envs, *(self.action_space.shape or ()))
+        if actions.shape != needed:
+            raise ValueError(f"actions have shape {actions.shape}; needed is {needed}")
+        if not np.isfinite(actions).all():
+            worlds = np.unique(np.nonzero(~np.isfinite(actions))[0])[:8]
+            raise ConfigError(f"the action is NaN or infinite in world(s) {worlds.tolist()}")
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Return observations, rewards, which episodes ended, and infos.
+
+        Raises:
+            ConfigError: If no actions were given.
+        """
+        if self._actions is None:
+            raise ConfigError("there are no actions to wait for: call step(actions)")
+        self.state, out = self._advance(self.state, self._actions)
+        self._actions = None
+        obs, final, reward, done, told = jax.device_get(out)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for world in np.flatnonzero(done):
+            last = {name: x[world] for name, x in final.items()}
+            infos[world] = {
+                "terminal_observation": self._out(last),
+                "TimeLimit.truncated": bool(told["out_of_time"][world]),
+                "episode": {
+                    "r": float(told["return"][world]),
+                    "l": int(told["length"][world]),
+                    "t": round(time.time() - self._since, 6),
+                },
+                "error": float(told["error"][world]),
+                "nonfinite": bool(told["nonfinite"][world]),
+            }
+        return self._out(obs), np.array(reward), np.array(done), infos
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the functional environment, which all worlds share, for each of some worlds.
+
+        Raises:
+            AttributeError: If it has none of that name.
+        """
+        value = self._mode if attr_name == "render_mode" else getattr(self.env, attr_name)
+        return [value] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refuse: all worlds are one compiled program.
+
+        Raises:
+            ConfigError: In any case.
+        """
+        del value, indices
+        raise ConfigError(f"{attr_name!r} cannot be set: all worlds are one compiled program; make another environment")
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Draw, which is the only thing that a world can be asked to do by itself.
+
+        Raises:
+            ConfigError: If something else is asked for.
+        """
+        del indices
+        if method_name != "render" or args or kwargs:
+            raise ConfigError(f"there is no {method_name!r} of a single world: all worlds are one compiled program")
+        return list(self.get_images())
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """Return whether infos have what a wrapper of Stable-Baselines3's would put there: only for ``Monitor``."""
+        return [wrapper_class.__name__ == "Monitor"] * len(list(self._get_indices(indices)))
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """Return a picture, (height, width, 3), of each world that is to be drawn, or draw the first into a window.
+
+        Raises:
+            ConfigError: If nothing was said of drawing when the environment was made, or it was not reset.
+            RenderError: If this machine cannot draw.
+        """
+        if self._mode is None or self.state is None:
+            raise ConfigError("to render, make the environment with render_mode='rgb_array' or 'human', and reset it")
+        self.sim.data = self.state.data
+        width, height = self._size
+        if self._mode == "human":
+            self.sim.render("human", self._worlds[0], width=width, height=height)
+            return []
+        return [np.asarray(self.sim.render("rgb_array", w, width=width, height=height)) for w in self._worlds]
+
+    def close(self) -> None:
+        """Close the window."""
+        self.sim.close()
+
+    def _first(self, key: Array) -> tuple[EnvState, Obs]:
+        state = self.env.reset(key)
+        return state, self._seen(state.obs)
+
+    def _next(self, state: EnvState, actions: Array) -> tuple[EnvState, Any]:
+        state = self.env.step(state, actions.reshape(state.action.shape))
+        info = state.info
+        told = {
+            "out_of_time": state.truncated & ~state.terminated,
+            "return": info["episode_return"].mean(axis=1),
+            "length": info["episode_length"],
+            "error": info["error"].mean(axis=1),
+            "nonfinite": info["nonfinite"],
+        }
+        out = (self._seen(state.obs), self._seen(info["final_obs"]), state.reward.mean(axis=1), state.done, told)
+        return state, out
+
+    def _seen(self, obs: Obs) -> Obs:
+        """Return observations as one vector called ``all``, or, where they are named, those of all drones by name."""
+        if not self.dict_obs:
+            obs = {"all": jnp.concatenate([obs[name] for name in sorted(obs)], axis=-1)}
+        return {name: x.reshape(x.shape[0], -1).astype(jnp.float32) for name, x in obs.items()}
+
+    def _out(self, obs: dict[str, Any]) -> Any:
+        """Return observations as arrays that may be written to: what comes from JAX may not, and Torch minds."""
+        return {name: np.array(x) for name, x in obs.items()} if self.dict_obs else np.array(obs["all"])

@@ -1,0 +1,124 @@
+"""The contract of Brax's environments: fields, shapes, types, jit, scan, and what its training wrappers would add."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from env_cases import kind, quick
+
+from crazysim import ConfigError
+from crazysim.envs import AutoReset, make
+from crazysim.envs.brax import BraxEnv
+from crazysim.train.networks import flatten
+
+pytestmark = pytest.mark.xdist_group("brax")
+N_WORLDS, N_STEPS = 3, 5
+
+
+@pytest.fixture(scope="module")
+def functional():
+    return make("hover", N_WORLDS, n_drones=2, seconds=N_STEPS / 50)
+
+
+@pytest.fixture(scope="module")
+def env(functional):
+    return BraxEnv(functional)
+
+
+@pytest.fixture(scope="module")
+def reset(env):
+    return quick(env.reset)
+
+
+@pytest.fixture(scope="module")
+def flown(env, reset):
+    """A scan over more than two episodes: the states from the first one on."""
+
+    @quick
+    def fly(state):
+        def step(state, _):
+            state = env.step(state, jnp.full((N_WORLDS, env.action_size), 0.1))
+            return state, state
+
+        return jax.lax.scan(step, state, length=2 * N_STEPS + 1)[1]
+
+    return fly(reset(jax.random.key(0)))
+
+
+def test_what_an_environment_says_of_itself(env):
+    assert (env.observation_size, env.action_size) == (2 * 21, 2 * 4)
+    assert env.backend == "crazysim"
+    assert env.unwrapped is env
+    assert env.dt == pytest.approx(0.02)
+
+
+def test_a_state_has_the_fields_of_brax(env, reset):
+    state = reset(jax.random.key(0))
+    assert state.obs.shape == (N_WORLDS, env.observation_size)
+    for x in (state.reward, state.done, state.metrics["error"], state.info["steps"], state.info["truncation"]):
+        assert (x.shape, x.dtype) == ((N_WORLDS,), jnp.float32)
+    assert set(state.info) == {"steps", "truncation", "episode_done", "episode_metrics"}
+    assert set(state.info["episode_metrics"]) == {"sum_reward", "length", "error"}
+    assert type(state.info) is type(state.metrics) is dict  # Brax's wrappers write into both
+    assert state.replace(done=1).done == 1
+    np.testing.assert_array_equal(state.obs, flatten(state.pipeline_state.obs).reshape(N_WORLDS, -1))
+
+
+def test_keys_of_any_kind_are_the_same_seed(env, reset):
+    state = reset(jax.random.key(3))
+    keys = jnp.stack([jax.random.key(3), jax.random.key(8), jax.random.key(9)])
+    for rng in (jax.random.PRNGKey(3), keys, jax.random.key_data(keys)):
+        np.testing.assert_array_equal(reset(rng).obs, state.obs)
+    assert len(np.unique(state.obs[:, 6])) == N_WORLDS
+    with pytest.raises(ValueError, match=r"shape \(4,\); needed is one key, or one for each of the 3 worlds"):
+        env.reset(jax.random.split(jax.random.key(0), 4))
+    with pytest.raises(ValueError, match=r"key data of shape \(4, 2\)"):
+        env.reset(jax.random.split(jax.random.PRNGKey(0), 4))
+
+
+def test_steps_return_the_same_kind_of_state(env, reset, flown):
+    state = reset(jax.random.key(0))
+    first = jax.tree.map(lambda x: x[0], flown)
+    assert kind(first) == kind(state)
+
+
+def test_episodes_end_and_begin_as_brax_wraps_them(flown):
+    ends = np.zeros((2 * N_STEPS + 1, N_WORLDS))
+    ends[[N_STEPS - 1, 2 * N_STEPS - 1]] = 1
+    np.testing.assert_array_equal(flown.done, ends)
+    np.testing.assert_array_equal(flown.info["episode_done"], ends)
+    np.testing.assert_array_equal(flown.info["truncation"], ends)
+    counts = np.array([1, 2, 3, 4, 5] * 2 + [1], float)
+    np.testing.assert_array_equal(flown.info["steps"], np.tile(counts[:, None], N_WORLDS))
+    np.testing.assert_array_equal(flown.info["episode_metrics"]["length"], flown.info["steps"])
+    sums = np.asarray(flown.reward[:N_STEPS]).sum(axis=0)
+    np.testing.assert_allclose(flown.info["episode_metrics"]["sum_reward"][N_STEPS - 1], sums, rtol=1e-5)
+    np.testing.assert_allclose(flown.info["episode_metrics"]["sum_reward"][N_STEPS], flown.reward[N_STEPS], rtol=1e-5)
+    jumps = np.abs(np.diff(flown.obs, axis=0)).max(axis=(1, 2))
+    assert set(np.argsort(jumps)[-2:]) == {N_STEPS - 2, 2 * N_STEPS - 2}, "new episodes begin in the step that ends one"
+
+
+def test_the_step_is_that_of_the_environment(functional, env, reset, flown):
+    state = functional.reset(jax.random.key(0))
+    state = quick(functional.step)(state, jnp.full(state.action.shape, 0.1))
+    np.testing.assert_allclose(flown.obs[0], flatten(state.obs).reshape(N_WORLDS, -1), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(flown.reward[0], state.reward.mean(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(flown.metrics["error"][0], state.info["error"].mean(axis=1), rtol=1e-5)
+
+
+def test_what_wrappers_add_is_kept(env, reset):
+    """Brax's evaluation writes into ``metrics`` and ``info`` of a state, and expects to find it in the next."""
+    state = reset(jax.random.key(0))
+    state.metrics["reward"] = state.reward
+    state.info["eval_metrics"] = {"mine": jnp.ones(N_WORLDS)}
+    after = quick(env.step)(state, jnp.zeros((N_WORLDS, env.action_size)))
+    assert set(after.metrics) == {"error", "reward"}
+    np.testing.assert_array_equal(after.info["eval_metrics"]["mine"], np.ones(N_WORLDS))
+
+
+def test_wrong_input_is_told(functional, env, reset):
+    with pytest.raises(ConfigError, match="without AutoReset"):
+        BraxEnv(AutoReset(functional))
+    state = reset(jax.random.key(0))
+    with pytest.raises(ValueError, match=r"shape \(8,\); needed is \(3, 8\) = \(n_worlds, action_size\)"):
+        env.step(state, jnp.zeros(8))

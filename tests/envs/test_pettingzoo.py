@@ -1,0 +1,139 @@
+"""PettingZoo's own tests of a parallel environment, and what they do not ask."""
+
+import importlib
+import sys
+
+import numpy as np
+import pytest
+from cases import trees_equal
+
+from crazysim import ConfigError
+from crazysim.envs import AutoReset, make
+
+pytest.importorskip("pettingzoo")
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from crazysim.envs.pettingzoo import DroneParallelEnv, make_parallel
+
+pytestmark = pytest.mark.xdist_group("pettingzoo")
+
+
+@pytest.fixture(scope="module")
+def functional():
+    return make("hover", 1, n_drones=2, seconds=0.3)
+
+
+@pytest.fixture(scope="module")
+def env(functional):
+    return DroneParallelEnv(functional)
+
+
+def zeros(env):
+    return {agent: np.zeros(4, np.float32) for agent in env.agents}
+
+
+def test_pettingzoos_own_test(env, capsys):
+    parallel_api_test(env, num_cycles=40)
+    assert "Passed" in capsys.readouterr().out
+
+
+def test_pettingzoos_own_test_of_seeds(functional):
+    parallel_seed_test(lambda: DroneParallelEnv(functional), num_cycles=10)
+
+
+def test_seeds_lead_to_the_same_episodes(env):
+    first, _ = env.reset(seed=5)
+    after = env.step(zeros(env))
+    next_one, _ = env.reset()
+    again, _ = env.reset(seed=5)
+    assert trees_equal(first, again)
+    assert trees_equal(env.step(zeros(env)), after)
+    assert trees_equal(env.reset()[0], next_one)
+    assert not trees_equal(first, next_one)
+    assert not trees_equal(env.reset(seed=6)[0], first)
+
+
+def test_every_drone_has_its_own(env):
+    obs, info = env.reset(seed=0)
+    assert env.agents == env.possible_agents == ["drone_0", "drone_1"]
+    assert all(obs[agent] in env.observation_space(agent) for agent in env.agents)
+    assert all(x.flags.writeable for agent in env.agents for x in obs[agent].values())
+    assert not np.allclose(obs["drone_0"]["pos"], obs["drone_1"]["pos"])
+    state = env.now
+    for i, agent in enumerate(env.agents):
+        np.testing.assert_array_equal(obs[agent]["pos"], state.obs["pos"][0, i])
+        np.testing.assert_array_equal(info[agent]["error"], state.info["error"][0, i])
+        assert info[agent]["nonfinite"] == np.False_
+    obs, reward, terminated, truncated, _ = env.step(zeros(env) | {"drone_1": np.ones(4)})
+    assert obs["drone_1"]["vel"][2] > obs["drone_0"]["vel"][2] or obs["drone_1"]["ang_vel"].any()
+    assert reward == {f"drone_{i}": float(env.now.reward[0, i]) for i in range(2)}
+    assert reward["drone_0"] != reward["drone_1"]
+    assert terminated == truncated == {"drone_0": False, "drone_1": False}
+
+
+def test_the_state_is_what_all_observe(env):
+    obs, _ = env.reset(seed=0)
+    expected = [obs[agent][name] for agent in env.agents for name in sorted(obs[agent])]
+    np.testing.assert_array_equal(env.state(), np.concatenate(expected))
+    assert env.state() in env.state_space
+
+
+def test_an_episode_ends_for_all(env):
+    env.reset(seed=0)
+    for _ in range(15):
+        assert len(env.agents) == 2
+        *_, truncated, _ = env.step(zeros(env))
+    assert truncated == {"drone_0": True, "drone_1": True}
+    assert env.agents == []
+    with pytest.raises(ConfigError, match="no episode is going on"):
+        env.step({})
+
+
+def test_wrong_actions_are_told(env):
+    env.reset(seed=0)
+    good = np.zeros(4)
+    for actions, error, message in (
+        ({"drone_0": good}, ConfigError, "no action for drone_1"),
+        ({"drone_0": good, "drone_1": good, "drone_7": good}, KeyError, "no agent drone_7; there are drone_0, drone_1"),
+        ({"drone_0": good, "drone_1": np.zeros(3)}, ValueError, r"drone_1 has shape \(3,\); needed is \(4,\)"),
+        ({"drone_0": good * np.nan, "drone_1": good}, ConfigError, "drone_0 is NaN or infinite"),
+    ):
+        with pytest.raises(error, match=message):
+            env.step(actions)
+
+
+def test_wrong_settings_are_told(functional):
+    with pytest.raises(ConfigError, match="has 2: make it with n_worlds=1"):
+        DroneParallelEnv(make("hover", 2))
+    with pytest.raises(ConfigError, match="without AutoReset"):
+        DroneParallelEnv(AutoReset(functional))
+    with pytest.raises(ConfigError, match="render_mode is 'ascii'"):
+        DroneParallelEnv(functional, "ascii")
+    fresh = make_parallel("hover", n_drones=2)
+    for ask in (fresh.state, fresh.render, lambda: fresh.step({})):
+        with pytest.raises(ConfigError, match="reset"):
+            ask()
+
+
+@pytest.mark.usefixtures("opengl")
+def test_pictures(functional):
+    env = DroneParallelEnv(functional, "rgb_array", (64, 48))
+    env.reset(seed=0)
+    picture = env.render()
+    assert (picture.shape, picture.dtype) == ((48, 64, 3), np.uint8)
+    assert picture.std() > 5
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("module", "package", "way"),
+    [
+        ("crazysim.envs.pettingzoo", "pettingzoo", r"needs PettingZoo; pip install 'crazysim\[pettingzoo\]'"),
+        ("crazysim.envs.sb3", "stable_baselines3", "needs Stable-Baselines3; pip install stable-baselines3"),
+    ],
+)
+def test_without_a_package_the_way_to_it_is_told(monkeypatch, module, package, way):
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    with pytest.raises(ImportError, match=way):
+        importlib.import_module(module)
