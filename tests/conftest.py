@@ -6,7 +6,11 @@ from pathlib import Path
 os.environ.setdefault("MUJOCO_GL", "egl")
 # XLA logs an error of 3,000 characters for every program from the cache that could use another vector width.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+FLAGS = os.environ.get("XLA_FLAGS", "")
+if "xla_backend_optimization_level" not in FLAGS:
+    # Compiling is most of the suite's time, and takes half of it like this; CI runs laws and engines in full too.
+    FLAGS += " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+os.environ["XLA_FLAGS"] = FLAGS + " --xla_force_host_platform_device_count=2"
 
 import jax
 import numpy as np
@@ -17,7 +21,7 @@ from crazysim.engine import cuda
 
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
 
-# Compiling is most of the suite's time; what was compiled once, in any worker or run, is kept.
+# What was compiled once, in any worker or run, is kept.
 CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

@@ -12,8 +12,10 @@ from crazysim.envs import TASKS, make
 from crazysim.envs.wrappers import Wrapper
 from crazysim.pytree import map_batched
 
-quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-"""``jax.jit`` that compiles in half the time."""
+quick = functools.partial(
+    jax.jit, compiler_options={"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": True}
+)
+"""``jax.jit`` that compiles in half the time, and rounds alike for any number of worlds."""
 
 
 class Compiled(Wrapper):

@@ -13,6 +13,7 @@ from jax import Array
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import Env, EnvState, Obs, Task, fitting, observed, told
 from crazysim.envs.random import episode_keys
+from crazysim.envs.statistics import RunningStats
 from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, scopes, select_worlds
 from crazysim.sim.data import SimData
@@ -213,6 +214,51 @@ class ObservationNoise(Observe):
             noise = jax.vmap(jax.vmap(lambda key, s=shape, d=dtype: jax.random.normal(key, s, d)))(own)
             noisy[name] = obs[name] + std * noise
         return noisy
+
+
+class Normalize(Wrapper):
+    """Observe what has mean zero and variance one over all that worlds and drones have seen so far, at most ten.
+
+    ``state.memory["Normalize"]`` holds the statistics, by name of what is observed. To fly a policy as it was trained,
+    give them back: ``Normalize(env, stats)`` changes them no more.
+    """
+
+    def __init__(self, env: Env, stats: dict[str, RunningStats] | None = None):
+        """Take the environment, and statistics that stay as they are; without any they are those of this run."""
+        super().__init__(env)
+        self.stats = stats
+
+    def reset(self, key: Array) -> EnvState:
+        """Return all worlds at the beginning of an episode.
+
+        Raises:
+            ConfigError: If the statistics that were given are of other observations.
+        """
+        state = self.env.reset(key)
+        stats = self.stats or {name: RunningStats.create(x.shape[-1]) for name, x in state.obs.items()}
+        if missing := set(state.obs) ^ set(stats):
+            raise ConfigError(
+                f"statistics and observations do not go together: {', '.join(sorted(missing))} is in one of them only"
+            )
+        return self._seen(state, stats)
+
+    def restart(self, state: EnvState, mask: Array) -> EnvState:
+        """Return the state with new episodes in the worlds of a mask. (n_worlds,)"""
+        stats = self.recall(state)
+        return self._normalized(self.env.restart(state, mask), stats)
+
+    def step(self, state: EnvState, action: Array) -> EnvState:
+        """Return the state one step later."""
+        stats = self.recall(state)
+        return self._seen(self.env.step(state, action), stats)
+
+    def _seen(self, state: EnvState, stats: dict[str, RunningStats]) -> EnvState:
+        if self.stats is None:
+            stats = {name: stats[name].update(x) for name, x in state.obs.items()}
+        return self._normalized(state, stats)
+
+    def _normalized(self, state: EnvState, stats: dict[str, RunningStats]) -> EnvState:
+        return self.remember(state, stats, obs={name: stats[name].normalize(x) for name, x in state.obs.items()})
 
 
 class FrameStack(Wrapper):

@@ -12,8 +12,9 @@ import optax
 from jax import Array
 
 from crazysim.envs.env import Env, EnvState
+from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
-from crazysim.train.networks import Layers, Policy, RunningStats, flatten, init_mlp
+from crazysim.train.networks import Layers, Policy, flatten, init_mlp
 
 
 @dataclass(frozen=True)

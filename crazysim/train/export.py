@@ -18,8 +18,9 @@ import numpy as np
 import crazysim
 from crazysim.control import Control
 from crazysim.envs.env import Env
+from crazysim.envs.statistics import CLIP, EPSILON
 from crazysim.errors import ConfigError
-from crazysim.train.networks import CLIP, EPSILON, Policy
+from crazysim.train.networks import Policy
 
 OBSERVATIONS = {
     "pos": "position, world frame, m",

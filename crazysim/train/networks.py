@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 
-CLIP, EPSILON = 10.0, 1e-6
-"""Largest normalised observation, and what is added to a variance before the root is taken."""
 Layers = list[tuple[Array, Array]]
 """Weights (n_in, n_out) and biases (n_out,), first layer first."""
 
@@ -44,35 +43,6 @@ def mlp(layers: Layers, x: Array) -> Array:
 def flatten(obs: dict[str, Array]) -> Array:
     """Return named observations one behind the other, by name. (..., n_obs)"""
     return jnp.concatenate([obs[name] for name in sorted(obs)], axis=-1)
-
-
-class RunningStats(PyTree):
-    """Mean and variance of what has been seen (Chan, Golub, LeVeque 1979)."""
-
-    mean: Array
-    """(k,)"""
-    var: Array
-    """(k,)"""
-    count: Array
-    """How many were seen. ()"""
-
-    @staticmethod
-    def create(size: int) -> RunningStats:
-        """Return the statistics of nothing: mean zero, variance one."""
-        return RunningStats(jnp.zeros(size), jnp.ones(size), jnp.asarray(1e-4))
-
-    def update(self, x: Array) -> RunningStats:
-        """Return the statistics with a batch more. (..., k)"""
-        x = x.reshape(-1, x.shape[-1])
-        n, mean, var = x.shape[0], x.mean(axis=0), x.var(axis=0)
-        total = self.count + n
-        delta = mean - self.mean
-        spread = self.var * self.count + var * n + delta * delta * self.count * n / total
-        return RunningStats(self.mean + delta * n / total, spread / total, total)
-
-    def normalize(self, x: Array) -> Array:
-        """Return numbers of mean zero and variance one, at most ten. (..., k)"""
-        return jnp.clip((x - self.mean) / jnp.sqrt(self.var + EPSILON), -CLIP, CLIP)
 
 
 class Policy(PyTree):

@@ -13,8 +13,9 @@ from jax import Array
 
 from crazysim.envs.env import Env, EnvState
 from crazysim.envs.rollout import bare
+from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
-from crazysim.train.networks import Layers, Policy, RunningStats, flatten, init_mlp, mlp
+from crazysim.train.networks import Layers, Policy, flatten, init_mlp, mlp
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,13 @@ import numpy as np
 import crazysim
 from crazysim.envs.env import DroneEnv
 from crazysim.envs.registry import entry_of, make
+from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train.evaluate import evaluate
 from crazysim.train.export import describe
-from crazysim.train.networks import Policy, RunningStats
+from crazysim.train.networks import Policy
 
 ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg}
 """Each a module with ``Config``, ``init`` and ``iterate``."""

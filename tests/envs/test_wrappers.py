@@ -13,6 +13,7 @@ from crazysim.envs import (
     AutoReset,
     EpisodeStatistics,
     FrameStack,
+    Normalize,
     ObservationNoise,
     Observe,
     Randomize,
@@ -100,6 +101,37 @@ def test_observe_changes_what_is_seen_at_all_times(env):
         state, plain = wrapped.step(state, random_action(plain)), env.step(plain, random_action(plain))
     state, plain = wrapped.restart(state, jnp.asarray(FIRST)), env.restart(plain, jnp.asarray(FIRST))
     assert trees_equal(state.obs["all"], flatten(plain.obs))
+
+
+def test_normalised_over_all_that_was_seen(env):
+    wrapped = AutoReset(Normalize(env), "NextStep")
+    begun = wrapped.reset(jax.random.key(0))
+    states = [begun, *steps(wrapped, begun, 9)]
+    plain = env.reset(jax.random.key(0))
+    seen = [s.obs["pos"] for s in (plain, *steps(env, plain, 9))]
+    stats = states[-1].memory["Normalize"]["pos"]
+    flat = np.concatenate([np.asarray(x, float).reshape(-1, 3) for x in seen])
+    # float32, and the weight of 1e-4 that the prior has among 40: relative to a variance of one
+    np.testing.assert_allclose(stats.mean, flat.mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(stats.var, flat.var(axis=0), atol=1e-4)
+    expected = (seen[-1] - flat.mean(axis=0)) / np.sqrt(flat.var(axis=0) + 1e-6)
+    np.testing.assert_allclose(states[-1].obs["pos"], expected, rtol=1e-3, atol=1e-3)
+    # a new episode is normalised with what is known, and its beginning is not counted twice
+    again = wrapped.restart(states[-1], jnp.asarray(FIRST))
+    assert trees_equal(again.memory, states[-1].memory)
+    np.testing.assert_array_equal(again.obs["pos"][1:], states[-1].obs["pos"][1:])
+
+
+def test_given_statistics_stay(env):
+    known = Normalize(env).reset(jax.random.key(0)).memory["Normalize"]
+    frozen = Normalize(env, known)
+    state = frozen.step(frozen.reset(jax.random.key(3)), jnp.zeros((4, 1, 4)))
+    assert trees_equal(state.memory["Normalize"], known)
+    plain = env.step(env.reset(jax.random.key(3)), jnp.zeros((4, 1, 4)))
+    np.testing.assert_array_equal(state.obs["vel"], known["vel"].normalize(plain.obs["vel"]))
+    del known["vel"]
+    with pytest.raises(ConfigError, match="vel is in one of them only"):
+        frozen.reset(jax.random.key(0))
 
 
 def test_noise_is_as_large_as_said_and_reproducible(env):

@@ -13,8 +13,9 @@ import pytest
 
 from crazysim import ConfigError
 from crazysim.envs import make
+from crazysim.envs.statistics import RunningStats
 from crazysim.train.export import describe, to_c, to_onnx
-from crazysim.train.networks import Policy, RunningStats, init_mlp
+from crazysim.train.networks import Policy, init_mlp
 
 FLAGS = ("-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 
