@@ -3,14 +3,12 @@
 import os
 from pathlib import Path
 
+import compiling
+
 os.environ.setdefault("MUJOCO_GL", "egl")
 # XLA logs an error of 3,000 characters for every program from the cache that could use another vector width.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-FLAGS = os.environ.get("XLA_FLAGS", "")
-if "xla_backend_optimization_level" not in FLAGS:
-    # Compiling is most of the suite's time, and takes half of it like this; CI runs laws and engines in full too.
-    FLAGS += " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-os.environ["XLA_FLAGS"] = FLAGS + " --xla_force_host_platform_device_count=2"
+os.environ.update(compiling.environment(os.environ))
 
 import jax
 import numpy as np

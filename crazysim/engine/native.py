@@ -6,6 +6,7 @@ import ctypes
 import functools
 import hashlib
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -21,7 +22,8 @@ from crazysim.engine.kernel import Kernel
 
 FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-shared",
          "-fPIC", "-fvisibility=hidden", "-pthread", "-w")  # fmt: skip
-"""Options of the compiler: contraction of multiply and add is allowed, nothing that forgets NaN is."""
+"""Options of the compiler, before those of the variable CXXFLAGS: contraction of multiply and add is allowed, nothing
+that forgets NaN is."""
 
 
 def call(kernel: Kernel, n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
@@ -48,7 +50,8 @@ def target(kernel: Kernel) -> str:
     path = compiler()
     if path is None:
         raise RuntimeError("no C++ compiler was found; install g++ or clang++, or set CXX")
-    command = [path, *FLAGS, "-I", jax.ffi.include_dir(), "-x", "c++", "-"]
+    own = shlex.split(os.environ.get("CXXFLAGS", ""))
+    command = [path, *FLAGS, *own, "-I", jax.ffi.include_dir(), "-x", "c++", "-"]
     digest = hashlib.sha256("\0".join([*command, jax.__version__, kernel.text]).encode()).hexdigest()[:16]
     library = _folder() / f"{digest}.so"
     if not library.exists():

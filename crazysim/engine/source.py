@@ -23,6 +23,9 @@ OPERATIONS = set(
 )
 """Operations that both preambles have."""
 
+OPERATORS = {"add": "+", "sub": "-", "mul": "*"}
+"""Operations that the language has, for single numbers and for vectors: quicker to compile than calls."""
+
 INDENT = "  "
 
 
@@ -115,6 +118,10 @@ class Writer:
         limit = _limit(value)
         if limit is not None:
             return f"{limit}({args[1]}, {args[2]})"
+        if value.op in OPERATORS and kind != "b1":
+            return f"{args[0]} {OPERATORS[value.op]} {args[1]}"
+        if value.op == "div" and kind in ("f32", "f64"):
+            return f"{args[0]} / {args[1]}"
         if value.op not in OPERATIONS:
             raise NoRuleError(f"operation {value.op!r} has no source")
         return f"{value.op}_({', '.join(args)})"

@@ -1,7 +1,6 @@
 """The scene is a spec that users edit: what is in it, what may be added, and what is refused."""
 
 import struct
-import time
 import zlib
 
 import jax
@@ -133,20 +132,10 @@ def test_the_tracking_camera_looks_at_its_drone():
     np.testing.assert_allclose(-data.cam_xmat[forward].reshape(3, 3)[:, 2], [np.cos(0.8), 0, -np.sin(0.8)], atol=1e-6)
 
 
-def test_a_swarm_of_thousands_builds_in_seconds():
-    """Time per drone must not grow with their number: MuJoCo goes through the whole spec for every geom it is given."""
-    airframe = load_airframe("cf21B_500")
-
-    def seconds(n):
-        begin = time.perf_counter()
-        model = compile_spec(build_spec(None, airframe, n, 500, 2 * n))
-        assert model.nmocap == n
-        return time.perf_counter() - begin
-
-    seconds(16)
-    few, many = seconds(256), seconds(4096)
-    assert many < 20
-    assert many / few < 16 * 3, f"{few:.2f} s for 256 drones, {many:.2f} s for 4,096"
+def test_a_swarm_of_thousands_builds():
+    """MuJoCo goes through the whole spec for every geom it is given: built one by one, this would take minutes."""
+    model = compile_spec(build_spec(None, load_airframe("cf21B_500"), 4096, 500, 8192))
+    assert model.nmocap == 4096
 
 
 def test_a_swarm_built_in_chunks_is_the_swarm_built_one_by_one(monkeypatch):

@@ -1,11 +1,12 @@
 // A block of W lanes is a vector, held as GCC's and Clang's vector types; what all lanes share stays a number.
-#include <algorithm>
+#include <pthread.h>
+#include <sched.h>
+#include <unistd.h>
+
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <thread>
 #include <type_traits>
-#include <vector>
 
 #include "xla/ffi/api/c_api.h"
 
@@ -221,13 +222,33 @@ template <int SIZE, int DRONES> FN void store(b1* p, int64_t first, int n, int k
 #define LOAD(SIZE, DRONES, p, k) load<SIZE, DRONES>(p, first, n_active, k)
 #define STORE(SIZE, DRONES, p, k, value) store<SIZE, DRONES>(p, first, n_active, k, value);
 
-// Work that is worth it is shared between the cores, in whole blocks of lanes.
+// Work that is worth it is shared between the cores, in whole blocks of lanes. Of the system's headers the small ones:
+// reading those of std::thread would take as long as reading all of this.
+static int64_t n_cores() {  // that this process may use
+#if defined(__linux__)
+  cpu_set_t set;
+  if (sched_getaffinity(0, sizeof(set), &set) == 0) return CPU_COUNT(&set);
+#endif
+  return sysconf(_SC_NPROCESSORS_ONLN);
+}
+static int64_t least(int64_t a, int64_t b) { return b < a ? b : a; }
+template <class F> struct Share { const F* run; int64_t from, to; pthread_t thread; bool begun; };
+template <class F> static void* work(void* share) {
+  const auto s = static_cast<Share<F>*>(share);
+  (*s->run)(s->from, s->to);
+  return nullptr;
+}
 template <class F> static void in_parallel(int64_t n_lanes, int n_steps, const F& run) {
-  const int64_t n_blocks = (n_lanes + LANES - 1) / LANES, n_cores = std::thread::hardware_concurrency();
-  const int64_t n_threads = std::min(n_cores, n_blocks * n_steps / 512);
-  std::vector<std::thread> threads;
-  const auto bound = [=](int64_t k) { return std::min(n_lanes, n_blocks * k / std::max<int64_t>(n_threads, 1) * LANES); };
-  for (int64_t k = 1; k < n_threads; ++k) threads.emplace_back(run, bound(k), bound(k + 1));
+  const int most = 256;
+  const int64_t n_blocks = (n_lanes + LANES - 1) / LANES, worth = n_blocks * n_steps / 512;
+  const int64_t n_threads = worth < 2 ? 1 : least(least(n_cores(), most), worth);
+  const auto bound = [=](int64_t k) { return least(n_lanes, n_blocks * k / n_threads * LANES); };
+  Share<F> shares[most];
+  for (int64_t k = 1; k < n_threads; ++k) {
+    shares[k] = {&run, bound(k), bound(k + 1), pthread_t(), false};
+    shares[k].begun = pthread_create(&shares[k].thread, nullptr, work<F>, &shares[k]) == 0;
+    if (!shares[k].begun) work<F>(&shares[k]);
+  }
   run(0, bound(1));
-  for (auto& t : threads) t.join();
+  for (int64_t k = 1; k < n_threads; ++k) if (shares[k].begun) pthread_join(shares[k].thread, nullptr);
 }

@@ -1,0 +1,26 @@
+"""How tests compile: without optimising, which takes half the time."""
+
+from collections.abc import Mapping
+from importlib.metadata import version
+
+HAS_EMITTERS = version("jaxlib").startswith("0.10.")
+"""Whether XLA lets one choose how loops are fused; later ones know one way only, and refuse to be asked."""
+
+
+def options(emitters: bool = False) -> dict[str, bool | int]:
+    """Return XLA's options; with its emitters of fused loops results round alike for any number of worlds."""
+    always = {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1}
+    return always | ({"xla_cpu_use_fusion_emitters": emitters} if HAS_EMITTERS else {})
+
+
+def environment(given: Mapping[str, str]) -> dict[str, str]:
+    """Return variables for the tests: two host devices, and no optimising unless ``XLA_FLAGS`` says how much.
+
+    CI runs laws and engines once more with all optimisations.
+    """
+    flags = given.get("XLA_FLAGS", "")
+    quick = "xla_backend_optimization_level" not in flags
+    if quick:
+        flags += "".join(f" --{name}={str(value).lower()}" for name, value in options().items())
+    own = {"CXXFLAGS": f"{given.get('CXXFLAGS', '')} -O1"} if quick else {}
+    return {"XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=2"} | own
