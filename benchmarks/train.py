@@ -13,10 +13,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from measure import digits, report
 
-from crazysim.train.show import plot_curve, read_curve
+from crazysim.train.show import read_curve
 
 
 def main() -> None:
@@ -28,15 +30,33 @@ def main() -> None:
     parser.add_argument("--plot", type=Path, help="picture of the learning curves")
     parser.add_argument("--only-plot", action="store_true", help="train nothing, plot what is there")
     args = parser.parse_args()
-    curves = {}
+    curves: dict[str, list[Any]] = {task: [] for task in args.tasks}
     for task in args.tasks:
         for seed in args.seeds:
             folder = args.out / f"{task}-{args.device}-{seed}"
             if not args.only_plot:
                 train(task, seed, folder, args.device)
-            curves[f"{task}, {seed}"] = read_curve(folder)
+            curves[task].append(read_curve(folder))
     if args.plot is not None:
-        plot_curve(curves, args.plot)
+        plot(curves, args.plot)
+
+
+def plot(curves: dict[str, list[Any]], path: Path) -> None:
+    """Draw success over time, a panel for each task, a line for each seed."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(curves), figsize=(3.2 * len(curves), 2.8), sharey=True, layout="constrained")
+    for axis, (task, seeds) in zip(np.atleast_1d(axes), curves.items(), strict=True):
+        for curve in seeds:
+            axis.plot([p["seconds"] for p in curve], [100 * p["success"] for p in curve], marker=".")
+        axis.set(title=task, xlabel="time with compilation, s", ylim=(-3, 103))
+        axis.grid(alpha=0.3)
+    np.atleast_1d(axes)[0].set_ylabel("held-out starts that succeed, %")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90)
 
 
 def train(task: str, seed: int, folder: Path, device: str) -> None:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -120,7 +121,6 @@ def test_limits_prints_a_floor_and_how_far_from_it(monkeypatch, benchmarks, caps
 
 def test_operations_are_counted_in_multiply_adds(benchmarks):
     import limits
-    import numpy as np
 
     from crazysim.engine.ir import Block
 
@@ -174,3 +174,17 @@ def test_a_gradient_is_timed_like_a_flight(benchmarks):
 def test_every_script_explains_itself(script):
     out = subprocess.run([sys.executable, BENCHMARKS / script, "--help"], capture_output=True, text=True, check=True)
     assert "--device" in out.stdout
+
+
+def test_learning_curves_of_several_seeds_are_drawn(tmp_path):
+    plt = pytest.importorskip("matplotlib.pyplot")
+    for seed, success in enumerate((0.0, 1.0)):
+        folder = tmp_path / f"hover-cpu-{seed}"
+        folder.mkdir()
+        curve = [{"seconds": 5.0, "success": 0.0}, {"seconds": 9.0, "success": success}]
+        (folder / "curve.json").write_text(json.dumps(curve))
+    picture = tmp_path / "curves.png"
+    run("train.py", "--only-plot", "--tasks", "hover", "--seeds", "0", "1", "--out", tmp_path, "--plot", picture)
+    pixels = (plt.imread(picture)[..., :3].reshape(-1, 3) * 255).round()
+    for color in ((31, 119, 180), (255, 127, 14)):  # matplotlib's first two, a line for each seed; smoothed
+        assert (np.abs(pixels - color).max(axis=-1) < 40).sum() > 20, color
