@@ -50,7 +50,7 @@ class Recipe:
 
 RECIPES: dict[str, Recipe] = {
     "hover": Recipe(config={"iterations": 80}),
-    "recover": Recipe(config={"iterations": 300}),
+    "recover": Recipe(config={"iterations": 150}),
     "race": Recipe(n_worlds=4096, config={"iterations": 600, "entropy": 0.01, "init_std": 0.7}, evaluate_every=60),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
 }
@@ -91,22 +91,22 @@ class Settings:
         """
         entry_of(task)
         recipe = RECIPES.get(task, Recipe())
-        algorithm = algorithm or recipe.algorithm
+        if algorithm not in (None, recipe.algorithm):
+            recipe = Recipe(algorithm)
+        algorithm = recipe.algorithm
         if algorithm not in ALGORITHMS:
             raise UnknownNameError(f"algorithm {algorithm!r} does not exist; there are {', '.join(ALGORITHMS)}")
-        of_recipe = recipe.config if algorithm == recipe.algorithm else {}
         known = {f.name: f for f in dataclasses.fields(ALGORITHMS[algorithm].Config)}
-        chosen = of_recipe | (config or {})
+        chosen = recipe.config | (config or {})
         if wrong := [name for name in chosen if name not in known]:
             raise ConfigError(f"{algorithm} has no setting {', '.join(wrong)}; it has {', '.join(known)}")
         full = dataclasses.asdict(ALGORITHMS[algorithm].Config(**chosen))
         full["hidden"] = list(full["hidden"])
-        n_worlds = n_worlds or (recipe.n_worlds if algorithm == recipe.algorithm else Recipe.n_worlds)
-        return Settings(task, algorithm, seed, n_worlds, dict(options or {}), full)
+        return Settings(task, algorithm, seed, n_worlds or recipe.n_worlds, dict(options or {}), full)
 
-    def environment(self, n_worlds: int | None = None) -> DroneEnv:
-        """Return the environment of the run, or one like it with another number of worlds."""
-        return make(self.task, n_worlds or self.n_worlds, **self.options)
+    def environment(self, n_worlds: int | None = None, **options: Any) -> DroneEnv:
+        """Return the environment of the run, or one like it with other worlds, and options that the run leaves open."""
+        return make(self.task, n_worlds or self.n_worlds, **options | self.options)
 
     def algorithm_config(self) -> Any:
         """Return the settings of the algorithm, as it wants them."""
@@ -155,7 +155,8 @@ def train(
     path = folder / CHECKPOINT
     begin = time.perf_counter()
     algorithm, config = ALGORITHMS[settings.algorithm], settings.algorithm_config()
-    base = settings.environment()
+    # A gradient runs on lanes in any case; a kernel for the way forward would take longer to compile than it saves.
+    base = settings.environment(settings.n_worlds, **{"engine": "lanes"} if algorithm is apg else {})
     env = base if algorithm is apg else AutoReset(base)
     judge = settings.environment(evaluation_worlds)
     key = jax.random.fold_in(jax.random.key(settings.seed), 1)
