@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.envs.drawing import RENDER_MODES, Drawing
 from crazysim.envs.env import Env, EnvState
 from crazysim.envs.registry import make
-from crazysim.envs.vector import RENDER_MODES
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, UnknownNameError
 
@@ -48,9 +48,8 @@ class DroneParallelEnv(ParallelEnv):
             )
         if isinstance(env, AutoReset):
             raise ConfigError("PettingZoo's users reset by themselves: give the environment without AutoReset")
-        if render_mode not in (None, *RENDER_MODES):
-            raise ConfigError(f"render_mode is {render_mode!r}; it must be None or one of {', '.join(RENDER_MODES)}")
-        self.env, self.sim, self.render_mode, self._size = env, env.sim, render_mode, render_size
+        self.env, self.sim, self.render_mode = env, env.sim, render_mode
+        self._drawing = Drawing(env.sim, render_mode, size=render_size)
         self.metadata = {
             "name": f"crazysim/{env.task.name}",
             "render_modes": list(RENDER_MODES),
@@ -142,12 +141,8 @@ class DroneParallelEnv(ParallelEnv):
             ConfigError: If nothing was said of drawing when the environment was made, or it was not reset.
             RenderError: If this machine cannot draw.
         """
-        if self.render_mode is None or self.now is None:
-            raise ConfigError("to render, make the environment with render_mode='rgb_array' or 'human', and reset it")
-        self.sim.data = self.now.data
-        width, height = self._size
-        picture = self.sim.render(self.render_mode, 0, width=width, height=height)
-        return np.asarray(picture) if self.render_mode == "rgb_array" else None
+        pictures = self._drawing(self.now)
+        return pictures[0] if pictures else None
 
     def close(self) -> None:
         """Close the window."""

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.envs.drawing import Drawing
 from crazysim.envs.env import Env, EnvState, Obs
-from crazysim.envs.vector import RENDER_MODES
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
 from crazysim.errors import ConfigError
 
@@ -54,14 +54,12 @@ class DroneVecEnv(VecEnv):
         Raises:
             ConfigError: If there is no such mode, or the environment begins episodes by itself.
         """
-        if render_mode not in (None, *RENDER_MODES):
-            raise ConfigError(f"render_mode is {render_mode!r}; it must be None or one of {', '.join(RENDER_MODES)}")
         if isinstance(env, AutoReset):
             raise ConfigError(
                 "give the environment without AutoReset: new episodes begin as Stable-Baselines3 wants it"
             )
         self.env, self.sim, self.dict_obs = AutoReset(EpisodeStatistics(env)), env.sim, dict_obs
-        self._mode, self._worlds, self._size = render_mode, tuple(render_worlds), render_size
+        self._drawing = Drawing(env.sim, render_mode, render_worlds, render_size)
         self._begin, self._advance = jax.jit(self._first), jax.jit(self._next)
         self._generator, _ = gymnasium.utils.seeding.np_random()
         self._actions: np.ndarray | None = None
@@ -142,7 +140,7 @@ class DroneVecEnv(VecEnv):
         Raises:
             AttributeError: If it has none of that name.
         """
-        value = self._mode if attr_name == "render_mode" else getattr(self.env, attr_name)
+        value = self._drawing.mode if attr_name == "render_mode" else getattr(self.env, attr_name)
         return [value] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -176,14 +174,7 @@ class DroneVecEnv(VecEnv):
             ConfigError: If nothing was said of drawing when the environment was made, or it was not reset.
             RenderError: If this machine cannot draw.
         """
-        if self._mode is None or self.state is None:
-            raise ConfigError("to render, make the environment with render_mode='rgb_array' or 'human', and reset it")
-        self.sim.data = self.state.data
-        width, height = self._size
-        if self._mode == "human":
-            self.sim.render("human", self._worlds[0], width=width, height=height)
-            return []
-        return [np.asarray(self.sim.render("rgb_array", w, width=width, height=height)) for w in self._worlds]
+        return self._drawing(self.state)
 
     def close(self) -> None:
         """Close the window."""

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
+from crazysim.envs.drawing import RENDER_MODES, Drawing
 from crazysim.envs.env import DroneEnv, Env, EnvState
 from crazysim.envs.registry import TASKS, make
 from crazysim.envs.rollout import bare
@@ -19,9 +20,6 @@ from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError
 from crazysim.sim.settings import as_mask, member
 from crazysim.sim.stage import with_leaves
-
-RENDER_MODES = ("rgb_array", "human")
-"""What ``render_mode`` may be besides None."""
 
 
 class DroneVectorEnv(gymnasium.vector.VectorEnv):
@@ -53,14 +51,12 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             ConfigError: If there is no such mode, or the environment begins episodes by itself.
         """
-        if render_mode not in (None, *RENDER_MODES):
-            raise ConfigError(f"render_mode is {render_mode!r}; it must be None or one of {', '.join(RENDER_MODES)}")
         if isinstance(env, AutoReset):
             raise ConfigError("give the environment without AutoReset, and say autoreset_mode= here")
         mode = member(GymnasiumMode, "autoreset_mode", autoreset_mode)
         self.env = AutoReset(env, AutoresetMode(mode.value))
         self.sim, self.render_mode = env.sim, render_mode
-        self._worlds, self._size = tuple(render_worlds), render_size
+        self._drawing = Drawing(env.sim, render_mode, render_worlds, render_size)
         self.metadata = {
             "autoreset_mode": mode,
             "render_modes": list(RENDER_MODES),
@@ -179,14 +175,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             ConfigError: If nothing was said of drawing when the environment was made, or it was not reset.
             RenderError: If this machine cannot draw.
         """
-        if self.render_mode is None or self.state is None:
-            raise ConfigError("to render, make the environment with render_mode='rgb_array' or 'human', and reset it")
-        self.sim.data = self.state.data
-        width, height = self._size
-        if self.render_mode == "human":
-            self.sim.render("human", self._worlds[0], width=width, height=height)
-            return None
-        return tuple(self.sim.render("rgb_array", world, width=width, height=height) for world in self._worlds)
+        pictures = self._drawing(self.state)
+        return tuple(pictures) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window."""
