@@ -17,9 +17,10 @@ import jax.numpy as jnp
 from measure import digits, engine_of, medians, report
 
 import crazysim.envs as envs
+from crazysim.envs.env import flatten
 from crazysim.envs.rollout import bare
 from crazysim.envs.statistics import RunningStats
-from crazysim.train.networks import Policy, flatten, init_mlp
+from crazysim.train.networks import Policy, init_mlp
 
 SIZES = {"cpu": (1024, 16384), "gpu": (4096, 65536, 1048576)}
 

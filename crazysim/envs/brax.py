@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.envs.env import Env, EnvState, Obs
+from crazysim.envs.env import Env, EnvState, Obs, flatten
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
@@ -152,5 +152,4 @@ class BraxEnv:
         return jnp.mean(x, axis=1)
 
     def _flat(self, obs: Obs) -> Array:
-        together = jnp.concatenate([obs[name] for name in sorted(obs)], axis=-1)
-        return together.reshape(self.sim.n_worlds, -1)
+        return flatten(obs).reshape(self.sim.n_worlds, -1)

@@ -243,6 +243,27 @@ def told(task: Task, data: SimData) -> dict[str, Array]:
     return {"nonfinite": data.core.nonfinite[:, 0], "error": task.error(data)} | task.info(data)
 
 
+def flatten(obs: Obs) -> Array:
+    """Return named observations one behind the other, by name. (..., n_obs)"""
+    return jnp.concatenate([obs[name] for name in sorted(obs)], axis=-1)
+
+
+def from_host(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return actions of the host for all worlds, checked. (n_worlds, ...)
+
+    Raises:
+        ConfigError: If they are not finite, with the first few worlds where.
+        ValueError: If they have another shape.
+    """
+    actions = np.asarray(actions, np.float32)
+    if actions.shape != shape:
+        raise ValueError(f"actions have shape {actions.shape}; needed is {shape}")
+    if not np.all(np.isfinite(actions)):
+        worlds = np.unique(np.nonzero(~np.isfinite(actions))[0])[:8]
+        raise ConfigError(f"the action is NaN or infinite in world(s) {worlds.tolist()}")
+    return actions
+
+
 def fitting(action: Array, state: EnvState, actions: Actions) -> Array:
     """Return an action in the type of the state's, or say which shape it must have.
 

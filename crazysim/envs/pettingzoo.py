@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.envs.drawing import RENDER_MODES, Drawing
-from crazysim.envs.env import Env, EnvState
+from crazysim.envs.env import Env, EnvState, flatten
 from crazysim.envs.registry import make
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, UnknownNameError
@@ -131,8 +131,7 @@ class DroneParallelEnv(ParallelEnv):
         """
         if self.now is None:
             raise ConfigError("there is no state before the first reset(): call it first")
-        obs = jax.device_get(self.now.obs)
-        return np.concatenate([obs[name][0] for name in sorted(obs)], axis=-1).ravel()
+        return np.array(flatten(self.now.obs)).ravel()
 
     def render(self) -> np.ndarray | None:
         """Draw the world: a picture (height, width, 3), or into a window.

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.envs.drawing import Drawing
-from crazysim.envs.env import Env, EnvState, Obs
+from crazysim.envs.env import Env, EnvState, Obs, flatten, from_host
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
 from crazysim.errors import ConfigError
 
@@ -98,14 +98,7 @@ class DroneVecEnv(VecEnv):
         """
         if self.state is None:
             raise ConfigError("the environment must be reset before its first step: call reset()")
-        actions = np.asarray(actions, np.float32)
-        needed = (self.num_envs, *(self.action_space.shape or ()))
-        if actions.shape != needed:
-            raise ValueError(f"actions have shape {actions.shape}; needed is {needed}")
-        if not np.isfinite(actions).all():
-            worlds = np.unique(np.nonzero(~np.isfinite(actions))[0])[:8]
-            raise ConfigError(f"the action is NaN or infinite in world(s) {worlds.tolist()}")
-        self._actions = actions
+        self._actions = from_host(actions, (self.num_envs, *(self.action_space.shape or ())))
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Return observations, rewards, which episodes ended, and infos.
@@ -200,7 +193,7 @@ class DroneVecEnv(VecEnv):
     def _seen(self, obs: Obs) -> Obs:
         """Return observations as one vector called ``all``, or, where they are named, those of all drones by name."""
         if not self.dict_obs:
-            obs = {"all": jnp.concatenate([obs[name] for name in sorted(obs)], axis=-1)}
+            obs = {"all": flatten(obs)}
         return {name: x.reshape(x.shape[0], -1).astype(jnp.float32) for name, x in obs.items()}
 
     def _out(self, obs: dict[str, Any]) -> Any:

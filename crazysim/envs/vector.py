@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
 from crazysim.envs.drawing import RENDER_MODES, Drawing
-from crazysim.envs.env import DroneEnv, Env, EnvState
+from crazysim.envs.env import DroneEnv, Env, EnvState, from_host
 from crazysim.envs.registry import TASKS, make
 from crazysim.envs.rollout import bare
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
@@ -130,15 +130,11 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         """
         if self._carried is None:
             raise ConfigError("the environment must be reset before its first step: call reset()")
+        needed = self.action_space.shape or ()
         if not isinstance(actions, jax.Array):
-            actions = np.asarray(actions, np.float32)
-            if actions.shape != self.action_space.shape:
-                raise ValueError(f"actions have shape {actions.shape}; needed is {self.action_space.shape}")
-            if not np.all(np.isfinite(actions)):
-                worlds = np.unique(np.nonzero(~np.isfinite(actions))[0])[:8]
-                raise ConfigError(f"the action is NaN or infinite in world(s) {worlds.tolist()}")
-        elif actions.shape != self.action_space.shape:
-            raise ValueError(f"actions have shape {actions.shape}; needed is {self.action_space.shape}")
+            actions = from_host(actions, needed)
+        elif actions.shape != needed:
+            raise ValueError(f"actions have shape {actions.shape}; needed is {needed}")
         self._carried, self._told = self._advance(self._carried, actions)
         obs, reward, info = self._told
         if self.render_mode == "human":

@@ -93,10 +93,9 @@ def _walls(shape: Shape, o: Vector, d: Vector) -> Hit:
 
 def _surface(shape: Shape, o: Vector, d: Vector) -> Hit:
     """Return where rays meet the triangles, by going through the cells that they pass over, in order."""
-    if shape.heights is None:
-        raise TypeError("shape.heights: None, where the kind has one")
-    n_rows, n_columns = shape.heights.shape
-    heights = jnp.asarray(shape.heights, o.x.dtype)
+    ground = shape.array("heights")
+    n_rows, n_columns = ground.shape
+    heights = jnp.asarray(ground, o.x.dtype)
     side_x, side_y = spacing(shape)
     # In cells: the place of the origin and the way per metre.
     u, v = (o.x + shape.size[0]) / side_x, (o.y + shape.size[1]) / side_y

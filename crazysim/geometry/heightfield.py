@@ -22,9 +22,7 @@ from crazysim.rotation import safe_clip, safe_sqrt
 
 def spacing(shape: Shape) -> tuple[float, float]:
     """Return the sides of a cell along x and y, m."""
-    if shape.heights is None:
-        raise TypeError("shape.heights: None, where the kind has one")
-    n_rows, n_columns = shape.heights.shape
+    n_rows, n_columns = shape.array("heights").shape
     return 2 * shape.size[0] / (n_columns - 1), 2 * shape.size[1] / (n_rows - 1)
 
 
@@ -90,9 +88,7 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
 
 def corners(shape: Shape, place: Vector, reach: float) -> Vector:
     """Return the corners of the cells within reach of a point, which carry no derivative. (..., n_y + 1, n_x + 1)"""
-    if shape.heights is None:
-        raise TypeError("shape.heights: None, where the kind has one")
-    heights = shape.heights
+    heights = shape.array("heights")
     starts, counts = [], []
     for position, half, side, n in (
         (place.y, shape.size[1], spacing(shape)[1], heights.shape[0] - 1),
@@ -146,9 +142,7 @@ def height(shape: Shape, x: Array, y: Array, like: Vector) -> Array:
 
 def plane_at(shape: Shape, x: Array, y: Array, like: Vector) -> tuple[Array, Array, Array, Array, Array]:
     """Return where in its cell a place is, 0 to 1, the rises of its triangle along the cell, and its start, m. (...)"""
-    if shape.heights is None:
-        raise TypeError("shape.heights: None, where the kind has one")
-    heights = jnp.asarray(shape.heights, like.x.dtype)
+    heights = jnp.asarray(shape.array("heights"), like.x.dtype)
     side_x, side_y = spacing(shape)
     u, v = (x + shape.size[0]) / side_x, (y + shape.size[1]) / side_y
     column = jnp.clip(jnp.floor(u), 0, heights.shape[1] - 2).astype(jnp.int32)

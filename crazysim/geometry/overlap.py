@@ -94,9 +94,7 @@ def _best_of(tried: Best, best: Best) -> Best:
 
 def _best_face(pair: Pair) -> Best:
     """Return the best of the normals of a mesh."""
-    normals, offsets = pair.other.normals, pair.other.offsets
-    if normals is None or offsets is None:
-        raise TypeError("normals, offsets: None, where the kind has one")
+    normals, offsets = pair.other.array("normals"), pair.other.array("offsets")
     x, y, z = (jnp.asarray(column, pair.place.x.dtype) for column in normals.T)
 
     def products(v: Vector) -> Array:

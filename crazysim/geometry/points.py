@@ -125,11 +125,10 @@ def _mesh(shape: Shape, point: Array) -> Array:
 
     Where the nearest triangle is, a small move of the point does not move what is nearest on it, to first order.
     """
-    if shape.vertices is None or shape.faces is None or shape.normals is None or shape.offsets is None:
-        raise TypeError("shape.vertices, shape.faces, shape.normals, shape.offsets: None, where the kind has one")
     place = vector(point)
-    inside = plane_distance(shape.normals, shape.offsets, place)
-    corners = [Vector(*jnp.asarray(shape.vertices[shape.faces[:, k]].T, point.dtype)) for k in range(3)]
+    inside = plane_distance(shape.array("normals"), shape.array("offsets"), place)
+    triangles = shape.array("vertices")[shape.array("faces")]
+    corners = [Vector(*jnp.asarray(triangles[:, k].T, point.dtype)) for k in range(3)]
     return jnp.where(inside > 0, triangles_distance(place, *corners), inside)
 
 

@@ -119,9 +119,7 @@ def _ellipsoid_line(shape: Shape, origin: Array, direction: Array) -> Interval:
 
 def _planes(shape: Shape, v: Array) -> Array:
     """Return the products of vectors with all normals of a mesh. (..., n_planes)"""
-    if shape.normals is None:
-        raise TypeError("shape.normals: None, where the kind has one")
-    x, y, z = (jnp.asarray(column, v.dtype) for column in shape.normals.T)
+    x, y, z = (jnp.asarray(column, v.dtype) for column in shape.array("normals").T)
     return x * v[..., :1] + y * v[..., 1:2] + z * v[..., 2:]
 
 
@@ -196,10 +194,8 @@ def _ellipsoid_normal(shape: Shape, point: Array) -> Array:
 
 
 def _mesh_normal(shape: Shape, point: Array) -> Array:
-    if shape.normals is None:
-        raise TypeError("shape.normals: None, where the kind has one")
     above = _planes(shape, point) - jnp.asarray(shape.offsets, point.dtype)
-    return jnp.take(jnp.asarray(shape.normals, point.dtype), jnp.argmax(above, axis=-1), axis=0)
+    return jnp.take(jnp.asarray(shape.array("normals"), point.dtype), jnp.argmax(above, axis=-1), axis=0)
 
 
 NORMAL = {

@@ -65,6 +65,17 @@ class Shape:
                 raise ConfigError(f"a {kind} without {name}; make it with geometry.{maker}")
         object.__setattr__(self, "size", tuple(size.tolist()))
 
+    def array(self, name: str) -> np.ndarray:
+        """Return an array that shapes of this kind have.
+
+        Raises:
+            TypeError: If they have none of that name.
+        """
+        found = getattr(self, name)
+        if found is None:
+            raise TypeError(f"a {self.kind} has no {name}")
+        return found
+
     def _content(self) -> tuple[Any, ...]:
         arrays = (self.vertices, self.faces, self.normals, self.offsets, self.heights)
         return (self.kind, self.size, *(None if a is None else (a.shape, a.tobytes()) for a in arrays))

@@ -72,9 +72,7 @@ def _ellipsoid_corner(shape: Shape, n: Vector) -> Vector:
 
 
 def _mesh_products(shape: Shape, n: Vector) -> tuple[Array, list[Array]]:
-    if shape.vertices is None:
-        raise TypeError("shape.vertices: None, where the kind has one")
-    x, y, z = (jnp.asarray(column, n.x.dtype) for column in shape.vertices.T)
+    x, y, z = (jnp.asarray(column, n.x.dtype) for column in shape.array("vertices").T)
     return x * n.x[..., None] + y * n.y[..., None] + z * n.z[..., None], [x, y, z]
 
 
@@ -85,10 +83,8 @@ def _mesh_reach(shape: Shape, n: Vector) -> Array:
 def _mesh_corner(shape: Shape, n: Vector) -> Vector:
     """Return the farthest corner, or a mean of those that tie: it takes no index."""
     products, columns = _mesh_products(shape, n)
-    if shape.vertices is None:
-        raise TypeError("shape.vertices: None, where the kind has one")
     behind = jnp.max(products, axis=-1, keepdims=True) - products
-    weight = jnp.clip(1 - behind * (sharpness(behind.dtype) / float(abs(shape.vertices).max())), 0.0, 1.0)
+    weight = jnp.clip(1 - behind * (sharpness(behind.dtype) / float(abs(shape.array("vertices")).max())), 0.0, 1.0)
     share = 1 / jnp.sum(weight, axis=-1)
     return Vector(*(jnp.sum(weight * v, axis=-1) * share for v in columns))
 

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from crazysim.envs.env import Env, EnvState
+from crazysim.envs.env import Env, EnvState, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
-from crazysim.train.networks import Layers, Policy, flatten, init_mlp
+from crazysim.train.networks import Layers, Policy, init_mlp
 
 
 @dataclass(frozen=True)

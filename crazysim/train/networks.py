@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.envs.env import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 
@@ -38,11 +39,6 @@ def mlp(layers: Layers, x: Array) -> Array:
         x = jnp.tanh(x @ weight + bias)
     weight, bias = layers[-1]
     return x @ weight + bias
-
-
-def flatten(obs: dict[str, Array]) -> Array:
-    """Return named observations one behind the other, by name. (..., n_obs)"""
-    return jnp.concatenate([obs[name] for name in sorted(obs)], axis=-1)
 
 
 class Policy(PyTree):

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from crazysim.envs.env import Env, EnvState
+from crazysim.envs.env import Env, EnvState, flatten
 from crazysim.envs.rollout import bare
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
-from crazysim.train.networks import Layers, Policy, flatten, init_mlp, mlp
+from crazysim.train.networks import Layers, Policy, init_mlp, mlp
 
 
 @dataclass(frozen=True)

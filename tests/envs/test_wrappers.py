@@ -20,7 +20,7 @@ from crazysim.envs import (
     make,
 )
 from crazysim.envs.actions import hover_rotors
-from crazysim.train.networks import flatten
+from crazysim.envs.env import flatten
 
 pytestmark = pytest.mark.xdist_group("env hover")
 FIRST = np.array([True, False, False, False])
