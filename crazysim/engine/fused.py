@@ -141,8 +141,10 @@ def _call(
     n_lanes = n_worlds * n_drones
     inputs = [_bare(leaves[i]) for i in source.inputs]
     outputs = [jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in source.outputs]
-    flags = jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)
     call = cuda.call if target == "cuda" else native.call
+    if program.check is None:
+        return call(source, n_lanes, count.reshape(1), inputs, outputs), jnp.zeros((n_worlds, 1), bool)
+    flags = jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)
     *written, flagged = call(source, n_lanes, count.reshape(1), inputs, [*outputs, flags])
     return written, flagged if n_drones == 1 else jnp.any(flagged, axis=1, keepdims=True)
 

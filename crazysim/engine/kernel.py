@@ -6,7 +6,7 @@ What one drone has stays in variables, registers for as long as there are enough
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import resources
 
 import numpy as np
@@ -29,7 +29,7 @@ class Kernel:
     inputs: tuple[int, ...]
     """Leaves that it reads."""
     outputs: tuple[int, ...]
-    """Leaves that it writes; behind them comes one bool per drone, whether its world is flagged."""
+    """Leaves that it writes; behind them comes one bool per drone, whether its world is flagged, if that is checked."""
     group: int = 1
     """Drones next to each other that must be in one warp or vector, for they look at each other's numbers."""
 
@@ -60,40 +60,48 @@ def write(program: Program, target: str) -> Kernel:
     """
     writer = Writer()
     segments, check = program.segments, program.check
+    each = program.of("each")
     checked = check.reads if check else []
     written = dict.fromkeys(slot for s in segments for slot in program.own(s, s.writes))
     inside = dict.fromkeys(slot for s in segments for slot in [*program.own(s, s.reads), *s.constants])
-    outputs = tuple(sorted({leaf for leaf, _ in written}))
+    outputs = tuple(program.written)
     # A leaf of which some numbers are written goes out whole.
     whole = [(leaf, k) for leaf in outputs for k in range(program.sizes(leaf))]
     slots = dict.fromkeys([*inside, *written, *checked, *whole])
-    inputs = tuple(sorted({leaf for leaf, _ in slots}))
+    loaded = _loaded(program, whole)
+    inputs = tuple(sorted({leaf for leaf, _ in loaded}))
 
     names = {slot: f"x{slot[0]}_{slot[1]}" for slot in slots}
     for slot in slots:
         kind, access = type_name(_dtype(program, slot)), _load(program, slot)
-        if slot in written:
+        if slot not in loaded:
+            writer.line(f"auto {names[slot]} = {kind}_lanes({kind}(0));", 1)
+        elif slot in written:
             writer.line(f"auto {names[slot]} = {kind}_lanes({access});", 1)
         elif slot not in whole and _is_late(program, slot):
             names[slot] = access
         else:
             writer.line(f"const auto {names[slot]} = {access};", 1)
+    for segment in program.of("first"):
+        _advance(writer, program, segment, names, [], 1)
     constants = [
-        writer.block(s.before, [names[slot] for slot in s.constants], 1) if s.before is not None else []
-        for s in segments
+        writer.block(s.before, [names[slot] for slot in s.constants], 1) if s.before is not None else [] for s in each
     ]
     writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
-    for segment, before in zip(segments, constants, strict=True):
-        _advance(writer, program, segment, names, before)
+    for segment, before in zip(each, constants, strict=True):
+        _advance(writer, program, segment, names, before, 2)
     writer.line("}", 1)
     if check is not None:
         (flagged,) = writer.block(check.block, [names[slot] for slot in checked], 1)
         writer.line(f"STORE(1, 1, flagged, 0, b1_lanes({flagged}))", 1)
+    for segment in program.of("last"):
+        _advance(writer, program, segment, names, [], 1)
     for slot in whole:
         writer.line(_store(program, slot, f"{type_name(_dtype(program, slot))}_lanes({names[slot]})"), 1)
 
     pointers = [f"const {_kind(program, i)}* __restrict__ p{i}" for i in inputs]
     pointers += [f"{_kind(program, i)}* __restrict__ q{i}" for i in outputs]
+    pointers += ["b1* __restrict__ flagged"] if check is not None else []
     frame = {"cuda": _cuda, "host": _host}[target]
     widest = 8 if any(_kind(program, i) == "f64" for i in (*inputs, *outputs)) else 4
     defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n"
@@ -101,31 +109,59 @@ def write(program: Program, target: str) -> Kernel:
     return Kernel(text, inputs, outputs, program.group)
 
 
+def _loaded(program: Program, whole: Sequence[Slot]) -> set[Slot]:
+    """Return the slots whose numbers at the beginning matter: they are used before they are written for certain."""
+    loaded: set[Slot] = set()
+    known: set[Slot] = set()
+
+    def use(slots: Iterable[Slot]) -> None:
+        loaded.update(slot for slot in slots if slot not in known)
+
+    def run(segment: Segment) -> None:
+        use(program.own(segment, segment.reads))
+        drones: dict[Slot, int] = {}
+        for (leaf, _), slot in zip(segment.writes, program.own(segment, segment.writes), strict=True):
+            of_world = segment.scope == "world" and program.axes.scopes[leaf] == "drone"
+            drones[slot] = drones.get(slot, 0) + (1 if of_world else program.n_drones)
+        known.update(slot for slot, n in drones.items() if n >= program.n_drones)
+
+    for segment in program.of("first"):
+        run(segment)
+    for segment in program.of("each"):  # there may be no step
+        use([*program.own(segment, [*segment.reads, *segment.writes]), *segment.constants])
+    if program.check is not None:
+        use(program.check.reads)
+    for segment in program.of("last"):
+        run(segment)
+    use(whole)
+    return loaded
+
+
 def _advance(
-    writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str]
+    writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str], depth: int
 ) -> None:
-    """Write what a segment does in a step."""
+    """Write what a segment does."""
     own = program.own(segment, segment.reads)
     inputs = [names[slot] for slot in own]
     if segment.scope == "world":  # a drone's numbers are asked of the lane that has them
         for k, (leaf, number) in enumerate(segment.reads):
             if program.axes.scopes[leaf] == "drone":
                 name = writer.new()
-                writer.line(f"const auto {name} = of_drone({inputs[k]}, {number // program.sizes(leaf)});", 2)
+                writer.line(f"const auto {name} = of_drone({inputs[k]}, {number // program.sizes(leaf)});", depth)
                 inputs[k] = name
-    outs = writer.block(segment.block, [*inputs, *constants], 2)
+    outs = writer.block(segment.block, [*inputs, *constants], depth)
     fresh = [writer.new() for _ in outs]
     for name, out in zip(fresh, outs, strict=True):
-        writer.line(f"const auto {name} = {out};", 2)
+        writer.line(f"const auto {name} = {out};", depth)
     for (leaf, number), slot, new in zip(segment.writes, program.own(segment, segment.writes), fresh, strict=True):
         kind, name = type_name(_dtype(program, slot)), names[slot]
         if (
             segment.scope == "world" and program.axes.scopes[leaf] == "drone"
         ):  # every lane has them all, and keeps its own
             mine = f"eq_(own, i32({number // program.sizes(leaf)}))"
-            writer.line(f"{name} = select_n_({mine}, {name}, {kind}_lanes({new}));", 2)
+            writer.line(f"{name} = select_n_({mine}, {name}, {kind}_lanes({new}));", depth)
         else:
-            writer.line(f"{name} = {kind}_lanes({new});", 2)
+            writer.line(f"{name} = {kind}_lanes({new});", depth)
 
 
 def _is_late(program: Program, slot: Slot) -> bool:
@@ -178,7 +214,7 @@ def _drones(program: Program, leaf: int) -> int:
 
 def _cuda(pointers: Sequence[str], body: str) -> str:
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
-    arguments = ", ".join([*scalars, *pointers, "b1* __restrict__ flagged"])
+    arguments = ", ".join([*scalars, *pointers])
     return f"""
 extern "C" __global__ void __launch_bounds__({BLOCK}, {UNBOUNDED}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0];
@@ -198,9 +234,8 @@ def _host(pointers: Sequence[str], body: str) -> str:
     n_in = sum(p.startswith("const") for p in pointers)
     buffers = [f"({kind}*)in[{k + 2}]->data" if k < n_in else f"({kind}*)out[{k - n_in}]->data"
                for k, kind in enumerate(kinds)]  # fmt: skip
-    n_out = len(pointers) - n_in
     return f"""
-static void advance_block(int64_t first, int64_t n_lanes, int n_steps, {arguments}, b1* __restrict__ flagged) {{
+static void advance_block(int64_t first, int64_t n_lanes, int n_steps, {arguments}) {{
   const int n_active = n_lanes - first < LANES ? int(n_lanes - first) : LANES;
   const i32v own = numbers() % GROUP;
 {body}
@@ -211,7 +246,7 @@ static void advance(XLA_FFI_Buffer** in, XLA_FFI_Buffer** out) {{
   const int n_steps = *(int*)in[1]->data;
   const auto run = [=](int64_t begin, int64_t end) {{
     for (int64_t first = begin; first < end; first += LANES)
-      advance_block(first, n_lanes, n_steps, {", ".join(buffers)}, (b1*)out[{n_out}]->data);
+      advance_block(first, n_lanes, n_steps, {", ".join(buffers)});
   }};
   in_parallel(n_lanes, n_steps, run);
 }}

@@ -6,6 +6,7 @@ not is given ordinary arrays, and takes the step apart at its place.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +17,7 @@ from jax import Array
 from jax.extend import core
 
 from crazysim.engine import xla
-from crazysim.engine.program import Program, Segment, Slot, is_key
+from crazysim.engine.program import Phase, Program, Segment, Slot, is_key
 
 
 class Lanes:
@@ -28,6 +29,12 @@ class Lanes:
         self.n_worlds, self.n_drones = _batch(program, leaves)
         self.arrays: dict[int, Any] = dict(enumerate(leaves))
         self.lanes: dict[Slot, Any] = {}
+
+    def copy(self) -> Lanes:
+        """Return the same leaves, to be written to."""
+        new = copy.copy(self)
+        new.arrays, new.lanes = dict(self.arrays), dict(self.lanes)
+        return new
 
     @property
     def shape(self) -> tuple[int]:
@@ -88,17 +95,18 @@ Constants = dict[int, list[Any]]
 
 
 def prepare(program: Program, lanes: Lanes) -> Constants:
-    """Compute what no step changes."""
+    """Run what comes before the first step, and compute what no step changes."""
+    run(program, lanes, "first", {})
     return {
         k: xla.run(s.before, [lanes.get(slot) for slot in s.constants], lanes.shape)
-        for k, s in enumerate(program.segments)
+        for k, s in enumerate(program.of("each"))
         if s.before is not None
     }
 
 
-def advance(program: Program, lanes: Lanes, constants: Constants) -> None:
-    """Run a step."""
-    for k, segment in enumerate(program.segments):
+def run(program: Program, lanes: Lanes, phase: Phase, constants: Constants) -> None:
+    """Run the segments of a phase."""
+    for k, segment in enumerate(program.of(phase)):
         match segment.scope:
             case "drone":
                 _run_drones(segment, lanes, constants.get(k, []))
@@ -155,34 +163,36 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
     """
     start = Lanes(program, leaves)
     constants = prepare(program, start)
-    by_lanes = sorted({slot for s in program.segments for slot in program.own(s, s.writes)})
-    by_array = sorted({i for s in program.segments if s.scope == "batch" for i in s.written})
-    by_lanes = [slot for slot in by_lanes if slot[0] not in by_array]
+    each = program.of("each")
+    by_array = sorted({i for s in each if s.scope == "batch" for i in s.written})
+    by_lanes = sorted({slot for s in each for slot in program.own(s, s.writes) if slot[0] not in by_array})
 
     def turn(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
-        lanes = Lanes(program, leaves)
-        lanes.lanes.update(start.lanes)
+        lanes = after(carry)
+        run(program, lanes, "each", constants)
+        return [lanes.get(slot) for slot in by_lanes], [lanes.array(leaf) for leaf in by_array]
+
+    def after(carry: tuple[list[Any], list[Any]]) -> Lanes:
+        lanes = start.copy()
         for slot, value in zip(by_lanes, carry[0], strict=True):
             lanes.set(slot, value)
         for leaf, value in zip(by_array, carry[1], strict=True):
             lanes.set_array(leaf, value)
-        advance(program, lanes, constants)
-        return [lanes.get(slot) for slot in by_lanes], [lanes.array(leaf) for leaf in by_array]
+        return lanes
 
-    carry = [jnp.broadcast_to(start.get(slot), start.shape) for slot in by_lanes], [leaves[i] for i in by_array]
-    for segment in program.segments:  # what is only read is taken apart once, outside the loop
+    carry = ([jnp.broadcast_to(start.get(slot), start.shape) for slot in by_lanes],
+             [start.array(leaf) for leaf in by_array])  # fmt: skip
+    for segment in each:  # what is only read is taken apart once, outside the loop
         for slot in program.own(segment, segment.reads):
             start.get(slot)
     if isinstance(n_steps, int):
         carry = repeat(turn, carry, n_steps)
     else:
         carry = jax.lax.fori_loop(0, n_steps, lambda _, c: turn(c), carry)
-    end = Lanes(program, leaves)
-    for slot, value in zip(by_lanes, carry[0], strict=True):
-        end.set(slot, value)
-    for leaf, value in zip(by_array, carry[1], strict=True):
-        end.set_array(leaf, value)
-    return [end.array(i) for i in program.written], nonfinite(program, end)
+    end = after(carry)
+    flagged = nonfinite(program, end)
+    run(program, end, "last", {})
+    return [end.array(i) for i in program.written], flagged
 
 
 def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:

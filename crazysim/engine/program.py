@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -20,6 +20,9 @@ from crazysim.sim.stage import Axes, Stage, StageScope
 Slot = tuple[int, int]
 """A number of the data: which leaf, and which element of what one drone (or one world) has of it."""
 
+Phase = Literal["first", "each", "last"]
+"""When a segment runs: once before the first step, at each step, once after the last."""
+
 LARGEST_SWARM = 8
 """Most drones of a world for which a stage of one world is written out; its program grows with their square."""
 
@@ -32,6 +35,8 @@ class Segment:
     """Whose numbers the program computes on; ``batch`` has no program."""
     stages: list[Stage]
     """The stages."""
+    phase: Phase = "each"
+    """When they run."""
     block: Block = dataclasses.field(default_factory=Block)
     """The program; empty if there is none."""
     reads: list[Slot] = dataclasses.field(default_factory=list)
@@ -65,33 +70,41 @@ class Program:
         data: Any,
         zeros: dict[int, frozenset[int]] | None = None,
         watched: Callable[[Any], list[Any]] | None = None,
+        first: Sequence[Stage] = (),
+        last: Sequence[Stage] = (),
+        scratch: Collection[int] = (),
     ):
         """Read the stages.
 
         Args:
-            stages: The stages, in order.
+            stages: The stages of a step, in order.
             data: Data of the simulation, or its shapes and types.
             zeros: Elements of shared leaves that are known to be zero, by leaf: nothing is computed with them.
             watched: Picks the leaves that are watched for NaN and infinity.
+            first: Stages that run once, before the first step.
+            last: Stages that run once, after the last step.
+            scratch: Leaves that are only there for one stage to tell another; what is written there is not kept.
         """
         self.axes, self.leaves = Axes(data), jax.tree.leaves(data)
         self.n_drones = data.core.n_drones
-        self.zeros = zeros or {}
+        self.zeros, self.scratch = zeros or {}, frozenset(scratch)
         self.packed: tuple[int, ...] = ()
         self.segments: list[Segment] = []
-        for stage in stages:
-            self._add(stage)
+        phases: dict[Phase, Sequence[Stage]] = {"first": first, "each": stages, "last": last}
+        for phase, some in phases.items():
+            for stage in some:
+                self._add(stage, phase)
         for segment in self.segments:
             if segment.scope != "batch":
                 _close(segment)
-        changing = {slot for s in self.segments for slot in s.writes} | {
+        changing = {slot for s in self.of("each") for slot in self.own(s, s.writes)} | {
             (leaf, k)
-            for s in self.segments
+            for s in self.of("each")
             if s.scope == "batch"
             for leaf in s.written
             for k in range(self.sizes(leaf))
         }
-        for segment in self.segments:
+        for segment in self.of("each"):
             if segment.scope == "drone":
                 _hoist(segment, changing)
         self.check = self._watch(data.core.nonfinite, watched(data)) if watched else None
@@ -101,6 +114,10 @@ class Program:
         """Whether all of it is written out, so that one kernel can run it."""
         return all(segment.scope != "batch" for segment in self.segments)
 
+    def of(self, phase: Phase) -> list[Segment]:
+        """Return the segments that run in a phase."""
+        return [segment for segment in self.segments if segment.phase == phase]
+
     @property
     def group(self) -> int:
         """How many drones look at each other's numbers: those of a world, if some segment is of worlds."""
@@ -109,7 +126,7 @@ class Program:
     @property
     def written(self) -> list[int]:
         """Numbers of the leaves that are written."""
-        return sorted({i for s in self.segments for i in s.written})
+        return sorted({i for s in self.segments for i in s.written} - self.scratch)
 
     @property
     def read(self) -> list[int]:
@@ -159,23 +176,24 @@ class Program:
         aval = self.axes.one_of(leaf, self.leaves[leaf], scope)
         return int(np.prod(aval.shape, dtype=int)) * (2 if is_key(aval) else 1)
 
-    def _add(self, stage: Stage) -> None:
+    def _add(self, stage: Stage, phase: Phase) -> None:
         if stage.scope == "batch":
-            self._add_batch(stage, "it is not declared for one drone or one world")
+            self._add_batch(stage, phase, "it is not declared for one drone or one world")
             return
         traced = _Traced(stage, self.axes, self.leaves)
         scope: StageScope = stage.scope
         if scope == "world" and not any(self.axes.scopes[i] == "drone" for i in [*traced.used, *traced.written]):
             scope = "drone"  # nothing of any drone is in it: every drone's lane can do it for its world
         if scope == "world" and self.n_drones > LARGEST_SWARM:
-            self._add_batch(stage, f"of one world, it is written out for up to {LARGEST_SWARM} drones")
+            self._add_batch(stage, phase, f"of one world, it is written out for up to {LARGEST_SWARM} drones")
             return
         last = self.segments[-1] if self.segments else None
-        segment = last if last is not None and last.scope == scope else Segment(scope, [])
+        follows = last is not None and (last.scope, last.phase) == (scope, phase)
+        segment = last if last is not None and follows else Segment(scope, [], phase)
         try:
             values = self._lower(segment, traced)
         except NoRuleError as error:
-            self._add_batch(stage, str(error))
+            self._add_batch(stage, phase, str(error))
             return
         if segment is not last:
             self.segments.append(segment)
@@ -193,12 +211,13 @@ class Program:
         inner = reader.inner()
         new = inner.read(traced.fn, args)
         old = [self._elements(segment, i, traced.avals[i]) for i in traced.written]
-        inner.block.outputs = [x for array in new for x in array.reshape(-1)]
-        olds = [x for array in old for x in array.reshape(-1)]
-        whole = segment.block.add("when", (mask, *olds), bool, (), (inner.block,))
-        items = iter([segment.block.add("item", (whole,), x.dtype, (("index", k),)) for k, x in enumerate(olds)])
-        return {i: pack([next(items) for _ in range(x.size)], x.shape)
-                for i, x in zip(traced.written, old, strict=True)}  # fmt: skip
+        pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(_words(x), _words(y), strict=True)]
+        changed = [(a, b) for a, b in pairs if a is not b]
+        inner.block.outputs = [b for _, b in changed]
+        whole = segment.block.add("when", (mask, *(a for a, _ in changed)), bool, (), (inner.block,))
+        items = iter([segment.block.add("item", (whole,), a.dtype, (("index", k),)) for k, (a, _) in enumerate(changed)])
+        words = iter([a if a is b else next(items) for a, b in pairs])
+        return {i: _with_words(x, words) for i, x in zip(traced.written, old, strict=True)}
 
     def _elements(self, segment: Segment, leaf: int, aval: Any) -> Elements:
         """Return a leaf's elements as they are now in a segment; inputs, if no stage of it has written them."""
@@ -206,9 +225,10 @@ class Program:
             segment.now[leaf] = segment.first[leaf] = _inputs(segment.block, aval, self.zeros.get(leaf, frozenset()))
         return segment.now[leaf]
 
-    def _add_batch(self, stage: Stage, why: str) -> None:
+    def _add_batch(self, stage: Stage, phase: Phase, why: str) -> None:
         traced = _Traced(Stage(stage, "batch", name=stage.__name__), self.axes, self.leaves)
-        self.segments.append(Segment("batch", [stage], used=traced.used, written=traced.written, why=why, fn=traced.fn))
+        segment = Segment("batch", [stage], phase, used=traced.used, written=traced.written, why=why, fn=traced.fn)
+        self.segments.append(segment)
 
     def _watch(self, flag: Any, watched: list[Any]) -> Segment:
         """Return a program that flags a drone: its world was flagged, or a watched number is not finite."""
@@ -284,6 +304,12 @@ def _inputs(block: Block, aval: Any, zeros: frozenset[int]) -> Elements:
 
 def _words(elements: Elements) -> list[Element]:
     return [w for x in elements.reshape(-1) for w in (x if isinstance(x, tuple) else (x,))]
+
+
+def _with_words(like: Elements, words: Iterator[Element]) -> Elements:
+    """Return elements of the same shape; of a key, two words."""
+    items = [(next(words), next(words)) if isinstance(x, tuple) else next(words) for x in like.reshape(-1)]
+    return pack(items, like.shape)
 
 
 def _close(segment: Segment) -> None:

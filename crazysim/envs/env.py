@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.engine import fused
 from crazysim.engine.rollout import COMMANDS
 from crazysim.envs.actions import Actions, actions_of
 from crazysim.envs.random import episode_keys
@@ -20,6 +21,7 @@ from crazysim.sim.data import SimData
 from crazysim.sim.settings import positive
 from crazysim.sim.sharding import shard
 from crazysim.sim.sim import Sim
+from crazysim.sim.stage import Stage
 
 Obs = dict[str, Array]
 """Named observations. (n_worlds, n_drones, k) each"""
@@ -156,7 +158,7 @@ class DroneEnv:
         self.n_substeps = sim.freq // freq
         self.max_steps = round(task.seconds * freq)
         self._step, self._reset = sim.build_step_fn(), sim.build_reset_fn().__wrapped__
-        self._zeros = self._step.zeros(sim.data)
+        self.zeros = self._step.zeros(sim.data)
         self._default = _compact(sim.default_data)
 
     def reset(self, key: Array) -> EnvState:
@@ -211,7 +213,7 @@ class DroneEnv:
         """
         action = fitting(action, state, self.actions)
         data = COMMANDS[self.actions.control](self.task.mark(state.data), self.actions.command(action))
-        data = self._step(data, self.n_substeps, self._zeros)
+        data = self.fly(data)
         lost = data.core.nonfinite[:, 0]
         reward = jnp.asarray(self.task.reward(data, action, state.action), action.dtype)
         return state.replace(
@@ -223,6 +225,22 @@ class DroneEnv:
             action=action,
             info=state.info | told(self.task, data),
         )
+
+    def fly(self, data: SimData) -> SimData:
+        """Return the data after the physics of an environment step."""
+        return self._step(data, self.n_substeps, self.zeros)
+
+    @property
+    def unfused(self) -> str | None:
+        """Why its physics runs in no kernel, as far as that is known before it is read; None if it may."""
+        if self._step.engine not in ("auto", "fused"):
+            return f"the engine is {self._step.engine!r}"
+        return fused.missing(self._step.platform)
+
+    @property
+    def stages(self) -> list[Stage]:
+        """Stages of its physics."""
+        return self._step.stages
 
     def _begin(self, data: SimData, mask: Array | None) -> SimData:
         default = _like(self._default, data)
@@ -307,5 +325,5 @@ def _spread(data: SimData, n_worlds: int, n_drones: int) -> SimData:
 
 def _like(default: SimData, data: SimData) -> SimData:
     """Return the default data, whatever is no number of a world exchanged for what the data has."""
-    core = default.core.replace(rng_key=data.core.rng_key, world_id=data.core.world_id, drone_id=data.core.drone_id)
-    return default.replace(core=core)
+    own = {name: getattr(data.core, name) for name in ("rng_key", "world_id", "drone_id", "n_worlds")}
+    return default.replace(core=default.core.replace(**own))

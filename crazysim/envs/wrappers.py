@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.engine.lower import NoRuleError
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import Env, EnvState, Obs, Task, fitting, observed, told
 from crazysim.envs.random import episode_keys
 from crazysim.envs.statistics import RunningStats
+from crazysim.envs.whole import Renewal, WholeStep, base_of
 from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, scopes, select_worlds
 from crazysim.sim.data import SimData
@@ -109,27 +111,56 @@ class AutoReset(Wrapper):
         """
         super().__init__(env)
         self.mode = member(AutoresetMode, "mode", mode)
+        self._renewal = {
+            AutoresetMode.disabled: None,
+            AutoresetMode.next_step: Renewal(lambda before, _: before.done, lambda after: after, self.env.restart),
+            AutoresetMode.same_step: Renewal(lambda _, after: after.done, self._ended, self._begun),
+        }[self.mode]
+        self._wholes: dict[Any, WholeStep | str] = {}
 
     def reset(self, key: Array) -> EnvState:
         """Return all worlds at the beginning of an episode."""
         state = self.env.reset(key)
-        return self._with_final(state, state.obs) if self.mode == AutoresetMode.same_step else state
+        return self._ended(state) if self.mode == AutoresetMode.same_step else state
 
     def step(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one step later, new episodes begun."""
-        if self.mode == AutoresetMode.disabled:
-            return self.env.step(state, action)
-        if self.mode == AutoresetMode.next_step:
-            return self.env.restart(self.env.step(state, action), state.done)
-        state = self.env.step(state, action)
-        begun = self.env.restart(state, state.done)
-        # The new episodes' observations, and what the last step gave: its reward, its end, and what is told of it.
-        kept = {"reward": state.reward, "terminated": state.terminated, "truncated": state.truncated}
-        return self._with_final(begun.replace(info=state.info, **kept), state.obs)
+        whole = self._whole(state, action)
+        if not isinstance(whole, str):
+            return whole(state, fitting(action, state, self.actions))
+        after = self.env.step(state, action)
+        if self._renewal is None:
+            return after
+        return self._renewal.begin(self._renewal.prepare(after), self._renewal.over(state, after))
+
+    def explain(self, state: EnvState) -> str:
+        """Return in a line whether a step is one kernel, and why not."""
+        whole = self._whole(state, state.action)
+        return f"a step is not one kernel: {whole}" if isinstance(whole, str) else "a step is one kernel"
+
+    def _whole(self, state: EnvState, action: Any) -> WholeStep | str:
+        """Return the step in one kernel, or why there is none."""
+        base = base_of(self.env)
+        if (why := base.unfused) is not None:
+            return why
+        leaves, treedef = jax.tree.flatten((state, action))
+        key = (treedef, tuple([(jnp.shape(x), jnp.result_type(x)) for x in leaves]))
+        if key not in self._wholes:
+            try:
+                self._wholes[key] = WholeStep(self.env, self._renewal, state, action)
+            except (NoRuleError, TypeError, ValueError) as error:
+                self._wholes[key] = str(error)
+        return self._wholes[key]
 
     @staticmethod
-    def _with_final(state: EnvState, obs: Obs) -> EnvState:
-        return state.replace(info=state.info | {"final_obs": obs})
+    def _ended(state: EnvState) -> EnvState:
+        """Return a state that tells its observations apart from those of an episode that begins."""
+        return state.replace(info=state.info | {"final_obs": state.obs})
+
+    def _begun(self, state: EnvState, mask: Array) -> EnvState:
+        """Return new episodes' observations, and what the last step gave: reward, ends, and what is told of it."""
+        kept = {name: getattr(state, name) for name in ("reward", "terminated", "truncated", "info")}
+        return self.env.restart(state, mask).replace(**kept)
 
 
 class EpisodeStatistics(Wrapper):
