@@ -38,6 +38,8 @@ def build(program: Program, platform: str) -> Callable[[list[Any], int | Array],
     """
     target = "cuda" if platform == "gpu" else "host"
     run = _one_kernel(program, target) if program.fused else _split(program, target)
+    if program.rows:  # nothing else reads rows
+        return lambda leaves, n_steps: run(leaves, jnp.asarray(n_steps, jnp.int32))
     batched = _over_batches(program, run)
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
@@ -136,11 +138,12 @@ def _split(program: Program, target: str) -> Run:
 def _call(
     program: Program, source: kernel.Kernel, leaves: list[Any], count: Array, target: str
 ) -> tuple[list[Any], Array]:
-    drone = next(i for i, scope in enumerate(program.axes.scopes) if scope == "drone")
+    drone = next(i for i, scope in enumerate(program.axes.scopes) if scope == "drone" and leaves[i] is not None)
     n_worlds, n_drones = leaves[drone].shape[:2]
     n_lanes = n_worlds * n_drones
     inputs = [_bare(leaves[i]) for i in source.inputs]
-    outputs = [jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in source.outputs]
+    like = [program.leaves[i] if leaves[i] is None else leaves[i] for i in source.outputs]
+    outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in like]
     call = cuda.call if target == "cuda" else native.call
     if program.check is None:
         return call(source, n_lanes, count.reshape(1), inputs, outputs), jnp.zeros((n_worlds, 1), bool)

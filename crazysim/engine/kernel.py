@@ -64,12 +64,10 @@ def write(program: Program, target: str) -> Kernel:
     checked = check.reads if check else []
     written = dict.fromkeys(slot for s in segments for slot in program.own(s, s.writes))
     inside = dict.fromkeys(slot for s in segments for slot in [*program.own(s, s.reads), *s.constants])
-    outputs = tuple(program.written)
-    # A leaf of which some numbers are written goes out whole.
-    whole = [(leaf, k) for leaf in outputs for k in range(program.sizes(leaf))]
+    outputs, whole = tuple(program.written), _whole(program)
     slots = dict.fromkeys([*inside, *written, *checked, *whole])
-    loaded = _loaded(program, whole)
-    inputs = tuple(sorted({leaf for leaf, _ in loaded}))
+    loaded = _loaded(program)
+    inputs = needed(program)
 
     names = {slot: f"x{slot[0]}_{slot[1]}" for slot in slots}
     for slot in slots:
@@ -109,7 +107,17 @@ def write(program: Program, target: str) -> Kernel:
     return Kernel(text, inputs, outputs, program.group)
 
 
-def _loaded(program: Program, whole: Sequence[Slot]) -> set[Slot]:
+def needed(program: Program) -> tuple[int, ...]:
+    """Return the leaves that a kernel reads."""
+    return tuple(sorted({leaf for leaf, _ in _loaded(program)}))
+
+
+def _whole(program: Program) -> list[Slot]:
+    """Return what goes out: a leaf of which some numbers are written goes whole."""
+    return [(leaf, k) for leaf in program.written for k in range(program.sizes(leaf))]
+
+
+def _loaded(program: Program) -> set[Slot]:
     """Return the slots whose numbers at the beginning matter: they are used before they are written for certain."""
     loaded: set[Slot] = set()
     known: set[Slot] = set()
@@ -133,7 +141,7 @@ def _loaded(program: Program, whole: Sequence[Slot]) -> set[Slot]:
         use(program.check.reads)
     for segment in program.of("last"):
         run(segment)
-    use(whole)
+    use(_whole(program))
     return loaded
 
 
@@ -199,11 +207,15 @@ def _load(program: Program, slot: Slot) -> str:
     scope = program.axes.scopes[leaf]
     if scope not in ("drone", "world"):
         return f"p{leaf}[{k}]"
+    if leaf in program.rows:
+        return f"LOAD_ROW(p{leaf}, {k})"
     return f"LOAD({program.sizes(leaf)}, {_drones(program, leaf)}, p{leaf}, {k})"
 
 
 def _store(program: Program, slot: Slot, value: str) -> str:
     leaf, k = slot
+    if leaf in program.rows:
+        return f"STORE_ROW(q{leaf}, {k}, {value})"
     return f"STORE({program.sizes(leaf)}, {_drones(program, leaf)}, q{leaf}, {k}, {value})"
 
 

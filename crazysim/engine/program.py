@@ -89,6 +89,7 @@ class Program:
         self.n_drones = data.core.n_drones
         self.zeros, self.scratch = zeros or {}, frozenset(scratch)
         self.packed: tuple[int, ...] = ()
+        self.rows: dict[int, int] = {}
         self.segments: list[Segment] = []
         phases: dict[Phase, Sequence[Stage]] = {"first": first, "each": stages, "last": last}
         for phase, some in phases.items():
@@ -158,6 +159,49 @@ class Program:
         self.axes.scopes.append("shared")
         self.axes.names.append("packed")
 
+    def lay(self, leaves: Collection[int]) -> dict[int, list[int]]:
+        """Lay leaves of drones and worlds under each other, as rows of one leaf for each type, behind the others.
+
+        A row is one number of all drones, which lie next to each other there, as a kernel's lanes do.
+
+        Returns:
+            The leaves that are in each of the new ones, from the first row on.
+        """
+        scope = self.axes.scopes
+        # A single drone is all there is of its world.
+        together = {i: ("drone" if self.n_drones == 1 else scope[i], self.leaves[i].dtype) for i in sorted(leaves)}
+        groups: dict[int, list[int]] = {}
+        rows: dict[int, tuple[int, int]] = {}
+        for kind in dict.fromkeys(together.values()):
+            new, n_rows = len(self.leaves), 0
+            groups[new] = [i for i, k in together.items() if k == kind]
+            for leaf in groups[new]:
+                rows[leaf] = (new, n_rows)
+                n_rows += self.sizes(leaf)
+            n_lanes = self.leaves[groups[new][0]].shape[0] * self.n_drones
+            self.leaves.append(jax.ShapeDtypeStruct((n_rows, n_lanes), kind[1]))
+            self.axes.scopes.append(kind[0])
+            self.axes.names.append("rows")
+            self.rows[new] = n_rows
+
+        def moved(slots: list[Slot]) -> list[Slot]:
+            out = []
+            for leaf, k in slots:
+                if leaf in rows:
+                    drone, k = divmod(k, old_sizes[leaf])
+                    new, first = rows[leaf]
+                    out.append((new, drone * self.rows[new] + first + k))
+                else:
+                    out.append((leaf, k))
+            return out
+
+        old_sizes = {leaf: self.sizes(leaf) for leaf in rows}
+        for segment in self.segments:
+            segment.reads, segment.constants = moved(segment.reads), moved(segment.constants)
+            segment.writes = moved(segment.writes)
+            segment.written = sorted({leaf for leaf, _ in segment.writes})
+        return groups
+
     def parts(self) -> list[Program]:
         """Return programs that run one after the other: segments that one kernel can run, and those that none can."""
         parts = []
@@ -173,6 +217,8 @@ class Program:
 
     def sizes(self, leaf: int, scope: StageScope = "drone") -> int:
         """Return how many numbers one drone (or world) has of a leaf; a key is two words."""
+        if leaf in self.rows:
+            return self.rows[leaf] * (self.n_drones if scope == "world" and self.axes.scopes[leaf] == "drone" else 1)
         aval = self.axes.one_of(leaf, self.leaves[leaf], scope)
         return int(np.prod(aval.shape, dtype=int)) * (2 if is_key(aval) else 1)
 

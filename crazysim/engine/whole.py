@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import jax.numpy as jnp
+from jax import Array
 
-from crazysim.engine import fused
+from crazysim.engine import fused, kernel
 from crazysim.engine.lower import NoRuleError
 from crazysim.engine.program import Program
 from crazysim.sim.stage import Stage, with_leaves
@@ -29,6 +30,7 @@ class Whole:
         n_steps: int,
         platform: str,
         scratch: Collection[int] = (),
+        lay: Callable[[list[int]], list[int]] | None = None,
     ):
         """Read the stages.
 
@@ -41,6 +43,7 @@ class Whole:
             n_steps: How many steps.
             platform: Where it runs, ``"cpu"`` or ``"gpu"``.
             scratch: Leaves that are only there for one stage to tell another.
+            lay: Picks, from the leaves that are written, those that ``advance`` is given as rows.
 
         Raises:
             NoRuleError: If something of it cannot be written out.
@@ -49,12 +52,57 @@ class Whole:
         split = [s for s in program.segments if s.scope == "batch"]
         if split:
             raise NoRuleError(f"{split[0].stages[0].__name__!r} is not fused: {split[0].why}")
+        self._n_leaves = len(program.leaves)
         program.pack()
-        self.n_steps = n_steps
+        self._rows = program.lay(lay(program.written)) if lay is not None else {}
+        self.read = [i for i in kernel.needed(program) if i < self._n_leaves]
+        """Leaves that are read as they are, not as rows and not with the shared numbers."""
+        self._n_steps = n_steps
         self._run = fused.build(program, platform)
 
     def __call__(self, leaves: Sequence[Any]) -> list[Any]:
         """Return the leaves after it all."""
-        packed = [jnp.concatenate([leaves[i].ravel() for i in self.program.packed])] if self.program.packed else []
-        written, _ = self._run([*leaves, *packed], self.n_steps)
+        written, _ = self._run([*leaves, *self.shared(leaves)], self._n_steps)
         return with_leaves(leaves, self.program.written, written)
+
+    def shared(self, leaves: Sequence[Any]) -> list[Array]:
+        """Return the shared numbers of some leaves one behind the other, if there are any."""
+        packed = self.program.packed
+        return [jnp.concatenate([leaves[i].ravel() for i in packed])] if packed else []
+
+    def rows(self, leaves: Sequence[Any]) -> list[Array]:
+        """Return leaves as rows of one number of all drones each, an array for each type. (n_rows, n_lanes) each"""
+        n_drones = self.program.n_drones
+
+        def row(x: Any) -> Array:
+            x = jnp.broadcast_to(x, (x.shape[0], n_drones, *x.shape[2:]))
+            return x.reshape(x.shape[0] * n_drones, -1).T
+
+        return [jnp.concatenate([row(leaves[i]) for i in some]) for some in self._rows.values()]
+
+    def unlaid(self, rows: Sequence[Array]) -> dict[int, Array]:
+        """Return the leaves that rows are of, by number."""
+        program, out = self.program, {}
+        for array, some in zip(rows, self._rows.values(), strict=True):
+            first = 0
+            for i in some:
+                like, size = program.leaves[i], program.sizes(i)
+                x = array[first : first + size].T.reshape(-1, program.n_drones, *like.shape[2:])
+                out[i] = x[:, :1] if program.axes.scopes[i] == "world" else x
+                first += size
+        return out
+
+    def advance(
+        self, rows: Sequence[Array], shared: Sequence[Array], read: dict[int, Any]
+    ) -> tuple[list[Array], dict[int, Array]]:
+        """Return the rows after it all, and the other leaves that are written.
+
+        Args:
+            rows: From ``rows``.
+            shared: From ``shared``.
+            read: What is to be read as it is, by leaf.
+        """
+        leaves = [read.get(i) for i in range(self._n_leaves)]
+        written, _ = self._run([*leaves, *shared, *rows], self._n_steps)
+        found = dict(zip(self.program.written, written, strict=True))
+        return [found.pop(i) for i in self._rows], found

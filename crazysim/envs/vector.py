@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -12,14 +12,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
+from crazysim.envs.advance import Advance
 from crazysim.envs.drawing import RENDER_MODES, Drawing
 from crazysim.envs.env import DroneEnv, Env, EnvState, from_host
 from crazysim.envs.registry import TASKS, make
-from crazysim.envs.rollout import bare
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError
 from crazysim.sim.settings import as_mask, member
-from crazysim.sim.stage import with_leaves
 
 
 class DroneVectorEnv(gymnasium.vector.VectorEnv):
@@ -66,8 +65,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self._single = env.sim.n_drones == 1
         self._begin = jax.jit(self.env.reset)
         self._again = jax.jit(self.env.restart)
-        self._advance = _Advance(self._step)
-        self._carried: EnvState | None = None
+        self._advance = Advance(self.env, self._tell)
         self._told: Any = None
         shapes = jax.eval_shape(self.env.reset, jax.random.key(0))
         self._of_drone = {k for k, v in shapes.info.items() if k != "final_obs" and v.ndim > 1}
@@ -103,20 +101,21 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         else:
             number = seed if seed is not None else int(self.np_random.integers(2**31))
             state = self._begin(jax.random.key(int(number)))
-        self._carried, self._told = _unseen(state), self._tell(state)
+        self._advance.state, self._told = state, self._tell(state)
         return self._told[0], self._told[2]
 
     @property
     def state(self) -> EnvState | None:
         """The functional environment's state, each drone with the reward of its world; None before the first reset."""
-        if self._carried is None:
+        state = self._advance.state
+        if state is None:
             return None
         obs, reward, info = self._told
         n = (self.num_envs, self.sim.n_drones)
         info = {k: v for k, v in info.items() if not k.endswith("final_obs")}
         info = {k: v.reshape(*n, *v.shape[1:]) if self._single and k in self._of_drone else v for k, v in info.items()}
         obs = {k: v.reshape(*n, -1) for k, v in obs.items()}
-        return self._carried.replace(obs=obs, reward=jnp.broadcast_to(reward[:, None], n), info=info)
+        return state.replace(obs=obs, reward=jnp.broadcast_to(reward[:, None], n), info=info)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Advance all worlds.
@@ -128,22 +127,18 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             ConfigError: If the environment was not reset, or actions of the host are not finite.
             ValueError: If they have another shape.
         """
-        if self._carried is None:
+        if self._told is None:
             raise ConfigError("the environment must be reset before its first step: call reset()")
         needed = self.action_space.shape or ()
         if not isinstance(actions, jax.Array):
             actions = from_host(actions, needed)
         elif actions.shape != needed:
             raise ValueError(f"actions have shape {actions.shape}; needed is {needed}")
-        self._carried, self._told = self._advance(self._carried, actions)
+        self._told, terminated, truncated = self._advance(actions)
         obs, reward, info = self._told
         if self.render_mode == "human":
             self.render()
-        return obs, reward, self._carried.terminated, self._carried.truncated, info
-
-    def _step(self, carried: EnvState, actions: Array) -> tuple[EnvState, Any]:
-        state = self.env.step(carried, jnp.asarray(actions).reshape(carried.action.shape))
-        return _unseen(state), self._tell(state)
+        return obs, reward, terminated, truncated, info
 
     def _tell(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
         """Return observations, rewards and infos as Gymnasium has them."""
@@ -178,53 +173,6 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         """Close the window."""
         del kwargs
         self.sim.close()
-
-
-def _unseen(state: EnvState) -> EnvState:
-    """Return a state without what no step reads."""
-    return bare(state).replace(obs={})
-
-
-class _Advance:
-    """A compiled ``fn(state, actions) -> state, out`` that returns what of the state it writes, and copies nothing.
-
-    What a compiled call returns as it came is copied, and an array costs more than the arithmetic on it here.
-    """
-
-    def __init__(self, fn: Callable[[EnvState, Any], tuple[EnvState, Any]]):
-        """Take the function."""
-        self._fn, self._key = fn, None
-        self._compiled: Any = None
-        self._written: list[int] = []
-        self._out: Any = None
-
-    def __call__(self, state: EnvState, actions: Any) -> tuple[EnvState, Any]:
-        """Return the state after the actions, and what else there is."""
-        leaves, treedef = jax.tree.flatten(state)
-        key = (treedef, [(x.shape, x.dtype) for x in leaves])
-        if key != self._key:
-            self._prepare(leaves, treedef, actions)
-            self._key = key
-        values = self._compiled(leaves, actions)
-        n = len(self._written)
-        after = with_leaves(leaves, self._written, values[:n])
-        return treedef.unflatten(after), self._out.unflatten(values[n:])
-
-    def _prepare(self, leaves: list[Any], treedef: Any, actions: Any) -> None:
-        """Find out what is written, and compile that."""
-
-        def flat(leaves: list[Any], actions: Any) -> list[Any]:
-            state, out = self._fn(treedef.unflatten(leaves), actions)
-            after, same = jax.tree.flatten(state)
-            if same != treedef:
-                raise ConfigError(f"a step changed the structure of the state: {treedef} became {same}")
-            values, self._out = jax.tree.flatten(out)
-            return [*after, *values]
-
-        jaxpr = jax.make_jaxpr(flat)(leaves, actions).jaxpr
-        self._written = [i for i in range(len(leaves)) if jaxpr.outvars[i] is not jaxpr.invars[i]]
-        kept = [*self._written, *range(len(leaves), len(jaxpr.outvars))]
-        self._compiled = jax.jit(lambda leaves, actions: [flat(leaves, actions)[i] for i in kept])
 
 
 def make_vector(

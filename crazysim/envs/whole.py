@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +52,7 @@ class Renewal:
 class WholeStep:
     """``step(state, action) -> state`` of an environment in one kernel, for states of one structure."""
 
-    def __init__(self, env: Env, renewal: Renewal | None, state: EnvState, action: Any):
+    def __init__(self, env: Env, renewal: Renewal | None, state: EnvState, action: Any, laid: bool = False):
         """Write it out.
 
         Args:
@@ -60,6 +60,7 @@ class WholeStep:
             renewal: How new episodes begin; None if they do not.
             state: State of the structure that is stepped, or its shapes and types.
             action: Action, or its shape and type.
+            laid: Whether it is for ``advance``, which hands few arrays to and fro, rather than to be called.
 
         Raises:
             NoRuleError: If something of it cannot be written out for one world.
@@ -87,7 +88,12 @@ class WholeStep:
             last.append(self._stage(self._begun, "new episodes", lambda one: one.plugins[NAME].of_worlds[OVER][0]))
         scratch = [i for i, name in enumerate(axes.names) if name.endswith(f"[{OVER!r}]")]
         first = [self._stage(self._acted, "actions")]
-        self._run = Whole(first, base.stages, last, example, zeros, base.n_substeps, base.sim.device.platform, scratch)
+        self._numbers = _numbers(example)
+        told = {self._numbers[name] for name in self._told.shapes if name.startswith(TOLD)}
+        lay = (lambda written: [i for i in written if i not in told]) if laid else None
+        settings = (base.n_substeps, base.sim.device.platform, scratch, lay)
+        self._run = Whole(first, base.stages, last, example, zeros, *settings)
+        self._treedef = jax.tree.structure(example)
 
     def __call__(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one step later. (n_worlds, n_drones, k)"""
@@ -95,6 +101,53 @@ class WholeStep:
         leaves, treedef = jax.tree.flatten(joined)
         after = treedef.unflatten(self._run(leaves))
         return self._state(after, self._told, _shown(_without_rest(after), False))
+
+    # With few arrays ----------------------------------------------------------------------------------------------
+
+    def lay(self, state: EnvState) -> Laid:
+        """Return a state as ``advance`` wants it.
+
+        Raises:
+            NoRuleError: If a step reads of the last one what is told, besides whether it was the last.
+        """
+        action = jnp.zeros(self._action.shape, self._action.dtype)
+        leaves = jax.tree.leaves(self._joined(state, action, state.terminated.shape[0]))
+        told = {i: name for name, i in self._numbers.items() if name.startswith(TOLD) and i in self._run.read}
+        if set(told.values()) - set(ENDS):
+            raise NoRuleError(f"a step reads {', '.join(sorted(told.values()))} of the step before")
+        own = {*told, self._numbers[ACTION]}
+        constants = {i: leaves[i] for i in self._run.read if i not in own}
+        return Laid(self._run.rows(leaves), self._run.shared(leaves), constants)
+
+    def advance(self, laid: Laid, ends: tuple[Array, Array], action: Array) -> tuple[Laid, EnvState]:
+        """Return what ``lay`` does of the state one step later, and that state without its data and what it remembers.
+
+        Args:
+            laid: The state before.
+            ends: Its ``terminated`` and ``truncated``. (n_worlds,) each
+            action: What all drones do. (n_worlds, n_drones, k)
+        """
+        given = self._rows(dict(zip(ENDS, ends, strict=True)) | {ACTION: action})
+        read = laid.constants | {self._numbers[k]: x for k, x in (given.of_drones | given.of_worlds).items()}
+        read = {i: x for i, x in read.items() if i in self._run.read}
+        rows, found = self._run.advance(laid.rows, laid.shared, read)
+        told = {name: found.get(self._numbers[name]) for name in self._told.shapes}
+        arrays = {k: None if x is None else x.reshape(x.shape[0], *self._told.shapes[k].shape[1:]) for k, x in told.items()}
+        return laid._replace(rows=rows), self._told.state(arrays, None)
+
+    def unlay(self, laid: Laid, state: EnvState) -> EnvState:
+        """Return the state after some calls of ``advance``, bare of what they tell.
+
+        Args:
+            laid: What the last of them returned.
+            state: What was given to ``lay``.
+        """
+        joined = self._joined(state, state.action, state.terminated.shape[0])
+        leaves = jax.tree.leaves(joined)
+        for i, x in self._run.unlaid(laid.rows).items():
+            leaves[i] = x
+        after = self._state(self._treedef.unflatten(leaves), self._given)
+        return after.replace(data=_shown(after.data, False))
 
     # For any number of worlds -------------------------------------------------------------------------------------
 
@@ -215,8 +268,23 @@ class WholeStep:
             require_apart(apart(self._begun), two, sources, "the beginning of an episode")
 
 
+class Laid(NamedTuple):
+    """A state as few arrays."""
+
+    rows: list[Array]
+    """What a step writes. (n_rows, n_lanes) each"""
+    shared: list[Array]
+    """What all drones share. (n,)"""
+    constants: dict[int, Array]
+    """What else a step reads, by number."""
+
+
 ACTION, OVER = "action of this step", "over"
 """Names of what no state has."""
+TOLD = (".obs", ".reward", ".terminated", ".truncated", ".info")
+"""Names of what a step tells."""
+ENDS = (".terminated", ".truncated")
+"""What is told and read by the next step."""
 
 
 class _Layout:
@@ -268,6 +336,13 @@ def _shown(data: SimData, shown: Any) -> SimData:
 
 def _without_rest(joined: SimData) -> SimData:
     return joined.replace(plugins={k: x for k, x in joined.plugins.items() if k != NAME})
+
+
+def _numbers(joined: SimData) -> dict[str, int]:
+    """Return the numbers of the leaves that are no data, by name."""
+    leaves, treedef = jax.tree.flatten(joined)
+    rest = treedef.unflatten(range(len(leaves))).plugins[NAME]
+    return rest.of_drones | rest.of_worlds
 
 
 def _places(data: SimData, joined: SimData) -> list[int]:

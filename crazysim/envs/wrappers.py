@@ -125,7 +125,7 @@ class AutoReset(Wrapper):
 
     def step(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one step later, new episodes begun."""
-        whole = self._whole(state, action)
+        whole = self.whole(state, action)
         if not isinstance(whole, str):
             return whole(state, fitting(action, state, self.actions))
         after = self.env.step(state, action)
@@ -135,19 +135,19 @@ class AutoReset(Wrapper):
 
     def explain(self, state: EnvState) -> str:
         """Return in a line whether a step is one kernel, and why not."""
-        whole = self._whole(state, state.action)
+        whole = self.whole(state, state.action)
         return f"a step is not one kernel: {whole}" if isinstance(whole, str) else "a step is one kernel"
 
-    def _whole(self, state: EnvState, action: Any) -> WholeStep | str:
-        """Return the step in one kernel, or why there is none."""
+    def whole(self, state: EnvState, action: Any, laid: bool = False) -> WholeStep | str:
+        """Return the step in one kernel, or why there is none; ``laid`` as in ``WholeStep``."""
         base = base_of(self.env)
         if (why := base.unfused) is not None:
             return why
         leaves, treedef = jax.tree.flatten((state, action))
-        key = (treedef, tuple([(jnp.shape(x), jnp.result_type(x)) for x in leaves]))
+        key = (laid, treedef, tuple([(jnp.shape(x), jnp.result_type(x)) for x in leaves]))
         if key not in self._wholes:
             try:
-                self._wholes[key] = WholeStep(self.env, self._renewal, state, action)
+                self._wholes[key] = WholeStep(self.env, self._renewal, state, action, laid)
             except (NoRuleError, TypeError, ValueError) as error:
                 self._wholes[key] = str(error)
         return self._wholes[key]

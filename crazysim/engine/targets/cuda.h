@@ -26,3 +26,6 @@ FN b1 of_drone(b1 x, int d) { return of_drone(i32(x), d) != 0; }
 
 #define LOAD(SIZE, DRONES, p, k) p[lane / DRONES * SIZE + k]
 #define STORE(SIZE, DRONES, p, k, value) if (active && lane % DRONES == 0) p[lane / DRONES * SIZE + k] = value;
+// A row of numbers, one for each lane.
+#define LOAD_ROW(p, k) p[size_t(k) * n_lanes + lane]
+#define STORE_ROW(p, k, value) if (active) p[size_t(k) * n_lanes + lane] = value;

@@ -221,6 +221,19 @@ template <int SIZE, int DRONES> FN void store(b1* p, int64_t first, int n, int k
 }
 #define LOAD(SIZE, DRONES, p, k) load<SIZE, DRONES>(p, first, n_active, k)
 #define STORE(SIZE, DRONES, p, k, value) store<SIZE, DRONES>(p, first, n_active, k, value);
+// A row of numbers, one for each lane.
+template <class T> FN typename vec<T>::type load_row(const T* p, int n) {
+  typename vec<T>::type x;
+  if (n < W) load_each(x, p, 1, 1, 0, n); else std::memcpy(&x, p, sizeof(x));
+  return x;
+}
+FN b1v load_row(const b1* p, int n) { i32v x; load_each(x, p, 1, 1, 0, n); return {-x}; }
+template <class T, class V> FN void store_row(T* p, int n, V x) {
+  if (n < W) store_each(p, 1, 1, 0, n, x); else std::memcpy(p, &x, sizeof(x));
+}
+FN void store_row(b1* p, int n, b1v x) { store_each(p, 1, 1, 0, n, -x.m); }
+#define LOAD_ROW(p, k) load_row(p + (k) * n_lanes + first, n_active)
+#define STORE_ROW(p, k, value) store_row(p + (k) * n_lanes + first, n_active, value);
 
 // Work that is worth it is shared between the cores, in whole blocks of lanes. Of the system's headers the small ones:
 // reading those of std::thread would take as long as reading all of this.
