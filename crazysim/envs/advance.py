@@ -46,6 +46,11 @@ class Advance:
             self._structure = structure
         self._steps.hold(state)
 
+    @property
+    def compiled(self) -> Any:
+        """The compiled step; None before there is one."""
+        return None if self._steps is None else self._steps.compiled
+
     def __call__(self, actions: Array | np.ndarray) -> tuple[Any, Array, Array]:
         """Return what is handed out after a step, and where an episode is over and where its time is. (n_worlds,)
 
@@ -69,13 +74,13 @@ class _Rows:
             laid, told = whole.advance(laid, ends, jnp.asarray(actions))
             return laid.rows, tell(told), (told.terminated, told.truncated)
 
-        self._advance, self._lay, self._unlay = jax.jit(advance), jax.jit(whole.lay), jax.jit(whole.unlay)
+        self.compiled, self._lay, self._unlay = jax.jit(advance), jax.jit(whole.lay), jax.jit(whole.unlay)
 
     def hold(self, state: EnvState) -> None:
         self._laid, self._start, self._ends = self._lay(state), state, (state.terminated, state.truncated)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array]:
-        rows, told, self._ends = self._advance(self._laid, self._ends, actions)
+        rows, told, self._ends = self.compiled(self._laid, self._ends, actions)
         self._laid = self._laid._replace(rows=rows)
         return told, *self._ends
 
@@ -93,15 +98,15 @@ class _Leaves:
     def __init__(self, env: AutoReset, tell: Tell):
         self._env, self._tell = env, tell
         self._leaves: list[Any] = []
-        self._compiled: Any = None
+        self.compiled: Any = None
 
     def hold(self, state: EnvState) -> None:
         self._leaves, self._treedef = jax.tree.flatten(state)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array]:
-        if self._compiled is None:
+        if self.compiled is None:
             self._prepare(actions)
-        values = self._compiled(self._leaves, actions)
+        values = self.compiled(self._leaves, actions)
         n = len(self._written)
         self._leaves = with_leaves(self._leaves, self._written, values[:n])
         state = self.state()
@@ -127,4 +132,4 @@ class _Leaves:
         n = len(self._leaves)
         self._written = [i for i in range(n) if jaxpr.outvars[i] is not jaxpr.invars[i]]
         kept = [*self._written, *range(n, len(jaxpr.outvars))]
-        self._compiled = jax.jit(lambda leaves, actions: [flat(leaves, actions)[i] for i in kept])
+        self.compiled = jax.jit(lambda leaves, actions: [flat(leaves, actions)[i] for i in kept])

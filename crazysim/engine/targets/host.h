@@ -132,11 +132,11 @@ template <class F, class V> FN V each2(F f, V x, V y) {
 }
 #define EACH(NAME) LANES1(V) V NAME##_(V x) { typedef typename is_lanes<V>::one T; return each<V>([](T t) { return NAME##_(t); }, x); }
 EACH(acos) EACH(acosh) EACH(asin) EACH(asinh) EACH(atan) EACH(atanh) EACH(cbrt) EACH(ceil) EACH(cosh) EACH(erf) EACH(erfc)
-EACH(erf_inv) EACH(exp) EACH(exp2) EACH(expm1) EACH(floor) EACH(log) EACH(log1p) EACH(logistic) EACH(round_even)
+EACH(erf_inv) EACH(exp2) EACH(expm1) EACH(floor) EACH(log) EACH(log1p) EACH(logistic) EACH(round_even)
 EACH(round_away) EACH(sign) EACH(sinh) EACH(sqrt) EACH(tan) EACH(tanh)
 #define EACH2(NAME) LANES2(A, B) auto NAME##_(A x, B y) { \
   typedef typename is_lanes<decltype(lift(x))>::one T; return each2([](T s, T t) { return NAME##_(s, t); }, lift(x), lift(y)); }
-EACH2(atan2) EACH2(pow) EACH2(rem) EACH2(shift_right_arithmetic) EACH2(shift_left) EACH2(shift_right_logical)
+EACH2(pow) EACH2(rem) EACH2(shift_right_arithmetic) EACH2(shift_left) EACH2(shift_right_logical)
 LANES1(V) V neg_(V x) { return -x; }
 LANES1(V) V abs_(V x) { return select_n_(lt_(x, V{}), select_n_(eq_(x, V{}), x, V{}), -x); }
 LANES1(V) V rsqrt_(V x) { return lift(typename is_lanes<V>::one(1)) / sqrt_(x); }
@@ -170,6 +170,36 @@ FN void sin_cos(f32v x, f32v& s, f32v& c) {
   c = ((quarter + 1) & 2) != 0 ? -cosine : cosine;
 }
 FN void sin_cos(f64v x, f64v& s, f64v& c) { for (int i = 0; i < W; ++i) { s[i] = sin(x[i]); c[i] = cos(x[i]); } }
+
+// To 1.5 units in the last place; polynomials fitted for the least relative error.
+FN f32v exp_(f32v x) {
+  const f32v in = at_most(at_least(x, -104.0f), 89.0f);  // beyond, zero and infinity
+  const f32v n = round_even_(in * 1.44269504088896341f);
+  const f32v r = (in - n * 0.693359375f) - n * -2.12194440e-4f;
+  const f32v p = 0.4999999403953552f + r * (0.1666652113199234f + r * (0.04166838899254799f +
+      r * (0.008368715643882751f + r * 0.0013814602280035615f)));
+  const i32v whole = __builtin_convertvector(select_n_(eq_(n, n), f32v{}, n), i32v), half = whole >> 1;
+  // In two factors, each of which is a normal number where their product is not.
+  return (1.0f + (r + r * r * p)) * (f32v)((half + 127) << 23) * (f32v)((whole - half + 127) << 23);
+}
+FN f64v exp_(f64v x) { return each<f64v>([](f64 t) { return exp_(t); }, x); }
+FN f32v atan2_(f32v y, f32v x) {
+  const i32v sign = (i32v)y & i32v(lift(i32(-2147483647 - 1)));
+  const f32v a = (f32v)((i32v)x & 0x7fffffff), b = (f32v)((i32v)y & 0x7fffffff);
+  const f32v low = a < b ? a : b, high = a < b ? b : a;
+  const f32v one = lift(f32(1));
+  const f32v z = low == high ? (low == 0.0f ? low : one) : low / high;  // both may be zero, or infinite
+  const f32v u = z * z;
+  const f32v q = -0.33333152532577515f + u * (0.19993773102760315f + u * (-0.14211055636405945f + u * (0.10666004568338394f +
+      u * (-0.07552213966846466f + u * (0.04321185126900673f + u * (-0.016367923468351364f + u * 0.0029206909239292145f))))));
+  f32v r = z + z * u * q;
+  r = a < b ? (1.57079637050628662f - r) - 4.37113883e-8f : r;
+  r = (i32v)x < 0 ? (3.14159274101257324f - r) - 8.74227766e-8f : r;
+  return (f32v)((i32v)r | sign);
+}
+FN f64v atan2_(f64v y, f64v x) { return each2([](f64 s, f64 t) { return atan2_(s, t); }, y, x); }
+template <class A, class B, class = std::enable_if_t<any_lanes<A, B>::value>, class = std::enable_if_t<!std::is_same<A, B>::value>>
+FN auto atan2_(A y, B x) { return atan2_(lift(y), lift(x)); }
 
 FN f32v to_f32(f32v x) { return x; }
 FN f32v to_f32(f64v x) { return __builtin_convertvector(x, f32v); }
