@@ -38,8 +38,6 @@ def build(program: Program, platform: str) -> Callable[[list[Any], int | Array],
     """
     target = "cuda" if platform == "gpu" else "host"
     run = _one_kernel(program, target) if program.fused else _split(program, target)
-    if program.rows:  # nothing else reads rows
-        return lambda leaves, n_steps: run(leaves, jnp.asarray(n_steps, jnp.int32))
     batched = _over_batches(program, run)
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
@@ -92,14 +90,20 @@ def _over_batches(program: Program, run: Run) -> Run:
             counts = count if count_batched else jnp.broadcast_to(count, (size,))
             return jax.lax.map(lambda xs: run(*xs), (whole, counts)), out_batched
 
-        def join(x: Any, b: bool) -> Any:
+        def join(x: Any, b: bool, lies: bool) -> Any:
             x = x if b else jnp.broadcast_to(x, (size, *x.shape))
-            return x.reshape(-1, *x.shape[2:])
+            return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1) if lies else x.reshape(-1, *x.shape[2:])
 
-        joined = [join(x, b) if o and x is not None else x for x, b, o in zip(leaves, batched, own, strict=True)]
+        def part(x: Any, lies: bool) -> Any:
+            return jnp.moveaxis(x.reshape(x.shape[0], size, -1), 1, 0) if lies else x.reshape(size, -1, *x.shape[1:])
+
+        lying = [i in program.rows for i in range(len(leaves))]
+        joined = [
+            join(x, b, lies) if o and x is not None else x
+            for x, b, o, lies in zip(leaves, batched, own, lying, strict=True)
+        ]
         written, flagged = run(joined, count)
-        apart = [x.reshape(size, -1, *x.shape[1:]) for x in (*written, flagged)]
-        return (apart[:-1], apart[-1]), out_batched
+        return ([part(x, lying[i]) for i, x in zip(program.written, written, strict=True)], part(flagged, False)), out_batched
 
     return call
 
@@ -138,12 +142,14 @@ def _split(program: Program, target: str) -> Run:
 def _call(
     program: Program, source: kernel.Kernel, leaves: list[Any], count: Array, target: str
 ) -> tuple[list[Any], Array]:
-    drone = next(i for i, scope in enumerate(program.axes.scopes) if scope == "drone" and leaves[i] is not None)
-    n_worlds, n_drones = leaves[drone].shape[:2]
+    n_worlds, n_drones = lanes.batch(program, leaves)
     n_lanes = n_worlds * n_drones
     inputs = [_bare(leaves[i]) for i in source.inputs]
-    like = [program.leaves[i] if leaves[i] is None else leaves[i] for i in source.outputs]
-    outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in like]
+    whole = {i: leaves[i] if leaves[i] is not None else program.leaves[i] for i in source.outputs}
+    outputs = [
+        jax.ShapeDtypeStruct(x.shape if leaves[i] is not None else (n_worlds, *x.shape[1:]), x.dtype)
+        for i, x in whole.items()
+    ]
     call = cuda.call if target == "cuda" else native.call
     if program.check is None:
         return call(source, n_lanes, count.reshape(1), inputs, outputs), jnp.zeros((n_worlds, 1), bool)

@@ -26,7 +26,7 @@ class Lanes:
     def __init__(self, program: Program, leaves: list[Any]):
         """Hold leaves as arrays."""
         self.program = program
-        self.n_worlds, self.n_drones = _batch(program, leaves)
+        self.n_worlds, self.n_drones = batch(program, leaves)
         self.arrays: dict[int, Any] = dict(enumerate(leaves))
         self.lanes: dict[Slot, Any] = {}
 
@@ -59,6 +59,9 @@ class Lanes:
         if leaf not in self.arrays:
             example = self.program.leaves[leaf]
             items = [self.lanes[leaf, k] for k in range(self.program.sizes(leaf))]
+            if leaf in self.program.rows:
+                self.arrays[leaf] = jnp.stack(items)
+                return self.arrays[leaf]
             array = jnp.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *example.shape[2:])
             self.arrays[leaf] = array[:, :1] if self.program.axes.scopes[leaf] == "world" else array
         return self.arrays[leaf]
@@ -72,6 +75,9 @@ class Lanes:
     def _split(self, leaf: int) -> None:
         x, scope = self.arrays[leaf], self.program.axes.scopes[leaf]
         size = self.program.sizes(leaf)
+        if leaf in self.program.rows or x is None:  # what is not given is written before it is read
+            self.lanes.update(((leaf, k), jnp.zeros(self.shape) if x is None else x[k]) for k in range(size))
+            return
         if is_key(x):
             x = jax.random.key_data(x)
         if scope == "world":
@@ -81,9 +87,13 @@ class Lanes:
         self.lanes.update(((leaf, k), x[..., k]) for k in range(size))
 
 
-def _batch(program: Program, leaves: list[Any]) -> tuple[int, int]:
+def batch(program: Program, leaves: list[Any]) -> tuple[int, int]:
     """Return the number of worlds and drones: under a mesh, of those on this device."""
-    drone = next(i for i, scope in enumerate(program.axes.scopes) if scope == "drone")
+    drone = next(
+        i
+        for i, scope in enumerate(program.axes.scopes)
+        if scope == "drone" and leaves[i] is not None and i not in program.rows
+    )
     return leaves[drone].shape[0], leaves[drone].shape[1]
 
 

@@ -9,15 +9,22 @@ import jax
 from jax import Array
 
 from crazysim.envs.env import Env, EnvState
+from crazysim.envs.whole import WholeStep
+from crazysim.envs.wrappers import AutoReset
+
+Act = Callable[[EnvState, Array], Array]
+"""State and random key to what all drones do. (n_worlds, n_drones, k)"""
+Keep = Callable[[EnvState], Any]
+"""State after a step to what is kept of it: any tree of arrays."""
 
 
 def rollout(
     env: Env,
     state: EnvState,
-    act: Callable[[EnvState, Array], Array],
+    act: Act,
     key: Array,
     n_steps: int,
-    keep: Callable[[EnvState], Any] = lambda state: (state.reward, state.done),
+    keep: Keep = lambda state: (state.reward, state.done),
 ) -> tuple[EnvState, Any]:
     """Return the state some steps later, and what was kept on the way; pure, for jit and grad.
 
@@ -35,11 +42,36 @@ def rollout(
         nothing else is asked for.
     """
 
+    start = bare(state)
+    keys = jax.random.split(key, n_steps)
+    whole = env.whole(start, start.action, laid=True) if isinstance(env, AutoReset) else None
+    if isinstance(whole, WholeStep):
+        return _laid(whole, start, act, keys, keep)
+
     def step(carry: EnvState, key: Array) -> tuple[EnvState, Any]:
         after = env.step(carry, act(carry, key))
         return bare(after), keep(after)
 
-    return jax.lax.scan(step, bare(state), jax.random.split(key, n_steps))
+    return jax.lax.scan(step, start, keys)
+
+
+def _laid(whole: WholeStep, start: EnvState, act: Act, keys: Array, keep: Keep) -> tuple[EnvState, Any]:
+    """Do the same in rows, which no step takes apart."""
+    first = whole.lay(start)
+
+    def step(carry: tuple[list[Array], dict[str, Any]], key: Array) -> tuple[Any, Any]:
+        laid, before = first._replace(rows=carry[0]), seen(carry)
+        laid, told = whole.advance(laid, (before.terminated, before.truncated), act(before, key))
+        after = whole.unlay(laid, start)
+        after = told.replace(data=after.data, action=after.action, memory=after.memory)
+        return (laid.rows, {name: getattr(after, name) for name in ("obs", "terminated", "truncated")}), keep(after)
+
+    def seen(carry: tuple[list[Array], dict[str, Any]]) -> EnvState:
+        return whole.unlay(first._replace(rows=carry[0]), start).replace(**carry[1])
+
+    told = {"obs": start.obs, "terminated": start.terminated, "truncated": start.truncated}
+    carry, kept = jax.lax.scan(step, (first.rows, told), keys)
+    return seen(carry), kept
 
 
 def bare(state: EnvState) -> EnvState:

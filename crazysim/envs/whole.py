@@ -94,6 +94,9 @@ class WholeStep:
         settings = (base.n_substeps, base.sim.device.platform, scratch, lay)
         self._run = Whole(first, base.stages, last, example, zeros, *settings)
         self._treedef = jax.tree.structure(example)
+        again = {name for name in self._told.shapes if self._numbers[name] in told & set(self._run.read)} - set(ENDS)
+        if laid and again:
+            raise NoRuleError(f"a step reads {', '.join(sorted(again))} of the step before")
 
     def __call__(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one step later. (n_worlds, n_drones, k)"""
@@ -105,17 +108,10 @@ class WholeStep:
     # With few arrays ----------------------------------------------------------------------------------------------
 
     def lay(self, state: EnvState) -> Laid:
-        """Return a state as ``advance`` wants it.
-
-        Raises:
-            NoRuleError: If a step reads of the last one what is told, besides whether it was the last.
-        """
+        """Return a state as ``advance`` wants it."""
         action = jnp.zeros(self._action.shape, self._action.dtype)
         leaves = jax.tree.leaves(self._joined(state, action, state.terminated.shape[0]))
-        told = {i: name for name, i in self._numbers.items() if name.startswith(TOLD) and i in self._run.read}
-        if set(told.values()) - set(ENDS):
-            raise NoRuleError(f"a step reads {', '.join(sorted(told.values()))} of the step before")
-        own = {*told, self._numbers[ACTION]}
+        own = {self._numbers[name] for name in (*ENDS, ACTION)}
         constants = {i: leaves[i] for i in self._run.read if i not in own}
         return Laid(self._run.rows(leaves), self._run.shared(leaves), constants)
 
