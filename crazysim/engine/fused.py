@@ -103,7 +103,10 @@ def _over_batches(program: Program, run: Run) -> Run:
             for x, b, o, lies in zip(leaves, batched, own, lying, strict=True)
         ]
         written, flagged = run(joined, count)
-        return ([part(x, lying[i]) for i, x in zip(program.written, written, strict=True)], part(flagged, False)), out_batched
+        return (
+            [part(x, lying[i]) for i, x in zip(program.written, written, strict=True)],
+            part(flagged, False),
+        ), out_batched
 
     return call
 
@@ -145,11 +148,9 @@ def _call(
     n_worlds, n_drones = lanes.batch(program, leaves)
     n_lanes = n_worlds * n_drones
     inputs = [_bare(leaves[i]) for i in source.inputs]
-    whole = {i: leaves[i] if leaves[i] is not None else program.leaves[i] for i in source.outputs}
-    outputs = [
-        jax.ShapeDtypeStruct(x.shape if leaves[i] is not None else (n_worlds, *x.shape[1:]), x.dtype)
-        for i, x in whole.items()
-    ]
+    like = {i: program.leaves[i] for i in source.outputs}
+    shapes = {i: (program.rows[i], n_lanes) if i in program.rows else (n_worlds, *x.shape[1:]) for i, x in like.items()}
+    outputs = [jax.ShapeDtypeStruct(shapes[i], x.dtype) for i, x in like.items()]
     call = cuda.call if target == "cuda" else native.call
     if program.check is None:
         return call(source, n_lanes, count.reshape(1), inputs, outputs), jnp.zeros((n_worlds, 1), bool)

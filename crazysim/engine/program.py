@@ -261,7 +261,9 @@ class Program:
         changed = [(a, b) for a, b in pairs if a is not b]
         inner.block.outputs = [b for _, b in changed]
         whole = segment.block.add("when", (mask, *(a for a, _ in changed)), bool, (), (inner.block,))
-        items = iter([segment.block.add("item", (whole,), a.dtype, (("index", k),)) for k, (a, _) in enumerate(changed)])
+        items = iter(
+            [segment.block.add("item", (whole,), a.dtype, (("index", k),)) for k, (a, _) in enumerate(changed)]
+        )
         words = iter([a if a is b else next(items) for a, b in pairs])
         return {i: _with_words(x, words) for i, x in zip(traced.written, old, strict=True)}
 

@@ -1,4 +1,4 @@
-"""Steps of an environment one call at a time, with as few arrays as can be: each costs more than the arithmetic on it."""
+"""Steps of an environment one call at a time, with as few arrays as can be: each costs more than what is done to it."""
 
 from __future__ import annotations
 
@@ -82,7 +82,8 @@ class _Rows:
     def step(self, actions: Any) -> tuple[Any, Array, Array]:
         rows, told, self._ends = self.compiled(self._laid, self._ends, actions)
         self._laid = self._laid._replace(rows=rows)
-        return told, *self._ends
+        terminated, truncated = self._ends
+        return told, terminated, truncated
 
     def state(self) -> EnvState:
         terminated, truncated = self._ends
@@ -105,7 +106,7 @@ class _Leaves:
 
     def step(self, actions: Any) -> tuple[Any, Array, Array]:
         if self.compiled is None:
-            self._prepare(actions)
+            self.compiled = self._prepare(actions)
         values = self.compiled(self._leaves, actions)
         n = len(self._written)
         self._leaves = with_leaves(self._leaves, self._written, values[:n])
@@ -115,8 +116,8 @@ class _Leaves:
     def state(self) -> EnvState:
         return self._treedef.unflatten(self._leaves)
 
-    def _prepare(self, actions: Any) -> None:
-        """Find out what is written, and compile that."""
+    def _prepare(self, actions: Any) -> Any:
+        """Find out what is written, and return what is to be compiled."""
         treedef = self._treedef
 
         def flat(leaves: list[Any], actions: Any) -> list[Any]:
@@ -132,4 +133,4 @@ class _Leaves:
         n = len(self._leaves)
         self._written = [i for i in range(n) if jaxpr.outvars[i] is not jaxpr.invars[i]]
         kept = [*self._written, *range(n, len(jaxpr.outvars))]
-        self.compiled = jax.jit(lambda leaves, actions: [flat(leaves, actions)[i] for i in kept])
+        return jax.jit(lambda leaves, actions: [flat(leaves, actions)[i] for i in kept])

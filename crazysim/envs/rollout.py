@@ -41,7 +41,6 @@ def rollout(
         The state, without reward and info, and what was kept with time in front, (n_steps, ...): rewards and ends if
         nothing else is asked for.
     """
-
     start = bare(state)
     keys = jax.random.split(key, n_steps)
     whole = env.whole(start, start.action, laid=True) if isinstance(env, AutoReset) else None

@@ -128,7 +128,9 @@ class WholeStep:
         read = {i: x for i, x in read.items() if i in self._run.read}
         rows, found = self._run.advance(laid.rows, laid.shared, read)
         told = {name: found.get(self._numbers[name]) for name in self._told.shapes}
-        arrays = {k: None if x is None else x.reshape(x.shape[0], *self._told.shapes[k].shape[1:]) for k, x in told.items()}
+        arrays = {
+            k: None if x is None else x.reshape(x.shape[0], *self._told.shapes[k].shape[1:]) for k, x in told.items()
+        }
         return laid._replace(rows=rows), self._told.state(arrays, None)
 
     def unlay(self, laid: Laid, state: EnvState) -> EnvState:
@@ -220,7 +222,9 @@ class WholeStep:
 
     # For one world ------------------------------------------------------------------------------------------------
 
-    def _stage(self, fn: Callable[[SimData], SimData], name: str, when: Callable[[SimData], Array] | None = None) -> Stage:
+    def _stage(
+        self, fn: Callable[[SimData], SimData], name: str, when: Callable[[SimData], Array] | None = None
+    ) -> Stage:
         """Return a function of all worlds as a stage of one."""
         axes = {"drone": 1, "world": 2}
 
@@ -229,7 +233,9 @@ class WholeStep:
             scopes = self._axes.scopes
             many = [x[(None,) * axes.get(s, 0)] if s in axes else x for s, x in zip(scopes, leaves, strict=True)]
             after = jax.tree.leaves(fn(_of_worlds(treedef.unflatten(many), 1)))
-            return treedef.unflatten([x[(0,) * axes[s]] if s in axes else x for s, x in zip(scopes, after, strict=True)])
+            return treedef.unflatten(
+                [x[(0,) * axes[s]] if s in axes else x for s, x in zip(scopes, after, strict=True)]
+            )
 
         return Stage(of_one, "world", when, name=name)
 
@@ -241,7 +247,9 @@ class WholeStep:
         """
         leaves, treedef = jax.tree.flatten(example)
         batched = [s in ("drone", "world") for s in self._axes.scopes]
-        two = [jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype) if b else x for x, b in zip(leaves, batched, strict=True)]
+        two = [
+            jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype) if b else x for x, b in zip(leaves, batched, strict=True)
+        ]
         sources = ["worlds" if b else "shared" for b in batched]
         of_data = jax.tree.leaves(scopes(state.data))
         old = [jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype) if s in ("drone", "world") else x
@@ -297,7 +305,7 @@ class _Layout:
     def arrays(self, state: EnvState) -> dict[str, Any]:
         return dict(zip(self._names, self._treedef.flatten_up_to(state.replace(data=None)), strict=True))
 
-    def state(self, arrays: dict[str, Any], data: SimData) -> EnvState:
+    def state(self, arrays: dict[str, Any], data: SimData | None) -> EnvState:
         return self._treedef.unflatten([arrays[name] for name in self._names]).replace(data=data)
 
 

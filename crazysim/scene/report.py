@@ -6,6 +6,7 @@ stage of the step. Nothing of MuJoCo takes part, and nothing is held per world.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Sequence
 from itertools import groupby
@@ -52,6 +53,12 @@ class ContactReport(PyTree):
     """Number of that drone; its own for a single drone. (n_worlds, n_drones)"""
     object_names: tuple[str, ...] = static()
     """Names of the objects' bodies."""
+
+    def joined(self, other: ContactReport) -> ContactReport:
+        """Return what both report; what both were asked for is this one's."""
+        names = (f.name for f in dataclasses.fields(self))  # type: ignore[arg-type]
+        mine = {name: x for name in names if (x := getattr(self, name)) is not None}
+        return other.replace(**mine | {"object_names": self.object_names or other.object_names})
 
     @property
     def any(self) -> Array:

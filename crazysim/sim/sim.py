@@ -28,7 +28,7 @@ from crazysim.scene.build import use_boxes
 from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
 from crazysim.scene.draw import Marks
-from crazysim.scene.objects import Handle
+from crazysim.scene.questions import Questions
 from crazysim.scene.render import Viewer
 from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Held, Scene
@@ -120,7 +120,7 @@ class Sim:
         self._scene = Scene(xml_path, self.airframe, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
         self._seed = as_key(rng_key)
         self._counts: dict[int, Array] = {}
-        self._questions: dict[Any, Any] = {}
+        self._questions = self._new_questions()
         self._whole: SimData | None = None
         self._apart: Apart | None = None
         self._cleared: Any = None
@@ -134,6 +134,10 @@ class Sim:
         self.build_reset_fn()
 
     # Data ---------------------------------------------------------------------------------------------------
+
+    def _new_questions(self) -> Questions:
+        kernels = self.mesh is None and self.engine in ("auto", "fused")
+        return Questions(self._scene, self.device.platform if kernels else None)
 
     @property
     def data(self) -> SimData:
@@ -223,6 +227,7 @@ class Sim:
         self.data = self.data
         self.default_data = shard(self.default_data, mesh)
         self._scene.shard(mesh)
+        self._questions = self._new_questions()
         self.build_step_fn()
         return self.data
 
@@ -420,9 +425,7 @@ class Sim:
         Raises:
             ValueError: If nothing is asked for, or an object is not there or is moved by hand.
         """
-        asked = objects if isinstance(objects, (Handle, str, type(None))) else tuple(objects)
-        report = self._compiled("report", lambda: self._scene.contact_fn(asked, floor, drones), asked, floor, drones)
-        return report(_seen(self.data))
+        return self._questions.contact_report(self.data, objects, floor, drones)
 
     def depth(
         self,
@@ -440,21 +443,7 @@ class Sim:
         Raises:
             ValueError: If the camera does not exist, or the resolution cannot be.
         """
-        settings = (camera, width, height, drones, hide_own, along)
-
-        def build() -> Any:
-            look = self._scene.depth_fn(*settings)
-            return lambda data: look(data).distance
-
-        return self._compiled("depth", build, *settings)(_seen(self.data))
-
-    def _compiled(self, question: str, build: Any, *settings: Any) -> Any:
-        """Return a question to the scene as it is now, compiled once for each setting."""
-        scene = id(self._scene.mj_model)
-        if (scene, question, *settings) not in self._questions:
-            self._questions = {k: v for k, v in self._questions.items() if k[0] == scene}
-            self._questions[scene, question, *settings] = jax.jit(build())
-        return self._questions[scene, question, *settings]
+        return self._questions.depth(self.data, camera, width, height, drones, hide_own, along)
 
     def render(
         self,
@@ -489,18 +478,6 @@ class Sim:
     def close(self) -> None:
         """Close the window and free what pictures needed."""
         self._scene.close()
-
-
-def _seen(data: SimData) -> SimData:
-    """Return what questions about poses look at: a compiled call costs by the number of its arrays."""
-    states = data.states.replace(vel=None, ang_vel=None, rotor_vel=None, force=None, torque=None)
-    core = data.core.replace(**dict.fromkeys(CLOCK))
-    objects = data.objects if data.objects is None else data.objects.replace(vel=None, mocap_ids=None)
-    return data.replace(states=states, controls=None, params=None, plugins={}, core=core, objects=objects)
-
-
-CLOCK = ("steps", "episode", "nonfinite", "world_id", "drone_id", "drone_mocap_ids", "rng_key", "mjx_synced")
-"""What of the core is an array."""
 
 
 def use_box_collision(sim: Sim, enable: bool = True) -> None:

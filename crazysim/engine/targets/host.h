@@ -231,9 +231,8 @@ template <class T, class V> RARELY void store_each(T* p, int size, int drones, i
 template <int SIZE, int DRONES, class T> FN typename vec<T>::type load(const T* p, int64_t first, int n, int k) {
   typedef typename vec<T>::type V;
   V x;
-  if (DRONES > 1 || n < W) { load_each(x, p + k, SIZE, DRONES, first, n); return x; }
-  const T* q = p + first * SIZE + k;
-  for (int i = 0; i < W; ++i) x[i] = q[i * SIZE];
+  if (n < LANES) load_each(x, p + k, SIZE, DRONES, first, n);
+  else for (int i = 0; i < W; ++i) x[i] = p[(first + (i < LANES ? i : LANES - 1)) / DRONES * SIZE + k];
   return x;
 }
 template <int SIZE, int DRONES> FN b1v load(const b1* p, int64_t first, int n, int k) {
@@ -242,19 +241,21 @@ template <int SIZE, int DRONES> FN b1v load(const b1* p, int64_t first, int n, i
   return {-x};
 }
 template <int SIZE, int DRONES, class T, class V> FN void store(T* p, int64_t first, int n, int k, V x) {
-  if (DRONES > 1 || n < W) return store_each(p + k, SIZE, DRONES, first, n, x);
-  T* q = p + first * SIZE + k;
-  for (int i = 0; i < W; ++i) q[i * SIZE] = x[i];
+  if (n < LANES) return store_each(p + k, SIZE, DRONES, first, n, x);
+  for (int i = 0; i < LANES; ++i) p[(first + i) / DRONES * SIZE + k] = x[i];
 }
 template <int SIZE, int DRONES> FN void store(b1* p, int64_t first, int n, int k, b1v x) {
-  store_each(p + k, SIZE, DRONES, first, n, -x.m);
+  if (n < LANES) return store_each(p + k, SIZE, DRONES, first, n, -x.m);
+  for (int i = 0; i < LANES; ++i) p[(first + i) / DRONES * SIZE + k] = -x.m[i];
 }
 #define LOAD(SIZE, DRONES, p, k) load<SIZE, DRONES>(p, first, n_active, k)
 #define STORE(SIZE, DRONES, p, k, value) store<SIZE, DRONES>(p, first, n_active, k, value);
 // A row of numbers, one for each lane.
 template <class T> FN typename vec<T>::type load_row(const T* p, int n) {
   typename vec<T>::type x;
-  if (n < W) load_each(x, p, 1, 1, 0, n); else std::memcpy(&x, p, sizeof(x));
+  if (n < LANES) load_each(x, p, 1, 1, 0, n);
+  else if (LANES == W) std::memcpy(&x, p, sizeof(x));
+  else for (int i = 0; i < W; ++i) x[i] = p[i < LANES ? i : LANES - 1];
   return x;
 }
 FN b1v load_row(const b1* p, int n) { i32v x; load_each(x, p, 1, 1, 0, n); return {-x}; }
@@ -283,7 +284,7 @@ template <class F> static void* work(void* share) {
 }
 template <class F> static void in_parallel(int64_t n_lanes, int n_steps, const F& run) {
   const int most = 256;
-  const int64_t n_blocks = (n_lanes + LANES - 1) / LANES, worth = n_blocks * n_steps / 512;
+  const int64_t n_blocks = (n_lanes + LANES - 1) / LANES, worth = n_blocks * (n_steps + 1) / 512;
   const int64_t n_threads = worth < 2 ? 1 : least(least(n_cores(), most), worth);
   const auto bound = [=](int64_t k) { return least(n_lanes, n_blocks * k / n_threads * LANES); };
   Share<F> shares[most];
