@@ -48,6 +48,9 @@ def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int) 
     policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base.actions.size), 0.01))
     policy = jax.device_put(policy, place)
 
+    def flying(policy: Policy) -> Any:
+        return lambda state, key: policy(state.obs) + 0.1 * jax.random.normal(key, state.action.shape)
+
     def flown(act: Any) -> Any:
         def run(carry: Any) -> Any:
             state, key = carry
@@ -60,7 +63,10 @@ def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int) 
 
     acts = {
         "random": lambda state, key: jax.random.uniform(key, state.action.shape, minval=-0.3, maxval=0.3),
-        "policy": lambda state, key: policy(state.obs) + 0.1 * jax.random.normal(key, state.action.shape),
+        "policy": flying(policy),
+        "policy in bfloat16": flying(
+            policy.replace(layers=jax.tree.map(lambda x: x.astype("bfloat16"), policy.layers))
+        ),
     }
     for name, act in acts.items():
         carry = (bare(start), jax.device_put(jax.random.key(2), place))

@@ -34,11 +34,13 @@ def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
 
 
 def mlp(layers: Layers, x: Array) -> Array:
-    """Return the outputs, tanh between layers. (..., n_in) -> (..., n_out)"""
+    """Return the outputs, tanh between layers, computed in the type of the weights. (..., n_in) -> (..., n_out)"""
+    dtype = x.dtype
+    x = x.astype(layers[0][0].dtype)
     for weight, bias in layers[:-1]:
         x = jnp.tanh(x @ weight + bias)
     weight, bias = layers[-1]
-    return x @ weight + bias
+    return (x @ weight + bias).astype(dtype)
 
 
 class Policy(PyTree):
