@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import statistics
 import sys
 import time
 from typing import Any
@@ -151,7 +152,7 @@ OBJECTS = {
 }
 """Eight objects that can be moved, none in the way of the drones: what they are, and where."""
 ANSWERS = 10
-"""Answers in a turn: the first after a pause takes longer, for the machine has gone to sleep."""
+"""Answers in a turn, of which the median counts: the first after a pause takes longer, for the machine has slept."""
 QUESTIONS = ("contacts", "depth", "swarm_build")
 
 
@@ -212,14 +213,14 @@ class Question:
             begin = time.perf_counter()
             self._sim = self._module.Sim(n_drones=self._case["n_drones"], device=self._device)
             return time.perf_counter() - begin
-        seconds = 0.0
+        seconds = []
         for _ in range(ANSWERS):
             self._sim.step()
             jax.block_until_ready(self._sim.data.states.pos)
             begin = time.perf_counter()
             jax.block_until_ready(self._ask())
-            seconds += time.perf_counter() - begin
-        return seconds / ANSWERS
+            seconds.append(time.perf_counter() - begin)
+        return statistics.median(seconds)
 
     def require_flying(self) -> None:
         """Refuse a figure of drones that lie on the floor.

@@ -63,7 +63,7 @@ def call(kernel: Kernel, n_lanes: int, count: Array, inputs: Sequence[Array], ou
     )  # groups that a warp has no room for go to the next
     n_blocks = -(-n_lanes // of_block)
     launch = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1, "block_x": BLOCK, "block_y": 1, "block_z": 1}
-    run = jax.ffi.ffi_call(TARGET, list(outputs))
+    run = jax.ffi.ffi_call(TARGET, list(outputs), input_output_aliases=kernel.aliases())
     return list(
         run(
             np.asarray([n_lanes], np.int32),

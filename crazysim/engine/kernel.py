@@ -30,8 +30,14 @@ class Kernel:
     """Leaves that it reads."""
     outputs: tuple[int, ...]
     """Leaves that it writes; behind them comes one bool per drone, whether its world is flagged, if that is checked."""
+    in_place: tuple[int, ...] = ()
+    """Leaves of rows that it reads where it then writes them: of each, input and output must be the same memory."""
     group: int = 1
     """Drones next to each other that must be in one warp or vector, for they look at each other's numbers."""
+
+    def aliases(self) -> dict[int, int]:
+        """Return which operand of a call, behind two numbers, is which of its results."""
+        return {2 + self.inputs.index(i): self.outputs.index(i) for i in self.in_place}
 
     def with_blocks(self, n: int) -> Kernel:
         """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
@@ -104,7 +110,8 @@ def write(program: Program, target: str) -> Kernel:
     widest = 8 if any(_kind(program, i) == "f64" for i in (*inputs, *outputs)) else 4
     defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n"
     text = defines + preamble(target) + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
-    return Kernel(text, inputs, outputs, program.group)
+    in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
+    return Kernel(text, inputs, outputs, in_place, program.group)
 
 
 def needed(program: Program) -> tuple[int, ...]:
@@ -208,7 +215,7 @@ def _load(program: Program, slot: Slot) -> str:
     if scope not in ("drone", "world"):
         return f"p{leaf}[{k}]"
     if leaf in program.rows:
-        return f"LOAD_ROW(p{leaf}, {k})"
+        return f"LOAD_ROW({'q' if leaf in program.written else 'p'}{leaf}, {k})"
     return f"LOAD({program.sizes(leaf)}, {_drones(program, leaf)}, p{leaf}, {k})"
 
 

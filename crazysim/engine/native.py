@@ -28,7 +28,7 @@ that forgets NaN is."""
 
 def call(kernel: Kernel, n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
     """Return what a kernel writes; arguments as in ``cuda.call``."""
-    run = jax.ffi.ffi_call(target(kernel), list(outputs))
+    run = jax.ffi.ffi_call(target(kernel), list(outputs), input_output_aliases=kernel.aliases())
     return list(run(np.asarray([n_lanes], np.int32), count, *inputs))
 
 

@@ -66,28 +66,32 @@ class _Rows:
 
     def __init__(self, whole: WholeStep, tell: Tell):
         self._whole = whole
+        self._rows: list[Array]
         self._laid: Laid
         self._start: EnvState
         self._ends: tuple[Array, Array]
 
-        def advance(laid: Laid, ends: tuple[Array, Array], actions: Any) -> Any:
-            laid, told = whole.advance(laid, ends, jnp.asarray(actions))
+        def advance(rows: list[Array], laid: Laid, ends: tuple[Array, Array], actions: Any) -> Any:
+            laid, told = whole.advance(laid._replace(rows=rows), ends, jnp.asarray(actions))
             return laid.rows, tell(told), (told.terminated, told.truncated)
 
-        self.compiled, self._lay, self._unlay = jax.jit(advance), jax.jit(whole.lay), jax.jit(whole.unlay)
+        self.compiled = jax.jit(advance, donate_argnums=0)  # nobody else has the rows
+        self._lay, self._unlay = jax.jit(whole.lay), jax.jit(whole.unlay)
 
     def hold(self, state: EnvState) -> None:
-        self._laid, self._start, self._ends = self._lay(state), state, (state.terminated, state.truncated)
+        laid = self._lay(state)
+        self._rows, self._laid = laid.rows, laid._replace(rows=[])
+        self._start, self._ends = state, (state.terminated, state.truncated)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array]:
-        rows, told, self._ends = self.compiled(self._laid, self._ends, actions)
-        self._laid = self._laid._replace(rows=rows)
+        self._rows, told, self._ends = self.compiled(self._rows, self._laid, self._ends, actions)
         terminated, truncated = self._ends
         return told, terminated, truncated
 
     def state(self) -> EnvState:
         terminated, truncated = self._ends
-        return self._unlay(self._laid, self._start).replace(terminated=terminated, truncated=truncated)
+        state = self._unlay(self._laid._replace(rows=self._rows), self._start)
+        return state.replace(terminated=terminated, truncated=truncated)
 
 
 class _Leaves:

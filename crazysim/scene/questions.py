@@ -32,7 +32,8 @@ class Questions:
     def contact_report(self, data: SimData, objects: Objects, floor: bool, drones: bool) -> ContactReport:
         """Return what each drone touches; see ``Sim.contact_report``."""
         asked = objects if isinstance(objects, (Handle, str, type(None))) else tuple(objects)
-        return self._answer("report", lambda: self._contacts(asked, floor, drones), asked, floor, drones)(_seen(data))
+        answer = self._answer("report", data, lambda: self._contacts(asked, floor, drones), asked, floor, drones)
+        return answer(*_poses(data))
 
     def depth(
         self, data: SimData, camera: str | int, width: int, height: int, drones: bool, hide_own: bool, along: Along
@@ -44,14 +45,16 @@ class Questions:
             look = self._scene.depth_fn(*settings)
             return lambda data: look(data).distance
 
-        return self._answer("depth", build, *settings)(_seen(data))
+        return self._answer("depth", data, build, *settings)(*_poses(data))
 
-    def _answer(self, question: str, build: Callable[[], Any], *settings: Any) -> Any:
-        """Return a question to the scene as it is now, compiled once for each setting."""
+    def _answer(
+        self, question: str, data: SimData, build: Callable[[], Callable[[SimData], Any]], *settings: Any
+    ) -> Callable[..., Any]:
+        """Return a question about poses to the scene as it is now, compiled once for each setting."""
         scene = id(self._scene.mj_model)
         if (scene, question, *settings) not in self._compiled:
             self._compiled = {k: v for k, v in self._compiled.items() if k[0] == scene}
-            self._compiled[scene, question, *settings] = jax.jit(build())
+            self._compiled[scene, question, *settings] = jax.jit(_of_poses(build(), data))
         return self._compiled[scene, question, *settings]
 
     def _contacts(self, objects: Objects, floor: bool, drones: bool) -> Callable[[SimData], ContactReport]:
@@ -74,13 +77,20 @@ class Questions:
         return contacts
 
 
-def _seen(data: SimData) -> SimData:
-    """Return what questions about poses look at: a compiled call costs by the number of its arrays."""
-    states = data.states.replace(vel=None, ang_vel=None, rotor_vel=None, force=None, torque=None)
-    core = data.core.replace(**dict.fromkeys(CLOCK))
-    objects = data.objects if data.objects is None else data.objects.replace(vel=None, mocap_ids=None)
-    return data.replace(states=states, controls=None, params=None, plugins={}, core=core, objects=objects)
+def _poses(data: SimData) -> tuple[Array | None, ...]:
+    """Return all that questions about poses look at: a compiled call costs by the number of its arrays."""
+    states, objects = data.states, data.objects
+    return states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat))
 
 
-CLOCK = ("steps", "episode", "nonfinite", "world_id", "drone_id", "drone_mocap_ids", "rng_key", "mjx_synced")
-"""What of the core is an array."""
+def _of_poses(fn: Callable[[SimData], Any], data: SimData) -> Callable[..., Any]:
+    """Return a function of data as one of its poses; nothing else of the data is there."""
+    bare = jax.tree.map(lambda _: None, data)
+
+    def of_poses(pos: Array, quat: Array, objects_pos: Array | None, objects_quat: Array | None) -> Any:
+        states, objects = bare.states.replace(pos=pos, quat=quat), bare.objects
+        if objects is not None:
+            objects = objects.replace(pos=objects_pos, quat=objects_quat)
+        return fn(bare.replace(states=states, objects=objects, plugins={}))
+
+    return of_poses
