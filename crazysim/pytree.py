@@ -144,6 +144,14 @@ def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
     return jnp.where(mask, new, old)
 
 
-def as_parameter(value: Any) -> Array:
-    """Return a number or array as a shared parameter: of floating type, and never a bare scalar."""
-    return jnp.atleast_1d(jnp.asarray(np.asarray(value, dtype=np.float64), dtype=float))
+def floating() -> Any:
+    """Return the type of numbers that JAX computes with as it is set now: float32, or float64."""
+    return np.float64 if jax.config.jax_enable_x64 else np.float32  # type: ignore[attr-defined]
+
+
+def as_parameter(value: Any) -> Any:
+    """Return a number or array as a shared parameter: of floating type, and never a bare scalar.
+
+    It is an array of the host, which takes no compilation; a simulation puts it on its device with all else.
+    """
+    return np.atleast_1d(np.asarray(value, floating()))

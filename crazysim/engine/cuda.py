@@ -12,6 +12,7 @@ import dataclasses
 import functools
 import importlib.util
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -94,13 +95,12 @@ def fitted(kernel: Kernel) -> Kernel:
 
     More blocks hide more latency, until registers that no longer fit cost more than that.
     """
-    least = resources(kernel)
+    candidates = [kernel, *(kernel.with_blocks(n) for n in BLOCKS_AT_ONCE)]
+    with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
+        least, *found = pool.map(resources, candidates)
     bearable = 16 if least.registers <= 224 else 256  # measured on an H200: docs/concepts/engine.md
-    for n in BLOCKS_AT_ONCE:
-        candidate = kernel.with_blocks(n)
-        if resources(candidate).spilled <= least.spilled + bearable:
-            return candidate
-    return kernel
+    fitting = (c for c, r in zip(candidates[1:], found, strict=True) if r.spilled <= least.spilled + bearable)
+    return next(fitting, kernel)
 
 
 @functools.cache

@@ -15,7 +15,7 @@ from crazysim.control import AllocationParams, AttitudeParams, Control, StatePar
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, static
+from crazysim.pytree import PyTree, floating, leaf, static
 
 SimParams = first_principles.Params | fitted.Params
 
@@ -45,13 +45,13 @@ class SimState(PyTree):
         grid = np.zeros((n_drones, 3))
         grid[:, :2] = grid_2d(n_drones)
         return SimState(
-            pos=jnp.asarray(np.broadcast_to(grid, (*shape, 3)), dtype=float),
-            quat=jnp.zeros((*shape, 4)).at[..., 3].set(1.0),
-            vel=jnp.zeros((*shape, 3)),
-            ang_vel=jnp.zeros((*shape, 3)),
-            force=jnp.zeros((*shape, 3)),
-            torque=jnp.zeros((*shape, 3)),
-            rotor_vel=jnp.zeros((*shape, n_rotors)),
+            pos=of_host(grid, *shape, 3),
+            quat=of_host([0.0, 0.0, 0.0, 1.0], *shape, 4),
+            vel=of_host(0.0, *shape, 3),
+            ang_vel=of_host(0.0, *shape, 3),
+            force=of_host(0.0, *shape, 3),
+            torque=of_host(0.0, *shape, 3),
+            rotor_vel=of_host(0.0, *shape, n_rotors),
         )
 
 
@@ -170,12 +170,12 @@ class SimControls(PyTree):
         with_rotors = dynamics == Dynamics.first_principles
         require_pair(dynamics, control)
 
-        def zeros(n: int) -> Array:
-            return jnp.zeros((*shape, n))
+        def zeros(n: int) -> Any:
+            return of_host(0.0, *shape, n)
 
         state = attitude = body_rate = force_torque = rotor_vel = None
         if control == Control.state:
-            cmd = zeros(16).at[..., 12].set(1.0)
+            cmd = of_host(np.eye(16)[12], *shape, 16)
             # A copy, for two leaves that share a buffer cannot both be donated.
             state = StateControlData(cmd, cmd.copy(), freqs[Control.state], zeros(3), StateParams.create(airframe))
         if control in (Control.state, Control.attitude):
@@ -231,16 +231,16 @@ class SimCore(PyTree):
         """Return the core of a simulation that has not begun."""
         return SimCore(
             freq=freq,
-            steps=jnp.zeros((n_worlds, 1), jnp.int32),
-            episode=jnp.zeros((n_worlds, 1), jnp.int32),
-            nonfinite=jnp.zeros((n_worlds, 1), bool),
+            steps=of_host(0, n_worlds, 1, dtype=np.int32),
+            episode=of_host(0, n_worlds, 1, dtype=np.int32),
+            nonfinite=of_host(False, n_worlds, 1, dtype=bool),
             n_worlds=n_worlds,
             n_drones=n_drones,
-            world_id=jnp.arange(n_worlds, dtype=jnp.int32)[:, None],
-            drone_id=jnp.tile(jnp.arange(n_drones, dtype=jnp.int32), (n_worlds, 1)),
-            drone_mocap_ids=jnp.asarray(drone_mocap_ids, jnp.int32),
+            world_id=of_host(np.arange(n_worlds)[:, None], n_worlds, 1, dtype=np.int32),
+            drone_id=of_host(np.arange(n_drones), n_worlds, n_drones, dtype=np.int32),
+            drone_mocap_ids=of_host(drone_mocap_ids, n_drones, dtype=np.int32),
             rng_key=as_key(rng_key),
-            mjx_synced=jnp.asarray(False),
+            mjx_synced=of_host(False, dtype=bool),
         )
 
 
@@ -295,6 +295,11 @@ class SimData(PyTree):
             params=create_params(dynamics, airframe),
             core=SimCore.create(freq, n_worlds, n_drones, drone_mocap_ids, rng_key),
         )
+
+
+def of_host(value: Any, *shape: int, dtype: Any = None) -> Any:
+    """Return a value repeated to a shape, as an array of the host: making it takes no compilation."""
+    return np.array(np.broadcast_to(value, shape), dtype or floating())
 
 
 def require_pair(dynamics: Dynamics, control: Control) -> None:

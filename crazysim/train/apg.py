@@ -14,7 +14,7 @@ from jax import Array
 from crazysim.envs.env import Env, EnvState, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
-from crazysim.train.networks import Layers, Policy, init_mlp
+from crazysim.train.networks import QUICK, Layers, Policy, init_mlp
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def init(env: Env, config: Config, key: Array) -> Learner:
     return Learner(policy, _optimizer(config).init(policy), stats, key, state, jnp.int32(0))
 
 
-@partial(jax.jit, static_argnames=("env", "config"))
+@partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK)
 def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
     """Fly a short way and learn from it; return the learner, and figures of the round.
 

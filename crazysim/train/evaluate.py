@@ -12,6 +12,7 @@ from jax import Array
 
 from crazysim.envs.env import Env
 from crazysim.pytree import PyTree, static
+from crazysim.train.networks import QUICK
 
 HELD_OUT = 0x5EED
 """Seed of the starts that policies are judged by; training seeds are folded away from it."""
@@ -28,7 +29,7 @@ class _Fixed(PyTree):
         return self.fn(obs)
 
 
-@partial(jax.jit, static_argnames=("env",))
+@partial(jax.jit, static_argnames=("env",), compiler_options=QUICK)
 def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
     """Return what one episode of every world gives.
 

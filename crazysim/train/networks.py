@@ -15,6 +15,9 @@ from crazysim.envs.env import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 
+QUICK = {"xla_gpu_autotune_level": 0}
+"""Options of compilation: on a GPU, trying out ways to multiply takes longer than networks of this size ever save."""
+
 Layers = list[tuple[Array, Array]]
 """Weights (n_in, n_out) and biases (n_out,), first layer first."""
 

@@ -15,7 +15,7 @@ from crazysim.envs.env import Env, EnvState, flatten
 from crazysim.envs.rollout import bare
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
-from crazysim.train.networks import Layers, Policy, init_mlp, mlp
+from crazysim.train.networks import QUICK, Layers, Policy, init_mlp, mlp
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def init(env: Env, config: Config, key: Array) -> Learner:
     return Learner(policy, log_std, value, optimizer, stats, key, bare(state), jnp.int32(0))
 
 
-@partial(jax.jit, static_argnames=("env", "config"))
+@partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK)
 def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
     """Fly a round and learn from it; return the learner, and figures of the round."""
     key, k_fly, k_learn = jax.random.split(learner.key, 3)
