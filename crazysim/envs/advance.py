@@ -56,8 +56,12 @@ class Advance:
 
         Args:
             actions: What all drones do, for each world in any shape. (n_worlds, ...)
+
+        Raises:
+            ConfigError: If there is no state.
         """
-        assert self._steps is not None
+        if self._steps is None:
+            raise ConfigError("there is no state to step on from")
         return self._steps.step(actions)
 
 

@@ -177,9 +177,9 @@ class WholeStep:
 
     def _begun(self, joined: SimData) -> SimData:
         """Begin new episodes in all worlds."""
-        assert self._renewal is not None
         after = self._state(joined, self._told)
-        after = self._renewal.begin(after, jnp.ones(after.terminated.shape, bool))
+        if self._renewal is not None:
+            after = self._renewal.begin(after, jnp.ones(after.terminated.shape, bool))
         return self._changed(joined, after.data, self._told.arrays(after))
 
     def _plainly(self, state: EnvState, action: Array) -> EnvState:

@@ -44,6 +44,8 @@ class Recipe:
     """Worlds that are flown at once."""
     config: dict[str, Any] = field(default_factory=dict)
     """What differs from the algorithm's own settings."""
+    practice: dict[str, Any] = field(default_factory=dict)
+    """Options of the environment that is learnt in, beyond those of the one that is judged in."""
     evaluate_every: int = 20
     """Rounds from one evaluation, and checkpoint, to the next."""
 
@@ -51,7 +53,11 @@ class Recipe:
 RECIPES: dict[str, Recipe] = {
     "hover": Recipe(config={"iterations": 80}),
     "recover": Recipe(config={"iterations": 150}),
-    "race": Recipe(n_worlds=4096, config={"iterations": 600, "entropy": 0.01, "init_std": 0.7}, evaluate_every=60),
+    "race": Recipe(
+        n_worlds=4096,
+        config={"iterations": 200, "entropy": 0.01, "init_std": 0.7},
+        practice={"practice": True},
+    ),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
 }
 """What is known to work, by task; every other task begins with ``Recipe()``."""
@@ -108,6 +114,10 @@ class Settings:
         """Return the environment of the run, or one like it with other worlds, and options that the run leaves open."""
         return make(self.task, n_worlds or self.n_worlds, **options | self.options)
 
+    def practice(self) -> dict[str, Any]:
+        """Return options of the environment that is learnt in, as the task's recipe has them."""
+        return dict(RECIPES.get(self.task, Recipe()).practice)
+
     def algorithm_config(self) -> Any:
         """Return the settings of the algorithm, as it wants them."""
         return ALGORITHMS[self.algorithm].Config(**self.config | {"hidden": tuple(self.config["hidden"])})
@@ -156,7 +166,8 @@ def train(
     begin = time.perf_counter()
     algorithm, config = ALGORITHMS[settings.algorithm], settings.algorithm_config()
     # A gradient runs on lanes in any case; a kernel for the way forward would take longer to compile than it saves.
-    base = settings.environment(settings.n_worlds, **{"engine": "lanes"} if algorithm is apg else {})
+    engine = {"engine": "lanes"} if algorithm is apg else {}
+    base = settings.environment(settings.n_worlds, **engine | settings.practice())
     env = base if algorithm is apg else AutoReset(base)
     judge = settings.environment(evaluation_worlds)
     key = jax.random.fold_in(jax.random.key(settings.seed), 1)

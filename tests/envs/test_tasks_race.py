@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim, rotation
-from crazysim.envs import DroneEnv, make
+from crazysim.envs import AutoReset, DroneEnv, make
 from crazysim.envs.tasks import race as task
 from crazysim.envs.tracks import Track, ranks
 from crazysim.sim.random import world_keys
@@ -264,10 +264,34 @@ def test_the_same_key_gives_the_same_course_in_any_world(drawn):
     assert not np.allclose(other.params.mass, data.params.mass)
 
 
-def test_way_leads_around_a_gate_from_behind():
-    ahead = task.way(jnp.array([[-1.0, 0.0, 0.0], [-3.0, 4.0, 0.0], [0.5, 0.0, 0.0], [0.3, 0.9, 0.0]]))
-    expected = [1.0, 5.0, np.hypot(0.5, 0.45) + 0.45, np.hypot(0.3, 0.45) + 0.45]
+def test_way_leads_around_a_gate_from_behind_and_back_from_beside_it():
+    ahead = task.way(
+        jnp.array([[-1.0, 0.0, 0.0], [-4.0, 3.0, 0.0], [-3.0, 4.0, 0.0], [0.5, 0.0, 0.0], [0.3, 0.9, 0.0]])
+    )
+    around = 2 * 0.45 - 0.15  # from beside the frame, where both ways are the same
+    expected = [1.0, 5.0, 5.0 + 0.85, np.hypot(0.5, 0.45) + around, np.hypot(0.3, 0.45) + around]
     np.testing.assert_allclose(ahead, expected, rtol=1e-6)
+    beside = np.array([[1e-7, 0.45, 0.0], [-1e-7, 0.45, 0.0]])
+    np.testing.assert_allclose(task.way(jnp.asarray(beside)), around, rtol=1e-6)
+    slope = jax.grad(lambda pos: task.way(pos))(jnp.array([-0.01, 0.38, 0.1]))
+    assert slope[0] > 0.9, "beside the frame the way is shorter farther back"
+
+
+def test_practice_begins_behind_gates():
+    env = make("race", 400, practice=True)
+    data = jax.jit(env.reset)(jax.random.key(0)).data
+    passed = np.asarray(task.race_of(data).passed)[:, 0]
+    assert np.bincount(passed, minlength=4).min() > 60, "each gate as often as the others"
+    pos, quat = task.gates_of(data)
+    for k in (1, 2, 3):
+        here = passed == k
+        inside = rotation.rotate_inverse(quat[here, 0, k - 1], data.states.pos[here, 0] - pos[here, 0, k - 1])
+        assert np.all((inside[:, 0] > 0.14) & (inside[:, 0] < 0.31)), "behind it, and clear of it"
+        np.testing.assert_allclose(inside[:, 1:], 0, atol=1e-5)
+    still = jax.jit(lambda state: AutoReset(env, "Disabled").step(state, state.action))(env.reset(jax.random.key(0)))
+    assert not np.any(still.info["disabled"])
+    with pytest.raises(ConfigError, match="practice is for a single drone"):
+        make("multi_race", practice=True)
 
 
 def test_ranks_are_a_draw_without_replacement():

@@ -145,7 +145,7 @@ def test_docstrings_tell_the_shapes(dynamics, control):
             value, shape = getattr(record, field.name), shapes[field.name]
             if isinstance(value, PyTree):
                 check(value)
-            elif isinstance(value, jax.Array):
+            elif isinstance(value, (jax.Array, np.ndarray)):
                 assert shape is not None, f"{type(record).__name__}.{field.name} does not say its shape"
                 words = [word.strip() for word in shape.split(",") if word.strip()]
                 assert tuple(sizes.get(w) or int(w) for w in words) == value.shape, (type(record), field.name)

@@ -38,6 +38,8 @@ OBSTACLE_JITTER = (0.15, 0.15, 0.05)
 """Most that an obstacle is moved at level 2, m."""
 AROUND = 0.45
 """Distance from the middle of a gate at which a way around it passes, m."""
+FUNNEL = 0.15
+"""Distance from the axis of a gate, m, that is no detour at the gate itself; it grows by a metre for each before it."""
 CORNERS = OPENING / 2 * np.array([[0, 1, 1], [0, 1, -1], [0, -1, -1], [0, -1, 1]])
 """Corners of the opening in the gate's frame, m. (4, 3)"""
 
@@ -89,6 +91,7 @@ def race(
     sensor_range: float = SENSOR_RANGE,
     seconds: float = 12.0,
     reward: Reward | None = None,
+    practice: bool = False,
 ) -> Task:
     """Return the task of racing through gates among obstacles, by the rules of lsy_drone_racing.
 
@@ -110,12 +113,16 @@ def race(
         sensor_range: Distance in the plane below which a drone sees where a gate or an obstacle really is, m.
         seconds: Length of an episode, s.
         reward: What is rewarded; None for ``dense``, ``sparse`` is another.
+        practice: Whether an episode begins anywhere on the course, for learning: as often as at the start, a drone is
+            behind a gate that counts as passed.
 
     Raises:
-        ConfigError: If there is no such level, or the track cannot be flown from its starts.
+        ConfigError: If there is no such level, the track cannot be flown from its starts, or several drones practise.
     """
     if level not in (0, 1, 2, 3):
         raise ConfigError(f"level is {level!r}; a race has level 0, 1, 2 or 3")
+    if practice and sim.n_drones > 1:
+        raise ConfigError(f"practice is for a single drone; behind a gate there is no room for {sim.n_drones}")
     jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if level == 2 else 0)
     course = checked(Track() if track is None else track, sim.n_drones, float(jitter), level == 3)
     n_gates, n_obstacles, n_drones = course.n_gates, course.n_obstacles, sim.n_drones
@@ -141,8 +148,9 @@ def race(
 
     def spawn(data: SimData, keys: Array) -> SimData:
         sizes = [6 * n_drones, 4 * n_drones * (level >= 1), (6 * n_gates + 3 * n_obstacles) * (level >= 2)]
-        x = uniform(keys, sum(sizes) + (n_random(course) if level == 3 else 0))
-        start_x, inertial_x, moved_x, course_x = jnp.split(x, np.cumsum(sizes), axis=-1)
+        sizes.append(n_random(course) if level == 3 else 0)
+        x = uniform(keys, sum(sizes) + 3 * practice)
+        start_x, inertial_x, moved_x, course_x, practice_x = jnp.split(x, np.cumsum(sizes), axis=-1)
         record = data.plugins[NAME]
         start = np.asarray(course.start, float).astype(x.dtype)
         if level >= 2:
@@ -167,7 +175,13 @@ def race(
             data = data.replace(params=_drawn(data.params, nominal, shares))
         off = (2 * start_x.reshape(-1, n_drones, 6) - 1) * np.array(START_JITTER, x.dtype)
         at = start + start_offsets(n_drones).astype(x.dtype) + off[..., :3]
-        data = flying(data, at, rotation.from_rpy(off[..., 3:]))
+        vel: Any = 0.0
+        if practice:
+            passed = (practice_x[:, :1] * n_gates).astype(jnp.int32)
+            behind, vel = _behind(data, passed, practice_x[:, None, 1:])
+            at = jnp.where(passed[..., None] > 0, behind, at)
+            record = record.replace(passed=passed)
+        data = flying(data, at, rotation.from_rpy(off[..., 3:]), vel)
         return data.replace(plugins=data.plugins | {NAME: record.replace(last_pos=data.states.pos)})
 
     def mark(data: SimData) -> SimData:
@@ -202,7 +216,13 @@ def race(
         succeeded=lambda data: race_of(data).finished,
         seconds=seconds,
         camera={"lookat": (0, 0, 0.7), "distance": 6.0, "elevation": -40},
-        settings={"level": level, "sensor_range": sensor_range, "seconds": seconds, "track": course.settings()},
+        settings={
+            "level": level,
+            "sensor_range": sensor_range,
+            "seconds": seconds,
+            "track": course.settings(),
+            "practice": practice,
+        },
     )
 
 
@@ -366,7 +386,9 @@ def to_go(data: SimData) -> Array:
 
 
 def way(pos: Array) -> Array:
-    """Return how far it is to the middle of a gate, and from behind it around its frame, m.
+    """Return how far it is to the middle of a gate, from beside it by a detour, and from behind it around its frame, m.
+
+    In a straight line the nearest place of all would be one beside the frame, from which the frame is in the way.
 
     Args:
         pos: Place in the gate's frame, m. (..., 3)
@@ -376,8 +398,10 @@ def way(pos: Array) -> Array:
     """
     beside = AROUND * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1]], pos.dtype)
     around = rotation.safe_norm(pos[..., None, :] - beside)[..., 0]
-    behind = AROUND + jnp.min(around, axis=-1)
-    return jnp.where(pos[..., 0] > 0, behind, rotation.safe_norm(pos)[..., 0])
+    off = rotation.safe_norm(pos[..., 1:])[..., 0]
+    detour = jnp.maximum(off - (FUNNEL - pos[..., 0]), 0)
+    behind = 2 * AROUND - FUNNEL + jnp.min(around, axis=-1)
+    return jnp.where(pos[..., 0] > 0, behind, rotation.safe_norm(pos)[..., 0] + detour)
 
 
 def dense(data: SimData, action: Array, last_action: Array) -> Array:
@@ -408,6 +432,22 @@ def _drawn(params: Any, nominal: dict[str, Array], shares: Array) -> Any:
     root = jnp.sqrt(1 + INERTIA * shares[..., 1:])
     scale = root[..., :, None] * root[..., None, :]
     return params.replace(mass=mass, J=nominal["J"] * scale, J_inv=nominal["J_inv"] / scale)
+
+
+def _behind(data: SimData, passed: Array, x: Array) -> tuple[Array, Array]:
+    """Return where a drone may be that has just passed some gates, m, and its velocity, m/s; at rest if it has not.
+
+    Args:
+        data: The simulation.
+        passed: Gates passed. (n_worlds, 1)
+        x: Numbers in [0, 1]. (n_worlds, 1, 2)
+
+    Returns:
+        (n_worlds, 1, 3) each
+    """
+    pos, quat = (pick(v, jnp.maximum(passed - 1, 0)) for v in gates_of(data))
+    ahead = rotation.rotate(quat, jnp.asarray([1.0, 0.0, 0.0], pos.dtype))
+    return pos + (0.15 + 0.15 * x[..., :1]) * ahead, jnp.where(passed[..., None] > 0, x[..., 1:], 0) * ahead
 
 
 def _of_worlds(x: Array, like: Array | None) -> Array:
