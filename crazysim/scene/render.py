@@ -42,10 +42,7 @@ class Viewer:
         """Return the picture that ``Sim.render`` documents."""
         if mode not in MODES:
             raise UnknownNameError(f"unknown render mode {mode!r}; the modes are {', '.join(MODES)}")
-        if not all(isinstance(n, (int, np.integer)) and n > 0 for n in (width, height)):
-            raise ConfigError(
-                f"a picture of {width} x {height} pixels cannot be; width and height must be positive whole numbers"
-            )
+        require_size(width, height)
         cam = self._camera(camera, cam_config)
         if mode == "human":
             if not self._windows:
@@ -73,19 +70,9 @@ class Viewer:
 
     def _camera(self, camera: int | str, cam_config: dict[str, Any] | None) -> mujoco.MjvCamera:
         cam = mujoco.MjvCamera()
-        if isinstance(camera, str):
-            camera_id = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-            if camera_id < 0:
-                names = [self._model.camera(i).name for i in range(self._model.ncam)]
-                raise UnknownNameError(f"the scene has no camera {camera!r}; it has {', '.join(names[:12])}, or -1")
-        else:
-            camera_id = camera
-            if not isinstance(camera, (int, np.integer)) or not -1 <= camera < self._model.ncam:
-                raise UnknownNameError(
-                    f"camera {camera!r} does not exist; ids go from 0 to {self._model.ncam - 1}, -1 is the free camera"
-                )
-        if camera_id >= 0:
-            cam.type, cam.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera_id
+        number = camera_id(self._model, camera)
+        if number >= 0:
+            cam.type, cam.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, number
             return cam
         mujoco.mjv_defaultFreeCamera(self._model, cam)
         for key, value in (cam_config or {}).items():
@@ -114,6 +101,37 @@ class Viewer:
             if len(self._renderers) > MAX_SIZES:
                 self._renderers.pop(next(iter(self._renderers))).close()
         return self._renderers[width, height]
+
+
+def camera_id(model: mujoco.MjModel, camera: int | str) -> int:
+    """Return the number of a camera, -1 for the free one.
+
+    Raises:
+        UnknownNameError: If there is none of that name or number.
+    """
+    if isinstance(camera, str):
+        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        if number < 0:
+            names = [model.camera(i).name for i in range(model.ncam)]
+            raise UnknownNameError(f"the scene has no camera {camera!r}; it has {', '.join(names[:12])}, or -1")
+        return number
+    if not isinstance(camera, (int, np.integer)) or not -1 <= camera < model.ncam:
+        raise UnknownNameError(
+            f"camera {camera!r} does not exist; ids go from 0 to {model.ncam - 1}, -1 is the free camera"
+        )
+    return int(camera)
+
+
+def require_size(width: Any, height: Any) -> None:
+    """Check the size of a picture.
+
+    Raises:
+        ConfigError: If it is no size.
+    """
+    if not all(isinstance(n, (int, np.integer)) and n > 0 for n in (width, height)):
+        raise ConfigError(
+            f"a picture of {width} x {height} pixels cannot be; width and height must be positive whole numbers"
+        )
 
 
 def font_scale(height: int) -> mujoco.mjtFontScale:

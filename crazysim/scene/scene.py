@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
 from crazysim.scene import build, contacts, depth, mjx, report, solids
+from crazysim.scene.batch import BatchRenderer
 from crazysim.scene.draw import Marks
 from crazysim.scene.objects import IDENTITY, Handle, add_bodies, as_poses
 from crazysim.scene.rays import Hits
 from crazysim.scene.render import Viewer
 from crazysim.scene.report import ContactReport
 from crazysim.scene.solids import Solids
-from crazysim.scene.sync import sync_one_world, sync_sim2mjx
+from crazysim.scene.sync import poses_of, sync_one_world, sync_sim2mjx
 from crazysim.sim.data import Objects, SimData
 from crazysim.sim.settings import positive
 from crazysim.sim.sharding import place_scene, put
@@ -95,6 +96,7 @@ class Scene:
         self.max_geom_pairs = -1 if n_drones < LARGE_SWARM else 2 * n_drones
         self.marks = Marks()
         self.viewer = None
+        self._batch: tuple[Any, BatchRenderer] | None = None
         self.spec = build.build_spec(xml_path, airframe, n_drones, freq, self.max_geom_pairs)
         self.handles: list[Handle] = []
         self._starts: list[tuple[NDArray, NDArray]] = []
@@ -358,6 +360,20 @@ class Scene:
             ConfigError: If nothing is asked for, or an object is not there or is moved by hand.
         """
         return report.build(self.solids, objects, floor, drones)
+
+    def pictures(self, data: SimData, worlds: NDArray, camera: int | str, width: int, height: int) -> Array:
+        """Return what a camera of the scene sees in some worlds, in one call. (n, height, width, 3), uint8
+
+        Raises:
+            ImportError: If MuJoCo Warp is not installed.
+            ConfigError: If it is the free camera, one that does not exist, or the size cannot be.
+        """
+        key = (id(self.mj_model), camera, width, height, len(worlds))
+        if self._batch is None or self._batch[0] != key:  # one, for each holds the scene of all its worlds
+            self._batch = None
+            renderer = BatchRenderer(self.mj_model, camera, width, height, len(worlds), self.device)
+            self._batch = (key, renderer)
+        return self._batch[1](*poses_of(data, self._mjx_data, worlds, self.mj_model))
 
     def draw(
         self, mode: str, camera: int | str, cam_config: dict[str, Any] | None, width: int, height: int

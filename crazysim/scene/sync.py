@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax import Array
+from numpy.typing import NDArray
 
 from crazysim.scene import mjx
 from crazysim.sim.data import SimData
@@ -66,6 +68,34 @@ def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
         body_pos=mjx_model.body_pos.at[mocap].set(world.mocap_pos),
         body_quat=mjx_model.body_quat.at[mocap].set(world.mocap_quat / norm),
     )
+
+
+def poses_of(
+    data: SimData, mjx_data: mjx.Data | None, worlds: NDArray, mj_model: mujoco.MjModel
+) -> tuple[Array, Array, Array]:
+    """Return where everything of some worlds is, for who computes the rest himself.
+
+    Args:
+        data: The simulation.
+        mjx_data: The scene of every world, if there is one yet: it knows where the user moved other bodies.
+        worlds: Which worlds. (n,)
+        mj_model: The model.
+
+    Returns:
+        Positions of mocap bodies, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), positions of joints (n, n_qpos).
+    """
+    if mjx_data is not None:
+        mocap_pos, mocap_quat, qpos = mjx_data.mocap_pos[worlds], mjx_data.mocap_quat[worlds], mjx_data.qpos[worlds]
+    else:
+        rest, n = mujoco.MjData(mj_model), len(worlds)
+        mocap_pos, mocap_quat, qpos = (
+            jnp.asarray(np.broadcast_to(x, (n, *x.shape)), jnp.float32)
+            for x in (rest.mocap_pos, rest.mocap_quat, mj_model.qpos0)
+        )
+    for ids, pos, quat in _poses(data):
+        mocap_pos = mocap_pos.at[:, ids].set(pos[worlds])
+        mocap_quat = mocap_quat.at[:, ids].set(jnp.roll(quat[worlds], 1, axis=-1))
+    return mocap_pos, mocap_quat, qpos
 
 
 def sync_one_world(

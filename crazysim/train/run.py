@@ -55,7 +55,7 @@ RECIPES: dict[str, Recipe] = {
     "recover": Recipe(config={"iterations": 150}),
     "race": Recipe(
         n_worlds=4096,
-        config={"iterations": 200, "entropy": 0.01, "init_std": 0.7},
+        config={"iterations": 150, "entropy": 0.01, "init_std": 0.7},
         practice={"practice": True},
     ),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),

@@ -286,3 +286,34 @@ def test_setpoints_need_state_commands(opengl):
     sim = Sim(control="attitude")
     with pytest.raises(ConfigError, match="control='attitude'"):
         View(width=32, height=24, setpoints=True).picture(sim)
+
+
+# Many worlds at once ----------------------------------------------------------------------------------------------
+
+
+def test_warp_draws_what_the_plain_renderer_draws(opengl, plain_scene):
+    """The same places, colours and shapes; edges and shadows are drawn in other ways."""
+    pytest.importorskip("warp")
+    sim = Sim(n_worlds=4, control="state", xml_path=plain_scene)
+    sim.scene.add("box", "lamp", pos=[0.0, 0.1, 0.2], size=(0.1, 0.1, 0.1), rgba=(1, 0, 0, 1))
+    place(sim, PLACES, 0.0)
+    size = {"camera": "down", "width": WIDTH, "height": HEIGHT}
+    plain, warp = (pictures_of(sim, [2, 0, 3], renderer=name, **size) for name in ("plain", "warp"))
+    assert warp.shape == plain.shape
+    assert warp.dtype == plain.dtype
+    for picture, expected, world in zip(warp, plain, (2, 0, 3), strict=True):
+        np.testing.assert_allclose(dark(picture), pixel(PLACES[world]), atol=2)
+        places = [np.argwhere(of_colour(x, RED)).mean(axis=0) for x in (picture, expected)]
+        np.testing.assert_allclose(*places, atol=1)
+    assert np.abs(warp.astype(int) - plain).mean() < 6, "of 255: floor and sky are the same"
+    moved = pictures_of(sim, [0, 0, 0], renderer="warp", **size)
+    np.testing.assert_array_equal(moved[0], moved[2])
+    np.testing.assert_array_equal(moved[0], warp[1])
+    with pytest.raises(ConfigError, match="not the free camera"):
+        pictures_of(sim, [0], renderer="warp")
+    with pytest.raises(ConfigError, match="no camera 'nose'"):
+        pictures_of(sim, [0], "nose", renderer="warp")
+    with pytest.raises(ConfigError, match="0 x 8 pixels"):
+        pictures_of(sim, [0], "down", width=0, height=8, renderer="warp")
+    with pytest.raises(ConfigError, match="renderer 'cycles' does not exist"):
+        pictures_of(sim, [0], "down", renderer="cycles")
