@@ -349,3 +349,32 @@ def test_what_has_no_rule_is_named_and_runs_as_it_is(data, fn, words):
     for engine in ("lanes", "auto"):
         out = Step(mine, engine)(data, jnp.int32(2)).states.pos
         np.testing.assert_allclose(out, Step(mine, "plain")(data, jnp.int32(2)).states.pos, rtol=1e-6)
+
+
+def test_powers_and_angles_of_special_numbers(data):
+    """What kernels of the host compute with vectors of their own: signs of zero, infinities, over- and underflow."""
+    sides = np.float32([0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -2.0, 1e-30, 1e30])
+    y, x = (v.ravel() for v in np.meshgrid(sides, sides))
+    powers = np.float32(
+        [0.0, -0.0, np.inf, -np.inf, np.nan, 88.7, 88.8, -87.0, -95.0, -103.9, -110.0, 1e-8, 200.0, -1e30]
+    )
+    z = np.resize(np.float32(powers), y.shape)
+    sim = Sim(n_worlds=len(y), control="rotor_vel")
+    pos = jnp.stack([jnp.asarray(v) for v in (y, x, z)], axis=-1)[:, None]
+    start = sim.data.replace(states=sim.data.states.replace(pos=pos))
+
+    @stage("drone")
+    def functions(data):
+        y, x, z = data.states.pos
+        out = jnp.stack([jnp.arctan2(y, x), jnp.exp(z), jnp.arctan2(z, 2.0)])
+        return data.replace(states=data.states.replace(vel=out))
+
+    found = np.asarray(Step({"functions": functions}, "auto")(start).states.vel)[:, 0]
+    with np.errstate(all="ignore"):
+        expected = [f.astype(np.float32) for f in (np.arctan2(*map(np.float64, (y, x))), np.exp(np.float64(z)),
+                                                   np.arctan2(np.float64(z), 2.0))]  # fmt: skip
+    for name, a, b in zip(("arctan2", "exp", "arctan2 of one"), found.T, expected, strict=True):
+        # XLA has its threads take what is below the least normal number for zero.
+        np.testing.assert_allclose(a, b, rtol=4 * ULP, atol=np.finfo(np.float32).tiny, err_msg=name)
+        known = ~np.isnan(b)
+        np.testing.assert_array_equal(np.signbit(a[known]), np.signbit(b[known]), err_msg=name)

@@ -234,3 +234,20 @@ def test_law_09_what_cannot_be_asked_is_refused():
         jax.eval_shape(
             Step({"mine": stage("drone")(lambda d: (sim.scene.contact_fn(())(d), d)[1])}, "lanes"), sim.data, 1
         )
+
+
+@pytest.mark.parametrize("n_drones", [1, 3, 9])
+def test_one_kernel_reports_what_xla_does(n_drones):
+    """Of more than eight drones the others of a world are no kernel's; what is left out stays out."""
+    sims = [Sim(n_worlds=5, n_drones=n_drones, engine=engine) for engine in ("auto", "lanes")]
+    key = jax.random.key(1)
+    for sim in sims:
+        sim.scene.add("box", count=2, pos=[[1, 0, 0.5], [0, 1, 0.5]])
+        sim.scene.add("pole", pos=[0.2, 0.2, 0])
+        pos = jax.random.uniform(key, sim.data.states.pos.shape, minval=-0.5, maxval=1)
+        sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    for asked in ({}, {"floor": False}, {"objects": (), "drones": False}, {"objects": "pole:0", "floor": False}):
+        found, expected = (sim.contact_report(**asked) for sim in sims)
+        assert jax.tree.structure(found) == jax.tree.structure(expected)
+        for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-5)
