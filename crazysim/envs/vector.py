@@ -93,8 +93,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
                 f"the seed is {seed!r}; one integer seeds all worlds, each of which draws its own numbers"
             )
         super().reset(seed=None if seed is None else int(seed))
-        before = self.state
-        if mask is not None and before is not None:
+        before = self.state if mask is not None else None
+        if before is not None:
             if seed is not None:
                 raise ConfigError("a seed is one for all worlds; reset them all with it, or leave it out with a mask")
             state = self._again(before, mask)

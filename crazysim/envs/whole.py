@@ -82,7 +82,8 @@ class WholeStep:
         self._axes = axes
         self._require_apart(example, state)
         places = _places(state.data, example)
-        zeros = {places[i]: some for i, some in base.zeros}
+        # A parameter that has become one per drone since is zero for none of them for certain.
+        zeros = {places[i]: some for i, some in base.zeros if axes.scopes[places[i]] == "shared"}
         last = [self._stage(self._observed, "observe and reward")]
         if renewal is not None:
             last.append(self._stage(self._begun, "new episodes", lambda one: one.plugins[NAME].of_worlds[OVER][0]))

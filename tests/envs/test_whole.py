@@ -36,9 +36,20 @@ def close(found, expected, tolerance=2e-5):
             np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance, err_msg=name)
 
 
+def lopsided(data, keys):
+    """Draw products of inertia, which are zero where all drones share them."""
+    x = jax.vmap(lambda key: jax.random.uniform(key, (1, 1, 1), minval=2e-6, maxval=4e-6))(keys)
+    off = jnp.array([[0.0, 1, 1], [1, 0, 1], [1, 1, 0]])
+    inertia = data.params.J + x * off
+    return data.replace(params=data.params.replace(J=inertia, J_inv=jnp.linalg.inv(inertia)))
+
+
 CASES = {
     "hover, same step": (lambda: envs.EpisodeStatistics(envs.make("hover", N, seconds=0.3)), "SameStep"),
-    "hover, next step": (lambda: envs.FrameStack(envs.make("hover", N, seconds=0.3), 2), "NextStep"),
+    "hover, next step": (
+        lambda: envs.FrameStack(envs.Randomize(envs.make("hover", N, seconds=0.3), lopsided, ("J", "J_inv")), 2),
+        "NextStep",
+    ),
     "race": (lambda: envs.ActionDelay(envs.make("race", N, practice=True), 1), "SameStep"),
     "swarm": (lambda: envs.make("swarm", N, n_drones=3, seconds=0.3), "Disabled"),
 }
