@@ -117,6 +117,12 @@ def pack(items: Sequence[Element], shape: tuple[int, ...]) -> Elements:
     return out.reshape(shape)
 
 
+def words(*arrays: Elements) -> list[Element]:
+    """Return single elements in a row; a key is two words."""
+    items = [x for array in arrays for x in np.asarray(array, object).reshape(-1)]
+    return [word for x in items for word in (x if isinstance(x, tuple) else (x,))]
+
+
 def constants(x: Any, dtype: Any) -> Elements:
     """Return an array of numbers, or of random keys, as elements."""
     if jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key):

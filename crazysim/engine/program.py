@@ -14,7 +14,7 @@ from jax.extend import core
 
 import crazysim.engine.rules  # noqa: F401  (fills the reader's table)
 from crazysim.engine.ir import Block, Element, Value, constant
-from crazysim.engine.lower import Elements, NoRuleError, Reader, pack
+from crazysim.engine.lower import Elements, NoRuleError, Reader, pack, words
 from crazysim.sim.stage import Axes, Stage, StageScope
 
 Slot = tuple[int, int]
@@ -257,15 +257,15 @@ class Program:
         inner = reader.inner()
         new = inner.read(traced.fn, args)
         old = [self._elements(segment, i, traced.avals[i]) for i in traced.written]
-        pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(_words(x), _words(y), strict=True)]
+        pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(words(x), words(y), strict=True)]
         changed = [(a, b) for a, b in pairs if a is not b]
         inner.block.outputs = [b for _, b in changed]
         whole = segment.block.add("when", (mask, *(a for a, _ in changed)), bool, (), (inner.block,))
         items = iter(
             [segment.block.add("item", (whole,), a.dtype, (("index", k),)) for k, (a, _) in enumerate(changed)]
         )
-        words = iter([a if a is b else next(items) for a, b in pairs])
-        return {i: _with_words(x, words) for i, x in zip(traced.written, old, strict=True)}
+        row = iter([a if a is b else next(items) for a, b in pairs])
+        return {i: _with_words(x, row) for i, x in zip(traced.written, old, strict=True)}
 
     def _elements(self, segment: Segment, leaf: int, aval: Any) -> Elements:
         """Return a leaf's elements as they are now in a segment; inputs, if no stage of it has written them."""
@@ -350,13 +350,9 @@ def _inputs(block: Block, aval: Any, zeros: frozenset[int]) -> Elements:
     return pack(items, aval.shape)
 
 
-def _words(elements: Elements) -> list[Element]:
-    return [w for x in elements.reshape(-1) for w in (x if isinstance(x, tuple) else (x,))]
-
-
-def _with_words(like: Elements, words: Iterator[Element]) -> Elements:
+def _with_words(like: Elements, row: Iterator[Element]) -> Elements:
     """Return elements of the same shape; of a key, two words."""
-    items = [(next(words), next(words)) if isinstance(x, tuple) else next(words) for x in like.reshape(-1)]
+    items = [(next(row), next(row)) if isinstance(x, tuple) else next(row) for x in like.reshape(-1)]
     return pack(items, like.shape)
 
 
@@ -364,8 +360,8 @@ def _close(segment: Segment) -> None:
     """Fix what a segment writes, and drop what nothing needs."""
     outputs: list[Element] = []
     for leaf, elements in segment.now.items():
-        before = _words(segment.first[leaf]) if leaf in segment.first else [None] * elements.size
-        for k, (old, new) in enumerate(zip(before, _words(elements), strict=True)):
+        before = words(segment.first[leaf]) if leaf in segment.first else [None] * elements.size
+        for k, (old, new) in enumerate(zip(before, words(elements), strict=True)):
             if old is not new:
                 segment.writes.append((leaf, k))
                 outputs.append(new)
@@ -377,7 +373,7 @@ def _close(segment: Segment) -> None:
 def _connect(segment: Segment) -> None:
     """Keep the inputs that are used, and note what they are."""
     block = segment.block
-    slots = {id(x): (leaf, k) for leaf, elements in segment.first.items() for k, x in enumerate(_words(elements))}
+    slots = {id(x): (leaf, k) for leaf, elements in segment.first.items() for k, x in enumerate(words(elements))}
     segment.reads = [slots[i] for i in _keep_used_inputs(block)]
 
 

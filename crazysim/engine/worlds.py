@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from crazysim.engine.ir import Block, Element, Value
-from crazysim.engine.lower import Elements, NoRuleError, Reader, pack
+from crazysim.engine.lower import Elements, NoRuleError, Reader, pack, words
 from crazysim.engine.program import is_key
 
 
@@ -32,18 +32,18 @@ def require_apart(fn: Callable[[list[Any]], list[Any]], two: Sequence[Any], sour
     for i, (aval, source) in enumerate(zip(two, sources, strict=True)):
         elements = _inputs(reader, aval)
         for world, part in enumerate(elements) if source == "worlds" else [(source, elements)]:
-            for k, word in enumerate(_words(part)):
+            for k, word in enumerate(words(part)):
                 labels[id(word)] = (("input", i, k), frozenset() if world == "shared" else frozenset([world]))
         inputs.append(elements)
     outputs = reader.read(jax.make_jaxpr(fn)(list(two)), inputs)
-    reader.block.outputs = [word for out in outputs for word in _words(out)]
+    reader.block.outputs = words(*outputs)
     reader.block.drop_unused()
     forms = _Forms(labels)
     forms.block(reader.block)
     for out in outputs:
         if out.shape[:1] != (2,):
             raise NoRuleError(f"{what} returns an array of shape {out.shape} for two worlds")
-        first, second = ([forms.of(x) for x in _words(np.asarray(part, object))] for part in out)
+        first, second = ([forms.of(x) for x in words(part)] for part in out)
         for (a, worlds_a), (b, worlds_b) in zip(first, second, strict=True):
             seen = (worlds_a | worlds_b) - {0, 1}
             if seen:
@@ -114,7 +114,3 @@ def _inputs(reader: Reader, aval: Any) -> Elements:
     if is_key(aval):
         return pack([(new(np.uint32), new(np.uint32)) for _ in range(size)], aval.shape)
     return pack([new(aval.dtype) for _ in range(size)], aval.shape)
-
-
-def _words(elements: Elements) -> list[Element]:
-    return [w for x in np.asarray(elements, object).reshape(-1) for w in (x if isinstance(x, tuple) else (x,))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,7 +11,7 @@ import numpy as np
 from jax.extend import core
 
 from crazysim.engine.ir import Block, Element, constant, is_constant
-from crazysim.engine.lower import UNROLL, Elements, NoRuleError, Reader, constants, pack, rule
+from crazysim.engine.lower import UNROLL, Elements, NoRuleError, Reader, constants, pack, rule, words
 
 
 @rule("jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_lin", "run_state")
@@ -39,7 +39,7 @@ def _high_level(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
 def _with_derivative(r: Reader, eqn: Any, args: list[Elements], called: core.ClosedJaxpr) -> list[Elements]:
     """Read a call that brings a derivative of its own, which is read when somebody asks for it."""
     body = r.inner()
-    body.block.outputs = _flat(body.read(called, [_inputs(body, x) for x in args]))
+    body.block.outputs = words(*body.read(called, [_inputs(body, x) for x in args]))
 
     @functools.cache
     def slope() -> Block:
@@ -49,10 +49,10 @@ def _with_derivative(r: Reader, eqn: Any, args: list[Elements], called: core.Clo
         traced = jax.make_jaxpr(lambda x, dx: jax.jvp(single, x, dx)[1])(avals, avals)
         reader = Reader(Block())
         inputs = [_inputs(reader, x) for x in (*args, *args)]
-        reader.block.outputs = _flat(reader.read(traced, inputs))
+        reader.block.outputs = words(*reader.read(traced, inputs))
         return reader.block
 
-    return _results(r, "custom_jvp", eqn, _flat(args), (body.block,), (("slope", slope),))
+    return _results(r, "custom_jvp", eqn, words(*args), (body.block,), (("slope", slope),))
 
 
 @rule("custom_linear_solve")
@@ -103,8 +103,8 @@ def _scan(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     if len(body.jaxpr.outvars) == n_carry and not xs and length > 1:
         inner = r.inner()
         inputs = [_inputs(inner, x) for x in carry]
-        inner.block.outputs = _flat(inner.read(body, [*fixed, *inputs]))
-        return _results(r, "loop", eqn, _flat(carry), (inner.block,), (("length", length),))
+        inner.block.outputs = words(*inner.read(body, [*fixed, *inputs]))
+        return _results(r, "loop", eqn, words(*carry), (inner.block,), (("length", length),))
     if length > UNROLL:
         raise NoRuleError(
             f"primitive 'scan' with inputs or outputs for each of {length} turns; written out are {UNROLL}"
@@ -126,9 +126,9 @@ def _while(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
     cond_fixed, body_fixed, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
     test, body = r.inner(), r.inner()
-    test.block.outputs = _flat(test.read(closed(p["cond_jaxpr"]), [*cond_fixed, *(_inputs(test, x) for x in carry)]))
-    body.block.outputs = _flat(body.read(closed(p["body_jaxpr"]), [*body_fixed, *(_inputs(body, x) for x in carry)]))
-    return _results(r, "while", eqn, _flat(carry), (test.block, body.block))
+    test.block.outputs = words(*test.read(closed(p["cond_jaxpr"]), [*cond_fixed, *(_inputs(test, x) for x in carry)]))
+    body.block.outputs = words(*body.read(closed(p["body_jaxpr"]), [*body_fixed, *(_inputs(body, x) for x in carry)]))
+    return _results(r, "while", eqn, words(*carry), (test.block, body.block))
 
 
 def closed(jaxpr: Any) -> core.ClosedJaxpr:
@@ -146,12 +146,6 @@ def _inputs(r: Reader, like: Elements) -> Elements:
         return tuple(map(new, x)) if isinstance(x, tuple) else r.block.input(x.dtype)
 
     return pack([new(x) for x in like.reshape(-1)], like.shape)
-
-
-def _flat(arrays: Sequence[Elements]) -> list[Element]:
-    """Return single elements in a row; a key is two words."""
-    items = [x for array in arrays for x in array.reshape(-1)]
-    return [word for x in items for word in (x if isinstance(x, tuple) else (x,))]
 
 
 def _results(
