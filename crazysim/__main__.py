@@ -75,6 +75,7 @@ def _add_training(commands: Any) -> None:
     judge.add_argument("folder", type=Path, help="folder of the run")
     judge.add_argument("--worlds", type=int, default=1000, help="number of starts")
     judge.add_argument("--seed", type=int, help="other starts than the held-out ones")
+    judge.add_argument("--device", help="where to fly: cpu, gpu; where it was trained if left out")
     export = commands.add_parser("export", help="write a trained policy as ONNX or as a C header", **shown)
     export.add_argument("folder", type=Path, help="folder of the run")
     export.add_argument("--onnx", type=Path, metavar="FILE", help="an .onnx file")
@@ -84,6 +85,7 @@ def _add_training(commands: Any) -> None:
     render.add_argument("--film", type=Path, metavar="FILE", help=".mp4 or .gif; policy.mp4 in the folder if left out")
     render.add_argument("--worlds", type=int, default=4, help="worlds side by side")
     render.add_argument("--seed", type=int, default=1, help="of the starts")
+    render.add_argument("--device", help="where to fly: cpu, gpu; where it was trained if left out")
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -153,7 +155,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     from crazysim.train.run import load_policy
 
     policy, settings, _ = load_policy(options.folder)
-    env = settings.environment(options.worlds)
+    env = settings.on(options.device).environment(options.worlds)
     figures = evaluate(env, policy, None if options.seed is None else jax.random.key(options.seed))
     print(f"{settings.task}, {options.worlds:,} starts: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
 
@@ -177,7 +179,8 @@ def _render(options: argparse.Namespace) -> None:
 
     policy, settings, _ = load_policy(options.folder)
     path = options.film or options.folder / "policy.mp4"
-    film(settings.environment(options.worlds), policy, path, options.worlds, options.seed, progress=True)
+    env = settings.on(options.device).environment(options.worlds)
+    film(env, policy, path, options.worlds, options.seed, progress=True)
     print(f"wrote {path}")
 
 

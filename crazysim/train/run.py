@@ -114,6 +114,10 @@ class Settings:
         """Return the environment of the run, or one like it with other worlds, and options that the run leaves open."""
         return make(self.task, n_worlds or self.n_worlds, **options | self.options)
 
+    def on(self, device: str | None) -> Settings:
+        """Return the same for another device, such as ``"cpu"``; None for that of the run."""
+        return self if device is None else dataclasses.replace(self, options=self.options | {"device": device})
+
     def practice(self) -> dict[str, Any]:
         """Return options of the environment that is learnt in, as the task's recipe has them."""
         return dict(RECIPES.get(self.task, Recipe()).practice)

@@ -189,6 +189,8 @@ def test_the_command_line_trains_judges_and_exports(tmp_path, capsys):
     assert (tmp_path / "hover" / "curve.png").stat().st_size > 5000
     assert main(["evaluate", folder, "--worlds", "8"]) == 0
     assert "hover, 8 starts: success" in capsys.readouterr().out
+    assert main(["evaluate", folder, "--worlds", "8", "--device", "tpu"]) == 2
+    assert "device 'tpu' does not exist" in capsys.readouterr().err
     assert main(["export", folder, "--c", str(tmp_path / "p.h")]) == 0
     assert "void policy(" in (tmp_path / "p.h").read_text()
     assert main(["export", folder]) == 2
