@@ -60,6 +60,11 @@ class Segment:
     now: dict[int, Elements] = dataclasses.field(default_factory=dict)
     """Elements of the leaves, as they are behind the last stage read."""
 
+    @property
+    def unfused(self) -> str:
+        """What a message says of a segment without a program."""
+        return f"{self.stages[0].__name__!r} is not fused: {self.why}"
+
 
 class Program:
     """What a pipeline does to the data of a simulation, ready for an engine."""
@@ -270,7 +275,7 @@ class Program:
     def _elements(self, segment: Segment, leaf: int, aval: Any) -> Elements:
         """Return a leaf's elements as they are now in a segment; inputs, if no stage of it has written them."""
         if leaf not in segment.now:
-            segment.now[leaf] = segment.first[leaf] = _inputs(segment.block, aval, self.zeros.get(leaf, frozenset()))
+            segment.now[leaf] = segment.first[leaf] = inputs_of(segment.block, aval, self.zeros.get(leaf, frozenset()))
         return segment.now[leaf]
 
     def _add_batch(self, stage: Stage, phase: Phase, why: str) -> None:
@@ -342,7 +347,8 @@ def _with_inputs(jaxpr: core.ClosedJaxpr, inputs: Sequence[int]) -> core.ClosedJ
     )
 
 
-def _inputs(block: Block, aval: Any, zeros: frozenset[int]) -> Elements:
+def inputs_of(block: Block, aval: Any, zeros: frozenset[int] = frozenset()) -> Elements:
+    """Return an array as new inputs of a block, but for elements that are known to be zero."""
     size = int(np.prod(aval.shape, dtype=int))
     if is_key(aval):
         return pack([(block.input(np.uint32), block.input(np.uint32)) for _ in range(size)], aval.shape)

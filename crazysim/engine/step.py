@@ -172,7 +172,7 @@ class Step:
         program = Program(self.stages, data, {i: some for i, some in zeros if kinds[i] == "shared"}, _watched)
         split = [s for s in program.segments if s.scope == "batch"]
         if self.mesh is not None and split:
-            return self._plain(data, f"with a mesh every stage must be fused, and {_unfused(split[0])}")
+            return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}")
         program.pack()
         engine, why, run = "lanes", "it was asked for", functools.partial(lanes.steps, program)
         if self.engine in ("auto", "fused"):
@@ -346,7 +346,7 @@ def explain(step: Step, data: SimData) -> str:
     for segment in plan.program.segments:
         names = ", ".join(s.__name__ for s in segment.stages)
         if segment.scope == "batch":
-            lines.append(f"splits the step: {_unfused(segment)}")
+            lines.append(f"splits the step: {segment.unfused}")
         else:
             lines.append(f"fused, for one {segment.scope}: {names} ({_operations(segment)} operations)")
     split = [s.stages[0].__name__ for s in plan.program.segments if s.scope == "batch"]
@@ -372,10 +372,6 @@ def _cost_of_split(step: Step, data: SimData, split: list[str]) -> str:
         f"cost of the split, measured: a step takes {1e6 * whole:.0f} us, and {1e6 * without:.0f} us without "
         f"{', '.join(split)}"
     )
-
-
-def _unfused(segment: Segment) -> str:
-    return f"{segment.stages[0].__name__!r} is not fused: {segment.why}"
 
 
 def _operations(segment: Segment) -> int:

@@ -51,7 +51,7 @@ class Whole:
         self.program = program = Program(stages, data, zeros, None, first, last, scratch)
         split = [s for s in program.segments if s.scope == "batch"]
         if split:
-            raise NoRuleError(f"{split[0].stages[0].__name__!r} is not fused: {split[0].why}")
+            raise NoRuleError(split[0].unfused)
         self._n_leaves = len(program.leaves)
         program.pack()
         self._rows = program.lay(lay(program.written)) if lay is not None else {}

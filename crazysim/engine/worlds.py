@@ -6,11 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import numpy as np
 
 from crazysim.engine.ir import Block, Element, Value
-from crazysim.engine.lower import Elements, NoRuleError, Reader, pack, words
-from crazysim.engine.program import is_key
+from crazysim.engine.lower import NoRuleError, Reader, words
+from crazysim.engine.program import inputs_of
 
 
 def require_apart(fn: Callable[[list[Any]], list[Any]], two: Sequence[Any], sources: Sequence[str], what: str) -> None:
@@ -30,7 +29,7 @@ def require_apart(fn: Callable[[list[Any]], list[Any]], two: Sequence[Any], sour
     labels: dict[int, tuple[Any, frozenset[Any]]] = {}
     inputs = []
     for i, (aval, source) in enumerate(zip(two, sources, strict=True)):
-        elements = _inputs(reader, aval)
+        elements = inputs_of(reader.block, aval)
         for world, part in enumerate(elements) if source == "worlds" else [(source, elements)]:
             for k, word in enumerate(words(part)):
                 labels[id(word)] = (("input", i, k), frozenset() if world == "shared" else frozenset([world]))
@@ -106,11 +105,3 @@ class _Forms:
                 after = [self._joined("while", [x, *self.block(block)]) for x in after]
             carry = [self._joined((value.op, value.params), [x, y]) for x, y in zip(carry, after, strict=True)]
         return carry
-
-
-def _inputs(reader: Reader, aval: Any) -> Elements:
-    new = reader.block.input
-    size = int(np.prod(aval.shape, dtype=int))
-    if is_key(aval):
-        return pack([(new(np.uint32), new(np.uint32)) for _ in range(size)], aval.shape)
-    return pack([new(aval.dtype) for _ in range(size)], aval.shape)

@@ -94,7 +94,6 @@ class WholeStep:
         lay = (lambda written: [i for i in written if i not in told]) if laid else None
         settings = (base.n_substeps, base.sim.device.platform, scratch, lay)
         self._run = Whole(first, base.stages, last, example, zeros, *settings)
-        self._treedef = jax.tree.structure(example)
         again = {name for name in self._told.shapes if self._numbers[name] in told & set(self._run.read)} - set(ENDS)
         if laid and again:
             raise NoRuleError(f"a step reads {', '.join(sorted(again))} of the step before")
@@ -103,8 +102,7 @@ class WholeStep:
         """Return the state one step later. (n_worlds, n_drones, k)"""
         joined = self._joined(state, action, state.terminated.shape[0])
         leaves, treedef = jax.tree.flatten(joined)
-        after = treedef.unflatten(self._run(leaves))
-        return self._state(after, self._told, _shown(_without_rest(after), False))
+        return self._stepped(self._run(leaves), treedef, self._told)
 
     # With few arrays ----------------------------------------------------------------------------------------------
 
@@ -142,10 +140,13 @@ class WholeStep:
             state: What was given to ``lay``.
         """
         joined = self._joined(state, state.action, state.terminated.shape[0])
-        leaves = jax.tree.leaves(joined)
+        leaves, treedef = jax.tree.flatten(joined)
         for i, x in self._run.unlaid(laid.rows).items():
             leaves[i] = x
-        after = self._state(self._treedef.unflatten(leaves), self._given)
+        return self._stepped(leaves, treedef, self._given)
+
+    def _stepped(self, leaves: list[Any], treedef: Any, layout: _Layout) -> EnvState:
+        after = self._state(treedef.unflatten(leaves), layout)
         return after.replace(data=_shown(after.data, False))
 
     # For any number of worlds -------------------------------------------------------------------------------------
@@ -210,9 +211,9 @@ class WholeStep:
         x = rest.of_drones[name] if name in rest.of_drones else rest.of_worlds[name]
         return x.reshape(x.shape[0], *like.shape[1:])
 
-    def _state(self, joined: SimData, layout: _Layout, data: SimData | None = None) -> EnvState:
+    def _state(self, joined: SimData, layout: _Layout) -> EnvState:
         arrays = {name: self._of(joined, name, like) for name, like in layout.shapes.items()}
-        return layout.state(arrays, _without_rest(joined) if data is None else data)
+        return layout.state(arrays, _without_rest(joined))
 
     def _changed(self, joined: SimData, data: SimData, arrays: dict[str, Array]) -> SimData:
         rest, new = joined.plugins[NAME], self._rows({k: x.astype(self._rest[k].dtype) for k, x in arrays.items()})
@@ -248,14 +249,11 @@ class WholeStep:
         """
         leaves, treedef = jax.tree.flatten(example)
         batched = [s in ("drone", "world") for s in self._axes.scopes]
-        two = [
-            jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype) if b else x for x, b in zip(leaves, batched, strict=True)
-        ]
+        two = [_two(x) if b else x for x, b in zip(leaves, batched, strict=True)]
         sources = ["worlds" if b else "shared" for b in batched]
-        of_data = jax.tree.leaves(scopes(state.data))
-        old = [jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype) if s in ("drone", "world") else x
-               for s, x in zip(of_data, jax.tree.leaves(state.data), strict=True)]  # fmt: skip
-        past = ["the data from before the step" if s in ("drone", "world") else "shared" for s in of_data]
+        of_data = [s in ("drone", "world") for s in jax.tree.leaves(scopes(state.data))]
+        old = [_two(x) if b else x for x, b in zip(jax.tree.leaves(state.data), of_data, strict=True)]
+        past = ["the data from before the step" if b else "shared" for b in of_data]
 
         def apart(fn: Callable[..., SimData]) -> Callable[[list[Any]], list[Any]]:
             def flat(values: list[Any]) -> list[Any]:
@@ -325,6 +323,11 @@ def _flown(env: Env, fly: Callable[[SimData], SimData]) -> Env:
     else:
         new.env = _flown(new.env, fly)  # type: ignore[attr-defined]
     return new
+
+
+def _two(x: Any) -> jax.ShapeDtypeStruct:
+    """Return shape and type of the same of two worlds."""
+    return jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype)
 
 
 def _is_of_drones(x: Any, n_drones: int) -> bool:

@@ -27,6 +27,7 @@ class Questions:
         """Take the scene, and the platform whose kernels may answer; None for answers by XLA alone."""
         self._scene = scene
         self._platform = None if platform is None or fused.missing(platform) else platform
+        self._model: Any = None
         self._compiled: dict[tuple[Any, ...], Any] = {}
 
     def contact_report(self, data: SimData, objects: Objects, floor: bool, drones: bool) -> ContactReport:
@@ -51,11 +52,11 @@ class Questions:
         self, question: str, data: SimData, build: Callable[[], Callable[[SimData], Any]], *settings: Any
     ) -> Callable[..., Any]:
         """Return a question about poses to the scene as it is now, compiled once for each setting."""
-        scene = id(self._scene.mj_model)
-        if (scene, question, *settings) not in self._compiled:
-            self._compiled = {k: v for k, v in self._compiled.items() if k[0] == scene}
-            self._compiled[scene, question, *settings] = jax.jit(_of_poses(build(), data))
-        return self._compiled[scene, question, *settings]
+        if self._model is not self._scene.mj_model:
+            self._model, self._compiled = self._scene.mj_model, {}
+        if (question, *settings) not in self._compiled:
+            self._compiled[question, *settings] = jax.jit(_of_poses(build(), data))
+        return self._compiled[question, *settings]
 
     def _contacts(self, objects: Objects, floor: bool, drones: bool) -> Callable[[SimData], ContactReport]:
         """Return the report of all worlds, by one kernel where it can be written out."""

@@ -368,12 +368,12 @@ class Scene:
             ImportError: If MuJoCo Warp is not installed.
             ConfigError: If it is the free camera, one that does not exist, or the size cannot be.
         """
-        key = (id(self.mj_model), camera, width, height, len(worlds))
+        model, key = self.mj_model, (camera, width, height, len(worlds))  # what was added is in the model from here on
         if self._batch is None or self._batch[0] != key:  # one, for each holds the scene of all its worlds
             self._batch = None
-            renderer = BatchRenderer(self.mj_model, camera, width, height, len(worlds), self.device)
+            renderer = BatchRenderer(model, camera, width, height, len(worlds), self.device)
             self._batch = (key, renderer)
-        return self._batch[1](*poses_of(data, self._mjx_data, worlds, self.mj_model))
+        return self._batch[1](*poses_of(data, self._mjx_data, worlds, model))
 
     def draw(
         self, mode: str, camera: int | str, cam_config: dict[str, Any] | None, width: int, height: int
@@ -400,6 +400,7 @@ class Scene:
         if self.viewer is not None:
             self.viewer.close()
             self.viewer = None
+        self._batch = None
 
 
 def _name(what: Any) -> str:
