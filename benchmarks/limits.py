@@ -24,10 +24,10 @@ from jax import Array
 from measure import Flight, digits, engine_of, medians, report, seconds
 
 from crazysim import PyTree, Sim, __version__, leaf
+from crazysim.core.stage import stage
 from crazysim.engine import fused
 from crazysim.engine.ir import Block, Value
 from crazysim.engine.step import ENGINES
-from crazysim.sim.stage import stage
 
 WEIGHTS = (
     dict.fromkeys("mark item input eq ne lt le gt ge neg abs custom_jvp when loop while".split(), 0)

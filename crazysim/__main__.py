@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="show a recorded flight in a browser, to be played and scrubbed",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    replay.add_argument("flight", type=Path, help="what crazysim.pictures.Flight has saved, an .npz file")
+    replay.add_argument("flight", type=Path, help="what crazysim.media.Flight has saved, an .npz file")
     replay.add_argument("--world", type=int, help="which world; the first that was recorded if left out")
     replay.add_argument("--port", type=int, default=8080, help="where the page is served; 0 for any free port")
     replay.add_argument("--host", default="127.0.0.1", help="who may see it; 0.0.0.0 for everyone")
@@ -95,8 +95,8 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _replay(options: argparse.Namespace) -> None:
-    from crazysim.pictures.flight import Flight
-    from crazysim.pictures.web import export, serve
+    from crazysim.media.flight import Flight
+    from crazysim.media.web import export, serve
 
     flight = Flight.load(options.flight)
     if options.export is None:

@@ -13,12 +13,12 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from crazysim.core import functional as F
+from crazysim.core.data import SimData
 from crazysim.dynamics import first_principles
 from crazysim.errors import RenderError
-from crazysim.pictures import Film, Flight, Recorder, View
-from crazysim.pictures.trail import COLORS
-from crazysim.sim import functional as F
-from crazysim.sim.data import SimData
+from crazysim.media import Film, Flight, Recorder, View
+from crazysim.media.trail import COLORS
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material
 

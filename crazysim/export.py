@@ -10,12 +10,12 @@ import jax
 import numpy as np
 
 from crazysim.control import Control
+from crazysim.core.data import SimData
+from crazysim.core.stage import Axes, Stage, as_stages
 from crazysim.engine import symbolic
-from crazysim.engine.lower import NoRuleError
+from crazysim.engine.lower import UnsupportedError
 from crazysim.engine.program import Program, Slot, is_key
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.sim.data import SimData
-from crazysim.sim.stage import Axes, Stage, as_stages
 
 if TYPE_CHECKING:
     from crazysim.sim.sim import Sim
@@ -161,11 +161,11 @@ def _step(program: Program, stages: Sequence[Stage], data: SimData, before: Call
         return {}
     try:
         return symbolic.step(program.segments[0], before)
-    except NoRuleError as error:
+    except UnsupportedError as error:
         for stage in stages:
             try:
                 symbolic.step(Program([stage], data).segments[0], before)
-            except NoRuleError as reason:
+            except UnsupportedError as reason:
                 raise _refusal(stage, str(reason)) from None
         raise ConfigError(f"the step cannot be exported: {error}") from None
 

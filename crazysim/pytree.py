@@ -13,7 +13,7 @@ from jax import Array
 
 from crazysim.errors import ConfigError
 
-Scope = Literal["drone", "world", "shared", "whole", "parameter"]
+Scope = Literal["drone", "world", "shared", "opaque", "parameter"]
 
 T = TypeVar("T")
 
@@ -24,7 +24,7 @@ def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None) 
     Args:
         scope: Which batch axes the array carries. ``drone``: (n_worlds, n_drones, *core). ``world``:
             (n_worlds, 1, *core). ``shared``: core. ``parameter``: shared or drone, told apart by its
-            number of dimensions. ``whole``: opaque to resets and to sharding.
+            number of dimensions. ``opaque``: untouched by resets and by sharding.
         core_ndim: Number of dimensions of the core shape.
         core: The core shape, where it can be no other. It keeps one mass for each of three worlds from passing
             for one along each of three axes.
@@ -64,7 +64,7 @@ class PyTree:
 def scopes(tree: Any) -> Any:
     """Return the same tree with the scope of every leaf in its place.
 
-    A parameter comes out as ``shared`` or ``drone``. What is declared nowhere is ``whole``.
+    A parameter comes out as ``shared`` or ``drone``. What is declared nowhere is ``opaque``.
     """
     return _map_declared(lambda x, metadata, _: _scope(x, metadata), tree, {}, "")
 
@@ -79,7 +79,7 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
 
     def check(x: Any, metadata: Any, name: str) -> None:
         scope = _scope(x, metadata)
-        if scope == "whole":
+        if scope == "opaque":
             return
         shape, batch, core_ndim, core = jnp.shape(x), batches[scope], metadata["core_ndim"], metadata["core"]
         has_axes = shape[: len(batch)] == batch and len(shape) == len(batch) + core_ndim
@@ -116,7 +116,7 @@ def _map_declared(fn: Callable[[Any, Any, str], Any], node: Any, metadata: Any, 
 
 
 def _scope(x: Any, metadata: Any) -> str:
-    scope = metadata.get("scope", "whole")
+    scope = metadata.get("scope", "opaque")
     if scope != "parameter":
         return scope
     return "shared" if jnp.ndim(x) == metadata["core_ndim"] else "drone"

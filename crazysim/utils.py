@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 import jax
 from jax import Array
 
+from crazysim.core.data import grid_2d
 from crazysim.pytree import PyTree, select_worlds
-from crazysim.sim.data import grid_2d
 
 __all__ = ["enable_cache", "grid_2d", "leaf_replace"]
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from crazysim import Sim, load_airframe
+from crazysim.core import functional as F
 from crazysim.dynamics import first_principles
-from crazysim.sim import functional as F
 
 FITTED = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
 LEVELS = ("state", "attitude", "body_rate", "force_torque", "rotor_vel")

@@ -7,10 +7,10 @@ import pytest
 from cases import INTEGRATORS, PAIRS, hover_command, hover_rotor_state
 
 from crazysim import Sim
+from crazysim.core.pipeline import append_fn, insert_fn_before
+from crazysim.core.stage import Axes, stage
 from crazysim.effects import battery, downwash
 from crazysim.export import STATES, to_casadi
-from crazysim.sim.pipeline import append_fn, insert_fn_before
-from crazysim.sim.stage import Axes, stage
 
 pytestmark = pytest.mark.usefixtures("casadi", "x64")
 

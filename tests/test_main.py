@@ -9,7 +9,7 @@ from imageio_ffmpeg import get_ffmpeg_exe
 
 from crazysim import demo
 from crazysim.__main__ import main
-from crazysim.pictures import Flight
+from crazysim.media import Flight
 
 
 def test_without_a_command_it_lists_what_there_is(capsys):

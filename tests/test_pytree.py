@@ -23,7 +23,7 @@ class Fleet(PyTree):
     rotor: Rotor
     time: jax.Array = leaf("world")
     wind: jax.Array = leaf("shared", 1)
-    table: jax.Array = leaf("whole")
+    table: jax.Array = leaf("opaque")
     spare: Rotor | None
     extras: dict
     rate: int = static()
@@ -55,9 +55,9 @@ def test_static_fields_are_part_of_the_type_and_arrays_are_leaves():
 
 def test_law_02_scopes_are_declared_and_undeclared_means_whole():
     declared = scopes(fleet())
-    assert (declared.time, declared.wind, declared.table) == ("world", "shared", "whole")
+    assert (declared.time, declared.wind, declared.table) == ("world", "shared", "opaque")
     assert (declared.rotor.speed, declared.rotor.curve) == ("drone", "shared")
-    assert declared.extras["bare"] == "whole"
+    assert declared.extras["bare"] == "opaque"
     assert declared.extras["record"].speed == "drone"
     assert declared.spare is None
     assert scopes({"list": [jnp.ones(3), Rotor(jnp.ones(1), jnp.ones(1))]})["list"][1].speed == "drone"

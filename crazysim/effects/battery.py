@@ -7,11 +7,11 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.core.data import SimData
+from crazysim.core.stage import stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
 from crazysim.effects.core import Simulation, as_setting, controls_of, install, per_drone, require_rotors, zeros
 from crazysim.pytree import PyTree, leaf, static
-from crazysim.sim.data import SimData
-from crazysim.sim.stage import stage
 
 NOMINAL_VOLTAGE = 3.7
 """Nominal voltage of a lithium-polymer cell, V, as makers print it on the cell."""

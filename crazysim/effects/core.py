@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.core.data import SimData
+from crazysim.core.pipeline import Pipeline, insert_fn_before, replace_fn
+from crazysim.core.stage import Stage
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.drag import drag_force
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
-from crazysim.sim.data import SimData
-from crazysim.sim.pipeline import Pipeline, insert_fn_before, replace_fn
-from crazysim.sim.stage import Stage
 
 Influence = Callable[[SimData], SimData]
 """Returns the data as the dynamics feel them; takes data of one drone, one world or all worlds alike."""

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.stage import stage
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve
 from crazysim.effects.core import Simulation, as_setting, blown_upon, install, require_drag, zeros
 from crazysim.pytree import PyTree, leaf
-from crazysim.sim.data import SimData
-from crazysim.sim.stage import stage
 
 DECAY, SPREAD = 5.8, 0.094
 """Velocity decay constant B and spreading rate S of a round turbulent jet, 1 (Hussein, Capp and George 1994; Pope,

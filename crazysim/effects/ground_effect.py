@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
 from crazysim.effects.core import Simulation, as_setting, install, require_rotors
 from crazysim.pytree import PyTree, leaf
-from crazysim.sim.data import SimData
 
 
 class GroundEffect(PyTree):

@@ -9,12 +9,12 @@ import numpy as np
 from jax import Array
 
 from crazysim.control import Control
+from crazysim.core.data import SimData
+from crazysim.core.pipeline import replace_fn
+from crazysim.core.stage import Stage, as_stages, stage
 from crazysim.effects.core import Simulation, as_setting, controls_of, install
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.sim.data import SimData
-from crazysim.sim.pipeline import replace_fn
-from crazysim.sim.stage import Stage, as_stages, stage
 
 
 class Latency(PyTree):

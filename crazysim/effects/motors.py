@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.core.data import SimData
+from crazysim.core.random import drone_key
+from crazysim.core.stage import stage
 from crazysim.effects.core import Simulation, as_setting, controls_of, install, per_drone, require_rotors
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.sim.data import SimData
-from crazysim.sim.random import drone_key
-from crazysim.sim.stage import stage
 
 
 class Motors(PyTree):

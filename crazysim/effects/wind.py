@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.core.data import SimData
+from crazysim.core.random import drone_key
+from crazysim.core.stage import stage
 from crazysim.effects.core import Simulation, as_setting, blown_upon, install, require_drag, zeros
 from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import dot, safe_clip, safe_normalize
-from crazysim.sim.data import SimData
-from crazysim.sim.random import drone_key
-from crazysim.sim.stage import stage
 
 FOOT = 0.3048
 """Metres per foot: the low-altitude model is stated in feet."""

@@ -11,9 +11,9 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
+from crazysim.core.stage import with_leaves
 from crazysim.engine import cuda, kernel, lanes, native
 from crazysim.engine.program import Program, is_key
-from crazysim.sim.stage import with_leaves
 
 Run = Callable[[list[Any], Array], tuple[list[Any], Array]]
 """Leaves and a number of steps to the written leaves and which worlds are flagged as not finite."""
@@ -34,7 +34,7 @@ def build(program: Program, platform: str) -> Callable[[list[Any], int | Array],
     """Return what ``lanes.steps`` is, in kernels: leaves and a number of steps to written leaves and flags.
 
     Raises:
-        NoRuleError: If the program has something that there is no source for.
+        UnsupportedError: If the program has something that there is no source for.
     """
     target = "cuda" if platform == "gpu" else "host"
     run = _one_kernel(program, target) if program.fused else _split(program, target)

@@ -62,7 +62,7 @@ def write(program: Program, target: str) -> Kernel:
     """Return the source of a program for ``cuda`` or ``host``.
 
     Raises:
-        NoRuleError: If an operation or a type has no source.
+        UnsupportedError: If an operation or a type has no source.
     """
     writer = Writer()
     segments, check = program.segments, program.check

@@ -41,7 +41,7 @@ UNROLL = 64
 """Longest loop with inputs or outputs for each turn, and largest index range, that is written out."""
 
 
-class NoRuleError(Exception):
+class UnsupportedError(Exception):
     """A primitive, or a use of one, that cannot be read; the message names it."""
 
 
@@ -66,7 +66,7 @@ class Reader:
         """Return the results of a jaxpr for arrays of elements.
 
         Raises:
-            NoRuleError: If it has a primitive without a rule.
+            UnsupportedError: If it has a primitive without a rule.
         """
         env: dict[Any, Elements] = {}
 
@@ -85,7 +85,7 @@ class Reader:
         """Return the results of one operation."""
         name = eqn.primitive.name
         if name not in RULES:
-            raise NoRuleError(f"primitive {name!r} has no rule")
+            raise UnsupportedError(f"primitive {name!r} has no rule")
         return RULES[name](self, eqn, args)
 
     def each(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:

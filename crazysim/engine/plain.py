@@ -11,10 +11,10 @@ from jax import Array
 from jax.experimental.layout import Layout, with_layout_constraint
 from jax.extend.core import jaxpr_as_fun
 
-from crazysim.sim.data import SimData
-from crazysim.sim.pipeline import Pipeline
-from crazysim.sim.stage import Axes, Stage, with_leaves
-from crazysim.sim.stages import finite
+from crazysim.core.data import SimData
+from crazysim.core.pipeline import Pipeline
+from crazysim.core.stage import Axes, Stage, with_leaves
+from crazysim.core.stages import finite
 
 ResetFn = Callable[..., SimData]
 

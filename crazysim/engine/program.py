@@ -13,9 +13,9 @@ import numpy as np
 from jax.extend import core
 
 import crazysim.engine.rules  # noqa: F401  (fills the reader's table)
+from crazysim.core.stage import Axes, Stage, StageScope
 from crazysim.engine.ir import Block, Element, Value, constant
-from crazysim.engine.lower import Elements, NoRuleError, Reader, pack, words
-from crazysim.sim.stage import Axes, Stage, StageScope
+from crazysim.engine.lower import Elements, Reader, UnsupportedError, pack, words
 
 Slot = tuple[int, int]
 """A number of the data: which leaf, and which element of what one drone (or one world) has of it."""
@@ -243,7 +243,7 @@ class Program:
         segment = last if last is not None and follows else Segment(scope, [], phase)
         try:
             values = self._lower(segment, traced)
-        except NoRuleError as error:
+        except UnsupportedError as error:
             self._add_batch(stage, phase, str(error))
             return
         if segment is not last:

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from crazysim.control import Control
+from crazysim.core import functional as F
+from crazysim.core.data import SimData
+from crazysim.core.stage import with_leaves
 from crazysim.engine.step import Step, Zeros
 from crazysim.errors import ConfigError
-from crazysim.sim import functional as F
-from crazysim.sim.data import SimData
-from crazysim.sim.stage import with_leaves
 
 Policy = Callable[[Any, SimData], Any]
 """Parameters and data to a command for every drone. (n_worlds, n_drones, k)"""

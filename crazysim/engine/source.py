@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from crazysim.engine.ir import Block, Element, Value, is_constant
-from crazysim.engine.lower import NoRuleError
+from crazysim.engine.lower import UnsupportedError
 
 TYPES = {"float32": "f32", "float64": "f64", "int32": "i32", "uint32": "u32", "bool": "b1"}
 
@@ -52,7 +52,7 @@ class Writer:
         """Write a block's operations, and return the names of its outputs.
 
         Raises:
-            NoRuleError: If there is no source for an operation or a type.
+            UnsupportedError: If there is no source for an operation or a type.
         """
         self.names.update(zip(map(id, block.inputs), inputs, strict=True))
         outside = dict(self.pairs)  # what is computed inside a block is not there outside
@@ -123,7 +123,7 @@ class Writer:
         if value.op == "div" and kind in ("f32", "f64"):
             return f"{args[0]} / {args[1]}"
         if value.op not in OPERATIONS:
-            raise NoRuleError(f"operation {value.op!r} has no source")
+            raise UnsupportedError(f"operation {value.op!r} has no source")
         return f"{value.op}_({', '.join(args)})"
 
     def _when(self, value: Value, args: list[str], depth: int) -> None:
@@ -189,11 +189,11 @@ def type_name(dtype: Any) -> str:
     """Return what a type is called in the source.
 
     Raises:
-        NoRuleError: If it has no name there.
+        UnsupportedError: If it has no name there.
     """
     name = np.dtype(dtype).name
     if name not in TYPES:
-        raise NoRuleError(f"numbers of type {name} have no source")
+        raise UnsupportedError(f"numbers of type {name} have no source")
     return TYPES[name]
 
 

@@ -13,15 +13,15 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
+from crazysim.core.data import SimData
+from crazysim.core.pipeline import Pipeline
+from crazysim.core.sharding import WORLD_AXIS
+from crazysim.core.stage import as_stages, with_leaves
 from crazysim.engine import fused, lanes, plain
-from crazysim.engine.lower import NoRuleError
+from crazysim.engine.lower import UnsupportedError
 from crazysim.engine.program import Program, Segment
 from crazysim.errors import ConfigError
 from crazysim.pytree import check_axes, scopes
-from crazysim.sim.data import SimData
-from crazysim.sim.pipeline import Pipeline
-from crazysim.sim.sharding import WORLD_AXIS
-from crazysim.sim.stage import as_stages, with_leaves
 
 ENGINES = ("auto", "plain", "lanes", "fused")
 """What ``engine=`` may be."""
@@ -180,7 +180,7 @@ class Step:
             try:
                 if not why:
                     engine, run = "fused", fused.build(program, self.platform)
-            except NoRuleError as error:
+            except UnsupportedError as error:
                 why = str(error)
                 if self.engine == "fused":
                     raise ConfigError(

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from crazysim.engine.ir import Block, Element, Value
-from crazysim.engine.lower import NoRuleError
+from crazysim.engine.lower import UnsupportedError
 from crazysim.engine.program import Segment, Slot
 
 Expression = Any
@@ -36,11 +36,11 @@ def step(segment: Segment, number: Callable[[Slot], Expression]) -> dict[Slot, E
         number: What its inputs are before the step.
 
     Raises:
-        NoRuleError: If CasADi has nothing for an operation.
+        UnsupportedError: If CasADi has nothing for an operation.
     """
     blocks = [segment.block] if segment.before is None else [segment.before, segment.block]
     if any(value.op == "threefry2x32" for block in blocks for value in block.walk()):
-        raise NoRuleError("it draws random numbers")
+        raise UnsupportedError("it draws random numbers")
     constants = [] if segment.before is None else run(segment.before, [number(slot) for slot in segment.constants])
     outputs = run(segment.block, [*(number(slot) for slot in segment.reads), *constants])
     return dict(zip(segment.writes, outputs, strict=True))
@@ -50,7 +50,7 @@ def run(block: Block, inputs: Sequence[Expression]) -> list[Expression]:
     """Return the outputs of a block.
 
     Raises:
-        NoRuleError: If CasADi has nothing for an operation.
+        UnsupportedError: If CasADi has nothing for an operation.
     """
     return _Reader().run(block, inputs)
 
@@ -85,12 +85,12 @@ class _Reader:
                 return [_select(mask, x, y) for x, y in zip(new, old, strict=True)]
             case "loop":
                 if params["length"] > LONGEST_LOOP:
-                    raise NoRuleError(f"a loop of {params['length']} turns; written out are up to {LONGEST_LOOP}")
+                    raise UnsupportedError(f"a loop of {params['length']} turns; written out are up to {LONGEST_LOOP}")
                 for _ in range(params["length"]):
                     args = self.run(value.blocks[0], args)
                 return args
             case "while":
-                raise NoRuleError("a loop that goes on until a condition fails has no form written out")
+                raise UnsupportedError("a loop that goes on until a condition fails has no form written out")
             case "custom_jvp":
                 outside, self.in_custom_jvp = self.in_custom_jvp, True
                 outputs = self.run(value.blocks[0], args)
@@ -101,10 +101,12 @@ class _Reader:
             case "sqrt" if self.in_custom_jvp:
                 return _guarded_sqrt(args[0])
             case "and" | "or" | "xor" | "not" if value.dtype.kind != "b":
-                raise NoRuleError(f"operation {value.op!r} on the bits of {value.dtype.name} has no form in CasADi")
+                raise UnsupportedError(
+                    f"operation {value.op!r} on the bits of {value.dtype.name} has no form in CasADi"
+                )
         unsigned = value.dtype.kind == "u"
         if value.op not in self.operations or (unsigned and value.op not in UNSIGNED):
-            raise NoRuleError(f"operation {value.op!r} on {value.dtype.name} has no form in CasADi")
+            raise UnsupportedError(f"operation {value.op!r} on {value.dtype.name} has no form in CasADi")
         out = self.operations[value.op](*args, **params)
         if value.op == "div" and value.dtype.kind in "iu":
             return _towards_zero(out)

@@ -8,12 +8,12 @@ import numpy as np
 from jax import Array
 
 from crazysim.control import COMMAND_FIELDS, Control
+from crazysim.core.data import SimParams
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles, fitted
 from crazysim.errors import ConfigError
 from crazysim.pytree import scopes
 from crazysim.rotation import safe_clip
-from crazysim.sim.data import SimParams
 
 TILT = np.pi / 4
 """Largest roll and pitch that an action commands, rad."""

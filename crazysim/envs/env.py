@@ -11,17 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.core.data import SimData
+from crazysim.core.settings import positive
+from crazysim.core.sharding import shard
+from crazysim.core.stage import Stage
 from crazysim.engine import fused
 from crazysim.engine.rollout import COMMANDS
 from crazysim.envs.actions import Actions, actions_of
 from crazysim.envs.random import episode_keys
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, map_batched, scopes, select_worlds
-from crazysim.sim.data import SimData
-from crazysim.sim.settings import positive
-from crazysim.sim.sharding import shard
 from crazysim.sim.sim import Sim
-from crazysim.sim.stage import Stage
 
 Obs = dict[str, Array]
 """Named observations. (n_worlds, n_drones, k) each"""

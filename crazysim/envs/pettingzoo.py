@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.envs.drawing import RENDER_MODES, Drawing
 from crazysim.envs.env import Env, EnvState, flatten
 from crazysim.envs.registry import make
+from crazysim.envs.rendering import RENDER_MODES, Drawing
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, UnknownNameError
 

@@ -1,4 +1,4 @@
-"""Random numbers of episodes: as repeatable as those of ``crazysim.sim.random``, at a twentieth of the arithmetic.
+"""Random numbers of episodes: as repeatable as those of ``crazysim.core.random``, at a twentieth of the arithmetic.
 
 A million worlds that draw twenty numbers each, in every step, for the few of them that begin anew, must cost less than
 the physics. JAX's generator is a cipher of twenty rounds; here two rounds of an integer hash with avalanche (Wellons
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.sim.data import SimData
+from crazysim.core.data import SimData
 
 STRIDE = np.uint32(0x9E3779B9)
 """2^32 over the golden ratio: multiples of it are spread evenly."""

@@ -9,7 +9,7 @@ import jax
 from jax import Array
 
 from crazysim.envs.env import Env, EnvState
-from crazysim.envs.whole import WholeStep
+from crazysim.envs.fused_step import WholeStep
 from crazysim.envs.wrappers import AutoReset
 
 Act = Callable[[EnvState, Array], Array]

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.envs.drawing import Drawing
 from crazysim.envs.env import Env, EnvState, Obs, flatten, from_host
+from crazysim.envs.rendering import Drawing
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
 from crazysim.errors import ConfigError
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from crazysim.core.data import SimData
 from crazysim.envs.actions import hover_rotors
-from crazysim.sim.data import SimData
 
 
 def flying(

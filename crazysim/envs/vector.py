@@ -12,13 +12,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
-from crazysim.envs.advance import Advance
-from crazysim.envs.drawing import RENDER_MODES, Drawing
+from crazysim.core.settings import as_mask, member
 from crazysim.envs.env import DroneEnv, Env, EnvState, from_host
 from crazysim.envs.registry import TASKS, make
+from crazysim.envs.rendering import RENDER_MODES, Drawing
+from crazysim.envs.stepper import Advance
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError
-from crazysim.sim.settings import as_mask, member
 
 
 class DroneVectorEnv(gymnasium.vector.VectorEnv):

@@ -10,19 +10,19 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.engine.lower import NoRuleError
+from crazysim.core.data import SimData
+from crazysim.core.random import drone_keys
+from crazysim.core.settings import member, positive
+from crazysim.core.stage import Axes
+from crazysim.engine.lower import UnsupportedError
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import Env, EnvState, Obs, Task, fitting, observed, told
+from crazysim.envs.fused_step import Renewal, WholeStep, base_of
 from crazysim.envs.random import episode_keys
 from crazysim.envs.statistics import RunningStats
-from crazysim.envs.whole import Renewal, WholeStep, base_of
 from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, scopes, select_worlds
-from crazysim.sim.data import SimData
-from crazysim.sim.random import drone_keys
-from crazysim.sim.settings import member, positive
 from crazysim.sim.sim import Sim
-from crazysim.sim.stage import Axes
 
 
 class Wrapper:
@@ -148,7 +148,7 @@ class AutoReset(Wrapper):
         if key not in self._wholes:
             try:
                 self._wholes[key] = WholeStep(self.env, self._renewal, state, action, laid)
-            except (NoRuleError, TypeError, ValueError) as error:
+            except (UnsupportedError, TypeError, ValueError) as error:
                 self._wholes[key] = str(error)
         return self._wholes[key]
 
@@ -401,7 +401,7 @@ class Randomize(Wrapper):
         """
         axes = Axes(data)
         leaves = zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(drawn), strict=True)
-        shared = [name for name, scope, x, new in leaves if scope in ("shared", "whole") and new is not x]
+        shared = [name for name, scope, x, new in leaves if scope in ("shared", "opaque") and new is not x]
         if shared:
             raise ConfigError(
                 f"{', '.join(shared)} cannot be randomised: all worlds share it. Name parameters that are to be one "

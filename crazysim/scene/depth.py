@@ -13,10 +13,10 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.scene.collision import CollisionModel
 from crazysim.scene.rays import Hits, cast
-from crazysim.scene.solids import Solids
-from crazysim.sim.data import SimData
 
 RAYS_AT_ONCE = 1 << 22
 """Rays whose numbers are held at once; more worlds go one piece after the other."""
@@ -107,7 +107,13 @@ def pixel_directions(fovy: float, width: int, height: int) -> np.ndarray:
 
 
 def build(
-    solids: Solids, cameras: Sequence[Camera], width: int, height: int, drones: bool, hide_own: bool, along: Along
+    solids: CollisionModel,
+    cameras: Sequence[Camera],
+    width: int,
+    height: int,
+    drones: bool,
+    hide_own: bool,
+    along: Along,
 ) -> Callable[[SimData], Hits]:
     """Return ``depth(data) -> Hits`` of pictures (n_worlds, n_cameras, height, width); see ``Scene.depth_fn``."""
     if along not in ("axis", "ray"):

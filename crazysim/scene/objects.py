@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from crazysim.core.data import Objects, SimData
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import select_worlds
-from crazysim.sim.data import Objects, SimData
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 """The attitude that turns nothing, xyzw."""

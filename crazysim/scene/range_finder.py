@@ -10,13 +10,13 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.stage import Stage
 from crazysim.effects.core import install
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.latch import SimulationWithScene
+from crazysim.scene.contact_log import SimulationWithScene
 from crazysim.scene.rays import cast
-from crazysim.sim.data import SimData
-from crazysim.sim.stage import Stage
 
 RANGER = {
     "front": (1, 0, 0),

@@ -10,10 +10,10 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
 from crazysim.geometry import ray_distance
 from crazysim.pytree import PyTree, static
-from crazysim.scene.solids import Part, Solids
-from crazysim.sim.data import SimData
+from crazysim.scene.collision import CollisionGeom, CollisionModel
 
 UNROLLED = 16
 """Shapes of objects made alike up to which each is written out; more go through a loop, which compiles once."""
@@ -32,13 +32,18 @@ class Hits(PyTree):
     """Floor, objects and drones, in that order."""
 
 
-def names(solids: Solids, n_drones: int) -> tuple[str, ...]:
+def names(solids: CollisionModel, n_drones: int) -> tuple[str, ...]:
     """Return what rays can meet, in the order of their numbers."""
     return ("floor", *(solid.name for solid in solids.objects), *(f"drone:{i}" for i in range(n_drones)))
 
 
 def cast(
-    solids: Solids, data: SimData, origin: Array, direction: Array, own: np.ndarray | None = None, drones: bool = True
+    solids: CollisionModel,
+    data: SimData,
+    origin: Array,
+    direction: Array,
+    own: np.ndarray | None = None,
+    drones: bool = True,
 ) -> Hits:
     """Return what rays meet. Of all worlds, of one world, or of one drone, as the data is.
 
@@ -59,7 +64,7 @@ def cast(
     for part in solids.floor:
         best = _nearer(best, *_meet(part, origin, direction), 0)
     first = 1
-    alike: dict[tuple[Part, ...], list[tuple[int, int]]] = {}
+    alike: dict[tuple[CollisionGeom, ...], list[tuple[int, int]]] = {}
     for k, solid in enumerate(solids.objects):
         if solid.place is None:
             for part in solid.parts:
@@ -85,7 +90,7 @@ def _of_rays(x: Array) -> Array:
 
 def _met_by(
     best: Hits,
-    parts: tuple[Part, ...],
+    parts: tuple[CollisionGeom, ...],
     pos: Array,
     quat: Array,
     some: np.ndarray,
@@ -123,7 +128,7 @@ def _met_by(
     return jax.lax.fori_loop(0, len(some), lambda k, best: with_one(best, table[k, 0], table[k, 1]), best)
 
 
-def _meet(part: Part, origin: Array, direction: Array) -> tuple[Array, Array]:
+def _meet(part: CollisionGeom, origin: Array, direction: Array) -> tuple[Array, Array]:
     """Return how far rays go to a part, and its normal, in the frame that the part is described in."""
     start = origin - jnp.asarray(part.pos, origin.dtype)
     if part.rot is None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, RenderError, UnknownNameError
-from crazysim.scene.draw import Marks
+from crazysim.scene.overlays import Marks
 from crazysim.scene.window import Window
 
 MAX_SIZES = 4

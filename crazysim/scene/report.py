@@ -17,12 +17,12 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
 from crazysim.errors import ConfigError
 from crazysim.geometry import distance
 from crazysim.pytree import PyTree, static
+from crazysim.scene.collision import CollisionBody, CollisionGeom, CollisionModel
 from crazysim.scene.objects import Handle
-from crazysim.scene.solids import Part, Solid, Solids
-from crazysim.sim.data import SimData
 
 CHUNK = 64
 """Drones whose distances to all others of their world are held at once."""
@@ -77,7 +77,7 @@ Objects = Iterable[Handle | str] | Handle | str | None
 
 
 def build(
-    solids: Solids, objects: Objects = None, floor: bool = True, drones: bool = True
+    solids: CollisionModel, objects: Objects = None, floor: bool = True, drones: bool = True
 ) -> Callable[[SimData], ContactReport]:
     """Return ``report(data) -> ContactReport``, pure: for all worlds, one world, or one drone.
 
@@ -121,7 +121,7 @@ def build(
     return report
 
 
-def choose(solids: Solids, objects: Objects) -> list[Solid]:
+def choose(solids: CollisionModel, objects: Objects) -> list[CollisionBody]:
     """Return the objects that are meant.
 
     Raises:
@@ -146,16 +146,16 @@ def choose(solids: Solids, objects: Objects) -> list[Solid]:
     return [by_name[name] for name in wanted]
 
 
-def _alike(solid: Solid) -> tuple[bool, tuple[Part, ...] | str]:
+def _alike(solid: CollisionBody) -> tuple[bool, tuple[CollisionGeom, ...] | str]:
     """Return what objects must have in common to be computed side by side."""
     return (True, solid.parts) if solid.place is not None else (False, solid.name)
 
 
-Own = Sequence[tuple[Part, Array]]
+Own = Sequence[tuple[CollisionGeom, Array]]
 """The drone's parts with their positions in the world, m. (..., 3)"""
 
 
-def _to_group(own: Own, turned: Array | None, some: list[Solid], data: SimData) -> Array:
+def _to_group(own: Own, turned: Array | None, some: list[CollisionBody], data: SimData) -> Array:
     """Return the distances to objects that are made alike, m. (..., n)"""
     parts = some[0].parts
     if some[0].place is None:
@@ -174,7 +174,7 @@ def _to_group(own: Own, turned: Array | None, some: list[Solid], data: SimData) 
     return _nearest(gaps, own[0][1])
 
 
-def _gap(mine: Part, at: Array, turned: Array | None, part: Part) -> Array:
+def _gap(mine: CollisionGeom, at: Array, turned: Array | None, part: CollisionGeom) -> Array:
     """Return the distance of a drone's part to another part, m. (...)
 
     Args:

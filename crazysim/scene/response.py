@@ -18,16 +18,16 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.pipeline import remove_fn
+from crazysim.core.stage import Stage
 from crazysim.effects.core import install
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape, distance, point_distance
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.latch import SimulationWithScene
+from crazysim.scene.collision import CollisionGeom
+from crazysim.scene.contact_log import SimulationWithScene
 from crazysim.scene.report import Objects, choose
-from crazysim.scene.solids import Part
-from crazysim.sim.data import SimData
-from crazysim.sim.pipeline import remove_fn
-from crazysim.sim.stage import Stage
 
 NAME = "contact_response"
 """Name of the stage, and of its record in ``data.plugins``."""
@@ -111,7 +111,7 @@ def add_contact_response(
 class _Surface(NamedTuple):
     """A part, and where it is."""
 
-    part: Part
+    part: CollisionGeom
     place: int | None
 
 
@@ -157,7 +157,7 @@ def _places(data: SimData, surfaces: list[_Surface], box: np.ndarray) -> _Touchi
     return _Touching(*(jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True))))
 
 
-def _nearest(data: SimData, part: Part, into: Callable, shape: Shape, middle: Array, vel: Array) -> _Touching:
+def _nearest(data: SimData, part: CollisionGeom, into: Callable, shape: Shape, middle: Array, vel: Array) -> _Touching:
     """Return where a plate comes nearest to a part.
 
     The gap's slope by the drone's position is the normal, that by its attitude the lever: their product is all that
@@ -179,7 +179,7 @@ def _nearest(data: SimData, part: Part, into: Callable, shape: Shape, middle: Ar
     return _Touching(gap, normal, point, jnp.broadcast_to(vel, normal.shape))
 
 
-def _frame(data: SimData, part: Part, place: int | None) -> tuple[Callable, Callable, Array | None]:
+def _frame(data: SimData, part: CollisionGeom, place: int | None) -> tuple[Callable, Callable, Array | None]:
     """Return what takes points and directions into a part's frame, directions back, and how fast it moves."""
     dtype = data.states.pos.dtype
     at = jnp.asarray(part.pos, dtype)

@@ -14,20 +14,20 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import NDArray
 
+from crazysim.core.data import Objects, SimData
+from crazysim.core.settings import positive
+from crazysim.core.sharding import place_scene, put
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
-from crazysim.scene import build, contacts, depth, mjx, report, solids
-from crazysim.scene.batch import BatchRenderer
-from crazysim.scene.draw import Marks
+from crazysim.scene import build, collision, contacts, depth, mjx, report
+from crazysim.scene.batch_render import BatchRenderer
+from crazysim.scene.collision import CollisionModel
 from crazysim.scene.objects import IDENTITY, Handle, add_bodies, as_poses
+from crazysim.scene.overlays import Marks
 from crazysim.scene.rays import Hits
 from crazysim.scene.render import Viewer
 from crazysim.scene.report import ContactReport
-from crazysim.scene.solids import Solids
 from crazysim.scene.sync import poses_of, sync_one_world, sync_sim2mjx
-from crazysim.sim.data import Objects, SimData
-from crazysim.sim.settings import positive
-from crazysim.sim.sharding import place_scene, put
 
 LARGE_SWARM = 64
 """From this many drones a world on, MJX checks two pairs per drone instead of every pair."""
@@ -167,14 +167,14 @@ class Scene:
         self._mj_model, self._mj_data = mj_model, mujoco.MjData(mj_model)
         self._mjx_model: mjx.Model | None = None
         self._mjx_data: mjx.Data | None = None
-        self._solids: Solids | None = None
-        self._visible: Solids | None = None
+        self._solids: CollisionModel | None = None
+        self._visible: CollisionModel | None = None
         self.edited = False
         self.invalidate()
         if self.on_compile is not None:
             self.on_compile()
 
-    def settle(self) -> None:
+    def compile_if_edited(self) -> None:
         """Compile, if something was added since."""
         if self.edited:
             self.compile()
@@ -182,19 +182,19 @@ class Scene:
     @property
     def mj_model(self) -> mujoco.MjModel:
         """What the spec was compiled to."""
-        self.settle()
+        self.compile_if_edited()
         return self._mj_model
 
     @property
     def mj_data(self) -> mujoco.MjData:
         """The one world that was drawn last."""
-        self.settle()
+        self.compile_if_edited()
         return self._mj_data
 
     @property
     def drone_mocap_ids(self) -> list[int]:
         """Mocap id of each drone's body. (n_drones,)"""
-        self.settle()
+        self.compile_if_edited()
         return self._drone_ids
 
     def objects(self, before: Objects | None) -> Objects | None:
@@ -219,7 +219,7 @@ class Scene:
     @property
     def mjx_model(self) -> mjx.Model:
         """The model on the device; made when first read."""
-        self.settle()
+        self.compile_if_edited()
         model = self._mjx_model
         if model is None:
             model = build.put_model(self.mj_model, self.device)
@@ -231,7 +231,7 @@ class Scene:
     @property
     def mjx_data(self) -> mjx.Data:
         """The scene of every world, as it was last synced; made when first read, and returned as it is."""
-        self.settle()
+        self.compile_if_edited()
         if self._mjx_data is None:
             self._mjx_data = self._place(build.make_data(self.mj_model, self.n_worlds, self.device))
         return self._mjx_data
@@ -280,7 +280,7 @@ class Scene:
         except ConfigError:
             return False
 
-    # Questions ----------------------------------------------------------------------------------------------
+    # SceneQueries ----------------------------------------------------------------------------------------------
 
     def contacts(self, body: str | None = None) -> Array:
         """Return which contact slots, of one body or of all, touched at the last sync. (n_worlds, n_slots)
@@ -293,11 +293,11 @@ class Scene:
         return contacts.body_contact_flags(self.mjx_data, self.mj_model, body)
 
     @property
-    def solids(self) -> Solids:
+    def solids(self) -> CollisionModel:
         """What drones can touch, as shapes; read anew after a compilation."""
-        self.settle()
+        self.compile_if_edited()
         if self._solids is None:
-            self._solids = solids.read(self._mj_model, self._movable())
+            self._solids = collision.read(self._mj_model, self._movable())
         return self._solids
 
     @property
@@ -306,11 +306,11 @@ class Scene:
         return tuple(solid.name for solid in self.solids.objects)
 
     @property
-    def visible(self) -> Solids:
+    def visible(self) -> CollisionModel:
         """What cameras see, as shapes: a mesh as its convex hull, nothing that is more than half transparent."""
-        self.settle()
+        self.compile_if_edited()
         if self._visible is None:
-            self._visible = solids.read(self._mj_model, self._movable(), touching=False)
+            self._visible = collision.read(self._mj_model, self._movable(), touching=False)
         return self._visible
 
     def depth_fn(

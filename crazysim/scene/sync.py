@@ -11,8 +11,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from crazysim.core.data import SimData
 from crazysim.scene import mjx
-from crazysim.sim.data import SimData
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
 """Cameras that follow a centre of mass, which nothing else needs."""

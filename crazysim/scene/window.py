@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 
 from crazysim.errors import RenderError
-from crazysim.scene.draw import Marks
+from crazysim.scene.overlays import Marks
 
 
 class Window:

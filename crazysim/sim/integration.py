@@ -1,84 +1,15 @@
-"""Integrators: from a state and its derivative to the next state."""
+"""Integrators, under the path that Crazyflow uses."""
 
-from __future__ import annotations
+from crazysim.core.integration import (
+    Integrator,
+    euler,
+    rk4,
+    symplectic_euler,
+)
 
-from collections.abc import Callable
-from enum import StrEnum
-
-import jax
-from jax import Array
-
-from crazysim import rotation
-from crazysim.sim.data import SimData, SimStateDeriv
-
-DerivFn = Callable[[SimData], SimStateDeriv]
-
-
-class Integrator(StrEnum):
-    """Integration scheme."""
-
-    euler = "euler"
-    """Explicit Euler, order 1: the fastest."""
-    symplectic_euler = "symplectic_euler"
-    """Velocities first, then positions with the new ones, order 1: as fast, and keeps energy better."""
-    rk4 = "rk4"
-    """Runge and Kutta, order 4; four derivatives a step."""
-    default = euler
-
-    @property
-    def order(self) -> int:
-        """Order of convergence."""
-        return 4 if self == Integrator.rk4 else 1
-
-
-def euler(data: SimData, deriv_fn: DerivFn) -> SimData:
-    """Return the data one explicit Euler step later."""
-    deriv, dt = deriv_fn(data), 1 / data.core.freq
-    return advance(data, deriv, dt, dt * deriv.ang_vel)
-
-
-def symplectic_euler(data: SimData, deriv_fn: DerivFn) -> SimData:
-    """Return the data one semi-implicit Euler step later: positions move with the new velocities."""
-    deriv, dt = deriv_fn(data), 1 / data.core.freq
-    vel, ang_vel = deriv.vel + dt * deriv.acc, deriv.ang_vel + dt * deriv.ang_acc
-    return advance(data, deriv.replace(vel=vel), dt, dt * ang_vel)
-
-
-def rk4(data: SimData, deriv_fn: DerivFn) -> SimData:
-    """Return the data one Runge-Kutta step of order 4 later.
-
-    Rotations about different axes do not commute, so an attitude that moves along the averaged body rate is
-    only of order 2. The two cross products are the commutators that restore order 4 (Munthe-Kaas 1999; in the
-    form of Celledoni, Marthinsen and Owren 2014, section 3, with the signs of body rates).
-    """
-    dt = 1 / data.core.freq
-    k1 = deriv_fn(data)
-    r1 = dt * k1.ang_vel
-    k2 = deriv_fn(advance(data, k1, dt / 2, r1 / 2, normalize=False))
-    r2 = dt * k2.ang_vel
-    k3 = deriv_fn(advance(data, k2, dt / 2, r2 / 2 + rotation.cross(r1, r2) / 8, normalize=False))
-    r3 = dt * k3.ang_vel
-    k4 = deriv_fn(advance(data, k3, dt, r3, normalize=False))
-    r4 = dt * k4.ang_vel
-    mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-    return advance(data, mean, dt, dt * mean.ang_vel + rotation.cross(r1, r4) / 12)
-
-
-def advance(data: SimData, deriv: SimStateDeriv, dt: float, rotvec: Array, normalize: bool = True) -> SimData:
-    """Return the data ``dt`` seconds along a derivative, the attitude turned by a body rotation vector, rad."""
-    s = data.states
-    states = s.replace(
-        pos=s.pos + dt * deriv.vel,
-        quat=rotation.turn(s.quat, rotvec, normalize),
-        vel=s.vel + dt * deriv.acc,
-        ang_vel=s.ang_vel + dt * deriv.ang_acc,
-        rotor_vel=s.rotor_vel + dt * deriv.rotor_acc,
-    )
-    return data.replace(states=states)
-
-
-INTEGRATORS: dict[Integrator, Callable[..., SimData]] = {
-    Integrator.euler: euler,
-    Integrator.symplectic_euler: symplectic_euler,
-    Integrator.rk4: rk4,
-}
+__all__ = [
+    "Integrator",
+    "euler",
+    "rk4",
+    "symplectic_euler",
+]

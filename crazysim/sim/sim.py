@@ -15,6 +15,14 @@ from jax.sharding import Mesh
 from numpy.typing import NDArray
 
 from crazysim.control import Control
+from crazysim.core import functional as F
+from crazysim.core.data import SimData, as_key, require_pair
+from crazysim.core.integration import Integrator
+from crazysim.core.pipeline import Pipeline
+from crazysim.core.random import seed_sim
+from crazysim.core.settings import as_mask, control_freqs, find_device, member, physics_freq, positive
+from crazysim.core.sharding import put, shard
+from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.core import require_support
@@ -27,20 +35,12 @@ from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
 from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
-from crazysim.scene.draw import Marks
-from crazysim.scene.questions import Questions
+from crazysim.scene.overlays import Marks
+from crazysim.scene.queries import SceneQueries
 from crazysim.scene.render import Viewer
 from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Held, Scene
 from crazysim.scene.sync import sync_sim2mjx
-from crazysim.sim import functional as F
-from crazysim.sim.data import SimData, as_key, require_pair
-from crazysim.sim.integration import Integrator
-from crazysim.sim.pipeline import Pipeline
-from crazysim.sim.random import seed_sim
-from crazysim.sim.settings import as_mask, control_freqs, find_device, member, physics_freq, positive
-from crazysim.sim.sharding import put, shard
-from crazysim.sim.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
 
 __all__ = ["Sim", "clip_floor_pos", "increment_steps", "reset", "seed_sim", "sync_sim2mjx", "use_box_collision"]
 
@@ -89,7 +89,7 @@ class Sim:
             device: Where the data lives: a platform such as ``"cpu"`` or ``"gpu"``, or a device.
             xml_path: MJCF scene; None for floor, light and sky.
             rng_key: Seed, or a key.
-            mesh: Devices to spread the worlds over, from ``crazysim.sim.sharding.world_mesh``.
+            mesh: Devices to spread the worlds over, from ``crazysim.core.sharding.world_mesh``.
             engine: How a step is executed: ``"plain"``, ``"lanes"`` or ``"fused"``; ``"auto"`` takes the fastest that
                 can run the step pipeline here. ``explain`` tells which that is.
 
@@ -120,7 +120,7 @@ class Sim:
         self._scene = Scene(xml_path, self.airframe, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
         self._seed = as_key(rng_key)
         self._counts: dict[int, Array] = {}
-        self._questions = self._new_questions()
+        self._queries = self._new_queries()
         self._whole: SimData | None = None
         self._apart: Apart | None = None
         self._cleared: Any = None
@@ -135,9 +135,9 @@ class Sim:
 
     # Data ---------------------------------------------------------------------------------------------------
 
-    def _new_questions(self) -> Questions:
+    def _new_queries(self) -> SceneQueries:
         kernels = self.mesh is None and self.engine in ("auto", "fused")
-        return Questions(self._scene, self.device.platform if kernels else None)
+        return SceneQueries(self._scene, self.device.platform if kernels else None)
 
     @property
     def data(self) -> SimData:
@@ -147,7 +147,7 @@ class Sim:
     @property
     def _data(self) -> SimData:
         """The data, put together when somebody wants it, with what has been added to the scene."""
-        self._scene.settle()
+        self._scene.compile_if_edited()
         if self._whole is None:
             self._whole = self._apart.data()
         return self._whole
@@ -209,7 +209,7 @@ class Sim:
     @property
     def default_data(self) -> SimData:
         """What resets return to."""
-        self._scene.settle()
+        self._scene.compile_if_edited()
         return self._default_data
 
     @default_data.setter
@@ -227,7 +227,7 @@ class Sim:
         self.data = self.data
         self.default_data = shard(self.default_data, mesh)
         self._scene.shard(mesh)
-        self._questions = self._new_questions()
+        self._queries = self._new_queries()
         self.build_step_fn()
         return self.data
 
@@ -245,7 +245,7 @@ class Sim:
     def step(self, n_steps: int = 1) -> None:
         """Advance every world by a number of physics steps; any number uses the same compilation."""
         n_steps = positive("n_steps", n_steps)
-        self._scene.settle()
+        self._scene.compile_if_edited()
         apart = self._step.take_apart(self._data) if self._apart is None else self._apart
         self._apart, self._whole = self._step.advance(apart, self._count(n_steps)), None
         self._cleared = self._apart.leaves[apart.plan.shown]
@@ -309,7 +309,7 @@ class Sim:
         self._advance(self._reset(self.data, self.default_data, as_mask(mask, self.n_worlds)))
 
     def state_control(self, controls: Any, check_finite: bool = False) -> None:
-        """Stage a full-state setpoint; see ``crazysim.sim.functional.state_control``. (n_worlds, n_drones, 16)"""
+        """Stage a full-state setpoint; see ``crazysim.core.functional.state_control``. (n_worlds, n_drones, 16)"""
         self._command(F.state_control(self.data, controls, check_finite))
 
     def attitude_control(self, controls: Any, check_finite: bool = False) -> None:
@@ -425,7 +425,7 @@ class Sim:
         Raises:
             ValueError: If nothing is asked for, or an object is not there or is moved by hand.
         """
-        return self._questions.contact_report(self.data, objects, floor, drones)
+        return self._queries.contact_report(self.data, objects, floor, drones)
 
     def depth(
         self,
@@ -443,7 +443,7 @@ class Sim:
         Raises:
             ValueError: If the camera does not exist, or the resolution cannot be.
         """
-        return self._questions.depth(self.data, camera, width, height, drones, hide_own, along)
+        return self._queries.depth(self.data, camera, width, height, drones, hide_own, along)
 
     def render(
         self,

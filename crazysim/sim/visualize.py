@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.scene.draw import RED
+from crazysim.scene.overlays import RED
 
 if TYPE_CHECKING:
     from crazysim.sim.sim import Sim

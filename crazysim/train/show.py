@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from crazysim.envs.env import DroneEnv
-from crazysim.pictures import Film, View
+from crazysim.media import Film, View
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points
 from crazysim.train.networks import Policy

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim import Sim
+from crazysim.core.random import drone_keys
 from crazysim.dynamics.first_principles import hover_rotor_vel
 from crazysim.pytree import select_worlds
-from crazysim.sim.random import drone_keys
 
 
 def randomize_motors(data, default_data, mask=None, spread=0.0):

@@ -12,12 +12,12 @@ import numpy as np
 from jax import Array
 
 from crazysim import PyTree, Sim, leaf
+from crazysim.core.random import world_keys
+from crazysim.core.stage import stage
 from crazysim.effects.core import install
-from crazysim.pictures import Film, View
+from crazysim.media import Film, View
 from crazysim.rotation import rotate, rotate_inverse
-from crazysim.scene.latch import latch_contacts
-from crazysim.sim.random import world_keys
-from crazysim.sim.stage import stage
+from crazysim.scene.contact_log import latch_contacts
 
 N_WORLDS, N_GATES, SECONDS = 16, 4, 16
 OPENING = 0.45  # width and height of a gate's opening, m

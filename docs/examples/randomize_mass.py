@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim import Sim
+from crazysim.core.pipeline import append_fn
+from crazysim.core.random import drone_keys
 from crazysim.pytree import select_worlds
-from crazysim.sim.pipeline import append_fn
-from crazysim.sim.random import drone_keys
 
 
 def randomize_mass(data, default_data, mask=None):

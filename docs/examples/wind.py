@@ -10,8 +10,8 @@ import numpy as np
 from jax import Array
 
 from crazysim import PyTree, Sim, leaf
-from crazysim.sim.pipeline import insert_fn_before
-from crazysim.sim.random import drone_keys
+from crazysim.core.pipeline import insert_fn_before
+from crazysim.core.random import drone_keys
 
 STEADY = np.array([20e-3, 0.0, 0.0])  # N; the drone weighs 426 mN
 GUST, GUST_TIME = 10e-3, 0.5  # N, s

@@ -14,7 +14,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 def test_page_runs(page, tmp_path, monkeypatch, opengl):
     monkeypatch.chdir(tmp_path)
     text = page.read_text()
-    for package, sign in (("casadi", "import casadi"), ("viser", "from crazysim.pictures.web")):
+    for package, sign in (("casadi", "import casadi"), ("viser", "from crazysim.media.web")):
         if sign in text:
             pytest.importorskip(package)
     namespace = {"__name__": "page"}

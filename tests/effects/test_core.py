@@ -12,9 +12,9 @@ import pytest
 from cases import hover_command, hover_rotor_state, to_all, trees_equal, with_states
 
 from crazysim import ConfigError, Sim, effects, load_airframe
+from crazysim.core.pipeline import replace_fn
 from crazysim.engine import Step
 from crazysim.pytree import scopes
-from crazysim.sim.pipeline import replace_fn
 
 ON = {
     "battery": {"capacity": 0.25, "resistance": 0.1},

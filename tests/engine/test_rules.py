@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from crazysim import Sim
+from crazysim.core.stage import stage
 from crazysim.engine import Step, native
 from crazysim.pytree import PyTree, leaf
-from crazysim.sim.stage import stage
 
 FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
 N_WORLDS, N_DRONES = 7, 3  # 21 lanes: not a multiple of any vector's or block's length

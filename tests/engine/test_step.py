@@ -8,15 +8,15 @@ from cases import shared_sim
 
 from crazysim import ConfigError, Sim
 from crazysim.control import Control, command_size
+from crazysim.core import functional as F
+from crazysim.core.pipeline import append_fn, insert_fn_before
+from crazysim.core.random import drone_key
+from crazysim.core.stage import stage
 from crazysim.dynamics import Dynamics
 from crazysim.engine import Step, cuda, kernel, native, rollout
 from crazysim.engine.program import LARGEST_SWARM
 from crazysim.engine.step import explain
 from crazysim.pytree import PyTree, leaf
-from crazysim.sim import functional as F
-from crazysim.sim.pipeline import append_fn, insert_fn_before
-from crazysim.sim.random import drone_key
-from crazysim.sim.stage import stage
 
 FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
 SLOW = {"state": {"state_freq": 100}, "attitude": {"attitude_freq": 250}}

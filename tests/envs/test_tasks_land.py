@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim, rotation
+from crazysim.core.random import world_keys
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks.land import land
-from crazysim.sim.random import world_keys
 from crazysim.train.evaluate import evaluate
 
 N_SPAWNS, SPEED = 2048, 0.5

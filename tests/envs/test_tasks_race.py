@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim, rotation
+from crazysim.core.random import world_keys
 from crazysim.envs import AutoReset, DroneEnv, make
 from crazysim.envs.tasks import race as task
 from crazysim.envs.tracks import Track, ranks
-from crazysim.sim.random import world_keys
 from crazysim.train.evaluate import evaluate
 
 TRACK = Track()

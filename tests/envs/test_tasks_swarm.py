@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
+from crazysim.core.random import world_keys
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks.swarm import separation, swarm
-from crazysim.sim.random import world_keys
 
 N_WORLDS, N_DRONES = 2048, 4
 

@@ -8,9 +8,9 @@ from cases import shared_sim
 from oracle import SHAPES
 
 from crazysim import rotation
+from crazysim.core.stage import stage
 from crazysim.engine import Step, native
 from crazysim.geometry import Shape, distance, hull
-from crazysim.sim.stage import stage
 
 FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
 SPHERE = Shape("sphere", (0.1,))

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from crazysim import Sim, load_airframe
-from crazysim.sim.data import SimControls, create_params
-from crazysim.sim.integration import advance
-from crazysim.sim.pipeline import replace_fn
-from crazysim.sim.stage import stage
+from crazysim.core.data import SimControls, create_params
+from crazysim.core.integration import advance
+from crazysim.core.pipeline import replace_fn
+from crazysim.core.stage import stage
 
 FOLDER = Path(__file__).parent
 FILES = sorted(path.stem for path in FOLDER.glob("*.npz"))

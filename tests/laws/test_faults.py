@@ -24,7 +24,7 @@ from cases import (
 )
 
 from crazysim import ConfigError, PyTree, Sim, leaf
-from crazysim.sim.stages import FLOOR
+from crazysim.core.stages import FLOOR
 
 
 @functools.cache

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from crazysim import Sim
+from crazysim.core import functional as F
 from crazysim.dynamics import first_principles
-from crazysim.sim import functional as F
 
 WEIGHT = 0.0434 * 9.81
 COMMANDS = {

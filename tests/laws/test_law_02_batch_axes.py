@@ -13,10 +13,10 @@ import pytest
 from cases import LEVELS, PAIRS, shared_sim, with_params, with_states
 
 from crazysim import ConfigError, Control, PyTree, Sim
+from crazysim.core.data import SimData
 from crazysim.engine import Step
 from crazysim.engine.step import ENGINES
 from crazysim.pytree import scopes
-from crazysim.sim.data import SimData
 
 SIZES = [(n, m) for n in (1, 2, 3, 4) for m in (1, 2, 3, 4)]
 EQUAL, UNEQUAL = ([size for size in SIZES if (size[0] == size[1]) == same] for same in (True, False))

@@ -10,7 +10,7 @@ import pytest
 from cases import hover_command, to_all, trees_equal, with_states
 
 from crazysim import Sim, dynamics
-from crazysim.sim import functional as F
+from crazysim.core import functional as F
 from crazysim.sim import sim as shell
 
 MASK = np.array([False, True, False])

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
 import crazysim.scene.scene as place
+from crazysim.core import functional as F
 from crazysim.sim import Sim
-from crazysim.sim import functional as F
 from crazysim.sim.sim import sync_sim2mjx, use_box_collision
 
 UP = 1.0

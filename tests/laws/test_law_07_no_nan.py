@@ -19,7 +19,7 @@ from cases import (
 )
 
 from crazysim import Sim
-from crazysim.sim.stages import FLOOR
+from crazysim.core.stages import FLOOR
 
 HALF = np.sqrt(0.5)
 SITUATIONS = (

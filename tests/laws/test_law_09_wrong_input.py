@@ -7,9 +7,9 @@ import pytest
 from cases import LEVELS
 
 from crazysim import ConfigError, Sim, load_airframe
-from crazysim.sim import functional as F
-from crazysim.sim.data import command_shape
-from crazysim.sim.pipeline import append_fn, insert_fn_before, remove_fn, replace_fn
+from crazysim.core import functional as F
+from crazysim.core.data import command_shape
+from crazysim.core.pipeline import append_fn, insert_fn_before, remove_fn, replace_fn
 
 
 def broken(tmp_path, text):

@@ -7,10 +7,10 @@ import pytest
 from cases import as_numbers
 
 from crazysim import Sim
+from crazysim.core.pipeline import append_fn
+from crazysim.core.random import drone_keys, world_keys
+from crazysim.core.sharding import world_mesh
 from crazysim.pytree import select_worlds
-from crazysim.sim.pipeline import append_fn
-from crazysim.sim.random import drone_keys, world_keys
-from crazysim.sim.sharding import world_mesh
 
 
 def randomise_mass(data, default_data, mask=None):

@@ -7,7 +7,7 @@ import pytest
 from cases import as_numbers, hover_command, to_all
 
 from crazysim import Sim
-from crazysim.sim import functional as F
+from crazysim.core import functional as F
 
 
 @pytest.fixture(scope="module")

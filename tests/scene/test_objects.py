@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
+from crazysim.core.stage import stage
 from crazysim.scene import build
 from crazysim.scene.objects import PRIMITIVES
-from crazysim.sim.stage import stage
 
 TOWER = """
 <mujoco>

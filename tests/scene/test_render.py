@@ -307,7 +307,7 @@ def screen_pixels(path):
 WINDOW = textwrap.dedent("""
     import sys
     import numpy as np
-    from crazysim.pictures import View
+    from crazysim.media import View
     from crazysim.sim import Sim
     from crazysim.sim.visualize import draw_points, draw_text
 
@@ -440,7 +440,7 @@ PRINTED = textwrap.dedent("""
 
     import jax
     from jax import Array
-    from crazysim.sim.data import SimData
+    from crazysim.core.data import SimData
     from crazysim.sim.sim import sync_sim2mjx
 
     _mjx_data = sim.mjx_data  # captured in closure

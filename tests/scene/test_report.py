@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
+from crazysim.core.stage import stage
 from crazysim.engine import Step
-from crazysim.scene.latch import latch_contacts
+from crazysim.scene.contact_log import latch_contacts
 from crazysim.scene.report import CHUNK
 from crazysim.sim.sim import use_box_collision
-from crazysim.sim.stage import stage
 
 N_WORLDS, N_DRONES = 40, 3
 SPHERE = 1e-5

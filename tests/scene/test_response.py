@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
+from crazysim.core.stage import stage
 from crazysim.engine import Step
 from crazysim.scene.response import add_contact_response
-from crazysim.sim.stage import stage
 
 HALF = 0.02
 """Half the height of the collision box of a cf21B_500, m."""

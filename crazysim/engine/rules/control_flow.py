@@ -11,7 +11,7 @@ import numpy as np
 from jax.extend import core
 
 from crazysim.engine.ir import Block, Element, constant, is_constant
-from crazysim.engine.lower import UNROLL, Elements, NoRuleError, Reader, constants, pack, rule, words
+from crazysim.engine.lower import UNROLL, Elements, Reader, UnsupportedError, constants, pack, rule, words
 
 
 @rule("jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_lin", "run_state")
@@ -106,7 +106,7 @@ def _scan(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
         inner.block.outputs = words(*inner.read(body, [*fixed, *inputs]))
         return _results(r, "loop", eqn, words(*carry), (inner.block,), (("length", length),))
     if length > UNROLL:
-        raise NoRuleError(
+        raise UnsupportedError(
             f"primitive 'scan' with inputs or outputs for each of {length} turns; written out are {UNROLL}"
         )
     stacked: list[list[Elements]] = []

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.engine.lower import Elements, NoRuleError, Reader, constants, rule
+from crazysim.engine.lower import Elements, Reader, UnsupportedError, constants, rule
 
 ELEMENTWISE: dict[str, tuple[str, ...]] = dict.fromkeys(
     "add sub mul div rem neg sign abs floor ceil is_finite exp exp2 log log1p expm1 tanh sin cos tan asin acos atan "
@@ -48,7 +48,7 @@ def _select_n(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
 def _bitcast(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     before, after = eqn.invars[0].aval.dtype, eqn.params["new_dtype"]
     if before.itemsize != np.dtype(after).itemsize:
-        raise NoRuleError(f"primitive 'bitcast_convert_type' from {before} to {after}, of another size")
+        raise UnsupportedError(f"primitive 'bitcast_convert_type' from {before} to {after}, of another size")
     return [r.each("bitcast_convert_type", args, after)]
 
 

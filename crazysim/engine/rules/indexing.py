@@ -10,7 +10,7 @@ import numpy as np
 from jax.lax import GatherScatterMode
 
 from crazysim.engine.ir import Element, constant, is_constant
-from crazysim.engine.lower import UNROLL, Elements, NoRuleError, Reader, constants, pack, rule
+from crazysim.engine.lower import UNROLL, Elements, Reader, UnsupportedError, constants, pack, rule
 from crazysim.engine.rules.movement import move_many, run_now
 
 
@@ -76,7 +76,9 @@ def _select(r: Reader, condition: Elements, yes: Elements, no: Elements) -> Elem
 
 def _check_range(n: int) -> None:
     if n > UNROLL:
-        raise NoRuleError(f"an index that is known at run time only, into {n} places; selected from are up to {UNROLL}")
+        raise UnsupportedError(
+            f"an index that is known at run time only, into {n} places; selected from are up to {UNROLL}"
+        )
 
 
 @rule("gather")
@@ -158,7 +160,7 @@ def _scatter(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     sizes = [updates.shape[axis] for axis in window]
     operand_axes = [a for a in range(x.ndim) if a not in (*dims.inserted_window_dims, *dims.operand_batching_dims)]
     if dims.operand_batching_dims:
-        raise NoRuleError(f"primitive {eqn.primitive.name!r} with batch axes")
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} with batch axes")
     size_of = dict.fromkeys(range(x.ndim), 1) | dict(zip(operand_axes, sizes, strict=True))
     limits = [x.shape[axis] - size_of[axis] for axis in dims.scatter_dims_to_operand_dims]
     rows = indices.reshape(-1, indices.shape[-1])

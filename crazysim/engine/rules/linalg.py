@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from crazysim.engine.ir import constant
-from crazysim.engine.lower import Elements, NoRuleError, Reader, pack, rule
+from crazysim.engine.lower import Elements, Reader, UnsupportedError, pack, rule
 
 LARGEST_SYSTEM = 6
 """Largest matrix that is factorised; beyond it the written-out arithmetic is longer than a drone's step."""
@@ -15,7 +15,7 @@ LARGEST_SYSTEM = 6
 
 def _check_size(eqn: Any, n: int) -> None:
     if n > LARGEST_SYSTEM:
-        raise NoRuleError(f"primitive {eqn.primitive.name!r} of size {n}; written out are up to {LARGEST_SYSTEM}")
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; written out are up to {LARGEST_SYSTEM}")
 
 
 def _matrices(x: Elements) -> list[Elements]:
@@ -72,7 +72,7 @@ def _lu(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Gauss with the largest pivot of each column, rows exchanged by selection."""
     n, m = args[0].shape[-2:]
     if n != m:
-        raise NoRuleError("primitive 'lu' of a matrix that is not square")
+        raise UnsupportedError("primitive 'lu' of a matrix that is not square")
     _check_size(eqn, n)
     factors, all_pivots, permutations = [], [], []
     for a in _matrices(args[0]):

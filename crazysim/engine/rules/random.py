@@ -9,7 +9,7 @@ import numpy as np
 from jax.extend.random import threefry_prng_impl
 
 from crazysim.engine.ir import is_constant
-from crazysim.engine.lower import Elements, NoRuleError, Reader, pack, rule
+from crazysim.engine.lower import Elements, Reader, UnsupportedError, pack, rule
 from crazysim.engine.rules.movement import run_now
 
 
@@ -31,7 +31,7 @@ def _words(keys: Elements) -> Elements:
 
 def _check_generator(impl: Any) -> None:
     if getattr(impl, "name", str(impl)) != threefry_prng_impl.name:
-        raise NoRuleError(f"a random generator other than JAX's default, {threefry_prng_impl.name}: {impl}")
+        raise UnsupportedError(f"a random generator other than JAX's default, {threefry_prng_impl.name}: {impl}")
 
 
 @rule("random_fold_in", "random_split", "random_bits", "random_seed")

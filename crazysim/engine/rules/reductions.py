@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from crazysim.engine.ir import Element, constant
-from crazysim.engine.lower import UNROLL, Elements, NoRuleError, Reader, constants, pack, rule
+from crazysim.engine.lower import UNROLL, Elements, Reader, UnsupportedError, constants, pack, rule
 from crazysim.engine.rules.movement import run_now
 
 COMBINE = {
@@ -64,7 +64,7 @@ def _sort(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     columns = [np.moveaxis(x, axis, 0).copy() for x in args]
     n = len(columns[0])
     if n > UNROLL:
-        raise NoRuleError(f"primitive 'sort' of {n} elements; written out are up to {UNROLL}")
+        raise UnsupportedError(f"primitive 'sort' of {n} elements; written out are up to {UNROLL}")
     for turn in range(n):
         for i in range(turn % 2, n - 1, 2):
             first = [np.asarray(c[i], object) for c in columns]

@@ -7,6 +7,8 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.stage import stage
 from crazysim.effects.core import install
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
@@ -15,9 +17,7 @@ from crazysim.envs.tasks.core import NAME, check_collisions, nearest, others_nea
 from crazysim.envs.tracks import ranks
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.latch import SimulationWithScene
-from crazysim.sim.data import SimData
-from crazysim.sim.stage import stage
+from crazysim.scene.contact_log import SimulationWithScene
 
 CELL, IN_CELL = 0.8, 0.15
 """Width of the cells that obstacles stand in, one at most in each, and most of each component of the distance from a

@@ -8,12 +8,12 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.pipeline import insert_fn_before
+from crazysim.core.stage import stage
 from crazysim.effects.core import Simulation, install
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.latch import SimulationWithScene
-from crazysim.sim.data import SimData
-from crazysim.sim.pipeline import insert_fn_before
-from crazysim.sim.stage import stage
+from crazysim.scene.contact_log import SimulationWithScene
 
 NAME = "task"
 """Name of a task's record in ``data.plugins``."""

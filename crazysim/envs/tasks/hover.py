@@ -7,12 +7,12 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
 from crazysim.effects.core import Simulation
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.core import away, goal_of, install_goal, out_of_bounds, state_of, with_goal
-from crazysim.sim.data import SimData
 
 HALF_WIDTH, HEIGHT = 3.0, 3.0
 """Edge of the arena, m."""

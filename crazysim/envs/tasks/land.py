@@ -7,6 +7,9 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData, grid_2d
+from crazysim.core.pipeline import insert_fn_before
+from crazysim.core.stage import stage
 from crazysim.effects.core import install
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
@@ -14,10 +17,7 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.core import NAME, pick, state_of
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.latch import SimulationWithScene
-from crazysim.sim.data import SimData, grid_2d
-from crazysim.sim.pipeline import insert_fn_before
-from crazysim.sim.stage import stage
+from crazysim.scene.contact_log import SimulationWithScene
 
 RADIUS, HEIGHT = 0.25, 0.2
 """Radius of a pad, and height of its upper side, m."""

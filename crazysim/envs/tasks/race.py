@@ -10,6 +10,8 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.stage import stage
 from crazysim.effects.core import install
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
@@ -18,9 +20,7 @@ from crazysim.envs.tasks.core import NAME, check_collisions, nearest, others_nea
 from crazysim.envs.tracks import Track, checked, n_random, random_course, start_offsets
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, static
-from crazysim.scene.latch import SimulationWithScene
-from crazysim.sim.data import SimData
-from crazysim.sim.stage import stage
+from crazysim.scene.contact_log import SimulationWithScene
 
 OPENING = 0.45
 """Width and height of a gate's opening, m."""

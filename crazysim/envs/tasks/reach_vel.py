@@ -7,12 +7,12 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
 from crazysim.effects.core import Simulation
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.core import goal_of, install_goal, on_floor, state_of, with_goal
-from crazysim.sim.data import SimData
 
 HEIGHT = 5.0
 """Where episodes begin, m; high enough to sink for as long as they last at most speeds."""

@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
 from crazysim.effects.core import Simulation
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
 from crazysim.envs.spawn import any_attitude, flying
 from crazysim.envs.tasks.core import away, goal_of, install_goal, out_of_bounds, state_of, with_goal
-from crazysim.sim.data import SimData
 
 HALF_WIDTH, HEIGHT = 8.0, 8.0
 """Edge of the arena, m."""

@@ -9,6 +9,8 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.stage import stage
 from crazysim.effects.core import install
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
@@ -16,9 +18,7 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.core import NAME, on_floor, others_near, state_of
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.latch import SimulationWithScene
-from crazysim.sim.data import SimData
-from crazysim.sim.stage import stage
+from crazysim.scene.contact_log import SimulationWithScene
 
 SEPARATION = (0.24, 0.24, 0.6)
 """Half axes of the ellipsoid around a drone that no other's centre may enter, m: twice the radii of 0.12 m across and

@@ -7,6 +7,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.core.data import SimData
 from crazysim.effects.core import Simulation, install
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
@@ -14,7 +15,6 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.core import NAME, on_floor, state_of
 from crazysim.envs.trajectories import Trajectory, figure_eight
 from crazysim.pytree import PyTree, leaf
-from crazysim.sim.data import SimData
 
 TOO_FAR = 1.5
 """Distance from the trajectory at which an episode ends, m."""

@@ -1,0 +1,1 @@
+"""What a simulation is made of: records, stages, pipelines, integrators, random numbers and settings."""

@@ -1,0 +1,363 @@
+"""Everything a simulation knows, as records: states, controls, parameters, and what users add."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.control import AllocationParams, AttitudeParams, Control, StateParams, command_size
+from crazysim.drones import Airframe
+from crazysim.dynamics import Dynamics, first_principles, fitted
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, floating, leaf, static
+
+SimParams = first_principles.Params | fitted.Params
+
+
+class SimState(PyTree):
+    """Rigid-body and rotor state of every drone, and the external wrench on it."""
+
+    pos: Array = leaf("drone", 1)
+    """Position of the centre of mass, world frame, m. (n_worlds, n_drones, 3)"""
+    quat: Array = leaf("drone", 1)
+    """Attitude, body to world, unit, xyzw. (n_worlds, n_drones, 4)"""
+    vel: Array = leaf("drone", 1)
+    """Velocity of the centre of mass, world frame, m/s. (n_worlds, n_drones, 3)"""
+    ang_vel: Array = leaf("drone", 1)
+    """Angular velocity, body frame, rad/s. (n_worlds, n_drones, 3)"""
+    force: Array = leaf("drone", 1)
+    """External force on the centre of mass, world frame, N; stays until it is changed. (n_worlds, n_drones, 3)"""
+    torque: Array = leaf("drone", 1)
+    """External torque, world frame, N m; stays until it is changed. (n_worlds, n_drones, 3)"""
+    rotor_vel: Array = leaf("drone", 1)
+    """Rotor speeds, rpm; in ``so_rpy_rotor*`` the collective thrust, N. (n_worlds, n_drones, n_rotors)"""
+
+    @staticmethod
+    def create(n_worlds: int, n_drones: int, n_rotors: int = 4) -> SimState:
+        """Return drones at rest on the floor, level, on a grid of 1 m around the origin of their world."""
+        shape = (n_worlds, n_drones)
+        grid = np.zeros((n_drones, 3))
+        grid[:, :2] = grid_2d(n_drones)
+        return SimState(
+            pos=of_host(grid, *shape, 3),
+            quat=of_host([0.0, 0.0, 0.0, 1.0], *shape, 4),
+            vel=of_host(0.0, *shape, 3),
+            ang_vel=of_host(0.0, *shape, 3),
+            force=of_host(0.0, *shape, 3),
+            torque=of_host(0.0, *shape, 3),
+            rotor_vel=of_host(0.0, *shape, n_rotors),
+        )
+
+
+class SimStateDeriv(PyTree):
+    """Time derivative of the state of every drone."""
+
+    vel: Array = leaf("drone", 1)
+    """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
+    ang_vel: Array = leaf("drone", 1)
+    """Angular velocity, body frame, rad/s. (n_worlds, n_drones, 3)"""
+    acc: Array = leaf("drone", 1)
+    """Acceleration, world frame, m/s^2. (n_worlds, n_drones, 3)"""
+    ang_acc: Array = leaf("drone", 1)
+    """Angular acceleration, body frame, rad/s^2. (n_worlds, n_drones, 3)"""
+    rotor_acc: Array = leaf("drone", 1)
+    """Rotor acceleration, rpm/s; in ``so_rpy_rotor*`` the rate of thrust, N/s. (n_worlds, n_drones, n_rotors)"""
+
+
+class StateControlData(PyTree):
+    """Command and memory of the state controller."""
+
+    cmd: Array = leaf("drone", 1)
+    """Setpoint in force: position, velocity, acceleration, quaternion, body rates. (n_worlds, n_drones, 16)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Setpoint that the next tick takes over. (n_worlds, n_drones, 16)"""
+    freq: int = static()
+    """Rate of the controller, Hz."""
+    pos_err_i: Array = leaf("drone", 1)
+    """Integral of the position error, m s. (n_worlds, n_drones, 3)"""
+    params: StateParams
+    """Gains and constants."""
+
+
+class AttitudeControlData(PyTree):
+    """Command and memory of the attitude controller."""
+
+    cmd: Array = leaf("drone", 1)
+    """Command in force: roll, pitch, yaw, rad, and collective thrust, N. (n_worlds, n_drones, 4)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Command that the next tick takes over. (n_worlds, n_drones, 4)"""
+    freq: int = static()
+    """Rate of the controller, Hz."""
+    ang_vel_des: Array | None = leaf("drone", 1)
+    """Wanted body rates in force, rad/s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
+    staged_ang_vel_des: Array | None = leaf("drone", 1)
+    """Wanted body rates that the next tick takes over, rad/s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
+    r_int_error: Array | None = leaf("drone", 1)
+    """Integral of the rotation error, rad s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
+    prev_ang_vel: Array | None = leaf("drone", 1)
+    """Angular velocity at the previous tick, rad/s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
+    params: Any
+    """Gains and constants, ``AttitudeParams``; None in fitted dynamics, which contain the controller."""
+
+
+class BodyRateControlData(PyTree):
+    """Command and memory of the body-rate controller."""
+
+    cmd: Array = leaf("drone", 1)
+    """Command in force: body rates, rad/s, and collective thrust, N. (n_worlds, n_drones, 4)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Command that the next tick takes over. (n_worlds, n_drones, 4)"""
+    freq: int = static()
+    """Rate of the controller, Hz."""
+    r_int_error: Array = leaf("drone", 1)
+    """Integral of the rotation error, rad s. (n_worlds, n_drones, 3)"""
+    prev_ang_vel: Array = leaf("drone", 1)
+    """Angular velocity at the previous tick, rad/s. (n_worlds, n_drones, 3)"""
+    params: AttitudeParams
+    """Gains and constants."""
+
+
+class ForceTorqueControlData(PyTree):
+    """Command of the allocation."""
+
+    cmd: Array = leaf("drone", 1)
+    """Command in force: collective thrust, N, and body torque, N m. (n_worlds, n_drones, 4)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Command that the next tick takes over. (n_worlds, n_drones, 4)"""
+    freq: int = static()
+    """Rate of the allocation, Hz."""
+    params: AllocationParams
+    """Limits and constants."""
+
+
+class SimControls(PyTree):
+    """The controllers in use; those that are not are None."""
+
+    mode: Control = static()
+    """Command level."""
+    state: StateControlData | None
+    """State controller."""
+    attitude: AttitudeControlData | None
+    """Attitude controller."""
+    body_rate: BodyRateControlData | None
+    """Body-rate controller."""
+    force_torque: ForceTorqueControlData | None
+    """Allocation."""
+    rotor_vel: Array | None = leaf("drone", 1)
+    """Commanded rotor speeds, rpm; None in fitted dynamics. (n_worlds, n_drones, n_rotors)"""
+
+    @staticmethod
+    def create(
+        n_worlds: int,
+        n_drones: int,
+        control: Control,
+        dynamics: Dynamics,
+        airframe: Airframe,
+        freqs: dict[Control, int],
+    ) -> SimControls:
+        """Return controllers at rest, with the airframe's gains.
+
+        Raises:
+            ConfigError: If the fitted dynamics, which have no rotors, are asked to take rotor commands.
+        """
+        shape = (n_worlds, n_drones)
+        with_rotors = dynamics == Dynamics.first_principles
+        require_pair(dynamics, control)
+
+        def zeros(n: int) -> Any:
+            return of_host(0.0, *shape, n)
+
+        state = attitude = body_rate = force_torque = rotor_vel = None
+        if control == Control.state:
+            cmd = of_host(np.eye(16)[12], *shape, 16)
+            # A copy, for two leaves that share a buffer cannot both be donated.
+            state = StateControlData(cmd, cmd.copy(), freqs[Control.state], zeros(3), StateParams.create(airframe))
+        if control in (Control.state, Control.attitude):
+            attitude = AttitudeControlData(
+                cmd=zeros(4),
+                staged_cmd=zeros(4),
+                freq=freqs[Control.attitude],
+                ang_vel_des=zeros(3) if with_rotors else None,
+                staged_ang_vel_des=zeros(3) if with_rotors else None,
+                r_int_error=zeros(3) if with_rotors else None,
+                prev_ang_vel=zeros(3) if with_rotors else None,
+                params=AttitudeParams.create(airframe) if with_rotors else None,
+            )
+        if control == Control.body_rate:
+            params = AttitudeParams.create(airframe)
+            body_rate = BodyRateControlData(zeros(4), zeros(4), freqs[control], zeros(3), zeros(3), params)
+        if with_rotors:
+            rotor_vel = zeros(airframe.n_rotors)
+        if with_rotors and control != Control.rotor_vel:
+            params = AllocationParams.create(airframe)
+            force_torque = ForceTorqueControlData(zeros(4), zeros(4), freqs[Control.force_torque], params)
+        return SimControls(control, state, attitude, body_rate, force_torque, rotor_vel)
+
+
+class SimCore(PyTree):
+    """Time, sizes, seed and flags."""
+
+    freq: int = static()
+    """Physics steps per second, Hz."""
+    steps: Array = leaf("world")
+    """Physics steps since the world's last reset. (n_worlds, 1)"""
+    episode: Array = leaf("world")
+    """How often the world has been reset; enters its random numbers. (n_worlds, 1)"""
+    nonfinite: Array = leaf("world")
+    """Whether the world has turned non-finite since its last reset. (n_worlds, 1)"""
+    n_worlds: int = static()
+    """Number of worlds."""
+    n_drones: int = static()
+    """Number of drones per world."""
+    world_id: Array = leaf("world")
+    """Number of the world; enters its random numbers. (n_worlds, 1)"""
+    drone_id: Array = leaf("drone")
+    """Number of the drone in its world; enters its random numbers. (n_worlds, n_drones)"""
+    drone_mocap_ids: Array = leaf("shared", 1)
+    """MuJoCo mocap ids of the drones' bodies. (n_drones,)"""
+    rng_key: Array = leaf("shared", 0)
+    """The seed's key; a reset leaves it alone. ()"""
+    mjx_synced: Array = leaf("shared", 0)
+    """Whether this data is what the scene shows. ()"""
+
+    @staticmethod
+    def create(freq: int, n_worlds: int, n_drones: int, drone_mocap_ids: Any, rng_key: int | Array) -> SimCore:
+        """Return the core of a simulation that has not begun."""
+        return SimCore(
+            freq=freq,
+            steps=of_host(0, n_worlds, 1, dtype=np.int32),
+            episode=of_host(0, n_worlds, 1, dtype=np.int32),
+            nonfinite=of_host(False, n_worlds, 1, dtype=bool),
+            n_worlds=n_worlds,
+            n_drones=n_drones,
+            world_id=of_host(np.arange(n_worlds)[:, None], n_worlds, 1, dtype=np.int32),
+            drone_id=of_host(np.arange(n_drones), n_worlds, n_drones, dtype=np.int32),
+            drone_mocap_ids=of_host(drone_mocap_ids, n_drones, dtype=np.int32),
+            rng_key=as_key(rng_key),
+            mjx_synced=of_host(False, dtype=bool),
+        )
+
+
+class Objects(PyTree):
+    """Movable objects of the scene: each world has them where it likes. ``sim.scene.add`` makes them."""
+
+    pos: Array = leaf("world", 2)
+    """Positions of their frames, world frame, m. (n_worlds, 1, n_objects, 3)"""
+    quat: Array = leaf("world", 2)
+    """Attitudes, body to world, unit, xyzw. (n_worlds, 1, n_objects, 4)"""
+    vel: Array = leaf("world", 2)
+    """Velocities that contacts feel, world frame, m/s; they move nothing. (n_worlds, 1, n_objects, 3)"""
+    mocap_ids: Array = leaf("shared", 1)
+    """MuJoCo mocap ids of their bodies. (n_objects,)"""
+    names: tuple[str, ...] = static()
+    """Names of their bodies."""
+
+
+class SimData(PyTree):
+    """The whole simulation: what a step takes and returns."""
+
+    states: SimState
+    """Where the drones are and how they move."""
+    controls: SimControls
+    """What they were told."""
+    params: Any
+    """What they are: ``SimParams``, by the dynamics model."""
+    core: SimCore
+    """When it is."""
+    plugins: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Whatever stages of the user keep. Records (``PyTree``) declare the scope of their leaves and are reset with
+    their world; bare arrays are opaque, and no reset touches them."""
+    objects: Objects | None = None
+    """Movable objects of the scene; None where there are none."""
+
+    @staticmethod
+    def create(
+        n_worlds: int,
+        n_drones: int,
+        dynamics: Dynamics,
+        control: Control,
+        airframe: Airframe,
+        freq: int,
+        freqs: dict[Control, int],
+        drone_mocap_ids: Any,
+        rng_key: int | Array,
+    ) -> SimData:
+        """Return drones at rest that have not begun, without plugins; ``freqs`` are the controllers' rates, Hz."""
+        return SimData(
+            states=SimState.create(n_worlds, n_drones, n_rotor_states(dynamics, airframe)),
+            controls=SimControls.create(n_worlds, n_drones, control, dynamics, airframe, freqs),
+            params=create_params(dynamics, airframe),
+            core=SimCore.create(freq, n_worlds, n_drones, drone_mocap_ids, rng_key),
+        )
+
+
+def of_host(value: Any, *shape: int, dtype: Any = None) -> Any:
+    """Return a value repeated to a shape, as an array of the host: making it takes no compilation."""
+    return np.array(np.broadcast_to(value, shape), dtype or floating())
+
+
+def require_pair(dynamics: Dynamics, control: Control) -> None:
+    """Check that a command level exists in a dynamics model.
+
+    Raises:
+        ConfigError: If it does not.
+    """
+    if dynamics != Dynamics.first_principles and control not in (Control.state, Control.attitude):
+        raise ConfigError(
+            f"control {control.value!r} needs rotors, which dynamics {dynamics.value!r} does not have. Use "
+            f"dynamics='first_principles', or control 'state' or 'attitude'."
+        )
+
+
+def create_params(dynamics: Dynamics, airframe: Airframe) -> SimParams:
+    """Return an airframe's shared parameters for a dynamics model.
+
+    Raises:
+        ConfigError: If the airframe has none for it.
+    """
+    if dynamics == Dynamics.first_principles:
+        return first_principles.Params.create(airframe)
+    return fitted.Params.create(airframe, dynamics)
+
+
+def n_rotor_states(dynamics: Dynamics, airframe: Airframe) -> int:
+    """Return the length of ``states.rotor_vel``: one per rotor, or four for a fitted model, as its peer has it."""
+    return airframe.n_rotors if dynamics == Dynamics.first_principles else 4
+
+
+def command_shape(data: SimData, control: Control) -> tuple[int, int, int]:
+    """Return the shape of a command to all drones, (n_worlds, n_drones, k)."""
+    n_worlds, n_drones, n_rotors = data.states.rotor_vel.shape
+    return n_worlds, n_drones, command_size(control, n_rotors)
+
+
+def as_key(seed: int | Array) -> Array:
+    """Return a typed random key from a seed, or a key as it is.
+
+    Raises:
+        ConfigError: If it is neither.
+    """
+    dtype = getattr(seed, "dtype", np.dtype(int) if type(seed) is int else None)
+    is_key = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    is_integer = dtype is not None and jnp.issubdtype(dtype, jnp.integer)
+    if np.shape(seed) != () or not (is_key or is_integer):
+        raise ConfigError(f"a seed is an integer, or one key as jax.random.key makes, got {seed!r}")
+    try:
+        return seed if is_key else jax.random.key(seed)  # type: ignore[return-value]
+    except OverflowError as error:
+        raise ConfigError(f"the seed {seed} needs more than 64 bits; a smaller integer will do") from error
+
+
+def grid_2d(n: int, spacing: float = 1.0) -> np.ndarray:
+    """Return the ``n`` points of a square grid nearest to its centre, nearest first, m. (n, 2)"""
+    side = math.isqrt(n - 1) + 1
+    line = spacing * (np.arange(side) - (side - 1) / 2)
+    x, y = np.meshgrid(line, line)
+    points = np.stack([x.ravel(), y.ravel()], axis=-1)
+    return points[np.argsort(np.linalg.norm(points, axis=-1), kind="stable")[:n]]

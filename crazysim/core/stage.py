@@ -1,0 +1,169 @@
+"""A stage that says what it sees: one drone, or one world. Undeclared, a stage sees the whole batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.errors import ConfigError
+from crazysim.pytree import scopes
+
+StageScope = Literal["drone", "world", "batch"]
+
+
+class Stage:
+    """A function ``SimData -> SimData`` with the scope that it was written for.
+
+    Called with the data of a simulation it does to every drone, or to every world, what its function does to one.
+    """
+
+    def __init__(
+        self,
+        fn: Callable[..., Any],
+        scope: StageScope,
+        when: Callable[..., Array | None] | None = None,
+        batched: bool = False,
+        name: str | None = None,
+    ):
+        """Declare a stage; see ``stage``. ``batched`` promises that the functions take any leading axes as well."""
+        self.fn, self.when, self.batched = fn, when, batched
+        self.scope: StageScope = scope
+        self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
+        self.__doc__ = fn.__doc__
+
+    def __call__(self, data: Any) -> Any:
+        """Return the data after the stage, in every world and for every drone."""
+        if self.batched or self.scope == "batch":
+            return self.one(data)
+        return _over_worlds(self, data)
+
+    def one(self, data: Any) -> Any:
+        """Return the data after the stage, for the one drone or world that the data is of."""
+        after = self.fn(data)
+        mask = None if self.when is None else self.when(data)
+        if mask is None:
+            return after
+
+        def select(new: Any, old: Any) -> Any:
+            return new if new is old else jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - mask.ndim)), new, old)
+
+        return jax.tree.map(select, after, data)
+
+    def __repr__(self) -> str:
+        return f"<stage {self.__name__} of one {self.scope}>"
+
+
+def stage(
+    scope: Literal["drone", "world"], when: Callable[..., Array | None] | None = None
+) -> Callable[[Callable[..., Any]], Stage]:
+    """Declare what a stage sees, so that an engine can fuse it with its neighbours.
+
+    ``@stage("drone")``: the data of one drone. Leaves of drones and worlds come without batch axes: ``pos`` is (3,),
+    ``steps`` (). The stage writes leaves of drones.
+
+    ``@stage("world")``: the data of one world. Leaves of drones come as (n_drones, ...), leaves of worlds without
+    batch axes. The stage writes leaves of drones or worlds.
+
+    Args:
+        scope: ``"drone"`` or ``"world"``.
+        when: Tells from the same data whether the stage acts at this step, as a bool (); None for always. An engine
+            spends nothing on a stage at steps where it acts nowhere.
+
+    Raises:
+        ConfigError: If the scope is neither.
+    """
+    if scope not in ("drone", "world"):
+        raise ConfigError(
+            f"a stage is of one 'drone' or one 'world', not {scope!r}; undeclared, it sees the whole batch"
+        )
+    return lambda fn: Stage(fn, scope, when)
+
+
+def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
+    """Return the functions of a pipeline as stages under the pipeline's names, undeclared ones of the whole batch."""
+    return [
+        Stage(fn.fn, fn.scope, fn.when, fn.batched, name) if isinstance(fn, Stage) else Stage(fn, "batch", name=name)
+        for name, fn in pipeline.items()
+    ]
+
+
+class Axes:
+    """Which batch axes every leaf of a simulation's data has, and what it is called."""
+
+    def __init__(self, data: Any):
+        """Read them off the data of all worlds."""
+        paths, self.treedef = jax.tree_util.tree_flatten_with_path(data)
+        self.names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in paths]
+        self.scopes: list[str] = jax.tree.leaves(scopes(data))
+
+    def written(self, before: list[Any], after: Any, stage: Stage) -> list[int]:
+        """Return the numbers of the leaves that a stage wrote, and check that it may.
+
+        Raises:
+            ConfigError: If it changed the structure, or a leaf's shape or type, or wrote a leaf beyond its scope.
+        """
+        name = stage.__name__
+        new, treedef = jax.tree.flatten(after)
+        if treedef != self.treedef:
+            raise ConfigError(
+                f"stage {name!r} changed the structure of SimData (a field became None, or a plugin came or went); "
+                f"put everything in place before the step, with sim.data = sim.data.replace(...)"
+            )
+        written = [i for i, (x, y) in enumerate(zip(before, new, strict=True)) if x is not y]
+        own = {"drone": ("drone",), "world": ("drone", "world")}.get(stage.scope)
+        for i in written:
+            x, y = before[i], new[i]
+            if jnp.shape(x) != jnp.shape(y) or jnp.result_type(x) != jnp.result_type(y):
+                raise ConfigError(
+                    f"stage {name!r} turned {self.names[i]} of shape {jnp.shape(x)} and type {jnp.result_type(x)} into "
+                    f"shape {jnp.shape(y)} and type {jnp.result_type(y)}; a step must keep both"
+                )
+            if own is not None and self.scopes[i] not in own:
+                raise ConfigError(
+                    f"stage {name!r} is declared for one {stage.scope} and writes {self.names[i]}, which is "
+                    f"{self.scopes[i]}; it may write leaves of scope {' or '.join(own)}. Give every {stage.scope} a "
+                    f"leaf of its own first, or leave the stage undeclared."
+                )
+        return written
+
+    def of_one(self, leaves: list[Any], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
+        """Return what a stage is given, for each leaf of all worlds: its shape and type for one drone or world."""
+        return [self.one_of(i, x, scope) for i, x in enumerate(leaves)]
+
+    def one_of(self, i: int, x: Any, scope: StageScope) -> jax.ShapeDtypeStruct:
+        """Return the same for the leaf with number ``i``."""
+        taken = {"drone": 2 if scope == "drone" else 1, "world": 2} if scope != "batch" else {}
+        return jax.ShapeDtypeStruct(jnp.shape(x)[taken.get(self.scopes[i], 0) :], x.dtype)
+
+
+def with_leaves(leaves: Sequence[Any], numbers: Sequence[int], values: Sequence[Any]) -> list[Any]:
+    """Return a list of leaves in which those of some numbers are replaced."""
+    out = list(leaves)
+    for i, value in zip(numbers, values, strict=True):
+        out[i] = value
+    return out
+
+
+def _over_worlds(stage: Stage, data: Any) -> Any:
+    """Return the data after ``stage.one`` in every world, and for every drone if that is what it is for."""
+    leaves, axes = jax.tree.leaves(data), Axes(data)
+    written: list[int] = []
+
+    def one(values: list[Any]) -> list[Any]:
+        after = stage.one(axes.treedef.unflatten(values))
+        written[:] = axes.written(values, after, stage)
+        new = jax.tree.leaves(after)
+        return [new[i] for i in written]
+
+    over_drones = [0 if s == "drone" else None for s in axes.scopes]
+    over_worlds = [0 if s in ("drone", "world") else None for s in axes.scopes]
+    each = jax.vmap(one, (over_drones,)) if stage.scope == "drone" else one
+    out = jax.vmap(each, (over_worlds,))(
+        [x[:, 0] if s == "world" else x for s, x in zip(axes.scopes, leaves, strict=True)]
+    )
+    new = [x[:, None] if axes.scopes[i] == "world" else x for i, x in zip(written, out, strict=True)]
+    return axes.treedef.unflatten(with_leaves(leaves, written, new))

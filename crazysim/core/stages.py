@@ -1,0 +1,251 @@
+"""The built-in stages: commands on their ticks, dynamics, floor and clock, as SimData -> SimData."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.control import (
+    Control,
+    attitude2force_torque,
+    body_rate2force_torque,
+    force_torque2rotor_vel,
+    state2attitude,
+)
+from crazysim.core.data import SimData, SimStateDeriv
+from crazysim.core.integration import INTEGRATORS, DerivFn, Integrator
+from crazysim.core.pipeline import Pipeline
+from crazysim.core.stage import Stage, StageScope
+from crazysim.dynamics import Dynamics, first_principles, fitted
+from crazysim.pytree import map_batched, scopes, select_worlds
+
+FLOOR = -0.001
+"""Height below which no drone falls, m: a little under zero, so that a negative height tells a landing."""
+
+
+def _built_in(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
+    """Declare a stage whose functions take data of one drone, one world or all worlds alike."""
+    return lambda fn: Stage(fn, scope, when, batched=True)
+
+
+def _ticks(controller: str) -> Callable[[SimData], Array | None]:
+    """Return the condition under which a controller acts: at its own rate."""
+    return lambda data: tick(data, getattr(data.controls, controller).freq)
+
+
+def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integrator) -> Pipeline:
+    """Return the stages of one physics step, in order."""
+    fitted_model = dynamics != Dynamics.first_principles
+    stages: Pipeline = {}
+    if control == Control.state:
+        stages["state_controller"] = state_controller
+    if control in (Control.state, Control.attitude):
+        if fitted_model:
+            stages["attitude_controller" if control == Control.state else "commit_attitude"] = commit_attitude
+        else:
+            stages["attitude_controller"] = attitude_controller
+    if control == Control.body_rate:
+        stages["body_rate_controller"] = body_rate_controller
+    if not fitted_model and control != Control.rotor_vel:
+        stages["force_torque_controller"] = force_torque_controller
+    stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
+    deriv_fn: DerivFn = fitted_derivative if fitted_model else first_principles_derivative
+    if integrator != Integrator.euler:
+        deriv_fn = held_on_floor(deriv_fn)
+    stages["integration"] = _built_in("drone")(partial(INTEGRATORS[integrator], deriv_fn=deriv_fn))
+    stages["clip_floor_pos"] = clip_floor_pos
+    stages["increment_steps"] = increment_steps
+    return stages
+
+
+def tick(data: SimData, freq: int) -> Array | None:
+    """Return which worlds' controllers of a rate fire at this step, or None where all do always. (n_worlds, 1)"""
+    period = data.core.freq // freq
+    return None if period == 1 else data.core.steps % period == 0
+
+
+def _controls(data: SimData) -> Any:
+    """Return the controls untyped: which of their fields are None follows from the pipeline a stage stands in."""
+    return data.controls
+
+
+@_built_in("drone", when=_ticks("state"))
+def state_controller(data: SimData) -> SimData:
+    """Take over the staged setpoint, and stage the attitude, thrust and body rates that lead to it."""
+    states, controls = data.states, _controls(data)
+    ctrl, attitude = controls.state, controls.attitude
+    cmd = ctrl.staged_cmd
+    attitude_cmd, pos_err_i = state2attitude(
+        states.pos, states.quat, states.vel, cmd, ctrl.pos_err_i, ctrl.freq, params=ctrl.params
+    )
+    ctrl = ctrl.replace(cmd=cmd, pos_err_i=pos_err_i)
+    attitude = attitude.replace(staged_cmd=attitude_cmd)
+    if attitude.staged_ang_vel_des is not None:
+        attitude = attitude.replace(staged_ang_vel_des=cmd[..., 13:16])
+    return data.replace(controls=controls.replace(state=ctrl, attitude=attitude))
+
+
+@_built_in("drone", when=_ticks("attitude"))
+def commit_attitude(data: SimData) -> SimData:
+    """Take over the staged attitude command; fitted dynamics contain the controller that follows it."""
+    ctrl = data.controls.attitude
+    ctrl = ctrl.replace(cmd=ctrl.staged_cmd)
+    return data.replace(controls=data.controls.replace(attitude=ctrl))
+
+
+@_built_in("drone", when=_ticks("attitude"))
+def attitude_controller(data: SimData) -> SimData:
+    """Take over the staged attitude command, and stage the wrench that turns the drone there."""
+    states, controls = data.states, _controls(data)
+    ctrl = controls.attitude
+    wrench, r_int_error = attitude2force_torque(
+        states.quat,
+        states.ang_vel,
+        ctrl.staged_cmd,
+        ctrl.staged_ang_vel_des,
+        ctrl.prev_ang_vel,
+        ctrl.ang_vel_des,
+        ctrl.r_int_error,
+        ctrl.freq,
+        params=ctrl.params,
+    )
+    ctrl = ctrl.replace(
+        cmd=ctrl.staged_cmd,
+        ang_vel_des=ctrl.staged_ang_vel_des,
+        r_int_error=r_int_error,
+        prev_ang_vel=states.ang_vel,
+    )
+    force_torque = controls.force_torque.replace(staged_cmd=wrench)
+    return data.replace(controls=controls.replace(attitude=ctrl, force_torque=force_torque))
+
+
+@_built_in("drone", when=_ticks("body_rate"))
+def body_rate_controller(data: SimData) -> SimData:
+    """Take over the staged body rates, and stage the wrench that follows them."""
+    states, controls = data.states, _controls(data)
+    ctrl = controls.body_rate
+    cmd = ctrl.staged_cmd
+    wrench, r_int_error = body_rate2force_torque(
+        states.quat,
+        states.ang_vel,
+        cmd,
+        ctrl.prev_ang_vel,
+        ctrl.cmd,
+        ctrl.r_int_error,
+        ctrl.freq,
+        params=ctrl.params,
+    )
+    ctrl = ctrl.replace(cmd=cmd, r_int_error=r_int_error, prev_ang_vel=states.ang_vel)
+    force_torque = controls.force_torque.replace(staged_cmd=wrench)
+    return data.replace(controls=controls.replace(body_rate=ctrl, force_torque=force_torque))
+
+
+@_built_in("drone", when=_ticks("force_torque"))
+def force_torque_controller(data: SimData) -> SimData:
+    """Take over the staged wrench, and command the rotor speeds that give it."""
+    controls = _controls(data)
+    ctrl = controls.force_torque
+    rotor_vel = force_torque2rotor_vel(ctrl.staged_cmd, params=ctrl.params)
+    force_torque = ctrl.replace(cmd=ctrl.staged_cmd)
+    return data.replace(controls=controls.replace(force_torque=force_torque, rotor_vel=rotor_vel))
+
+
+@_built_in("drone")
+def clip_rotor_vel_cmd(data: SimData) -> SimData:
+    """Keep commanded rotor speeds within what the motors can do; zero or less is off."""
+    rotor_vel = first_principles.saturate(_controls(data).rotor_vel, data.params)
+    return data.replace(controls=data.controls.replace(rotor_vel=rotor_vel))
+
+
+@_built_in("drone")
+def clip_thrust_cmd(data: SimData) -> SimData:
+    """Keep the commanded collective thrust within what the rotors can give; zero or less is off."""
+    ctrl = data.controls.attitude
+    ctrl = ctrl.replace(cmd=fitted.saturate(ctrl.cmd, data.params))
+    return data.replace(controls=data.controls.replace(attitude=ctrl))
+
+
+def first_principles_derivative(data: SimData) -> SimStateDeriv:
+    """Return the derivative of every drone from first principles."""
+    return _derivative(data, first_principles.dynamics, _controls(data).rotor_vel)
+
+
+def fitted_derivative(data: SimData) -> SimStateDeriv:
+    """Return the derivative of every drone under a fitted model."""
+    return _derivative(data, fitted.dynamics, data.controls.attitude.cmd)
+
+
+def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: Array) -> SimStateDeriv:
+    s = data.states
+    vel, acc, ang_acc, rotor_acc = dynamics(
+        s.pos, s.quat, s.vel, s.ang_vel, cmd, s.rotor_vel, s.force, s.torque, params=data.params
+    )
+    return SimStateDeriv(vel=vel, ang_vel=s.ang_vel, acc=acc, ang_acc=ang_acc, rotor_acc=rotor_acc)
+
+
+def held_on_floor(deriv_fn: DerivFn) -> DerivFn:
+    """Return a derivative in which a drone that stands on the floor and does not lift off neither slides nor turns.
+
+    Needed where positions move with velocities of the same step. Explicit Euler moves them with those of the last,
+    which ``clip_floor_pos`` has set to zero.
+    """
+
+    def held(data: SimData) -> SimStateDeriv:
+        s, deriv = data.states, deriv_fn(data)
+        stands = (s.pos[..., 2:] == FLOOR) & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
+        return deriv.replace(acc=jnp.where(stands, 0.0, deriv.acc), ang_acc=jnp.where(stands, 0.0, deriv.ang_acc))
+
+    return held
+
+
+@_built_in("drone")
+def clip_floor_pos(data: SimData) -> SimData:
+    """Stop drones at the floor: one that is below it, or on it and not rising, is set on it, at rest."""
+    s = data.states
+    height, climb = s.pos[..., 2:], s.vel[..., 2:]
+    stopped = (height < FLOOR) | ((height == FLOOR) & (climb <= 0))
+    states = s.replace(
+        pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(height, FLOOR)], axis=-1),
+        vel=jnp.where(stopped, 0.0, s.vel),
+        ang_vel=jnp.where(stopped, 0.0, s.ang_vel),
+    )
+    return data.replace(states=states)
+
+
+@_built_in("world")
+def increment_steps(data: SimData) -> SimData:
+    """Count the step."""
+    return data.replace(core=data.core.replace(steps=data.core.steps + 1))
+
+
+def finite(data: SimData) -> Array:
+    """Return in which worlds no state and no command is NaN or infinite. (n_worlds, 1)"""
+    watched = (data.states, data.controls)
+    pairs = zip(jax.tree.leaves(scopes(watched)), jax.tree.leaves(watched), strict=True)
+    leaves = [x for scope, x in pairs if scope == "drone"]
+    each = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in leaves])
+    return jnp.all(each, axis=0)[:, None]
+
+
+def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:
+    """Bring worlds back to the default data: everything that belongs to a world, and nothing else.
+
+    What is shared between worlds (parameters that were not randomised, opaque plugin data, the seed's key)
+    stays as it is, with a mask and without. A parameter that has become one per drone goes back to its
+    default in every world that is reset. Plugins that the default does not know stay.
+
+    Args:
+        data: The simulation.
+        default_data: What it is brought back to.
+        mask: Which worlds; None for all. (n_worlds,)
+    """
+    known = {name: default_data.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
+    default_data = default_data.replace(plugins=known)
+    new = map_batched(lambda x, default: select_worlds(mask, default, x), data, default_data)
+    episode = select_worlds(mask, data.core.episode + 1, data.core.episode)
+    return new.replace(core=new.core.replace(episode=episode))

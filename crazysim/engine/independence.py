@@ -1,0 +1,107 @@
+"""Whether a function of all worlds does to each what it does to the others, so that it can be written for one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+
+from crazysim.engine.ir import Block, Element, Value
+from crazysim.engine.lower import Reader, UnsupportedError, words
+from crazysim.engine.program import inputs_of
+
+
+def require_apart(fn: Callable[[list[Any]], list[Any]], two: Sequence[Any], sources: Sequence[str], what: str) -> None:
+    """Check on two worlds that neither sees the other, and that both are treated alike.
+
+    Args:
+        fn: From arrays to arrays that have an axis of worlds in front.
+        two: Shapes and types of what it is given, for two worlds.
+        sources: What each of it is: of ``"worlds"``, which are its first axis, ``"shared"``, or something that no
+            result may depend on, and that the message is to name.
+        what: What the function is, for the message.
+
+    Raises:
+        UnsupportedError: If one world's result depends on the other's numbers or on its place, or cannot be read.
+    """
+    reader = Reader(Block())
+    labels: dict[int, tuple[Any, frozenset[Any]]] = {}
+    inputs = []
+    for i, (aval, source) in enumerate(zip(two, sources, strict=True)):
+        elements = inputs_of(reader.block, aval)
+        for world, part in enumerate(elements) if source == "worlds" else [(source, elements)]:
+            for k, word in enumerate(words(part)):
+                labels[id(word)] = (("input", i, k), frozenset() if world == "shared" else frozenset([world]))
+        inputs.append(elements)
+    outputs = reader.read(jax.make_jaxpr(fn)(list(two)), inputs)
+    reader.block.outputs = words(*outputs)
+    reader.block.drop_unused()
+    forms = _Forms(labels)
+    forms.block(reader.block)
+    for out in outputs:
+        if out.shape[:1] != (2,):
+            raise UnsupportedError(f"{what} returns an array of shape {out.shape} for two worlds")
+        first, second = ([forms.of(x) for x in words(part)] for part in out)
+        for (a, worlds_a), (b, worlds_b) in zip(first, second, strict=True):
+            seen = (worlds_a | worlds_b) - {0, 1}
+            if seen:
+                raise UnsupportedError(f"{what} looks at {', '.join(sorted(seen))}")
+            if worlds_a - {0} or worlds_b - {1}:
+                raise UnsupportedError(f"{what} looks from one world into another")
+            if a != b:
+                raise UnsupportedError(f"{what} does not do the same in every world")
+
+
+Known = tuple[Any, frozenset[Any]]
+"""What a value computes, whatever world's numbers it computes with, and whose numbers those are."""
+
+
+class _Forms:
+    """Finds out of every value what it computes, and from whose numbers."""
+
+    def __init__(self, labels: dict[int, Known]):
+        self.known: dict[int, Any] = dict(labels)
+        self.numbers: dict[Any, int] = {}
+
+    def of(self, x: Element) -> Known:
+        return self.known[id(x)] if isinstance(x, Value) else ((x.dtype.name, x.tobytes()), frozenset())
+
+    def block(self, block: Block) -> list[Known]:
+        """Go through a block whose inputs are known, and return what its outputs are."""
+        for value in block.values:
+            if value.op != "mark":
+                self.known[id(value)] = self._value(value, [self.of(x) for x in value.args])
+        return [self.of(x) for x in block.outputs]
+
+    def _value(self, value: Value, args: list[Known]) -> Any:
+        match value.op:
+            case "item":
+                return self.known[id(value.args[0])][dict(value.params)["index"]]
+            case "threefry2x32":
+                return [self._joined((value.op, k), args) for k in (0, 1)]
+            case "custom_jvp":
+                (body,) = value.blocks
+                self.known.update(zip(map(id, body.inputs), args, strict=True))
+                return self.block(body)
+            case "loop" | "while":
+                return self._repeated(value, args)
+        return self._joined((value.op, value.dtype.name, value.params), args)
+
+    def _joined(self, what: Any, args: list[Known]) -> Known:
+        form = (what, *(f for f, _ in args))
+        return self.numbers.setdefault(form, len(self.numbers)), frozenset().union(*(w for _, w in args))
+
+    def _repeated(self, value: Value, carry: list[Known]) -> list[Known]:
+        """Tell what is carried apart by what it begins as and what becomes of it, until no turn tells more apart."""
+        *test, body = value.blocks
+        n_before: Any = None
+        while (len({f for f, _ in carry}), sum(len(w) for _, w in carry)) != n_before:
+            n_before = (len({f for f, _ in carry}), sum(len(w) for _, w in carry))
+            self.known.update(zip(map(id, body.inputs), carry, strict=True))
+            after = self.block(body)
+            for block in test:
+                self.known.update(zip(map(id, block.inputs), carry, strict=True))
+                after = [self._joined("while", [x, *self.block(block)]) for x in after]
+            carry = [self._joined((value.op, value.params), [x, y]) for x, y in zip(carry, after, strict=True)]
+        return carry

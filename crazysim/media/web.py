@@ -1,0 +1,247 @@
+"""Recorded flights in a browser: one page that needs no server, with a bar to play and scrub."""
+
+from __future__ import annotations
+
+import contextlib
+import http.server
+import io
+import socket
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError, RenderError
+from crazysim.media.flight import Flight
+from crazysim.media.trail import colors_of
+from crazysim.scene.visual_geoms import VisualGeom
+
+FPS = 30
+"""Moments per second that a page has."""
+FAR = 20.0
+"""Half the size of a floor that has no end, m."""
+FOV = 50.0
+"""Vertical field of view at the beginning, degrees."""
+
+
+def page(flight: Flight, world: int | None = None) -> str:
+    """Return one world of a flight as a page of HTML: drones, obstacles, setpoints, and the way that was flown.
+
+    The page is whole: viewer and flight are in it, and it opens from a file, without a server or a network.
+
+    Args:
+        flight: The flight.
+        world: Which world of the simulation; the first that was recorded if left out.
+
+    Raises:
+        ConfigError: If that world was not recorded.
+        ImportError: If viser is not installed.
+    """
+    k = 0 if world is None else flight.index(world)
+    viser = _viser()
+    with contextlib.redirect_stdout(io.StringIO()):  # what viser prints is about a server that nobody is to visit
+        server = viser.ViserServer(host="127.0.0.1", port=_free_port(), verbose=False)
+        try:
+            return _record(server, flight, k).as_html()
+        finally:
+            server.stop()
+
+
+def export(flight: Flight, path: str | Path, world: int | None = None) -> None:
+    """Write ``page`` into a file.
+
+    Raises:
+        ConfigError: If the world was not recorded, there is no such folder, or the name ends otherwise.
+        ImportError: If viser is not installed.
+    """
+    path = Path(path)
+    if path.suffix != ".html":
+        raise ConfigError(f"{path} is no page; its name must end with .html")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{path} cannot be written: there is no folder {path.parent}")
+    path.write_text(page(flight, world), encoding="utf-8")
+
+
+def server_of(html: str, port: int, host: str = "127.0.0.1") -> http.server.ThreadingHTTPServer:
+    """Return a server of one page; ``serve_forever`` has it begin.
+
+    Args:
+        html: The page.
+        port: Where it listens; 0 for any that is free.
+        host: Who may see it; ``0.0.0.0`` for everyone.
+
+    Raises:
+        RenderError: If it cannot listen there.
+    """
+    content = html.encode()
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    try:
+        return http.server.ThreadingHTTPServer((host, port), Handler)
+    except (OSError, OverflowError) as error:
+        raise RenderError(f"no page can be served at {host}:{port}: {error}; choose another --port") from error
+
+
+def camera_of(flight: Flight, k: int) -> tuple[NDArray, NDArray]:
+    """Return where a page's camera is at first, and where it looks: at all of the k-th world's flight, m. (3,), (3,)"""
+    places = flight.pos[:, k].reshape(-1, 3)
+    places = places[np.isfinite(places).all(-1)]
+    low, high = (places.min(0), places.max(0)) if len(places) else (np.zeros(3), np.ones(3))
+    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
+    return middle + reach * np.array([0.0, -1.1, 0.7]), middle
+
+
+def serve(flight: Flight, world: int | None = None, port: int = 8080, host: str = "127.0.0.1") -> None:
+    """Show a flight at a port until it is interrupted.
+
+    Raises:
+        ConfigError: If the world was not recorded.
+        ImportError: If viser is not installed.
+        RenderError: If nothing can be served there.
+    """
+    with server_of(page(flight, world), port, host) as server:
+        print(f"the flight is at http://{host}:{server.server_port}; Ctrl-C ends", flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            server.serve_forever()
+
+
+def _record(server: Any, flight: Flight, k: int) -> Any:
+    """Return viser's recording of the k-th of a flight's worlds."""
+    scene = server.scene
+    scene.set_up_direction("+z")
+    camera = server.initial_camera
+    camera.fov, (camera.position, camera.look_at) = np.deg2rad(FOV), camera_of(flight, k)
+
+    frames = {
+        int(mocap): scene.add_frame(f"/bodies/{mocap}", show_axes=False)
+        for mocap in (*flight.drone_ids, *flight.body_ids)
+    }
+    by_look: dict[tuple[int, tuple], list[VisualGeom]] = defaultdict(list)
+    for shape in flight.shapes:
+        by_look[shape.mocap, tuple(np.round(shape.rgba, 3))].append(shape)
+    for i, ((mocap, rgba), shapes) in enumerate(by_look.items()):
+        parent = f"/bodies/{mocap}" if mocap in frames else "/scene"
+        _add(scene, f"{parent}/{i}", shapes, rgba)
+
+    colors = colors_of(flight.n_drones, None)
+    for drone in range(flight.n_drones):
+        way = flight.pos[:, k, drone]
+        way = way[np.isfinite(way).all(-1)]
+        if len(way) > 1:
+            pieces = np.stack([way[:-1], way[1:]], axis=1).astype(np.float32)
+            scene.add_line_segments(
+                f"/ways/{drone}", pieces, _rgb(colors[drone]), thickness=1.5, thickness_units="screen"
+            )
+    balls = [
+        scene.add_icosphere(f"/setpoints/{drone}", radius=0.02, color=_rgb(colors[drone]))
+        for drone in range(flight.setpoint.shape[2])
+    ]
+
+    recording = server.get_scene_serializer()
+    end = float(flight.time[-1])
+    times = np.linspace(0, end, int(np.ceil(FPS * end)) + 1)  # viser itself puts nothing between two moments
+    shown: dict[Any, NDArray] = {}
+
+    def move(handle: Any, pos: NDArray, quat: NDArray | None = None) -> None:
+        pose = np.concatenate([pos, [] if quat is None else np.roll(quat, 1)])
+        if not np.isfinite(pose).all() or np.array_equal(shown.get(handle.name, np.inf), pose):
+            return  # what stands still is sent once, and a world that broke stays where it was last seen
+        shown[handle.name] = pose
+        handle.position = pose[:3]
+        if quat is not None:
+            handle.wxyz = pose[3:]
+
+    for i, time in enumerate(times):
+        if i:
+            recording.insert_sleep(float(time - times[i - 1]))
+        now = flight.at(float(time))
+        for ids, pos, quat in (
+            (flight.drone_ids, now["pos"][k], now["quat"][k]),
+            (flight.body_ids, now["body_pos"][k], now["body_quat"][k]),
+        ):
+            for mocap, p, q in zip(ids, pos, quat, strict=True):
+                move(frames[int(mocap)], p, q)
+        for ball, p in zip(balls, now["setpoint"][k], strict=True):
+            move(ball, p)
+    return recording
+
+
+def _add(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> None:
+    """Add shapes of one body and one colour: the planes each, all others as one mesh."""
+    import trimesh
+
+    meshes = []
+    for i, shape in enumerate(shapes):
+        if shape.kind == "plane":
+            width, height = (2 * FAR if size == 0 else 2 * float(size) for size in shape.size[:2])
+            scene.add_grid(
+                f"{name}/plane{i}", width, height, cell_size=1.0, cell_color=_rgb(rgba, 0.9), section_size=5.0,
+                section_color=_rgb(rgba, 0.8), plane_color=_rgb(rgba), plane_opacity=float(rgba[3]),
+                infinite_grid=not shape.size[:2].any(), fade_distance=2 * FAR,
+                position=shape.pos, wxyz=np.roll(shape.quat, 1),
+            )  # fmt: skip
+            continue
+        mesh = _mesh(shape)
+        turn = np.eye(4)
+        turn[:3, :3] = trimesh.transformations.quaternion_matrix(np.roll(shape.quat, 1))[:3, :3]
+        turn[:3, 3] = shape.pos
+        meshes.append(mesh.apply_transform(turn))
+    if meshes:
+        mesh = trimesh.util.concatenate(meshes)
+        scene.add_mesh_simple(
+            name,
+            np.asarray(mesh.vertices, np.float32),
+            np.asarray(mesh.faces, np.uint32),
+            color=_rgb(rgba),
+            opacity=None if rgba[3] >= 1 else float(rgba[3]),
+            flat_shading=True,
+            side="double",
+        )
+
+
+def _mesh(shape: VisualGeom) -> Any:
+    """Return a shape as triangles, in its own frame."""
+    import trimesh
+
+    radius, half = float(shape.size[0]), float(shape.size[1])
+    if shape.kind == "box":
+        return trimesh.creation.box(extents=2 * shape.size)
+    if shape.kind == "cylinder":
+        return trimesh.creation.cylinder(radius=radius, height=2 * half, sections=24)
+    if shape.kind == "capsule":
+        return trimesh.creation.capsule(radius=radius, height=2 * half, count=[12, 12])
+    if shape.kind == "mesh":
+        return trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    return mesh.apply_scale(shape.size if shape.kind == "ellipsoid" else radius)
+
+
+def _rgb(rgba: Any, darker: float = 1.0) -> tuple[int, int, int]:
+    r, g, b = (round(255 * darker * float(np.clip(channel, 0, 1))) for channel in rgba[:3])
+    return r, g, b
+
+
+def _viser() -> Any:
+    try:
+        import viser
+    except ImportError as error:
+        raise ImportError("flights in a browser need viser; pip install 'crazysim[web]'") from error
+    return viser
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]

@@ -1,0 +1,120 @@
+"""What a simulation knows at the start: places, sizes, rates and which controllers there are."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import PAIRS, shared_sim
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crazysim import Sim, load_airframe
+from crazysim.core.data import SimState, as_key, command_shape, create_params, grid_2d, n_rotor_states
+from crazysim.dynamics import Dynamics, first_principles, fitted
+
+
+@given(n=st.integers(1, 200), spacing=st.floats(0.1, 5))
+def test_grid_2d_keeps_distance_and_fills_from_its_centre(n, spacing):
+    points = grid_2d(n, spacing)
+    assert points.shape == (n, 2)
+    between = np.linalg.norm(points[:, None] - points[None], axis=-1) + np.where(np.eye(n), np.inf, 0)
+    if n > 1:
+        assert np.min(between) == pytest.approx(spacing)
+    from_centre = np.linalg.norm(points, axis=-1)
+    assert np.all(np.diff(from_centre) >= -1e-12)
+    assert from_centre[-1] <= spacing * np.sqrt(n) / np.sqrt(2) + spacing
+
+
+def test_grid_2d_of_one_and_of_four():
+    np.testing.assert_array_equal(grid_2d(1), [[0, 0]])
+    np.testing.assert_array_equal(np.sort(grid_2d(4), axis=0), [[-0.5, -0.5], [-0.5, -0.5], [0.5, 0.5], [0.5, 0.5]])
+
+
+def test_drones_begin_at_rest_level_and_alike_in_every_world():
+    states = SimState.create(3, 5, n_rotors=6)
+    np.testing.assert_array_equal(states.pos[0], states.pos[2])
+    np.testing.assert_array_equal(states.pos[..., 2], np.zeros((3, 5)))
+    np.testing.assert_array_equal(states.quat, np.broadcast_to([0, 0, 0, 1], (3, 5, 4)))
+    for name in ("vel", "ang_vel", "force", "torque", "rotor_vel"):
+        assert not np.any(getattr(states, name)), name
+    assert states.rotor_vel.shape == (3, 5, 6)
+
+
+USED = {
+    ("first_principles", "state"): {"state", "attitude", "force_torque", "rotor_vel"},
+    ("first_principles", "attitude"): {"attitude", "force_torque", "rotor_vel"},
+    ("first_principles", "body_rate"): {"body_rate", "force_torque", "rotor_vel"},
+    ("first_principles", "force_torque"): {"force_torque", "rotor_vel"},
+    ("first_principles", "rotor_vel"): {"rotor_vel"},
+}
+
+
+@pytest.mark.parametrize("dynamics, control", PAIRS)
+def test_controllers_that_are_not_in_use_are_none(dynamics, control):
+    controls = shared_sim(n_worlds=2, n_drones=2, dynamics=dynamics, control=control).data.controls
+    fields = ("state", "attitude", "body_rate", "force_torque", "rotor_vel")
+    expected = USED.get((dynamics, control), {"state", "attitude"} if control == "state" else {"attitude"})
+    assert {name for name in fields if getattr(controls, name) is not None} == expected
+    assert controls.mode == control
+
+
+@pytest.mark.parametrize("dynamics, control", PAIRS)
+def test_nothing_is_commanded_at_the_start(dynamics, control):
+    """A state setpoint at the origin with yaw zero, no thrust at every other level."""
+    data = shared_sim(n_worlds=2, n_drones=2, dynamics=dynamics, control=control).data
+    for ctrl in (data.controls.attitude, data.controls.body_rate, data.controls.force_torque):
+        if ctrl is not None:
+            assert not np.any(ctrl.cmd)
+            assert not np.any(ctrl.staged_cmd)
+    if data.controls.state is not None:
+        expected = np.zeros((2, 2, 16))
+        expected[..., 12] = 1
+        np.testing.assert_array_equal(data.controls.state.staged_cmd, expected)
+    assert command_shape(data, control) == (2, 2, {"state": 16}.get(control, 4))
+
+
+def test_default_rates_are_100_hz_for_state_and_500_below_or_the_next_divisor():
+    ctrl = shared_sim(n_worlds=2, n_drones=2, dynamics="first_principles", control="state").data.controls
+    assert (ctrl.state.freq, ctrl.attitude.freq, ctrl.force_torque.freq) == (100, 500, 500)
+    slow = Sim(control="state", freq=240)
+    assert (slow.data.controls.state.freq, slow.data.controls.attitude.freq) == (80, 240)
+    fast = Sim(control="state", freq=1000)
+    assert (fast.control_freq, fast.data.controls.attitude.freq) == (100, 500)
+    assert Sim(control="rotor_vel", freq=240).control_freq == 240
+
+
+@pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag"])
+def test_parameters_are_those_of_the_model_and_shared(dynamics):
+    airframe = load_airframe("cf21B_500")
+    dynamics = Dynamics(dynamics)
+    params = create_params(dynamics, airframe)
+    assert isinstance(params, first_principles.Params if dynamics == "first_principles" else fitted.Params)
+    assert n_rotor_states(dynamics, airframe) == 4
+    assert all(leaf.ndim <= 2 for leaf in jax.tree.leaves(params))
+    if isinstance(params, fitted.Params):
+        assert (params.thrust_dyn_coef is None) == (dynamics == "so_rpy")
+        assert (params.drag_matrix is None) == (dynamics != "so_rpy_rotor_drag")
+
+
+def test_a_seed_becomes_a_key_and_a_key_stays():
+    key = jax.random.key(3)
+    assert as_key(key) is key
+    for seed in (3, np.int32(3), jnp.int32(3)):
+        np.testing.assert_array_equal(jax.random.key_data(as_key(seed)), jax.random.key_data(key))
+
+
+def test_everything_is_float64_under_x64(x64):
+    data = Sim(control="state").data
+    types = {x.dtype.name for x in jax.tree.leaves(data) if jnp.issubdtype(x.dtype, jnp.floating)}
+    assert types == {"float64"}
+    assert data.core.steps.dtype == jnp.int32
+
+
+def test_no_two_leaves_share_a_buffer_that_a_rollout_may_give_away():
+    """A leaf that a user donates (``donate_argnums``) must not take another one along: commands start apart."""
+    data = shared_sim(n_worlds=2, n_drones=2, dynamics="first_principles", control="state").data
+    pointers = {}
+    for path, x in jax.tree_util.tree_leaves_with_path(data):
+        if not jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            pointers.setdefault(x.unsafe_buffer_pointer(), []).append(jax.tree_util.keystr(path))
+    assert not [names for names in pointers.values() if len(names) > 1]

@@ -1,0 +1,205 @@
+"""Pipelines: named stages that are added, exchanged and taken out, and the checks on what a stage returns."""
+
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import Sim
+from crazysim.core.pipeline import (
+    append_fn,
+    insert_fn_after,
+    insert_fn_before,
+    prepend_fn,
+    remove_fn,
+    replace_fn,
+)
+from crazysim.errors import UnknownNameError
+
+
+def first(x):
+    return x
+
+
+def second(x):
+    return x
+
+
+def third(x):
+    return x
+
+
+@pytest.fixture
+def pipeline():
+    return {"first": first, "second": second}
+
+
+@pytest.mark.parametrize(
+    "change, order",
+    [
+        (lambda p: append_fn(p, third), "first second third"),
+        (lambda p: prepend_fn(p, third), "third first second"),
+        (lambda p: insert_fn_before(p, "first", third), "third first second"),
+        (lambda p: insert_fn_before(p, "second", third), "first third second"),
+        (lambda p: insert_fn_after(p, "first", third), "first third second"),
+        (lambda p: insert_fn_after(p, "second", third), "first second third"),
+        (lambda p: append_fn(p, third, "wind"), "first second wind"),
+        (lambda p: append_fn(p, partial(third), name="wind"), "first second wind"),
+        (lambda p: append_fn(p, lambda x: x, name="wind"), "first second wind"),
+        (lambda p: replace_fn(p, third, "first"), "first second"),
+        (lambda p: remove_fn(p, "first"), "second"),
+    ],
+)
+def test_every_change_keeps_the_order_of_the_rest(pipeline, change, order):
+    held = pipeline
+    assert change(pipeline) is None
+    assert " ".join(pipeline) == order
+    assert held is pipeline, "changed in place"
+
+
+def test_replace_keeps_the_place_and_exchanges_the_function(pipeline):
+    replace_fn(pipeline, third, "first")
+    assert list(pipeline.items()) == [("first", third), ("second", second)]
+
+
+@pytest.mark.parametrize(
+    "change, error, fragment",
+    [
+        (lambda p: append_fn(p, first), UnknownNameError, "stage named 'first' already exists"),
+        (lambda p: prepend_fn(p, third, "second"), UnknownNameError, "stage named 'second' already exists"),
+        (
+            lambda p: insert_fn_before(p, "zeroth", third),
+            UnknownNameError,
+            "No stage named 'zeroth' in the pipeline; its stages are first, second",
+        ),
+        (
+            lambda p: insert_fn_after(p, "zeroth", third),
+            UnknownNameError,
+            "No stage named 'zeroth' in the pipeline; its stages are first, second",
+        ),
+        (
+            lambda p: replace_fn(p, third, "third"),
+            UnknownNameError,
+            "No stage named 'third' in the pipeline; its stages are first, second",
+        ),
+        (
+            lambda p: remove_fn(p, "third"),
+            UnknownNameError,
+            "No stage named 'third' in the pipeline; its stages are first, second",
+        ),
+        (lambda p: append_fn(p, partial(third)), ValueError, "needs an explicit name; pass name="),
+        (lambda p: append_fn(p, lambda x: x), ValueError, "needs an explicit name; pass name="),
+        (lambda p: append_fn(p, 3), ValueError, "a stage is a function, not 3"),
+    ],
+)
+def test_changes_that_cannot_be_leave_the_pipeline_as_it_was(pipeline, change, error, fragment):
+    with pytest.raises(error) as raised:
+        change(pipeline)
+    assert fragment in str(raised.value)
+    assert isinstance(raised.value, ValueError)
+    assert list(pipeline.items()) == [("first", first), ("second", second)]
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return Sim(n_worlds=2, n_drones=2)
+
+
+@pytest.fixture(autouse=True)
+def restore(request):
+    """Give the shared simulation its own stages and data back."""
+    if "sim" not in request.fixturenames:
+        yield
+        return
+    sim = request.getfixturevalue("sim")
+    data, stages, resets = sim.data, dict(sim.step_pipeline), dict(sim.reset_pipeline)
+    yield
+    sim.data, sim.step_pipeline, sim.reset_pipeline = data, stages, resets
+    sim.build_step_fn()
+    sim.build_reset_fn()
+
+
+def lift(data):
+    return data.replace(states=data.states.replace(pos=data.states.pos + jnp.asarray([0, 0, 1.0])))
+
+
+def double(data):
+    return data.replace(states=data.states.replace(pos=data.states.pos * 2))
+
+
+def test_a_change_takes_effect_when_the_step_is_built(sim):
+    sim.step_pipeline = {"increment_steps": sim.step_pipeline["increment_steps"]}
+    before_building = sim.build_step_fn()
+    start = sim.data
+    append_fn(sim.step_pipeline, lift)
+    sim.step(3)
+    np.testing.assert_array_equal(sim.data.states.pos, start.states.pos)
+    sim.build_step_fn()
+    sim.step(3)
+    np.testing.assert_allclose(sim.data.states.pos[..., 2], start.states.pos[..., 2] + 3)
+    # What was built before is a snapshot, and stays one.
+    np.testing.assert_array_equal(before_building(start, 3).states.pos, start.states.pos)
+
+
+def test_stages_run_in_their_order(sim):
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.zeros((2, 2, 3))))
+    heights = []
+    for stages in ({"lift": lift, "double": double}, {"double": double, "lift": lift}):
+        sim.step_pipeline = stages
+        heights.append(float(sim.build_step_fn()(sim.data, 2).states.pos[0, 0, 2]))
+    assert heights == [6.0, 3.0]  # (((0 + 1) * 2) + 1) * 2, and ((0 * 2) + 1) * 2 + 1
+
+
+def test_reset_stages_take_effect_when_the_reset_is_built(sim):
+    def raise_them(data, default_data, mask=None):
+        del default_data, mask
+        return lift(data)
+
+    append_fn(sim.reset_pipeline, raise_them)
+    sim.reset()
+    np.testing.assert_array_equal(sim.data.states.pos, sim.default_data.states.pos)
+    sim.build_reset_fn()
+    sim.reset()
+    np.testing.assert_allclose(sim.data.states.pos[..., 2], sim.default_data.states.pos[..., 2] + 1)
+
+
+def drops_a_field(data):
+    return data.replace(controls=data.controls.replace(rotor_vel=None))
+
+
+def brings_a_plugin(data):
+    return data.replace(plugins={"wind": jnp.zeros(3)})
+
+
+def grows_a_leaf(data):
+    return data.replace(states=data.states.replace(force=jnp.zeros((2, 2, 6))))
+
+
+def shrinks_a_leaf(data):
+    return data.replace(states=data.states.replace(force=jnp.zeros(3)))
+
+
+def casts_a_leaf(data):
+    return data.replace(core=data.core.replace(steps=data.core.steps.astype(jnp.float32)))
+
+
+@pytest.mark.parametrize(
+    "stage, fragments",
+    [
+        (drops_a_field, ("changed the structure", "before the step")),
+        (brings_a_plugin, ("changed the structure", "sim.data.replace")),
+        (grows_a_leaf, ("shape (2, 2, 3)", "shape (2, 2, 6)")),
+        (shrinks_a_leaf, ("shape (2, 2, 3)", "shape (3,)")),
+        (casts_a_leaf, ("type int32", "type float32")),
+    ],
+)
+def test_a_stage_that_changes_what_data_is_made_of_is_named(sim, stage, fragments):
+    insert_fn_before(sim.step_pipeline, "integration", stage)
+    sim.build_step_fn()
+    before = sim.data
+    with pytest.raises(ValueError) as error:
+        sim.step()
+    for fragment in (f"stage {stage.__name__!r}", *fragments):
+        assert fragment in str(error.value)
+    assert sim.data is before

@@ -1,0 +1,215 @@
+"""Parameters and disturbances drawn per world and drone, each as a stage of a pipeline; effects checked by physics."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import hover_command, hover_rotor_state, to_all, with_states
+
+from crazysim import PyTree, Sim, leaf
+from crazysim.core.pipeline import append_fn, insert_fn_before, prepend_fn
+from crazysim.core.random import drone_keys, world_keys
+from crazysim.pytree import select_worlds
+
+N_WORLDS, N_DRONES, N = 3, 2, 100
+T = N / 500
+
+
+def draw(keys, low, high, shape=(1,)):
+    """Return one uniform draw for every key of (n_worlds, n_drones)."""
+    one = lambda key: jax.random.uniform(key, shape, minval=low, maxval=high)  # noqa: E731
+    return jax.vmap(jax.vmap(one))(keys)
+
+
+def drawn_mass(data, default_data, mask=None):
+    """Scale every drone's mass by 0.7 to 1.4."""
+    mass = default_data.params.mass * draw(drone_keys(data, "mass"), 0.7, 1.4)
+    return data.replace(params=data.params.replace(mass=select_worlds(mask, mass, data.params.mass)))
+
+
+def drawn_inertia(data, default_data, mask=None):
+    """Scale every drone's inertia by 0.5 to 2, and its inverse along."""
+    scale, p = draw(drone_keys(data, "inertia"), 0.5, 2.0, (1, 1)), default_data.params
+    J, J_inv = p.J * scale, p.J_inv / scale
+    params = data.params.replace(
+        J=select_worlds(mask, J, data.params.J), J_inv=select_worlds(mask, J_inv, data.params.J_inv)
+    )
+    return data.replace(params=params)
+
+
+def drawn_motors(data, default_data, mask=None):
+    """Scale the thrust of each of the four rotors of every drone by 0.8 to 1.2."""
+    curve = default_data.params.rpm2thrust * draw(drone_keys(data, "motors"), 0.8, 1.2, (4, 1))
+    return data.replace(params=data.params.replace(rpm2thrust=select_worlds(mask, curve, data.params.rpm2thrust)))
+
+
+def build(*reset_stages, control="rotor_vel"):
+    """Return hovering drones whose parameters were drawn by the stages, and their step."""
+    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control=control, rng_key=5)
+    sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=hover_rotor_state(sim.data))
+    nominal = sim.build_default_data()
+    for stage in reset_stages:
+        append_fn(sim.reset_pipeline, stage)
+    sim.build_reset_fn()
+    sim.reset()
+    getattr(sim, f"{control}_control")(to_all(nominal, hover_command(nominal)))
+    return sim, nominal
+
+
+def test_a_drawn_mass_sinks_or_climbs_as_newton_has_it():
+    """At the thrust that carries the nominal mass m0 a mass m accelerates by g (m0 / m - 1), less drag."""
+    sim, nominal = build(drawn_mass)
+    mass = np.asarray(sim.data.params.mass, np.float64)
+    assert mass.shape == (N_WORLDS, N_DRONES, 1)
+    assert len(np.unique(mass)) == N_WORLDS * N_DRONES
+    sim.step(N)
+    m0, drag = float(nominal.params.mass[0]), float(nominal.params.drag_matrix[2, 2])
+    acc, rate = 9.81 * (m0 / mass[..., 0] - 1), -drag / mass[..., 0]
+    expected = acc / rate * (1 - np.exp(-rate * T))
+    # explicit Euler is off by half a step in time, 0.5 % at 0.2 s with drag of 0.6 per s; hover in float32 by 1e-4 m/s
+    np.testing.assert_allclose(sim.data.states.vel[..., 2], expected, rtol=2e-3, atol=2e-4)
+    heavier = mass[..., 0] > m0
+    assert heavier.any()
+    assert not heavier.all()
+    np.testing.assert_array_equal(np.asarray(sim.data.states.vel[..., 2]) < 0, heavier)
+
+    # A reset of one world draws there anew, and leaves the masses of the others.
+    sim.reset(np.array([False, True, False]))
+    again = np.asarray(sim.data.params.mass, np.float64)
+    np.testing.assert_array_equal(again[::2], mass[::2])
+    assert not np.any(again[1] == mass[1])
+
+
+def test_under_attitude_commands_the_heavier_drone_hangs_lower():
+    sim, _ = build(drawn_mass, control="attitude")
+    sim.step(N)
+    mass, height = np.asarray(sim.data.params.mass).ravel(), np.asarray(sim.data.states.pos[..., 2]).ravel()
+    np.testing.assert_array_equal(np.argsort(mass), np.argsort(-height))
+    assert np.ptp(height) > 0.05
+
+
+def test_a_drawn_inertia_answers_a_torque_in_proportion():
+    """A small external torque turns a drone at rest by J w' = tau: twice the inertia, half the rate."""
+    sim, nominal = build(drawn_inertia)
+    p = sim.data.params
+    eye = np.broadcast_to(np.eye(3), (N_WORLDS, N_DRONES, 3, 3))
+    np.testing.assert_allclose(p.J @ p.J_inv, eye, atol=1e-5)  # float32 product of inverses
+    assert len(np.unique(np.asarray(p.J[..., 0, 0]))) == N_WORLDS * N_DRONES
+    torque = 1e-6
+    sim.data = with_states(sim.data, torque=[torque, 0, 0])
+    sim.step(10)
+    expected = torque * 10 / 500 / np.asarray(p.J[..., 0, 0])
+    # after 20 ms of turning, rotors' gyroscopic torques cancel but for 1e-4 of float32 differences
+    np.testing.assert_allclose(sim.data.states.ang_vel[..., 0], expected, rtol=1e-3)
+    np.testing.assert_allclose(nominal.params.J[0, 0], 25e-6, rtol=1e-6)
+
+
+def test_drawn_motors_push_and_tilt_as_their_thrusts_have_it():
+    """Rotors at hover speed with thrusts off by drawn factors: acceleration by their mean, roll by left over right."""
+    sim, nominal = build(drawn_motors)
+    scale = np.asarray(sim.data.params.rpm2thrust[..., 2] / nominal.params.rpm2thrust[0, 2], np.float64)
+    assert scale.shape == (N_WORLDS, N_DRONES, 4)
+    assert 0.8 <= scale.min() < 0.95
+    assert 1.05 < scale.max() <= 1.2
+    dt = 1 / 500
+    sim.step(1)
+    acc = 9.81 * (scale.mean(axis=-1) - 1)
+    # float32: the last bits of a hover force, 1e-6 of 9.81 m/s^2 over 2 ms
+    np.testing.assert_allclose(sim.data.states.vel[..., 2], acc * dt, atol=1e-6, rtol=1e-4)
+    each, p = float(nominal.params.mass[0]) * 9.81 / 4, nominal.params
+    arm, mixing = float(p.L[0]), np.asarray(p.mixing_matrix, np.float64)
+    torque = (scale * each * arm) @ mixing[:2].T
+    expected = dt * torque / np.diag(p.J)[:2]
+    np.testing.assert_allclose(sim.data.states.ang_vel[..., :2], expected, rtol=1e-3, atol=1e-4)
+
+
+def gusts(data):
+    """Blow on each world with a force of its own, drawn anew every step."""
+    one = lambda key: jax.random.normal(key, (1, 3)) * jnp.asarray([1e-3, 1e-3, 0.0])  # noqa: E731
+    force = jax.vmap(one)(world_keys(data, "gusts"))
+    return data.replace(states=data.states.replace(force=jnp.broadcast_to(force, data.states.force.shape)))
+
+
+def steady_wind(data):
+    """Push along x with 2 mN times the number of the world."""
+    push = 2e-3 * jnp.arange(data.core.n_worlds, dtype=data.states.force.dtype)
+    force = jnp.zeros_like(data.states.force).at[..., 0].set(push[:, None])
+    return data.replace(states=data.states.replace(force=force))
+
+
+def test_a_steady_wind_drives_each_world_by_its_own_force():
+    sim, nominal = build()
+    insert_fn_before(sim.step_pipeline, "integration", steady_wind)
+    sim.build_step_fn()
+    sim.step(N)
+    m, drag = float(nominal.params.mass[0]), -float(nominal.params.drag_matrix[0, 0])
+    force = 2e-3 * np.arange(N_WORLDS)[:, None]
+    expected = np.broadcast_to(force / drag * (1 - np.exp(-drag / m * T)), (N_WORLDS, N_DRONES))
+    # explicit Euler is off by half a step of the drag's decay, 0.05 %
+    np.testing.assert_allclose(sim.data.states.vel[..., 0], expected, rtol=2e-3, atol=1e-6)
+    np.testing.assert_allclose(sim.data.states.vel[..., 1], 0.0, atol=1e-6)
+
+
+def test_gusts_are_new_every_step_and_alike_for_the_drones_of_a_world():
+    sim, _ = build()
+    insert_fn_before(sim.step_pipeline, "integration", gusts)
+    sim.build_step_fn()
+    forces = []
+    for _ in range(3):
+        sim.step()
+        forces.append(np.asarray(sim.data.states.force))
+    forces = np.stack(forces)
+    np.testing.assert_array_equal(forces[:, :, 0], forces[:, :, 1])
+    assert len(np.unique(forces[:, :, 0, 0])) == 3 * N_WORLDS
+    np.testing.assert_array_equal(forces[..., 2], 0.0)
+
+
+class Delay(PyTree):
+    """Commands that are on their way, oldest first."""
+
+    queue: jax.Array = leaf("drone", 2)
+    """(n_worlds, n_drones, k, 4)"""
+
+
+def delay_commands(data):
+    """Put the staged command at the queue's end, and stage the one from its front, k steps old."""
+    ctrl = data.controls.attitude
+    queue = jnp.concatenate([data.plugins["delay"].queue, ctrl.staged_cmd[:, :, None]], axis=2)
+    controls = data.controls.replace(attitude=ctrl.replace(staged_cmd=queue[:, :, 0]))
+    return data.replace(controls=controls, plugins=data.plugins | {"delay": Delay(queue[:, :, 1:])})
+
+
+@pytest.mark.parametrize("k", [1, 5])
+def test_a_delay_of_k_steps_shifts_the_response_by_exactly_k(k):
+    """The queue is a record of the user with declared axes, so a masked reset empties it in its worlds only."""
+    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, dynamics="so_rpy")
+    hover = hover_command(sim.data)
+    command = to_all(sim.data, hover + np.array([0.1, 0.2, 0.3, 0]))
+    waiting = np.broadcast_to(hover.astype(np.float32), (N_WORLDS, N_DRONES, k, 4))
+    sim.data = with_states(sim.data, pos=[0, 0, 10.0]).replace(plugins={"delay": Delay(waiting)})
+    default = sim.build_default_data()
+
+    def flight():
+        track = []
+        for _ in range(12):
+            sim.attitude_control(command)
+            sim.step()
+            track.append(np.asarray(sim.data.states.ang_vel))
+        return np.stack(track)
+
+    at_once = flight()
+    sim.data = default
+    prepend_fn(sim.step_pipeline, delay_commands)
+    sim.build_step_fn()
+    late = flight()
+    assert np.abs(at_once[0]).min() > 1e-2, "without the delay the first step turns the drone already"
+    np.testing.assert_array_equal(late[:k], 0.0)
+    # Two programs of the same arithmetic: an ulp of what they fuse differently, at 2 rad/s.
+    np.testing.assert_allclose(late[k:], at_once[: 12 - k], atol=1e-6, rtol=1e-6)
+
+    before = np.asarray(sim.data.plugins["delay"].queue)
+    sim.reset(np.array([True, False, True]))
+    after = np.asarray(sim.data.plugins["delay"].queue)
+    np.testing.assert_array_equal(after[::2], waiting[::2])
+    np.testing.assert_array_equal(after[1], before[1])
+    assert not np.array_equal(before, waiting)

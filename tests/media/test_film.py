@@ -1,0 +1,174 @@
+"""A film is read back, and looked at frame by frame."""
+
+import builtins
+import re
+import subprocess
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from imageio_ffmpeg import get_ffmpeg_exe
+
+from crazysim.errors import ConfigError, RenderError
+from crazysim.media import Film, Recorder, View
+from crazysim.sim import Sim
+
+WIDTH, HEIGHT = 96, 64
+
+
+@pytest.fixture(scope="module")
+def sim(opengl, plain_scene):
+    """Two worlds whose drones go east by 1 m/s, 0.2 m and 0.5 m ahead, under a camera that looks down."""
+    sim = Sim(n_worlds=2, xml_path=plain_scene)
+    yield sim
+    sim.close()
+
+
+def fly(sim, steps):
+    """Put the drones where they are after so many steps."""
+    pos = jnp.zeros((2, 1, 3)).at[..., 0].set(-0.5 + steps / sim.freq).at[1, :, 1].set(0.3).at[..., 2].set(1.0)
+    core = sim.data.core.replace(steps=jnp.full_like(sim.data.core.steps, steps))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos), core=core)
+
+
+def view(**options):
+    return View(**{"camera": "down", "width": WIDTH, "height": HEIGHT} | options)
+
+
+def read(path):
+    """Return the frames of a film. (n, HEIGHT, WIDTH, 3)"""
+    decode = [get_ffmpeg_exe(), "-loglevel", "error", "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)
+    return pixels.reshape(-1, HEIGHT, WIDTH, 3)
+
+
+def column(frame):
+    """Return the mean column of what is darker than the floor."""
+    return np.nonzero(frame.astype(int).max(-1) < 130)[1].mean()
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_film_shows_the_drone_go_from_left_to_right(sim, tmp_path, suffix):
+    """One second at 1 m/s: 11 frames at 10 Hz, each with the drone further right by as much as it flew."""
+    path = tmp_path / f"flight{suffix}"
+    with Film(path, view(), fps=10) as film:
+        for k in range(11):
+            fly(sim, 50 * k)
+            assert film.add(sim) == 1
+    frames = read(path)
+    assert len(frames) == film.n_frames == 11
+    columns = [column(frame) for frame in frames]
+    focal = 0.5 * HEIGHT / np.tan(np.deg2rad(45 / 2))
+    np.testing.assert_allclose(np.diff(columns), 0.1 * focal, atol=1.5)
+    np.testing.assert_allclose(columns[5] + 0.5, WIDTH / 2, atol=1.5)
+
+
+@pytest.mark.parametrize(("fps", "speed", "n_frames"), [(10, 1.0, 11), (25, 1.0, 26), (10, 0.25, 41), (10, 5.0, 3)])
+def test_frames_go_with_simulated_time(sim, tmp_path, fps, speed, n_frames):
+    """Whatever the rate of calls, a second makes fps / speed frames and the first; too few calls repeat a picture."""
+    drawn = []
+    with Film(tmp_path / "flight.mp4", view(), fps=fps, speed=speed) as film:
+        for k in range(21):
+            fly(sim, 25 * k)
+            drawn.append(film.add(sim))
+    assert sum(drawn) == film.n_frames == len(read(tmp_path / "flight.mp4")) == n_frames
+    assert max(drawn) - min(drawn[1:]) <= 1
+
+
+def test_a_reset_does_not_turn_the_film_back(sim, tmp_path):
+    with Film(tmp_path / "flight.mp4", view(), fps=10) as film:
+        for steps in (0, 50, 100, 0, 50, 100):
+            fly(sim, steps)
+            film.add(sim)
+    assert film.n_frames == 5  # 0.2 s before the reset, 0.2 s after it
+
+
+def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path):
+    """Recorded at 10 Hz and played at 20 Hz: drones are between moments where they flew, and the sim stays as it is."""
+    recorder = Recorder(sim)
+    for k in range(6):
+        fly(sim, 50 * k)
+        recorder.add()
+    fly(sim, 5000)
+    shown = view(worlds=[0, 1], columns=1, border=0)
+    with Film(tmp_path / "flight.mp4", shown, fps=20, progress=True) as film:
+        assert film.play(sim, recorder.flight()) == 11
+    np.testing.assert_allclose(sim.data.states.pos[:, 0, 0], 9.5)
+    np.testing.assert_array_equal(sim.data.core.steps, 5000)
+    frames = read(tmp_path / "flight.mp4")
+    for k in range(2):
+        columns = [column(frame[shown.tile(k)]) for frame in frames]
+        focal = 0.25 * HEIGHT / np.tan(np.deg2rad(45 / 2))
+        np.testing.assert_allclose(np.diff(columns), 0.05 * focal, atol=1.0)
+        np.testing.assert_allclose(columns[10] - columns[0], 0.5 * focal, atol=1.5)
+
+
+def test_pictures_of_ones_own_are_frames(sim, tmp_path):
+    with Film(tmp_path / "flight.mp4", view(), fps=10) as film:
+        film.write(np.full((HEIGHT, WIDTH, 3), 200, np.uint8), 3)
+    frames = read(tmp_path / "flight.mp4")
+    assert len(frames) == 3
+    np.testing.assert_allclose(frames.astype(int), 200, atol=3)
+
+
+# Wrong input ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("flight.avi", {}, "must end with .mp4 or .gif"),
+        ("nowhere/flight.mp4", {}, "there is no folder"),
+        ("flight.mp4", {"fps": 0}, "fps is 0; it must be positive"),
+        ("flight.mp4", {"fps": -5}, "fps is -5"),
+        ("flight.mp4", {"fps": np.nan}, "fps is nan"),
+        ("flight.mp4", {"speed": 0.0}, "speed is 0.0"),
+        ("flight.mp4", {"view": View(width=321, height=240)}, "even sizes only, not 321 x 240 pixels; 322 x 240 would"),
+    ],
+)
+def test_a_film_that_cannot_be_is_told(tmp_path, name, options, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        Film(tmp_path / name, **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_of_nothing_is_told(tmp_path):
+    with pytest.raises(ConfigError, match=r"nothing was recorded.*film\.add\(sim\)"), Film(tmp_path / "flight.mp4"):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_worlds_cameras_and_pictures_that_are_not_there_are_told(sim, tmp_path):
+    with pytest.raises(ConfigError, match="world 2 does not exist"), Film(tmp_path / "a.mp4", view(worlds=[2])) as film:
+        film.add(sim)
+    with pytest.raises(ConfigError, match="no camera 'up'"), Film(tmp_path / "a.mp4", view(camera="up")) as film:
+        film.add(sim)
+    with (
+        pytest.raises(ConfigError, match=r"takes pictures of shape \(64, 96, 3\), uint8; got \(9, 9, 3\), float64"),
+        Film(tmp_path / "a.mp4", view()) as film,
+    ):
+        film.write(np.zeros((9, 9, 3)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_cannot_be_written_is_told(sim, tmp_path):
+    (tmp_path / "flight.mp4").mkdir()
+    with (
+        pytest.raises(RenderError, match=r"flight\.mp4 could not be written: "),
+        Film(tmp_path / "flight.mp4", view()) as film,
+    ):
+        film.add(sim)
+
+
+@pytest.mark.parametrize(("missing", "word"), [("imageio_ffmpeg", "imageio-ffmpeg"), ("tqdm", "tqdm")])
+def test_a_missing_package_is_named(tmp_path, monkeypatch, missing, word):
+    found = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name == missing:
+            raise ImportError(name)
+        return found(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=rf"{word}; pip install 'crazysim\[demo\]'"):
+        Film(tmp_path / "flight.mp4", progress=True)

@@ -1,0 +1,319 @@
+"""A view is looked at: which world is in which tile, what the camera follows, and what is drawn over it."""
+
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import ABOVE, FOVY
+
+from crazysim.errors import ConfigError
+from crazysim.media import View, pictures_of
+from crazysim.sim import Sim
+from crazysim.sim.visualize import draw_points
+
+HEIGHT, WIDTH = 120, 160
+FOCAL = 0.5 * HEIGHT / np.tan(np.deg2rad(FOVY / 2))
+PLACES = np.array([[0.4, 0.2, 0.5], [-0.4, 0.2, 0.5], [-0.4, -0.2, 0.5], [0.4, -0.2, 0.5]])
+"""Where the drone of each world is, m. (4, 3)"""
+RED, GREEN, BLUE = ([1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1])
+
+
+@pytest.fixture(scope="module")
+def sim(opengl, plain_scene):
+    """Four worlds over a plain floor, the drone of each in another corner, under a camera that looks down."""
+    sim = Sim(n_worlds=4, control="state", xml_path=plain_scene)
+    place(sim, PLACES, 0.0)
+    yield sim
+    sim.close()
+
+
+def place(sim, pos, time):
+    states = sim.data.states.replace(pos=jnp.asarray(pos, jnp.float32)[:, None])
+    core = sim.data.core.replace(steps=jnp.full_like(sim.data.core.steps, round(time * sim.freq)))
+    sim.data = sim.data.replace(states=states, core=core)
+
+
+def pixel(point):
+    """Return row and column at which the camera that looks straight down sees a point."""
+    x, y, z = point
+    return 0.5 * HEIGHT - FOCAL * y / (ABOVE - z), 0.5 * WIDTH + FOCAL * x / (ABOVE - z)
+
+
+def dark(tile):
+    """Return the mean row and column of what is darker than the floor."""
+    rows, columns = np.nonzero(tile.astype(int).max(-1) < 100)
+    assert len(rows) > 5
+    return rows.mean() + 0.5, columns.mean() + 0.5
+
+
+def of_colour(picture, rgba):
+    picture, on = picture.astype(int), np.asarray(rgba[:3]) > 0.5
+    return picture[..., on].min(-1) > picture[..., ~on].max(-1) + 60
+
+
+def view(**options):
+    return View(**{"camera": "down", "width": WIDTH, "height": HEIGHT} | options)
+
+
+# The grid -------------------------------------------------------------------------------------------------------
+
+
+def test_each_tile_shows_its_world(sim):
+    """Tile k of a grid is the picture of world k alone, in the order asked for, and borders lie between."""
+    worlds = [2, 0, 3, 1]
+    grid = view(worlds=worlds, width=2 * WIDTH + 4, height=2 * HEIGHT + 4, border=4)
+    picture = grid.picture(sim)
+    assert picture.shape == (2 * HEIGHT + 4, 2 * WIDTH + 4, 3)
+    assert picture.dtype == np.uint8
+    upper, lower, left, right = slice(HEIGHT), slice(HEIGHT + 4, None), slice(WIDTH), slice(WIDTH + 4, None)
+    for k, tile in enumerate([(upper, left), (upper, right), (lower, left), (lower, right)]):
+        np.testing.assert_allclose(dark(picture[tile]), pixel(PLACES[worlds[k]]), atol=1.5)
+        alone = sim.render("rgb_array", worlds[k], "down", None, WIDTH, HEIGHT)
+        np.testing.assert_array_equal(picture[tile], alone)
+        np.testing.assert_array_equal(picture[grid.tile(k)], alone)
+    assert (picture[HEIGHT : HEIGHT + 4] == 40).all()
+    assert (picture[:, WIDTH : WIDTH + 4] == 40).all()
+
+
+@pytest.mark.parametrize(
+    ("n", "columns", "grid", "size"),
+    [
+        (1, None, (1, 1), (100, 60)),
+        (2, None, (1, 2), (49, 60)),
+        (3, 1, (3, 1), (100, 18)),
+        (5, None, (2, 3), (32, 29)),
+        (5, 8, (1, 5), (18, 60)),
+    ],
+)
+def test_grids_are_filled_row_by_row(n, columns, grid, size):
+    shown = View(worlds=range(n), width=100, height=60, columns=columns)
+    assert (shown.grid, shown.tile_size) == (grid, size)
+    seen = np.zeros((60, 100), int)
+    for k in range(n):
+        seen[shown.tile(k)] += 1
+    assert seen.max() == 1
+    assert seen.sum() == n * size[0] * size[1]
+
+
+def test_what_a_user_drew_is_in_every_tile_and_only_once(sim):
+    grid = view(worlds=[0, 1], width=2 * WIDTH, border=0)
+    draw_points(sim, [[0, 0, 1.0]], rgba=GREEN, size=0.05)
+    picture = grid.picture(sim)
+    for k in range(2):
+        rows, columns = np.nonzero(of_colour(picture[grid.tile(k)], GREEN))
+        np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [HEIGHT / 2, WIDTH / 2], atol=0.5)
+    assert not of_colour(grid.picture(sim), GREEN).any()
+
+
+def test_what_a_user_drew_waits_when_a_picture_fails(sim):
+    draw_points(sim, [[0, 0, 1.0]], rgba=GREEN, size=0.05)
+    with pytest.raises(ConfigError, match="no camera 'up'"):
+        view(camera="up", text="failed").picture(sim)
+    picture = view().picture(sim)
+    assert of_colour(picture, GREEN).any()
+    np.testing.assert_array_equal(view().picture(sim), sim.render("rgb_array", 0, "down", None, WIDTH, HEIGHT))
+
+
+# Cameras --------------------------------------------------------------------------------------------------------
+
+
+def test_a_batch_holds_a_picture_of_each_world_in_the_order_asked_for(sim):
+    batch = pictures_of(sim, [2, 0, 3], "down", width=WIDTH, height=HEIGHT)
+    assert batch.shape == (3, HEIGHT, WIDTH, 3)
+    assert batch.dtype == np.uint8
+    for picture, world in zip(batch, (2, 0, 3), strict=True):
+        np.testing.assert_allclose(dark(picture), pixel(PLACES[world]), atol=2)
+    every = pictures_of(sim, camera="down", width=WIDTH, height=HEIGHT)
+    np.testing.assert_array_equal(every[[2, 0, 3]], batch)
+    free = {"lookat": [0, 0, 0], "distance": ABOVE, "azimuth": 90, "elevation": -90}
+    draw_points(sim, np.array([[0, 0, 0.5]]), rgba=RED, size=0.05)
+    marked = pictures_of(sim, [1, 1], cam_config=free, width=WIDTH, height=HEIGHT)
+    for picture in marked:
+        rows, columns = np.nonzero(of_colour(picture, RED))
+        np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [HEIGHT / 2, WIDTH / 2], atol=1)
+    assert not of_colour(pictures_of(sim, [1], "down"), RED).any()
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"worlds": []}, "worlds is empty"),
+        ({"worlds": [4]}, "world 4 does not exist"),
+        ({"height": 0}, "height"),
+        ({"width": 1.5}, "width"),
+        ({"camera": "nose"}, "no camera 'nose'"),
+    ],
+)
+def test_law_09_a_batch_that_cannot_be_is_told(sim, wrong, message):
+    with pytest.raises(ConfigError, match=message):
+        pictures_of(sim, **wrong)
+
+
+def test_a_camera_that_follows_keeps_each_worlds_drone_in_its_middle(sim):
+    """Without lag every drone is in the middle of its tile; a camera that stands still sees it elsewhere."""
+    down = {"distance": 1.5, "azimuth": 90, "elevation": -90}
+    follow = view(worlds=[0, 2], camera=-1, cam_config=down, follow=0, lag=0, width=2 * WIDTH, border=0)
+    fixed = view(worlds=[0, 2], camera=-1, cam_config=down | {"lookat": [0, 0, 0.5]}, width=2 * WIDTH, border=0)
+    for k in range(2):
+        np.testing.assert_allclose(dark(follow.picture(sim)[follow.tile(k)]), [HEIGHT / 2, WIDTH / 2], atol=2)
+        assert abs(dark(fixed.picture(sim)[fixed.tile(k)])[1] - WIDTH / 2) > 20
+
+
+def test_a_camera_that_follows_lags_behind(sim):
+    """After a jump of 0.2 m its middle has gone 1 - exp(-t / lag) of the way; after a reset all of it."""
+    config = {"distance": 1.5, "azimuth": 90, "elevation": -90}
+    follow = view(camera=-1, cam_config=config, follow=0, lag=0.5)
+    place(sim, PLACES, 1.0)
+    follow.picture(sim)
+    place(sim, PLACES + [0.2, 0, 0], 1.5)
+    moved = dark(follow.picture(sim))[1] - WIDTH / 2
+    place(sim, PLACES + [0.1, 0, 0], 0.0)
+    after_reset = dark(follow.picture(sim))[1] - WIDTH / 2
+    place(sim, PLACES, 0.0)
+    focal = 0.5 * HEIGHT / np.tan(np.deg2rad(sim.mj_model.vis.global_.fovy / 2))
+    np.testing.assert_allclose(moved, focal * 0.2 * np.exp(-1) / 1.5, atol=1.5)
+    np.testing.assert_allclose(after_reset, 0, atol=1.5)
+
+
+def test_a_camera_may_move_with_time(sim):
+    """Its settings may be a function of time: here the camera goes east by 0.1 m/s, and the drone west."""
+    moving = view(
+        camera=-1,
+        cam_config=lambda time: {"lookat": [0.1 * time, 0, 0.5], "distance": 1.5, "azimuth": 90, "elevation": -90},
+    )
+    columns = []
+    for time in (0.0, 2.0):
+        place(sim, PLACES, time)
+        columns.append(dark(moving.picture(sim))[1])
+    place(sim, PLACES, 0.0)
+    focal = 0.5 * HEIGHT / np.tan(np.deg2rad(sim.mj_model.vis.global_.fovy / 2))
+    np.testing.assert_allclose(columns[0] - columns[1], focal * 0.2 / 1.5, atol=1.5)
+
+
+# What is drawn over it ------------------------------------------------------------------------------------------
+
+
+def test_a_trail_follows_the_way_of_each_worlds_drone(sim):
+    """Its pixels lie on the way that was flown, from end to end, in its own world only, and fade to its beginning."""
+    shown = view(worlds=[0, 1], width=2 * WIDTH, border=0, trail=5.0, rgba=BLUE)
+    x = np.linspace(-0.5, 0.5, 11)
+    for k in range(11):
+        pos = PLACES.copy()
+        pos[0], pos[1] = [x[k], 0.1, 1.0], [0.3, 0.6 * x[k], 1.0]
+        place(sim, pos, 0.1 * k)
+        picture = shown.picture(sim)
+    place(sim, PLACES, 0.0)
+    east, north = (of_colour(picture[shown.tile(k)], BLUE) for k in range(2))
+    rows, columns = np.nonzero(east)
+    assert np.abs(rows + 0.5 - pixel([0, 0.1, 1])[0]).max() < 3
+    # The drone hides the end of its way, and the faint beginning is no longer blue enough.
+    assert columns.min() < pixel([-0.25, 0.1, 1])[1]
+    assert columns.max() > pixel([0.4, 0.1, 1])[1]
+    rows, columns = np.nonzero(north)
+    assert np.abs(columns + 0.5 - pixel([0.3, 0, 1])[1]).max() < 3
+    blueness = picture[shown.tile(0)].astype(int) @ [-1, 0, 1]
+    row = int(pixel([0, 0.1, 1])[0])
+    old, new = (blueness[row - 2 : row + 3, int(pixel([at, 0.1, 1])[1])].max() for at in (-0.35, 0.35))
+    assert 20 < old < new - 60
+
+
+def test_setpoints_are_seen_where_commands_want_the_drones(sim):
+    """Each world's tile has a green sphere at its own setpoint."""
+    command = np.zeros((4, 1, 16))
+    command[..., 12] = 1
+    command[:, 0, :3] = -PLACES + [0, 0, 1.5]
+    data = sim.data
+    sim.state_control(command)
+    shown = view(worlds=[0, 1, 2, 3], width=2 * WIDTH, height=2 * HEIGHT, border=0, setpoints=True, rgba=GREEN)
+    picture = shown.picture(sim)
+    sim.data = data
+    for k in range(4):
+        rows, columns = np.nonzero(of_colour(picture[shown.tile(k)], GREEN))
+        np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], pixel(command[k, 0, :3]), atol=1.0)
+
+
+def test_text_changes_its_corner_and_nothing_else(sim):
+    """Text stands at the top left of each tile, says which world it is, and leaves every other pixel alone."""
+    options = {"worlds": [0, 1], "width": 2 * WIDTH, "border": 0}
+    plain, shown = view(**options), view(**options, text="world {world}  {time:.2f} s")
+    before, after = plain.picture(sim), shown.picture(sim)
+    tiles = []
+    for k in range(2):
+        changed = (before != after)[shown.tile(k)].any(-1)
+        rows, columns = np.nonzero(changed)
+        assert len(rows) > 200
+        assert rows.max() < 30
+        assert columns.max() < 0.75 * WIDTH
+        tiles.append(after[shown.tile(k)][:30, :120])
+    assert (tiles[0] != tiles[1]).any(), "the number of the world is another"
+    bright = tiles[0].min(-1) > 230
+    assert 30 < bright.sum() < 600, "letters are bright on a dark ground"
+    np.testing.assert_array_equal(shown.picture(sim), after)
+    np.testing.assert_array_equal(plain.picture(sim), before)
+
+
+# Wrong input ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"worlds": []}, "at least one world"),
+        ({"worlds": [0, 4]}, "world 4 does not exist; worlds go from 0 to 3"),
+        ({"worlds": [0.5]}, "world 0.5 does not exist"),
+        ({"worlds": range(100), "width": 20}, "100 worlds do not fit into a picture of 20 x 120"),
+        ({"width": 0}, "width is 0; it must be a positive"),
+        ({"height": -2}, "height is -2; it must be a positive"),
+        ({"border": -1}, "border is -1"),
+        ({"columns": 0}, "columns is 0"),
+        ({"camera": "up"}, "no camera 'up'"),
+        ({"follow": 0}, "only the free camera, -1, can follow a drone; camera is 'down'"),
+        ({"camera": -1, "follow": 1}, "drone 1 does not exist; drones go from 0 to 0"),
+        ({"camera": -1, "follow": 0, "lag": -1.0}, "lag is -1.0 s"),
+        ({"trail": -1.0}, "a trail of -1.0 s cannot be"),
+        ({"text": "{drone}"}, "'{drone}' cannot be filled in"),
+        ({"text": "Zürich"}, "ASCII letters only; 'Zürich' has 'ü'"),
+    ],
+)
+def test_a_view_that_cannot_be_is_told(sim, wrong, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        view(**wrong).picture(sim)
+    assert len(sim.marks) == 0
+
+
+def test_setpoints_need_state_commands(opengl):
+    sim = Sim(control="attitude")
+    with pytest.raises(ConfigError, match="control='attitude'"):
+        View(width=32, height=24, setpoints=True).picture(sim)
+
+
+# Many worlds at once ----------------------------------------------------------------------------------------------
+
+
+def test_warp_draws_what_the_plain_renderer_draws(opengl, plain_scene):
+    """The same places, colours and shapes; edges and shadows are drawn in other ways."""
+    pytest.importorskip("warp")
+    sim = Sim(n_worlds=4, control="state", xml_path=plain_scene)
+    sim.scene.add("box", "lamp", pos=[0.0, 0.1, 0.2], size=(0.1, 0.1, 0.1), rgba=(1, 0, 0, 1))
+    place(sim, PLACES, 0.0)
+    size = {"camera": "down", "width": WIDTH, "height": HEIGHT}
+    plain, warp = (pictures_of(sim, [2, 0, 3], renderer=name, **size) for name in ("plain", "warp"))
+    assert warp.shape == plain.shape
+    assert warp.dtype == plain.dtype
+    for picture, expected, world in zip(warp, plain, (2, 0, 3), strict=True):
+        np.testing.assert_allclose(dark(picture), pixel(PLACES[world]), atol=2)
+        places = [np.argwhere(of_colour(x, RED)).mean(axis=0) for x in (picture, expected)]
+        np.testing.assert_allclose(*places, atol=1)
+    assert np.abs(warp.astype(int) - plain).mean() < 6, "of 255: floor and sky are the same"
+    moved = pictures_of(sim, [0, 0, 0], renderer="warp", **size)
+    np.testing.assert_array_equal(moved[0], moved[2])
+    np.testing.assert_array_equal(moved[0], warp[1])
+    with pytest.raises(ConfigError, match="not the free camera"):
+        pictures_of(sim, [0], renderer="warp")
+    with pytest.raises(ConfigError, match="no camera 'nose'"):
+        pictures_of(sim, [0], "nose", renderer="warp")
+    with pytest.raises(ConfigError, match="0 x 8 pixels"):
+        pictures_of(sim, [0], "down", width=0, height=8, renderer="warp")
+    with pytest.raises(ConfigError, match="renderer 'cycles' does not exist"):
+        pictures_of(sim, [0], "down", renderer="cycles")

@@ -1,0 +1,328 @@
+"""What is drawn into a picture is there in its colour and at its place, and in that picture only."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import ABOVE, FOVY
+
+from crazysim.scene.overlays import Marks
+from crazysim.sim import Sim
+from crazysim.sim.visualize import (
+    change_material,
+    draw_capsule,
+    draw_label,
+    draw_line,
+    draw_points,
+    draw_setpoints,
+    draw_text,
+)
+
+HEIGHT, WIDTH = 180, 240
+FOCAL = 0.5 * HEIGHT / np.tan(np.deg2rad(FOVY / 2))
+DRONES = np.array([[0.3, 0.0, 1.4], [-0.3, 0.0, 1.4]])
+RED, GREEN, BLUE = ([1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1])
+
+
+@pytest.fixture(scope="module")
+def sim(opengl, plain_scene):
+    """Two worlds of two drones near a camera that looks straight down on a plain floor."""
+    sim = Sim(n_worlds=2, n_drones=2, xml_path=plain_scene)
+    pos = jnp.broadcast_to(jnp.asarray(DRONES), (2, 2, 3))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    yield sim
+    sim.close()
+
+
+def shoot(sim, **options):
+    picture = sim.render(**{"mode": "rgb_array", "camera": "down", "width": WIDTH, "height": HEIGHT} | options)
+    return picture.astype(int)
+
+
+def of_colour(picture, rgba):
+    """Return which pixels have a colour's hue: its channels far above the others."""
+    on = np.asarray(rgba[:3]) > 0.5
+    return picture[..., on].min(-1) > picture[..., ~on].max(-1) + 60
+
+
+def seen_at(mask):
+    """Return the rows and columns of a mask's pixels in metres east and north of the camera, one metre away."""
+    rows, columns = np.nonzero(mask)
+    return (columns + 0.5 - 0.5 * WIDTH) / FOCAL, (0.5 * HEIGHT - rows - 0.5) / FOCAL
+
+
+def test_points_are_spheres_of_their_radius(sim):
+    """Two green points: each a disc in the picture, of its radius and at its place, and gone in the next picture."""
+    plain = shoot(sim)
+    draw_points(sim, [[0.0, 0.2, 1.0], [0.0, -0.3, 1.0]], rgba=GREEN, size=0.05)
+    marked = shoot(sim)
+    x, y = seen_at(of_colour(marked, GREEN))  # one metre below the camera
+    for north in (0.2, -0.3):
+        near = np.sign(y) == np.sign(north)
+        np.testing.assert_allclose([x[near].mean(), y[near].mean()], [0, north], atol=0.01)
+        area = near.sum() / FOCAL**2
+        np.testing.assert_allclose(area, np.pi * 0.05**2, rtol=0.15)
+    np.testing.assert_array_equal(shoot(sim), plain)
+
+
+def test_a_line_goes_through_its_points(sim):
+    """Blue along an L: every pixel lies on one of its two legs, and both legs are covered end to end."""
+    draw_line(sim, [[-0.4, -0.3, 1.0], [0.4, -0.3, 1.0], [0.4, 0.3, 1.0]], rgba=BLUE, start_size=3, end_size=3)
+    x, y = seen_at(of_colour(shoot(sim), BLUE))
+    first, second = np.abs(y + 0.3) < 2 / FOCAL, np.abs(x - 0.4) < 2 / FOCAL
+    assert (first | second).all()
+    np.testing.assert_allclose([x[first].min(), x[first].max()], [-0.4, 0.4], atol=0.02)
+    np.testing.assert_allclose([y[second].min(), y[second].max()], [-0.3, 0.3], atol=0.02)
+
+
+def test_a_line_is_as_wide_as_it_is_told(sim):
+    """Its width in pixels grows from piece to piece, as a trail's does."""
+    points = np.linspace([-0.5, 0.3, 1.0], [0.5, 0.3, 1.0], 13)
+    draw_line(sim, points, rgba=BLUE, start_size=2, end_size=8)
+    mask = of_colour(shoot(sim), BLUE)
+    widths = mask.sum(0)[mask.any(0)]
+    assert abs(widths[:10].mean() - 2) < 1.5
+    assert abs(widths[-10:].mean() - 8) < 1.5
+
+
+@pytest.mark.parametrize("cylinder", [False, True])
+def test_a_capsule_reaches_from_end_to_end(sim, cylinder):
+    """A capsule is longer by its round ends than a cylinder; both are as wide as twice their radius."""
+    draw_capsule(sim, [-0.2, 0.3, 1.0], [0.3, 0.3, 1.0], radius=0.06, rgba=BLUE, cylinder=cylinder)
+    x, y = seen_at(of_colour(shoot(sim), BLUE))
+    end = 0.0 if cylinder else 0.06
+    np.testing.assert_allclose([x.min(), x.max()], [-0.2 - end, 0.3 + end], atol=0.02)
+    np.testing.assert_allclose([y.min(), y.max()], [0.24, 0.36], atol=0.02)
+
+
+def test_marks_are_red_unless_told(sim):
+    nose = of_colour(shoot(sim), RED)
+    draw_points(sim, [0.0, 0.3, 1.0], size=0.05)
+    draw_line(sim, [[-0.4, -0.3, 1], [0.4, -0.3, 1]])
+    draw_capsule(sim, [-0.4, 0.2, 1], [-0.4, 0.3, 1])
+    x, y = seen_at(of_colour(shoot(sim), RED) & ~nose)
+    for at in ([0, 0.3], [0.2, -0.3], [-0.4, 0.25]):
+        assert (np.hypot(x - at[0], y - at[1]) < 0.03).sum() > 20, at
+
+
+def test_marks_are_paint(sim):
+    """The colour picture has them, the depth beside it is that of the bodies."""
+    plain = sim.render("depth_array", camera="down", width=WIDTH, height=HEIGHT)
+    draw_points(sim, [[0.0, 0.0, 1.0]], rgba=GREEN, size=0.1)
+    color, depth = sim.render("rgbd_tuple", camera="down", width=WIDTH, height=HEIGHT)
+    assert of_colour(color.astype(int), GREEN).sum() > 200
+    np.testing.assert_array_equal(depth, plain)
+
+
+def test_marks_drawn_before_the_first_picture_are_in_it(opengl):
+    """The peer's draw functions do nothing until something has been rendered."""
+    sim = Sim(n_worlds=2)
+    draw_points(sim, [[0.0, 0.0, 0.5]], rgba=GREEN, size=0.2)
+    view = {"lookat": [0, 0, 0.5], "distance": 2.0}
+    assert of_colour(sim.render("rgb_array", cam_config=view, width=64, height=48).astype(int), GREEN).sum() > 50
+    sim.close()
+
+
+def test_marks_wait_through_steps_and_wrong_pictures(sim):
+    """They go into the next picture that comes to be, not into the next attempt."""
+    data = sim.data
+    draw_points(sim, [[0.0, 0.4, 1.0]], rgba=GREEN, size=0.05)
+    sim.step()
+    with pytest.raises(ValueError):
+        shoot(sim, camera="nobody")
+    assert of_colour(shoot(sim), GREEN).any()
+    sim.data = data
+
+
+def test_drawing_draws_no_random_numbers(sim):
+    """The peer's draw_line takes from NumPy's global generator, so that looking changes what is flown."""
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    draw_line(sim, np.zeros((5, 3)))
+    shoot(sim)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+
+
+# Text and setpoints ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("corner", ["top left", "top right", "bottom left", "bottom right"])
+def test_text_is_in_its_corner_and_nowhere_else(sim, corner):
+    """Two lines, written one after the other, change pixels of one corner only, some of them to bright letters."""
+    plain = shoot(sim)
+    draw_text(sim, "height", corner)
+    draw_text(sim, "1.4 m", corner)
+    written = shoot(sim)
+    rows, columns = np.nonzero((written != plain).any(-1))
+    down, right = corner.startswith("bottom"), corner.endswith("right")
+    assert (rows > HEIGHT / 2).all() == down
+    assert (rows < HEIGHT / 2).all() != down
+    assert (columns > WIDTH / 2).all() == right
+    assert (columns < WIDTH / 2).all() != right
+    assert 24 < np.ptp(rows) < 60, "two lines of 10 to 20 pixels"
+    letters = written[rows.min() : rows.max(), columns.min() : columns.max()].min(-1) > 230
+    assert 30 < letters.sum() < 0.4 * letters.size
+    np.testing.assert_array_equal(shoot(sim), plain)
+
+
+def test_text_is_not_in_depth_and_is_beside_it(sim):
+    plain = sim.render("depth_array", camera="down", width=WIDTH, height=HEIGHT)
+    draw_text(sim, "depth")
+    color, depth = sim.render("rgbd_tuple", camera="down", width=WIDTH, height=HEIGHT)
+    assert (color[:40, :80].min(-1) > 230).sum() > 20
+    np.testing.assert_array_equal(depth, plain)
+
+
+def test_a_label_stands_at_its_point(sim):
+    """Letters begin at the point, wherever that is in the picture, and are bright on a dark outline."""
+    plain = shoot(sim)
+    for east, north in ((-0.3, 0.3), (0.2, -0.2)):
+        draw_label(sim, [east, north, 1.0], "gate 3")
+        x, y = seen_at((shoot(sim) != plain).any(-1))
+        assert len(x) > 100
+        assert abs(y.mean() - north) < 0.05
+        assert abs(x.mean() - east) < 0.2
+    np.testing.assert_array_equal(shoot(sim), plain)
+
+
+def test_a_line_may_change_its_colour(sim):
+    """Each piece has its own colour: the first green, the second blue."""
+    draw_line(sim, [[-0.4, 0.3, 1], [0, 0.3, 1], [0.4, 0.3, 1]], rgba=[GREEN, BLUE])
+    picture = shoot(sim)
+    (green, _), (blue, _) = seen_at(of_colour(picture, GREEN)), seen_at(of_colour(picture, BLUE))
+    np.testing.assert_allclose([green.min(), green.max()], [-0.4, 0], atol=0.02)
+    np.testing.assert_allclose([blue.min(), blue.max()], [0, 0.4], atol=0.02)
+
+
+def test_setpoints_are_where_the_last_command_of_a_world_is(opengl, plain_scene):
+    sim = Sim(n_worlds=2, n_drones=2, control="state", xml_path=plain_scene)
+    command = np.zeros((2, 2, 16))
+    command[..., 12] = 1
+    command[1, :, :3] = [[0.2, 0.3, 1.0], [-0.2, -0.3, 1.0]]
+    sim.state_control(command)
+    draw_setpoints(sim, world=1, rgba=[GREEN, BLUE], size=0.05)
+    picture = shoot(sim, world=1)
+    for rgba, (east, north, _) in zip((GREEN, BLUE), command[1, :, :3], strict=True):
+        x, y = seen_at(of_colour(picture, rgba))
+        np.testing.assert_allclose([x.mean(), y.mean()], [east, north], atol=0.01)
+        np.testing.assert_allclose(len(x) / FOCAL**2, np.pi * 0.05**2, rtol=0.15)
+    with pytest.raises(ValueError, match="world 2 does not exist"):
+        draw_setpoints(sim, world=2)
+    sim.close()
+
+
+# LEDs -----------------------------------------------------------------------------------------------------------
+
+
+def test_an_led_lights_up_on_its_drone_only(sim):
+    """Drone 1's upper LED turns red: pixels change at drone 1, none elsewhere; then it glows brighter."""
+    before = shoot(sim)
+    change_material(sim, "led_top", [1], rgba=RED)
+    dull = shoot(sim)
+    change_material(sim, "led_top", [1], emission=1.0)
+    bright = shoot(sim)
+    change_material(sim, "led_top", [0, 1], rgba=[1, 1, 1, 0.15], emission=0.0)
+    x, y = seen_at(np.abs(dull - before).sum(-1) > 30)
+    assert len(x) > 3
+    distance = ABOVE - DRONES[1, 2]
+    assert np.hypot(x * distance - DRONES[1, 0], y * distance - DRONES[1, 1]).max() < 0.02
+    lit = of_colour(bright, RED)
+    assert lit.any()
+    assert bright[lit][:, 0].mean() > dull[lit][:, 0].mean() + 10
+    np.testing.assert_array_equal(shoot(sim), before)
+
+
+def test_colours_may_be_one_for_each_drone(sim):
+    before = shoot(sim)
+    change_material(sim, "led_top", [0, 1], rgba=[RED, BLUE], emission=[1.0, 1.0])
+    picture = shoot(sim)
+    change_material(sim, "led_top", [0, 1], rgba=[1, 1, 1, 0.15], emission=0.0)
+    (east, _), (west, _) = (
+        seen_at(of_colour(picture, rgba) & ~of_colour(before, rgba)) for rgba in (RED, BLUE)
+    )  # the noses of the drones are red, too
+    assert len(east) > 0
+    assert len(west) > 0
+    assert east.min() > 0 > west.max()
+    np.testing.assert_array_equal(shoot(sim), before)
+
+
+def test_the_lower_led_is_seen_from_below(opengl):
+    sim = Sim(n_worlds=2)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.full((2, 1, 3), 1.0)))
+    shot = {"mode": "rgb_array", "width": 256, "height": 192}
+    counts = {}
+    for side, elevation in (("above", -60), ("below", 60)):
+        for led in ("led_top", "led_bot"):
+            change_material(sim, led, [0], rgba=GREEN, emission=1.0)
+            view = {"lookat": [1, 1, 1], "distance": 0.2, "azimuth": 0, "elevation": elevation}
+            counts[side, led] = of_colour(sim.render(**shot, cam_config=view).astype(int), GREEN).sum()
+            change_material(sim, led, [0], rgba=[1, 1, 1, 0.15], emission=0.0)
+    sim.close()
+    assert counts["above", "led_top"] > 10 > counts["above", "led_bot"]
+    assert counts["below", "led_bot"] > 10 > counts["below", "led_top"]
+
+
+# Wrong input ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda sim: draw_points(sim, np.zeros((4, 2))), r"shape \(n, 3\), got \(4, 2\)"),
+        (lambda sim: draw_line(sim, np.zeros((2, 2, 3))), r"shape \(n, 3\), got \(2, 2, 3\)"),
+        (lambda sim: draw_capsule(sim, [0, 0], [1, 1]), r"shape \(3,\), got \(2,\) and \(2,\)"),
+        (lambda sim: draw_capsule(sim, np.zeros((2, 3)), [1, 1, 1]), r"shape \(3,\), got \(2, 3\)"),
+        (lambda sim: draw_points(sim, np.zeros((4, 3)), rgba=[1, 0]), "broadcast|shape"),
+        (lambda sim: draw_text(sim, "x", "middle"), "no corner 'middle'; its corners are top left"),
+        (lambda sim: draw_text(sim, ""), "text must be a string with something in it"),
+        (lambda sim: draw_text(sim, 3), "text must be a string"),
+        (lambda sim: draw_text(sim, "5 µm"), "ASCII letters only; '5 µm' has 'µ'"),
+        (lambda sim: draw_label(sim, [0, 0, 0], "x" * 100), "99 letters at most, got 100"),
+        (lambda sim: draw_label(sim, [0, 0, 0], "two\nlines"), "a label is one line"),
+        (lambda sim: draw_label(sim, [0, 0], "x"), r"shape \(3,\), got \(2,\)"),
+        (lambda sim: draw_setpoints(sim), "control='attitude'"),
+        (lambda sim: draw_points(sim, np.zeros((20_000, 3))), "10000 marks at most"),
+        (
+            lambda sim: change_material(sim, "led_top", [2], rgba=RED),
+            r"drone_ids must be in range \[0, 1\], got \[-?\d",
+        ),
+        (
+            lambda sim: change_material(sim, "led_top", [-1], rgba=RED),
+            r"drone_ids must be in range \[0, 1\], got \[-?\d",
+        ),
+        (lambda sim: change_material(sim, "led_top", 0, rgba=RED), "drone_ids must be 1D array.* of integers"),
+        (lambda sim: change_material(sim, "led_top", [0.5], rgba=RED), "drone_ids must be 1D array.* of integers"),
+        (lambda sim: change_material(sim, "lamp", [0], rgba=RED), "no material 'lamp'"),
+        (lambda sim: change_material(sim, "led_top", [0], rgba=[1, 0]), "broadcast|shape"),
+    ],
+)
+def test_what_cannot_be_drawn_is_told_and_leaves_no_mark(sim, draw, message):
+    with pytest.raises(ValueError, match=message):
+        draw(sim)
+    assert len(sim.marks) == 0
+    assert not sim.marks.has_text
+
+
+def test_the_limit_of_marks_can_be_raised():
+    """A picture takes as many marks as it was told to, and no more."""
+    marks = Marks(limit=3)
+    marks.points(np.zeros((3, 3)), RED, 0.1)
+    with pytest.raises(ValueError, match=r"3 marks at most; draw fewer, or raise sim\.max_visual_geom"):
+        marks.points(np.zeros((1, 3)), RED, 0.1)
+    assert len(marks) == 3
+    marks.limit = 4
+    marks.points(np.zeros((1, 3)), RED, 0.1)
+    assert len(marks) == 4
+
+
+def test_as_many_marks_as_allowed_fit_into_a_picture(sim):
+    """The limit is for marks: bodies of the scene take none of it."""
+    limit = sim.max_visual_geom
+    try:
+        sim.max_visual_geom = 200
+        xy = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 20), np.linspace(-0.35, 0.35, 10)), -1).reshape(-1, 2)
+        draw_points(sim, np.concatenate([xy, np.ones((200, 1))], 1), rgba=GREEN, size=0.01)
+        picture = shoot(sim)
+        columns = [int(0.5 * WIDTH + FOCAL * x) for x in xy[:, 0]]
+        rows = [int(0.5 * HEIGHT - FOCAL * y) for y in xy[:, 1]]
+        assert of_colour(picture, GREEN)[rows, columns].mean() > 0.9  # a few are hidden by the drones above them
+    finally:
+        sim.max_visual_geom = limit
