@@ -1,4 +1,4 @@
-"""Distances of segments: to another segment, and to a box."""
+"""Distances from a segment to another segment, and to a box."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ PARALLEL = 1e-12
 
 
 def segment_to_segment(middle: Components, axis: Components, half: float, other_half: float) -> Array:
-    """Return the distance of a segment to one along z around the origin, m (Ericson 2005, section 5.1.9). (...)
+    """Return the distance from a segment to one along z around the origin, m (Ericson 2005, section 5.1.9). (...)
 
-    Of parallel segments any pair of nearest points will do, and of nearly parallel ones nearly any: no digit is lost.
+    For parallel or nearly parallel segments the choice of the nearest points does not change the distance.
 
     Args:
         middle: Its middle, m. 3 of (...)
@@ -35,7 +35,7 @@ def segment_to_segment(middle: Components, axis: Components, half: float, other_
 
 
 def segment_to_box(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
-    """Return the signed distance of a segment to a box, m. (...)
+    """Return the signed distance from a segment to a box, m. (...)
 
     Outside, the squared distance of a point that runs along the segment has a slope that rises, in straight pieces
     between the places where it passes a side's plane; the root lies between the last place of negative and the first
@@ -74,7 +74,7 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
 
 
 def _inside_box(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
-    """Return the largest gap of a segment and a box along the normals of their Minkowski difference, m. (...)"""
+    """Return the largest gap between a segment and a box along the normals of their Minkowski difference, m. (...)"""
     c, u = [magnitude(p) for p in middle], [magnitude(d) for d in axis]
     faces = [p - h - half * d for p, h, d in zip(c, box, u, strict=True)]
     out = larger(larger(faces[0], faces[1]), faces[2])
@@ -88,6 +88,6 @@ def _inside_box(middle: Components, axis: Components, half: Array | float, box: 
 
 
 def _fixed(vector: Components) -> Components:
-    """Return a vector as a constant to derivatives. 3 of (...)"""
+    """Return a vector without its derivatives. 3 of (...)"""
     x, y, z = vector
     return lax.stop_gradient(x), lax.stop_gradient(y), lax.stop_gradient(z)
