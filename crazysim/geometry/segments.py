@@ -18,10 +18,10 @@ def segment_to_segment(middle: Components, axis: Components, half: float, other_
     For parallel or nearly parallel segments the choice of the nearest points does not change the distance.
 
     Args:
-        middle: Its middle, m. 3 of (...)
-        axis: Its unit direction. 3 of (...)
-        half: Its half length, m.
-        other_half: Half length of the other, m.
+        middle: Centre of the segment, m. 3 of (...)
+        axis: Unit direction of the segment. 3 of (...)
+        half: Half length of the segment, m.
+        other_half: Half length of the other segment, m.
     """
     (cx, cy, cz), (x, y, z) = map(_fixed, (middle, axis))
     across = x * x + y * y
@@ -37,15 +37,15 @@ def segment_to_segment(middle: Components, axis: Components, half: float, other_
 def segment_to_box(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
     """Return the signed distance from a segment to a box, m. (...)
 
-    Outside, the squared distance of a point that runs along the segment has a slope that rises, in straight pieces
-    between the places where it passes a side's plane; the root lies between the last place of negative and the first
-    of positive slope. Inside, the shortest way out is along a normal of one of the faces of the two bodies' Minkowski
-    difference: the box's own, and those across one of its edges and the segment (Gottschalk 1996).
+    Outside, the slope of the squared distance along the segment is increasing and piecewise linear, with kinks at the
+    planes of the sides; its root lies between the last kink of negative and the first of positive slope. Inside, the
+    shortest separating translation is along a face normal of the Minkowski difference: a normal of the box, or a cross
+    product of one of its edges and the segment (Gottschalk 1996).
 
     Args:
-        middle: Middle of the segment in the frame of the box, m. 3 of (...)
-        axis: Its unit direction. 3 of (...)
-        half: Its half length, m.
+        middle: Centre of the segment in the frame of the box, m. 3 of (...)
+        axis: Unit direction of the segment. 3 of (...)
+        half: Half length of the segment, m.
         box: Half lengths of the box, m.
     """
     c, u = _fixed(middle), _fixed(axis)
