@@ -68,7 +68,7 @@ def test_wrong_arguments_are_one_line(arguments, word, capsys):
 def test_the_poles_are_where_drones_can_hit_them():
     """Contacts are found in some worlds and not in all: the check would be worthless otherwise."""
     sim = demo.build(64, 4, "cpu")
-    fly = demo.chunk_of(sim)
+    fly = demo.build_fly_frame(sim)
     touched = np.zeros(64, bool)
     for _ in range(75):
         sim.data, _ = fly(sim.data)
