@@ -1,6 +1,6 @@
-"""Prose of the package and of the pages: what of the rules of CONTRIBUTING.md ("Style") can be checked.
+"""Prose of the package and of the pages follows the rules of CONTRIBUTING.md ("Style"), as far as they can be checked.
 
-Only text is examined, by tokenizing and parsing: nothing is imported and nothing runs.
+The sources are parsed and tokenized, not imported.
 """
 
 import ast
@@ -27,8 +27,8 @@ BANNED = {
     r"knows": "has, holds, uses",
     r"sees": "receives, reads",
     r"wants": "needs, requires",
-    r"asks": "requests, queries",
-    r"asked for": "requested",
+    r"asks?": "requests, queries",
+    r"asked": "requested, queried",
     r"believes?": "uses, assumes",
     r"nobody": "no caller, unused",
     r"anew": "again",
@@ -46,12 +46,12 @@ BANNED = {
 """Regular expressions of words that are not used, each with replacements."""
 
 REMEDY = re.compile(
-    r"\b(expected|must|needs?|needed|use|pass|install|pip install|call|set|choose|add|remove|give|see|try|leave|give|build"
-    r"|make|reduce|increase|define|declare|move|write|omit|replace|update|delete|known|available|one of|at least|at most"
-    r"|run|allowed|only|did you mean|first)\b|>=|<=",
+    r"\b(expected|must|needs?|needed|use|pass|install|call|set|choose|add|remove|give|see|try|make|reduce|raise|increase"
+    r"|define|declare|move|write|omit|replace|update|delete|known|available|one of|at least|at most|run|allowed|only"
+    r"|did you mean|there are|it has|takes?|check|name|nearest|start|describe|repeat|first|are \{\}|reads)\b|>=|<=",
     re.IGNORECASE,
 )
-"""What a message to the user contains at least one of: the requirement or the remedy."""
+"""Words of which a message to the user contains at least one: those of a requirement, an alternative or a remedy."""
 USER_ERRORS = {"ConfigError", "UnknownNameError", "ValueError", "TypeError", "RenderError", "ImportError"}
 
 FIELD_LINE = re.compile(r"^\s*\*{0,2}\w+( \([^)]*\))?: (\w+)", re.MULTILINE)

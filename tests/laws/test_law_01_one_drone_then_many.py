@@ -92,14 +92,16 @@ def arguments(module, function, model, rng, per_drone):
 def test_a_batch_is_its_drones(module, function, model, per_drone, x64, rng):
     """Law 1 for every function of dynamics and control, with parameters shared and one per drone."""
     batched, common = arguments(module, function, model, rng, per_drone)
-    # Nothing has batch axes where all there is to pass are shared parameters.
-    axes = BATCH if batched else ()
+    if not batched:  # a function of parameters alone: without batch axes there is nothing to compare
+        assert not per_drone
+        batched, common = arguments(module, function, model, rng, per_drone=True)
     compiled = jax.jit(lambda batched: function(**batched, **common))
     whole = jax.tree.leaves(compiled(batched))
-    for i in np.ndindex(axes):
+    assert whole
+    for i in np.ndindex(BATCH):
         alone = jax.tree.leaves(compiled(jax.tree.map(lambda x, i=i: x[i], batched)))
         for many, one in zip(whole, alone, strict=True):
-            assert many.shape == (*axes, *one.shape)
+            assert many.shape == (*BATCH, *one.shape)
             assert np.all(np.isfinite(one))
             # float64 rounding: one drone and many may be vectorised and contracted (FMA) differently
             scale = 1e-13 * max(1.0, float(np.abs(many).max()))
