@@ -5,6 +5,7 @@ The sources are parsed and tokenized, not imported.
 
 import ast
 import io
+import itertools
 import re
 import tokenize
 from pathlib import Path
@@ -67,7 +68,7 @@ def docstrings(tree):
         body = getattr(node, "body", None)
         if not isinstance(body, list):
             continue
-        for before, after in zip(body, body[1:], strict=False):
+        for before, after in itertools.pairwise(body):
             is_text = isinstance(after, ast.Expr) and isinstance(getattr(after.value, "value", None), str)
             if is_text and isinstance(before, (ast.Assign, ast.AnnAssign)):
                 annotation = getattr(before, "annotation", None)

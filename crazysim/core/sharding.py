@@ -1,4 +1,4 @@
-"""Where worlds live: on one device, or spread over several."""
+"""Distribution of worlds over devices."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import scopes
 
 WORLD_AXIS = "worlds"
-"""Name of the mesh axis that worlds are spread over."""
+"""Name of the mesh axis over which worlds are distributed."""
 
 
 def put(tree: Any, device: jax.Device) -> Any:
-    """Return the tree on a device, bound to it; leaves that are so already are not touched."""
+    """Return the tree committed to a device; leaves that already are remain the same arrays."""
     here = SingleDeviceSharding(device)
 
     def place(x: Any) -> Any:
@@ -33,30 +33,32 @@ def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
 
 
 def placement(data: SimData, mesh: Mesh) -> SimData:
-    """Return where every leaf goes: what belongs to a world is split, what is shared is copied to each device.
+    """Return the sharding of every leaf: leaves of drones and worlds are split, shared leaves are replicated.
 
     Raises:
-        ConfigError: If the worlds cannot be split evenly.
+        ConfigError: If the mesh has no axis of worlds, or the worlds cannot be split evenly.
     """
     if not isinstance(mesh, Mesh):
-        raise ConfigError(f"a mesh is what world_mesh(jax.devices()) returns, not {mesh!r}")
+        raise ConfigError(f"expected a mesh, got {mesh!r}; use world_mesh(jax.devices())")
     n_devices = mesh.shape.get(WORLD_AXIS)
     if n_devices is None:
         raise ConfigError(
-            f"the mesh has axes {mesh.axis_names}; needed is one named {WORLD_AXIS!r}, as world_mesh makes"
+            f"expected a mesh with an axis {WORLD_AXIS!r}, got axes {mesh.axis_names}; make it with world_mesh"
         )
     if data.core.n_worlds % n_devices:
-        raise ConfigError(f"{data.core.n_worlds} worlds cannot be split evenly over {n_devices} devices")
+        raise ConfigError(
+            f"{data.core.n_worlds} worlds cannot be split evenly over {n_devices} devices; use a multiple of {n_devices}"
+        )
     split = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
     copied = NamedSharding(mesh, PartitionSpec())
     return jax.tree.map(lambda scope: split if scope in ("drone", "world") else copied, scopes(data))
 
 
 def shard(data: SimData, mesh: Mesh) -> SimData:
-    """Return the data spread over a mesh."""
+    """Return the data distributed over a mesh."""
     return jax.device_put(data, placement(data, mesh))
 
 
 def place_scene(mjx_data: Any, mesh: Mesh) -> Any:
-    """Return the scene of every world spread over a mesh."""
+    """Return the MJX data of all worlds distributed over a mesh."""
     return jax.device_put(mjx_data, NamedSharding(mesh, PartitionSpec(WORLD_AXIS)))

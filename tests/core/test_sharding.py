@@ -132,7 +132,7 @@ def test_law_09_worlds_that_cannot_be_split_evenly_are_refused(mesh):
 
 def test_law_09_a_mesh_with_another_axis_is_refused(whole):
     other = jax.make_mesh((2,), ("batch",), axis_types=(AxisType.Auto,), devices=jax.devices("cpu")[:2])
-    with pytest.raises(ConfigError, match=f"axes \\('batch',\\); needed is one named '{WORLD_AXIS}'"):
+    with pytest.raises(ConfigError, match=f"an axis '{WORLD_AXIS}', got axes \\('batch',\\)"):
         placement(whole.data, other)
     with pytest.raises(ConfigError, match="batch"):
         Sim(**SETTINGS, mesh=other)
