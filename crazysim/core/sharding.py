@@ -47,7 +47,8 @@ def placement(data: SimData, mesh: Mesh) -> SimData:
         )
     if data.core.n_worlds % n_devices:
         raise ConfigError(
-            f"{data.core.n_worlds} worlds cannot be split evenly over {n_devices} devices; use a multiple of {n_devices}"
+            f"{data.core.n_worlds} worlds cannot be split evenly over {n_devices} devices; use a multiple of "
+            f"{n_devices}"
         )
     split = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
     copied = NamedSharding(mesh, PartitionSpec())

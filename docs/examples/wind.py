@@ -1,7 +1,7 @@
-"""Blow at hovering drones: a steady wind and gusts, as a stage that writes the external force.
+"""Apply steady wind and gusts to hovering drones, with a stage that writes the external force.
 
-``states.force`` stays until something changes it, so the stage sets it at every step. The gusts are filtered noise
-(an Ornstein-Uhlenbeck process), remembered in a record of the stage's own, one value per drone.
+``states.force`` keeps its value until it is changed, so the stage sets it at every step. The gusts are filtered noise
+(an Ornstein-Uhlenbeck process) whose state is in a record of the stage, one value per drone.
 """
 
 import jax
@@ -18,14 +18,14 @@ GUST, GUST_TIME = 10e-3, 0.5  # N, s
 
 
 class Gusts(PyTree):
-    """What the wind stage remembers."""
+    """State of the wind stage."""
 
     force: Array = leaf("drone", 1)
-    """Force of the present gust, world frame, N. (n_worlds, n_drones, 3)"""
+    """Force of the current gust, world frame, N. (n_worlds, n_drones, 3)"""
 
 
 def wind(data):
-    """Let the gusts wander, and put them and the steady wind on every drone."""
+    """Advance the gusts, and apply them and the steady wind to every drone."""
     dt = 1 / data.core.freq
     noise = jax.vmap(jax.vmap(lambda key: jax.random.normal(key, (3,))))(drone_keys(data, "wind"))
     gust = data.plugins["gusts"].force
