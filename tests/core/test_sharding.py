@@ -20,7 +20,7 @@ COMMAND = np.broadcast_to([0.05, -0.02, 0.1, 0.45], (4, 2, 4)).astype(np.float32
 @pytest.fixture(scope="module")
 def mesh():
     devices = jax.devices("cpu")
-    assert len(devices) >= 2, "tests/conftest.py asks for two host devices"
+    assert len(devices) >= 2, "tests/conftest.py requests two host devices"
     return world_mesh(devices[:2])
 
 

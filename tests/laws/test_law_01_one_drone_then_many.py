@@ -125,7 +125,7 @@ def sources():
     return paths
 
 
-def test_physics_and_control_know_no_batch():
+def test_physics_and_control_contain_no_batching():
     """Law 1: they contain no vmap, no loop of JAX, and no batch index."""
     forbidden = {"vmap", "pmap", "shard_map", "scan", "fori_loop", "while_loop", "n_worlds", "n_drones"}
     for path in sources():

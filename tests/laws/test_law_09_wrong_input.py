@@ -1,4 +1,4 @@
-"""Law 9: wrong input is told at once, with what came and what is needed, and the simulation stays as it was."""
+"""Law 9: wrong input is an error at once, with expected, given and remedy, and the simulation does not change."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def broken(tmp_path, text):
     return path
 
 
-# What is passed, and what the message must contain: what came, then what was needed or what to do.
+# Arguments, and parts of the message: the given value, then the expected one or the remedy.
 WRONG_SETTINGS = [
     ({"n_worlds": 0}, "n_worlds is 0", "positive whole number"),
     ({"n_worlds": 2.5}, "n_worlds is 2.5", "positive whole number"),
@@ -63,7 +63,7 @@ WRONG_SETTINGS = [
 
 
 @pytest.mark.parametrize("case", WRONG_SETTINGS, ids=lambda case: "-".join(f"{k}={v}" for k, v in case[0].items()))
-def test_wrong_settings_are_told_at_construction(case):
+def test_wrong_settings_are_errors_at_construction(case):
     settings, *fragments = case
     with pytest.raises(ValueError) as error:
         Sim(**settings)
@@ -81,7 +81,7 @@ def test_wrong_settings_are_told_at_construction(case):
         ("<mujoco><worldbody><body name='drone:0'/></worldbody></mujoco>", "'drone:0'"),
     ],
 )
-def test_a_broken_scene_file_is_told_at_construction(text, fragment, tmp_path):
+def test_a_broken_scene_file_is_an_error_at_construction(text, fragment, tmp_path):
     with pytest.raises(ConfigError) as error:
         Sim(xml_path=broken(tmp_path, text))
     assert fragment in str(error.value)
@@ -190,8 +190,8 @@ def test_a_command_of_another_level_names_both(at_level):
         assert sim.data is before
 
 
-def test_device_commands_are_looked_at_only_when_asked(at_level):
-    """Looking at a device array would wait for the device, so it is done with ``check_finite=True`` only."""
+def test_device_commands_are_checked_only_on_request(at_level):
+    """Reading a device array waits for the device, so it is done only with ``check_finite=True``."""
     sim, before = at_level, at_level.data
     set_command = getattr(sim, f"{sim.control.value}_control")
     command = jnp.zeros(command_shape(sim.data, sim.control)).at[2, 0, 1].set(jnp.nan)
@@ -224,7 +224,7 @@ def stage_that_is_none(data):
     return data
 
 
-# What is called, and what the message must contain.
+# Calls, and parts of the message.
 WRONG_CALLS = [
     (lambda sim: sim.step(0), "n_steps is 0", "positive whole number"),
     (lambda sim: sim.step(-5), "n_steps is -5", "positive whole number"),
@@ -315,8 +315,8 @@ def test_a_spec_that_does_not_compile_leaves_the_old_scene():
     sim.build_mjx()
 
 
-def test_no_assertion_checks_what_users_pass():
-    """Under ``python -O`` an assert is gone."""
+def test_no_assert_statement_checks_user_input():
+    """``python -O`` removes assert statements."""
     from pathlib import Path
 
     import crazysim
