@@ -150,6 +150,10 @@ def test_evaluation_uses_tolerance_and_hold_of_the_task():
     assert found["crashed"] < 1
     easy = make("hover", 16, seconds=2.0, reach=1e-3, tolerance=2.0)
     assert evaluate(easy, idle)["success"] == 1
+    # A crash is no success, however small the error was.
+    crashed = evaluate(make("hover", 16, seconds=2.0, tolerance=1e3), lambda obs: -jnp.ones((16, 1, 4)))
+    assert crashed["crashed"] == 1
+    assert crashed["success"] == 0
 
 
 def test_advantages_are_sums_of_discounted_errors(rng):
