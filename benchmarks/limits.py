@@ -25,9 +25,8 @@ from measure import Flight, digits, engine_of, medians, report, seconds
 
 from crazysim import PyTree, Sim, __version__, leaf
 from crazysim.core.stage import stage
-from crazysim.engine import fused
+from crazysim.engine import ENGINES, fused
 from crazysim.engine.ir import Block, Value
-from crazysim.engine.step import ENGINES
 
 WEIGHTS = (
     dict.fromkeys("barrier item input eq ne lt le gt ge neg abs custom_jvp when loop while".split(), 0)

@@ -17,9 +17,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend import core
 
+from crazysim.engine import jaxcompat
 from crazysim.engine.ir import Block, Element, constant
+from crazysim.engine.jaxcompat import ClosedJaxpr, Literal
+from crazysim.errors import UnsupportedError
 
 Elements = np.ndarray
 """An array of elements: of type object, whatever the elements are."""
@@ -41,10 +43,6 @@ MAX_UNROLL = 64
 """Longest scan with inputs or outputs per iteration, and largest range of a run-time index, that is unrolled."""
 
 
-class UnsupportedError(Exception):
-    """A primitive, or a use of one, that cannot be read; the message names it."""
-
-
 def rule(*names: str) -> Callable[[Rule], Rule]:
     """Register a function as the rule of primitives."""
 
@@ -62,7 +60,7 @@ class Lowering:
         """Add operations to a block."""
         self.builder = builder
 
-    def lower(self, jaxpr: core.ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
+    def lower(self, jaxpr: ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
         """Return the results of a jaxpr for arrays of elements.
 
         Raises:
@@ -71,7 +69,7 @@ class Lowering:
         env: dict[Any, Elements] = {}
 
         def value(v: Any) -> Elements:
-            return constants(v.val, v.aval.dtype) if isinstance(v, core.Literal) else env[v]
+            return constants(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
 
         inner = jaxpr.jaxpr
         env.update(zip(inner.constvars, (constants(x, x.dtype) for x in jaxpr.consts), strict=True))
@@ -86,7 +84,8 @@ class Lowering:
         name = eqn.primitive.name
         if name not in RULES:
             raise UnsupportedError(f"primitive {name!r} has no rule")
-        return RULES[name](self, eqn, args)
+        with jaxcompat.reading(eqn) as equation:
+            return RULES[name](self, equation, args)
 
     def elementwise(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:
         """Return an operation on every element; scalars stand for arrays of any shape."""

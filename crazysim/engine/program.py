@@ -15,7 +15,8 @@ from jax.extend import core
 import crazysim.engine.rules  # noqa: F401  (fills the table of rules)
 from crazysim.core.stage import Axes, Stage, StageScope
 from crazysim.engine.ir import Block, Element, Value, constant
-from crazysim.engine.lower import Elements, Lowering, UnsupportedError, as_elements, scalars
+from crazysim.engine.lower import Elements, Lowering, as_elements, scalars
+from crazysim.errors import UnsupportedError
 
 Slot = tuple[int, int]
 """A number of the data: which leaf, and which element of what one drone (or one world) has of it."""
@@ -53,6 +54,8 @@ class Segment:
     """Leaves that are written."""
     why: str = ""
     """Why there is no program."""
+    error: UnsupportedError | None = None
+    """Set where that is no documented limit, but something in a declared stage that is not supported."""
     fn: Any = None
     """The jaxpr that runs then, from ``used`` to ``written``."""
     first: dict[int, Elements] = dataclasses.field(default_factory=dict)
@@ -244,7 +247,7 @@ class Program:
         try:
             values = self._lower(segment, traced)
         except UnsupportedError as error:
-            self._add_batch(stage, phase, str(error))
+            self._add_batch(stage, phase, str(error), error)
             return
         if segment is not last:
             self.segments.append(segment)
@@ -278,9 +281,11 @@ class Program:
             )
         return segment.now[leaf]
 
-    def _add_batch(self, stage: Stage, phase: Phase, why: str) -> None:
+    def _add_batch(self, stage: Stage, phase: Phase, why: str, error: UnsupportedError | None = None) -> None:
         traced = _Traced(Stage(stage, "batch", name=stage.__name__), self.axes, self.leaves)
-        segment = Segment("batch", [stage], phase, used=traced.used, written=traced.written, why=why, fn=traced.fn)
+        segment = Segment(
+            "batch", [stage], phase, used=traced.used, written=traced.written, why=why, error=error, fn=traced.fn
+        )
         self.segments.append(segment)
 
     def _watch(self, flag: Any, watched: list[Any]) -> Segment:

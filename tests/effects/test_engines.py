@@ -31,7 +31,7 @@ def sim():
 
 
 def test_every_effect_is_fused(sim):
-    segments = sim._step.plan(sim.data).program.segments
+    segments = sim.step_fn.plan(sim.data).program.segments
     assert [s.why for s in segments if s.scope == "batch"] == []
     fused = {stage.__name__ for s in segments for stage in s.stages}
     assert {"wind", "downwash", "battery", "motors"} <= fused

@@ -11,11 +11,11 @@ from crazysim.control import Control, command_size
 from crazysim.core import functional as F
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.core.random import drone_key
+from crazysim.core.sharding import put
 from crazysim.core.stage import stage
 from crazysim.dynamics import Dynamics
-from crazysim.engine import Step, cuda, kernel, native, rollout
+from crazysim.engine import Step, cuda, explain, kernel, native, rollout
 from crazysim.engine.program import MAX_UNROLLED_DRONES
-from crazysim.engine.step import explain
 from crazysim.pytree import PyTree, leaf
 
 FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
@@ -45,7 +45,7 @@ def scattered(sim, extreme=False, dtype=np.float32):
         **({} if rotors is None else {"rotor_vel": dtype(rotors)}),
     )
     core = data.core.replace(steps=jnp.asarray(rng.integers(0, 10, (sim.n_worlds, 1)), jnp.int32))
-    data = sim._place(data.replace(states=states, core=core))
+    data = put(data.replace(states=states, core=core), sim.device)
     size = command_size(sim.control, n_rotors)
     command = far * 0.2 * rng.normal(size=(*shape, size))
     if sim.control == Control.rotor_vel:
@@ -463,7 +463,7 @@ def test_every_pipeline_compiles_for_a_gpu(dynamics, control):
     source = kernel.write(plan.program, "cuda")
     text = cuda.ptx(source, cuda.DEFAULT_ARCHITECTURE)
     assert ".entry advance(" in text
-    inputs = step.take_apart(sim.data).inputs()
+    inputs = step.flatten(sim.data).inputs()
     lowered = plan.dynamic.trace(inputs, jnp.int32(3)).lower(lowering_platforms=("cuda",))
     assert cuda.TARGET in lowered.as_text()
 
