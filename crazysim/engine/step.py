@@ -160,13 +160,12 @@ class Step:
         if isinstance(x, jax.core.Tracer) or not isinstance(x, jax.Array) or x.sharding is self._at_home:
             return None
         here, home = locate(x), self.location
-        if not here.spread:
-            same_device = home.devices is None or home.platform == "cpu" or here.devices == home.devices
-            if here.platform == home.platform and (same_device or home.mesh is not None):
-                self._at_home = x.sharding
-                return None
-            return here
-        if home.mesh is not None and (here.mesh, here.axis) == (home.mesh, home.axis):
+        if here.spread:
+            at_home = home.mesh is not None and (here.mesh, here.axis) == (home.mesh, home.axis)
+        elif home.devices is None or home.mesh is not None:
+            at_home = True
+        else:  # one host kernel serves all devices of the host
+            at_home = here.devices == home.devices or here.platform == home.platform == "cpu"
+        if at_home:
             self._at_home = x.sharding
-            return None
-        return here
+        return None if at_home else here
