@@ -5,7 +5,7 @@ of multiply-adds measured here, through the same engine, and that of its data, e
 moved once, at the bandwidth of a copy measured here. Both limits are the best of all repeats, the time over them is a
 median. Data that fits into a cache may move faster than the copy, which does not.
 
-Operations are counted from the program of one drone (``Plan.program``), in multiply-adds: see ``WEIGHTS``. The count
+Operations are counted from the program of one drone (``Plan.program``), in multiply-adds: see ``ops.TABLE``. The count
 errs to the low side, so the floor does too.
 
     python benchmarks/limits.py [--engine auto plain lanes] [--device gpu] [--worlds 1048576] [--steps 1 10 100]
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections import Counter
 from typing import Any, NamedTuple
 
 import jax
@@ -26,23 +25,8 @@ from measure import Flight, digits, engine_of, medians, report, seconds
 from crazysim import PyTree, Sim, __version__, leaf
 from crazysim.core.stage import stage
 from crazysim.engine import ENGINES, fused
-from crazysim.engine.ir import Block, Value
-
-WEIGHTS = (
-    dict.fromkeys("barrier item input eq ne lt le gt ge neg abs custom_jvp when loop while".split(), 0)
-    | {"rsqrt": 2}
-    | dict.fromkeys("div sqrt cbrt floor ceil round integer_pow".split(), 4)
-    | dict.fromkeys("exp exp2 log rem sin cos logistic tanh".split(), 8)
-    | dict.fromkeys("expm1 log1p tan asin acos atan atan2 sinh cosh asinh acosh atanh erf erfc erf_inv pow".split(), 16)
-    | {"threefry2x32": 60}
-)
-"""What an operation costs, in multiply-adds; what is not named, 1.
-
-Comparisons are counted with the selections that they decide (one instruction, where that is a limit), signs with what
-takes them. Functions are those of hardware that approximates them and a step that refines, or the shortest polynomial
-that is exact to float32; twenty rounds of add, rotate and xor make a random number. What contains a block costs as
-much as that does (``operations``).
-"""
+from crazysim.engine.ir import Block, Operation, Value
+from crazysim.engine.ops import TABLE
 
 BIG = {"cpu": 2**26, "gpu": 2**28}
 """Numbers of float32 in the copy that the bandwidth is measured by: beyond any cache."""
@@ -126,40 +110,41 @@ def work(sim: Sim) -> tuple[float, float, int]:
     one = Sim(1, control=sim.control, integrator=sim.integrator, engine="lanes")
     program = one.build_step_fn().plan(one.data).program
     assert program is not None
-    if any(segment.scope == "batch" for segment in program.segments):
-        raise SystemExit("a stage of the pipeline is not written out; its operations cannot be counted")
+    if program.unfused_stages:
+        raise SystemExit(f"{program.unfused_stages[0].unfused}; its operations cannot be counted")
     often = sim.control_freq / sim.freq  # the one condition in the built-in pipelines is the state controller's rate
-    each_step = sum(operations(segment.block, often) for segment in program.segments)
-    blocks = [s.before for s in program.segments if s.before] + ([program.check.block] if program.check else [])
+    each_step = sum(operations(segment.block, often) for segment in program.fused_segments)
+    blocks = [s.hoisted for s in program.fused_segments] + ([program.check.block] if program.check else [])
     each_call = sum(operations(block, often) for block in blocks)
-    batched = [i for i, scope in enumerate(program.axes.scopes) if scope in ("drone", "world")]
-    read, written = (sum(program.leaves[i].nbytes for i in batched if i in leaves)
-                     for leaves in (program.read, program.written))  # fmt: skip
+    batched = [i for i, leaf in enumerate(program.leaves) if leaf.scope in ("drone", "world")]
+    sizes = {i: program.leaves[i].size * program.leaves[i].number.itemsize for i in batched}
+    read, written = (sum(sizes[i] for i in batched if i in leaves) for leaves in (program.read, program.written))
     return each_step, each_call, read + written
 
 
 def operations(block: Block, often: float) -> float:
     """Return the operations of a block, in multiply-adds; what a condition guards is counted as often as it acts."""
     total = -float(_contracted(block))
-    for value in block.values:
-        turns = {"when": often, "loop": dict(value.params).get("length", 1)}.get(value.op, 1)
-        total += WEIGHTS.get(value.op, 1) + turns * sum(operations(inner, often) for inner in value.blocks)
+    for op in block.operations:
+        turns = {"when": often, "loop": dict(op.params).get("length", 1)}.get(op.name, 1)
+        total += TABLE[op.name].cost + turns * sum(operations(inner, often) for inner in op.blocks)
     return total
 
 
 def _contracted(block: Block) -> int:
     """Return how many products cost nothing, being taken up by the sums they go into: one by each sum."""
-    users: dict[int, list[Value]] = {}
-    for value in block.walk():
-        for x in value.args:
-            users.setdefault(id(x), []).append(value)
-    kept = Counter(id(x) for inner in (block, *(b for v in block.walk() for b in v.blocks)) for x in inner.outputs)
-    full: set[int] = set()
+    users: dict[Value, list[Operation]] = {}
+    for op in block.walk():
+        for x in op.args:
+            if isinstance(x, Value):
+                users.setdefault(x, []).append(op)
+    kept = {x for inner in block.blocks() for x in inner.outputs}
+    full: set[Value] = set()
     contracted = 0
-    for value in block.values:
-        sums = {id(user): user for user in users.get(id(value), [])}
-        fits = all(u.op in ("add", "sub") and k not in full for k, u in sums.items())
-        if value.op == "mul" and value.dtype.kind == "f" and sums and fits and not kept[id(value)]:
+    for op in block.operations:
+        sums = {user.results[0]: user for x in op.results for user in users.get(x, []) if user.results}
+        fits = all(u.name in ("add", "sub") and k not in full for k, u in sums.items())
+        if op.name == "mul" and op.dtype.kind == "f" and sums and fits and op.results[0] not in kept:
             full |= sums.keys()
             contracted += 1
     return contracted

@@ -17,13 +17,5 @@ class RenderError(RuntimeError):
     """No picture can be made on this machine: a screen or OpenGL is missing or does not work."""
 
 
-class UnsupportedError(Exception):
-    """A primitive, type or use of one that the engine does not support; the message names it."""
-
-
-class KernelError(UnsupportedError):
-    """A kernel that its compiler refused, or did not finish in time."""
-
-
 class EngineWarning(UserWarning):
     """A step that runs on a slower engine than asked for, because the faster one does not support it."""

@@ -122,24 +122,23 @@ def test_limits_prints_a_floor_and_how_far_from_it(monkeypatch, benchmarks, caps
 def test_operations_are_counted_in_multiply_adds(benchmarks):
     import limits
 
-    from crazysim.engine.ir import Block
+    from crazysim.engine.ir import Builder
 
-    block = Block()
-    x, y = block.input(np.float32), block.input(np.float32)
-    product = block.add("mul", (x, y), np.float32)
-    total = block.add("add", (product, x), np.float32)
-    block.outputs = [total]
-    assert limits.operations(block, 1.0) == 1  # one multiply-add
-    block.outputs = [total, product]
-    assert limits.operations(block, 1.0) == 2  # the product is needed for itself
-    block.outputs = [block.add("sqrt", (total,), np.float32)]
-    assert limits.operations(block, 1.0) == 5
+    builder = Builder()
+    x, y = builder.input(np.float32), builder.input(np.float32)
+    product = builder.add("mul", (x, y), np.float32)
+    total = builder.add("add", (product, x), np.float32)
+    assert limits.operations(builder.finish([total]), 1.0) == 1  # one multiply-add
+    assert limits.operations(builder.finish([total, product]), 1.0) == 2  # the product is needed for itself
+    root = builder.add("sqrt", (total,), np.float32)
+    assert limits.operations(builder.finish([root]), 1.0) == 5
 
-    guarded = Block()
-    guarded.outputs = [guarded.add("max", (guarded.input(np.float32), np.float32(1)), np.float32)]
-    outer = Block()
-    outer.add("when", (outer.input(bool),), bool, (), (guarded,))
-    assert limits.operations(outer, 0.2) == pytest.approx(0.2)
+    outer = Builder()
+    mask, old = outer.input(bool), outer.input(np.float32)
+    inner = Builder(outer)
+    guarded = inner.finish([inner.add("max", (old, np.float32(1)), np.float32)])
+    new = outer.add_many("when", (mask, old), (np.float32,), (), (guarded,))
+    assert limits.operations(outer.finish(new), 0.2) == pytest.approx(0.2)
 
 
 def test_the_work_of_a_step_is_what_its_data_and_stages_say(benchmarks):

@@ -20,10 +20,10 @@ import jax
 import numpy as np
 from jax import Array
 
-from crazysim.engine import jaxcompat
+from crazysim.engine import dump, jaxcompat
+from crazysim.engine.errors import KernelError
 from crazysim.engine.kernel import BLOCK, Kernel
 from crazysim.engine.native import Launch
-from crazysim.errors import KernelError
 
 TARGET = "__gpu$xla.gpu.ptx"
 """XLA's name for a kernel that is passed to it as PTX."""
@@ -128,6 +128,8 @@ def ptx(kernel: Kernel, arch: str) -> str:
     Raises:
         KernelError: If NVRTC is missing, or refuses the source, with its message.
     """
+    if dump.enabled():
+        dump.write(f"kernel.{arch}.cu", f"// NVRTC --gpu-architecture={arch} {' '.join(OPTIONS)}\n{kernel.text}")
     return _compile(kernel.text, arch, "PTX").decode()
 
 

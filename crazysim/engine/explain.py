@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from crazysim.core.data import SimData
 from crazysim.engine import fused
-from crazysim.engine.program import Segment
+from crazysim.engine.program import UnfusedStage
 from crazysim.engine.step import Step
 
 
@@ -27,12 +27,12 @@ def explain(step: Step, data: SimData, measure: bool = False) -> str:
     if plan.program is None:
         return "\n".join([*lines, f"stages: {', '.join(s.__name__ for s in step.stages)}"])
     for segment in plan.program.segments:
-        names = ", ".join(s.__name__ for s in segment.stages)
-        if segment.scope == "batch":
+        if isinstance(segment, UnfusedStage):
             lines.append(f"splits the step: {segment.unfused}")
         else:
-            lines.append(f"fused, for one {segment.scope}: {names} ({_operations(segment)} operations)")
-    split = [s.stages[0].__name__ for s in plan.program.segments if s.scope == "batch"]
+            names = ", ".join(segment.stages)
+            lines.append(f"fused, for one {segment.scope}: {names} ({segment.n_operations} operations)")
+    split = [stage.name for stage in plan.program.unfused_stages]
     if split and measure:
         lines.append(_cost_of_split(step, data, split))
     if plan.engine == "fused":
@@ -55,7 +55,3 @@ def _cost_of_split(step: Step, data: SimData, split: list[str]) -> str:
         f"cost of the split, measured: a step takes {1e6 * with_them:.0f} us, and {1e6 * without:.0f} us without "
         f"{', '.join(split)}"
     )
-
-
-def _operations(segment: Segment) -> int:
-    return sum(v.op not in ("barrier", "item") for v in segment.block.walk())

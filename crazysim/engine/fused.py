@@ -96,7 +96,7 @@ def _over_batches(program: Program, run: Run) -> Run:
 
     def batched(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
         of_leaves, of_count = in_batched
-        own = [scope in ("drone", "world") for scope in program.axes.scopes]
+        own = [leaf.scope in ("drone", "world") for leaf in program.leaves]
         out_batched = ([True] * len(program.written), True)
         if of_count or not program.fused or any(b and not o for b, o in zip(of_leaves, own, strict=True)):
             # Shared parameters that differ between batches: one batch after the other.
@@ -134,7 +134,7 @@ def _one_kernel(program: Program, compiled: Compiled) -> Run:
 
 def _split(program: Program, compile_part: Callable[[Program], Compiled]) -> Run:
     """Return the same for a step that unfused stages split: a kernel for the stages between them."""
-    parts = program.parts()
+    parts = list(program.parts())
     with ThreadPoolExecutor() as pool:
         kernels = list(pool.map(lambda part: compile_part(part) if part.fused else None, parts))
     written = program.written

@@ -19,7 +19,7 @@ from jax.experimental.layout import Layout, with_layout_constraint
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.extend.random import threefry2x32_p, threefry_prng_impl
 
-from crazysim.errors import UnsupportedError
+from crazysim.engine.errors import UnsupportedError
 
 __all__ = [
     "ClosedJaxpr",
@@ -82,8 +82,7 @@ class Parameters(dict):
 
     def __missing__(self, name: str) -> Any:
         raise UnsupportedError(
-            f"primitive {self._primitive!r} has no parameter {name!r} in JAX {jax.__version__}; it has "
-            f"{', '.join(self) or 'none'}"
+            f"it has no parameter {name!r} in JAX {jax.__version__}, only {', '.join(self) or 'none'}", self._primitive
         )
 
 
@@ -118,7 +117,7 @@ def reading(eqn: Any) -> Iterator[Equation]:
         if owner is None:
             raise
         raise UnsupportedError(
-            f"parameter {owner!r} of primitive {name!r} has no {error.name!r} in JAX {jax.__version__}"
+            f"its parameter {owner!r} has no {error.name!r} in JAX {jax.__version__}", name
         ) from error
 
 

@@ -19,9 +19,9 @@ import jax
 import numpy as np
 from jax import Array
 
-from crazysim.engine import jaxcompat, kernel_cache
+from crazysim.engine import dump, jaxcompat, kernel_cache
+from crazysim.engine.errors import KernelError
 from crazysim.engine.kernel import Kernel
-from crazysim.errors import KernelError
 from crazysim.version import __version__
 
 FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-shared",
@@ -83,6 +83,8 @@ def target(kernel: Kernel) -> str:
         KernelError: If the compiler refuses it or takes too long, or the library cannot be loaded.
     """
     words = command()
+    if dump.enabled():
+        dump.write("kernel.cpp", f"// {shlex.join(words)} -x c++ -\n{kernel.text}")
     key = kernel_cache.digest(*words, toolchain(tuple(words)), kernel.text)
     name = f"crazysim_advance_{key}"
     if name not in _LOADED:

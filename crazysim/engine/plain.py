@@ -36,9 +36,7 @@ def build(
         finite, (n_worlds, 1), and the numbers of the written leaves.
     """
     axes = Axes(data)
-    by_component = by_component and all(
-        stage.batched for stage in stages
-    )  # XLA gives some operations no layout
+    by_component = by_component and all(stage.batched for stage in stages)  # XLA gives some operations no layout
 
     def single(leaves: list[Any]) -> list[Any]:
         data = axes.treedef.unflatten(leaves)

@@ -25,14 +25,16 @@ from jax.sharding import PartitionSpec
 from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Stage, with_leaves
-from crazysim.engine import fused, lanes, plain
+from crazysim.engine import fused, interpret, lanes, plain
+from crazysim.engine.build import build_program
+from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.flat import Zeros
 from crazysim.engine.program import Program
-from crazysim.errors import ConfigError, EngineWarning, UnsupportedError
+from crazysim.errors import ConfigError, EngineWarning
 from crazysim.pytree import scopes
 
-ENGINES = ("auto", "plain", "lanes", "fused")
-"""Values of ``engine=``."""
+ENGINES = ("auto", "plain", "lanes", "fused", "interpret")
+"""Values of ``engine=``. ``interpret`` runs the program in NumPy: slow, without derivatives, to find bugs with."""
 
 Steps = Callable[[list[Any], int | Array], tuple[list[Any], Array]]
 """Leaves and a number of steps to the written leaves and the worlds that are flagged as not finite."""
@@ -121,14 +123,15 @@ class Planner(NamedTuple):
         kinds = jax.tree.leaves(scopes(data))
         # Zeros that a caller found earlier may belong to a parameter that was shared then and is one per drone now.
         known = {i: some for i, some in zeros if kinds[i] == "shared"}
-        program = Program(self.stages, data, known, _watched)
-        problems = [f"stage {s.unfused}" for s in program.segments if s.error is not None]
-        split = [s for s in program.segments if s.scope == "batch"]
+        program = build_program(self.stages, data, known, _watched)
+        split = program.unfused_stages
+        problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
         if self.location.spread and split:
             return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}"), problems
-        program.pack()
         engine, why, run = "lanes", "it was asked for", functools.partial(lanes.steps, program)
-        if self.engine != "lanes":
+        if self.engine == "interpret":
+            engine, run = "interpret", functools.partial(interpret.steps, program)
+        elif self.engine != "lanes":
             why = fused.missing(self.location.platform) or ""
             if not why:
                 try:
@@ -191,7 +194,7 @@ class Planner(NamedTuple):
     ) -> Callable[..., Any]:
         """Return a step in which every device advances its own worlds."""
         split, shared = PartitionSpec(self.location.axis), PartitionSpec()
-        specs = [split if scope in ("drone", "world") else shared for scope in program.axes.scopes]
+        specs = [split if leaf.scope in ("drone", "world") else shared for leaf in program.leaves]
 
         def spread(values: list[Any], n_steps: int | Array) -> list[Any]:
             count = [] if isinstance(n_steps, int) else [n_steps]
@@ -221,7 +224,7 @@ class Planner(NamedTuple):
         """Return the stage at which the engine fails, for a message."""
         for stage in self.stages:
             try:
-                Program([stage], data, {}, None)
+                build_program([stage], data)
             except Exception:
                 return f" in stage {stage.__name__!r}"
         return ""
@@ -241,4 +244,4 @@ def _needed(program: Program) -> list[int]:
     """Return the leaves that are watched, and one whose shape gives the number of worlds."""
     check = program.check
     watched = [leaf for leaf, _ in check.reads] if check is not None else []
-    return [*watched, next(i for i, scope in enumerate(program.axes.scopes) if scope == "drone")]
+    return [*watched, next(i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone")]

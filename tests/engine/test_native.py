@@ -70,7 +70,9 @@ def test_a_kernel_is_compiled_once_for_all_processes(source, place, compilations
     assert library.name.startswith(name.removeprefix("crazysim_advance_"))
 
 
-def test_the_key_holds_the_machine_the_compiler_and_the_versions(source, place, compilations, monkeypatch, tmp_path_factory):
+def test_the_key_holds_the_machine_the_compiler_and_the_versions(
+    source, place, compilations, monkeypatch, tmp_path_factory
+):
     """What ``-march=native`` stands for, the CPU's features, version and options of the compiler, JAX, this package."""
     folder = tmp_path_factory.mktemp("bin")
     fake_compiler(folder, monkeypatch)
