@@ -6,7 +6,7 @@ import pytest
 from cases import shared_sim
 
 from crazysim.engine import Step, cuda, jaxcompat, kernel
-from crazysim.errors import KernelError
+from crazysim.engine.errors import KernelError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ import pytest
 from cases import shared_sim
 
 from crazysim.engine import Step, kernel, kernel_cache, native
-from crazysim.errors import KernelError
+from crazysim.engine.errors import KernelError
 
 COMPILER = native.compiler()
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
@@ -55,7 +55,7 @@ def fake_compiler(folder, monkeypatch, version="1.0", march="znver3"):
     """Put a script in place of the compiler that says which machine it compiles for."""
     script = folder / "c++"
     script.write_text(
-        f'#!/bin/sh\ncase "$*" in *fsyntax-only*) echo "gcc version {version} cc1plus -march={march}" >&2; exit 0;; esac\n'
+        f'#!/bin/sh\ncase "$*" in *fsyntax-only*) echo "gcc version {version} -march={march}" >&2; exit 0;; esac\n'
         f'exec {COMPILER} "$@"\n'
     )
     script.chmod(0o755)
@@ -70,9 +70,7 @@ def test_a_kernel_is_compiled_once_for_all_processes(source, place, compilations
     assert library.name.startswith(name.removeprefix("crazysim_advance_"))
 
 
-def test_the_key_holds_the_machine_the_compiler_and_the_versions(
-    source, place, compilations, monkeypatch, tmp_path_factory
-):
+def test_the_key_holds_machine_compiler_and_versions(source, place, compilations, monkeypatch, tmp_path_factory):
     """What ``-march=native`` stands for, the CPU's features, version and options of the compiler, JAX, this package."""
     folder = tmp_path_factory.mktemp("bin")
     fake_compiler(folder, monkeypatch)

@@ -12,8 +12,9 @@ from crazysim import ConfigError, Sim
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.core.stage import stage
 from crazysim.engine import Step, explain, kernel, lanes, native
+from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.lower import RULES
-from crazysim.errors import EngineWarning, UnsupportedError
+from crazysim.errors import EngineWarning
 
 needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
 
