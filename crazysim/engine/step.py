@@ -157,7 +157,8 @@ class Step:
 
     def _elsewhere(self, x: Any) -> Location | None:
         """Return where an array is, if that is not where the step was built for and is known."""
-        if isinstance(x, jax.core.Tracer) or not isinstance(x, jax.Array) or x.sharding is self._at_home:
+        sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
+        if sharding is None or sharding is self._at_home:
             return None
         here, home = locate(x), self.location
         if here.spread:
@@ -167,5 +168,5 @@ class Step:
         else:  # one host kernel serves all devices of the host
             at_home = here.devices == home.devices or here.platform == home.platform == "cpu"
         if at_home:
-            self._at_home = x.sharding
+            self._at_home = sharding
         return None if at_home else here
