@@ -13,6 +13,7 @@ from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
 from crazysim.scene.overlays import Marks
 from crazysim.scene.queries import SceneQueries
+from crazysim.scene.render import Viewer
 from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Scene
 
@@ -62,7 +63,7 @@ class SceneShell:
     max_geom_pairs = SceneAttribute[int]("Cap on the pairs MJX checks per kind of collision, from ``build_mjx`` on.")
     max_visual_geom = SceneAttribute[int]("Largest number of marks in one picture.")
     marks = SceneAttribute[Marks]("Marks to draw over the next picture.")
-    viewer = SceneAttribute["Viewer | None"]("The renderer; made for the first picture.")
+    viewer = SceneAttribute[Viewer | None]("The renderer; made for the first picture.")
 
     @property
     def mjx_data(self) -> mjx.Data:
