@@ -1,9 +1,9 @@
-"""Distribution of worlds over devices."""
+"""Devices that hold worlds, and the distribution of worlds over them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
@@ -14,6 +14,34 @@ from crazysim.pytree import scopes
 
 WORLD_AXIS = "worlds"
 """Name of the mesh axis over which worlds are distributed."""
+
+
+class Location(NamedTuple):
+    """Devices that hold the data of a simulation, and how worlds are spread over them."""
+
+    platform: str
+    """``"cpu"`` or ``"gpu"``."""
+    devices: tuple[jax.Device, ...] | None = None
+    """The devices; None for any of the platform."""
+    mesh: Mesh | None = None
+    """Mesh of the devices; None for a single one, or where an array's sharding names no mesh."""
+    axis: Any = WORLD_AXIS
+    """Axis of the mesh, or axes, that worlds are split over; None where each device has all of them."""
+
+    @property
+    def spread(self) -> bool:
+        """True where there are several devices."""
+        return self.mesh is not None or (self.devices is not None and len(self.devices) > 1)
+
+
+def locate(x: jax.Array) -> Location:
+    """Return where an array with an axis of worlds in front is."""
+    devices = tuple(sorted(x.sharding.device_set, key=lambda d: d.id))
+    platform = devices[0].platform
+    if len(devices) == 1 or not isinstance(x.sharding, NamedSharding):
+        return Location(platform, devices)
+    spec = x.sharding.spec
+    return Location(platform, devices, x.sharding.mesh, spec[0] if len(spec) else None)
 
 
 def put(tree: Any, device: jax.Device) -> Any:
