@@ -9,9 +9,9 @@ import jax
 from jax import Array
 
 from crazysim.core.data import grid_2d
-from crazysim.pytree import PyTree, select_worlds
+from crazysim.pytree import CORE_NDIM_KEY, PyTree, select_worlds
 
-__all__ = ["enable_cache", "grid_2d", "leaf_replace"]
+__all__ = ["CORE_NDIM_KEY", "enable_cache", "grid_2d", "leaf_replace"]
 
 Record = TypeVar("Record", bound=PyTree)
 

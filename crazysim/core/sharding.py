@@ -10,7 +10,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDev
 
 from crazysim.core.data import SimData
 from crazysim.errors import ConfigError
-from crazysim.pytree import scopes
+from crazysim.pytree import PER_WORLD, scopes
 
 WORLD_AXIS = "worlds"
 """Name of the mesh axis that worlds are spread over."""
@@ -49,7 +49,7 @@ def placement(data: SimData, mesh: Mesh) -> SimData:
         raise ConfigError(f"{data.core.n_worlds} worlds cannot be split evenly over {n_devices} devices")
     split = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
     copied = NamedSharding(mesh, PartitionSpec())
-    return jax.tree.map(lambda scope: split if scope in ("drone", "world") else copied, scopes(data))
+    return jax.tree.map(lambda scope: split if scope in PER_WORLD else copied, scopes(data))
 
 
 def shard(data: SimData, mesh: Mesh) -> SimData:

@@ -105,7 +105,7 @@ class Window:
         self._move(mujoco.mjtMouse.mjMOUSE_ZOOM, 0.0, -0.05 * dy)
 
     def _move(self, action: mujoco.mjtMouse, dx: float, dy: float) -> None:
-        mujoco.mjv_moveCamera(self._model, action, dx, dy, self._scene, self._camera)
+        mujoco.mjv_moveCamera(self._model, action, dx, dy, self._camera)
 
 
 def _glfw() -> Any:
