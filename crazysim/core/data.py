@@ -69,6 +69,20 @@ class SimStateDeriv(PyTree):
     rotor_acc: Array = leaf("drone", 1)
     """Rotor acceleration, rpm/s; in ``so_rpy_rotor*`` the rate of thrust, N/s. (n_worlds, n_drones, n_rotors)"""
 
+    @staticmethod
+    def create(n_worlds: int, n_drones: int, device: Any = None, n_rotors: int = 4) -> SimStateDeriv:
+        """Return zeros.
+
+        Args:
+            n_worlds: Number of worlds.
+            n_drones: Number of drones per world.
+            device: Device of the arrays; None for arrays of the host.
+            n_rotors: Number of rotors.
+        """
+        sizes = {"vel": 3, "ang_vel": 3, "acc": 3, "ang_acc": 3, "rotor_acc": n_rotors}
+        zeros = {name: of_host(0.0, n_worlds, n_drones, size) for name, size in sizes.items()}
+        return SimStateDeriv(**(zeros if device is None else jax.device_put(zeros, device)))
+
 
 class StateControlData(PyTree):
     """Command and memory of the state controller."""
@@ -354,10 +368,10 @@ def as_key(seed: int | Array) -> Array:
         raise ConfigError(f"the seed {seed} needs more than 64 bits; a smaller integer will do") from error
 
 
-def grid_2d(n: int, spacing: float = 1.0) -> np.ndarray:
+def grid_2d(n: int, spacing: float = 1.0, center: Any = (0.0, 0.0)) -> np.ndarray:
     """Return the ``n`` points of a square grid nearest to its centre, nearest first, m. (n, 2)"""
     side = math.isqrt(n - 1) + 1
     line = spacing * (np.arange(side) - (side - 1) / 2)
     x, y = np.meshgrid(line, line)
     points = np.stack([x.ravel(), y.ravel()], axis=-1)
-    return points[np.argsort(np.linalg.norm(points, axis=-1), kind="stable")[:n]]
+    return points[np.argsort(np.linalg.norm(points, axis=-1), kind="stable")[:n]] + np.asarray(center)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 
 COLORS = np.array([[0.90, 0.30, 0.20, 1], [0.15, 0.50, 0.85, 1], [0.20, 0.65, 0.35, 1], [0.85, 0.60, 0.10, 1]])
 """Colours that tell drones apart, one after the other, rgba. (4, 4)"""
@@ -87,11 +87,11 @@ class Trail:
             way.append(places[world])
         return np.stack(way[::-1]) if way else np.zeros((0, 0, 3))
 
-    def draw(self, marks: Marks, world: int = 0, rgba: ArrayLike | None = None, width: float = 3.0) -> None:
-        """Add the lines to what is drawn into the next picture, ``sim.marks``.
+    def draw(self, overlays: Overlays, world: int = 0, rgba: ArrayLike | None = None, width: float = 3.0) -> None:
+        """Add the lines to what is drawn into the next picture, ``sim.overlays``.
 
         Args:
-            marks: What they are added to.
+            overlays: What they are added to.
             world: Which of the worlds that ``add`` gets, counted from 0.
             rgba: Colour, one or one per drone; None for colours that tell drones apart. (4,) or (n_drones, 4)
             width: Width at the drone, pixels.
@@ -101,4 +101,4 @@ class Trail:
             return
         fade = np.linspace(FAINTEST, 1.0, len(way) - 1)[:, None] ** [0, 0, 0, 1]
         for drone, color in enumerate(colors_of(way.shape[1], rgba)):
-            marks.line(way[:, drone], color * fade, 1.0, width)
+            overlays.line(way[:, drone], color * fade, 1.0, width)

@@ -125,15 +125,15 @@ class View:
         time, pos = self._look(sim)
         picture = np.full((self.height, self.width, 3), BORDER_COLOR, np.uint8)
         width, height = self.tile_size
-        drawn = sim.marks.copy()
+        drawn = sim.overlays.copy()
         try:
             for k, world in enumerate(self.worlds):
-                sim.marks.restore(drawn)
+                sim.overlays.restore(drawn)
                 self._draw(sim, k, time[k])
                 config = self._cam_config(k, time[k], pos[k])
                 picture[self.tile(k)] = np.asarray(sim.render("rgb_array", world, self.camera, config, width, height))
         except Exception:
-            sim.marks.restore(drawn)  # what the user drew waits for the next picture that comes to be
+            sim.overlays.restore(drawn)  # what the user drew waits for the next picture that comes to be
             raise
         return picture
 
@@ -161,7 +161,7 @@ class View:
     def _draw(self, sim: Sim, k: int, time: float) -> None:
         """Draw over the k-th of the worlds what belongs to it."""
         if self._trail is not None:
-            self._trail.draw(sim.marks, k, self.rgba)
+            self._trail.draw(sim.overlays, k, self.rgba)
         if self.setpoints:
             draw_setpoints(sim, self.worlds[k], colors_of(sim.n_drones, self.rgba))
         if self.draw is not None:
@@ -216,9 +216,9 @@ def pictures_of(
     if renderer not in RENDERERS:
         raise ConfigError(f"renderer {renderer!r} does not exist; choose one of {', '.join(RENDERERS)}")
     shown = range(sim.n_worlds) if worlds is None else worlds
-    plain = camera == -1 or len(sim.marks) > 0 or sim.device.platform != "gpu" or not batch_render.installed()
+    plain = camera == -1 or len(sim.overlays) > 0 or sim.device.platform != "gpu" or not batch_render.installed()
     if renderer == "warp" or (renderer == "auto" and not plain):
-        return np.asarray(sim.scene.pictures(sim.data, chosen(sim, shown), camera, width, height))
+        return np.asarray(sim.scene.render_worlds(sim.data, chosen(sim, shown), camera, width, height))
     whole = positive("height", height) * max(1, len(shown))
     column = View(shown, width, whole, camera, cam_config, columns=1, border=0)
     return column.picture(sim).reshape(-1, height, width, 3)

@@ -69,7 +69,7 @@ def latch_contacts(sim: SimulationWithScene, objects: Objects = None, floor: boo
         ConfigError: If contacts are latched already, nothing is asked for, or an object is not there or is moved by
             hand.
     """
-    names = tuple(solid.name for solid in choose(sim.scene.solids, objects))
+    names = tuple(body.name for body in choose(sim.scene.collision_model, objects))
     if not (names or floor or drones):
         raise ConfigError("contacts of nothing are not latched; ask for floor, drones or some object")
     shape = (sim.n_worlds, sim.n_drones)

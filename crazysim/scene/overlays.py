@@ -1,4 +1,4 @@
-"""Marks that a user draws into the next picture: lines, points, capsules, labels and text."""
+"""Overlays that a user draws into the next picture: lines, points, capsules, labels and text."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ LONGEST_LABEL = 99
 
 
 @dataclass
-class Marks:
+class Overlays:
     """What is drawn over the scene in the next picture only."""
 
     limit: int = 10_000
-    """Most marks that one picture takes."""
+    """Most overlays that one picture takes."""
     _geoms: list[tuple] = field(default_factory=list)
     _texts: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Return how many marks wait for the next picture, text aside."""
+        """Return how many overlays wait for the next picture, text aside."""
         return len(self._geoms)
 
     def line(self, points: NDArray, rgba: ArrayLike, start_size: float, end_size: float) -> None:
@@ -68,13 +68,13 @@ class Marks:
     def _add(self, geoms: list[tuple], rgba: ArrayLike) -> None:
         if len(self) + len(geoms) > self.limit:
             raise ValueError(
-                f"a picture takes {self.limit} marks at most; draw fewer, or raise sim.max_visual_geom before drawing"
+                f"a picture takes {self.limit} overlays at most; draw fewer, or raise sim.max_visual_geom before drawing"
             )
         colors = np.broadcast_to(np.asarray(rgba, np.float32), (len(geoms), 4))
         self._geoms += [(*geom, color) for geom, color in zip(geoms, colors, strict=True)]
 
     def write(self, scene: mujoco.MjvScene) -> None:
-        """Append the marks to a scene that is about to be drawn."""
+        """Append the overlays to a scene that is about to be drawn."""
         for kind, size, a, b, rgba in self._geoms:
             if scene.ngeom >= scene.maxgeom:
                 raise ValueError(f"the picture is full: {scene.maxgeom} geoms; raise sim.max_visual_geom")
@@ -97,17 +97,17 @@ class Marks:
             mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, CORNERS[corner], pixels, text, "", context)
 
     def clear(self) -> None:
-        """Forget the marks."""
+        """Forget the overlays."""
         self._geoms.clear()
         self._texts.clear()
 
-    def copy(self) -> Marks:
-        """Return marks of their own that are the same."""
-        return Marks(self.limit, list(self._geoms), dict(self._texts))
+    def copy(self) -> Overlays:
+        """Return overlays of their own that are the same."""
+        return Overlays(self.limit, list(self._geoms), dict(self._texts))
 
-    def restore(self, marks: Marks) -> None:
-        """Have these marks instead of what is there, as they were when ``copy`` was asked."""
-        self._geoms[:], self._texts = marks._geoms, dict(marks._texts)
+    def restore(self, overlays: Overlays) -> None:
+        """Have these overlays instead of what is there, as they were when ``copy`` was asked."""
+        self._geoms[:], self._texts = overlays._geoms, dict(overlays._texts)
 
 
 def _readable(text: str, longest: int | None = None) -> str:

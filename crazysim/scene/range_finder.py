@@ -73,7 +73,7 @@ def add_range_finder(
         raise ConfigError(f"a range finder at {freq} Hz does not fit steps at {steps} Hz; take a divisor")
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
     # The few rays of a range finder need no more of a drone than its outline.
-    solids = dataclasses.replace(sim.scene.visible, drone=sim.scene.solids.drone)
+    model = dataclasses.replace(sim.scene.visual_model, drone_geoms=sim.scene.collision_model.drone_geoms)
 
     def measure(data: SimData) -> SimData:
         mine, states = data.plugins[NAME], data.states
@@ -82,7 +82,7 @@ def add_range_finder(
         n_rays = direction.shape[1]
         origin = jnp.broadcast_to(pos[:, None], direction.shape)
         own = np.repeat(np.arange(direction.shape[0]), n_rays) if drones else None
-        hits = cast(solids, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, drones)
+        hits = cast(model, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, drones)
         far = jnp.minimum(hits.distance, mine.max_range).reshape(direction.shape[:2])
         new = mine.replace(distance=far if drones else far[0])
         return data.replace(plugins=data.plugins | {NAME: new})

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, RenderError, UnknownNameError
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 from crazysim.scene.window import Window
 
 MAX_SIZES = 4
@@ -37,7 +37,7 @@ class Viewer:
         cam_config: dict[str, Any] | None,
         width: int,
         height: int,
-        marks: Marks,
+        overlays: Overlays,
     ) -> NDArray | tuple[NDArray, NDArray] | None:
         """Return the picture that ``Sim.render`` documents."""
         if mode not in MODES:
@@ -47,18 +47,18 @@ class Viewer:
         if mode == "human":
             if not self._windows:
                 self._windows.append(Window(self._model, self._max_geom, width, height))
-            self._windows[0].draw(self._data, cam, marks, width, height)
+            self._windows[0].draw(self._data, cam, overlays, width, height)
             return None
         renderer = self._renderer(width, height)
         # Twice: MuJoCo lays endless floors out around the camera of the update before.
         renderer.update_scene(self._data, camera=cam)
         renderer.update_scene(self._data, camera=cam)
         bodies = renderer.scene.ngeom
-        marks.write(renderer.scene)
+        overlays.write(renderer.scene)
         if mode == "rgb_array":
-            return _picture(renderer, marks)
-        color = _picture(renderer, marks) if mode == "rgbd_tuple" else None
-        renderer.scene.ngeom = bodies  # marks are paint: no distance is measured to them
+            return _picture(renderer, overlays)
+        color = _picture(renderer, overlays) if mode == "rgbd_tuple" else None
+        renderer.scene.ngeom = bodies  # overlays are paint: no distance is measured to them
         renderer.enable_depth_rendering()
         depth = renderer.render().copy()
         renderer.disable_depth_rendering()
@@ -139,10 +139,10 @@ def font_scale(height: int) -> mujoco.mjtFontScale:
     return mujoco.mjtFontScale(int(np.clip(50 * (height // 240), 50, 300)))
 
 
-def _picture(renderer: mujoco.Renderer, marks: Marks) -> NDArray:
+def _picture(renderer: mujoco.Renderer, overlays: Overlays) -> NDArray:
     picture = renderer.render().copy()
-    if marks.has_text:  # the renderer knows no text: it is written over what is still in its buffer, and read again
-        marks.write_text(renderer._rect, renderer._mjr_context)
+    if overlays.has_text:  # the renderer knows no text: it is written over what is still in its buffer, and read again
+        overlays.write_text(renderer._rect, renderer._mjr_context)
         mujoco.mjr_readPixels(picture, None, renderer._rect, renderer._mjr_context)
         picture = np.flipud(picture).copy() if renderer._gl_context else picture
     return picture

@@ -116,10 +116,10 @@ class _Surface(NamedTuple):
 
 
 def _surfaces(sim: SimulationWithScene, objects: Objects) -> list[_Surface]:
-    solids = sim.scene.solids
-    found = [_Surface(part, None) for part in solids.floor]
-    for solid in choose(solids, objects):
-        found += [_Surface(part, solid.place) for part in solid.parts]
+    model = sim.scene.collision_model
+    found = [_Surface(geom, None) for geom in model.floor]
+    for body in choose(model, objects):
+        found += [_Surface(geom, body.row) for geom in body.geoms]
     return found
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 
 from crazysim.errors import RenderError
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 
 
 class Window:
@@ -55,7 +55,7 @@ class Window:
         """Whether the window is there; false once its user or ``close`` has closed it."""
         return self._window is not None
 
-    def draw(self, data: mujoco.MjData, camera: mujoco.MjvCamera, marks: Marks, width: int, height: int) -> None:
+    def draw(self, data: mujoco.MjData, camera: mujoco.MjvCamera, overlays: Overlays, width: int, height: int) -> None:
         """Show ``data``; a camera or a size other than at the last call is taken over, the mouse does the rest."""
         glfw = self._glfw
         if self._window is not None and glfw.window_should_close(self._window):
@@ -72,11 +72,11 @@ class Window:
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
-        marks.write(self._scene)
+        overlays.write(self._scene)
         glfw.make_context_current(self._window)
         pixels = mujoco.MjrRect(0, 0, *glfw.get_framebuffer_size(self._window))
         mujoco.mjr_render(pixels, self._scene, self._context)
-        marks.write_text(pixels, self._context)
+        overlays.write_text(pixels, self._context)
         glfw.swap_buffers(self._window)
 
     def close(self) -> None:

@@ -23,9 +23,11 @@ from crazysim.core.random import seed_sim
 from crazysim.core.settings import as_mask, control_freqs, find_device, member, physics_freq, positive
 from crazysim.core.sharding import put, shard
 from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
+from crazysim.deprecation import warn_renamed
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.core import require_support
+from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.engine import Step, build_reset, explain
 from crazysim.engine.plain import ResetFn
 from crazysim.engine.rollout import Keep, Policy, states_of
@@ -35,14 +37,24 @@ from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
 from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 from crazysim.scene.queries import SceneQueries
 from crazysim.scene.render import Viewer
 from crazysim.scene.report import ContactReport, Objects
-from crazysim.scene.scene import Held, Scene
+from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
+from crazysim.sim.scene_attribute import SceneAttribute
 
-__all__ = ["Sim", "clip_floor_pos", "increment_steps", "reset", "seed_sim", "sync_sim2mjx", "use_box_collision"]
+__all__ = [
+    "Sim",
+    "clip_floor_pos",
+    "increment_steps",
+    "reset",
+    "rotor_vel_limits",
+    "seed_sim",
+    "sync_sim2mjx",
+    "use_box_collision",
+]
 
 
 class Sim:
@@ -350,14 +362,22 @@ class Sim:
         """What MuJoCo holds; ``scene.add`` adds objects."""
         return self._scene
 
-    spec = Held[mujoco.MjSpec]("The scene, to be edited; ``build_mjx`` has an edit take effect.")
-    mj_model = Held[mujoco.MjModel]("What ``spec`` was compiled to.")
-    mj_data = Held[mujoco.MjData]("The one world that was drawn last.")
-    mjx_model = Held[mjx.Model]("The scene's model on the device; made when first read.")
-    max_geom_pairs = Held[int]("Cap on the pairs MJX checks per kind of collision, from the next ``build_mjx`` on.")
-    max_visual_geom = Held[int]("Most marks that one picture takes.")
-    marks = Held[Marks]("What is drawn over the next picture.")
-    viewer = Held[Viewer | None]("What draws; made for the first picture.")
+    spec = SceneAttribute[mujoco.MjSpec]("spec", "Editable scene; ``build_mjx`` makes edits take effect.")
+    mj_model = SceneAttribute[mujoco.MjModel]("mj_model", "Compiled scene.")
+    mj_data = SceneAttribute[mujoco.MjData]("mj_data", "State of the world that was drawn last.")
+    mjx_model = SceneAttribute[mjx.Model]("mjx_model", "Compiled scene on the device; made when first read.")
+    max_geom_pairs = SceneAttribute[int](
+        "max_geom_pairs", "Most pairs that MJX checks per kind of collision, from the next ``build_mjx`` on; -1 for all."
+    )
+    max_visual_geom = SceneAttribute[int]("renderer.max_visual_geom", "Most overlays of one image.")
+    overlays = SceneAttribute[Overlays]("renderer.overlays", "Lines, points, labels and text of the next image.")
+    viewer = SceneAttribute[Viewer | None]("renderer.viewer", "Renderer of one world; None before the first image.")
+
+    @property
+    def marks(self) -> Overlays:
+        """Deprecated name of ``overlays``."""
+        warn_renamed("Sim.marks", "Sim.overlays")
+        return self.overlays
 
     @property
     def mjx_data(self) -> mjx.Data:
@@ -413,17 +433,18 @@ class Sim:
         return self._scene.contacts(body)
 
     def contact_report(self, objects: Objects = None, floor: bool = True, drones: bool = True) -> ContactReport:
-        """Return what each drone touches, and how far it is from the rest: floor, objects, other drones.
+        """Return the contacts and distances of every drone: to the floor, to objects, to other drones.
 
-        Pure JAX on the drones' poses: neither MuJoCo nor anything that was drawn takes part.
+        Computed by JAX from the poses in the data. Bodies that were attached to ``spec`` and are moved through
+        ``mjx_data`` are taken where ``mjx_data`` has them. Fields that were not requested are None and are not computed.
 
         Args:
             objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.
-            floor: Whether to report the floor.
-            drones: Whether to report the other drones of a world. What is left out costs nothing, and is None.
+            floor: True to report the floor.
+            drones: True to report the other drones of a world.
 
         Raises:
-            ValueError: If nothing is asked for, or an object is not there or is moved by hand.
+            ValueError: If nothing is requested, or an object does not exist.
         """
         return self._queries.contact_report(self.data, objects, floor, drones)
 
@@ -473,7 +494,7 @@ class Sim:
         if not 0 <= world < self.n_worlds:
             raise ValueError(f"world {world} does not exist; worlds go from 0 to {self.n_worlds - 1}")
         self._data = self._scene.sync(self._data, world)
-        return self._scene.draw(mode, camera, cam_config, width, height)
+        return self._scene.render(mode, camera, cam_config, width, height)
 
     def close(self) -> None:
         """Close the window and free what pictures needed."""

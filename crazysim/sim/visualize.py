@@ -30,7 +30,7 @@ def draw_line(
     Raises:
         ValueError: If the points have another shape.
     """
-    sim.marks.line(_points(points), RED if rgba is None else rgba, start_size, end_size)
+    sim.overlays.line(_points(points), RED if rgba is None else rgba, start_size, end_size)
 
 
 def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size: float = 0.01) -> None:
@@ -45,7 +45,7 @@ def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size
     Raises:
         ValueError: If the points have another shape.
     """
-    sim.marks.points(_points(points), RED if rgba is None else rgba, size)
+    sim.overlays.points(_points(points), RED if rgba is None else rgba, size)
 
 
 def draw_capsule(
@@ -72,7 +72,7 @@ def draw_capsule(
     first, last = np.asarray(p1, dtype=float), np.asarray(p2, dtype=float)
     if first.shape != (3,) or last.shape != (3,):
         raise ValueError(f"the ends of a capsule must have shape (3,), got {first.shape} and {last.shape}")
-    sim.marks.capsule(first, last, radius, RED if rgba is None else rgba, cylinder)
+    sim.overlays.capsule(first, last, radius, RED if rgba is None else rgba, cylinder)
 
 
 def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:
@@ -89,7 +89,7 @@ def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:
     at = np.asarray(point, dtype=float)
     if at.shape != (3,):
         raise ValueError(f"the point of a label must have shape (3,), got {at.shape}")
-    sim.marks.label(text, at)
+    sim.overlays.label(text, at)
 
 
 def draw_text(sim: Sim, text: str, corner: str = "top left") -> None:
@@ -103,7 +103,7 @@ def draw_text(sim: Sim, text: str, corner: str = "top left") -> None:
     Raises:
         ValueError: If there is no such corner, or the text cannot be written.
     """
-    sim.marks.text(text, corner)
+    sim.overlays.text(text, corner)
 
 
 def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size: float = 0.02) -> None:
@@ -125,7 +125,7 @@ def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size
     if not 0 <= world < sim.n_worlds:
         raise ConfigError(f"world {world} does not exist; worlds go from 0 to {sim.n_worlds - 1}")
     wanted = np.asarray(sim.data.controls.state.staged_cmd[world, :, :3], float)
-    sim.marks.points(wanted, RED if rgba is None else rgba, size)
+    sim.overlays.points(wanted, RED if rgba is None else rgba, size)
 
 
 def change_material(

@@ -5,7 +5,7 @@ import pytest
 
 from crazysim.errors import ConfigError
 from crazysim.media import Trail
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 
 
 def moments(trail, times, n_worlds=2, n_drones=1):
@@ -39,11 +39,11 @@ def test_a_second_call_at_one_time_replaces_the_first():
 
 
 def test_lines_fade_towards_their_beginning():
-    trail, marks = Trail(5.0), Marks()
+    trail, overlays = Trail(5.0), Overlays()
     moments(trail, np.arange(5.0), n_drones=2)
-    trail.draw(marks, 1, rgba=[[1, 0, 0, 1], [0, 0, 1, 0.5]])
-    assert len(marks) == 8
-    alphas = np.array([geom[-1][3] for geom in marks._geoms]).reshape(2, 4)
+    trail.draw(overlays, 1, rgba=[[1, 0, 0, 1], [0, 0, 1, 0.5]])
+    assert len(overlays) == 8
+    alphas = np.array([geom[-1][3] for geom in overlays._geoms]).reshape(2, 4)
     np.testing.assert_allclose(alphas[:, -1], [1.0, 0.5])
     assert (np.diff(alphas) > 0.05).all()
 

@@ -279,7 +279,7 @@ def test_text_changes_its_corner_and_nothing_else(sim):
 def test_a_view_that_cannot_be_is_told(sim, wrong, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         view(**wrong).picture(sim)
-    assert len(sim.marks) == 0
+    assert len(sim.overlays) == 0
 
 
 def test_setpoints_need_state_commands(opengl):

@@ -38,7 +38,7 @@ def test_a_handle_stays_valid_when_more_is_added(course):
     np.testing.assert_allclose(gates.pose(sim.data)[0], np.tile([[1, 0, 1], [2, 0, 1]], (3, 1, 1)))
     np.testing.assert_allclose(tower.pose(sim.data)[0][:, 0, 2], [1, 2, 3])
     data = gates[1].set_pose(sim.data, [5, 5, 5])
-    more = sim.scene.add("sphere", f"ball-{len(sim.scene.handles)}", pos=[7, 0, 0])
+    more = sim.scene.add("sphere", f"ball-{len(sim.scene.object_names)}", pos=[7, 0, 0])
     data2 = sim.data
     np.testing.assert_allclose(more.pose(data2)[0], np.tile([[7, 0, 0]], (3, 1, 1)))
     np.testing.assert_allclose(gates[1].pose(data)[0][0], [[5, 5, 5]])
@@ -139,21 +139,21 @@ def test_every_primitive_is_there_and_touched_by_drones_only(what):
 
 
 BAD = {
-    "taken": (lambda s: s.scene.add("gate"), "has a body 'gate:0' already"),
-    "drone": (lambda s: s.scene.add("box", "drone"), "has a body 'drone:0' already"),
-    "unknown": (lambda s: s.scene.add("tree"), "no object and no file 'tree'; objects are gate, box"),
+    "taken": (lambda s: s.scene.add("gate"), "got 'gate:0', a body of the scene"),
+    "drone": (lambda s: s.scene.add("box", "drone"), "got 'drone:0', a body of the scene"),
+    "unknown": (lambda s: s.scene.add("tree"), "expected gate, box, pole, sphere, wall, landing_pad, an MJCF file, MJCF text, an MjSpec or a body of one, got 'tree'"),
     "mjcf": (
         lambda s: s.scene.add("<mujoco><worldbody><geom type='box'/></worldbody></mujoco>", "q"),
         "size 0 must be",
     ),
-    "text": (lambda s: s.scene.add("<mujoco><worldbody>", "q"), "does not compile"),
-    "what": (lambda s: s.scene.add(3, "q"), "an object cannot be 3"),
-    "setting": (lambda s: s.scene.add("box", "q", length=3), "Its settings: size="),
-    "size": (lambda s: s.scene.add("sphere", "q", radius=-1), "every length must be positive"),
-    "mjcf setting": (lambda s: s.scene.add(TOWER, "q", radius=1), "only the primitives"),
+    "text": (lambda s: s.scene.add("<mujoco><worldbody>", "q"), "expected an object that compiles"),
+    "what": (lambda s: s.scene.add(3, "q"), "or a body of one, got 3"),
+    "setting": (lambda s: s.scene.add("box", "q", length=3), "expected settings size=(0.2, 0.2, 0.2), rgba"),
+    "size": (lambda s: s.scene.add("sphere", "q", radius=-1), "expected positive lengths"),
+    "mjcf setting": (lambda s: s.scene.add(TOWER, "q", radius=1), "expected no settings, which only gate"),
     "count": (lambda s: s.scene.add("box", "q", count=0), "count"),
-    "pos": (lambda s: s.scene.add("box", "q", count=2, pos=[[0, 0]]), "needed is one of (3,), (2, 3), (1, 2, 3)"),
-    "stand": (lambda s: s.scene.add("gate", "q", stand=0.1), "lower bar"),
+    "pos": (lambda s: s.scene.add("box", "q", count=2, pos=[[0, 0]]), "expected pos of shape (3,) or (2, 3) or (1, 2, 3), got (1, 2)"),
+    "stand": (lambda s: s.scene.add("gate", "q", stand=0.1), "expected stand above 0.275 m"),
     "pole": (lambda s: s.scene.add("pole", "q", height=0.1, radius=0.1), "higher than it is thick"),
 }
 
@@ -172,12 +172,12 @@ def test_law_09_what_cannot_be_added_is_refused(name):
 def test_law_09_a_pose_that_cannot_be_is_refused(course):
     sim, gates, pole, _ = course
     for act, words in (
-        (lambda: gates.set_pose(sim.data, [0, 0]), "shape (2,); needed is one of (3,), (2, 3), (3, 2, 3)"),
+        (lambda: gates.set_pose(sim.data, [0, 0]), "expected pos of shape (3,) or (2, 3) or (3, 2, 3), got (2,)"),
         (lambda: gates.set_pose(sim.data, [0, 0, np.nan]), "finite numbers"),
         (lambda: gates.set_pose(sim.data, None, [0, 0, 0, 0]), "not all zero"),
-        (lambda: gates.set_pose(sim.data, "here"), "needed are numbers"),
+        (lambda: gates.set_pose(sim.data, "here"), "expected numbers for pos, got 'here'"),
         (lambda: pole.set_pose(sim.data, [0, 0, 0]), "mocap=False"),
-        (lambda: gates.set_pose(Sim().data, [0, 0, 0]), "of another simulation"),
+        (lambda: gates.set_pose(Sim().data, [0, 0, 0]), "expected a handle of this simulation"),
     ):
         with pytest.raises(ConfigError) as error:
             act()

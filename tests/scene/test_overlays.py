@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from cases import ABOVE, FOVY
 
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 from crazysim.sim import Sim
 from crazysim.sim.visualize import (
     change_material,
@@ -297,13 +297,13 @@ def test_the_lower_led_is_seen_from_below(opengl):
 def test_what_cannot_be_drawn_is_told_and_leaves_no_mark(sim, draw, message):
     with pytest.raises(ValueError, match=message):
         draw(sim)
-    assert len(sim.marks) == 0
-    assert not sim.marks.has_text
+    assert len(sim.overlays) == 0
+    assert not sim.overlays.has_text
 
 
 def test_the_limit_of_marks_can_be_raised():
     """A picture takes as many marks as it was told to, and no more."""
-    marks = Marks(limit=3)
+    marks = Overlays(limit=3)
     marks.points(np.zeros((3, 3)), RED, 0.1)
     with pytest.raises(ValueError, match=r"3 marks at most; draw fewer, or raise sim\.max_visual_geom"):
         marks.points(np.zeros((1, 3)), RED, 0.1)

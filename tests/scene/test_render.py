@@ -122,7 +122,7 @@ def test_a_body_that_a_user_moved_is_drawn_where_it_is(opengl):
         return columns.mean() + 0.5
 
     assert abs(where(0) - 32) < 1
-    assert sim._scene._mjx_data is None
+    assert not sim.scene.is_allocated
     k = sim.mj_model.body("ball").mocapid.item()
     sim.mjx_data = sim.mjx_data.replace(mocap_pos=sim.mjx_data.mocap_pos.at[:, k, 0].set(jnp.array([-0.8, 0.8])))
     assert where(0) < 25
@@ -390,7 +390,7 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
 
 
 PRINTED = textwrap.dedent("""
-    import crazysim.scene.scene as place
+    import crazysim.scene.mjx_scene as place
     from crazysim.sim.sim import sync_sim2mjx as whole
     syncs = []
     place.sync_sim2mjx = lambda *args: syncs.append(1) or whole(*args)

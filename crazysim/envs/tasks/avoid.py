@@ -96,7 +96,7 @@ def avoid(
         handles.append(sim.scene.add("pole", count=n_poles, pos=(0, 0, 0), radius=POLE_RADIUS, height=HEIGHT))
     if n_boxes:
         handles.append(sim.scene.add("box", count=n_boxes, pos=(0, 0, HEIGHT / 2), size=(BOX, BOX, BOX)))
-    places = slice(handles[0].places[0], handles[-1].places[-1] + 1)
+    places = slice(handles[0].rows[0], handles[-1].rows[-1] + 1)
     # Middle and half size of what is solid, in an object's frame; a pole's radius is taken off the distance.
     middle = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[0, 0, 0]] * n_boxes)
     size = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[BOX / 2] * 3] * n_boxes)

@@ -245,7 +245,7 @@ def _install(sim: SimulationWithScene, gates: Any, obstacles: Any, course: Track
         to_go_before=jnp.zeros(shape, pos.dtype),
         nominal_pos=jnp.zeros((sim.n_worlds, 1, n_gates + n_obstacles, 3), pos.dtype) if moved else None,
         nominal_quat=jnp.zeros((sim.n_worlds, 1, n_gates, 4), pos.dtype) if moved else None,
-        places=(gates.places[0], gates.places[-1] + 1, obstacles.places[0], obstacles.places[-1] + 1),
+        places=(gates.rows[0], gates.rows[-1] + 1, obstacles.rows[0], obstacles.rows[-1] + 1),
     )
     low, high = (np.asarray(x, float).astype(pos.dtype) for x in (course.low, course.high))
     contacts = sim.scene.contact_fn([gates, obstacles], drones=False)
