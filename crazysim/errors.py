@@ -1,8 +1,8 @@
-"""The errors that a wrong configuration raises, and the one of a machine that cannot draw."""
+"""Errors of a wrong configuration, and of a machine that cannot draw."""
 
 
 class ConfigError(ValueError):
-    """A simulation that cannot be: settings that contradict each other or lack something."""
+    """Settings that are invalid, incomplete or contradict each other."""
 
 
 class UnknownNameError(ConfigError, KeyError):
@@ -14,4 +14,4 @@ class UnknownNameError(ConfigError, KeyError):
 
 
 class RenderError(RuntimeError):
-    """No picture can be made on this machine: a screen or OpenGL is missing or does not work."""
+    """A missing or broken screen or OpenGL."""

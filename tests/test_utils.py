@@ -94,7 +94,7 @@ def test_derivatives_under_the_names_of_crazyflow():
     deriv = first_principles_dynamics(sim.data)
     np.testing.assert_allclose(deriv.acc, np.broadcast_to([0, 0, -9.81], (2, 3, 3)), atol=1e-5)
     zeros = SimStateDeriv.create(2, 3, sim.device)
-    assert jax.tree.map(jnp.shape, zeros) == jax.tree.map(jnp.shape, deriv)
+    assert [x.shape for x in jax.tree.leaves(zeros)] == [x.shape for x in jax.tree.leaves(deriv)]
     assert not any(np.any(x) for x in jax.tree.leaves(zeros))
     fitted = Sim(n_worlds=2, dynamics="so_rpy_rotor").data
     np.testing.assert_allclose(so_rpy_rotor_dynamics(fitted).acc[..., 2], -9.81, atol=1e-5)

@@ -18,7 +18,7 @@ def moments(trail, times, n_worlds=2, n_drones=1):
 def test_it_keeps_its_time_and_no_more():
     trail = Trail(1.0)
     moments(trail, 0.25 * np.arange(9))
-    np.testing.assert_allclose(trail.way(0)[:, 0, 0], [1.0, 1.25, 1.5, 1.75, 2.0])
+    np.testing.assert_allclose(trail.path(0)[:, 0, 0], [1.0, 1.25, 1.5, 1.75, 2.0])
     assert len(trail) == 5
 
 
@@ -27,15 +27,15 @@ def test_a_reset_world_leaves_its_way_behind_and_others_keep_theirs():
     moments(trail, [0.0, 1.0, 2.0])
     trail.add([0.0, 3.0], [[[7, 0, 0]], [[3, 0, 0]]])
     trail.add([1.0, 4.0], [[[8, 0, 0]], [[4, 0, 0]]])
-    np.testing.assert_allclose(trail.way(0)[:, 0, 0], [7, 8])
-    np.testing.assert_allclose(trail.way(1)[:, 0, 0], [0, 1, 2, 3, 4])
+    np.testing.assert_allclose(trail.path(0)[:, 0, 0], [7, 8])
+    np.testing.assert_allclose(trail.path(1)[:, 0, 0], [0, 1, 2, 3, 4])
 
 
 def test_a_second_call_at_one_time_replaces_the_first():
     trail = Trail(5.0)
     moments(trail, [0.0, 1.0])
     trail.add([1.0, 1.0], np.full((2, 1, 3), 9.0))
-    np.testing.assert_allclose(trail.way(1)[:, 0, 0], [0, 9])
+    np.testing.assert_allclose(trail.path(1)[:, 0, 0], [0, 9])
 
 
 def test_lines_fade_towards_their_beginning():
@@ -50,7 +50,7 @@ def test_lines_fade_towards_their_beginning():
 
 @pytest.mark.parametrize("seconds", [0, -1.0, np.nan, np.inf])
 def test_a_time_that_cannot_be_is_told(seconds):
-    with pytest.raises(ConfigError, match="must be positive"):
+    with pytest.raises(ConfigError, match="expected a positive duration"):
         Trail(seconds)
 
 

@@ -216,10 +216,10 @@ def test_an_exported_flight_opens_from_its_file(viser, browser, flight, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere.npz"], "there is no file nowhere.npz"),
+        (["nowhere.npz"], "expected an existing file, got 'nowhere.npz'"),
         (["flight.npz", "--world", "5"], "world 5 was not recorded; recorded are [0, 1]"),
-        (["flight.npz", "--export", "flight.txt"], "must end with .html"),
-        (["flight.npz", "--export", "nowhere/flight.html"], "there is no folder nowhere"),
+        (["flight.npz", "--export", "flight.txt"], "to end with .html"),
+        (["flight.npz", "--export", "nowhere/flight.html"], "expected an existing folder, got 'nowhere'"),
         (["flight.npz", "--port", "99999"], "choose another --port"),
     ],
 )

@@ -176,7 +176,7 @@ def test_law_09_a_pose_that_cannot_be_is_refused(course):
         (lambda: gates.set_pose(sim.data, [0, 0, np.nan]), "finite numbers"),
         (lambda: gates.set_pose(sim.data, None, [0, 0, 0, 0]), "not all zero"),
         (lambda: gates.set_pose(sim.data, "here"), "expected numbers for pos, got 'here'"),
-        (lambda: pole.set_pose(sim.data, [0, 0, 0]), "mocap=False"),
+        (lambda: pole.set_pose(sim.data, [0, 0, 0]), "added with mocap=True, got 'pole'"),
         (lambda: gates.set_pose(Sim().data, [0, 0, 0]), "expected a handle of this simulation"),
     ):
         with pytest.raises(ConfigError) as error:

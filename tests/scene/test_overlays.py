@@ -204,7 +204,7 @@ def test_setpoints_are_where_the_last_command_of_a_world_is(opengl, plain_scene)
         x, y = seen_at(of_colour(picture, rgba))
         np.testing.assert_allclose([x.mean(), y.mean()], [east, north], atol=0.01)
         np.testing.assert_allclose(len(x) / FOCAL**2, np.pi * 0.05**2, rtol=0.15)
-    with pytest.raises(ValueError, match="world 2 does not exist"):
+    with pytest.raises(ValueError, match="expected a world from 0 to 1, got 2"):
         draw_setpoints(sim, world=2)
     sim.close()
 
@@ -271,26 +271,26 @@ def test_the_lower_led_is_seen_from_below(opengl):
         (lambda sim: draw_capsule(sim, [0, 0], [1, 1]), r"shape \(3,\), got \(2,\) and \(2,\)"),
         (lambda sim: draw_capsule(sim, np.zeros((2, 3)), [1, 1, 1]), r"shape \(3,\), got \(2, 3\)"),
         (lambda sim: draw_points(sim, np.zeros((4, 3)), rgba=[1, 0]), "broadcast|shape"),
-        (lambda sim: draw_text(sim, "x", "middle"), "no corner 'middle'; its corners are top left"),
-        (lambda sim: draw_text(sim, ""), "text must be a string with something in it"),
-        (lambda sim: draw_text(sim, 3), "text must be a string"),
-        (lambda sim: draw_text(sim, "5 µm"), "ASCII letters only; '5 µm' has 'µ'"),
-        (lambda sim: draw_label(sim, [0, 0, 0], "x" * 100), "99 letters at most, got 100"),
-        (lambda sim: draw_label(sim, [0, 0, 0], "two\nlines"), "a label is one line"),
+        (lambda sim: draw_text(sim, "x", "middle"), "expected corner 'top left' or .*, got 'middle'"),
+        (lambda sim: draw_text(sim, ""), "expected a string that is not empty as text, got ''"),
+        (lambda sim: draw_text(sim, 3), "expected a string .*, got 3"),
+        (lambda sim: draw_text(sim, "5 µm"), "expected ASCII text, got '5 µm' with 'µ'"),
+        (lambda sim: draw_label(sim, [0, 0, 0], "x" * 100), "at most 99 characters, got 100"),
+        (lambda sim: draw_label(sim, [0, 0, 0], "two\nlines"), "a label of one line"),
         (lambda sim: draw_label(sim, [0, 0], "x"), r"shape \(3,\), got \(2,\)"),
         (lambda sim: draw_setpoints(sim), "control='attitude'"),
-        (lambda sim: draw_points(sim, np.zeros((20_000, 3))), "10000 marks at most"),
+        (lambda sim: draw_points(sim, np.zeros((20_000, 3))), "at most 10000 overlays in one image, got 20000"),
         (
             lambda sim: change_material(sim, "led_top", [2], rgba=RED),
-            r"drone_ids must be in range \[0, 1\], got \[-?\d",
+            r"expected drone_ids from 0 to 1, got \[-?\d",
         ),
         (
             lambda sim: change_material(sim, "led_top", [-1], rgba=RED),
-            r"drone_ids must be in range \[0, 1\], got \[-?\d",
+            r"expected drone_ids from 0 to 1, got \[-?\d",
         ),
-        (lambda sim: change_material(sim, "led_top", 0, rgba=RED), "drone_ids must be 1D array.* of integers"),
-        (lambda sim: change_material(sim, "led_top", [0.5], rgba=RED), "drone_ids must be 1D array.* of integers"),
-        (lambda sim: change_material(sim, "lamp", [0], rgba=RED), "no material 'lamp'"),
+        (lambda sim: change_material(sim, "led_top", 0, rgba=RED), "expected drone_ids as a 1D array .*of integers"),
+        (lambda sim: change_material(sim, "led_top", [0.5], rgba=RED), "expected drone_ids as a 1D array .*of integers"),
+        (lambda sim: change_material(sim, "lamp", [0], rgba=RED), "got 'lamp'"),
         (lambda sim: change_material(sim, "led_top", [0], rgba=[1, 0]), "broadcast|shape"),
     ],
 )
@@ -301,20 +301,20 @@ def test_what_cannot_be_drawn_is_told_and_leaves_no_mark(sim, draw, message):
     assert not sim.overlays.has_text
 
 
-def test_the_limit_of_marks_can_be_raised():
-    """A picture takes as many marks as it was told to, and no more."""
-    marks = Overlays(limit=3)
-    marks.points(np.zeros((3, 3)), RED, 0.1)
-    with pytest.raises(ValueError, match=r"3 marks at most; draw fewer, or raise sim\.max_visual_geom"):
-        marks.points(np.zeros((1, 3)), RED, 0.1)
-    assert len(marks) == 3
-    marks.limit = 4
-    marks.points(np.zeros((1, 3)), RED, 0.1)
-    assert len(marks) == 4
+def test_the_limit_of_overlays_can_be_raised():
+    """An image takes as many geoms as the limit allows."""
+    overlays = Overlays(limit=3)
+    overlays.points(np.zeros((3, 3)), RED, 0.1)
+    with pytest.raises(ValueError, match=r"at most 3 overlays in one image, got 4. Increase sim\.max_visual_geom"):
+        overlays.points(np.zeros((1, 3)), RED, 0.1)
+    assert len(overlays) == 3
+    overlays.limit = 4
+    overlays.points(np.zeros((1, 3)), RED, 0.1)
+    assert len(overlays) == 4
 
 
 def test_as_many_marks_as_allowed_fit_into_a_picture(sim):
-    """The limit is for marks: bodies of the scene take none of it."""
+    """The limit is for overlays: bodies of the scene take none of it."""
     limit = sim.max_visual_geom
     try:
         sim.max_visual_geom = 200

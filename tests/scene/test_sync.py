@@ -84,7 +84,9 @@ def test_a_world_to_be_drawn_is_that_of_c_mujoco(sim, world):
     """The sync of one world for a picture gives the same, and the lights besides, without MJX."""
     expected = reference(sim, world)
     data = mujoco.MjData(sim.mj_model)
-    sync_one_world(sim.data, sim.mjx_data, world, sim.mj_model, data)
+    mjx_data = sim.mjx_data
+    poses = (mjx_data.mocap_pos[world], mjx_data.mocap_quat[world], mjx_data.qpos[world])
+    sync_one_world(sim.data, world, poses, sim.mj_model, data)
     for name in (*DERIVED, "light_xpos", "light_xdir"):
         np.testing.assert_allclose(getattr(data, name), getattr(expected, name), atol=1e-6, err_msg=name)
 
