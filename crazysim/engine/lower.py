@@ -1,48 +1,37 @@
-"""From a function written for one drone to a program on single numbers.
+"""From a jaxpr to a block of scalar operations.
 
-The function is traced by JAX, and its jaxpr read operation by operation. An array is a NumPy object array of
-elements (``ir``). What a primitive means for elements is a rule; there are four kinds, and most primitives need no
-rule of their own:
+A function that is written for one drone is traced by JAX, and its jaxpr lowered equation by equation. An array is a
+NumPy object array of elements (``ir``). A rule says what a primitive means for elements; there are four kinds, and
+most primitives need no rule of their own:
 
 - element-wise: the same operation for every element;
-- movement: nothing is computed, so the primitive is run once on the numbers of the elements;
+- movement: nothing is computed, so the primitive is run once on the indices of the elements;
 - reduction: unrolled;
-- structure: calls are followed, branches become selections, loops stay loops.
+- structure: calls are inlined, branches become selections, loops stay loops.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.extend import core
 
-from crazysim.engine.ir import Block, Element, constant
+from crazysim.engine import ops
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import Block, Builder, Element, constant
+from crazysim.engine.simplify import known_zero
 
 Elements = np.ndarray
-"""An array of elements: of type object, whatever the elements are."""
+"""An array of elements, of type object. A random key is a pair of elements."""
 
-LOGIC = {
-    "lt": ("and", 0),
-    "gt": ("and", 1),
-    "le": ("or", 0),
-    "ge": ("or", 1),
-    "max": ("or", None),
-    "min": ("and", None),
-}
-"""Order of truth values as logic, and which operand is negated for it."""
-
-Rule = Callable[["Reader", Any, list[Elements]], Sequence[Elements]]
+Rule = Callable[["Lowering", Any, list[Elements]], Sequence[Elements]]
 RULES: dict[str, Rule] = {}
 
-UNROLL = 64
-"""Longest loop with inputs or outputs for each turn, and largest index range, that is written out."""
-
-
-class UnsupportedError(Exception):
-    """A primitive, or a use of one, that cannot be read; the message names it."""
+MAX_UNROLL = 64
+"""Longest scan with inputs or outputs per iteration, and largest range of a run-time index, that is unrolled."""
 
 
 def rule(*names: str) -> Callable[[Rule], Rule]:
@@ -55,14 +44,35 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
     return register
 
 
-class Reader:
-    """Reads jaxprs into a block."""
+class Params(dict[str, Any]):
+    """Parameters of an equation; one that this version of JAX does not have makes the primitive unsupported."""
 
-    def __init__(self, block: Block):
-        """Write to a block."""
-        self.block = block
+    def __missing__(self, name: str) -> Any:
+        """Refuse the primitive."""
+        raise UnsupportedError(f"it has no parameter {name!r} in this version of JAX")
 
-    def read(self, jaxpr: core.ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
+
+class Equation(NamedTuple):
+    """An equation of a jaxpr, as rules get it."""
+
+    primitive: Any
+    """JAX's primitive."""
+    params: Params
+    """Its parameters."""
+    invars: Sequence[Any]
+    """Operands, with ``aval`` for shape and type."""
+    outvars: Sequence[Any]
+    """Results, likewise."""
+
+
+class Lowering:
+    """Lowers jaxprs into a block of scalar operations."""
+
+    def __init__(self, builder: Builder | None = None):
+        """Add operations to a block, to a new one if none is given."""
+        self.builder = Builder() if builder is None else builder
+
+    def lower(self, jaxpr: core.ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
         """Return the results of a jaxpr for arrays of elements.
 
         Raises:
@@ -77,56 +87,116 @@ class Reader:
         env.update(zip(inner.constvars, (constants(x, x.dtype) for x in jaxpr.consts), strict=True))
         env.update(zip(inner.invars, args, strict=True))
         for eqn in inner.eqns:
-            outs = self.apply(eqn, [value(v) for v in eqn.invars])
+            outs = self.lower_eqn(eqn, [value(v) for v in eqn.invars])
             env.update(zip(eqn.outvars, outs, strict=True))
         return [value(v) for v in inner.outvars]
 
-    def apply(self, eqn: Any, args: list[Elements]) -> Sequence[Elements]:
-        """Return the results of one operation."""
+    def lower_eqn(self, eqn: Any, args: list[Elements]) -> Sequence[Elements]:
+        """Return the results of one equation of a jaxpr."""
         name = eqn.primitive.name
         if name not in RULES:
-            raise UnsupportedError(f"primitive {name!r} has no rule")
-        return RULES[name](self, eqn, args)
+            raise UnsupportedError(f"primitive {name!r} has no rule", name)
+        try:
+            return RULES[name](self, Equation(eqn.primitive, Params(eqn.params), eqn.invars, eqn.outvars), args)
+        except UnsupportedError as error:
+            raise error.located(name) from None
 
-    def each(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:
-        """Return an operation on every element; scalars stand for arrays of any shape."""
-        if op in LOGIC and args[0].size and args[0].reshape(-1)[0].dtype == bool:
-            op, negated = LOGIC[op]
-            args = [self.each("not", [x], bool) if k == negated else x for k, x in enumerate(args)]
+    def elementwise(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:
+        """Return an operation on every element; scalars stand for arrays of any shape.
+
+        Raises:
+            UnsupportedError: If the operation is not defined for elements of these types.
+        """
         shape = np.broadcast_shapes(*(x.shape for x in args))
         rows = [np.broadcast_to(x, shape).reshape(-1) for x in args]
-        if args[-1].size and isinstance(rows[-1][0], tuple):  # keys: both words alike
-            pairs = [[self.one(op, c[0], *(k[i] for k in c[1:])) for i in (0, 1)] for c in zip(*rows, strict=True)]
-            return pack([(a, b) for a, b in pairs], shape)
-        return pack([self.block.add(op, column, dtype, params) for column in zip(*rows, strict=True)], shape)
+        if not rows[-1].size:
+            return np.empty(shape, object)
+        first = [row[0] for row in rows]
+        if isinstance(first[-1], tuple):  # keys: both halves alike
+            halves = [[self.scalar(op, c[0], *(k[i] for k in c[1:])) for i in (0, 1)] for c in zip(*rows, strict=True)]
+            return as_elements([(a, b) for a, b in halves], shape)
+        dtypes = [x.dtype for x in first]
+        if op in ops.BOOLEAN_FORM and dtypes[0].kind == "b":
+            op, negated = ops.BOOLEAN_FORM[op]
+            args = [self.elementwise("not", [x], bool) if k == negated else x for k, x in enumerate(args)]
+            return self.elementwise(op, args, bool)
+        error = ops.unsupported(op, dtypes, dtype)
+        if error is not None:
+            raise error
+        return as_elements([self.builder.add(op, column, dtype, params) for column in zip(*rows, strict=True)], shape)
 
-    def one(self, op: str, *args: Element, dtype: Any = None) -> Element:
-        """Return an operation on single elements; of the last operand's type, if no other is given."""
-        return self.block.add(op, args, args[-1].dtype if dtype is None else dtype)
+    def scalar(self, op: str, *args: Element, dtype: Any = None) -> Element:
+        """Return an operation on single elements; of the last operand's type, unless another is given."""
+        return self.builder.add(op, args, args[-1].dtype if dtype is None else dtype)
 
-    def inner(self) -> Reader:
-        """Return a reader into a new block inside this one."""
-        return Reader(Block(self.block))
+    def inner(self) -> Lowering:
+        """Return a lowering into a new block inside this one."""
+        return Lowering(Builder(self.builder))
+
+    def finish(self, outputs: Sequence[Elements]) -> Block:
+        """Return the block, with these outputs."""
+        return self.builder.finish(scalars(*outputs))
 
 
-def pack(items: Sequence[Element], shape: tuple[int, ...]) -> Elements:
-    """Return a flat sequence of elements as an array; NumPy must not look into them."""
+def as_elements(items: Sequence[Element], shape: tuple[int, ...]) -> Elements:
+    """Return a flat sequence of elements as an array. NumPy must not convert them."""
     out = np.empty(len(items), dtype=object)
     for i, item in enumerate(items):
         out[i] = item
     return out.reshape(shape)
 
 
-def words(*arrays: Elements) -> list[Element]:
-    """Return single elements in a row; a key is two words."""
+def scalars(*arrays: Elements) -> list[Element]:
+    """Return the single elements of arrays, one after the other; a random key is two 32-bit integers."""
     items = [x for array in arrays for x in np.asarray(array, object).reshape(-1)]
-    return [word for x in items for word in (x if isinstance(x, tuple) else (x,))]
+    return [half for x in items for half in (x if isinstance(x, tuple) else (x,))]
 
 
 def constants(x: Any, dtype: Any) -> Elements:
     """Return an array of numbers, or of random keys, as elements."""
     if jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key):
-        words = np.asarray(jax.random.key_data(x))
-        return pack([(constant(a, np.uint32), constant(b, np.uint32)) for a, b in words.reshape(-1, 2)], np.shape(x))
+        halves = np.asarray(jax.random.key_data(x)).reshape(-1, 2)
+        return as_elements([(constant(a, np.uint32), constant(b, np.uint32)) for a, b in halves], np.shape(x))
     array = np.asarray(x)
-    return pack([constant(item, dtype) for item in array.reshape(-1)], array.shape)
+    return as_elements([constant(item, dtype) for item in array.reshape(-1)], array.shape)
+
+
+def inputs(builder: Builder, aval: Any, zeros: frozenset[int] = frozenset()) -> Elements:
+    """Return an array as new inputs of a block.
+
+    Args:
+        builder: Takes the inputs.
+        aval: Shape and type of the array.
+        zeros: Flat indices of elements that are known to be zero: they are no inputs.
+
+    Raises:
+        UnsupportedError: If the engine has no numbers of this type.
+    """
+    size = int(np.prod(aval.shape, dtype=int))
+    if is_key(aval):
+        return as_elements([(builder.input(np.uint32), builder.input(np.uint32)) for _ in range(size)], aval.shape)
+    if aval.dtype.name not in ops.DTYPES:
+        raise UnsupportedError(f"numbers of type {aval.dtype.name}")
+    zero = known_zero(aval.dtype)
+    items = [zero if k in zeros and zero is not None else builder.input(aval.dtype) for k in range(size)]
+    return as_elements(items, aval.shape)
+
+
+def lower_function(fn: Callable[..., Any], *avals: Any) -> Block:
+    """Return the block of a function of small arrays.
+
+    Args:
+        fn: From arrays to an array, or to any tree of arrays.
+        avals: Shapes and types of the arguments.
+
+    Raises:
+        UnsupportedError: If it has a primitive without a rule.
+    """
+    lowering = Lowering()
+    args = [inputs(lowering.builder, x) for x in jax.tree.leaves(avals)]
+    return lowering.finish(lowering.lower(jax.make_jaxpr(fn)(*avals), args))
+
+
+def is_key(x: Any) -> bool:
+    """Return True for an array of random keys."""
+    return jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
