@@ -53,7 +53,9 @@ def load_params(controller: str, drone: Drone, xp: ModuleType | None = None, dev
     tables: dict[str, dict[str, Any]] = {"core": core}
     for name, table, keys in SOURCES:
         known = airframe.table(table)
-        tables.setdefault(name, {}).update({new: airframe.value(f"{table}.{k}") for k, new in keys.items() if k in known})
+        tables.setdefault(name, {}).update(
+            {new: airframe.value(f"{table}.{k}") for k, new in keys.items() if k in known}
+        )
     return as_arrays(tables, xp, device)
 
 

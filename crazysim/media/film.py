@@ -65,7 +65,9 @@ class Film:
         """
         self.path, self.view = Path(path), View() if view is None else view
         if self.path.suffix.lower() not in ENCODERS:
-            raise ConfigError(f"expected the name of a film to end with {' or '.join(ENCODERS)}, got {str(self.path)!r}")
+            raise ConfigError(
+                f"expected the name of a film to end with {' or '.join(ENCODERS)}, got {str(self.path)!r}"
+            )
         if not self.path.parent.is_dir():
             raise ConfigError(f"expected an existing folder, got {str(self.path.parent)!r} for {self.path.name!r}")
         for name, value in (("fps", fps), ("speed", speed)):
@@ -75,7 +77,8 @@ class Film:
         if self.path.suffix.lower() == ".mp4" and any(n % 2 for n in size):
             even = [n + n % 2 for n in size]
             raise ConfigError(
-                f"expected an even width and height for .mp4, got {size[0]} x {size[1]} pixels. Use {even[0]} x {even[1]}."
+                f"expected an even width and height for .mp4, got {size[0]} x {size[1]} pixels. Use "
+                f"{even[0]} x {even[1]}."
             )
         self.fps, self.speed, self.n_frames = float(fps), float(speed), 0
         self._command = self._encode(*size)
@@ -160,7 +163,9 @@ class Film:
         if self._ffmpeg is not None:
             self._end(self._ffmpeg)
         elif not self.n_frames:
-            raise ConfigError(f"expected at least one frame of {str(self.path)!r}, got none. Call film.add(sim) between steps.")
+            raise ConfigError(
+                f"expected at least one frame of {str(self.path)!r}, got none. Call film.add(sim) between steps."
+            )
 
     def _end(self, ffmpeg: subprocess.Popen[bytes]) -> None:
         self._ffmpeg = None
@@ -169,13 +174,17 @@ class Film:
         message = ffmpeg.stderr.read().decode(errors="replace").strip()
         ffmpeg.stderr.close()
         if ffmpeg.wait() != 0:
-            raise RenderError(f"expected a file that can be written, got {str(self.path)!r}: {message or 'ffmpeg failed'}")
+            raise RenderError(
+                f"expected a file that can be written, got {str(self.path)!r}: {message or 'ffmpeg failed'}"
+            )
 
     def _encode(self, width: int, height: int) -> list[str]:
         try:
             from imageio_ffmpeg import get_ffmpeg_exe
         except ImportError as error:
-            raise ImportError("expected imageio-ffmpeg, which films need, got none. Run pip install 'crazysim[demo]'.") from error
+            raise ImportError(
+                "expected imageio-ffmpeg, which films need, got none. Run pip install 'crazysim[demo]'."
+            ) from error
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self.fps:g}", "-i", "-"]
         encoder = ENCODERS[self.path.suffix.lower()]
         return [get_ffmpeg_exe(), "-loglevel", "error", *raw, *encoder, "-y", str(self.path)]
@@ -197,5 +206,7 @@ def _bar(total: int | None) -> Any:
     try:
         from tqdm import tqdm
     except ImportError as error:
-        raise ImportError("expected tqdm, which progress=True needs, got none. Run pip install 'crazysim[demo]'.") from error
+        raise ImportError(
+            "expected tqdm, which progress=True needs, got none. Run pip install 'crazysim[demo]'."
+        ) from error
     return tqdm(total=total, desc="filming", unit="frame", ncols=80)

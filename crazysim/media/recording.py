@@ -90,7 +90,9 @@ class Recorder:
         """
         if not self._samples:
             raise ConfigError("expected at least one sample, got none. Call recorder.add() between steps.")
-        return Flight(**{name: np.stack([sample[name] for sample in self._samples]) for name in self._samples[0]}, **self._scene)
+        return Flight(
+            **{name: np.stack([sample[name] for sample in self._samples]) for name in self._samples[0]}, **self._scene
+        )
 
 
 def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = None) -> Flight:
@@ -146,8 +148,8 @@ def put(sim: Sim, flight: Flight, time: float) -> None:
     found, recorded = (sim.n_drones, sim.mj_model.nmocap - sim.n_drones), (flight.n_drones, len(flight.body_ids))
     if found != recorded:
         raise ConfigError(
-            f"expected a simulation of {recorded[0]} drones and {recorded[1]} other mocap bodies, as the flight has, got "
-            f"{found[0]} and {found[1]}"
+            f"expected a simulation of {recorded[0]} drones and {recorded[1]} other mocap bodies, as the flight has, "
+            f"got {found[0]} and {found[1]}"
         )
     now, data = flight.at(time), sim.data
     states = data.states.replace(

@@ -80,8 +80,8 @@ class View:
             )
         if self.follow is not None and self.camera != -1:
             raise ConfigError(
-                f"expected camera=-1, the free camera, to follow a drone, got {self.camera!r}. Drones carry the cameras "
-                f"track_cam:i and fpv_cam:i."
+                f"expected camera=-1, the free camera, to follow a drone, got {self.camera!r}. Drones carry the "
+                f"cameras track_cam:i and fpv_cam:i."
             )
         if not np.isfinite(self.lag) or self.lag < 0:
             raise ConfigError(f"expected a lag of 0 s or more, got {self.lag!r}")
@@ -153,7 +153,7 @@ class View:
         sim.render("human", self.worlds[0], self.camera, self._cam_config(0, time[0], pos[0]), self.width, self.height)
 
     def _sample(self, sim: Sim) -> tuple[NDArray, NDArray]:
-        """Return times, s (n,), and positions of drones, m (n, n_drones, 3), of the worlds, and add them to the trails."""
+        """Return times, s (n,), and drone positions, m (n, n_drones, 3), of the worlds, and extend the trails."""
         worlds = world_indices(sim, self.worlds)
         if self.follow is not None and self.follow not in range(sim.n_drones):
             raise ConfigError(f"expected a drone from 0 to {sim.n_drones - 1} to follow, got {self.follow!r}")

@@ -41,7 +41,9 @@ def page(flight: Flight, world: int | None = None) -> str:
     """
     k = 0 if world is None else flight.index(world)
     viser = _viser()
-    with contextlib.redirect_stdout(io.StringIO()):  # viser prints the address of its server, which runs for this call only
+    with contextlib.redirect_stdout(
+        io.StringIO()
+    ):  # viser prints the address of its server, which runs for this call only
         server = viser.ViserServer(host="127.0.0.1", port=_free_port(), verbose=False)
         try:
             return _record(server, flight, k).as_html()
@@ -95,7 +97,7 @@ def server_of(html: str, port: int, host: str = "127.0.0.1") -> http.server.Thre
 
 
 def camera_of(flight: Flight, k: int) -> tuple[NDArray, NDArray]:
-    """Return the initial position of a page's camera and the point it looks at, with a whole flight in view, m. (3,), (3,)"""
+    """Return the initial position of a page's camera and the point it looks at, for a whole flight, m. (3,), (3,)"""
     points = flight.pos[:, k].reshape(-1, 3)
     points = points[np.isfinite(points).all(-1)]
     low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.ones(3))

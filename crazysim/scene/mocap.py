@@ -52,8 +52,8 @@ def require_poses(model: CollisionModel, names: Iterable[str], mocap: MocapPoses
     missing = [name for name in names if name in model.mocap_bodies]
     if missing and mocap is None:
         raise ConfigError(
-            f"expected the pose of body {missing[0]!r}, which is moved through sim.mjx_data and not part of the data. Pass "
-            f"mocap=sim.mjx_data, add the body with sim.scene.add, or leave it out with objects=."
+            f"expected the pose of body {missing[0]!r}, which is moved through sim.mjx_data and not part of the data. "
+            f"Pass mocap=sim.mjx_data, add the body with sim.scene.add, or leave it out with objects=."
         )
 
 

@@ -160,7 +160,9 @@ class SceneObjects:
         names = [f"{name}:{k}" for k in numbers]
         taken = sorted({body.name for body in spec.bodies} & {name, *names})
         if taken or name == "drone":
-            raise ConfigError(f"expected a new name, got {(taken or ['drone:0'])[0]!r}, a body of the scene. Pass name=.")
+            raise ConfigError(
+                f"expected a new name, got {(taken or ['drone:0'])[0]!r}, a body of the scene. Pass name=."
+            )
         n_worlds = self._n_worlds if mocap else None
         poses = [
             np.broadcast_to(np.asarray(as_poses(x, what, count, size, n_worlds)), (n_worlds or 1, count, size))

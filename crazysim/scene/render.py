@@ -130,9 +130,7 @@ def require_size(width: Any, height: Any) -> None:
         ConfigError: If width or height is not a positive integer.
     """
     if not all(isinstance(n, (int, np.integer)) and n > 0 for n in (width, height)):
-        raise ConfigError(
-            f"expected positive integers as width and height of an image, got {width} x {height} pixels"
-        )
+        raise ConfigError(f"expected positive integers as width and height of an image, got {width} x {height} pixels")
 
 
 def font_scale(height: int) -> mujoco.mjtFontScale:

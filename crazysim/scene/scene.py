@@ -247,9 +247,7 @@ class Scene:
         """Names of the objects that drones can touch, in the order of a contact report."""
         return tuple(body.name for body in self.collision_model.objects)
 
-    def contact_fn(
-        self, objects: report.Objects = None, floor: bool = True, drones: bool = True
-    ) -> report.ContactFn:
+    def contact_fn(self, objects: report.Objects = None, floor: bool = True, drones: bool = True) -> report.ContactFn:
         """Return ``contacts(data, mocap=None) -> ContactReport``, pure, for the scene as it is now.
 
         The function takes all worlds or, in a stage, one world or one drone; for a stage of one drone pass

@@ -70,9 +70,7 @@ def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
     )
 
 
-def with_poses_of(
-    data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]
-) -> tuple[Array, Array, Array]:
+def with_poses_of(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     """Return poses of bodies and joints in some worlds, with those of drones and handles as the data have them.
 
     Args:

@@ -367,7 +367,8 @@ class Sim:
     mj_data = SceneAttribute[mujoco.MjData]("mj_data", "State of the world that was drawn last.")
     mjx_model = SceneAttribute[mjx.Model]("mjx_model", "Compiled scene on the device; made when first read.")
     max_geom_pairs = SceneAttribute[int](
-        "max_geom_pairs", "Most pairs that MJX checks per kind of collision, from the next ``build_mjx`` on; -1 for all."
+        "max_geom_pairs",
+        "Most pairs that MJX checks per kind of collision, from the next ``build_mjx`` on; -1 for all.",
     )
     max_visual_geom = SceneAttribute[int]("renderer.max_visual_geom", "Most overlays of one image.")
     overlays = SceneAttribute[Overlays]("renderer.overlays", "Lines, points, labels and text of the next image.")
@@ -436,7 +437,7 @@ class Sim:
         """Return the contacts and distances of every drone: to the floor, to objects, to other drones.
 
         Computed by JAX from the poses in the data. Bodies that were attached to ``spec`` and are moved through
-        ``mjx_data`` are taken where ``mjx_data`` has them. Fields that were not requested are None and are not computed.
+        ``mjx_data`` are where ``mjx_data`` has them. Fields that were not requested are None and are not computed.
 
         Args:
             objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.

@@ -119,9 +119,7 @@ def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size
         ValueError: If the simulation has another command level, or no such world.
     """
     if sim.data.controls.state is None:
-        raise ConfigError(
-            f"expected control='state', whose commands have positions, got control={str(sim.control)!r}"
-        )
+        raise ConfigError(f"expected control='state', whose commands have positions, got control={str(sim.control)!r}")
     if not 0 <= world < sim.n_worlds:
         raise ConfigError(f"expected a world from 0 to {sim.n_worlds - 1}, got {world}")
     setpoints = np.asarray(sim.data.controls.state.staged_cmd[world, :, :3], float)
@@ -149,9 +147,9 @@ def change_material(
     """
     ids = np.asarray(drone_ids)
     if ids.ndim != 1 or not np.issubdtype(ids.dtype, np.integer):
-        raise ValueError(f"expected drone_ids as a 1D array or list of integers, got {drone_ids!r}")
+        raise ValueError(f"drone_ids must be 1D arrays or lists of integers, got {drone_ids!r}")
     if ids.size and not (ids.min() >= 0 and ids.max() < sim.n_drones):
-        raise ValueError(f"expected drone_ids from 0 to {sim.n_drones - 1}, got {ids.tolist()}")
+        raise ValueError(f"drone_ids must be in range [0, {sim.n_drones - 1}], got {ids.tolist()}")
     materials = [mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{mat_name}:{drone}") for drone in ids]
     if any(material < 0 for material in materials):
         raise UnknownNameError(f"expected material 'led_top' or 'led_bot', got {mat_name!r}")

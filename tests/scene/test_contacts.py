@@ -169,7 +169,9 @@ def test_a_body_without_geoms_touches_nothing(crowd):
 
 
 def test_an_unknown_body_is_told_with_the_names_there_are(crowd):
-    with pytest.raises(ValueError, match=r"expected a body of the scene, world, drone:0, drone:1, ball, pole, got 'gate'"):
+    with pytest.raises(
+        ValueError, match=r"expected a body of the scene, world, drone:0, drone:1, ball, pole, got 'gate'"
+    ):
         crowd[0].contacts("gate")
 
 

@@ -141,7 +141,10 @@ def test_every_primitive_is_there_and_touched_by_drones_only(what):
 BAD = {
     "taken": (lambda s: s.scene.add("gate"), "got 'gate:0', a body of the scene"),
     "drone": (lambda s: s.scene.add("box", "drone"), "got 'drone:0', a body of the scene"),
-    "unknown": (lambda s: s.scene.add("tree"), "expected gate, box, pole, sphere, wall, landing_pad, an MJCF file, MJCF text, an MjSpec or a body of one, got 'tree'"),
+    "unknown": (
+        lambda s: s.scene.add("tree"),
+        "landing_pad, an MJCF file, MJCF text, an MjSpec or a body of one, got 'tree'",
+    ),
     "mjcf": (
         lambda s: s.scene.add("<mujoco><worldbody><geom type='box'/></worldbody></mujoco>", "q"),
         "size 0 must be",
@@ -152,7 +155,10 @@ BAD = {
     "size": (lambda s: s.scene.add("sphere", "q", radius=-1), "expected positive lengths"),
     "mjcf setting": (lambda s: s.scene.add(TOWER, "q", radius=1), "expected no settings, which only gate"),
     "count": (lambda s: s.scene.add("box", "q", count=0), "count"),
-    "pos": (lambda s: s.scene.add("box", "q", count=2, pos=[[0, 0]]), "expected pos of shape (3,) or (2, 3) or (1, 2, 3), got (1, 2)"),
+    "pos": (
+        lambda s: s.scene.add("box", "q", count=2, pos=[[0, 0]]),
+        "expected pos of shape (3,) or (2, 3) or (1, 2, 3), got (1, 2)",
+    ),
     "stand": (lambda s: s.scene.add("gate", "q", stand=0.1), "expected stand above 0.275 m"),
     "pole": (lambda s: s.scene.add("pole", "q", height=0.1, radius=0.1), "higher than it is thick"),
 }

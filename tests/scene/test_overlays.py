@@ -282,14 +282,17 @@ def test_the_lower_led_is_seen_from_below(opengl):
         (lambda sim: draw_points(sim, np.zeros((20_000, 3))), "at most 10000 overlays in one image, got 20000"),
         (
             lambda sim: change_material(sim, "led_top", [2], rgba=RED),
-            r"expected drone_ids from 0 to 1, got \[-?\d",
+            r"drone_ids must be in range \[0, 1\], got \[-?\d",
         ),
         (
             lambda sim: change_material(sim, "led_top", [-1], rgba=RED),
-            r"expected drone_ids from 0 to 1, got \[-?\d",
+            r"drone_ids must be in range \[0, 1\], got \[-?\d",
         ),
-        (lambda sim: change_material(sim, "led_top", 0, rgba=RED), "expected drone_ids as a 1D array .*of integers"),
-        (lambda sim: change_material(sim, "led_top", [0.5], rgba=RED), "expected drone_ids as a 1D array .*of integers"),
+        (lambda sim: change_material(sim, "led_top", 0, rgba=RED), "drone_ids must be 1D array.* of integers"),
+        (
+            lambda sim: change_material(sim, "led_top", [0.5], rgba=RED),
+            "drone_ids must be 1D array.* of integers",
+        ),
         (lambda sim: change_material(sim, "lamp", [0], rgba=RED), "got 'lamp'"),
         (lambda sim: change_material(sim, "led_top", [0], rgba=[1, 0]), "broadcast|shape"),
     ],

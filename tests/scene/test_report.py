@@ -273,9 +273,7 @@ def test_before_mjx_data_is_read_such_bodies_are_where_the_spec_has_them():
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
     sim.build_mjx()
     centre = np.asarray(sim.airframe.value("shape.collision_sphere"))
-    np.testing.assert_allclose(
-        sim.contact_report("rock").object_distance, 2 - centre[2] - centre[3] - 0.1, atol=SPHERE
-    )
+    np.testing.assert_allclose(sim.contact_report("rock").object_distance, 2 - centre[2] - centre[3] - 0.1, atol=SPHERE)
     assert not sim.scene.is_allocated
 
 
@@ -321,7 +319,9 @@ def test_cameras_see_such_bodies_and_hang_on_them(attached):
 def test_law_09_wrong_queries_are_refused(attached):
     sim, _ = attached
     for refused in (lambda: sim.scene.contact_fn()(sim.data), lambda: sim.scene.depth_fn("fpv_cam", 2, 2)(sim.data)):
-        with pytest.raises(ConfigError, match=r"'rock:0', which is moved through sim.mjx_data.*Pass mocap=sim.mjx_data"):
+        with pytest.raises(
+            ConfigError, match=r"'rock:0', which is moved through sim.mjx_data.*Pass mocap=sim.mjx_data"
+        ):
             refused()
     with pytest.raises(ConfigError, match=r"expected mocap_pos of shape \(2, n_mocap, 3\), got \(5, 3\)"):
         sim.scene.contact_fn()(sim.data, (jnp.zeros((5, 3)), jnp.zeros((5, 4))))
