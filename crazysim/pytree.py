@@ -27,12 +27,12 @@ def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None) 
     """Declare an array field, or a dict of such arrays.
 
     Args:
-        scope: Which batch axes the array carries. ``drone``: (n_worlds, n_drones, *core). ``world``:
-            (n_worlds, 1, *core). ``shared``: core. ``parameter``: shared or drone, told apart by its
-            number of dimensions. ``opaque``: untouched by resets and by sharding.
+        scope: Batch axes of the array. ``drone``: (n_worlds, n_drones, *core). ``world``: (n_worlds, 1, *core).
+            ``shared``: core. ``parameter``: shared or drone, by its number of dimensions. ``opaque``: none that are
+            known; masked resets and sharding leave it alone.
         core_ndim: Number of dimensions of the core shape.
-        core: The core shape, where it can be no other. It keeps one mass for each of three worlds from passing
-            for one along each of three axes.
+        core: The core shape, if it is fixed. It keeps one mass for each of three worlds from passing for one along
+            each of three axes.
     """
     return dataclasses.field(metadata={"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core})
 
@@ -137,8 +137,14 @@ def _map_foreign(fn: Callable[[Any, Any, str], Any], record: Any, name: str) -> 
     metadata = {field.name: field.metadata for field in dataclasses.fields(record)}
     mapped = []
     for path, child in children:
-        key = getattr(path[0], "name", None)  # without keys of attributes the fields cannot be told from each other
-        mapped.append(_map_declared(fn, child, metadata.get(key, {}), f"{name}{jax.tree_util.keystr(path)}"))
+        key = getattr(path[0], "name", None)  # absent where the record is registered without names
+        child_name, declared = f"{name}{jax.tree_util.keystr(path)}", metadata.get(key, {})
+        if CORE_NDIM_KEY in declared and _is_record(child):
+            raise ConfigError(
+                f"expected an array in {child_name}, whose metadata have {CORE_NDIM_KEY!r}, got a "
+                f"{type(child).__name__}. Give the metadata to the fields of that record."
+            )
+        mapped.append(_map_declared(fn, child, declared, child_name))
     return treedef.unflatten(mapped)
 
 
@@ -172,9 +178,9 @@ def map_batched(fn: Callable[..., Any], tree: T, *others: T) -> T:
 
 
 def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
-    """Return ``new`` where ``mask`` says so, ``old`` elsewhere; the mask (n_worlds,), (n_worlds, 1) or of one world ().
+    """Return ``new`` where ``mask`` is True, ``old`` elsewhere; the mask (n_worlds,), (n_worlds, 1) or of one world ().
 
-    Both are broadcast to the larger of their shapes; without a mask ``new`` is taken everywhere.
+    Both are broadcast to the larger of their shapes; without a mask the result is ``new`` everywhere.
     """
     shape = jnp.broadcast_shapes(jnp.shape(new), jnp.shape(old))
     if mask is None:

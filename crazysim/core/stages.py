@@ -25,7 +25,7 @@ from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.pytree import PER_WORLD, scopes, select_worlds
 
 FLOOR = -0.001
-"""Height below which no drone falls, m: a little under zero, so that a negative height tells a landing."""
+"""Height below which no drone falls, m: a little under zero, so that a negative height marks a landing."""
 
 
 def _built_in(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:

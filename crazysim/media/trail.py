@@ -24,7 +24,7 @@ def colors_of(n_drones: int, rgba: ArrayLike | None) -> NDArray:
 class Trail:
     """Positions of the drones of some worlds over the last seconds.
 
-    A world whose time decreases has been reset, and its trail begins anew.
+    A world whose time decreases has been reset, and its trail begins again.
     """
 
     def __init__(self, seconds: float):

@@ -183,5 +183,5 @@ def _pose(camera: Camera, data: SimData) -> tuple[Array, Array]:
     at, quat = (x[:, camera.row] for x in poses)
     if not camera.turns:
         return at + pos, jnp.broadcast_to(rot, (n, 3, 3))
-    # Written out: a GPU may round matrix products to 10 bits.
+    # By components: a GPU may round matrix products to 10 bits.
     return at + rotation.rotate(quat, pos), jnp.stack([rotation.rotate(quat, rot[:, k]) for k in range(3)], axis=-1)

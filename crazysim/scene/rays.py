@@ -17,7 +17,7 @@ from crazysim.scene.collision import CollisionGeom, CollisionModel
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
 MAX_UNROLLED = 16
-"""Geoms of equal objects up to which the program is written out; more go through a loop, which compiles once."""
+"""Geoms of equal objects up to which the program is unrolled; more go through a loop, which compiles once."""
 
 
 class Hits(PyTree):

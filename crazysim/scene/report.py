@@ -204,7 +204,7 @@ def _gap(mine: CollisionGeom, at: Array, drone_rot: Array | None, geom: Collisio
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Return ``a @ b`` of 3 x 3 matrices, written out: a GPU may round matrix products to 10 bits. (..., 3, 3)"""
+    """Return ``a @ b`` of 3 x 3 matrices, by components: a GPU may round matrix products to 10 bits. (..., 3, 3)"""
     return jnp.stack([rotation.matvec(a, b[..., k]) for k in range(3)], axis=-1)
 
 

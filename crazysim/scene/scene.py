@@ -199,8 +199,8 @@ class Scene:
     def sync(self, data: SimData, world: int | None = None) -> SimData:
         """Bring the scene up to date: all worlds, or ``mj_data`` with the one world that is to be drawn.
 
-        Drawing one world leaves the others alone, except where there is only one. The host knows whether a sync is
-        due, so the call does not wait for the device.
+        Drawing one world leaves the others alone, except where there is only one. Whether a sync is due
+        is a flag on the host, so the call does not wait for the device.
 
         Returns:
             The data, with ``core.mjx_synced`` set if all worlds were synced.

@@ -11,6 +11,7 @@ from cases import hover_command, hover_rotor_state, to_all, with_states
 from crazysim import PyTree, Sim, leaf
 from crazysim.core.pipeline import insert_fn_before
 from crazysim.errors import ConfigError
+from crazysim.pytree import scopes
 from crazysim.utils import CORE_NDIM_KEY
 
 N_WORLDS, N_DRONES = 3, 2
@@ -94,6 +95,12 @@ def test_a_declared_axis_that_is_not_over_worlds_is_refused(counting):
     with pytest.raises(ConfigError, match=r"data.plugins\['foreign'\].count .* got shape \(4, 1\)"):
         counting.step()
     counting.data = data
+
+
+def test_metadata_on_a_field_that_holds_a_record_are_refused(counting):
+    nested = dataclasses.replace(Counter.create(), count=Counter.create())
+    with pytest.raises(ConfigError, match=r"\['foreign'\].count, whose metadata have 'core_ndim', got a Counter"):
+        scopes(counting.data.replace(plugins={"foreign": nested}))
 
 
 def test_an_action_queue_flies_the_same_way_after_a_full_reset():

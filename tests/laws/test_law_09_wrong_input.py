@@ -54,7 +54,7 @@ WRONG_SETTINGS = [
     ({"device": "cpu:99"}, "'cpu:99' does not exist", "'cpu' or 'gpu'"),
     ({"device": None}, "not None", "jax.Device"),
     ({"mesh": 2}, "not 2", "world_mesh"),
-    ({"xml_path": "/nowhere/scene.xml"}, "/nowhere/scene.xml does not exist", "xml_path="),
+    ({"xml_path": "/nowhere/scene.xml"}, "expected an existing MJCF file as xml_path", "/nowhere/scene.xml"),
     ({"xml_path": 3}, "xml_path is 3", "MJCF"),
     ({"rng_key": "lucky"}, "'lucky'", "an integer"),
     ({"rng_key": 1.5}, "1.5", "an integer"),
@@ -74,10 +74,10 @@ def test_wrong_settings_are_told_at_construction(case):
 @pytest.mark.parametrize(
     "text, fragment",
     [
-        ("<mujoco><worldbody>", "is not a scene MuJoCo can read"),
-        ("no XML at all", "is not a scene MuJoCo can read"),
-        ("<mujoco><worldbody><geom type='teapot'/></worldbody></mujoco>", "is not a scene MuJoCo can read"),
-        ("<mujoco><worldbody><geom type='sphere'/></worldbody></mujoco>", "does not compile"),
+        ("<mujoco><worldbody>", "expected a scene that MuJoCo can read"),
+        ("no XML at all", "expected a scene that MuJoCo can read"),
+        ("<mujoco><worldbody><geom type='teapot'/></worldbody></mujoco>", "expected a scene that MuJoCo can read"),
+        ("<mujoco><worldbody><geom type='sphere'/></worldbody></mujoco>", "expected a scene that compiles"),
         ("<mujoco><worldbody><body name='drone:0'/></worldbody></mujoco>", "'drone:0'"),
     ],
 )
@@ -307,7 +307,7 @@ def test_a_spec_that_does_not_compile_leaves_the_old_scene():
     sim = Sim()
     before, model = sim.data, sim.mj_model
     geom = sim.spec.worldbody.add_geom(name="bad", size=[-1.0, 0, 0])
-    with pytest.raises(ConfigError, match="the scene does not compile"):
+    with pytest.raises(ConfigError, match="expected a scene that compiles"):
         sim.build_mjx()
     assert sim.data is before
     assert sim.mj_model is model

@@ -139,7 +139,7 @@ def test_another_simulation_is_put_where_the_flight_was(flight, opengl):
     np.testing.assert_allclose(other.mjx_data.mocap_quat[2, k], np.roll(ROLL[1], 1), atol=1e-6)
     above = {"lookat": [2, 0, 0.3], "distance": 2.0, "azimuth": 90, "elevation": -89}
     for world, seen in ((2, True), (0, False)):
-        picture = View(worlds=world, width=64, height=48, cam_config=above).picture(other).astype(int)
+        picture = View(worlds=world, width=64, height=48, cam_config=above).render(other).astype(int)
         red = picture[..., 0] > picture[..., 1:].max(-1) + 60
         assert red[23:25, 31:33].all() == red.any() == seen
     other.close()

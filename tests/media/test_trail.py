@@ -59,7 +59,7 @@ def test_a_time_that_cannot_be_is_told(seconds):
     [
         ([0.0], np.zeros((2, 1, 3)), r"got \(1,\) and \(2, 1, 3\)"),
         ([0.0, 0.0], np.zeros((2, 3)), r"got \(2,\) and \(2, 3\)"),
-        ([0.0] * 3, np.zeros((3, 1, 3)), r"positions of shape \(2, 1, 3\), got \(3, 1, 3\)"),
+        ([0.0] * 3, np.zeros((3, 1, 3)), r"positions of shape \(2, 1, 3\), as before, got \(3, 1, 3\)"),
     ],
 )
 def test_positions_of_another_shape_are_told(time, pos, message):

@@ -252,20 +252,23 @@ def broken_scene(tmp_path, text):
 
 WORLD = "<mujoco><worldbody>{}</worldbody></mujoco>"
 BROKEN = {
-    "no XML": ("this is no XML", "is not a scene MuJoCo can read"),
-    "empty": ("", "is not a scene MuJoCo can read"),
-    "cut off": ("<mujoco><worldbody>", "is not a scene MuJoCo can read"),
-    "unknown element": (WORLD.format("<wall/>"), "is not a scene MuJoCo can read"),
-    "include that is not there": ("<mujoco><include file='none.xml'/></mujoco>", "is not a scene MuJoCo can read"),
+    "no XML": ("this is no XML", "expected a scene that MuJoCo can read"),
+    "empty": ("", "expected a scene that MuJoCo can read"),
+    "cut off": ("<mujoco><worldbody>", "expected a scene that MuJoCo can read"),
+    "unknown element": (WORLD.format("<wall/>"), "expected a scene that MuJoCo can read"),
+    "include that is not there": (
+        "<mujoco><include file='none.xml'/></mujoco>",
+        "expected a scene that MuJoCo can read",
+    ),
     "mesh that is not there": (
         "<mujoco><asset><mesh name='m' file='none.stl'/></asset></mujoco>",
-        "does not compile.*none.stl",
+        "expected a scene that compiles.*none.stl",
     ),
-    "geom without size": (WORLD.format("<geom type='sphere'/>"), "does not compile"),
-    "a drone of its own": (WORLD.format("<body name='drone:0'/>"), "has bodies named .'drone:0'."),
+    "geom without size": (WORLD.format("<geom type='sphere'/>"), "expected a scene that compiles"),
+    "a drone of its own": (WORLD.format("<body name='drone:0'/>"), "reserved for the drones, got .'drone:0'."),
     "a drone deep in the tree": (
         WORLD.format("<body name='a'><body name='drone:7'/></body>"),
-        "has bodies named .'drone:7'.",
+        "reserved for the drones, got .'drone:7'.",
     ),
 }
 
@@ -302,7 +305,7 @@ def test_a_spec_that_does_not_compile_leaves_the_old_scene(sim):
     sim = Sim()
     model, data = sim.mj_model, sim.data
     wrong = sim.spec.worldbody.add_geom(name="wrong", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0, 0, 0])
-    with pytest.raises(ValueError, match="does not compile"):
+    with pytest.raises(ValueError, match="expected a scene that compiles"):
         sim.build_mjx()
     assert sim.mj_model is model
     assert sim.data is data
@@ -337,7 +340,7 @@ def not_for_mjx():
 def test_shapes_that_mjx_cannot_check_are_told_when_contacts_are_asked_for(not_for_mjx):
     """MJX has no box against cylinder: the scene flies, and says so when it is asked what touches."""
     not_for_mjx.step()
-    with pytest.raises(ValueError, match="MJX cannot hold this scene"):
+    with pytest.raises(ValueError, match="expected a scene that MJX supports"):
         not_for_mjx.contacts()
 
 
