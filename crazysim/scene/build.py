@@ -193,8 +193,8 @@ def check_poses(mjx_data: mjx.Data, mj_model: mujoco.MjModel, n_worlds: int) -> 
         value, needed = getattr(mjx_data, name), (n_worlds, mj_model.nmocap, size)
         if np.shape(value) != needed:
             raise ConfigError(
-                f"expected mjx_data.{name} of shape {needed} = (n_worlds, mocap bodies, {size}), got {np.shape(value)}. "
-                f"To move some bodies use sim.mjx_data.{name}.at[:, ids].set(...)."
+                f"expected mjx_data.{name} of shape {needed} = (n_worlds, mocap bodies, {size}), got "
+                f"{np.shape(value)}. To move some bodies use sim.mjx_data.{name}.at[:, ids].set(...)."
             )
         if not isinstance(value, jax.Array) and not np.isfinite(value).all():
             raise ConfigError(f"expected finite numbers in mjx_data.{name}, got NaN or infinity")
