@@ -1,4 +1,4 @@
-"""Errors of a wrong configuration, and of a machine that cannot draw."""
+"""Errors and warnings of the package."""
 
 
 class ConfigError(ValueError):
@@ -15,3 +15,7 @@ class UnknownNameError(ConfigError, KeyError):
 
 class RenderError(RuntimeError):
     """A missing or broken screen or OpenGL."""
+
+
+class EngineWarning(UserWarning):
+    """A step that runs on a slower engine than requested, because the faster one does not support it."""

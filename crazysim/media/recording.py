@@ -183,8 +183,8 @@ def _body_ids(sim: Sim) -> NDArray:
 
 def _scene(sim: Sim, worlds: NDArray) -> dict[str, Any]:
     """Return the fields of a flight that do not change with time."""
-    ids = _body_ids(sim)  # first, because it compiles an edited scene
-    sim._data = sim._scene.sync(sim._data, worlds[0])
+    ids = _body_ids(sim)
+    sim.sync(worlds[0])
     return {
         "worlds": worlds,
         "drone_ids": np.asarray(sim.data.core.drone_mocap_ids),
@@ -198,6 +198,6 @@ def _bodies(sim: Sim, worlds: NDArray) -> tuple[NDArray, NDArray]:
     ids = _body_ids(sim)
     pos, quat = np.zeros((len(worlds), len(ids), 3)), np.zeros((len(worlds), len(ids), 4))
     for k, world in enumerate(worlds if len(ids) else []):
-        sim._data = sim._scene.sync(sim._data, world)
+        sim.sync(world)
         pos[k], quat[k] = sim.mj_data.mocap_pos[ids], np.roll(sim.mj_data.mocap_quat[ids], -1, axis=-1)
     return pos, quat

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import Objects, SimData
 from crazysim.drones.airframe import Airframe
+from crazysim.errors import ConfigError
 from crazysim.scene import build, collision, depth, mjx, report
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.mjx_scene import MjxScene
@@ -38,8 +39,8 @@ class Scene:
     """Most pairs that MJX checks per kind of collision, from the next ``compile`` on; -1 for all."""
     renderer: SceneRenderer
     """Renderers and the overlays of the next image."""
-    on_compile: Callable[[], None] | None
-    """Function called after each compilation."""
+    revision: int
+    """Number of changes of the objects and mocap ids that the data hold."""
 
     def __init__(
         self,
@@ -70,7 +71,7 @@ class Scene:
         self.renderer = SceneRenderer(device)
         self.spec = build.build_spec(xml_path, airframe, n_drones, freq, self.max_geom_pairs)
         self._objects = SceneObjects(n_worlds)
-        self.on_compile = None
+        self.revision = 0
         self.compile()
 
     def add(
@@ -103,6 +104,7 @@ class Scene:
         """
         handle = self._objects.add(self.spec, what, name, count, pos, quat, mocap, options)
         self.edited = True
+        self.revision += 1
         return handle
 
     def compile(self) -> None:
@@ -122,9 +124,8 @@ class Scene:
         self._collision_model: CollisionModel | None = None
         self._visual_model: CollisionModel | None = None
         self.edited = False
+        self.revision += 1
         self.invalidate()
-        if self.on_compile is not None:
-            self.on_compile()
 
     def compile_if_edited(self) -> None:
         """Compile the spec if objects were added since the last compilation."""
@@ -145,13 +146,25 @@ class Scene:
 
     @property
     def drone_mocap_ids(self) -> list[int]:
-        """Mocap id of each drone's body. (n_drones,)"""
-        self.compile_if_edited()
-        return self._drone_ids
+        """Mocap id of each drone's body, as in the next compiled model. (n_drones,)"""
+        return self._ids([f"drone:{i}" for i in range(self.n_drones)]) if self.edited else self._drone_ids
 
     def objects(self, before: Objects | None) -> Objects | None:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects."""
-        return self._objects.record(before, self._object_ids)
+        movable = self._objects.movable
+        return self._objects.record(before, self._ids(movable) if self.edited else self._object_ids)
+
+    def _ids(self, names: Sequence[str]) -> list[int]:
+        """Return mocap ids in the spec, which are those of the compiled model; nothing is compiled.
+
+        Raises:
+            ConfigError: If the spec lacks one of the bodies.
+        """
+        ids = build.spec_mocap_ids(self.spec)
+        lost = [name for name in names if name not in ids]
+        if lost:
+            raise ConfigError(f"expected mocap body {lost[0]!r} in the spec, got none. Leave drones and objects in it.")
+        return [ids[name] for name in names]
 
     # State of all worlds ----------------------------------------------------------------------------------------------
 

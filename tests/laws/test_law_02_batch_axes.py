@@ -14,8 +14,7 @@ from cases import LEVELS, PAIRS, shared_sim, with_params, with_states
 
 from crazysim import ConfigError, Control, PyTree, Sim
 from crazysim.core.data import SimData
-from crazysim.engine import Step
-from crazysim.engine.step import ENGINES
+from crazysim.engine import ENGINES, Step
 from crazysim.pytree import scopes
 
 SIZES = [(n, m) for n in (1, 2, 3, 4) for m in (1, 2, 3, 4)]

@@ -204,11 +204,11 @@ def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two):
     """Whatever the flag is, it is exchanged; one that is known to be clear stays, so that edits cost no transfer."""
     fresh(two, UP, UP)
     two.step()
-    compiled = two._step._cache_size()
+    compiled = two.step_fn._cache_size()
     for flag in (Unreadable(), False, True, jnp.asarray(True), np.asarray(True)):
         two.data = two.data.replace(core=two.data.core.replace(mjx_synced=flag))
         two.step()
-    assert two._step._cache_size() == compiled
+    assert two.step_fn._cache_size() == compiled
     clear = two.data.core.mjx_synced
     two.data = at_height(two.data, UP, UP)
     assert two.data.core.mjx_synced is clear
@@ -291,15 +291,15 @@ def test_asking_reads_no_device(two, syncs):
     """Whether a sync is due is known on the host: a flag that cannot be read does no harm."""
 
     fresh(two, UP, UP)
-    fine = two._data
+    fine = two._stepper.data
     try:
-        two._data = fine.replace(core=fine.core.replace(mjx_synced=Unreadable()))
+        two._stepper.data = fine.replace(core=fine.core.replace(mjx_synced=Unreadable()))
         syncs.clear()
         two.contacts()
         two.contacts("drone:0")
         assert not syncs
     finally:
-        two._data = fine
+        two._stepper.data = fine
 
 
 # What is allocated ----------------------------------------------------------------------------------------------

@@ -52,7 +52,7 @@ def flown(request):
 
 def oracle(sim, world, names, geom):
     """Return distances of each drone to the floor, to every object and to the nearest drone, by C MuJoCo."""
-    sim._scene.sync(sim.data, world)
+    sim.scene.sync(sim.data, world)
     model, data = sim.mj_model, sim.mj_data
     root = model.body_rootid[model.geom_bodyid]
 

@@ -123,7 +123,7 @@ def test_a_checkpoint_of_another_version_or_a_corrupt_one_is_refused(whole, tmp_
     with pytest.raises(ConfigError, match=r"expected a checkpoint of crazysim .*, got .* of 0\.0\.1"):
         trained(tmp_path, small_config(), resume=True)
     (tmp_path / POLICY).write_bytes(b"nothing")
-    with pytest.raises(ConfigError, match="expected a checkpoint of crazysim .*, got an unreadable file"):
+    with pytest.raises(ConfigError, match=r"expected a checkpoint of crazysim .*, got an unreadable file"):
         load_policy(tmp_path)
     with pytest.raises(ConfigError, match="expected the arrays of this task and version"):
         checkpoint.load(tmp_path / CHECKPOINT, {"y": np.zeros(2, np.float32)})
