@@ -14,6 +14,7 @@ from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.queries import SceneQueries
+from crazysim.scene.render import Viewer
 from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Scene
 
@@ -70,7 +71,7 @@ class SceneShell:
     )
     max_visual_geom = SceneAttribute[int]("Most overlays of one image.", of_renderer=True)
     overlays = SceneAttribute[Overlays]("Lines, points, labels and text of the next image.", of_renderer=True)
-    viewer = SceneAttribute["Viewer | None"]("Renderer of one world; None before the first image.", of_renderer=True)
+    viewer = SceneAttribute[Viewer | None]("Renderer of one world; None before the first image.", of_renderer=True)
 
     @property
     def marks(self) -> Overlays:

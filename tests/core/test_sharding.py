@@ -136,7 +136,8 @@ def test_the_mesh_is_that_of_the_data_whatever_its_axes_are_called(whole):
     """Users of plain JAX name their own axes, and may have more than one."""
     mesh = jax.make_mesh((2, 1), ("batch", "model"), axis_types=(AxisType.Auto,) * 2, devices=jax.devices("cpu")[:2])
     data = F.attitude_control(whole.data, COMMAND)
-    kinds = jax.tree.map(lambda s: PartitionSpec("batch" if s in ("drone", "world") else None), scopes(data))
+    split, shared = PartitionSpec("batch"), PartitionSpec()
+    kinds = jax.tree.map(lambda s: split if s in ("drone", "world") else shared, scopes(data))
     spread = jax.device_put(data, jax.tree.map(lambda spec: NamedSharding(mesh, spec), kinds))
     step = whole.build_step_fn()
     after = step(spread, jnp.int32(6))

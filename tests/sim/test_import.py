@@ -22,7 +22,6 @@ sim.scene.add("gate")
 sim.step()
 print(json.dumps(sorted(packages() - before - set(sys.stdlib_module_names))))
 from crazysim.scene import mjx
-sim.contacts()
 assert mjx.Model is sys.modules["mujoco.mjx"].Model
 assert isinstance(sim.mjx_data, mjx.Data)
 """
