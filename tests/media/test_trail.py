@@ -1,4 +1,4 @@
-"""A trail remembers as long as it was told to, and forgets a world's way when it is reset."""
+"""Trails keep their duration, and begin again when a world is reset."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_lines_fade_towards_their_beginning():
 
 
 @pytest.mark.parametrize("seconds", [0, -1.0, np.nan, np.inf])
-def test_a_time_that_cannot_be_is_told(seconds):
+def test_a_duration_that_is_not_positive_is_refused(seconds):
     with pytest.raises(ConfigError, match="expected a positive duration"):
         Trail(seconds)
 
@@ -62,7 +62,7 @@ def test_a_time_that_cannot_be_is_told(seconds):
         ([0.0] * 3, np.zeros((3, 1, 3)), r"positions of shape \(2, 1, 3\), as before, got \(3, 1, 3\)"),
     ],
 )
-def test_positions_of_another_shape_are_told(time, pos, message):
+def test_positions_of_another_shape_are_refused(time, pos, message):
     trail = Trail(1.0)
     moments(trail, [0.0])
     with pytest.raises(ConfigError, match=message):

@@ -60,7 +60,7 @@ def view(**options):
 
 
 def test_each_tile_shows_its_world(sim):
-    """Tile k of a grid is the picture of world k alone, in the order asked for, and borders lie between."""
+    """Tile k of a grid is the image of the k-th requested world alone, with borders between."""
     worlds = [2, 0, 3, 1]
     grid = view(worlds=worlds, width=2 * WIDTH + 4, height=2 * HEIGHT + 4, border=4)
     picture = grid.render(sim)
@@ -106,7 +106,7 @@ def test_what_a_user_drew_is_in_every_tile_and_only_once(sim):
     assert not of_colour(grid.render(sim), GREEN).any()
 
 
-def test_what_a_user_drew_waits_when_a_picture_fails(sim):
+def test_overlays_are_kept_when_an_image_fails(sim):
     draw_points(sim, [[0, 0, 1.0]], rgba=GREEN, size=0.05)
     with pytest.raises(ConfigError, match="got 'up'"):
         view(camera="up", text="failed").render(sim)
@@ -118,7 +118,7 @@ def test_what_a_user_drew_waits_when_a_picture_fails(sim):
 # Cameras --------------------------------------------------------------------------------------------------------
 
 
-def test_a_batch_holds_a_picture_of_each_world_in_the_order_asked_for(sim):
+def test_a_batch_holds_an_image_of_each_world_in_the_requested_order(sim):
     batch = render_worlds(sim, [2, 0, 3], "down", width=WIDTH, height=HEIGHT)
     assert batch.shape == (3, HEIGHT, WIDTH, 3)
     assert batch.dtype == np.uint8
@@ -145,7 +145,7 @@ def test_a_batch_holds_a_picture_of_each_world_in_the_order_asked_for(sim):
         ({"camera": "nose"}, "got 'nose'"),
     ],
 )
-def test_law_09_a_batch_that_cannot_be_is_told(sim, wrong, message):
+def test_law_09_invalid_batches_are_refused(sim, wrong, message):
     with pytest.raises(ConfigError, match=message):
         render_worlds(sim, **wrong)
 
@@ -161,7 +161,7 @@ def test_a_camera_that_follows_keeps_each_worlds_drone_in_its_middle(sim):
 
 
 def test_a_camera_that_follows_lags_behind(sim):
-    """After a jump of 0.2 m its middle has gone 1 - exp(-t / lag) of the way; after a reset all of it."""
+    """After a jump of 0.2 m its centre has moved by 1 - exp(-t / lag) of it; after a reset by all of it."""
     config = {"distance": 1.5, "azimuth": 90, "elevation": -90}
     follow = view(camera=-1, cam_config=config, follow=0, lag=0.5)
     place(sim, PLACES, 1.0)
@@ -195,7 +195,7 @@ def test_a_camera_may_move_with_time(sim):
 
 
 def test_a_trail_follows_the_way_of_each_worlds_drone(sim):
-    """Its pixels lie on the way that was flown, from end to end, in its own world only, and fade to its beginning."""
+    """Its pixels lie on the flown path, from end to end, in its own world only, and fade towards its beginning."""
     shown = view(worlds=[0, 1], width=2 * WIDTH, border=0, trail=5.0, rgba=BLUE)
     x = np.linspace(-0.5, 0.5, 11)
     for k in range(11):
@@ -218,7 +218,7 @@ def test_a_trail_follows_the_way_of_each_worlds_drone(sim):
     assert 20 < old < new - 60
 
 
-def test_setpoints_are_seen_where_commands_want_the_drones(sim):
+def test_setpoints_are_drawn_at_the_commanded_positions(sim):
     """Each world's tile has a green sphere at its own setpoint."""
     command = np.zeros((4, 1, 16))
     command[..., 12] = 1
@@ -276,7 +276,7 @@ def test_text_changes_its_corner_and_nothing_else(sim):
         ({"text": "Zürich"}, "expected ASCII text, got 'Zürich' with 'ü'"),
     ],
 )
-def test_a_view_that_cannot_be_is_told(sim, wrong, message):
+def test_invalid_views_are_refused(sim, wrong, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         view(**wrong).render(sim)
     assert len(sim.overlays) == 0

@@ -234,8 +234,8 @@ def test_a_scene_of_ones_own_finds_its_files(scene_file, as_type):
     assert [bool(x) for x in sim.contacts().ravel()] == [True], "the drone stands on this scene's ground"
 
 
-def test_the_files_of_a_scene_are_seen(scene_file, opengl):
-    """The mesh is drawn with its texture, red, in the middle of its camera's picture."""
+def test_meshes_and_textures_of_a_scene_file_are_drawn(scene_file, opengl):
+    """The mesh is drawn with its texture, red, in the middle of its camera's image."""
     sim = Sim(n_worlds=2, xml_path=scene_file)
     picture = sim.render("rgb_array", camera="above", width=64, height=48).astype(int)
     red = (picture[..., 0] > 60) & (picture[..., 0] > 2 * picture[..., 1]) & (picture[..., 0] > 2 * picture[..., 2])
@@ -274,14 +274,14 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_a_broken_scene_is_told_at_once(tmp_path, case):
+def test_a_broken_scene_is_refused_at_construction(tmp_path, case):
     text, message = BROKEN[case]
     with pytest.raises(ValueError, match=message):
         Sim(xml_path=broken_scene(tmp_path, text))
 
 
 @pytest.mark.parametrize("path", ["nowhere.xml", "."])
-def test_a_missing_scene_is_told_at_once(path):
+def test_a_missing_scene_is_refused_at_construction(path):
     with pytest.raises(ValueError, match="does not exist"):
         Sim(xml_path=path)
 
@@ -327,7 +327,7 @@ def test_a_spec_that_has_lost_a_drone_is_refused():
 
 @pytest.fixture(scope="module")
 def not_for_mjx():
-    """A world that MJX cannot check for contacts: a box and a cylinder that are moved by hand."""
+    """A world that MJX cannot check for contacts: a box and a cylinder that are moved through mjx_data."""
     sim = Sim()
     shapes = [(mujoco.mjtGeom.mjGEOM_BOX, [0.1, 0.1, 0.1]), (mujoco.mjtGeom.mjGEOM_CYLINDER, [0.1, 0.1, 0])]
     for i, (kind, size) in enumerate(shapes):
@@ -337,13 +337,13 @@ def not_for_mjx():
     return sim
 
 
-def test_shapes_that_mjx_cannot_check_are_told_when_contacts_are_asked_for(not_for_mjx):
-    """MJX has no box against cylinder: the scene flies, and says so when it is asked what touches."""
+def test_contacts_are_refused_for_geoms_that_mjx_does_not_support(not_for_mjx):
+    """MJX does not support a box against a cylinder: stepping works, and contacts raise an error."""
     not_for_mjx.step()
     with pytest.raises(ValueError, match="expected a scene that MJX supports"):
         not_for_mjx.contacts()
 
 
-def test_shapes_that_mjx_cannot_check_are_drawn_all_the_same(not_for_mjx, opengl):
+def test_geoms_that_mjx_does_not_support_are_drawn(not_for_mjx, opengl):
     assert not_for_mjx.render("rgb_array", width=32, height=24).shape == (24, 32, 3)
     not_for_mjx.close()

@@ -1,4 +1,4 @@
-"""Depth cameras and range finders against geometry worked out by hand, C MuJoCo's rays and its depth pictures."""
+"""Depth cameras and range finders against formulas, C MuJoCo's rays and its depth images."""
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +72,7 @@ def test_depth_along_the_axis_of_a_wall_is_one_number(room):
     np.testing.assert_allclose(depth[:, 1, 0], 3 - 0.025 - eye - 0.5, rtol=1e-5)
 
 
-def test_objects_are_seen_where_they_are_in_each_world(room):
+def test_depth_follows_the_objects_of_each_world(room):
     sim, _, box = room
     data = box.set_pose(sim.data, np.array([[[1.0, 0, 1.0]], [[0, 0, -50.0]]]))
     hits = jax.jit(sim.scene.depth_fn("fpv_cam:0", WIDTH, HEIGHT))(data)
@@ -99,7 +99,7 @@ def test_a_drone_sees_others_and_not_itself(room):
 
 @pytest.mark.usefixtures("opengl")
 @pytest.mark.parametrize("camera", ["fpv_cam:0", "track_cam:1"])
-def test_depth_is_that_of_the_picture(room, camera):
+def test_depth_equals_that_of_the_renderer(room, camera):
     """MuJoCo's renderer, at any attitude; but for edges, and for what is half transparent, they are the same."""
     sim, _, box = room
     before = sim.data
@@ -178,7 +178,7 @@ def test_a_range_finder_measures_at_its_rate():
     )
 
 
-def test_law_09_what_cannot_be_seen_is_refused(room):
+def test_law_09_wrong_cameras_and_resolutions_are_refused(room):
     sim, _, _ = room
     for act, words in (
         (lambda: sim.depth("nose"), "expected a camera of the scene, track_cam, fpv_cam, got 'nose'"),

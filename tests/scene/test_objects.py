@@ -1,4 +1,4 @@
-"""Objects with handles: their poses live in SimData, and the scene is compiled when it is next used."""
+"""Objects with handles: their poses are part of SimData, and the scene is compiled at its next use."""
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +58,7 @@ def test_everything_is_compiled_once_at_the_next_use(monkeypatch):
 
 
 def test_poses_are_those_that_mujoco_has(course, rng):
-    """In a picture's world and in MJX, quaternions converted, parts that hang on an object moved along."""
+    """In the drawn world and in MJX, with quaternions converted and children moved along."""
     sim, gates, _, tower = course
     pos, quat = rng.normal(size=(3, 2, 3)), rng.normal(size=(3, 2, 4))
     sim.data = tower.set_pose(gates.set_pose(sim.data, pos, quat), pos[:, :1] + 1, quat[:, 1:])
@@ -165,7 +165,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_law_09_what_cannot_be_added_is_refused(name):
+def test_law_09_invalid_objects_are_refused(name):
     act, words = BAD[name]
     sim = Sim()
     sim.scene.add("gate")
@@ -175,7 +175,7 @@ def test_law_09_what_cannot_be_added_is_refused(name):
     sim.step()  # and the simulation goes on
 
 
-def test_law_09_a_pose_that_cannot_be_is_refused(course):
+def test_law_09_invalid_poses_are_refused(course):
     sim, gates, pole, _ = course
     for act, words in (
         (lambda: gates.set_pose(sim.data, [0, 0]), "expected pos of shape (3,) or (2, 3) or (3, 2, 3), got (2,)"),
@@ -212,7 +212,7 @@ def test_a_scene_loads_whole_with_mesh_texture_and_height_field(tmp_path):
 
 
 def _png(pixels):
-    """Return a picture as the bytes of a PNG file."""
+    """Return an image as the bytes of a PNG file."""
     import struct
     import zlib
 

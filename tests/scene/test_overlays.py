@@ -1,4 +1,4 @@
-"""What is drawn into a picture is there in its colour and at its place, and in that picture only."""
+"""Overlays: drawn with their colours at their positions, in one image only."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -51,7 +51,7 @@ def seen_at(mask):
 
 
 def test_points_are_spheres_of_their_radius(sim):
-    """Two green points: each a disc in the picture, of its radius and at its place, and gone in the next picture."""
+    """Two green points are discs of their radii at their positions, and absent from the next image."""
     plain = shoot(sim)
     draw_points(sim, [[0.0, 0.2, 1.0], [0.0, -0.3, 1.0]], rgba=GREEN, size=0.05)
     marked = shoot(sim)
@@ -74,7 +74,7 @@ def test_a_line_goes_through_its_points(sim):
     np.testing.assert_allclose([y[second].min(), y[second].max()], [-0.3, 0.3], atol=0.02)
 
 
-def test_a_line_is_as_wide_as_it_is_told(sim):
+def test_a_line_has_the_requested_width(sim):
     """Its width in pixels grows from piece to piece, as a trail's does."""
     points = np.linspace([-0.5, 0.3, 1.0], [0.5, 0.3, 1.0], 13)
     draw_line(sim, points, rgba=BLUE, start_size=2, end_size=8)
@@ -94,7 +94,7 @@ def test_a_capsule_reaches_from_end_to_end(sim, cylinder):
     np.testing.assert_allclose([y.min(), y.max()], [0.24, 0.36], atol=0.02)
 
 
-def test_marks_are_red_unless_told(sim):
+def test_overlays_are_red_by_default(sim):
     nose = of_colour(shoot(sim), RED)
     draw_points(sim, [0.0, 0.3, 1.0], size=0.05)
     draw_line(sim, [[-0.4, -0.3, 1], [0.4, -0.3, 1]])
@@ -104,8 +104,8 @@ def test_marks_are_red_unless_told(sim):
         assert (np.hypot(x - at[0], y - at[1]) < 0.03).sum() > 20, at
 
 
-def test_marks_are_paint(sim):
-    """The colour picture has them, the depth beside it is that of the bodies."""
+def test_overlays_are_not_in_depth_images(sim):
+    """The colour image has them; the depth image is that of the bodies."""
     plain = sim.render("depth_array", camera="down", width=WIDTH, height=HEIGHT)
     draw_points(sim, [[0.0, 0.0, 1.0]], rgba=GREEN, size=0.1)
     color, depth = sim.render("rgbd_tuple", camera="down", width=WIDTH, height=HEIGHT)
@@ -113,7 +113,7 @@ def test_marks_are_paint(sim):
     np.testing.assert_array_equal(depth, plain)
 
 
-def test_marks_drawn_before_the_first_picture_are_in_it(opengl):
+def test_overlays_drawn_before_the_first_image_are_in_it(opengl):
     """The peer's draw functions do nothing until something has been rendered."""
     sim = Sim(n_worlds=2)
     draw_points(sim, [[0.0, 0.0, 0.5]], rgba=GREEN, size=0.2)
@@ -122,8 +122,8 @@ def test_marks_drawn_before_the_first_picture_are_in_it(opengl):
     sim.close()
 
 
-def test_marks_wait_through_steps_and_wrong_pictures(sim):
-    """They go into the next picture that comes to be, not into the next attempt."""
+def test_overlays_are_kept_through_steps_and_failed_images(sim):
+    """They appear in the next image that succeeds."""
     data = sim.data
     draw_points(sim, [[0.0, 0.4, 1.0]], rgba=GREEN, size=0.05)
     sim.step()
@@ -172,7 +172,7 @@ def test_text_is_not_in_depth_and_is_beside_it(sim):
 
 
 def test_a_label_stands_at_its_point(sim):
-    """Letters begin at the point, wherever that is in the picture, and are bright on a dark outline."""
+    """Letters begin at the point, anywhere in the image, and are bright on a dark outline."""
     plain = shoot(sim)
     for east, north in ((-0.3, 0.3), (0.2, -0.2)):
         draw_label(sim, [east, north, 1.0], "gate 3")
@@ -244,7 +244,7 @@ def test_colours_may_be_one_for_each_drone(sim):
     np.testing.assert_array_equal(shoot(sim), before)
 
 
-def test_the_lower_led_is_seen_from_below(opengl):
+def test_the_lower_led_is_visible_from_below(opengl):
     sim = Sim(n_worlds=2)
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.full((2, 1, 3), 1.0)))
     shot = {"mode": "rgb_array", "width": 256, "height": 192}
@@ -297,7 +297,7 @@ def test_the_lower_led_is_seen_from_below(opengl):
         (lambda sim: change_material(sim, "led_top", [0], rgba=[1, 0]), "broadcast|shape"),
     ],
 )
-def test_what_cannot_be_drawn_is_told_and_leaves_no_mark(sim, draw, message):
+def test_wrong_overlays_are_refused_and_nothing_is_drawn(sim, draw, message):
     with pytest.raises(ValueError, match=message):
         draw(sim)
     assert len(sim.overlays) == 0
@@ -316,7 +316,7 @@ def test_the_limit_of_overlays_can_be_raised():
     assert len(overlays) == 4
 
 
-def test_as_many_marks_as_allowed_fit_into_a_picture(sim):
+def test_as_many_overlays_as_allowed_fit_into_an_image(sim):
     """The limit is for overlays: bodies of the scene take none of it."""
     limit = sim.max_visual_geom
     try:

@@ -19,7 +19,7 @@ SPHERE = 1e-5
 
 
 def course():
-    """Return a simulation among one object of every kind, some that move and some that stand, and the handles."""
+    """Return a simulation with objects of every kind, movable and fixed, and the handles."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude")
     handles = {
         "gate": sim.scene.add("gate", count=2, pos=[[1, 0, 1], [2, 0, 1]], stand=1.0),
@@ -86,13 +86,13 @@ def test_every_distance_is_that_of_c_mujoco(flown):
     np.testing.assert_array_equal(report.any, report.floor | report.drones | report.objects.any(axis=-1))
 
 
-def test_nothing_of_mujoco_is_made_for_it(flown):
+def test_a_report_allocates_nothing_of_mujoco(flown):
     sim, _ = flown
     sim.contact_report()
     assert not sim.scene.is_allocated
 
 
-def test_boxes_of_drones_are_taken_when_they_touch_by_boxes():
+def test_box_collision_changes_the_distances():
     sim = Sim(n_worlds=2, control="attitude")
     sim.scene.add("box", pos=[0, 0, 1.0], size=(1, 1, 1))
     half = np.asarray(sim.airframe.value("shape.collision_box"))[5]
@@ -104,7 +104,7 @@ def test_boxes_of_drones_are_taken_when_they_touch_by_boxes():
     np.testing.assert_allclose(sim.contact_report().object_distance[:, 0, 0], [0.01 + offset, offset - 0.01], atol=1e-5)
 
 
-def test_filters_leave_out_what_is_not_asked_for(flown):
+def test_fields_that_were_not_requested_are_none(flown):
     sim, handles = flown
     all_of_it, some = sim.contact_report(), sim.contact_report(handles["box"], floor=False, drones=False)
     assert some.object_names == ("box:0", "box:1")
@@ -155,7 +155,7 @@ def test_the_distance_has_the_slope_of_the_way_to_the_object(flown):
     np.testing.assert_allclose(np.linalg.norm(slope, axis=-1), 1.0, atol=1e-4)
 
 
-def test_large_swarms_are_asked_piece_by_piece():
+def test_large_swarms_are_computed_in_chunks():
     n = CHUNK + 9
     sim = Sim(n_worlds=2, n_drones=n, control="attitude")
     rng = np.random.default_rng(1)

@@ -41,7 +41,7 @@ def test_camera_0_follows_the_first_drone_and_sees_45_degrees(sim):
     np.testing.assert_allclose(all_seen[drone], away, atol=0.1)
 
 
-def test_law_09_what_cannot_be_seen_is_refused(sim):
+def test_law_09_wrong_cameras_and_resolutions_are_refused(sim):
     for act, words in (
         (lambda: render_depth(sim, "nose"), "got 'nose'"),
         (lambda: render_depth(sim, 4), "got 4"),
