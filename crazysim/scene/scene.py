@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from crazysim.core.data import Objects, SimData
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
-from crazysim.scene import build, collision, depth, mjx, report
-from crazysim.scene.collision import CollisionModel
+from crazysim.scene import build, mjx
 from crazysim.scene.mjx_scene import MjxScene
 from crazysim.scene.objects import IDENTITY, Handle, SceneObjects
+from crazysim.scene.pure_queries import PureQueries
 from crazysim.scene.renderer import SceneRenderer
 from crazysim.scene.sync import sync_one_world, with_poses_of
 
@@ -26,7 +26,7 @@ LARGE_SWARM = 64
 """Drones per world from which on MJX checks two pairs per drone instead of every pair."""
 
 
-class Scene:
+class Scene(PureQueries):
     """MuJoCo's side of a simulation.
 
     The scene is updated lazily, when contacts or images are requested: ``sync`` decides whether it is up to date, and
@@ -39,6 +39,8 @@ class Scene:
     """Most pairs that MJX checks per kind of collision, from the next ``compile`` on; -1 for all."""
     renderer: SceneRenderer
     """Renderers and the overlays of the next image."""
+    added: SceneObjects
+    """Objects that were added with ``add``."""
     revision: int
     """Number of changes of the objects and mocap ids that the data hold."""
 
@@ -70,7 +72,7 @@ class Scene:
         self.max_geom_pairs = -1 if n_drones < LARGE_SWARM else 2 * n_drones
         self.renderer = SceneRenderer(device)
         self.spec = build.build_spec(xml_path, airframe, n_drones, freq, self.max_geom_pairs)
-        self._objects = SceneObjects(n_worlds)
+        self.added = SceneObjects(n_worlds)
         self.revision = 0
         self.compile()
 
@@ -102,7 +104,7 @@ class Scene:
         Raises:
             ConfigError: If a name is taken, MJCF does not compile (with the compiler's words), or a setting is invalid.
         """
-        handle = self._objects.add(self.spec, what, name, count, pos, quat, mocap, options)
+        handle = self.added.add(self.spec, what, name, count, pos, quat, mocap, options)
         self.edited = True
         self.revision += 1
         return handle
@@ -116,13 +118,12 @@ class Scene:
         self.spec.numeric("max_geom_pairs").data = [self.max_geom_pairs]
         mj_model = build.compile_spec(self.spec)
         drone_ids = build.mocap_ids(mj_model, [f"drone:{i}" for i in range(self.n_drones)])
-        self._object_ids = build.mocap_ids(mj_model, self._objects.movable)
+        self._object_ids = build.mocap_ids(mj_model, self.added.movable)
         self._drone_ids = drone_ids
         self.renderer.close()
         self._mj_model, self._mj_data = mj_model, mujoco.MjData(mj_model)
         self._mjx = MjxScene(mj_model, self.n_worlds, self.device, self.mesh)
-        self._collision_model: CollisionModel | None = None
-        self._visual_model: CollisionModel | None = None
+        self.clear_models()
         self.edited = False
         self.revision += 1
         self.invalidate()
@@ -151,8 +152,8 @@ class Scene:
 
     def objects(self, before: Objects | None) -> Objects | None:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects."""
-        movable = self._objects.movable
-        return self._objects.record(before, self._ids(movable) if self.edited else self._object_ids)
+        movable = self.added.movable
+        return self.added.record(before, self._ids(movable) if self.edited else self._object_ids)
 
     def _ids(self, names: Sequence[str]) -> list[int]:
         """Return mocap ids in the spec, which are those of the compiled model; nothing is compiled.
@@ -226,7 +227,7 @@ class Scene:
             sync_one_world(data, world, self._mjx.poses(world), self._mj_model, self._mj_data)
         return data
 
-    # Queries ----------------------------------------------------------------------------------------------------------
+    # Contact slots and images -----------------------------------------------------------------------------------------
 
     def contacts(self, body: str | None = None) -> Array:
         """Return True for every contact slot, of one body or of all, that touched at the last sync.
@@ -238,78 +239,6 @@ class Scene:
             UnknownNameError: If the scene has no such body.
         """
         return self._mjx.contacts(body)
-
-    @property
-    def collision_model(self) -> CollisionModel:
-        """Geoms that drones touch; read again after a compilation."""
-        self.compile_if_edited()
-        if self._collision_model is None:
-            self._collision_model = collision.collision_model(self._mj_model, self._objects.movable)
-        return self._collision_model
-
-    @property
-    def visual_model(self) -> CollisionModel:
-        """Geoms that cameras see; read again after a compilation."""
-        self.compile_if_edited()
-        if self._visual_model is None:
-            self._visual_model = collision.visual_model(self._mj_model, self._objects.movable)
-        return self._visual_model
-
-    @property
-    def object_names(self) -> tuple[str, ...]:
-        """Names of the objects that drones can touch, in the order of a contact report."""
-        return tuple(body.name for body in self.collision_model.objects)
-
-    def contact_fn(self, objects: report.Objects = None, floor: bool = True, drones: bool = True) -> report.ContactFn:
-        """Return ``contacts(data, mocap=None) -> ContactReport``, pure, for the scene as it is now.
-
-        The function takes all worlds or, in a stage, one world or one drone; for a stage of one drone pass
-        ``drones=False``. Fields that were not requested are None and are not computed.
-
-        Bodies that were attached to ``spec`` and are moved through ``mjx_data`` are not part of the data: for those
-        pass ``mocap=mjx_data``, or the pair ``(mocap_pos, mocap_quat)`` as ``mjx_data`` has them.
-
-        Args:
-            objects: Handles, or names of bodies; None for all, () for none.
-            floor: True to report the floor: planes and height fields of the world body.
-            drones: True to report the other drones of a world.
-
-        Raises:
-            ConfigError: If nothing is requested, or an object does not exist.
-        """
-        return report.build(self.collision_model, objects, floor, drones)
-
-    def depth_fn(
-        self,
-        camera: str | int = "fpv_cam",
-        width: int = 64,
-        height: int = 64,
-        drones: bool = True,
-        hide_own: bool = True,
-        along: depth.Along = "axis",
-    ) -> depth.DepthFn:
-        """Return ``depth(data, mocap=None) -> Hits``, pure: depth images of all worlds, by one ray for each pixel.
-
-        ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), with ``normal`` and ``number`` (the
-        body that was hit) beside it. Inside jit, fields that are not used are not computed.
-
-        Args:
-            camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones (n_cameras is n_drones then); or the name
-                or id of one camera.
-            width: Pixels.
-            height: Pixels.
-            drones: True for drones to be visible.
-            hide_own: True for a drone to be invisible to its own camera.
-            along: ``"axis"`` for the distance along the camera's axis, as ``Sim.render`` has it, ``"ray"`` for the
-                distance from the camera.
-
-        Raises:
-            ConfigError: If the resolution is invalid, or the camera aims at a body.
-            UnknownNameError: If there is no such camera.
-        """
-        objects = (*self._objects.movable, *self.visual_model.mocap_bodies)
-        cameras = depth.find_cameras(self.mj_model, camera, objects)
-        return depth.build(self.visual_model, cameras, width, height, drones, hide_own, along)
 
     def render(
         self, mode: str, camera: int | str, cam_config: dict[str, Any] | None, width: int, height: int

@@ -84,7 +84,7 @@ def test_a_reset_does_not_turn_the_film_back(sim, tmp_path):
 
 
 def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path):
-    """Recorded at 10 Hz and played at 20 Hz: drones are interpolated between samples, and the simulation stays as it is."""
+    """Recorded at 10 Hz and played at 20 Hz: drones are interpolated, and the simulation stays as it is."""
     recorder = Recorder(sim)
     for k in range(6):
         fly(sim, 50 * k)
