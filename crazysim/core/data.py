@@ -285,8 +285,8 @@ class SimData(PyTree):
     core: SimCore
     """When it is."""
     plugins: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Data of plugins and of the user's stages. Records (``PyTree``) declare the scope of their leaves and are reset with
-    their world; bare arrays are opaque and are restored by full resets only."""
+    """Data of plugins and of the user's stages. Records (``PyTree``) declare the scope of their leaves and are reset
+    with their world; bare arrays are opaque and are restored by full resets only."""
     objects: Objects | None = None
     """Movable objects of the scene; None where there are none."""
 
