@@ -137,7 +137,7 @@ def _map_foreign(fn: Callable[[Any, Any, str], Any], record: Any, name: str) -> 
     metadata = {field.name: field.metadata for field in dataclasses.fields(record)}
     mapped = []
     for path, child in children:
-        key = getattr(path[0], "name", None)  # absent where the record is registered without names
+        key = getattr(path[0], "name", "")  # absent where the record is registered without names
         child_name, declared = f"{name}{jax.tree_util.keystr(path)}", metadata.get(key, {})
         if CORE_NDIM_KEY in declared and _is_record(child):
             raise ConfigError(

@@ -42,12 +42,13 @@ class MjxScene:
         Raises:
             ConfigError: If MJX does not support the scene.
         """
-        if self._model is None:
+        model = self._model
+        if model is None:
             model = build.put_model(self._mj_model, self._device)
             if self._mesh is not None:
                 model = jax.device_put(model, NamedSharding(self._mesh, PartitionSpec()))
             self._model = model
-        return self._model
+        return model
 
     @property
     def data(self) -> mjx.Data:
