@@ -1,24 +1,75 @@
 """A drone simulator in which thousands of worlds advance in one call."""
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from crazysim.control import Control
+from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
+from crazysim.core.plugin import Placement, Plugin, parameter
+from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
+from crazysim.effects import Battery, Downwash, GroundEffect, Latency, MotorFailure, Wind
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, static
 from crazysim.sim.sim import Sim
 
+if TYPE_CHECKING:
+    from crazysim.core import functional as functional
+    from crazysim.envs import make
+    from crazysim.scene.contact_log import ContactLog
+    from crazysim.scene.range_finder import RangeFinder
+    from crazysim.scene.response import ContactResponse
+
 __all__ = [
     "Airframe",
+    "Battery",
     "ConfigError",
+    "ContactLog",
+    "ContactResponse",
     "Control",
+    "Downwash",
     "Drone",
     "Dynamics",
+    "GroundEffect",
     "Integrator",
+    "Latency",
+    "MotorFailure",
+    "Placement",
+    "Plugin",
     "PyTree",
+    "RangeFinder",
     "Sim",
+    "SimData",
+    "Wind",
     "leaf",
     "load_airframe",
+    "make",
+    "parameter",
+    "stage",
     "static",
 ]
 __version__ = "0.1.0"
+
+_LAZY = {
+    "ContactLog": "crazysim.scene.contact_log",
+    "ContactResponse": "crazysim.scene.response",
+    "RangeFinder": "crazysim.scene.range_finder",
+    "functional": "crazysim.core",
+    "make": "crazysim.envs",
+}
+"""Names whose modules are imported at their first use."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name at its first use."""
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(importlib.import_module(_LAZY[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return all names, those not yet imported included."""
+    return sorted({*globals(), *_LAZY})

@@ -19,7 +19,9 @@ from crazysim.core import functional as F
 from crazysim.core.data import SimData, as_key, require_pair
 from crazysim.core.integration import Integrator
 from crazysim.core.pipeline import Pipeline
+from crazysim.core.plugin import Plugin
 from crazysim.core.random import seed_sim
+from crazysim.core.registry import P, PluginRegistry
 from crazysim.core.settings import as_mask, control_freqs, find_device, member, physics_freq, positive
 from crazysim.core.sharding import put, shard
 from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
@@ -124,6 +126,7 @@ class Sim:
         self._whole: SimData | None = None
         self._apart: Apart | None = None
         self._cleared: Any = None
+        self.plugins = PluginRegistry(self)
         self.build_data()
         self.build_default_data()
         self._scene.on_compile = self._adopt_scene
@@ -191,7 +194,7 @@ class Sim:
         return F.controllable(self.data)
 
     def build_data(self) -> SimData:
-        """Return new data at rest, as at construction, and make it the simulation's."""
+        """Return new data at rest, as at construction, with a new record of every plugin; make it the simulation's."""
         data = SimData.create(
             self.n_worlds,
             self.n_drones,
@@ -204,6 +207,7 @@ class Sim:
             self._seed,
         )
         self.data = data.replace(objects=self._scene.objects(None))
+        self.plugins.build_records()
         return self.data
 
     @property
@@ -343,6 +347,43 @@ class Sim:
         self._reset = build_reset(self.reset_pipeline)
         return self._reset
 
+    # Plugins ------------------------------------------------------------------------------------------------
+
+    def add(self, plugin: P, name: str | None = None) -> P:
+        """Add an effect, a sensor, a log or any other plugin, and return it.
+
+        Its record goes into ``data.plugins`` of the data and the default data, of which nothing else changes, its
+        stages into the step pipeline, its influences and states into the integration. The step is compiled again.
+
+        Args:
+            plugin: The plugin, such as ``crazysim.Wind(velocity=(2, 0, 0))``.
+            name: Name to add it under; None for ``plugin.name``.
+
+        Raises:
+            ConfigError: If the name is taken, a setting is invalid, or the simulation lacks what the plugin needs.
+        """
+        return self.plugins.add(plugin, name)
+
+    def remove(self, plugin: Plugin | str) -> None:
+        """Remove a plugin, with its record and its stages; stages that it had replaced return.
+
+        Raises:
+            UnknownNameError: If it has not been added.
+            ConfigError: If one of its stages has been replaced since.
+        """
+        self.plugins.remove(plugin)
+
+    def replace(self, plugin: P) -> P:
+        """Replace the settings of the plugin of the same name; its states continue.
+
+        Where only numbers change (the fields declared with ``parameter``), nothing is compiled.
+
+        Raises:
+            UnknownNameError: If there is no plugin of that name.
+            ConfigError: If it is of another class, or a setting is invalid.
+        """
+        return self.plugins.replace(plugin)
+
     # Scene --------------------------------------------------------------------------------------------------
 
     @property
@@ -473,6 +514,7 @@ class Sim:
         if not 0 <= world < self.n_worlds:
             raise ValueError(f"world {world} does not exist; worlds go from 0 to {self.n_worlds - 1}")
         self._data = self._scene.sync(self._data, world)
+        self.plugins.draw(world)
         return self._scene.draw(mode, camera, cam_config, width, height)
 
     def close(self) -> None:
