@@ -19,9 +19,8 @@ from crazysim.core import functional as F
 from crazysim.core.data import SimData, as_key, require_pair
 from crazysim.core.integration import Integrator
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.plugin import Plugin
 from crazysim.core.random import seed_sim
-from crazysim.core.registry import P, PluginRegistry
+from crazysim.core.registry import PluginRegistry
 from crazysim.core.settings import as_mask, control_freqs, find_device, member, physics_freq, positive
 from crazysim.core.sharding import put, shard
 from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
@@ -43,11 +42,12 @@ from crazysim.scene.render import Viewer
 from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Held, Scene
 from crazysim.scene.sync import sync_sim2mjx
+from crazysim.sim.plugins import PluginMethods
 
 __all__ = ["Sim", "clip_floor_pos", "increment_steps", "reset", "seed_sim", "sync_sim2mjx", "use_box_collision"]
 
 
-class Sim:
+class Sim(PluginMethods):
     """Worlds of drones that advance together.
 
     ``data`` holds everything that changes, ``step_pipeline`` and ``reset_pipeline`` what happens to it, ``spec``
@@ -346,43 +346,6 @@ class Sim:
         """Make the reset pipeline as it is now take effect; return ``reset(data, default_data, mask=None)``, pure."""
         self._reset = build_reset(self.reset_pipeline)
         return self._reset
-
-    # Plugins ------------------------------------------------------------------------------------------------
-
-    def add(self, plugin: P, name: str | None = None) -> P:
-        """Add an effect, a sensor, a log or any other plugin, and return it.
-
-        Its record goes into ``data.plugins`` of the data and the default data, of which nothing else changes, its
-        stages into the step pipeline, its influences and states into the integration. The step is compiled again.
-
-        Args:
-            plugin: The plugin, such as ``crazysim.Wind(velocity=(2, 0, 0))``.
-            name: Name to add it under; None for ``plugin.name``.
-
-        Raises:
-            ConfigError: If the name is taken, a setting is invalid, or the simulation lacks what the plugin needs.
-        """
-        return self.plugins.add(plugin, name)
-
-    def remove(self, plugin: Plugin | str) -> None:
-        """Remove a plugin, with its record and its stages; stages that it had replaced return.
-
-        Raises:
-            UnknownNameError: If it has not been added.
-            ConfigError: If one of its stages has been replaced since.
-        """
-        self.plugins.remove(plugin)
-
-    def replace(self, plugin: P) -> P:
-        """Replace the settings of the plugin of the same name; its states continue.
-
-        Where only numbers change (the fields declared with ``parameter``), nothing is compiled.
-
-        Raises:
-            UnknownNameError: If there is no plugin of that name.
-            ConfigError: If it is of another class, or a setting is invalid.
-        """
-        return self.plugins.replace(plugin)
 
     # Scene --------------------------------------------------------------------------------------------------
 
