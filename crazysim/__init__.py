@@ -1,7 +1,6 @@
 """A drone simulator in which thousands of worlds advance in one call."""
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crazysim.control import Control
 from crazysim.core.data import SimData
@@ -12,6 +11,7 @@ from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.effects import Battery, Downwash, GroundEffect, Latency, MotorFailure, Wind
 from crazysim.errors import ConfigError
+from crazysim.lazy import lazy
 from crazysim.pytree import PyTree, leaf, static
 from crazysim.sim.sim import Sim
 
@@ -52,24 +52,18 @@ __all__ = [
 ]
 __version__ = "0.1.0"
 
-_LAZY = {
-    "ContactLog": "crazysim.scene.contact_log",
-    "ContactResponse": "crazysim.scene.response",
-    "RangeFinder": "crazysim.scene.range_finder",
-    "functional": "crazysim.core",
-    "make": "crazysim.envs",
-}
-"""Names whose modules are imported at their first use."""
-
-
-def __getattr__(name: str) -> Any:
-    """Import a name at its first use."""
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module(_LAZY[name]), name)
-    return value
+__getattr__ = lazy(
+    __name__,
+    {
+        "ContactLog": "crazysim.scene.contact_log",
+        "ContactResponse": "crazysim.scene.response",
+        "RangeFinder": "crazysim.scene.range_finder",
+        "functional": "crazysim.core",
+        "make": "crazysim.envs",
+    },
+)
 
 
 def __dir__() -> list[str]:
-    """Return all names, those not yet imported included."""
-    return sorted({*globals(), *_LAZY})
+    """Return the public names, those not yet imported included."""
+    return __all__
