@@ -158,7 +158,6 @@ class Plugin:
         Raises:
             ConfigError: If a setting is invalid, or the simulation lacks something the plugin needs.
         """
-        del sim
         return None
 
     def default_record(self, sim: Simulation) -> PyTree | None:
@@ -167,7 +166,6 @@ class Plugin:
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages of the plugin with their places, in the order in which they are inserted."""
-        del sim
         return ()
 
     def influence(self, data: SimData) -> SimData:
@@ -184,12 +182,10 @@ class Plugin:
         The integrator advances them together with the drone's states, in every scheme. ``data`` is of one drone, with
         all influences applied.
         """
-        del data
         return {}
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return named measurements of one drone. (k,) each"""
-        del data
         return {}
 
     def draw(self, sim: Simulation, world: int) -> None:
@@ -224,17 +220,14 @@ class FunctionPlugin(Plugin):
 
     def record(self, sim: Simulation) -> PyTree | None:
         """Return the record."""
-        del sim
         return self.data
 
     def default_record(self, sim: Simulation) -> PyTree | None:
         """Return the record that resets restore."""
-        del sim
         return self.data if self.default is None else self.default
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages."""
-        del sim
         return self.placements
 
     def influence(self, data: SimData) -> SimData:

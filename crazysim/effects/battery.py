@@ -90,7 +90,6 @@ class Battery(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that discharges the batteries."""
-        del sim
         return [Placement(stage("drone")(self.discharge))]
 
     def influence(self, data: SimData) -> SimData:

@@ -59,7 +59,6 @@ class Downwash(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that computes the air velocity, of one world."""
-        del sim
         return [Placement(stage("world")(self.sum_jets))]
 
     def influence(self, data: SimData) -> SimData:

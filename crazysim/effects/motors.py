@@ -61,7 +61,6 @@ class MotorFailure(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that makes rotors fail, if any can."""
-        del sim
         can_fail = self.fail_step is not None or self.rate is not None
         return [Placement(stage("drone")(self.fail_in_flight))] if can_fail else []
 

@@ -68,7 +68,6 @@ class Wind(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that advances the gusts, if there are any."""
-        del sim
         return [] if self.speed_20ft is None else [Placement(stage("drone")(self.advance_gust))]
 
     def influence(self, data: SimData) -> SimData:

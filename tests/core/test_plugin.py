@@ -378,7 +378,6 @@ class Nameless(FunctionPlugin):
     order: ClassVar[int] = 3
 
     def stages(self, sim):
-        del sim
         return [Placement(lambda data: data, name="clip_floor_pos")]
 
 
