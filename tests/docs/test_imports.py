@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import inspect
 from pathlib import Path
 
 import pytest
@@ -46,4 +47,5 @@ def test_pages_import_public_names_of_these_modules(source):
         for name in names:
             package = importlib.import_module(module)
             is_public = name in getattr(package, "__all__", [name])
-            assert is_public or importlib.util.find_spec(f"{module}.{name}"), f"{name} is no public name of {module}"
+            is_module = inspect.ismodule(getattr(package, name, None)) or importlib.util.find_spec(f"{module}.{name}")
+            assert is_public or is_module, f"{name} is no public name of {module}"
