@@ -235,7 +235,7 @@ def test_the_landing_place_has_a_gradient():
     assert float(slope) == pytest.approx(float(difference), rel=0.15)
 
 
-def test_engines_agree_and_the_impulse_is_told():
+def test_engines_agree_and_the_impulse_is_reported():
     ends = []
     for engine in ("plain", "lanes", "auto"):
         sim = without_air(2, engine=engine)
