@@ -14,6 +14,7 @@ from crazysim.errors import ConfigError
 from crazysim.lazy import lazy
 from crazysim.pytree import PyTree, leaf, static
 from crazysim.sim.sim import Sim
+from crazysim.version import __version__
 
 if TYPE_CHECKING:
     from crazysim.core import functional as functional
@@ -43,6 +44,7 @@ __all__ = [
     "Sim",
     "SimData",
     "Wind",
+    "__version__",
     "leaf",
     "load_airframe",
     "make",
@@ -50,7 +52,6 @@ __all__ = [
     "stage",
     "static",
 ]
-__version__ = "0.1.0"
 
 __getattr__ = lazy(
     __name__,

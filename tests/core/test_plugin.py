@@ -201,7 +201,7 @@ def test_replace_changes_numbers_without_compiling_and_keeps_states():
     sim.add(Wind((2.0, 0, 0), 7.7))
     sim.add(Wake())
     fly_on(sim)
-    flown, step, n = sim.data.plugins, sim.step_pipeline, sim._step._cache_size()
+    flown, step, n = sim.data.plugins, sim.step_pipeline, sim.step_fn._cache_size()
     wind = sim.replace(Wind(np.full((3, 2, 3), 4.0) * [1, 0, 0], 3.0))
     sim.replace(Wake(rate=60.0))
     sim.replace(Wind((4.0, 0, 0), 3.0))
@@ -213,7 +213,7 @@ def test_replace_changes_numbers_without_compiling_and_keeps_states():
     np.testing.assert_array_equal(sim.default_data.plugins["wind"].velocity, [4.0, 0, 0])
     np.testing.assert_array_equal(sim.default_data.plugins["wind"].gust, 0.0)
     fly_on(sim, 60)
-    assert sim._step._cache_size() == n
+    assert sim.step_fn._cache_size() == n
     # after 7 time constants the lagging velocity is the drone's over the rate, which changes by some 10% meanwhile
     np.testing.assert_allclose(sim.data.plugins["wake"].vel, sim.data.states.vel / 60, rtol=0.3, atol=3e-5)
 
