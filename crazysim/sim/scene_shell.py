@@ -20,6 +20,7 @@ from crazysim.scene.scene import Scene
 
 if TYPE_CHECKING:
     from crazysim.core.data import SimData
+    from crazysim.core.registry import PluginRegistry
     from crazysim.engine import Stepper
 
 T = TypeVar("T")
@@ -53,6 +54,8 @@ class SceneShell:
     """Number of worlds."""
     data: SimData
     """Everything that changes."""
+    plugins: PluginRegistry
+    """Plugins, which draw overlays."""
     _scene: Scene
     _stepper: Stepper
     _queries: SceneQueries
@@ -195,7 +198,13 @@ class SceneShell:
             RenderError: If this machine cannot draw.
         """
         self.sync(world)
-        return self._scene.render(mode, camera, cam_config, width, height)
+        before = self.overlays.copy()
+        try:
+            self.plugins.draw(world)
+            return self._scene.render(mode, camera, cam_config, width, height)
+        except Exception:
+            self.overlays.restore(before)  # without what plugins have drawn, which draw again for the next image
+            raise
 
     def close(self) -> None:
         """Close the window and free the renderers."""
