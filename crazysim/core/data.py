@@ -68,6 +68,22 @@ class SimStateDeriv(PyTree):
     """Angular acceleration, body frame, rad/s^2. (n_worlds, n_drones, 3)"""
     rotor_acc: Array = leaf("drone", 1)
     """Rotor acceleration, rpm/s; in ``so_rpy_rotor*`` the rate of thrust, N/s. (n_worlds, n_drones, n_rotors)"""
+    plugins: dict[str, dict[str, Array]] = dataclasses.field(default_factory=dict)
+    """Derivatives of plugins' own states, per second: by plugin, then by field of its record."""
+
+    @staticmethod
+    def create(n_worlds: int, n_drones: int, device: Any = None, n_rotors: int = 4) -> SimStateDeriv:
+        """Return zeros.
+
+        Args:
+            n_worlds: Number of worlds.
+            n_drones: Number of drones per world.
+            device: Device of the arrays; None for arrays of the host.
+            n_rotors: Number of rotors.
+        """
+        sizes = {"vel": 3, "ang_vel": 3, "acc": 3, "ang_acc": 3, "rotor_acc": n_rotors}
+        zeros = {name: of_host(0.0, n_worlds, n_drones, size) for name, size in sizes.items()}
+        return SimStateDeriv(**(zeros if device is None else jax.device_put(zeros, device)))
 
 
 class StateControlData(PyTree):
@@ -272,8 +288,8 @@ class SimData(PyTree):
     core: SimCore
     """Time, sizes, seed and flags."""
     plugins: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Records of effects and of user stages, by name. Records (``PyTree``) declare the scopes of their leaves and are
-    reset per world; bare arrays are opaque, and masked resets do not change them."""
+    """Records of plugins and of user stages, by name. Records (``PyTree``) declare the scopes of their leaves and are
+    reset per world; bare arrays are opaque, and only full resets restore them."""
     objects: Objects | None = None
     """Movable objects of the scene; None if there are none."""
 
@@ -355,10 +371,10 @@ def as_key(seed: int | Array) -> Array:
         raise ConfigError(f"the seed {seed} needs more than 64 bits; use a smaller integer") from error
 
 
-def grid_2d(n: int, spacing: float = 1.0) -> np.ndarray:
+def grid_2d(n: int, spacing: float = 1.0, center: Any = (0.0, 0.0)) -> np.ndarray:
     """Return the ``n`` points of a square grid nearest to its centre, nearest first, m. (n, 2)"""
     side = math.isqrt(n - 1) + 1
     line = spacing * (np.arange(side) - (side - 1) / 2)
     x, y = np.meshgrid(line, line)
     points = np.stack([x.ravel(), y.ravel()], axis=-1)
-    return points[np.argsort(np.linalg.norm(points, axis=-1), kind="stable")[:n]]
+    return points[np.argsort(np.linalg.norm(points, axis=-1), kind="stable")[:n]] + np.asarray(center)

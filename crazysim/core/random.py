@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from typing import Any
 
 import jax
 from jax import Array
@@ -15,9 +16,16 @@ from jax import Array
 from crazysim.core.data import SimData, as_key
 
 
-def seed_sim(data: SimData, seed: int | Array) -> SimData:
-    """Return the data with another seed or key for all random numbers drawn from now on."""
-    return data.replace(core=data.core.replace(rng_key=as_key(seed)))
+def seed_sim(data: SimData, seed: int | Array, device: Any = None) -> SimData:
+    """Return the data with another seed or key for all random numbers drawn from now on.
+
+    Args:
+        data: Data of the simulation.
+        seed: Seed or key.
+        device: Device of the key; None for the default device.
+    """
+    key = as_key(seed)
+    return data.replace(core=data.core.replace(rng_key=key if device is None else jax.device_put(key, device)))
 
 
 def world_key(data: SimData, name: str) -> Array:

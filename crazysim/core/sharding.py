@@ -10,7 +10,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDev
 
 from crazysim.core.data import SimData
 from crazysim.errors import ConfigError
-from crazysim.pytree import scopes
+from crazysim.pytree import PER_WORLD, scopes
 
 WORLD_AXIS = "worlds"
 """Name of the mesh axis over which worlds are distributed."""
@@ -80,7 +80,7 @@ def placement(data: SimData, mesh: Mesh) -> SimData:
         )
     split = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
     copied = NamedSharding(mesh, PartitionSpec())
-    return jax.tree.map(lambda scope: split if scope in ("drone", "world") else copied, scopes(data))
+    return jax.tree.map(lambda scope: split if scope in PER_WORLD else copied, scopes(data))
 
 
 def shard(data: SimData, mesh: Mesh) -> SimData:

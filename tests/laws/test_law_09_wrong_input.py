@@ -54,8 +54,8 @@ WRONG_SETTINGS = [
     ({"device": "cpu:99"}, "'cpu:99' does not exist", "'cpu' or 'gpu'"),
     ({"device": None}, "got None", "jax.Device"),
     ({"mesh": 2}, "got 2", "world_mesh"),
-    ({"xml_path": "/nowhere/scene.xml"}, "/nowhere/scene.xml does not exist", "xml_path="),
-    ({"xml_path": 3}, "xml_path is 3", "MJCF"),
+    ({"xml_path": "/nowhere/scene.xml"}, "expected an existing MJCF file as xml_path", "/nowhere/scene.xml"),
+    ({"xml_path": 3}, "as xml_path, got 3", "MJCF"),
     ({"rng_key": "lucky"}, "'lucky'", "an integer"),
     ({"rng_key": 1.5}, "1.5", "an integer"),
     ({"rng_key": 2**70}, str(2**70), "64 bits"),
@@ -74,10 +74,10 @@ def test_wrong_settings_are_errors_at_construction(case):
 @pytest.mark.parametrize(
     "text, fragment",
     [
-        ("<mujoco><worldbody>", "is not a scene MuJoCo can read"),
-        ("no XML at all", "is not a scene MuJoCo can read"),
-        ("<mujoco><worldbody><geom type='teapot'/></worldbody></mujoco>", "is not a scene MuJoCo can read"),
-        ("<mujoco><worldbody><geom type='sphere'/></worldbody></mujoco>", "does not compile"),
+        ("<mujoco><worldbody>", "expected a scene that MuJoCo can read"),
+        ("no XML at all", "expected a scene that MuJoCo can read"),
+        ("<mujoco><worldbody><geom type='teapot'/></worldbody></mujoco>", "expected a scene that MuJoCo can read"),
+        ("<mujoco><worldbody><geom type='sphere'/></worldbody></mujoco>", "expected a scene that compiles"),
         ("<mujoco><worldbody><body name='drone:0'/></worldbody></mujoco>", "'drone:0'"),
     ],
 )
@@ -241,8 +241,8 @@ WRONG_CALLS = [
     (lambda sim: sim.seed(1.5), "1.5", "an integer"),
     (lambda sim: sim.seed("7"), "'7'", "an integer"),
     (lambda sim: sim.seed(None), "None", "an integer"),
-    (lambda sim: sim.render("rgb_array", world=3), "world 3 does not exist", "0 to 2"),
-    (lambda sim: sim.render("rgb_array", world=-1), "world -1 does not exist", "0 to 2"),
+    (lambda sim: sim.render("rgb_array", world=3), "expected a world from 0 to 2", "got 3"),
+    (lambda sim: sim.render("rgb_array", world=-1), "expected a world from 0 to 2", "got -1"),
     (lambda sim: setattr(sim, "max_visual_geom", 0), "max_visual_geom is 0", "positive whole number"),
     (lambda sim: remove_fn(sim.step_pipeline, "wind"), "No stage named 'wind'", "integration"),
     (lambda sim: replace_fn(sim.step_pipeline, stage_that_is_none, "wind"), "No stage named 'wind'", "integration"),
@@ -307,7 +307,7 @@ def test_a_spec_that_does_not_compile_leaves_the_old_scene():
     sim = Sim()
     before, model = sim.data, sim.mj_model
     geom = sim.spec.worldbody.add_geom(name="bad", size=[-1.0, 0, 0])
-    with pytest.raises(ConfigError, match="the scene does not compile"):
+    with pytest.raises(ConfigError, match="expected a scene that compiles"):
         sim.build_mjx()
     assert sim.data is before
     assert sim.mj_model is model
