@@ -97,7 +97,7 @@ class SceneShell:
             ValueError: If the world does not exist.
         """
         if world is not None and not 0 <= world < self.n_worlds:
-            raise ValueError(f"world {world} does not exist; worlds go from 0 to {self.n_worlds - 1}")
+            raise ValueError(f"world {world} does not exist; choose one from 0 to {self.n_worlds - 1}")
         self._scene.compile_if_edited()
         self._stepper.data = self._scene.sync(self.data, world)
 
