@@ -92,7 +92,7 @@ class Planner(NamedTuple):
                 stage or the fastest engine is not supported.
         """
         if self.engine == "plain":
-            return self._plain(data, "it was asked for")
+            return self._plain(data, "it was chosen")
         try:
             plan, problems = self._fast(data, zeros)
             trace(plan)
@@ -128,7 +128,7 @@ class Planner(NamedTuple):
         problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
         if self.location.spread and split:
             return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}"), problems
-        engine, why, run = "lanes", "it was asked for", functools.partial(lanes.steps, program)
+        engine, why, run = "lanes", "it was chosen", functools.partial(lanes.steps, program)
         if self.engine == "interpret":
             engine, run = "interpret", functools.partial(interpret.steps, program)
         elif self.engine != "lanes":

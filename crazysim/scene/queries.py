@@ -12,7 +12,7 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.engine import fused
 from crazysim.engine.lower import UnsupportedError
-from crazysim.engine.query import Question, ask
+from crazysim.engine.query import Query, query
 from crazysim.scene import report
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.depth import Along
@@ -51,18 +51,18 @@ class SceneQueries:
         return self._run("depth", build, self._scene.visual_model, data, *settings)
 
     def _run(
-        self, query: str, build: Callable[[], Callable[..., Any]], model: CollisionModel, data: SimData, *settings: Any
+        self, name: str, build: Callable[[], Callable[..., Any]], model: CollisionModel, data: SimData, *settings: Any
     ) -> Any:
         """Return the result of a query about poses, which is compiled once for its settings."""
         if self._model is not self._scene.mj_model:
             self._model, self._compiled = self._scene.mj_model, {}
-        if (query, *settings) not in self._compiled:
-            self._compiled[query, *settings] = jax.jit(_of_poses(build(), data))
+        if (name, *settings) not in self._compiled:
+            self._compiled[name, *settings] = jax.jit(_of_poses(build(), data))
         states, objects = data.states, data.objects
         # Only what the query needs: a compiled call costs by the number of its arrays.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
         mocap = self._scene.mocap_poses() if model.mocap_bodies else None
-        return self._compiled[query, *settings](*poses, mocap)
+        return self._compiled[name, *settings](*poses, mocap)
 
     def _contacts(self, objects: Objects, floor: bool, drones: bool) -> Callable[..., ContactReport]:
         """Return the contacts of all worlds as a function of data and mocap poses, by one kernel where possible."""
@@ -72,7 +72,7 @@ class SceneQueries:
         model = self._scene.collision_model
         # Their poses become part of the data before the kernel runs, which is for data alone.
         in_data = model.without_mocap_bodies()
-        queries: list[Question] = []
+        queries: list[Query] = []
         if floor or report.choose(in_data, objects):
             queries.append(("drone", report.build(in_data, objects, floor, drones=False)))
         if drones:
@@ -80,7 +80,7 @@ class SceneQueries:
 
         def contacts(data: SimData, mocap: Any) -> ContactReport:
             try:
-                found = ask(queries, with_mocap_bodies(model, data, mocap), platform)
+                found = query(queries, with_mocap_bodies(model, data, mocap), platform)
                 return functools.reduce(ContactReport.joined, found)
             except UnsupportedError:
                 return by_xla(data, mocap)

@@ -307,7 +307,7 @@ class Sim(Commands, PluginMethods, SceneShell):
 
 
 def use_box_collision(sim: Sim, enable: bool = True) -> None:
-    """Let drones touch with boxes instead of spheres, or with spheres again; compiles the scene anew.
+    """Let drones touch with boxes instead of spheres, or with spheres again; compiles the scene again.
 
     Boxes follow the drone's outline more closely and cost more to check.
     """
