@@ -296,7 +296,7 @@ def _tangential(weight: Array, p: Array) -> Array:
 
 
 def _solve(matrix: Array, b: Array) -> Array:
-    """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive, written out. (..., n)
+    """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive definite, unrolled. (..., n)
 
     Scaled to a unit diagonal first: mass and moments of inertia are four orders apart.
     """
