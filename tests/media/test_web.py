@@ -217,10 +217,10 @@ def test_an_exported_flight_opens_from_its_file(viser, browser, flight, tmp_path
     ("arguments", "message"),
     [
         (["nowhere.npz"], "expected an existing file, got 'nowhere.npz'"),
-        (["flight.npz", "--world", "5"], "world 5 was not recorded; recorded are [0, 1]"),
+        (["flight.npz", "--world", "5"], "expected a recorded world, one of [0, 1], got 5"),
         (["flight.npz", "--export", "flight.txt"], "to end with .html"),
         (["flight.npz", "--export", "nowhere/flight.html"], "expected an existing folder, got 'nowhere'"),
-        (["flight.npz", "--port", "99999"], "choose another --port"),
+        (["flight.npz", "--port", "99999"], "Choose another --port"),
     ],
 )
 def test_an_invalid_replay_is_refused_in_one_line(viser, flight, tmp_path, monkeypatch, capsys, arguments, message):
