@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, Stage
-from crazysim.engine.fused_rollout import Whole
+from crazysim.engine.fused_rollout import FusedRollout
 from crazysim.pytree import PyTree, leaf
 
 NAME = "answers"
@@ -54,8 +54,8 @@ def ask(questions: Sequence[Question], data: SimData, platform: str) -> list[Any
         trees.append(treedef)
         stages.append(Stage(_answering(fn, names, scope), scope, name=f"question {number}"))
     asked = data.replace(plugins={NAME: Answers(answers)})
-    whole = Whole((), (), stages, asked, {}, 0, platform)
-    found = jax.tree.unflatten(jax.tree.structure(asked), whole(jax.tree.leaves(asked))).plugins[NAME].rows
+    rollout = FusedRollout((), (), stages, asked, {}, 0, platform)
+    found = jax.tree.unflatten(jax.tree.structure(asked), rollout(jax.tree.leaves(asked))).plugins[NAME].rows
     return [
         tree.unflatten([found[name].reshape(n_worlds, n_drones, *shape) for name, shape in some.items()])
         for tree, some in zip(trees, shapes, strict=True)

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.envs.env import Env, EnvState, Obs, flatten
+from crazysim.envs.env import Env
+from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree

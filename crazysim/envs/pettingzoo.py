@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.envs.env import Env, EnvState, flatten
+from crazysim.envs.env import Env
 from crazysim.envs.registry import make
-from crazysim.envs.rendering import RENDER_MODES, Drawing
+from crazysim.envs.rendering import RENDER_MODES, Renderer
+from crazysim.envs.state import EnvState, flatten
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, UnknownNameError
 
@@ -49,7 +50,7 @@ class DroneParallelEnv(ParallelEnv):
         if isinstance(env, AutoReset):
             raise ConfigError("PettingZoo's users reset by themselves: give the environment without AutoReset")
         self.env, self.sim, self.render_mode = env, env.sim, render_mode
-        self._drawing = Drawing(env.sim, render_mode, size=render_size)
+        self._renderer = Renderer(env.sim, render_mode, size=render_size)
         self.metadata = {
             "name": f"crazysim/{env.task.name}",
             "render_modes": list(RENDER_MODES),
@@ -140,7 +141,7 @@ class DroneParallelEnv(ParallelEnv):
             ConfigError: If nothing was said of drawing when the environment was made, or it was not reset.
             RenderError: If this machine cannot draw.
         """
-        pictures = self._drawing(self.now)
+        pictures = self._renderer(self.now)
         return pictures[0] if pictures else None
 
     def close(self) -> None:

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.envs.env import Env, EnvState, Obs, flatten, from_host
-from crazysim.envs.rendering import Drawing
+from crazysim.envs.env import Env
+from crazysim.envs.rendering import Renderer
+from crazysim.envs.state import EnvState, Obs, flatten, from_host
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
 from crazysim.errors import ConfigError
 
@@ -59,7 +60,7 @@ class DroneVecEnv(VecEnv):
                 "give the environment without AutoReset: new episodes begin as Stable-Baselines3 wants it"
             )
         self.env, self.sim, self.dict_obs = AutoReset(EpisodeStatistics(env)), env.sim, dict_obs
-        self._drawing = Drawing(env.sim, render_mode, render_worlds, render_size)
+        self._renderer = Renderer(env.sim, render_mode, render_worlds, render_size)
         self._begin, self._advance = jax.jit(self._first), jax.jit(self._next)
         self._generator, _ = gymnasium.utils.seeding.np_random()
         self._actions: np.ndarray | None = None
@@ -133,7 +134,7 @@ class DroneVecEnv(VecEnv):
         Raises:
             AttributeError: If it has none of that name.
         """
-        value = self._drawing.mode if attr_name == "render_mode" else getattr(self.env, attr_name)
+        value = self._renderer.mode if attr_name == "render_mode" else getattr(self.env, attr_name)
         return [value] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -167,7 +168,7 @@ class DroneVecEnv(VecEnv):
             ConfigError: If nothing was said of drawing when the environment was made, or it was not reset.
             RenderError: If this machine cannot draw.
         """
-        return self._drawing(self.state)
+        return self._renderer(self.state)
 
     def close(self) -> None:
         """Close the window."""

@@ -145,11 +145,11 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
 
     Args:
         track: Heights, numbers and limits.
-        x: Random numbers from 0 to 1. (n_worlds, n_random)
+        x: Random numbers in [0, 1). (..., n_random)
 
     Returns:
-        Start (n_worlds, 3), positions of gates (n_worlds, n_gates, 3), their attitudes, xyzw (n_worlds, n_gates, 4),
-        positions of obstacles (n_worlds, n_obstacles, 3).
+        Start, m (..., 3), positions of gates, m (..., n_gates, 3), their attitudes, xyzw (..., n_gates, 4), positions
+        of obstacles, m (..., n_obstacles, 3).
     """
     n, (n_x, n_y) = track.n_gates, track.grid
     cells, corners, within, turns = jnp.split(x, np.cumsum([n_x * n_y, (n_x + 1) * (n_y + 1), 2 * n]), axis=-1)
@@ -159,11 +159,11 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
 
     cell = ranks(cells, n + 1)
     flat = jnp.asarray(first) + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
-    shift = IN_CELL * (2 * within.reshape(-1, n, 2) - 1)
-    gates = flat[:, 1:] + shift
-    start = jnp.concatenate([flat[:, 0], jnp.full_like(flat[:, 0, :1], START_HEIGHT)], axis=-1)
+    shift = IN_CELL * (2 * within.reshape(*x.shape[:-1], n, 2) - 1)
+    gates = flat[..., 1:, :] + shift
+    start = jnp.concatenate([flat[..., 0, :], jnp.full_like(flat[..., 0, :1], START_HEIGHT)], axis=-1)
 
-    way = gates - jnp.concatenate([flat[:, :1], gates[:, :-1]], axis=1)
+    way = gates - jnp.concatenate([flat[..., :1, :], gates[..., :-1, :]], axis=-2)
     yaw = jnp.arctan2(way[..., 1], way[..., 0]) + TURN * (2 * turns - 1)
     quat = rotation.from_rpy(jnp.stack([0 * yaw, 0 * yaw, yaw], axis=-1))
 

@@ -13,10 +13,11 @@ from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
 from crazysim.core.settings import as_mask, member
-from crazysim.envs.env import DroneEnv, Env, EnvState, from_host
+from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.registry import TASKS, make
-from crazysim.envs.rendering import RENDER_MODES, Drawing
-from crazysim.envs.stepper import Advance
+from crazysim.envs.rendering import RENDER_MODES, Renderer
+from crazysim.envs.state import EnvState, from_host
+from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError
 
@@ -55,7 +56,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         mode = member(GymnasiumMode, "autoreset_mode", autoreset_mode)
         self.env = AutoReset(env, AutoresetMode(mode.value))
         self.sim, self.render_mode = env.sim, render_mode
-        self._drawing = Drawing(env.sim, render_mode, render_worlds, render_size)
+        self._renderer = Renderer(env.sim, render_mode, render_worlds, render_size)
         self.metadata = {
             "autoreset_mode": mode,
             "render_modes": list(RENDER_MODES),
@@ -65,8 +66,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self._single = env.sim.n_drones == 1
         self._begin = jax.jit(self.env.reset)
         self._again = jax.jit(self.env.restart)
-        self._advance = Advance(self.env, self._tell)
-        self._told: Any = None
+        self._stepper = EnvStepper(self.env, self._output)
+        self._outputs: Any = None
         shapes = jax.eval_shape(self.env.reset, jax.random.key(0))
         self._of_drone = {k for k, v in shapes.info.items() if k != "final_obs" and v.ndim > 1}
         self.single_observation_space = gymnasium.spaces.Dict(
@@ -101,16 +102,16 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         else:
             number = seed if seed is not None else int(self.np_random.integers(2**31))
             state = self._begin(jax.random.key(int(number)))
-        self._advance.state, self._told = state, self._tell(state)
-        return self._told[0], self._told[2]
+        self._stepper.state, self._outputs = state, self._output(state)
+        return self._outputs[0], self._outputs[2]
 
     @property
     def state(self) -> EnvState | None:
         """The functional environment's state, each drone with the reward of its world; None before the first reset."""
-        state = self._advance.state
+        state = self._stepper.state
         if state is None:
             return None
-        obs, reward, info = self._told
+        obs, reward, info = self._outputs
         n = (self.num_envs, self.sim.n_drones)
         info = {k: v for k, v in info.items() if not k.endswith("final_obs")}
         info = {k: v.reshape(*n, *v.shape[1:]) if self._single and k in self._of_drone else v for k, v in info.items()}
@@ -127,20 +128,20 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             ConfigError: If the environment was not reset, or actions of the host are not finite.
             ValueError: If they have another shape.
         """
-        if self._told is None:
+        if self._outputs is None:
             raise ConfigError("the environment must be reset before its first step: call reset()")
         needed = self.action_space.shape or ()
         if not isinstance(actions, jax.Array):
             actions = from_host(actions, needed)
         elif actions.shape != needed:
             raise ValueError(f"actions have shape {actions.shape}; needed is {needed}")
-        self._told, terminated, truncated = self._advance(actions)
-        obs, reward, info = self._told
+        self._outputs, terminated, truncated = self._stepper(actions)
+        obs, reward, info = self._outputs
         if self.render_mode == "human":
             self.render()
         return obs, reward, terminated, truncated, info
 
-    def _tell(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
+    def _output(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
         """Return observations, rewards and infos as Gymnasium has them."""
         reward = state.reward[:, 0] if self._single else jnp.mean(state.reward, axis=1)
         return self._of_drones(state.obs), reward, self._info(state)
@@ -166,7 +167,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             ConfigError: If nothing was said of drawing when the environment was made, or it was not reset.
             RenderError: If this machine cannot draw.
         """
-        pictures = self._drawing(self.state)
+        pictures = self._renderer(self.state)
         return tuple(pictures) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -85,14 +85,16 @@ def film(
     skip = max(rate // 25, 1)
 
     def mark(sim: Sim, world: int) -> None:
-        if env.task.target is not None:
-            draw_points(sim, np.asarray(env.task.target(sim.data)[world]), TARGET_COLOR, 0.04)
+        target = targets(state)
+        if target is not None:
+            draw_points(sim, np.asarray(target[world]), TARGET_COLOR, 0.04)
 
+    targets = jax.jit(env.target)
     step = jax.jit(lambda state: env.step(state, policy(state.obs)))
     state = jax.jit(env.reset)(jax.random.key(seed))
     view = View(
         worlds=range(min(worlds, sim.n_worlds)), width=960, height=720, trail=1.5, text="{time:.1f} s", draw=mark,
-        cam_config=env.task.camera,
+        cam_config=env.task.camera(sim.n_drones),
     )  # fmt: skip
     n_frames = env.max_steps // skip + 1
     with Film(path, view, fps=rate / skip, progress=progress, total=n_frames) as recording:
