@@ -233,20 +233,11 @@ class _Layout:
 
 
 def _of_one_world(state: EnvState) -> EnvState:
-    """Return shapes and types of a state in one world.
-
-    Raises:
-        UnsupportedError: If a wrapper remembers what all worlds share.
-    """
-    paths, treedef = jax.tree_util.tree_flatten_with_path(state)
+    """Return shapes and types of a state in one world."""
     taken = {"drone": 1, "world": 2, "rows": 1}
-    for (path, _), kind in zip(paths, kinds := jax.tree.leaves(scopes(state)), strict=True):
-        if kind not in taken and path[0] != jax.tree_util.GetAttrKey("data"):
-            raise UnsupportedError(f"all worlds share the state's {jax.tree_util.keystr(path)}")
-    shapes = [
-        jax.ShapeDtypeStruct(x.shape[taken.get(kind, 0) :], x.dtype) for (_, x), kind in zip(paths, kinds, strict=True)
-    ]
-    return treedef.unflatten(shapes)
+    return jax.tree.map(
+        lambda kind, x: jax.ShapeDtypeStruct(x.shape[taken.get(kind, 0) :], x.dtype), scopes(state), state
+    )
 
 
 def _finite(data: SimData) -> Array:

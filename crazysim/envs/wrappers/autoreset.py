@@ -94,7 +94,7 @@ class AutoReset(Wrapper):
             return ended
         over = self.policy.is_over(state.done, ended)
         ended = self.policy.end(ended)
-        return select_states(over, self.policy.begin(ended, self.begin(ended)), ended)
+        return select_states(over, self.policy.begin(ended, self.env.begin(ended)), ended)
 
     def explain(self, state: EnvState) -> str:
         """Return one line that says whether a step is one kernel, and if not, why."""
