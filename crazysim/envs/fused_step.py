@@ -16,7 +16,7 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, Stage
 from crazysim.engine.fused_rollout import FusedRollout
-from crazysim.engine.lower import UnsupportedError
+from crazysim.engine.errors import UnsupportedError
 from crazysim.envs.phases import act, begin, observe
 from crazysim.envs.state import EnvState
 from crazysim.pytree import PyTree, leaf, scopes

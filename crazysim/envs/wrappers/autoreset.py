@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.settings import member
-from crazysim.engine.lower import UnsupportedError
+from crazysim.engine.errors import UnsupportedError
 from crazysim.envs.env import Env, select_states
 from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.state import EnvState, validate_action
