@@ -127,7 +127,7 @@ class Env(ABC):
         return self._of_task(self.task.target, state)
 
     def succeeded(self, state: EnvState) -> Array | None:
-        """Return true where a drone has succeeded; None if success is an error that stays small. (n_worlds, n_drones)"""
+        """Return true where a drone has succeeded, (n_worlds, n_drones); None if success is an error that stays small."""
         return self._of_task(self.task.succeeded, state)
 
     def _of_task(self, fn: Callable[[SimData], Any], state: EnvState) -> Any:
@@ -135,7 +135,7 @@ class Env(ABC):
 
 
 class DroneEnv(Env):
-    """Many worlds of one task. Episodes that are over go on; ``AutoReset`` begins new ones."""
+    """Many worlds of one task. Episodes that are over continue; ``AutoReset`` begins new ones."""
 
     def __init__(self, sim: Sim, task: Task, freq: int = 50, actions: Actions | None = None):
         """Take a simulation in which the task is installed.

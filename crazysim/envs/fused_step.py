@@ -1,12 +1,11 @@
 """An environment step as one kernel: action, physics, observation and the start of new episodes.
 
-The phases of a step (``crazysim.envs.phases``) are functions of one world. Here they become stages of the engine: ``act``
-runs before the first physics step, ``observe`` after the last, and ``begin`` where an episode is over.
+The phases of a step (``crazysim.envs.phases``) are functions of one world. Here they become stages of the engine:
+``act`` runs before the first physics step, ``observe`` after the last, and ``begin`` where an episode is over.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -15,8 +14,8 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, Stage
-from crazysim.engine.fused_rollout import FusedRollout
 from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.fused_rollout import FusedRollout
 from crazysim.envs.phases import act, begin, observe
 from crazysim.envs.state import EnvState
 from crazysim.pytree import PyTree, leaf, scopes
@@ -63,7 +62,7 @@ class FusedEnvStep:
 
         Args:
             env: The environment, without automatic resets.
-            policy: How new episodes begin; None if they do not.
+            policy: Rule of automatic resets; None for no resets.
             state: A state of the structure that is stepped, or its shapes and types.
             action: An action, or its shape and type.
             packed: True for ``step_packed``, False for calls.
@@ -139,7 +138,7 @@ class FusedEnvStep:
         """Return a packed state as a state, without the outputs of its last step.
 
         Args:
-            packed: What ``step_packed`` returned.
+            packed: Result of ``step_packed``.
             state: The state that ``pack`` was called with.
         """
         leaves, treedef = jax.tree.flatten(self._joined(state, state.action))
@@ -208,7 +207,9 @@ class FusedEnvStep:
         data = joined.replace(plugins={k: x for k, x in joined.plugins.items() if k != NAME})
         return layout.state({name: self._get(joined, name, worlds) for name in layout.shapes}, data)
 
-    def _with(self, joined: SimData, state: EnvState, layout: _Layout, further: dict[str, Array] | None = None) -> SimData:
+    def _with(
+        self, joined: SimData, state: EnvState, layout: _Layout, further: dict[str, Array] | None = None
+    ) -> SimData:
         """Return the joined data of one world with a state in place of its own."""
         arrays = layout.arrays(state) | (further or {})
         arrays = {name: jnp.asarray(x, self._shapes[name].dtype) for name, x in arrays.items()}

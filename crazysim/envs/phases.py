@@ -1,7 +1,7 @@
 """Phases of an environment step: act, (physics), observe, and begin, which starts an episode.
 
-Each is written for one world. ``Env`` runs them for all worlds with ``apply=all_worlds``; ``FusedEnvStep`` runs the same
-functions as stages of the engine. Tasks and wrappers are called here and nowhere else.
+Each is written for one world. ``Env`` runs them for all worlds with ``apply=all_worlds``; ``FusedEnvStep`` runs the
+same functions as stages of the engine. Tasks and wrappers are called here and nowhere else.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def act(env: Env, state: EnvState, action: Array, apply: Apply = one_world) -> t
         env: The environment with its wrappers.
         state: The state before the step.
         action: Action. (n_drones, k)
-        apply: How functions of one world are called.
+        apply: Caller of functions of one world.
     """
     for wrapper in reversed(env.wrappers):
         state, action = apply(wrapper.before_step, wrapper.batched)(state, action)
@@ -58,9 +58,9 @@ def observe(env: Env, state: EnvState, action: Array, apply: Apply = one_world) 
 
     Args:
         env: The environment with its wrappers.
-        state: What ``act`` returned, with the data after the physics.
+        state: Result of ``act``, with the data after the physics.
         action: The action that ``act`` returned. (n_drones, k)
-        apply: How functions of one world are called.
+        apply: Caller of functions of one world.
     """
     task, last_step = env.task, env.max_steps * env.n_substeps
 
@@ -94,7 +94,7 @@ def begin(env: Env, state: EnvState, default: SimData, apply: Apply = one_world)
         env: The environment with its wrappers.
         state: The state before.
         default: Data that the world is reset to.
-        apply: How functions of one world are called.
+        apply: Caller of functions of one world.
     """
     task, base = env.task, env.base
     shape = (base.sim.n_drones, env.actions.size)

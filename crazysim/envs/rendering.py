@@ -41,7 +41,9 @@ class Renderer:
             RenderError: If this machine cannot render.
         """
         if self.mode is None or state is None:
-            raise ConfigError("to render, make the environment with render_mode='rgb_array' or 'human', and reset it")
+            raise ConfigError(
+                "expected an environment with render_mode='rgb_array' or 'human' after its reset, got none. Make it so."
+            )
         self.sim.data = state.data
         width, height = self.size
         if self.mode == "human":

@@ -78,7 +78,7 @@ class _PackedSteps:
             packed, state = fused.step_packed(rest._replace(rows=rows), ends, jnp.asarray(actions))
             return packed.rows, output(state), (state.terminated, state.truncated)
 
-        self.compiled = jax.jit(step, donate_argnums=0)  # nobody else has the rows
+        self.compiled = jax.jit(step, donate_argnums=0)  # no caller has the rows
         self._pack, self._unpack = jax.jit(fused.pack), jax.jit(fused.unpack)
 
     def hold(self, state: EnvState) -> None:

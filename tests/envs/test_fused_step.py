@@ -60,9 +60,7 @@ class Bound(Wrapper):
 
 CASES = {
     "hover, same step": (
-        lambda: Bound(
-            envs.EpisodeStatistics(envs.ObservationNoise(envs.make("hover", N, seconds=0.3), {"pos": 0.1}))
-        ),
+        lambda: Bound(envs.EpisodeStatistics(envs.ObservationNoise(envs.make("hover", N, seconds=0.3), {"pos": 0.1}))),
         "SameStep",
     ),
     "hover, next step": (

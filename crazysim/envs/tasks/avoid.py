@@ -125,9 +125,7 @@ class Avoid(Task):
         """Add the obstacles and the check of contacts."""
         handles = []
         if self.n_poles:
-            handles.append(
-                sim.scene.add("pole", count=self.n_poles, pos=(0, 0, 0), radius=POLE_RADIUS, height=HEIGHT)
-            )
+            handles.append(sim.scene.add("pole", count=self.n_poles, pos=(0, 0, 0), radius=POLE_RADIUS, height=HEIGHT))
         if self.n_boxes:
             handles.append(sim.scene.add("box", count=self.n_boxes, pos=(0, 0, HEIGHT / 2), size=(BOX, BOX, BOX)))
         contacts = sim.scene.contact_fn(handles, drones=False)

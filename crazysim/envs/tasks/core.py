@@ -51,7 +51,7 @@ def with_record(data: SimData, record: PyTree) -> SimData:
 
 
 def state_of(data: SimData) -> dict[str, Array]:
-    """Return the usual observations of every drone: ``pos`` m, ``rot`` (rotation matrix), ``vel`` m/s, ``ang_vel`` rad/s.
+    """Return the usual observations: ``pos`` m, ``rot`` (rotation matrix), ``vel`` m/s and ``ang_vel`` rad/s.
 
     Returns:
         (..., n_drones, k) each

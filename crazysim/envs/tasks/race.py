@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -66,7 +66,7 @@ class Race(Task):
 
     level: int = 0
     """Amount of randomness, 0 to 3."""
-    track: Track = Track()
+    track: Track = field(default_factory=Track)
     """The course. Level 3 takes numbers, heights and limits from it."""
     sensor_range: float = SENSOR_RANGE
     """Distance in the plane below which a drone observes the true pose of a gate or obstacle, m."""
@@ -75,8 +75,8 @@ class Race(Task):
     reward: Rewards = dense
     """Function that returns the terms of the reward; ``race_rules.sparse`` is another."""
     practice: bool = False
-    """True to start anywhere on the course, for learning: as often as at the start, a drone is behind a gate that counts
-    as passed."""
+    """True to start anywhere on the course, for learning: as often as at the start, a drone is behind a gate that
+    counts as passed."""
 
     def __post_init__(self) -> None:
         """Check the settings.
@@ -94,7 +94,9 @@ class Race(Task):
             ConfigError: If the track cannot be flown from its starts, or several drones practise.
         """
         if self.practice and sim.n_drones > 1:
-            raise ConfigError(f"expected a single drone for practice, got {sim.n_drones}: there is no room behind a gate")
+            raise ConfigError(
+                f"expected a single drone for practice, got {sim.n_drones}: there is no room behind a gate"
+            )
         jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if self.level == 2 else 0)
         course = checked(self.track, sim.n_drones, float(jitter), self.level == 3)
         tallest = float(np.max(np.asarray(course.gates_pos)[:, 2])) + GATE_JITTER[2]

@@ -42,7 +42,10 @@ class Wrapper(Env):
         if not isinstance(env, Env):
             raise ConfigError(f"expected an environment, got {env!r}")
         if env.auto_resets:
-            raise ConfigError(f"{type(self).__name__} goes inside of AutoReset, which is the outermost wrapper")
+            raise ConfigError(
+                f"expected an environment without AutoReset, which is the outermost wrapper, got one with it. Put "
+                f"{type(self).__name__} inside."
+            )
         self.env = env
         self.name = self.name or type(self).__name__
 
