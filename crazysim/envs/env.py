@@ -127,7 +127,11 @@ class Env(ABC):
         return self._of_task(self.task.target, state)
 
     def succeeded(self, state: EnvState) -> Array | None:
-        """Return true where a drone has succeeded, (n_worlds, n_drones); None if success is an error that stays small."""
+        """Return true where a drone has succeeded; None if success is an error that stays small.
+
+        Returns:
+            (n_worlds, n_drones)
+        """
         return self._of_task(self.task.succeeded, state)
 
     def _of_task(self, fn: Callable[[SimData], Any], state: EnvState) -> Any:

@@ -29,8 +29,8 @@ class DroneVecEnv(VecEnv):
 
     A new episode starts within the step that ends one. The infos of worlds whose episode ended have the entries of
     ``Monitor`` and ``DummyVecEnv``, ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` with ``r``, ``l``
-    and ``t``, and also ``error`` and ``nonfinite``; other infos are empty. With several drones the reward is the mean of
-    theirs, and observations and actions are those of all, drone after drone.
+    and ``t``, and also ``error`` and ``nonfinite``; other infos are empty. With several drones the reward is their
+    mean, and observations and actions are those of all, drone after drone.
     """
 
     def __init__(

@@ -9,7 +9,7 @@ from env_cases import kind, quick
 from crazysim import ConfigError
 from crazysim.envs import AutoReset, make
 from crazysim.envs.brax import BraxEnv
-from crazysim.envs.env import flatten
+from crazysim.envs.state import flatten
 
 pytestmark = pytest.mark.xdist_group("brax")
 N_WORLDS, N_STEPS = 3, 5

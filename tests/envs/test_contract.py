@@ -12,7 +12,9 @@ from env_cases import compiled, entries, kind, obs_of, of_worlds, one_step_to_go
 from gymnasium.vector.utils import batch_space
 
 from crazysim.dynamics import first_principles
+from crazysim.engine import interpret
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
+from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.hover import Hover
 
@@ -165,6 +167,23 @@ def test_episodes_end_in_time_and_are_counted(env, flown):
         assert not info["episode_length"][~done[:, world], world].any()
         sums = np.add.reduceat(reward[: ends[-1] + 1, world], np.concatenate([[0], ends[:-1] + 1]), axis=0)
         np.testing.assert_allclose(info["episode_return"][ends, world], sums, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", entries(classes_once=True), indirect=True)
+def test_one_program_is_the_whole_step(env, begun):
+    """Actions, physics, task and new episodes, lowered for one world and interpreted, equal the unfused step."""
+    auto = AutoReset(env, "SameStep")
+    fused = FusedEnvStep(env.env, auto.policy, begun, begun.action)
+    program = fused._run.program
+    fused._run._run = lambda leaves, n_steps: interpret.steps(program, leaves, n_steps)
+    before, action = one_step_to_go(env, begun, ENDS), random_action(begun)
+    found, expected = fused(before, jnp.asarray(action)), auto.step(before, action)
+    assert kind(found)[0] == kind(expected)[0]
+    pairs = zip(jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(expected), strict=True)
+    for (path, x), y in pairs:
+        assert (x.shape, x.dtype) == (y.shape, y.dtype), path
+        if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+            np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4, err_msg=jax.tree_util.keystr(path))
 
 
 def test_next_step_begins_with_the_step_after_the_last(env, begun):

@@ -107,7 +107,7 @@ def test_wrong_actions_are_refused(env):
 
 
 def test_wrong_settings_are_refused(functional):
-    with pytest.raises(ConfigError, match="got 2 worlds. Make it with n_worlds=1"):
+    with pytest.raises(ConfigError, match=r"got 2 worlds\. Make it with n_worlds=1"):
         DroneParallelEnv(make("hover", 2))
     with pytest.raises(ConfigError, match="without AutoReset"):
         DroneParallelEnv(AutoReset(functional))

@@ -70,8 +70,8 @@ class Land(Task):
     """Land on a pad, 0.2 m above the floor.
 
     A drone has landed when it touches the pad from above, within its radius, with at most 0.5 m/s relative to it and a
-    tilt of at most 20 degrees; contact is checked at every physics step. Any other contact is a crash, as is leaving the
-    2.8 m around the middle of the pad's path. An episode ends when every drone has landed or crashed.
+    tilt of at most 20 degrees; contact is checked at every physics step. Any other contact is a crash, as is leaving
+    the 2.8 m around the middle of the pad's path. An episode ends when every drone has landed or crashed.
     """
 
     name = "land"
