@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
@@ -18,6 +17,7 @@ from crazysim.core.stage import Stage
 from crazysim.core.stages import reset
 from crazysim.engine import fused
 from crazysim.envs.actions import Actions, actions_of
+from crazysim.envs.default_data import compact, spread, with_own
 from crazysim.envs.phases import act, all_worlds, begin, observe
 from crazysim.envs.state import EnvState, validate_action
 from crazysim.envs.task import NAME, Task
@@ -184,7 +184,7 @@ class DroneEnv(Env):
         )
         """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``batched_reset``."""
         self.zeros = self._step.zeros(sim.data)
-        self._default = default = _compact(sim.default_data)
+        self._default = default = compact(sim.default_data)
         kinds = zip(jax.tree.leaves(scopes(default)), jax.tree.leaves(default), strict=True)
         self.default_varies = any(
             kind in ("drone", "world") and x.shape[0] > 1 and x is not default.core.world_id for kind, x in kinds
@@ -255,14 +255,14 @@ class DroneEnv(Env):
         """Return the data of all worlds before their first episode. The key is that of ``reset``. ()"""
         if not isinstance(key, jax.core.Tracer):
             key = jax.device_put(key, self.sim.device)
-        data = _spread(self._default, self.sim.n_worlds, self.sim.n_drones)
+        data = spread(self._default, self.sim.n_worlds, self.sim.n_drones)
         data = data.replace(core=data.core.replace(rng_key=key))
         return data if self.sim.mesh is None else shard(data, self.sim.mesh)
 
     def default_of(self, data: SimData) -> SimData:
         """Return the data of all worlds that an episode begins from; seed and numbers are those of the data given."""
         n_worlds, n_drones = data.states.pos.shape[:2]
-        return _like(_spread(self._default, n_worlds, n_drones), data)
+        return with_own(spread(self._default, n_worlds, n_drones), data)
 
     def default_of_world(self, data: SimData) -> SimData:
         """Return the data of one world that an episode begins from, where worlds do not differ in that."""
@@ -271,7 +271,7 @@ class DroneEnv(Env):
         def one(scope: str, x: Any) -> Any:
             return x[(0,) * taken[scope]] if scope in taken else x
 
-        return _like(jax.tree.map(one, scopes(self._default), self._default), data)
+        return with_own(jax.tree.map(one, scopes(self._default), self._default), data)
 
 
 def select_states(mask: Array, new: EnvState, old: EnvState) -> EnvState:
@@ -287,36 +287,3 @@ def select_states(mask: Array, new: EnvState, old: EnvState) -> EnvState:
     pairs = zip(kinds, jax.tree.leaves(new), jax.tree.leaves(old), strict=True)
     leaves = [select_worlds(mask, x, y) if kind in ("drone", "world", "rows") else x for kind, x, y in pairs]
     return jax.tree.structure(new).unflatten(leaves)
-
-
-def _compact(data: SimData) -> SimData:
-    """Return the data with one world and drone in place of all where they are alike, as arrays of the host."""
-
-    def one(scope: str, x: Any) -> Any:
-        if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
-            return x
-        x = np.asarray(x)
-        for axis in range({"drone": 2, "world": 1}.get(scope, 0)):
-            first = x.take([0], axis)
-            if np.array_equal(x, np.broadcast_to(first, x.shape)):
-                x = first
-        return x
-
-    return jax.tree.map(one, scopes(data), data)
-
-
-def _spread(data: SimData, n_worlds: int, n_drones: int) -> SimData:
-    """Return compacted data with all worlds and drones."""
-    shapes = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1)}
-
-    def all_of(scope: str, x: Any) -> Any:
-        shape = shapes.get(scope, ())
-        return jnp.broadcast_to(x, (*shape, *x.shape[len(shape) :])) if shape else x
-
-    return jax.tree.map(all_of, scopes(data), data)
-
-
-def _like(default: SimData, data: SimData) -> SimData:
-    """Return the default data with the seed, numbers and flags of the data."""
-    own = {name: getattr(data.core, name) for name in ("rng_key", "world_id", "drone_id", "n_worlds")}
-    return default.replace(core=default.core.replace(**own))

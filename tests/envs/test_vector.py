@@ -109,11 +109,11 @@ def test_one_dispatch_a_step_and_arrays_stay_where_they_are(next_step):
     with jax.transfer_guard("disallow"):
         obs, reward, terminated, truncated, info = next_step.step(action)
     assert all(isinstance(x, jax.Array) for x in jax.tree.leaves((obs, reward, terminated, truncated, info)))
-    traces = next_step._advance.compiled._cache_size()
+    traces = next_step._stepper.compiled._cache_size()
     for given in (zeros(next_step), zeros(next_step).astype(np.float64), zeros(next_step).tolist()):
         next_step.step(given)
     # NumPy comes in by another door than JAX, and is traced once
-    assert next_step._advance.compiled._cache_size() <= traces + 1
+    assert next_step._stepper.compiled._cache_size() <= traces + 1
 
 
 @pytest.mark.parametrize(

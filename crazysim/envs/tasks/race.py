@@ -19,8 +19,9 @@ from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks import race_rules as rules
-from crazysim.envs.tasks.core import check_collisions, nearest, others_near, pick, with_record
-from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, obstacles_of, race_of
+from crazysim.envs.tasks.core import check_collisions, pick, with_record
+from crazysim.envs.tasks.race_observations import observe, visited
+from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.tracks import Track, checked, n_random, random_course, start_offsets
 from crazysim.errors import ConfigError
 from crazysim.sim.sim import Sim
@@ -36,8 +37,6 @@ GATE_JITTER = (0.15, 0.15, 0.1, 0.05, 0.1, 0.2)
 """Largest displacement, m, and rotation, rad, of a gate from level 2 on."""
 OBSTACLE_JITTER = (0.15, 0.15, 0.05)
 """Largest displacement of an obstacle from level 2 on, m."""
-CORNERS = OPENING / 2 * np.array([[0, 1, 1], [0, 1, -1], [0, -1, -1], [0, -1, 1]])
-"""Corners of the opening in the gate's frame, m. (4, 3)"""
 FOOT = np.array([0.0, 0.0, POLE_HEIGHT])
 """From the foot of an obstacle to its upper end, m."""
 
@@ -171,7 +170,7 @@ class Race(Task):
     def before_step(self, data: SimData) -> SimData:
         """Note what each drone has observed, its progress, and the way to go."""
         record = race_of(data)
-        seen_gates, seen_obstacles = self.visited(data)
+        seen_gates, seen_obstacles = visited(data, self.sensor_range)
         new = record.replace(
             gates_visited=seen_gates,
             obstacles_visited=seen_obstacles,
@@ -181,66 +180,9 @@ class Race(Task):
         )
         return with_record(data, new)
 
-    def visited(self, data: SimData) -> tuple[Array, Array]:
-        """Return true for gates and obstacles that each drone is or has been near. (n_drones, n) each"""
-        record = race_of(data)
-
-        def near(pos: Array) -> Array:
-            flat = (pos - data.states.pos[..., None, :])[..., :2]
-            return jnp.sum(flat * flat, axis=-1) < self.sensor_range**2
-
-        return record.gates_visited | near(gates_of(data)[0]), record.obstacles_visited | near(obstacles_of(data))
-
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the observations of lsy_drone_racing, each as one row, and more of them for small networks.
-
-        Those are ``rot`` (9), ``vel_body`` (3), ``gate_corners`` of the next two gates in the drone's frame (24),
-        ``obstacles_near``, ways to the axes of the next two poles (6), and with several drones ``drones_near``, the
-        nearest two of those still in the race (6); all from observed poses, in the drone's frame, m.
-        """
-        record, s, n_drones = race_of(data), data.states, data.core.n_drones
-        gates_pos, gates_quat, poles = (
-            jnp.broadcast_to(x, (n_drones, *x.shape)) for x in (*gates_of(data), obstacles_of(data))
-        )
-        seen_gates, seen_obstacles = self.visited(data)
-        n_gates, n_obstacles = seen_gates.shape[-1], seen_obstacles.shape[-1]
-        nominal_pos, nominal_quat = record.nominal_pos, record.nominal_quat
-        if nominal_pos is not None and nominal_quat is not None:
-            gates_pos = jnp.where(seen_gates[..., None], gates_pos, nominal_pos[:n_gates])
-            gates_quat = jnp.where(seen_gates[..., None], gates_quat, nominal_quat)
-            poles = jnp.where(seen_obstacles[..., None], poles, nominal_pos[n_gates:])
-        matrix = rotation.matrix(s.quat)
-
-        def in_body(world: Array) -> Array:
-            return rotation.matvec(jnp.swapaxes(matrix, -1, -2)[..., None, :, :], world)
-
-        corners = []
-        for k in (0, 1):
-            number = jnp.minimum(record.passed + k, n_gates - 1)
-            pos, quat = pick(gates_pos, number)[..., None, :], pick(gates_quat, number)[..., None, :]
-            around = pos + rotation.rotate(quat, jnp.asarray(CORNERS, pos.dtype))
-            corners.append(in_body(around - s.pos[..., None, :]))
-        to_poles = (poles - s.pos[..., None, :]) * np.array([1, 1, 0], s.pos.dtype)
-        far = jnp.sum(to_poles * to_poles, axis=-1)
-        obs = {
-            "pos": s.pos,
-            "quat": s.quat,
-            "vel": s.vel,
-            "ang_vel": s.ang_vel,
-            "target_gate": jnp.where(record.finished, -1, record.passed)[..., None],
-            "gates_pos": gates_pos,
-            "gates_quat": gates_quat,
-            "gates_visited": seen_gates,
-            "obstacles_pos": poles,
-            "obstacles_visited": seen_obstacles,
-            "rot": matrix,
-            "vel_body": in_body(s.vel[..., None, :]),
-            "gate_corners": jnp.concatenate(corners, axis=-2),
-            "obstacles_near": in_body(nearest(far, to_poles, min(2, n_obstacles))),
-        }
-        if n_drones > 1:
-            obs["drones_near"] = in_body(others_near(data, 2, ~record.out)[0])
-        return {name: x.reshape(n_drones, -1).astype(s.pos.dtype) for name, x in obs.items()}
+        """Return the observations; see ``race_observations.observe``."""
+        return observe(data, self.sensor_range)
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return the terms of ``reward``."""
