@@ -3,6 +3,8 @@
 Importing this module registers every task with Gymnasium, as ``crazysim/Hover-v0`` and so on.
 """
 
+from typing import TYPE_CHECKING
+
 from crazysim.envs import terms
 from crazysim.envs.actions import Actions, actions_of
 from crazysim.envs.env import DroneEnv, Env
@@ -27,6 +29,12 @@ from crazysim.envs.wrappers import (
     RewardTerms,
     Wrapper,
 )
+from crazysim.lazy import lazy
+
+if TYPE_CHECKING:
+    from crazysim.envs.brax import BraxEnv
+    from crazysim.envs.pettingzoo import make_parallel
+    from crazysim.envs.sb3 import DroneVecEnv
 
 register()
 
@@ -36,7 +44,9 @@ __all__ = [
     "Actions",
     "AutoReset",
     "AutoresetMode",
+    "BraxEnv",
     "DroneEnv",
+    "DroneVecEnv",
     "DroneVectorEnv",
     "Env",
     "EnvState",
@@ -54,8 +64,18 @@ __all__ = [
     "flatten",
     "flying",
     "make",
+    "make_parallel",
     "rollout",
     "state_of",
     "terms",
     "uniform",
 ]
+
+__getattr__ = lazy(
+    __name__,
+    {
+        "BraxEnv": "crazysim.envs.brax",
+        "DroneVecEnv": "crazysim.envs.sb3",
+        "make_parallel": "crazysim.envs.pettingzoo",
+    },
+)

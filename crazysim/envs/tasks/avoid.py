@@ -13,12 +13,11 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.stage import stage
-from crazysim.effects.core import install
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.core import check_collisions, nearest, others_near, state_of, with_record
+from crazysim.envs.tasks.core import install_rules, nearest, others_near, state_of, with_record
 from crazysim.envs.tracks import ranks
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, static
@@ -143,8 +142,7 @@ class Avoid(Task):
             return with_record(data, own.replace(disabled=disabled, reached=reached))
 
         record = Crossing(zero, no, no, no, zero[..., 0], tuple(handles))
-        install(sim, NAME, record, check, before="increment_steps")
-        check_collisions(sim)
+        install_rules(sim, record, check, collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight before the field, and obstacles in cells of their own."""

@@ -9,9 +9,8 @@ from jax.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.pipeline import insert_fn_before
-from crazysim.core.stage import stage
-from crazysim.effects.core import install
+from crazysim.core.plugin import FunctionPlugin, Placement
+from crazysim.core.stage import Stage, stage
 from crazysim.envs.task import NAME
 from crazysim.pytree import PyTree, leaf
 from crazysim.sim.sim import Sim
@@ -31,7 +30,7 @@ class Goal(PyTree):
 
 def install_goal(sim: Sim) -> None:
     """Give every drone a goal, ``data.plugins["task"]``, at the origin and at rest."""
-    install(sim, NAME, Goal(jnp.zeros_like(sim.data.states.pos), jnp.zeros_like(sim.data.states.pos)))
+    sim.add(FunctionPlugin(NAME, Goal(jnp.zeros_like(sim.data.states.pos), jnp.zeros_like(sim.data.states.pos))))
 
 
 def goal_of(data: SimData) -> Goal:
@@ -115,14 +114,27 @@ def nearest(distance: Array, x: Array, n: int) -> Array:
     return jnp.stack(out, axis=-2)
 
 
-def check_collisions(sim: Sim) -> None:
-    """Disable drones that touch each other, at every physics step, in the task's record, before its own stage.
+def install_rules(sim: Sim, record: PyTree, rules: Stage, collisions: bool = False) -> None:
+    """Add a task's record, and a stage that updates it at the end of every physics step.
+
+    Args:
+        sim: The simulation.
+        record: Record of all worlds, for ``data.plugins["task"]``.
+        rules: The stage.
+        collisions: True to disable drones that touch each other, before the stage.
+    """
+    placements = [Placement(rules, before="increment_steps")]
+    if collisions and sim.n_drones > 1:
+        placements.insert(0, Placement(collision_stage(sim), before="increment_steps", name=f"{NAME}_collisions"))
+    sim.add(FunctionPlugin(NAME, record, placements))
+
+
+def collision_stage(sim: Sim) -> Stage:
+    """Return a stage that disables drones that touch each other, in the task's record.
 
     Drones whose ``out`` is true in the record neither touch nor are touched. The record needs leaves ``disabled`` and
     ``out``, (n_worlds, n_drones) each.
     """
-    if sim.n_drones == 1:
-        return
     contacts = sim.scene.contact_fn((), floor=False)
 
     @stage("world")
@@ -135,8 +147,7 @@ def check_collisions(sim: Sim) -> None:
         hit = contacts(data.replace(states=s.replace(pos=elsewhere))).any & ~out
         return with_record(data, record.replace(disabled=record.disabled | hit))
 
-    insert_fn_before(sim.step_pipeline, NAME, collide, f"{NAME}_collisions")
-    sim.build_step_fn()
+    return collide
 
 
 def others_near(data: SimData, n: int, counts: Array | None = None) -> tuple[Array, Array]:

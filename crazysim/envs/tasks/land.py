@@ -12,9 +12,8 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
-from crazysim.core.pipeline import insert_fn_before
+from crazysim.core.plugin import FunctionPlugin, Placement
 from crazysim.core.stage import stage
-from crazysim.effects.core import install
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
@@ -125,10 +124,10 @@ class Land(Task):
             return pads.set_pose(data, pos, vel=vel)
 
         record = Landing(zero, zero, zero, no, no, no, zero[..., 0], pads)
-        install(sim, NAME, record, touch, before="increment_steps")
+        placements = [Placement(touch, before="increment_steps")]
         if self.speed > 0:
-            insert_fn_before(sim.step_pipeline, NAME, move, f"{NAME}_pads")
-            sim.build_step_fn()
+            placements.insert(0, Placement(move, before="increment_steps", name=f"{NAME}_pads"))
+        sim.add(FunctionPlugin(NAME, record, placements))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight about a metre above their pads."""

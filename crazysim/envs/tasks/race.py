@@ -14,12 +14,11 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.stage import stage
-from crazysim.effects.core import install
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import Task
 from crazysim.envs.tasks import race_rules as rules
-from crazysim.envs.tasks.core import check_collisions, pick, with_record
+from crazysim.envs.tasks.core import install_rules, pick, with_record
 from crazysim.envs.tasks.race_observations import observe, visited
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.tracks import Track, checked, n_random, random_course, start_offsets
@@ -135,8 +134,7 @@ class Race(Task):
             passed = record.passed + (rules.passes(data) & ~disabled)
             return with_record(data, record.replace(passed=passed, disabled=disabled, last_pos=pos))
 
-        install(sim, NAME, record, judge, before="increment_steps")
-        check_collisions(sim)
+        install_rules(sim, record, judge, collisions=True)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight at the start, and gates and obstacles in their places."""

@@ -13,12 +13,11 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.stage import stage
-from crazysim.effects.core import install
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.core import on_floor, others_near, state_of, with_record
+from crazysim.envs.tasks.core import install_rules, on_floor, others_near, state_of, with_record
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 from crazysim.sim.sim import Sim
@@ -98,7 +97,7 @@ class Swarm(Task):
             return with_record(data, own.replace(closest=jnp.minimum(own.closest, separation(data.states.pos))))
 
         record = SwarmRecord(zero, jnp.full(zero.shape[:2], jnp.inf, zero.dtype))
-        install(sim, NAME, record, keep_closest, before="increment_steps")
+        install_rules(sim, record, keep_closest)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight on the circle, and their goals."""
