@@ -13,7 +13,7 @@ import pytest
 from crazysim import ConfigError
 from crazysim.__main__ import main
 from crazysim.envs import AutoReset, DroneEnv, make
-from crazysim.envs.rollout import bare
+from crazysim.envs.state import bare
 from crazysim.errors import UnknownNameError
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import run as runs
