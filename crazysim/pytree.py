@@ -44,14 +44,14 @@ def static(**kwargs: Any) -> Any:
 
 @dataclass_transform(frozen_default=True, field_specifiers=(leaf, static, dataclasses.field))
 class PyTree:
-    """A frozen record of arrays that JAX can look into.
+    """Base class of records: frozen dataclasses that are JAX pytrees.
 
-    Subclasses list annotated fields; an array field says with ``leaf`` which batch axes it carries, a
-    ``static`` field belongs to the type, any other field holds a record of its own.
+    Subclasses list annotated fields. An array field declares its batch axes with ``leaf``, a ``static`` field is part
+    of the type, and any other field holds a record.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Make every subclass a frozen dataclass that is registered with JAX."""
+        """Make the subclass a frozen dataclass and register it with JAX."""
         super().__init_subclass__(**kwargs)
         dataclasses.dataclass(frozen=True, eq=False)(cls)
         fields = dataclasses.fields(cls)  # type: ignore[arg-type]
@@ -62,7 +62,7 @@ class PyTree:
         )
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with the named fields exchanged."""
+        """Return a copy with the given fields replaced."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
 
 
@@ -71,7 +71,7 @@ def scopes(tree: Any) -> Any:
 
     A parameter is returned as ``shared`` or ``drone``. Leaves without a declaration are ``opaque``. A leaf of another
     dataclass whose field has ``CORE_NDIM_KEY`` in its metadata is ``batched`` if it has more dimensions than that:
-    its first axis is over worlds, and stages see it as they see opaque leaves.
+    its first axis is over worlds, and stages receive it like an opaque leaf.
     """
     return _map_declared(lambda x, metadata, _: _scope(x, metadata), tree, {}, "")
 
@@ -178,9 +178,12 @@ def map_batched(fn: Callable[..., Any], tree: T, *others: T) -> T:
 
 
 def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
-    """Return ``new`` where ``mask`` is True, ``old`` elsewhere; the mask (n_worlds,), (n_worlds, 1) or of one world ().
+    """Return ``new`` in the worlds of a mask and ``old`` elsewhere, both broadcast to a common shape.
 
-    Both are broadcast to the larger of their shapes; without a mask the result is ``new`` everywhere.
+    Args:
+        mask: True in worlds that take ``new``; None for all. (n_worlds,), (n_worlds, 1), or () for one world
+        new: New values. (n_worlds, ...)
+        old: Old values. (n_worlds, ...)
     """
     shape = jnp.broadcast_shapes(jnp.shape(new), jnp.shape(old))
     if mask is None:
@@ -190,13 +193,13 @@ def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
 
 
 def floating() -> Any:
-    """Return the type of numbers that JAX computes with as it is set now: float32, or float64."""
+    """Return the floating dtype of JAX in its current configuration: float32 or float64."""
     return np.float64 if jax.config.jax_enable_x64 else np.float32  # type: ignore[attr-defined]
 
 
 def as_parameter(value: Any) -> Any:
-    """Return a number or array as a shared parameter: of floating type, and never a bare scalar.
+    """Return a number or array as a shared parameter: of floating dtype, and never zero-dimensional.
 
-    It is an array of the host, which takes no compilation; a simulation puts it on its device with all else.
+    It is a NumPy array, which needs no compilation; the simulation moves it to its device with the other data.
     """
     return np.atleast_1d(np.asarray(value, floating()))

@@ -149,7 +149,7 @@ def wrong_commands(shape):
     yield np.zeros((2, 3, shape[2])), str((2, 3, shape[2])), needed
     yield 0.0, "()", "n_worlds, n_drones"
     yield None, "()", "n_worlds, n_drones"
-    yield [[1.0, 2.0], [3.0]], "no regular array", "command"
+    yield [[1.0, 2.0], [3.0]], "a regular array, got", "command"
     yield zeros[..., :0].tolist(), str((3, 2, 0)), needed
     yield np.full(shape, "up"), "<U2", "real numbers"
     yield np.zeros(shape, bool), "bool", "real numbers"
