@@ -136,21 +136,41 @@ def z_axis(q: Array) -> Array:
 
 
 def turn(q: Array, rotvec: Array, normalize: bool = True) -> Array:
-    """Return the attitude after a turn about a body axis by less than half a revolution. (..., 4)
+    """Return the attitude after a small rotation about a body axis, such as that of one physics step. (..., 4)
 
-    The turn of one physics step: polynomials of sine and cosine take the place of functions that cost more than
-    the whole rest of the step. Up to ``|rotvec| = pi`` they are exact to rounding: the first term left out is
-    (pi/2)^14 / 14! = 6e-9 in float32 and (pi/2)^22 / 22! = 2e-17 in float64. Renormalising keeps rounding from
-    adding up; an attitude that is used once can do without.
+    The result is ``q (sin(h) rotvec / |rotvec|, cos(h))`` with half the angle h, to rounding up to half a revolution.
+    ``jnp.sin`` and ``jnp.cos`` would cost more than the rest of the step. A result that is normalised needs their ratio
+    only, which is that of imaginary and real part of the Pade approximation of ``exp(2ih)``. Otherwise both are Taylor
+    polynomials.
+
+    Args:
+        q: Attitude, body to world, unit, xyzw. (..., 4)
+        rotvec: Rotation vector, body frame, rad. (..., 3)
+        normalize: True to scale the result to unit length, which keeps rounding errors from accumulating. An attitude
+            that is used once, as in the stages of a Runge-Kutta step, can do without.
     """
+    is_float32 = rotvec.dtype == jnp.float32
+    if normalize:
+        coefficients = _pade_coefficients(6 if is_float32 else 11)
+    else:
+        coefficients = [1 / math.factorial(n) for n in range(14 if is_float32 else 22)]
     s = 0.25 * dot(rotvec, rotvec)
-    n_terms = 6 if s.dtype == jnp.float32 else 10
-    sinc = cos = 0.0
-    for n in range(n_terms, -1, -1):  # Horner: every term is one multiply-add
-        sinc = sinc * s + (-1) ** n / math.factorial(2 * n + 1)
-        cos = cos * s + (-1) ** n / math.factorial(2 * n)
-    turned = multiply(q, jnp.concatenate([0.5 * sinc * rotvec, cos], axis=-1))
+    sinc = _alternating(s, coefficients[1::2])
+    turned = multiply(q, jnp.concatenate([0.5 * sinc * rotvec, _alternating(s, coefficients[::2])], axis=-1))
     return turned * lax.rsqrt(dot(turned, turned)) if normalize else turned
+
+
+def _pade_coefficients(order: int) -> list[float]:
+    """Return the numerator's coefficients of the Pade approximation of ``exp(2x)``, lowest power first."""
+    return [2**n * math.comb(order, n) / math.perm(2 * order, n) for n in range(order + 1)]
+
+
+def _alternating(s: Array, coefficients: list[float]) -> Array:
+    """Return ``c_0 - c_1 s + c_2 s^2 - ...``. (...)"""
+    value = 0.0
+    for n in reversed(range(len(coefficients))):
+        value = value * s + (-1) ** n * coefficients[n]
+    return jnp.asarray(value)
 
 
 def from_rpy(rpy: Array) -> Array:

@@ -10,12 +10,12 @@ from crazysim import rotation
 from crazysim.drones import Airframe
 from crazysim.dynamics.core import GRAVITY, Dynamics, require_support
 from crazysim.dynamics.drag import drag_force
-from crazysim.dynamics.rigid_body import angular_acceleration, linear_acceleration
+from crazysim.dynamics.rigid_body import angular_acceleration, linear_acceleration, stable_angular_acceleration
 from crazysim.dynamics.rotor import (
     curve,
-    gyroscopic_torque,
     reaction_torque,
     rotor_acceleration,
+    rotor_momentum,
     rotor_torque,
     rotor_vel_of_thrust,
 )
@@ -94,6 +94,7 @@ def dynamics(
     dist_t: Array | None = None,
     *,
     params: Params,
+    dt: float | None = None,
 ) -> tuple[Array, Array, Array, Array]:
     """Return the time derivatives of one multirotor.
 
@@ -107,6 +108,8 @@ def dynamics(
         dist_f: External force on the centre of mass, world frame, N. (..., 3)
         dist_t: External torque, world frame, N m. (..., 3)
         params: Parameters, shared or with the leading axes of the state.
+        dt: Duration of the Euler step that the derivatives are for, s: above 20 rad/s at 500 Hz the angular
+            acceleration is then that of ``stable_angular_acceleration``. None for the exact derivatives.
 
     Returns:
         Velocity, m/s, acceleration, m/s^2 (both world frame), angular acceleration, rad/s^2 (body frame),
@@ -125,13 +128,17 @@ def dynamics(
 
     sign = p.mixing_matrix[..., 2, :]
     torque = rotor_torque(thrust, drag_torque, p.L, p.mixing_matrix)
-    torque = torque + gyroscopic_torque(ang_vel, rotor_vel, sign, p.prop_inertia)
     torque = torque + reaction_torque(rotor_acc, sign, p.prop_inertia)
     if dist_t is not None:
         torque = torque + rotation.rotate_inverse(quat, dist_t)
 
     acc = linear_acceleration(force, p.mass, p.gravity_vec)
-    return vel, acc, angular_acceleration(torque, ang_vel, p.J, p.J_inv), rotor_acc
+    momentum = rotor_momentum(rotor_vel, sign, p.prop_inertia)
+    if dt is None:
+        ang_acc = angular_acceleration(torque, ang_vel, p.J, p.J_inv, momentum)
+    else:
+        ang_acc = stable_angular_acceleration(torque, ang_vel, p.J, p.J_inv, momentum, dt)
+    return vel, acc, ang_acc, rotor_acc
 
 
 def saturate(cmd: Array, params: Params) -> Array:

@@ -62,28 +62,26 @@ def rotor_torque(thrust: Array, drag_torque: Array, L: Array, mixing_matrix: Arr
     return jnp.concatenate([tilt, matvec(mixing_matrix[..., 2:, :], drag_torque)], axis=-1)
 
 
-def gyroscopic_torque(ang_vel: Array, rotor_vel: Array, yaw_torque_sign: Array, prop_inertia: Array) -> Array:
-    """Return the torque of spinning rotors on a turning body, ``-ang_vel x h``, body frame, N m.
+def rotor_momentum(rotor_vel: Array, yaw_torque_sign: Array, prop_inertia: Array) -> Array:
+    """Return the angular momentum of the spinning rotors relative to the body, body frame, N m s.
 
-    Their angular momentum h lies along body z, against the sign of their drag torque. Being a cross product
-    with ``ang_vel`` it does no work.
+    It points along body z, against the sign of the drag torques.
 
     Args:
-        ang_vel: Angular velocity of the body, body frame, rad/s. (..., 3)
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)
         yaw_torque_sign: Signs of the rotors' drag torques about body z. (..., n_rotors)
         prop_inertia: Inertia of one propeller with its motor, kg m^2. (..., 1 or n_rotors)
 
     Returns:
-        Torque, body frame, N m. (..., 3)
+        Angular momentum, body frame, N m s. (..., 3)
     """
-    momentum = -RPM_TO_RAD_S * jnp.sum(yaw_torque_sign * prop_inertia * rotor_vel, axis=-1)
-    wx, wy = ang_vel[..., 0], ang_vel[..., 1]
-    return jnp.stack([-wy * momentum, wx * momentum, jnp.zeros_like(momentum)], axis=-1)
+    about_z = -RPM_TO_RAD_S * jnp.sum(yaw_torque_sign * prop_inertia * rotor_vel, axis=-1)
+    zero = jnp.zeros_like(about_z)
+    return jnp.stack([zero, zero, about_z], axis=-1)
 
 
 def reaction_torque(rotor_acc: Array, yaw_torque_sign: Array, prop_inertia: Array) -> Array:
-    """Return the torque that speeding rotors up puts on the body, ``-dh/dt``, body frame, N m.
+    """Return the torque that accelerating rotors exert on the body, ``-dh/dt``, body frame, N m.
 
     Args:
         rotor_acc: Rotor accelerations, rpm/s. (..., n_rotors)
@@ -93,9 +91,7 @@ def reaction_torque(rotor_acc: Array, yaw_torque_sign: Array, prop_inertia: Arra
     Returns:
         Torque, body frame, N m. (..., 3)
     """
-    about_z = RPM_TO_RAD_S * jnp.sum(yaw_torque_sign * prop_inertia * rotor_acc, axis=-1)
-    zero = jnp.zeros_like(about_z)
-    return jnp.stack([zero, zero, about_z], axis=-1)
+    return -rotor_momentum(rotor_acc, yaw_torque_sign, prop_inertia)
 
 
 def rotor_vel_of_thrust(thrust: Array, rpm2thrust: Array) -> Array:
