@@ -24,19 +24,35 @@ def cross(a: Array, b: Array) -> Array:
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
-def matvec(matrix: Array, vector: Array) -> Array:
-    """Return ``matrix @ vector`` for small arrays, written out.
+def along_z(value: Array) -> Array:
+    """Return the vectors along z with these values. (...) -> (..., 3)"""
+    zero = jnp.zeros_like(value)
+    return jnp.stack([zero, zero, value], axis=-1)
+
+
+def add_cross(offset: Array, a: Array, b: Array) -> Array:
+    """Return ``offset + a x b`` as six multiply-adds. (..., 3)"""
+    x, y, z = offset[..., 0], offset[..., 1], offset[..., 2]
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return jnp.stack([x + ay * bz - az * by, y + az * bx - ax * bz, z + ax * by - ay * bx], axis=-1)
+
+
+def matvec(matrix: Array, vector: Array, offset: Array | None = None) -> Array:
+    """Return ``matrix @ vector + offset`` for small arrays, written out.
 
     Args:
         matrix: (..., m, n)
         vector: (..., n)
+        offset: First summand; None for zero. (..., m)
 
     Returns:
         (..., m)
     """
     n_rows, n_columns = matrix.shape[-2:]
     columns = [vector[..., k] for k in range(n_columns)]
-    rows = [sum(matrix[..., i, k] * columns[k] for k in range(n_columns)) for i in range(n_rows)]
+    start = [0 if offset is None else offset[..., i] for i in range(n_rows)]
+    rows = [sum((matrix[..., i, k] * columns[k] for k in range(n_columns)), start[i]) for i in range(n_rows)]
     return jnp.stack(rows, axis=-1)
 
 
@@ -120,14 +136,14 @@ def matrix(q: Array) -> Array:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def rotate(q: Array, v: Array) -> Array:
-    """Return a body vector in the world frame, ``R(q) v``. (..., 3)"""
-    return matvec(matrix(q), v)
+def rotate(q: Array, v: Array, offset: Array | None = None) -> Array:
+    """Return a body vector in the world frame, ``R(q) v``, plus an offset. (..., 3)"""
+    return matvec(matrix(q), v, offset)
 
 
-def rotate_inverse(q: Array, v: Array) -> Array:
-    """Return a world vector in the body frame, ``R(q)^T v``. (..., 3)"""
-    return matvec(jnp.swapaxes(matrix(q), -1, -2), v)
+def rotate_inverse(q: Array, v: Array, offset: Array | None = None) -> Array:
+    """Return a world vector in the body frame, ``R(q)^T v``, plus an offset. (..., 3)"""
+    return matvec(jnp.swapaxes(matrix(q), -1, -2), v, offset)
 
 
 def z_axis(q: Array) -> Array:
@@ -135,42 +151,40 @@ def z_axis(q: Array) -> Array:
     return matrix(q)[..., 2]
 
 
-def turn(q: Array, rotvec: Array, normalize: bool = True) -> Array:
-    """Return the attitude after a small rotation about a body axis, such as that of one physics step. (..., 4)
+def turn(q: Array, ang_vel: Array, dt: float, normalize: bool = True) -> Array:
+    """Return the attitude after a rotation with a constant angular velocity, for small angles. (..., 4)
 
-    The result is ``q (sin(h) rotvec / |rotvec|, cos(h))`` with half the angle h, to rounding up to half a revolution.
-    ``jnp.sin`` and ``jnp.cos`` would cost more than the rest of the step. A result that is normalised needs their ratio
-    only, which is that of imaginary and real part of the Pade approximation of ``exp(2ih)``. Otherwise both are Taylor
-    polynomials.
+    The result is ``q (sin(h) ang_vel / |ang_vel|, cos(h))`` with half the angle ``h = |ang_vel| dt / 2``, to rounding
+    up to half a revolution. ``jnp.sin`` and ``jnp.cos`` would cost more than the rest of a physics step. A result that
+    is normalised needs their ratio only, which is that of imaginary and real part of the Pade approximation of
+    ``exp(2ih)``. Otherwise both are Taylor polynomials.
 
     Args:
         q: Attitude, body to world, unit, xyzw. (..., 4)
-        rotvec: Rotation vector, body frame, rad. (..., 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        dt: Duration, s.
         normalize: True to scale the result to unit length, which keeps rounding errors from accumulating. An attitude
             that is used once, as in the stages of a Runge-Kutta step, can do without.
     """
-    is_float32 = rotvec.dtype == jnp.float32
+    is_float32 = ang_vel.dtype == jnp.float32
     if normalize:
-        coefficients = _pade_coefficients(6 if is_float32 else 11)
+        order = 6 if is_float32 else 11
+        coefficients = [2**n * math.comb(order, n) / math.perm(2 * order, n) for n in range(order + 1)]
     else:
         coefficients = [1 / math.factorial(n) for n in range(14 if is_float32 else 22)]
-    s = 0.25 * dot(rotvec, rotvec)
-    sinc = _alternating(s, coefficients[1::2])
-    turned = multiply(q, jnp.concatenate([0.5 * sinc * rotvec, _alternating(s, coefficients[::2])], axis=-1))
+    signed = [(-1) ** (n // 2) * c * (dt / 2) ** n for n, c in enumerate(coefficients)]
+    square = dot(ang_vel, ang_vel)
+    step = jnp.concatenate([_polynomial(square, signed[1::2]) * ang_vel, _polynomial(square, signed[::2])], axis=-1)
+    turned = multiply(q, step)
     return turned * lax.rsqrt(dot(turned, turned)) if normalize else turned
 
 
-def _pade_coefficients(order: int) -> list[float]:
-    """Return the numerator's coefficients of the Pade approximation of ``exp(2x)``, lowest power first."""
-    return [2**n * math.comb(order, n) / math.perm(2 * order, n) for n in range(order + 1)]
-
-
-def _alternating(s: Array, coefficients: list[float]) -> Array:
-    """Return ``c_0 - c_1 s + c_2 s^2 - ...``. (...)"""
-    value = 0.0
-    for n in reversed(range(len(coefficients))):
-        value = value * s + (-1) ** n * coefficients[n]
-    return jnp.asarray(value)
+def _polynomial(x: Array, coefficients: list[float]) -> Array:
+    """Return the polynomial with these coefficients, constant term first. (...)"""
+    value = jnp.full_like(x, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):  # Horner: one multiply-add for each
+        value = value * x + coefficient
+    return value
 
 
 def from_rpy(rpy: Array) -> Array:

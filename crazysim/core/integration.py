@@ -40,8 +40,7 @@ class Integrator(StrEnum):
 
 def euler(data: SimData, deriv_fn: DerivFn) -> SimData:
     """Return the data one explicit Euler step later."""
-    deriv, dt = deriv_fn(data), 1 / data.core.freq
-    return apply_derivative(data, deriv, dt, dt * deriv.ang_vel)
+    return apply_derivative(data, deriv_fn(data), 1 / data.core.freq)
 
 
 def symplectic_euler(data: SimData, deriv_fn: DerivFn) -> SimData:
@@ -49,7 +48,7 @@ def symplectic_euler(data: SimData, deriv_fn: DerivFn) -> SimData:
     deriv, dt = deriv_fn(data), 1 / data.core.freq
     vel = deriv.vel + dt * deriv.acc
     ang_vel = limit_ang_vel(deriv.ang_vel + dt * deriv.ang_acc, data.core.freq)
-    return apply_derivative(data, deriv.replace(vel=vel), dt, dt * ang_vel)
+    return apply_derivative(data, deriv.replace(vel=vel, ang_vel=ang_vel), dt)
 
 
 def rk4(data: SimData, deriv_fn: DerivFn) -> SimData:
@@ -61,25 +60,22 @@ def rk4(data: SimData, deriv_fn: DerivFn) -> SimData:
     """
     dt = 1 / data.core.freq
     k1 = deriv_fn(data)
-    r1 = dt * k1.ang_vel
-    k2 = deriv_fn(apply_derivative(data, k1, dt / 2, r1 / 2, final=False))
-    r2 = dt * k2.ang_vel
-    k3 = deriv_fn(apply_derivative(data, k2, dt / 2, r2 / 2 + rotation.cross(r1, r2) / 8, final=False))
-    r3 = dt * k3.ang_vel
-    k4 = deriv_fn(apply_derivative(data, k3, dt, r3, final=False))
-    r4 = dt * k4.ang_vel
+    k2 = deriv_fn(apply_derivative(data, k1, dt / 2, final=False))
+    commutator = dt / 4 * rotation.cross(k1.ang_vel, k2.ang_vel)
+    k3 = deriv_fn(apply_derivative(data, k2.replace(ang_vel=k2.ang_vel + commutator), dt / 2, final=False))
+    k4 = deriv_fn(apply_derivative(data, k3, dt, final=False))
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-    return apply_derivative(data, mean, dt, dt * mean.ang_vel + rotation.cross(r1, r4) / 12)
+    commutator = dt / 12 * rotation.cross(k1.ang_vel, k4.ang_vel)
+    return apply_derivative(data, mean.replace(ang_vel=mean.ang_vel + commutator), dt)
 
 
-def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, rotvec: Array, final: bool = True) -> SimData:
+def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, final: bool = True) -> SimData:
     """Return the data ``dt`` seconds along a derivative.
 
     Args:
         data: Data at the start of the step.
         deriv: Derivative of the states.
         dt: Duration, s.
-        rotvec: Rotation of the attitude, rotation vector in the body frame, rad. (..., 3)
         final: True for the end of a step, where quaternions are normalised and angular velocities limited; False for
             its intermediate points.
     """
@@ -87,7 +83,7 @@ def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, rotvec: Arr
     ang_vel = s.ang_vel + dt * deriv.ang_acc
     states = s.replace(
         pos=s.pos + dt * deriv.vel,
-        quat=rotation.turn(s.quat, rotvec, normalize=final),
+        quat=rotation.turn(s.quat, deriv.ang_vel, dt, normalize=final),
         vel=s.vel + dt * deriv.acc,
         ang_vel=limit_ang_vel(ang_vel, data.core.freq) if final else ang_vel,
         rotor_vel=s.rotor_vel + dt * deriv.rotor_acc,

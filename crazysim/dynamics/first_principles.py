@@ -9,7 +9,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.drones import Airframe
 from crazysim.dynamics.core import GRAVITY, Dynamics, require_support
-from crazysim.dynamics.drag import drag_force
+from crazysim.dynamics.drag import body_drag_force
 from crazysim.dynamics.rigid_body import angular_acceleration, linear_acceleration, stable_angular_acceleration
 from crazysim.dynamics.rotor import (
     curve,
@@ -20,6 +20,7 @@ from crazysim.dynamics.rotor import (
     rotor_vel_of_thrust,
 )
 from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import along_z
 
 
 class Params(PyTree):
@@ -121,16 +122,14 @@ def dynamics(
     drag_torque = curve(rotor_vel, p.rpm2torque)
     rotor_acc = rotor_acceleration(cmd, rotor_vel, p.rotor_dyn_coef)
 
-    collective = jnp.sum(thrust, axis=-1, keepdims=True)
-    force = collective * rotation.z_axis(quat) + drag_force(quat, vel, p.drag_matrix)
-    if dist_f is not None:
-        force = force + dist_f
+    body_force = along_z(jnp.sum(thrust, axis=-1)) + body_drag_force(quat, vel, p.drag_matrix)
+    force = rotation.rotate(quat, body_force, offset=dist_f)
 
     sign = p.mixing_matrix[..., 2, :]
     torque = rotor_torque(thrust, drag_torque, p.L, p.mixing_matrix)
     torque = torque + reaction_torque(rotor_acc, sign, p.prop_inertia)
     if dist_t is not None:
-        torque = torque + rotation.rotate_inverse(quat, dist_t)
+        torque = rotation.rotate_inverse(quat, dist_t, offset=torque)
 
     acc = linear_acceleration(force, p.mass, p.gravity_vec)
     momentum = rotor_momentum(rotor_vel, sign, p.prop_inertia)

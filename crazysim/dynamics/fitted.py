@@ -21,9 +21,9 @@ from jax import Array
 from crazysim import rotation
 from crazysim.drones import Airframe
 from crazysim.dynamics.core import GRAVITY, Dynamics, require_support
-from crazysim.dynamics.drag import drag_force
+from crazysim.dynamics.drag import body_drag_force
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import matvec
+from crazysim.rotation import along_z, matvec
 
 FITTED_UP_TO = math.cos(math.radians(80))
 HANDED_OVER_AT = math.cos(math.radians(88))
@@ -135,11 +135,10 @@ def dynamics(
         thrust, thrust_rate = thrust_cmd, jnp.zeros_like(rotor_vel)
     else:
         thrust, thrust_rate = rotor_vel[..., :1], p.thrust_dyn_coef * (thrust_cmd - rotor_vel)
-    force = (p.acc_coef + p.cmd_f_coef * thrust) * rotation.z_axis(quat)
+    body_force = along_z((p.acc_coef + p.cmd_f_coef * thrust)[..., 0])
     if p.drag_matrix is not None:
-        force = force + drag_force(quat, vel, p.drag_matrix)
-    if dist_f is not None:
-        force = force + dist_f
+        body_force = body_force + body_drag_force(quat, vel, p.drag_matrix)
+    force = rotation.rotate(quat, body_force, offset=dist_f)
 
     ang_acc = _fitted_angular_acceleration(quat, ang_vel, cmd[..., :3], p)
     if dist_t is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.rotation import cross, dot, matvec
+from crazysim.rotation import add_cross, cross, dot, matvec
 
 EXPLICIT_UP_TO = 0.04
 """Rotation per step, rad, up to which ``stable_angular_acceleration`` is the exact derivative.
@@ -30,21 +30,6 @@ def linear_acceleration(force: Array, mass: Array, gravity_vec: Array) -> Array:
     return force / mass + gravity_vec
 
 
-def gyroscopic_torque(ang_vel: Array, ang_momentum: Array) -> Array:
-    """Return the torque ``-w x H`` that appears in the rotating body frame, N m.
-
-    It does no work and does not change the length of the angular momentum.
-
-    Args:
-        ang_vel: Angular velocity w, body frame, rad/s. (..., 3)
-        ang_momentum: Angular momentum H of the body and its rotors, body frame, N m s. (..., 3)
-
-    Returns:
-        Torque, body frame, N m. (..., 3)
-    """
-    return cross(ang_momentum, ang_vel)
-
-
 def angular_acceleration(torque: Array, ang_vel: Array, J: Array, J_inv: Array, rotor_momentum: Array) -> Array:
     """Return the angular acceleration under a torque, body frame, rad/s^2 (Euler's equation).
 
@@ -60,7 +45,7 @@ def angular_acceleration(torque: Array, ang_vel: Array, J: Array, J_inv: Array, 
     Returns:
         Angular acceleration, body frame, rad/s^2. (..., 3)
     """
-    return matvec(J_inv, torque + gyroscopic_torque(ang_vel, matvec(J, ang_vel) + rotor_momentum))
+    return matvec(J_inv, add_cross(torque, matvec(J, ang_vel, rotor_momentum), ang_vel))
 
 
 def stable_angular_acceleration(
@@ -89,12 +74,11 @@ def stable_angular_acceleration(
     Returns:
         Mean angular acceleration over the step, body frame, rad/s^2. (..., 3)
     """
-    rotvec = dt * ang_vel
-    x2 = dot(rotvec, rotvec)
+    square = dot(ang_vel, ang_vel)
     slope = 0.5 * dt * (1 + STABLE_FROM**2) / (STABLE_FROM**2 - EXPLICIT_UP_TO**2)
-    theta_dt = jnp.minimum(0.5 * dt + 0.5 * dt * x2, jnp.maximum(slope * x2 - slope * EXPLICIT_UP_TO**2, 0.0))
+    rising = jnp.maximum(slope * dt**2 * square - slope * EXPLICIT_UP_TO**2, 0.0)
+    theta_dt = jnp.minimum(rising, 0.5 * dt + 0.5 * dt**3 * square)
 
-    ang_momentum = matvec(J, ang_vel) + rotor_momentum
-    impulse = theta_dt * gyroscopic_torque(ang_vel, ang_momentum)
-    within = gyroscopic_torque(ang_vel + matvec(J_inv, impulse), ang_momentum + impulse)
-    return matvec(J_inv, torque + within)
+    ang_momentum = matvec(J, ang_vel, rotor_momentum)
+    impulse = theta_dt * cross(ang_momentum, ang_vel)
+    return matvec(J_inv, add_cross(torque, ang_momentum + impulse, matvec(J_inv, impulse, ang_vel)))

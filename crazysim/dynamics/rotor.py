@@ -7,7 +7,7 @@ import math
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.rotation import matvec, safe_sqrt
+from crazysim.rotation import along_z, matvec, safe_sqrt
 
 RPM_TO_RAD_S = 2 * math.pi / 60
 
@@ -58,7 +58,9 @@ def rotor_torque(thrust: Array, drag_torque: Array, L: Array, mixing_matrix: Arr
     Returns:
         Torque about the centre of mass, body frame, N m. (..., 3)
     """
-    tilt = matvec(mixing_matrix[..., :2, :], thrust * L)
+    positions = mixing_matrix[..., :2, :]
+    # One arm scales two sums, which costs less than to scale each thrust.
+    tilt = L * matvec(positions, thrust) if L.shape[-1] == 1 else matvec(positions, L * thrust)
     return jnp.concatenate([tilt, matvec(mixing_matrix[..., 2:, :], drag_torque)], axis=-1)
 
 
@@ -75,9 +77,7 @@ def rotor_momentum(rotor_vel: Array, yaw_torque_sign: Array, prop_inertia: Array
     Returns:
         Angular momentum, body frame, N m s. (..., 3)
     """
-    about_z = -RPM_TO_RAD_S * jnp.sum(yaw_torque_sign * prop_inertia * rotor_vel, axis=-1)
-    zero = jnp.zeros_like(about_z)
-    return jnp.stack([zero, zero, about_z], axis=-1)
+    return along_z(jnp.sum(-RPM_TO_RAD_S * yaw_torque_sign * prop_inertia * rotor_vel, axis=-1))
 
 
 def reaction_torque(rotor_acc: Array, yaw_torque_sign: Array, prop_inertia: Array) -> Array:

@@ -39,11 +39,11 @@ def peers_rk4(data, deriv_fn):
     """Average body rates as the peer does, which leaves the attitude at order 2; everything else as ours."""
     dt = 1 / data.core.freq
     k1 = deriv_fn(data)
-    k2 = deriv_fn(apply_derivative(data, k1, dt / 2, dt / 2 * k1.ang_vel))
-    k3 = deriv_fn(apply_derivative(data, k2, dt / 2, dt / 2 * k2.ang_vel))
-    k4 = deriv_fn(apply_derivative(data, k3, dt, dt * k3.ang_vel))
+    k2 = deriv_fn(apply_derivative(data, k1, dt / 2))
+    k3 = deriv_fn(apply_derivative(data, k2, dt / 2))
+    k4 = deriv_fn(apply_derivative(data, k3, dt))
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-    return apply_derivative(data, mean, dt, dt * mean.ang_vel)
+    return apply_derivative(data, mean, dt)
 
 
 def fly(stem, variant, as_the_peer=True):
