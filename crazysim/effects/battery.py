@@ -14,7 +14,8 @@ from crazysim.effects.core import Simulation, as_setting, controls_of, install, 
 from crazysim.pytree import PyTree, leaf, static
 
 NOMINAL_VOLTAGE = 3.7
-"""Nominal voltage of a lithium-polymer cell, V, as makers print it on the cell."""
+"""Nominal voltage of a lithium-polymer cell, V, as printed on cells: assumed for full rotor speed where an airframe has
+no table ``[battery]``."""
 
 
 class Battery(PyTree):
@@ -63,8 +64,8 @@ def add(
         n_cells: Number of lithium-polymer cells in series.
         efficiency: Mechanical power of the propellers per electric power of the motors, above 0, up to 1.
         base_power: Electric power of everything but the motors, W.
-        full_speed_voltage: Voltage from which on the rotors reach the airframe's largest speed, V; None for the
-            nominal 3.7 V a cell.
+        full_speed_voltage: Voltage from which on the rotors reach the airframe's largest speed, V; None for that of the
+            airframe's table ``[battery]`` (2.8 to 3.4 V for Crazyflies), or else the nominal 3.7 V per cell.
         charge: State of charge at the beginning of an episode, 0 to 1.
 
     Raises:
@@ -72,7 +73,8 @@ def add(
     """
     require_rotors(sim, "battery sag")
     cells = int(as_setting(sim, "n_cells", n_cells, (1,), 1, dtype=jnp.int32).item())
-    full_speed_voltage = NOMINAL_VOLTAGE * cells if full_speed_voltage is None else full_speed_voltage
+    if full_speed_voltage is None:
+        full_speed_voltage = sim.airframe.full_thrust_voltage or NOMINAL_VOLTAGE * cells
     full = per_drone(sim, as_setting(sim, "charge", charge, (1,), 0.0, 1.0))
     record = Battery(
         charge=full,

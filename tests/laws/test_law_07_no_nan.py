@@ -181,7 +181,10 @@ def test_a_minute_of_any_constant_command_stays_finite(dynamics, control, integr
         sim.step(sim.freq)
         fastest = np.maximum(fastest, np.abs(sim.data.states.ang_vel[:, 0]).max(-1))
     for name, x in vars(sim.data.states).items():
-        assert np.all(np.isfinite(x)), (name, {a.name for a, ok in zip(of_world, np.isfinite(x), strict=True) if not ok.all()})
+        assert np.all(np.isfinite(x)), (
+            name,
+            {a.name for a, ok in zip(of_world, np.isfinite(x), strict=True) if not ok.all()},
+        )
     assert not sim.data.core.nonfinite.any()
     assert fastest.max() <= sim.freq
     assert (fastest == sim.freq).any() == (control in ("force_torque", "rotor_vel")), "some command reaches the limit"

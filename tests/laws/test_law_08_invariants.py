@@ -140,7 +140,9 @@ def test_convergence_order_of_position_and_attitude(integrator, x64):
 def test_euler_term_does_no_work(ang_vel):
     """Without a torque, energy w J w / 2 has derivative w . J w' = 0."""
     inertia = np.diag([2e-5, 3e-5, 5e-5]).astype(np.float32)
-    acc = angular_acceleration(jnp.zeros(3), jnp.asarray(ang_vel, jnp.float32), inertia, np.linalg.inv(inertia), jnp.zeros(3))
+    acc = angular_acceleration(
+        jnp.zeros(3), jnp.asarray(ang_vel, jnp.float32), inertia, np.linalg.inv(inertia), jnp.zeros(3)
+    )
     np.testing.assert_allclose(ang_vel @ inertia @ np.asarray(acc), 0.0, atol=1e-7)  # rounding of terms of 1e-2
 
 
