@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from crazysim import rotation
 from crazysim.control.core import allocation_matrix
@@ -100,8 +100,7 @@ def attitude2force_torque(
         Collective thrust, N, and body torque, N m (..., 4); the new integral, rad s (..., 3).
     """
     p = params
-    # Without the barrier XLA computes the six sines and cosines anew for every number that uses them.
-    wanted = lax.optimization_barrier(rotation.from_rpy(cmd[..., :3]))
+    wanted = rotation.from_rpy(cmd[..., :3])
     error = rotation.multiply(rotation.conjugate(wanted), quat)
     rotation_error = 4 * error[..., 3:] * error[..., :3]  # vee(Rd^T R - R^T Rd)
     rate_error_dot = ((ang_vel_des - prev_ang_vel_des) - (ang_vel - prev_ang_vel)) * ctrl_freq

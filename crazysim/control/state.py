@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from crazysim import rotation
 from crazysim.drones import Airframe
@@ -84,13 +84,10 @@ def state2attitude(
     force = p.mass * (cmd[..., 6:9] - p.gravity_vec) + p.kp * pos_err + p.kd * vel_err + p.ki * pos_err_i
 
     yaw = rotation.yaw(cmd[..., 9:13])
-    # The barriers keep XLA from computing angles and axes anew for every number that uses them.
-    cos, sin, force = lax.optimization_barrier((jnp.cos(yaw), jnp.sin(yaw), force))
-    zero = jnp.zeros_like(yaw)
+    cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
     ahead, left = jnp.stack([cos, sin, zero], axis=-1), jnp.stack([-sin, cos, zero], axis=-1)
     z_axis = rotation.safe_normalize(force, jnp.asarray([0.0, 0.0, 1.0], force.dtype))
     y_axis = rotation.safe_normalize(rotation.cross(z_axis, ahead), left)
-    y_axis, z_axis = lax.optimization_barrier((y_axis, z_axis))
     rpy = rotation.from_axes(rotation.cross(y_axis, z_axis), y_axis, z_axis)
 
     thrust = p.thrust_scale * rotation.dot(force, rotation.z_axis(quat))
