@@ -1,6 +1,7 @@
-"""Rotations as unit quaternions, xyzw, body to world, with gradients that stay finite everywhere.
+"""Rotations as unit quaternions, xyzw, body to world, with finite gradients everywhere.
 
-Written out element by element: a product of small matrices is slow on every device, sums of products fuse.
+Small products are written out element by element: matrix products of this size are slow on every device, and sums of
+products fuse.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from jax import Array, lax
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the scalar product over the last axis, kept with length one. (..., 1)"""
+    """Return the scalar product over the last axis, which is kept with length one. (..., 1)"""
     return jnp.sum(a * b, axis=-1, keepdims=True)
 
 
@@ -58,7 +59,7 @@ def matvec(matrix: Array, vector: Array, offset: Array | None = None) -> Array:
 
 @jax.custom_jvp
 def safe_sqrt(x: Array) -> Array:
-    """Return the square root of what is positive, else zero, with gradient zero there; NaN comes through. (...)"""
+    """Return the square root of positive values and zero, with gradient zero, of all others; NaN passes. (...)"""
     return jnp.sqrt(jnp.maximum(x, 0.0))
 
 
@@ -83,9 +84,9 @@ def safe_normalize(x: Array, fallback: Array) -> Array:
 
 
 def safe_clip(x: Array, low: Array | float, high: Array | float) -> Array:
-    """Return ``x`` within limits, with gradient one at a limit itself: that of the inner side. (...)
+    """Return ``x`` clipped to limits, with gradient one at a limit itself, that of the inner side. (...)
 
-    ``jnp.clip`` gives one half there, which is the slope of neither side.
+    ``jnp.clip`` has one half there, the slope of neither side.
     """
     raised = jnp.where(x < low, low, x)
     return jnp.where(raised > high, high, raised)
@@ -94,7 +95,7 @@ def safe_clip(x: Array, low: Array | float, high: Array | float) -> Array:
 def safe_arctan2(y: Array, x: Array) -> Array:
     """Return the angle of the point (x, y), rad, zero with gradient zero at the origin. (...)
 
-    The origin is where the squared distance, by which the gradient divides, vanishes or underflows.
+    A point counts as the origin where its squared distance, by which the gradient divides, vanishes or underflows.
     """
     at_origin = x * x + y * y == 0
     return jnp.where(at_origin, 0.0, jnp.arctan2(y, jnp.where(at_origin, 1.0, x)))
@@ -123,7 +124,7 @@ def conjugate(q: Array) -> Array:
 def matrix(q: Array) -> Array:
     """Return the rotation matrix of a unit quaternion, body to world. (..., 3, 3)
 
-    A step turns several vectors by the same attitude, so its nine numbers are worth having.
+    Several vectors of a step are rotated by the same attitude, so the matrix pays off.
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     x2, y2, z2 = 2 * x, 2 * y, 2 * z
@@ -207,8 +208,8 @@ def from_rpy(rpy: Array) -> Array:
 def to_rpy(q: Array) -> Array:
     """Return roll, pitch, yaw in rad, pitch in [-pi/2, pi/2]. (..., 4) -> (..., 3)
 
-    At a pitch of exactly 90 degrees roll and yaw are not defined on their own; zero is returned for an
-    angle whose sine and cosine both vanish.
+    At a pitch of exactly 90 degrees roll and yaw are not unique; zero is returned for an angle whose sine and cosine
+    both vanish.
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     r00, r10 = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
@@ -220,13 +221,13 @@ def to_rpy(q: Array) -> Array:
 
 
 def yaw(q: Array) -> Array:
-    """Return the yaw angle of a quaternion of any length, rad; the zero quaternion has yaw zero. (...)"""
+    """Return the yaw angle of a quaternion of any length, rad; zero for the zero quaternion. (...)"""
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     return safe_arctan2(2 * (x * y + w * z), x * x + w * w - y * y - z * z)
 
 
 def from_axes(x: Array, y: Array, z: Array) -> Array:
-    """Return roll, pitch, yaw of the frame with these orthonormal axes, rad. (..., 3)"""
+    """Return roll, pitch, yaw of the frame with these orthonormal axes in the world frame, rad. (..., 3)"""
     cos_pitch = safe_norm(jnp.stack([x[..., 0], x[..., 1]], axis=-1))[..., 0]
     return jnp.stack(
         [

@@ -23,7 +23,7 @@ MATERIALS = {
 """Colours that all drones share, rgba."""
 
 BATTERY_VOLUME = 1.2e-4
-"""Volume of a derived battery per mass of the drone, m^3/kg: between those of the built-in airframes (0.8 to 1.5e-4)."""
+"""Volume of a derived battery over the mass of the drone, m^3/kg; the built-in airframes have 0.8e-4 to 1.5e-4."""
 
 
 @dataclass(frozen=True, eq=False)

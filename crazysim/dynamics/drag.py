@@ -1,4 +1,4 @@
-"""Air drag."""
+"""Aerodynamic drag."""
 
 from __future__ import annotations
 

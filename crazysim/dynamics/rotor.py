@@ -1,4 +1,4 @@
-"""Rotors: how fast they turn, and what they push and twist."""
+"""Rotors: lag, thrust and drag torque curves, and the torques on the body."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ RPM_TO_RAD_S = 2 * math.pi / 60
 
 
 def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> Array:
-    """Return how fast the rotors follow their command, rpm/s.
+    """Return the accelerations of the rotors towards their command, rpm/s.
 
     ``a (cmd - r) + b (cmd^2 - r^2)``: a motor's back-EMF gives the linear term, the propeller's drag the
-    quadratic one. Spinning up is driven, spinning down is coasting, so each has its own pair (a, b).
+    quadratic one. Spinning up is driven and spinning down is coasting, so each has its own pair (a, b).
 
     Args:
         cmd: Commanded rotor speeds, rpm. (..., n_rotors)
@@ -33,25 +33,25 @@ def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> A
 
 
 def curve(rotor_vel: Array, coefficients: Array) -> Array:
-    """Return a quadratic curve over the rotor speed: thrust in N, or drag torque in N m.
+    """Return the value of a quadratic curve over the rotor speed: thrust, N, or drag torque, N m.
 
     Args:
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)
         coefficients: Constant, linear and quadratic term over rpm. (..., 1 or n_rotors, 3)
 
     Returns:
-        The curve's value for each rotor. (..., n_rotors)
+        Value of the curve for each rotor. (..., n_rotors)
     """
     k0, k1, k2 = coefficients[..., 0], coefficients[..., 1], coefficients[..., 2]
     return k0 + rotor_vel * (k1 + rotor_vel * k2)
 
 
 def rotor_torque(thrust: Array, drag_torque: Array, L: Array, mixing_matrix: Array) -> Array:
-    """Return the torque of thrusts off the centre and of the propellers' drag, body frame, N m.
+    """Return the torque of the thrusts' lever arms and the propellers' drag, body frame, N m.
 
     Args:
         thrust: Thrust of each rotor, N. (..., n_rotors)
-        drag_torque: Size of each propeller's drag torque, N m. (..., n_rotors)
+        drag_torque: Magnitude of each propeller's drag torque, N m. (..., n_rotors)
         L: Arm that scales the first two rows of the mixing matrix, m. (..., 1 or n_rotors)
         mixing_matrix: Rotor positions over L, and signs of the drag torque. (..., 3, n_rotors)
 
@@ -95,9 +95,9 @@ def reaction_torque(rotor_acc: Array, yaw_torque_sign: Array, prop_inertia: Arra
 
 
 def rotor_vel_of_thrust(thrust: Array, rpm2thrust: Array) -> Array:
-    """Return the rotor speed that gives a thrust, rpm: the upper root of the thrust curve.
+    """Return the rotor speed that produces a thrust, rpm: the upper root of the thrust curve.
 
-    Below the least thrust of the curve, where it has no root, the speed of that least thrust is returned.
+    Below the minimum of the curve, where it has no root, the speed of that minimum is returned.
 
     Args:
         thrust: Thrust of each rotor, N. (..., n_rotors)

@@ -49,7 +49,7 @@ WRONG_SETTINGS = [
     ({"dynamics": "so_rpy", "control": "rotor_vel"}, "'rotor_vel'", "dynamics='first_principles'"),
     ({"dynamics": "so_rpy_rotor", "control": "force_torque"}, "'force_torque'", "dynamics='first_principles'"),
     ({"dynamics": "so_rpy_rotor_drag", "control": "body_rate"}, "'body_rate'", "dynamics='first_principles'"),
-    ({"drone": "hb_x500"}, "'hb_x500' has no parameters for dynamics 'first_principles'", "so_rpy"),
+    ({"drone": "hb_x500"}, "expected dynamics that drone 'hb_x500' has parameters for", "so_rpy"),
     ({"device": "abacus"}, "'abacus' does not exist", "'cpu' or 'gpu'"),
     ({"device": "cpu:99"}, "'cpu:99' does not exist", "'cpu' or 'gpu'"),
     ({"device": None}, "not None", "jax.Device"),
