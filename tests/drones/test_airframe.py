@@ -68,7 +68,7 @@ def test_drones_of_a_model_are_those_that_support_it():
         assert drones == tuple(drone for drone in Drone if dynamics in supported_dynamics(drone))
     assert Drone.hb_x500 in supported_drones("so_rpy")
     assert Drone.hb_x500 not in supported_drones(Dynamics.first_principles)
-    with pytest.raises(ValueError, match="expected dynamics as one of first_principles, so_rpy.*, got 'so_rpyx'"):
+    with pytest.raises(ValueError, match=r"expected dynamics as one of first_principles, so_rpy.*, got 'so_rpyx'"):
         supported_drones("so_rpyx")
 
 
