@@ -280,7 +280,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_law_09_a_wrong_airframe_is_told_at_once(case):
+def test_law_09_a_wrong_airframe_is_refused(case):
     change, message = WRONG[case]
     tables = plain("cf21B_500")
     change(tables)
@@ -291,14 +291,14 @@ def test_law_09_a_wrong_airframe_is_told_at_once(case):
 @pytest.mark.parametrize(
     "source", ["no_such_drone", "missing.toml", Path("nowhere") / "x.toml", "", 5, None, ["cf21B_500"]]
 )
-def test_law_09_a_source_that_is_no_airframe_is_told_with_the_names_there_are(source):
+def test_law_09_a_source_that_is_no_airframe_is_answered_with_the_names(source):
     with pytest.raises(
         ConfigError, match=r"expected a drone as .*cf21B_500.*or a dict, got|a drone as a name, the path of a TOML file"
     ):
         load_airframe(source)
 
 
-def test_law_09_a_broken_toml_file_is_told_with_its_path(tmp_path):
+def test_law_09_a_broken_toml_file_is_named(tmp_path):
     path = tmp_path / "broken.toml"
     path.write_text("[rotors\nposition = 3", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"broken\.toml is not valid TOML"):
