@@ -1,4 +1,4 @@
-"""What several tests share: pairs of dynamics and command level, commands that hover, random vectors, scenes."""
+"""Helpers shared by tests: pairs of dynamics and command level, hover commands, random vectors, scenes."""
 
 import functools
 
@@ -34,7 +34,7 @@ BOX = """
 ABOVE = 2.0
 """Height of the cameras of the plain scene, m."""
 FOVY = 45.0
-"""What they see from top to bottom, degrees."""
+"""Vertical fields of view, degrees."""
 PLAIN_SCENE = f"""
 <mujoco>
   <statistic center="0 0 0.5" extent="2"/>
@@ -137,7 +137,7 @@ def hover_command(data, pos=(0.0, 0.0, 1.0)):
 
 
 def zero_thrust_command(data):
-    """Return the command of one drone that asks for no thrust at all. (k,)
+    """Return the command of one drone for zero thrust. (k,)
 
     For the state level that is a fall with the gravity that the controller believes in, at the place where the drone
     is anyway; for all others the thrust itself.

@@ -22,10 +22,10 @@ from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integra
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.stage import Stage, StageScope
 from crazysim.dynamics import Dynamics, first_principles, fitted
-from crazysim.pytree import map_batched, scopes, select_worlds
+from crazysim.pytree import PER_WORLD, scopes, select_worlds
 
 FLOOR = -0.001
-"""Height below which no drone falls, m: a little under zero, so that a negative height tells a landing."""
+"""Height below which no drone falls, m: a little under zero, so that a negative height marks a landing."""
 
 
 def _built_in(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
@@ -243,19 +243,25 @@ def finite(data: SimData) -> Array:
 
 
 def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:
-    """Bring worlds back to the default data: everything that belongs to a world, and nothing else.
+    """Return the data with worlds, or the whole simulation, brought back to the default data.
 
-    What is shared between worlds (parameters that were not randomised, opaque plugin data, the seed's key)
-    stays as it is, with a mask and without. A parameter that has become one per drone goes back to its
-    default in every world that is reset. Plugins that the default does not know stay.
+    With a mask, everything that belongs to the worlds of the mask is restored. What worlds share (parameters that are
+    not one per drone, plugins without declared axes) stays. Without a mask that is restored too. Either way the
+    seed stays, a parameter that has become one per drone stays one per drone, with its default values, and plugins
+    that the default data lack stay as they are.
 
     Args:
         data: The simulation.
-        default_data: What it is brought back to.
-        mask: Which worlds; None for all. (n_worlds,)
+        default_data: The data to return to.
+        mask: True in the worlds to reset; None for all. (n_worlds,)
     """
-    known = {name: default_data.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
-    default_data = default_data.replace(plugins=known)
-    new = map_batched(lambda x, default: select_worlds(mask, default, x), data, default_data)
+    plugins = {name: default_data.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
+
+    def restore(scope: str, x: Any, default: Any) -> Any:
+        if scope in PER_WORLD:
+            return select_worlds(mask, default, x)
+        return default if mask is None else x
+
+    new = jax.tree.map(restore, scopes(data), data, default_data.replace(plugins=plugins))
     episode = select_worlds(mask, data.core.episode + 1, data.core.episode)
-    return new.replace(core=new.core.replace(episode=episode))
+    return new.replace(core=new.core.replace(episode=episode, rng_key=data.core.rng_key))

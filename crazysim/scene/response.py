@@ -123,10 +123,10 @@ class _Surface(NamedTuple):
 
 
 def _surfaces(sim: Simulation, objects: Objects) -> list[_Surface]:
-    solids = sim.scene.solids
-    found = [_Surface(part, None) for part in solids.floor]
-    for solid in choose(solids, objects):
-        found += [_Surface(part, solid.place) for part in solid.parts]
+    model = sim.scene.collision_model
+    found = [_Surface(geom, None) for geom in model.floor]
+    for body in choose(model, objects):
+        found += [_Surface(geom, body.row) for geom in body.geoms]
     return found
 
 
@@ -296,7 +296,7 @@ def _tangential(weight: Array, p: Array) -> Array:
 
 
 def _solve(matrix: Array, b: Array) -> Array:
-    """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive, written out. (..., n)
+    """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive definite, unrolled. (..., n)
 
     Scaled to a unit diagonal first: mass and moments of inertia are four orders apart.
     """

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import with_airframes
+from cases import PAIRS, with_airframes
 
 from crazysim import Sim, load_airframe
 from crazysim.core.integration import apply_derivative
@@ -33,6 +33,14 @@ def flights(stem):
 
 
 CASES = [(stem, variant) for stem in FILES for variant in flights(stem)]
+
+
+def test_every_command_level_and_dynamics_is_recorded():
+    """Without recordings the tests below would have no cases."""
+    recorded = {tuple(stem.split("-")) for stem in FILES}
+    assert recorded == set(PAIRS)
+    assert {variant.removesuffix("-slow") for _, variant in CASES} == {"euler", "symplectic_euler", "rk4"}
+    assert len(CASES) == 25
 
 
 def peers_rk4(data, deriv_fn):

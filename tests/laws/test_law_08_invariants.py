@@ -70,7 +70,7 @@ def precession(integrator, freq):
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_torque_free_precession_keeps_momentum_and_energy_to_order(integrator, x64):
-    """What drifts is the integrator's error: it shrinks by 2^order when the step is halved."""
+    """The drift is the integration error, which shrinks by 2^order when the step is halved."""
     order = {"euler": 1, "rk4": 4}[integrator]
     coarse, fine = precession(integrator, 250), precession(integrator, 500)
     for drift_coarse, drift_fine in zip(coarse, fine, strict=True):
