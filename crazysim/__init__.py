@@ -7,6 +7,7 @@ from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, static
 from crazysim.sim.sim import Sim
+from crazysim.version import __version__
 
 __all__ = [
     "Airframe",
@@ -17,8 +18,8 @@ __all__ = [
     "Integrator",
     "PyTree",
     "Sim",
+    "__version__",
     "leaf",
     "load_airframe",
     "static",
 ]
-__version__ = "0.1.0"

@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, as_stages
 from crazysim.engine import symbolic
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.lower import is_key
+from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.lower_stages import lower_stages
 from crazysim.engine.passes import fuse
 from crazysim.engine.program import Program, Segment, Slot, UnfusedStage

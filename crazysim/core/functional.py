@@ -70,8 +70,13 @@ def rotor_vel_control(data: SimData, controls: Any, check_finite: bool = False) 
     return data.replace(controls=data.controls.replace(rotor_vel=controls))
 
 
+def time(data: SimData) -> Array:
+    """Return the time since each world's last reset, s. (n_worlds, 1)"""
+    return data.core.steps / data.core.freq
+
+
 def controllable(data: SimData) -> Array:
-    """Return in which worlds the next step takes over a staged command. (n_worlds, 1)"""
+    """Return True in worlds where a staged command takes effect at the next step. (n_worlds, 1)"""
     mode = data.controls.mode
     mask = None if mode == Control.rotor_vel else tick(data, getattr(data.controls, mode.value).freq)
     return jnp.ones_like(data.core.steps, bool) if mask is None else mask

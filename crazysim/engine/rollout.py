@@ -13,7 +13,8 @@ from crazysim.control import Control
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.core.stage import with_leaves
-from crazysim.engine.step import Step, Zeros
+from crazysim.engine.flat import Zeros
+from crazysim.engine.step import Step
 from crazysim.errors import ConfigError
 
 Policy = Callable[[Any, SimData], Any]
@@ -79,7 +80,7 @@ def rollout(
     leaves, treedef = jax.tree.flatten(data)
     plan = step.plan(data, zeros)
     staged = next(i for i, x in enumerate(leaves) if x is _staged(data))
-    changed = sorted({*plan.written, plan.shown, staged})
+    changed = sorted({*plan.written, plan.synced, staged})
 
     def control_step(carry: list[Any]) -> list[Any]:
         data = unpack(carry)

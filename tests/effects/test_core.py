@@ -101,7 +101,7 @@ def test_law_02_shapes_and_types_stay_for_any_number_of_worlds_drones_and_rotors
         drone = ("cf21B_500", hexacopter)[i // 2 % 2]
         sim = Sim(n_worlds, n_drones, drone=drone, control=control)
         switch_on(sim)
-        after = jax.eval_shape(lambda d, sim=sim: sim._step(d, 1), sim.data)
+        after = jax.eval_shape(lambda d, sim=sim: sim.step_fn(d, 1), sim.data)
         assert signature(after) == signature(sim.data)
         for scope, x in zip(*map(jax.tree.leaves, (scopes(sim.data.plugins), sim.data.plugins)), strict=True):
             assert scope in ("drone", "shared")
@@ -112,7 +112,7 @@ def test_float64_stays_float64(x64):
     sim = Sim(2, 2)
     switch_on(sim)
     assert all(x.dtype != jnp.float32 for x in jax.tree.leaves(sim.data.plugins))
-    after = jax.eval_shape(lambda d: sim._step(d, 1), sim.data)
+    after = jax.eval_shape(lambda d: sim.step_fn(d, 1), sim.data)
     assert signature(after) == signature(sim.data)
 
 
@@ -175,7 +175,7 @@ def test_law_06_one_trace_whatever_is_reset_and_changed(every):
         sim.reset(np.array([True, False, i % 2 == 0]))
     sim.reset()
     sim.step()
-    assert sim._step._cache_size() == 1
+    assert sim.step_fn._cache_size() == 1
 
 
 def test_the_users_wrench_parameters_and_commands_stay(every):

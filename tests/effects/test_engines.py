@@ -31,7 +31,7 @@ def sim():
 
 
 def test_every_effect_is_fused(sim):
-    program = sim._step.plan(sim.data).program
+    program = sim.step_fn.plan(sim.data).program
     assert program.unfused_stages == ()
     segments = program.fused_segments
     fused = {name for s in segments for name in s.stages}

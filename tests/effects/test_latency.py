@@ -110,13 +110,13 @@ def test_the_delay_may_change_in_flight_without_another_trace(late):
     record = before.plugins["latency"]
     sim.attitude_control(command_of(sim, 0))
     sim.step()
-    n_traces = sim._step._cache_size()
+    n_traces = sim.step_fn._cache_size()
     sim.data = before.replace(plugins={"latency": record.replace(delay=record.delay + 2)})
     for _ in range(6):
         arrived = np.asarray(sim.data.controls.attitude.cmd)
         sim.attitude_control(command_of(sim, 0))
         sim.step()
-    assert sim._step._cache_size() == n_traces
+    assert sim.step_fn._cache_size() == n_traces
     assert not np.any(arrived)
     assert np.all(np.asarray(sim.data.controls.attitude.cmd)[..., 3] > 0)
     sim.data = before

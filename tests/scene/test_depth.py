@@ -206,7 +206,7 @@ def test_rays_are_those_of_c_mujoco(room, rng):
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     rays = (jnp.asarray(np.tile(x, (2, 1, 1)), jnp.float32) for x in (origin, direction))
     hits = cast(sim.scene.visible, data, *rays, drones=False)
-    sim._scene.sync(data, 0)
+    sim.scene.sync(data, 0)
     group = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # drones are in groups 2 and 3
     geom = np.zeros(1, np.int32)
     met = 0

@@ -122,7 +122,7 @@ def test_a_body_that_a_user_moved_is_drawn_where_it_is(opengl):
         return columns.mean() + 0.5
 
     assert abs(where(0) - 32) < 1
-    assert sim._scene._mjx_data is None
+    assert sim.scene._mjx_data is None
     k = sim.mj_model.body("ball").mocapid.item()
     sim.mjx_data = sim.mjx_data.replace(mocap_pos=sim.mjx_data.mocap_pos.at[:, k, 0].set(jnp.array([-0.8, 0.8])))
     assert where(0) < 25

@@ -52,7 +52,7 @@ def flown(request):
 
 def oracle(sim, world, names, geom):
     """Return distances of each drone to the floor, to every object and to the nearest drone, by C MuJoCo."""
-    sim._scene.sync(sim.data, world)
+    sim.scene.sync(sim.data, world)
     model, data = sim.mj_model, sim.mj_data
     root = model.body_rootid[model.geom_bodyid]
 
@@ -89,7 +89,7 @@ def test_every_distance_is_that_of_c_mujoco(flown):
 def test_nothing_of_mujoco_is_made_for_it(flown):
     sim, _ = flown
     sim.contact_report()
-    assert sim._scene._mjx_data is None
+    assert sim.scene._mjx_data is None
 
 
 def test_boxes_of_drones_are_taken_when_they_touch_by_boxes():
