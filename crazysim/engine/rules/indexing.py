@@ -11,19 +11,19 @@ from jax.extend import core
 from jax.lax import GatherScatterMode
 
 from crazysim.engine.ir import Element, constant, is_constant
-from crazysim.engine.lower import UNROLL, Elements, Reader, UnsupportedError, constants, pack, rule
+from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, constants, as_elements, rule
 from crazysim.engine.rules.movement import move_many, run_now
 
 
 @rule("dynamic_slice")
-def _dynamic_slice(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _dynamic_slice(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     x, sizes = args[0], eqn.params["slice_sizes"]
     for axis, (start, size) in enumerate(zip(args[1:], sizes, strict=True)):
-        x = _take(r, x, start[()], size, axis)
+        x = _take(ctx, x, start[()], size, axis)
     return [x]
 
 
-def _take(r: Reader, x: Elements, start: Element, size: int, axis: int) -> Elements:
+def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> Elements:
     """Return ``size`` elements along an axis from a start that is kept inside."""
     last = x.shape[axis] - size
     pieces = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
@@ -32,13 +32,13 @@ def _take(r: Reader, x: Elements, start: Element, size: int, axis: int) -> Eleme
     _check_range(last + 1)
     taken = pieces[last]
     for k in range(last - 1, -1, -1):
-        here = pack([r.one("le", start, constant(k, start.dtype), dtype=bool)], ())
-        taken = _select(r, here, pieces[k], taken)
+        here = as_elements([ctx.scalar("le", start, constant(k, start.dtype), dtype=bool)], ())
+        taken = _select(ctx, here, pieces[k], taken)
     return taken
 
 
 @rule("dynamic_update_slice")
-def _dynamic_update_slice(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _dynamic_update_slice(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     x, update = args[:2]
     starts = [a[()] for a in args[2:]]
     ranges = []
@@ -48,42 +48,42 @@ def _dynamic_update_slice(r: Reader, eqn: Any, args: list[Elements]) -> list[Ele
     _check_range(int(np.prod([len(options) for options in ranges])))
     out = x
     for corner in itertools.product(*ranges):
-        here = _all(r, (_at(r, s, k, options[-1]) for s, k, options in zip(starts, corner, ranges, strict=True)
+        here = _all(ctx, (_at(ctx, s, k, options[-1]) for s, k, options in zip(starts, corner, ranges, strict=True)
                         if len(options) > 1))  # fmt: skip
         place = tuple(slice(k, k + size) for k, size in zip(corner, update.shape, strict=True))
         out = out.copy()
-        out[place] = update if here is None else _select(r, here, update, out[place])
+        out[place] = update if here is None else _select(ctx, here, update, out[place])
     return [out]
 
 
-def _at(r: Reader, index: Element, k: int, last: int) -> Elements:
+def _at(ctx: Lowering, index: Element, k: int, last: int) -> Elements:
     """Return whether an index, kept inside 0 to ``last``, is ``k``."""
     op = "le" if k == 0 else "ge" if k == last else "eq"
-    return pack([r.one(op, index, constant(k, index.dtype), dtype=bool)], ())
+    return as_elements([ctx.scalar(op, index, constant(k, index.dtype), dtype=bool)], ())
 
 
-def _all(r: Reader, conditions: Iterable[Elements]) -> Elements | None:
+def _all(ctx: Lowering, conditions: Iterable[Elements]) -> Elements | None:
     out = None
     for condition in conditions:
-        out = condition if out is None else r.each("and", [out, condition], bool)
+        out = condition if out is None else ctx.elementwise("and", [out, condition], bool)
     return out
 
 
-def _select(r: Reader, condition: Elements, yes: Elements, no: Elements) -> Elements:
+def _select(ctx: Lowering, condition: Elements, yes: Elements, no: Elements) -> Elements:
     first = no.reshape(-1)[0] if no.size else constant(0, np.float32)
     dtype = np.uint32 if isinstance(first, tuple) else first.dtype
-    return r.each("select_n", [condition, no, yes], dtype)
+    return ctx.elementwise("select_n", [condition, no, yes], dtype)
 
 
 def _check_range(n: int) -> None:
-    if n > UNROLL:
+    if n > MAX_UNROLL:
         raise UnsupportedError(
-            f"an index that is known at run time only, into {n} places; selected from are up to {UNROLL}"
+            f"an index that is known at run time only, into {n} places; selected from are up to {MAX_UNROLL}"
         )
 
 
 @rule("gather")
-def _gather(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _gather(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     x, indices = args
     if known(indices):
         p = eqn.params
@@ -110,18 +110,18 @@ def _gather(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
         if not result:
             result = list(here)
             continue
-        hit = [_all(r, (_at(r, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0)) for row in rows]
+        hit = [_all(ctx, (_at(ctx, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0)) for row in rows]
         for o, item in enumerate(here):
             condition = hit[row_of[o]]
             if condition is not None and item is not result[o]:
-                result[o] = _select(r, condition, pack([item], ()), pack([result[o]], ()))[()]
+                result[o] = _select(ctx, condition, as_elements([item], ()), as_elements([result[o]], ()))[()]
     if mode == GatherScatterMode.FILL_OR_DROP:
-        inside = [_inside(r, row, limits) for row in rows]
+        inside = [_inside(ctx, row, limits) for row in rows]
         fill = eqn.params["fill_value"]
         fill = _fill_value(out.dtype) if fill is None else fill
-        result = [_select(r, inside[row_of[o]], pack([item], ()), constants(fill, out.dtype))[()]
+        result = [_select(ctx, inside[row_of[o]], as_elements([item], ()), constants(fill, out.dtype))[()]
                   for o, item in enumerate(result)]  # fmt: skip
-    return [pack(result, out.shape)]
+    return [as_elements(result, out.shape)]
 
 
 def _gather_filled(eqn: Any, x: Elements, indices: np.ndarray) -> Elements:
@@ -131,7 +131,7 @@ def _gather_filled(eqn: Any, x: Elements, indices: np.ndarray) -> Elements:
     fill = eqn.params["fill_value"]
     outside = constants(_fill_value(eqn.outvars[0].aval.dtype) if fill is None else fill, eqn.outvars[0].aval.dtype)[()]
     flat = x.reshape(-1)
-    return pack([outside if i < 0 else flat[i] for i in places.reshape(-1)], places.shape)
+    return as_elements([outside if i < 0 else flat[i] for i in places.reshape(-1)], places.shape)
 
 
 def _fill_value(dtype: Any) -> Any:
@@ -142,17 +142,17 @@ def _fill_value(dtype: Any) -> Any:
     )
 
 
-def _inside(r: Reader, row: Elements, limits: list[int]) -> Elements:
+def _inside(ctx: Lowering, row: Elements, limits: list[int]) -> Elements:
     tests = []
     for i, limit in zip(row, limits, strict=True):
-        tests.append(pack([r.one("ge", i, constant(0, i.dtype), dtype=bool)], ()))
-        tests.append(pack([r.one("le", i, constant(limit, i.dtype), dtype=bool)], ()))
-    inside = _all(r, tests)
+        tests.append(as_elements([ctx.scalar("ge", i, constant(0, i.dtype), dtype=bool)], ()))
+        tests.append(as_elements([ctx.scalar("le", i, constant(limit, i.dtype), dtype=bool)], ()))
+    inside = _all(ctx, tests)
     return constants(True, bool) if inside is None else inside
 
 
 @rule("scatter", *(f"scatter{mark}{op}" for mark in "-_" for op in ("add", "sub", "mul", "min", "max")))
-def _scatter(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _scatter(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Write windows of ``updates`` into the operand, one row of ``indices`` after the other.
 
     A window whose place is computed at run time is compared with every place it may have. A window that is partly
@@ -182,15 +182,15 @@ def _scatter(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
             here = _all(
                 r,
                 (
-                    _at(r, i, k, limit) if clip else pack([r.one("eq", i, constant(k, i.dtype), dtype=bool)], ())
+                    _at(ctx, i, k, limit) if clip else as_elements([ctx.scalar("eq", i, constant(k, i.dtype), dtype=bool)], ())
                     for i, k, limit in zip(start, places, limits, strict=True)
                     if not is_constant(i) and not (clip and limit == 0)
                 ),
             )
             place = tuple(slice(k, k + size) for k, size in zip(corner, window, strict=True))
             old = out[place]
-            new = _combined(r, eqn, old, block.reshape(old.shape))
-            out[place] = new if here is None else _select(r, here, new, old)
+            new = _combined(ctx, eqn, old, block.reshape(old.shape))
+            out[place] = new if here is None else _select(ctx, here, new, old)
     return [out]
 
 
@@ -203,14 +203,14 @@ def _options(index: Element, limit: int, clip: bool) -> Sequence[int]:
     return [int(index)] if 0 <= index <= limit else []
 
 
-def _combined(r: Reader, eqn: Any, old: Elements, new: Elements) -> Elements:
+def _combined(ctx: Lowering, eqn: Any, old: Elements, new: Elements) -> Elements:
     """Return what a scatter writes where ``old`` was: ``new``, their sum and the like, or a function of ``old``."""
     combination = eqn.params["update_jaxpr"]
     if combination is None:
         return new
     called = core.ClosedJaxpr(combination, eqn.params["update_consts"])
     pairs = zip(old.reshape(-1), new.reshape(-1), strict=True)
-    return pack([r.read(called, [pack([a], ()), pack([b], ())])[0][()] for a, b in pairs], old.shape)
+    return as_elements([ctx.lower(called, [as_elements([a], ()), as_elements([b], ())])[0][()] for a, b in pairs], old.shape)
 
 
 def known(x: Elements) -> bool:
