@@ -30,7 +30,7 @@ from crazysim.engine.ir import Block, Value
 from crazysim.engine.step import ENGINES
 
 WEIGHTS = (
-    dict.fromkeys("mark item input eq ne lt le gt ge neg abs custom_jvp when loop while".split(), 0)
+    dict.fromkeys("barrier item input eq ne lt le gt ge neg abs custom_jvp when loop while".split(), 0)
     | {"rsqrt": 2}
     | dict.fromkeys("div sqrt cbrt floor ceil round integer_pow".split(), 4)
     | dict.fromkeys("exp exp2 log rem sin cos logistic tanh".split(), 8)

@@ -8,8 +8,8 @@ from typing import Any
 import jax
 
 from crazysim.engine.ir import Block, Element, Value
-from crazysim.engine.lower import Reader, UnsupportedError, words
-from crazysim.engine.program import inputs_of
+from crazysim.engine.lower import Lowering, UnsupportedError, scalars
+from crazysim.engine.program import input_elements
 
 
 def require_apart(fn: Callable[[list[Any]], list[Any]], two: Sequence[Any], sources: Sequence[str], what: str) -> None:
@@ -25,24 +25,24 @@ def require_apart(fn: Callable[[list[Any]], list[Any]], two: Sequence[Any], sour
     Raises:
         UnsupportedError: If one world's result depends on the other's numbers or on its place, or cannot be read.
     """
-    reader = Reader(Block())
+    lowering = Lowering(Block())
     labels: dict[int, tuple[Any, frozenset[Any]]] = {}
     inputs = []
     for i, (aval, source) in enumerate(zip(two, sources, strict=True)):
-        elements = inputs_of(reader.block, aval)
+        elements = input_elements(lowering.builder, aval)
         for world, part in enumerate(elements) if source == "worlds" else [(source, elements)]:
-            for k, word in enumerate(words(part)):
-                labels[id(word)] = (("input", i, k), frozenset() if world == "shared" else frozenset([world]))
+            for k, x in enumerate(scalars(part)):
+                labels[id(x)] = (("input", i, k), frozenset() if world == "shared" else frozenset([world]))
         inputs.append(elements)
-    outputs = reader.read(jax.make_jaxpr(fn)(list(two)), inputs)
-    reader.block.outputs = words(*outputs)
-    reader.block.drop_unused()
+    outputs = lowering.lower(jax.make_jaxpr(fn)(list(two)), inputs)
+    block = lowering.finish(outputs)
+    block.drop_unused()
     forms = _Forms(labels)
-    forms.block(reader.block)
+    forms.block(block)
     for out in outputs:
         if out.shape[:1] != (2,):
             raise UnsupportedError(f"{what} returns an array of shape {out.shape} for two worlds")
-        first, second = ([forms.of(x) for x in words(part)] for part in out)
+        first, second = ([forms.of(x) for x in scalars(part)] for part in out)
         for (a, worlds_a), (b, worlds_b) in zip(first, second, strict=True):
             seen = (worlds_a | worlds_b) - {0, 1}
             if seen:
@@ -70,7 +70,7 @@ class _Forms:
     def block(self, block: Block) -> list[Known]:
         """Go through a block whose inputs are known, and return what its outputs are."""
         for value in block.values:
-            if value.op != "mark":
+            if value.op != "barrier":
                 self.known[id(value)] = self._value(value, [self.of(x) for x in value.args])
         return [self.of(x) for x in block.outputs]
 

@@ -7,7 +7,7 @@ CUDA source, and symbolic expressions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -61,10 +61,22 @@ class Block:
         self.values.append(value)
         return value
 
-    def mark(self) -> None:
-        """Mark a place before which everything used behind it is better computed once."""
-        if self.values and self.values[-1].op != "mark":
-            self.values.append(Value("mark", (), bool))
+    def add_many(
+        self, op: str, args: tuple[Element, ...], dtypes: Sequence[Any], params: tuple = (), blocks: tuple = ()
+    ) -> list[Element]:
+        """Return the results of an operation that has several."""
+        operation = self.add(op, args, bool, params, blocks)
+        return [self.add("item", (operation,), dtype, (("index", k),)) for k, dtype in enumerate(dtypes)]
+
+    def barrier(self) -> None:
+        """Mark a place before which everything that is used after it should be computed once."""
+        if self.values and self.values[-1].op != "barrier":
+            self.values.append(Value("barrier", (), bool))
+
+    def finish(self, outputs: Sequence[Element]) -> Block:
+        """Return the block, with these outputs."""
+        self.outputs = list(outputs)
+        return self
 
     def _find(self, key: Any) -> Value | None:
         block: Block | None = self
@@ -82,7 +94,7 @@ class Block:
         needed |= {id(x) for x in self.outputs if isinstance(x, Value)}
         kept = []
         for value in reversed(self.values):
-            if id(value) in needed or value.op == "mark":
+            if id(value) in needed or value.op == "barrier":
                 kept.append(value)
                 needed |= {id(x) for x in value.args if isinstance(x, Value)}
                 for block in value.blocks:

@@ -12,10 +12,10 @@ import jax
 import numpy as np
 from jax.extend import core
 
-import crazysim.engine.rules  # noqa: F401  (fills the reader's table)
+import crazysim.engine.rules  # noqa: F401  (fills the table of rules)
 from crazysim.core.stage import Axes, Stage, StageScope
 from crazysim.engine.ir import Block, Element, Value, constant
-from crazysim.engine.lower import Elements, Reader, UnsupportedError, pack, words
+from crazysim.engine.lower import Elements, Lowering, UnsupportedError, as_elements, scalars
 
 Slot = tuple[int, int]
 """A number of the data: which leaf, and which element of what one drone (or one world) has of it."""
@@ -23,7 +23,7 @@ Slot = tuple[int, int]
 Phase = Literal["first", "each", "last"]
 """When a segment runs: once before the first step, at each step, once after the last."""
 
-LARGEST_SWARM = 8
+MAX_UNROLLED_DRONES = 8
 """Most drones of a world for which a stage of one world is written out; its program grows with their square."""
 
 
@@ -221,7 +221,7 @@ class Program:
         return list(slots) if segment.scope == "drone" else [(leaf, k % self.sizes(leaf)) for leaf, k in slots]
 
     def sizes(self, leaf: int, scope: StageScope = "drone") -> int:
-        """Return how many numbers one drone (or world) has of a leaf; a key is two words."""
+        """Return how many numbers one drone (or world) has of a leaf; a key is two 32-bit integers."""
         if leaf in self.rows:
             return self.rows[leaf] * (self.n_drones if scope == "world" and self.axes.scopes[leaf] == "drone" else 1)
         aval = self.axes.one_of(leaf, self.leaves[leaf], scope)
@@ -235,8 +235,8 @@ class Program:
         scope: StageScope = stage.scope
         if scope == "world" and not any(self.axes.scopes[i] == "drone" for i in [*traced.used, *traced.written]):
             scope = "drone"  # nothing of any drone is in it: every drone's lane can do it for its world
-        if scope == "world" and self.n_drones > LARGEST_SWARM:
-            self._add_batch(stage, phase, f"of one world, it is written out for up to {LARGEST_SWARM} drones")
+        if scope == "world" and self.n_drones > MAX_UNROLLED_DRONES:
+            self._add_batch(stage, phase, f"of one world, it is written out for up to {MAX_UNROLLED_DRONES} drones")
             return
         last = self.segments[-1] if self.segments else None
         follows = last is not None and (last.scope, last.phase) == (scope, phase)
@@ -250,32 +250,32 @@ class Program:
             self.segments.append(segment)
         segment.stages.append(stage)
         segment.now.update(values)
-        segment.block.mark()
+        segment.block.barrier()
 
     def _lower(self, segment: Segment, traced: _Traced) -> dict[int, Elements]:
         """Return what the written leaves of a stage become, as elements of the segment's block."""
-        reader = Reader(segment.block)
+        lowering = Lowering(segment.block)
         args = [self._elements(segment, i, traced.avals[i]) for i in traced.used]
         if traced.when is None:
-            return dict(zip(traced.written, reader.read(traced.fn, args), strict=True))
-        mask = reader.read(traced.when, args)[0][()]
-        inner = reader.inner()
-        new = inner.read(traced.fn, args)
+            return dict(zip(traced.written, lowering.lower(traced.fn, args), strict=True))
+        mask = lowering.lower(traced.when, args)[0][()]
+        inner = lowering.inner()
+        new = inner.lower(traced.fn, args)
         old = [self._elements(segment, i, traced.avals[i]) for i in traced.written]
-        pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(words(x), words(y), strict=True)]
+        pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(scalars(x), scalars(y), strict=True)]
         changed = [(a, b) for a, b in pairs if a is not b]
-        inner.block.outputs = [b for _, b in changed]
-        whole = segment.block.add("when", (mask, *(a for a, _ in changed)), bool, (), (inner.block,))
-        items = iter(
-            [segment.block.add("item", (whole,), a.dtype, (("index", k),)) for k, (a, _) in enumerate(changed)]
-        )
+        guarded = inner.builder.finish([b for _, b in changed])
+        before = tuple(a for a, _ in changed)
+        items = iter(segment.block.add_many("when", (mask, *before), [a.dtype for a in before], (), (guarded,)))
         row = iter([a if a is b else next(items) for a, b in pairs])
-        return {i: _with_words(x, row) for i, x in zip(traced.written, old, strict=True)}
+        return {i: _with_scalars(x, row) for i, x in zip(traced.written, old, strict=True)}
 
     def _elements(self, segment: Segment, leaf: int, aval: Any) -> Elements:
         """Return a leaf's elements as they are now in a segment; inputs, if no stage of it has written them."""
         if leaf not in segment.now:
-            segment.now[leaf] = segment.first[leaf] = inputs_of(segment.block, aval, self.zeros.get(leaf, frozenset()))
+            segment.now[leaf] = segment.first[leaf] = input_elements(
+                segment.block, aval, self.zeros.get(leaf, frozenset())
+            )
         return segment.now[leaf]
 
     def _add_batch(self, stage: Stage, phase: Phase, why: str) -> None:
@@ -347,27 +347,27 @@ def _with_inputs(jaxpr: core.ClosedJaxpr, inputs: Sequence[int]) -> core.ClosedJ
     )
 
 
-def inputs_of(block: Block, aval: Any, zeros: frozenset[int] = frozenset()) -> Elements:
+def input_elements(block: Block, aval: Any, zeros: frozenset[int] = frozenset()) -> Elements:
     """Return an array as new inputs of a block, but for elements that are known to be zero."""
     size = int(np.prod(aval.shape, dtype=int))
     if is_key(aval):
-        return pack([(block.input(np.uint32), block.input(np.uint32)) for _ in range(size)], aval.shape)
+        return as_elements([(block.input(np.uint32), block.input(np.uint32)) for _ in range(size)], aval.shape)
     items = [constant(0, aval.dtype) if k in zeros else block.input(aval.dtype) for k in range(size)]
-    return pack(items, aval.shape)
+    return as_elements(items, aval.shape)
 
 
-def _with_words(like: Elements, row: Iterator[Element]) -> Elements:
-    """Return elements of the same shape; of a key, two words."""
+def _with_scalars(like: Elements, row: Iterator[Element]) -> Elements:
+    """Return elements of the same shape; of a key, two integers."""
     items = [(next(row), next(row)) if isinstance(x, tuple) else next(row) for x in like.reshape(-1)]
-    return pack(items, like.shape)
+    return as_elements(items, like.shape)
 
 
 def _close(segment: Segment) -> None:
     """Fix what a segment writes, and drop what nothing needs."""
     outputs: list[Element] = []
     for leaf, elements in segment.now.items():
-        before = words(segment.first[leaf]) if leaf in segment.first else [None] * elements.size
-        for k, (old, new) in enumerate(zip(before, words(elements), strict=True)):
+        before = scalars(segment.first[leaf]) if leaf in segment.first else [None] * elements.size
+        for k, (old, new) in enumerate(zip(before, scalars(elements), strict=True)):
             if old is not new:
                 segment.writes.append((leaf, k))
                 outputs.append(new)
@@ -379,7 +379,7 @@ def _close(segment: Segment) -> None:
 def _connect(segment: Segment) -> None:
     """Keep the inputs that are used, and note what they are."""
     block = segment.block
-    slots = {id(x): (leaf, k) for leaf, elements in segment.first.items() for k, x in enumerate(words(elements))}
+    slots = {id(x): (leaf, k) for leaf, elements in segment.first.items() for k, x in enumerate(scalars(elements))}
     segment.reads = [slots[i] for i in _keep_used_inputs(block)]
 
 
@@ -416,7 +416,7 @@ def _hoist(segment: Segment, changing: set[Slot]) -> None:
             replaced[id(value)] = product
             continue
         values.append(value)
-        if value.op != "mark" and not value.blocks and all(map(is_fixed, value.args)):
+        if value.op != "barrier" and not value.blocks and all(map(is_fixed, value.args)):
             fixed.add(id(value))
             if value.op in EXPENSIVE or any(id(x) in worth for x in value.args):
                 worth.add(id(value))

@@ -68,7 +68,7 @@ class Writer:
     def _value(self, value: Value, depth: int) -> None:
         args = [self.element(a) for a in value.args]
         match value.op:
-            case "mark":
+            case "barrier":
                 return
             case "item":
                 self.names[id(value)] = f"{args[0]}_{dict(value.params)['index']}"

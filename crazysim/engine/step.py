@@ -375,4 +375,4 @@ def _cost_of_split(step: Step, data: SimData, split: list[str]) -> str:
 
 
 def _operations(segment: Segment) -> int:
-    return sum(v.op not in ("mark", "item") for v in segment.block.walk())
+    return sum(v.op not in ("barrier", "item") for v in segment.block.walk())

@@ -67,7 +67,7 @@ class _Reader:
     def run(self, block: Block, inputs: Sequence[Expression]) -> list[Expression]:
         self.env.update(zip(map(id, block.inputs), inputs, strict=True))
         for value in block.values:
-            if value.op != "mark":
+            if value.op != "barrier":
                 self.env[id(value)] = self._value(value, [self._element(x) for x in value.args])
         return [self._element(x) for x in block.outputs]
 

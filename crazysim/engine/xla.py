@@ -31,7 +31,7 @@ def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: dict
     env.update(zip(map(id, block.inputs), inputs, strict=True))
     last_use = _last_uses(block)
     for position, value in enumerate(block.values):
-        if value.op == "mark":
+        if value.op == "barrier":
             _settle(env, block, position, last_use)
         else:
             env[id(value)] = _apply(value, [_get(env, a) for a in value.args], shape, env)

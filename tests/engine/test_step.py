@@ -14,7 +14,7 @@ from crazysim.core.random import drone_key
 from crazysim.core.stage import stage
 from crazysim.dynamics import Dynamics
 from crazysim.engine import Step, cuda, kernel, native, rollout
-from crazysim.engine.program import LARGEST_SWARM
+from crazysim.engine.program import MAX_UNROLLED_DRONES
 from crazysim.engine.step import explain
 from crazysim.pytree import PyTree, leaf
 
@@ -241,7 +241,7 @@ def test_stages_of_the_user_mean_the_same_on_every_engine(stages, n_segments):
     )
 
 
-@pytest.mark.parametrize("n_drones", [1, 3, LARGEST_SWARM])
+@pytest.mark.parametrize("n_drones", [1, 3, MAX_UNROLLED_DRONES])
 def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
     """Worlds that fill a vector, and worlds that do not; more of them than one vector has."""
     sim, data = with_stages(n_drones, separation)
@@ -256,9 +256,9 @@ def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
 
 
 def test_a_stage_of_one_world_splits_a_large_swarm():
-    sim, data = with_stages(LARGEST_SWARM + 1, separation)
+    sim, data = with_stages(MAX_UNROLLED_DRONES + 1, separation)
     step = Step(sim.step_pipeline, "lanes")
-    assert f"written out for up to {LARGEST_SWARM} drones" in explain(step, data)
+    assert f"written out for up to {MAX_UNROLLED_DRONES} drones" in explain(step, data)
     found, expected = step(data, jnp.int32(3)), Step(sim.step_pipeline, "plain")(data, jnp.int32(3))
     np.testing.assert_allclose(found.states.vel, expected.states.vel, rtol=2e-5, atol=2e-6)
 

@@ -11,21 +11,30 @@ import numpy as np
 from jax.extend import core
 
 from crazysim.engine.ir import Block, Element, constant, is_constant
-from crazysim.engine.lower import UNROLL, Elements, Reader, UnsupportedError, constants, pack, rule, words
+from crazysim.engine.lower import (
+    MAX_UNROLL,
+    Elements,
+    Lowering,
+    UnsupportedError,
+    as_elements,
+    constants,
+    rule,
+    scalars,
+)
 
 
 @rule("jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_lin", "run_state")
-def _call(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    return r.read(closed(eqn.params.get("jaxpr") or eqn.params["call_jaxpr"]), args)
+def _call(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    return ctx.lower(closed(eqn.params.get("jaxpr") or eqn.params["call_jaxpr"]), args)
 
 
 @rule("custom_jvp_call")
-def _custom_jvp(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    return _with_derivative(r, eqn, args, closed(eqn.params["call_jaxpr"]))
+def _custom_jvp(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    return _with_derivative(ctx, eqn, args, closed(eqn.params["call_jaxpr"]))
 
 
 @rule("call_hi_primitive")
-def _high_level(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _high_level(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """A primitive that is written in terms of others, from JAX 0.12 on."""
     primitive = eqn.params["_prim"]
 
@@ -33,13 +42,13 @@ def _high_level(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
         return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, args)))
 
     avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-    return _with_derivative(r, eqn, args, jax.make_jaxpr(expanded)(*avals))
+    return _with_derivative(ctx, eqn, args, jax.make_jaxpr(expanded)(*avals))
 
 
-def _with_derivative(r: Reader, eqn: Any, args: list[Elements], called: core.ClosedJaxpr) -> list[Elements]:
+def _with_derivative(ctx: Lowering, eqn: Any, args: list[Elements], called: core.ClosedJaxpr) -> list[Elements]:
     """Read a call that brings a derivative of its own, which is read when somebody asks for it."""
-    body = r.inner()
-    body.block.outputs = words(*body.read(called, [_inputs(body, x) for x in args]))
+    body = ctx.inner()
+    block = body.finish(body.lower(called, [_inputs(body, x) for x in args]))
 
     @functools.cache
     def slope() -> Block:
@@ -47,44 +56,43 @@ def _with_derivative(r: Reader, eqn: Any, args: list[Elements], called: core.Clo
         single = _as_function(eqn)
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
         traced = jax.make_jaxpr(lambda x, dx: jax.jvp(single, x, dx)[1])(avals, avals)
-        reader = Reader(Block())
-        inputs = [_inputs(reader, x) for x in (*args, *args)]
-        reader.block.outputs = words(*reader.read(traced, inputs))
-        return reader.block
+        fresh = Lowering(Block())
+        inputs = [_inputs(fresh, x) for x in (*args, *args)]
+        return fresh.finish(fresh.lower(traced, inputs))
 
-    return _results(r, "custom_jvp", eqn, words(*args), (body.block,), (("slope", slope),))
+    return _results(ctx, "custom_jvp", eqn, scalars(*args), (block,), (("slope", slope),))
 
 
 @rule("custom_linear_solve")
-def _linear_solve(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _linear_solve(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
     n_before = lengths.matvec + lengths.vecmat
     solve = args[n_before : n_before + lengths.solve]
     n_all = n_before + lengths.solve + lengths.transpose_solve
-    return r.read(closed(jaxprs.solve), [*solve, *args[n_all:]])
+    return ctx.lower(closed(jaxprs.solve), [*solve, *args[n_all:]])
 
 
 @rule("cond")
-def _cond(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _cond(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Both branches are computed, and one is taken: lanes differ in which."""
     which, *operands = args
     branches = [closed(b) for b in eqn.params["branches"]]
     index = which[()]
     if is_constant(index):
-        return r.read(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
-    outs = [r.read(b, operands) for b in branches]
+        return ctx.lower(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
+    outs = [ctx.lower(b, operands) for b in branches]
     results = []
     for k, v in enumerate(eqn.outvars):
         taken = outs[-1][k]
         for i in range(len(branches) - 2, -1, -1):
-            here = r.one("le", index, constant(i, index.dtype), dtype=bool)
-            taken = r.each("select_n", [pack([here], ()), taken, outs[i][k]], v.aval.dtype)
+            here = ctx.scalar("le", index, constant(i, index.dtype), dtype=bool)
+            taken = ctx.elementwise("select_n", [as_elements([here], ()), taken, outs[i][k]], v.aval.dtype)
         results.append(taken)
     return results
 
 
 @rule("platform_index")
-def _platform_index(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _platform_index(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Of code that is written for several platforms, what serves all of them, else what serves the CPU."""
     platforms = list(eqn.params["platforms"])
     cpu = next((k for k, names in enumerate(platforms) if names is not None and "cpu" in names), 0)
@@ -92,7 +100,7 @@ def _platform_index(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]
 
 
 @rule("scan")
-def _scan(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _scan(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     p, length = eqn.params, eqn.params["length"]
     body = closed(p["jaxpr"])
     # Versions of JAX name the groups differently; what is stacked over turns has one axis more outside.
@@ -101,17 +109,17 @@ def _scan(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     n_consts = len(eqn.invars) - n_carry - n_stacked
     fixed, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
     if len(body.jaxpr.outvars) == n_carry and not xs and length > 1:
-        inner = r.inner()
+        inner = ctx.inner()
         inputs = [_inputs(inner, x) for x in carry]
-        inner.block.outputs = words(*inner.read(body, [*fixed, *inputs]))
-        return _results(r, "loop", eqn, words(*carry), (inner.block,), (("length", length),))
-    if length > UNROLL:
+        block = inner.finish(inner.lower(body, [*fixed, *inputs]))
+        return _results(ctx, "loop", eqn, scalars(*carry), (block,), (("length", length),))
+    if length > MAX_UNROLL:
         raise UnsupportedError(
-            f"primitive 'scan' with inputs or outputs for each of {length} turns; written out are {UNROLL}"
+            f"primitive 'scan' with inputs or outputs for each of {length} turns; written out are {MAX_UNROLL}"
         )
     stacked: list[list[Elements]] = []
     for i in range(length)[::-1] if p["reverse"] else range(length):
-        outs = r.read(body, [*fixed, *carry, *(np.asarray(x[i], object) for x in xs)])
+        outs = ctx.lower(body, [*fixed, *carry, *(np.asarray(x[i], object) for x in xs)])
         carry = outs[:n_carry]
         stacked.append(outs[n_carry:])
     if p["reverse"]:
@@ -121,14 +129,14 @@ def _scan(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 
 @rule("while")
-def _while(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _while(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     p = eqn.params
     n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
     cond_fixed, body_fixed, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
-    test, body = r.inner(), r.inner()
-    test.block.outputs = words(*test.read(closed(p["cond_jaxpr"]), [*cond_fixed, *(_inputs(test, x) for x in carry)]))
-    body.block.outputs = words(*body.read(closed(p["body_jaxpr"]), [*body_fixed, *(_inputs(body, x) for x in carry)]))
-    return _results(r, "while", eqn, words(*carry), (test.block, body.block))
+    test, body = ctx.inner(), ctx.inner()
+    goes_on = test.finish(test.lower(closed(p["cond_jaxpr"]), [*cond_fixed, *(_inputs(test, x) for x in carry)]))
+    turn = body.finish(body.lower(closed(p["body_jaxpr"]), [*body_fixed, *(_inputs(body, x) for x in carry)]))
+    return _results(ctx, "while", eqn, scalars(*carry), (goes_on, turn))
 
 
 def closed(jaxpr: Any) -> core.ClosedJaxpr:
@@ -141,24 +149,24 @@ def _as_function(eqn: Any) -> Callable[..., Any]:
     return lambda *args: eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(eqn.params))
 
 
-def _inputs(r: Reader, like: Elements) -> Elements:
+def _inputs(ctx: Lowering, like: Elements) -> Elements:
     def new(x: Any) -> Any:
-        return tuple(map(new, x)) if isinstance(x, tuple) else r.block.input(x.dtype)
+        return tuple(map(new, x)) if isinstance(x, tuple) else ctx.builder.input(x.dtype)
 
-    return pack([new(x) for x in like.reshape(-1)], like.shape)
+    return as_elements([new(x) for x in like.reshape(-1)], like.shape)
 
 
 def _results(
-    r: Reader, op: str, eqn: Any, args: list[Element], blocks: tuple[Block, ...], params: tuple = ()
+    ctx: Lowering, op: str, eqn: Any, args: list[Element], blocks: tuple[Block, ...], params: tuple = ()
 ) -> list[Elements]:
     """Return the results of an operation that has many."""
-    whole = r.block.add(op, tuple(args), bool, params, blocks)
-    out, k = [], 0
-    for v in eqn.outvars:
-        is_key = jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.prng_key)
-        size = int(np.prod(v.aval.shape)) * (2 if is_key else 1)
-        dtype = np.uint32 if is_key else v.aval.dtype
-        items = [r.block.add("item", (whole,), dtype, (("index", k + i),)) for i in range(size)]
-        out.append(pack(list(zip(items[::2], items[1::2], strict=True)) if is_key else items, v.aval.shape))
-        k += size
+    keys = [jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in eqn.outvars]
+    sizes = [int(np.prod(v.aval.shape)) * (2 if is_key else 1) for v, is_key in zip(eqn.outvars, keys, strict=True)]
+    dtypes = [np.uint32 if is_key else v.aval.dtype for v, is_key in zip(eqn.outvars, keys, strict=True)]
+    of_all = [dtype for dtype, size in zip(dtypes, sizes, strict=True) for _ in range(size)]
+    flat = iter(ctx.builder.add_many(op, tuple(args), of_all, params, blocks))
+    out = []
+    for v, is_key, size in zip(eqn.outvars, keys, sizes, strict=True):
+        items = [next(flat) for _ in range(size)]
+        out.append(as_elements(list(zip(items[::2], items[1::2], strict=True)) if is_key else items, v.aval.shape))
     return out

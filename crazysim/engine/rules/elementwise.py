@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.engine.lower import Elements, Reader, UnsupportedError, constants, rule
+from crazysim.engine.lower import Elements, Lowering, UnsupportedError, constants, rule
 
 ELEMENTWISE: dict[str, tuple[str, ...]] = dict.fromkeys(
     "add sub mul div rem neg sign abs floor ceil is_finite exp exp2 log log1p expm1 tanh sin cos tan asin acos atan "
@@ -19,85 +19,85 @@ ELEMENTWISE: dict[str, tuple[str, ...]] = dict.fromkeys(
 
 
 @rule(*ELEMENTWISE)
-def _each(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _each(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     name = eqn.primitive.name
     params = tuple(sorted((k, eqn.params[k]) for k in ELEMENTWISE[name]))
-    return [r.each(name, args, eqn.outvars[0].aval.dtype, params)]
+    return [ctx.elementwise(name, args, eqn.outvars[0].aval.dtype, params)]
 
 
 @rule("convert_element_type")
-def _convert(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    return [r.each("convert_element_type", args, eqn.params["new_dtype"])]
+def _convert(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    return [ctx.elementwise("convert_element_type", args, eqn.params["new_dtype"])]
 
 
 @rule("select_n")
-def _select_n(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _select_n(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """One of two cases by a bool; of more by a number, each against the next."""
     which, *cases = args
     dtype, kind = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
     if np.dtype(kind).kind == "b":
-        return [r.each("select_n", args, dtype)]
+        return [ctx.elementwise("select_n", args, dtype)]
     taken = cases[-1]
     for k in range(len(cases) - 2, -1, -1):
-        here = r.each("le", [which, constants(k, kind)], bool)
-        taken = r.each("select_n", [here, taken, cases[k]], dtype)
+        here = ctx.elementwise("le", [which, constants(k, kind)], bool)
+        taken = ctx.elementwise("select_n", [here, taken, cases[k]], dtype)
     return [taken]
 
 
 @rule("bitcast_convert_type")
-def _bitcast(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _bitcast(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     before, after = eqn.invars[0].aval.dtype, eqn.params["new_dtype"]
     if before.itemsize != np.dtype(after).itemsize:
         raise UnsupportedError(f"primitive 'bitcast_convert_type' from {before} to {after}, of another size")
-    return [r.each("bitcast_convert_type", args, after)]
+    return [ctx.elementwise("bitcast_convert_type", args, after)]
 
 
 @rule("square")
-def _square(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    return [r.each("mul", [args[0], args[0]], eqn.outvars[0].aval.dtype)]
+def _square(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    return [ctx.elementwise("mul", [args[0], args[0]], eqn.outvars[0].aval.dtype)]
 
 
 @rule("integer_pow")
-def _integer_pow(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _integer_pow(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     y, dtype = eqn.params["y"], eqn.outvars[0].aval.dtype
     if y not in (2, 3, 4):
-        return [r.each("integer_pow", args, dtype, (("y", y),))]
-    squared = r.each("mul", [args[0], args[0]], dtype)
-    return [squared if y == 2 else r.each("mul", [squared, squared if y == 4 else args[0]], dtype)]
+        return [ctx.elementwise("integer_pow", args, dtype, (("y", y),))]
+    squared = ctx.elementwise("mul", [args[0], args[0]], dtype)
+    return [squared if y == 2 else ctx.elementwise("mul", [squared, squared if y == 4 else args[0]], dtype)]
 
 
 @rule("one_minus_square")
-def _one_minus_square(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _one_minus_square(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     dtype = eqn.outvars[0].aval.dtype
-    return [r.each("sub", [constants(1, dtype), r.each("mul", [args[0], args[0]], dtype)], dtype)]
+    return [ctx.elementwise("sub", [constants(1, dtype), ctx.elementwise("mul", [args[0], args[0]], dtype)], dtype)]
 
 
 @rule("add_any")
-def _add_any(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    return [r.each("add", args, eqn.outvars[0].aval.dtype)]
+def _add_any(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    return [ctx.elementwise("add", args, eqn.outvars[0].aval.dtype)]
 
 
 @rule("lt_to", "le_to", "eq_to")
-def _total_order(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _total_order(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Comparisons in which NaN is the largest number, and equal to itself."""
     name = eqn.primitive.name.removesuffix("_to")
     if eqn.invars[0].aval.dtype.kind != "f":
-        return [r.each(name, args, bool)]
-    a_nan, b_nan = (r.each("ne", [x, x], bool) for x in args)
+        return [ctx.elementwise(name, args, bool)]
+    a_nan, b_nan = (ctx.elementwise("ne", [x, x], bool) for x in args)
     of_nan = {
-        "lt": lambda: r.each("and", [b_nan, r.each("not", [a_nan], bool)], bool),
+        "lt": lambda: ctx.elementwise("and", [b_nan, ctx.elementwise("not", [a_nan], bool)], bool),
         "le": lambda: b_nan,
-        "eq": lambda: r.each("and", [a_nan, b_nan], bool),
+        "eq": lambda: ctx.elementwise("and", [a_nan, b_nan], bool),
     }[name]()
-    return [r.each("or", [r.each(name, args, bool), of_nan], bool)]
+    return [ctx.elementwise("or", [ctx.elementwise(name, args, bool), of_nan], bool)]
 
 
 @rule("optimization_barrier")
-def _barrier(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
-    r.block.mark()
+def _barrier(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    ctx.builder.barrier()
     return args
 
 
 @rule("copy", "copy_p", "stop_gradient", "pvary", "random_clone", "name")
-def _identity(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _identity(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     return args

@@ -11,7 +11,7 @@ from jax.extend import core
 from jax.lax import GatherScatterMode
 
 from crazysim.engine.ir import Element, constant, is_constant
-from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, constants, as_elements, rule
+from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
 from crazysim.engine.rules.movement import move_many, run_now
 
 
@@ -110,7 +110,9 @@ def _gather(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
         if not result:
             result = list(here)
             continue
-        hit = [_all(ctx, (_at(ctx, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0)) for row in rows]
+        hit = [
+            _all(ctx, (_at(ctx, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0)) for row in rows
+        ]
         for o, item in enumerate(here):
             condition = hit[row_of[o]]
             if condition is not None and item is not result[o]:
@@ -180,9 +182,11 @@ def _scatter(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
             for axis, k in zip(starts_of, places, strict=True):
                 corner[axis] = k
             here = _all(
-                r,
+                ctx,
                 (
-                    _at(ctx, i, k, limit) if clip else as_elements([ctx.scalar("eq", i, constant(k, i.dtype), dtype=bool)], ())
+                    _at(ctx, i, k, limit)
+                    if clip
+                    else as_elements([ctx.scalar("eq", i, constant(k, i.dtype), dtype=bool)], ())
                     for i, k, limit in zip(start, places, limits, strict=True)
                     if not is_constant(i) and not (clip and limit == 0)
                 ),
@@ -210,7 +214,9 @@ def _combined(ctx: Lowering, eqn: Any, old: Elements, new: Elements) -> Elements
         return new
     called = core.ClosedJaxpr(combination, eqn.params["update_consts"])
     pairs = zip(old.reshape(-1), new.reshape(-1), strict=True)
-    return as_elements([ctx.lower(called, [as_elements([a], ()), as_elements([b], ())])[0][()] for a, b in pairs], old.shape)
+    return as_elements(
+        [ctx.lower(called, [as_elements([a], ()), as_elements([b], ())])[0][()] for a, b in pairs], old.shape
+    )
 
 
 def known(x: Elements) -> bool:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from crazysim.engine.ir import constant
-from crazysim.engine.lower import Elements, Reader, UnsupportedError, pack, rule
+from crazysim.engine.lower import Elements, Lowering, UnsupportedError, as_elements, rule
 
 LARGEST_SYSTEM = 6
 """Largest matrix that is factorised; beyond it the written-out arithmetic is longer than a drone's step."""
@@ -23,7 +23,7 @@ def _matrices(x: Elements) -> list[Elements]:
 
 
 @rule("cholesky")
-def _cholesky(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _cholesky(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     n, dtype = args[0].shape[-1], eqn.outvars[0].aval.dtype
     _check_size(eqn, n)
     zero = constant(0, dtype)
@@ -34,14 +34,14 @@ def _cholesky(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
             for i in range(j, n):
                 rest = a[i, j]
                 for k in range(j):
-                    rest = r.one("sub", rest, r.one("mul", low[i, k], low[j, k]))
-                low[i, j] = r.block.add("sqrt", (rest,), dtype) if i == j else r.one("div", rest, low[j, j])
+                    rest = ctx.scalar("sub", rest, ctx.scalar("mul", low[i, k], low[j, k]))
+                low[i, j] = ctx.builder.add("sqrt", (rest,), dtype) if i == j else ctx.scalar("div", rest, low[j, j])
         out.append(low)
-    return [pack([x for low in out for x in low.reshape(-1)], args[0].shape)]
+    return [as_elements([x for low in out for x in low.reshape(-1)], args[0].shape)]
 
 
 @rule("triangular_solve")
-def _triangular_solve(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _triangular_solve(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     p = eqn.params
     _check_size(eqn, args[0].shape[-1])
     out = []
@@ -50,25 +50,25 @@ def _triangular_solve(r: Reader, eqn: Any, args: list[Elements]) -> list[Element
         lower = p["lower"] != p["transpose_a"]
         if not p["left_side"]:  # x a = b is a' x' = b'
             a, b, lower = a.T, b.T, not lower
-        x = _substitute(r, a, b, lower, p["unit_diagonal"])
+        x = _substitute(ctx, a, b, lower, p["unit_diagonal"])
         out.append(x if p["left_side"] else x.T)
-    return [pack([e for x in out for e in x.reshape(-1)], args[1].shape)]
+    return [as_elements([e for x in out for e in x.reshape(-1)], args[1].shape)]
 
 
-def _substitute(r: Reader, a: Elements, b: Elements, lower: bool, unit: bool) -> Elements:
+def _substitute(ctx: Lowering, a: Elements, b: Elements, lower: bool, unit: bool) -> Elements:
     n, x = len(a), np.empty(b.shape, object)
     order = list(range(n)) if lower else list(range(n))[::-1]
     for column in range(b.shape[1]):
         for done, i in enumerate(order):
             rest = b[i, column]
             for k in order[:done]:
-                rest = r.one("sub", rest, r.one("mul", a[i, k], x[k, column]))
-            x[i, column] = rest if unit else r.one("div", rest, a[i, i])
+                rest = ctx.scalar("sub", rest, ctx.scalar("mul", a[i, k], x[k, column]))
+            x[i, column] = rest if unit else ctx.scalar("div", rest, a[i, i])
     return x
 
 
 @rule("lu")
-def _lu(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _lu(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Gauss with the largest pivot of each column, rows exchanged by selection."""
     n, m = args[0].shape[-2:]
     if n != m:
@@ -80,27 +80,27 @@ def _lu(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
         rows = np.array([constant(i, np.int32) for i in range(n)], object)
         pivots = []
         for j in range(n):
-            pivot, largest = constant(j, np.int32), r.one("abs", a[j, j])
+            pivot, largest = constant(j, np.int32), ctx.scalar("abs", a[j, j])
             for i in range(j + 1, n):
-                size = r.one("abs", a[i, j])
-                wins = r.one("gt", size, largest, dtype=bool)
-                pivot = r.one("select_n", wins, pivot, constant(i, np.int32))
-                largest = r.one("select_n", wins, largest, size)
+                size = ctx.scalar("abs", a[i, j])
+                wins = ctx.scalar("gt", size, largest, dtype=bool)
+                pivot = ctx.scalar("select_n", wins, pivot, constant(i, np.int32))
+                largest = ctx.scalar("select_n", wins, largest, size)
             pivots.append(pivot)
             for i in range(j + 1, n):
-                here = r.one("eq", pivot, constant(i, np.int32), dtype=bool)
+                here = ctx.scalar("eq", pivot, constant(i, np.int32), dtype=bool)
                 for x in (*a.T, rows):  # every column, and the list of rows
-                    x[i], x[j] = r.one("select_n", here, x[i], x[j]), r.one("select_n", here, x[j], x[i])
+                    x[i], x[j] = ctx.scalar("select_n", here, x[i], x[j]), ctx.scalar("select_n", here, x[j], x[i])
             for i in range(j + 1, n):
-                a[i, j] = r.one("div", a[i, j], a[j, j])
+                a[i, j] = ctx.scalar("div", a[i, j], a[j, j])
                 for k in range(j + 1, n):
-                    a[i, k] = r.one("sub", a[i, k], r.one("mul", a[i, j], a[j, k]))
+                    a[i, k] = ctx.scalar("sub", a[i, k], ctx.scalar("mul", a[i, j], a[j, k]))
         factors.append(a)
         all_pivots.append(pivots)
         permutations.append(rows)
     shape = args[0].shape
     return [
-        pack([x for a in factors for x in a.reshape(-1)], shape),
-        pack([x for pivots in all_pivots for x in pivots], shape[:-1]),
-        pack([x for rows in permutations for x in rows], shape[:-1]),
+        as_elements([x for a in factors for x in a.reshape(-1)], shape),
+        as_elements([x for pivots in all_pivots for x in pivots], shape[:-1]),
+        as_elements([x for rows in permutations for x in rows], shape[:-1]),
     ]

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from crazysim.engine.lower import Elements, Reader, constants, pack, rule
+from crazysim.engine.lower import Elements, Lowering, as_elements, constants, rule
 
 MOVEMENT = (
     "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "split", "unstack",
@@ -17,7 +17,7 @@ MOVEMENT = (
 
 
 @rule(*MOVEMENT)
-def _move(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _move(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     return move_many(eqn, args) if eqn.primitive.multiple_results else [move(eqn, args)]
 
 
@@ -60,7 +60,7 @@ def move_many(eqn: Any, args: list[Elements], fixed: Sequence[Any] = ()) -> list
         elements.extend(x.reshape(-1))
     params = {"fill_value": 0} if eqn.primitive.name == "gather" else {}  # never used: all places are inside
     places = run_now(eqn, [*numbers, *fixed], **params)
-    return [pack([elements[i] for i in p.reshape(-1)], p.shape) for p in places]
+    return [as_elements([elements[i] for i in p.reshape(-1)], p.shape) for p in places]
 
 
 def run_now(eqn: Any, args: Sequence[Any], **params: Any) -> list[np.ndarray]:
@@ -71,6 +71,6 @@ def run_now(eqn: Any, args: Sequence[Any], **params: Any) -> list[np.ndarray]:
 
 
 @rule("iota", "iota_2x32_shape")
-def _iota(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _iota(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     outs = run_now(eqn, [])
     return [constants(x, x.dtype) for x in outs]

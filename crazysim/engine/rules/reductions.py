@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from crazysim.engine.ir import Element, constant
-from crazysim.engine.lower import UNROLL, Elements, Reader, UnsupportedError, constants, pack, rule
+from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
 from crazysim.engine.rules.movement import run_now
 
 COMBINE = {
@@ -20,73 +20,83 @@ COMBINE = {
 
 
 @rule(*COMBINE)
-def _reduce(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _reduce(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     op, dtype, axes = COMBINE[eqn.primitive.name], eqn.outvars[0].aval.dtype, eqn.params["axes"]
     x = np.moveaxis(args[0], axes, range(len(axes)))
     rest = x.shape[len(axes) :]
     rows = list(x.reshape(-1, *rest))
     if not rows:
         return [constants(run_now(eqn, [np.zeros(args[0].shape, dtype)])[0], dtype)]
-    return [functools.reduce(lambda a, b: r.each(op, [a, b], dtype), [np.asarray(row, object) for row in rows])]
+    return [
+        functools.reduce(lambda a, b: ctx.elementwise(op, [a, b], dtype), [np.asarray(row, object) for row in rows])
+    ]
 
 
 @rule("cumsum", "cumprod", "cummax", "cummin")
-def _cumulate(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _cumulate(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     op = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}[eqn.primitive.name]
     x = np.moveaxis(args[0], eqn.params["axis"], 0).copy()
     order = range(len(x))[::-1] if eqn.params["reverse"] else range(len(x))
     for last, i in itertools.pairwise(order):
-        x[i] = r.each(op, [np.asarray(x[last], object), np.asarray(x[i], object)], eqn.outvars[0].aval.dtype)[()]
+        x[i] = ctx.elementwise(op, [np.asarray(x[last], object), np.asarray(x[i], object)], eqn.outvars[0].aval.dtype)[
+            ()
+        ]
     return [np.moveaxis(x, 0, eqn.params["axis"])]
 
 
 @rule("argmax", "argmin")
-def _argmax(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _argmax(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """The first of the best, or the first NaN, as XLA has it."""
     (axis,), index = eqn.params["axes"], eqn.params["index_dtype"]
     better = "gt" if eqn.primitive.name == "argmax" else "lt"
     rows = [np.asarray(row, object) for row in np.moveaxis(args[0], axis, 0)]
     best, where = rows[0], np.broadcast_to(constants(0, index), rows[0].shape)
     for i, row in enumerate(rows[1:], 1):
-        best_is_number = r.each("eq", [best, best], bool)
-        wins = r.each("or", [r.each(better, [row, best], bool), r.each("ne", [row, row], bool)], bool)
-        wins = r.each("and", [wins, best_is_number], bool)
-        best = r.each("select_n", [wins, best, row], eqn.invars[0].aval.dtype)
-        where = r.each("select_n", [wins, where, constants(i, index)], index)
+        best_is_number = ctx.elementwise("eq", [best, best], bool)
+        wins = ctx.elementwise(
+            "or", [ctx.elementwise(better, [row, best], bool), ctx.elementwise("ne", [row, row], bool)], bool
+        )
+        wins = ctx.elementwise("and", [wins, best_is_number], bool)
+        best = ctx.elementwise("select_n", [wins, best, row], eqn.invars[0].aval.dtype)
+        where = ctx.elementwise("select_n", [wins, where, constants(i, index)], index)
     return [where]
 
 
 @rule("sort")
-def _sort(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _sort(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Odd-even transposition: neighbours change places, which keeps the order of equals. NaN goes last."""
     axis, n_keys = eqn.params["dimension"], eqn.params["num_keys"]
     dtypes = [v.aval.dtype for v in eqn.invars]
     columns = [np.moveaxis(x, axis, 0).copy() for x in args]
     n = len(columns[0])
-    if n > UNROLL:
-        raise UnsupportedError(f"primitive 'sort' of {n} elements; written out are up to {UNROLL}")
+    if n > MAX_UNROLL:
+        raise UnsupportedError(f"primitive 'sort' of {n} elements; written out are up to {MAX_UNROLL}")
     for turn in range(n):
         for i in range(turn % 2, n - 1, 2):
             first = [np.asarray(c[i], object) for c in columns]
             second = [np.asarray(c[i + 1], object) for c in columns]
             swap, tied = constants(False, bool), constants(True, bool)
             for a, b, dtype in zip(first[:n_keys], second[:n_keys], dtypes, strict=False):
-                above = r.each("lt", [b, a], bool)
-                equal = r.each("eq", [a, b], bool)
+                above = ctx.elementwise("lt", [b, a], bool)
+                equal = ctx.elementwise("eq", [a, b], bool)
                 if dtype.kind == "f":
-                    a_nan, b_nan = r.each("ne", [a, a], bool), r.each("ne", [b, b], bool)
-                    above = r.each("or", [above, r.each("and", [a_nan, r.each("not", [b_nan], bool)], bool)], bool)
-                    equal = r.each("or", [equal, r.each("and", [a_nan, b_nan], bool)], bool)
-                swap = r.each("or", [swap, r.each("and", [tied, above], bool)], bool)
-                tied = r.each("and", [tied, equal], bool)
+                    a_nan, b_nan = ctx.elementwise("ne", [a, a], bool), ctx.elementwise("ne", [b, b], bool)
+                    above = ctx.elementwise(
+                        "or",
+                        [above, ctx.elementwise("and", [a_nan, ctx.elementwise("not", [b_nan], bool)], bool)],
+                        bool,
+                    )
+                    equal = ctx.elementwise("or", [equal, ctx.elementwise("and", [a_nan, b_nan], bool)], bool)
+                swap = ctx.elementwise("or", [swap, ctx.elementwise("and", [tied, above], bool)], bool)
+                tied = ctx.elementwise("and", [tied, equal], bool)
             for c, a, b, dtype in zip(columns, first, second, dtypes, strict=True):
-                c[i] = r.each("select_n", [swap, a, b], dtype)[()]
-                c[i + 1] = r.each("select_n", [swap, b, a], dtype)[()]
+                c[i] = ctx.elementwise("select_n", [swap, a, b], dtype)[()]
+                c[i + 1] = ctx.elementwise("select_n", [swap, b, a], dtype)[()]
     return [np.moveaxis(c, 0, axis) for c in columns]
 
 
 @rule("dot_general")
-def _dot(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
+def _dot(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     (lhs_axes, rhs_axes), (lhs_batch, rhs_batch) = eqn.params["dimension_numbers"]
     dtype, (a, b) = eqn.outvars[0].aval.dtype, args
 
@@ -104,11 +114,13 @@ def _dot(r: Reader, eqn: Any, args: list[Elements]) -> list[Elements]:
     for n in range(a.shape[0]):
         for row in a[n]:
             for column in b[n]:
-                terms = [r.one("mul", *(_cast(r, x, dtype) for x in pair)) for pair in zip(row, column, strict=True)]
+                terms = [
+                    ctx.scalar("mul", *(_cast(ctx, x, dtype) for x in pair)) for pair in zip(row, column, strict=True)
+                ]
                 zero = constant(0, dtype)
-                out.append(functools.reduce(lambda s, t: r.one("add", s, t), terms, zero))
-    return [pack(out, (*batch, *a_sizes, *b_sizes))]
+                out.append(functools.reduce(lambda s, t: ctx.scalar("add", s, t), terms, zero))
+    return [as_elements(out, (*batch, *a_sizes, *b_sizes))]
 
 
-def _cast(r: Reader, x: Element, dtype: Any) -> Element:
-    return r.block.add("convert_element_type", (x,), dtype)
+def _cast(ctx: Lowering, x: Element, dtype: Any) -> Element:
+    return ctx.builder.add("convert_element_type", (x,), dtype)
