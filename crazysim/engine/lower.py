@@ -95,7 +95,7 @@ class Lowering:
             args = [self.elementwise("not", [x], bool) if k == negated else x for k, x in enumerate(args)]
         shape = np.broadcast_shapes(*(x.shape for x in args))
         rows = [np.broadcast_to(x, shape).reshape(-1) for x in args]
-        if args[-1].size and isinstance(rows[-1][0], tuple):  # keys: both halves alike
+        if rows[-1].size and isinstance(rows[-1][0], tuple):  # keys: both halves alike
             pairs = [[self.scalar(op, c[0], *(k[i] for k in c[1:])) for i in (0, 1)] for c in zip(*rows, strict=True)]
             return as_elements([(a, b) for a, b in pairs], shape)
         return as_elements([self.builder.add(op, column, dtype, params) for column in zip(*rows, strict=True)], shape)

@@ -24,6 +24,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 if __name__ == "__main__":  # the environment must be set before JAX is imported
     sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -40,7 +41,7 @@ from programs import Program, draw, evaluate, kept
 
 from crazysim import Sim
 from crazysim.core.stage import Stage, stage
-from crazysim.engine import Step, native
+from crazysim.engine import Step, ir, native
 from crazysim.engine.step import ENGINES
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
@@ -79,7 +80,7 @@ class Results(PyTree):
 SHAPES = {"f": [(), (3,), (4,), (2, 3), (3, 3)], "i": [(), (3,), (2, 3)], "u": [(), (3,)], "b": [(), (3,)]}
 DTYPES = {"f": np.float32, "i": np.int32, "u": np.uint32, "b": np.bool_}
 SPECIAL = np.float32(
-    [0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 2.0, np.nan, np.inf, -np.inf, 1e-3, 1e30, -1e30, 1e-30, 3e38, 89.0, -104.0,
+    [0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 2.0, np.nan, np.inf, -np.inf, 1e-3, 1e30, -1e30, 1e-30, 8e37, 89.0, -104.0,
      8388609.0, -2147483648.0, 4294967296.0, 1.5, -2.5, TINY, 1e5, 0.99999994]
 )  # fmt: skip
 
@@ -190,6 +191,17 @@ class Find:
         return f"--- {self.engine}, one {self.case.scope}: {self.what}\n{self.case.program}"
 
 
+_SIMPLIFY = ir.simplify
+
+
+def _exactly(op: str, args: tuple[Any, ...], dtype: np.dtype, params: tuple) -> Any:
+    """Return what ``ir.simplify`` does, but for products with zero, and quotients of zero."""
+    if op in ("mul", "div") and dtype.kind == "f" and not all(map(ir.is_constant, args)):
+        if any(ir.is_constant(x) and x == 0 for x in args):
+            return None
+    return _SIMPLIFY(op, args, dtype, params)
+
+
 class Fuzzer:
     """Runs programs on all engines and counts."""
 
@@ -273,7 +285,9 @@ class Fuzzer:
                 found[engine] = self.run(cases, engine)
                 self.counts[f"ms {engine}"] += int(1e3 * (time.perf_counter() - start))
             except Exception as error:
-                if len(cases) == 1:
+                if len(cases) == 1 and engine == "plain":
+                    self.counts["refused by JAX"] += 1
+                elif len(cases) == 1:
                     yield Find(cases[0], engine, f"{type(error).__name__}: {str(error)[:2000]}")
                 else:
                     half = len(cases) // 2
@@ -284,34 +298,60 @@ class Fuzzer:
             for engine in engines:
                 self.counts[f"compared on {engine}"] += 1
                 find = self._first_difference(case, engine, found["plain"][k], found[engine][k])
-                if find is not None:
-                    yield find
-                    break
+                if find is None:
+                    continue
+                if self._without_zero_products(case, engine, found["plain"][k]):
+                    self.counts["product with a constant zero"] += 1
+                    continue
+                yield find
+                break
 
     def _first_difference(self, case: Case, engine: str, plain: list[Any], other: list[Any]) -> Find | None:
         """Return the first value that differs for no good reason."""
         n = len(case.program.inputs)
         inputs = [self._lanes(case.scope, name) for name in case.program.inputs]
         for j, (a, b) in enumerate(zip(plain, other, strict=True)):
-            bad = ~_close(a, b)
+            signed = _keeps_sign_of_zero(case.program.lines[j], case.avals[: n + j])
+            bad = ~_close(a, b, signed)
             lanes = np.flatnonzero(bad.reshape(len(a), -1).any(1))
             if not len(lanes):
                 continue
             self.counts["looked at again"] += 1
             values = [*inputs, *other[:j]]
-            lanes = lanes[~_explained(case.program.lines[j], [x[lanes] for x in values], b[lanes])]
+            lanes = lanes[~_explained(case.program.lines[j], [x[lanes] for x in values], b[lanes], signed)]
             if not len(lanes):
                 continue
             lane = lanes[0]
             smaller = kept(case.program, n + j)
-            shown = ", ".join(f"v{m}={_text(v[lane])}" for m, v in enumerate([*inputs, *plain[:j]]) if f"v{m}" in case.program.lines[j])
+            shown = ", ".join(f"v{m}={_text(v[lane])}" for m, v in enumerate([*inputs, *other[:j]]) if f"v{m}" in case.program.lines[j])
             what = f"{case.program.lines[j]} with {shown}: plain {_text(a[lane])}, {engine} {_text(b[lane])} ({len(lanes)} lanes)"
             return Find(Case(smaller, case.scope), engine, what)
         return None
 
+    def _without_zero_products(self, case: Case, engine: str, plain: list[Any]) -> bool:
+        """Return whether a program is right once a product with a constant zero is computed, not taken for zero."""
+        with mock.patch.object(ir, "simplify", _exactly):
+            (values,) = self.run([case], engine)
+        return self._first_difference(case, engine, plain, values) is None
+
     def _lanes(self, scope: str, name: str) -> np.ndarray:
         x = np.asarray(flat(self.given)[name])
         return x.reshape(-1, *x.shape[2:]) if scope == "drone" else x
+
+
+MOVES_ONLY = frozenset(
+    "neg abs sign select_n copy convert_element_type bitcast_convert_type reshape squeeze broadcast_in_dim transpose "
+    "rev slice concatenate gather scatter pad dynamic_slice dynamic_update_slice jit pjit stop_gradient iota lt ge gt "
+    "le eq ne and or not clamp split stack unstack tile sqrt ceil floor round".split()
+)
+"""Primitives that keep the sign of zero on every engine. XLA does not in sums and products, nor do libraries of
+functions."""
+
+
+def _keeps_sign_of_zero(line: str, avals: Sequence[Any]) -> bool:
+    with jax.disable_jit():
+        jaxpr = jax.make_jaxpr(lambda *v: evaluate(line, v))(*avals)
+    return all(eqn.primitive.name in MOVES_ONLY for eqn in jaxpr.jaxpr.eqns)
 
 
 def _text(x: Any) -> str:
@@ -319,8 +359,8 @@ def _text(x: Any) -> str:
     return np.array2string(x.astype(np.float32) if x.dtype.kind == "V" else x, separator=",", precision=9).replace("\n", "")
 
 
-def _close(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return where values are equal, or numbers to a few units in the last place with the same sign of zero."""
+def _close(a: np.ndarray, b: np.ndarray, signed: bool) -> np.ndarray:
+    """Return where values are equal, or numbers to a few units in the last place, the sign of zero if asked for."""
     if not jnp.issubdtype(a.dtype, jnp.floating):
         return a == b
     eps = max(EPS, float(jnp.finfo(a.dtype).eps))
@@ -328,66 +368,62 @@ def _close(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
         near = np.abs(a - b) <= UNITS * eps * np.maximum(np.abs(a), np.abs(b))
         near |= (np.abs(a) <= TINY) & (np.abs(b) <= TINY)  # below is zero to XLA, whose threads flush
-    zeros = (a != 0) | (b != 0) | (np.signbit(a) == np.signbit(b))
+    zeros = np.full(a.shape, True) if not signed else (a != 0) | (b != 0) | (np.signbit(a) == np.signbit(b))
     return ((a == b) & zeros) | (np.isnan(a) & np.isnan(b)) | (near & zeros & np.isfinite(a) & np.isfinite(b))
 
 
-def _explained(line: str, values: list[np.ndarray], found: np.ndarray) -> np.ndarray:
-    """Return for which lanes a value is what the line gives for its operands, within their rounding."""
-    rng = np.random.default_rng(0)
+def _explained(line: str, values: list[np.ndarray], found: np.ndarray, signed: bool) -> np.ndarray:
+    """Return for which lanes a value is what the line gives for its operands, within rounding.
 
-    def disturbed(x: np.ndarray) -> Any:
-        if not jnp.issubdtype(x.dtype, jnp.floating):
-            return jnp.broadcast_to(x, (SAMPLES, *x.shape))
-        noise = rng.uniform(-1, 1, (SAMPLES, *x.shape)) * np.arange(SAMPLES).reshape(-1, *[1] * x.ndim) / SAMPLES
-        eps = float(jnp.finfo(x.dtype).eps)
-        with np.errstate(all="ignore"):
-            x64 = x.astype(np.float64)
-            out = np.where(np.isfinite(x64), x64 * (1 + 3 * eps * noise), x64)
-            out = out.astype(x.dtype)
-        return jnp.asarray(np.where(np.isinf(out.astype(np.float64)) & np.isfinite(x64), x, out))
-
-    samples = [disturbed(x) for x in values]
-    results = np.asarray(jax.vmap(jax.vmap(lambda *v: evaluate(line, v)))(*samples))
+    The line is computed primitive by primitive, many times, and every result of arithmetic disturbed by a few units in
+    the last place.
+    """
+    results = np.asarray(_disturbed(line, values))
     if not jnp.issubdtype(results.dtype, jnp.floating):
         ok = (results == found).any(0)
         return ok.reshape(len(ok), -1).all(1)
-    size = _largest(line, values)
     r, f = results.astype(np.float64), found.astype(np.float64)
     eps = max(EPS, float(jnp.finfo(results.dtype).eps))
     with np.errstate(all="ignore"):
-        low, high = np.nanmin(np.where(np.isnan(r), np.inf, r), 0), np.nanmax(np.where(np.isnan(r), -np.inf, r), 0)
-        slack = UNITS * eps * np.maximum(np.abs(low), np.abs(high)) + 8 * eps * size.reshape(-1, *[1] * (f.ndim - 1)) + TINY
+        low, high = np.min(np.where(np.isnan(r), np.inf, r), 0), np.max(np.where(np.isnan(r), -np.inf, r), 0)
+        slack = UNITS * eps * np.maximum(np.abs(low), np.abs(high)) + (high - low) + TINY
         slack = np.where(np.isfinite(slack), slack, 0)
-        within = (f >= low - slack) & (f <= high + slack) & ~((f == 0) & (r == 0).all(0) & (np.signbit(f) != np.signbit(r[0])))
+        within = (f >= low - slack) & (f <= high + slack)
+        if signed:
+            within &= ~((f == 0) & (r == 0).all(0) & (np.signbit(f) != np.signbit(r[0])))
         ok = within | (np.isnan(f) & np.isnan(r).any(0)) | (f == r).any(0) & ((f != 0) | within)
     return ok.reshape(len(ok), -1).all(1)
 
 
-def _largest(line: str, values: list[np.ndarray]) -> np.ndarray:
-    """Return the largest finite intermediate of a line for each lane."""
-    sizes = [np.zeros(len(values[0]))]
+EXACT = MOVES_ONLY | {"max", "min", "sort", "while", "scan", "cond", "reduce_max", "reduce_min", "clamp", "random_bits"}
+"""Primitives whose results are not disturbed: they do not round, or consist of others."""
 
-    def note(x: Any) -> None:
-        x = np.asarray(x)
-        if jnp.issubdtype(x.dtype, jnp.floating) and x.ndim and len(x) == len(values[0]):
-            flat_x = np.abs(x.astype(np.float64)).reshape(len(x), -1)
-            if flat_x.shape[1]:
-                sizes.append(np.where(np.isfinite(flat_x), flat_x, 0).max(1))
 
-    with jax.disable_jit():
-        jaxpr = jax.make_jaxpr(jax.vmap(lambda *v: evaluate(line, v)))(*values)
-    for v in values:
-        note(v)
+def _disturbed(line: str, values: list[np.ndarray]) -> Any:
+    """Return a line's value with disturbed arithmetic. (SAMPLES, n_lanes, ...)"""
+    rng = np.random.default_rng(0)
+    samples = [jnp.broadcast_to(x, (SAMPLES, *x.shape)) for x in values]
+    with jax.disable_jit():  # so that calls are written out
+        jaxpr = jax.make_jaxpr(jax.vmap(jax.vmap(lambda *v: evaluate(line, v))))(*samples)
+    strength = np.linspace(0, 4, SAMPLES)  # the first is not disturbed
+
+    def noisy(x: Any) -> Any:
+        if jax.dtypes.issubdtype(x.dtype, jax.dtypes.extended) or not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        if x.shape[:2] != samples[0].shape[:2]:
+            return x
+        noise = rng.uniform(-1, 1, x.shape) * strength.reshape(-1, *[1] * (x.ndim - 1)) * float(jnp.finfo(x.dtype).eps)
+        disturbed = (x.astype(np.float32) * (1 + noise.astype(np.float32))).astype(x.dtype)
+        return jnp.where(jnp.isfinite(disturbed), disturbed, x)
+
     env: dict[Any, Any] = dict(zip(jaxpr.jaxpr.constvars, jaxpr.consts, strict=True))
-    env.update(zip(jaxpr.jaxpr.invars, values, strict=True))
+    env.update(zip(jaxpr.jaxpr.invars, map(noisy, samples), strict=True))
     for eqn in jaxpr.jaxpr.eqns:
-        args = [v.val if hasattr(v, "val") else env[v] for v in eqn.invars]
-        outs = _apply(eqn, args)
-        for v, x in zip(eqn.outvars, outs, strict=True):
-            env[v] = x
-            note(x) if not jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.extended) else None
-    return np.max(sizes, axis=0)
+        outs = _apply(eqn, [v.val if hasattr(v, "val") else env[v] for v in eqn.invars])
+        exact = eqn.primitive.name in EXACT
+        env.update(zip(eqn.outvars, outs if exact else map(noisy, outs), strict=True))
+    (out,) = jaxpr.jaxpr.outvars
+    return out.val if hasattr(out, "val") else env[out]
 
 
 def _apply(eqn: Any, args: list[Any]) -> list[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import numpy as np
 
 from crazysim.engine.lower import Elements, Lowering, UnsupportedError, constants, rule
@@ -23,6 +24,11 @@ def _each(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     name = eqn.primitive.name
     params = tuple(sorted((k, eqn.params[k]) for k in ELEMENTWISE[name]))
     return [ctx.elementwise(name, args, eqn.outvars[0].aval.dtype, params)]
+
+
+def is_floating(dtype: Any) -> bool:
+    """Return whether numbers are of floating point, bfloat16 included, which NumPy does not count among them."""
+    return jax.dtypes.issubdtype(dtype, np.floating)
 
 
 @rule("convert_element_type")
@@ -47,9 +53,18 @@ def _select_n(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 @rule("bitcast_convert_type")
 def _bitcast(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     before, after = eqn.invars[0].aval.dtype, eqn.params["new_dtype"]
+    if before == after:
+        return args
     if before.itemsize != np.dtype(after).itemsize:
         raise UnsupportedError(f"primitive 'bitcast_convert_type' from {before} to {after}, of another size")
     return [ctx.elementwise("bitcast_convert_type", args, after)]
+
+
+@rule("pow")
+def _pow(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """A power, with an integer exponent converted to the type of the base."""
+    dtype = eqn.outvars[0].aval.dtype
+    return [ctx.elementwise("pow", [ctx.elementwise("convert_element_type", [x], dtype) for x in args], dtype)]
 
 
 @rule("square")
@@ -81,7 +96,7 @@ def _add_any(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 def _total_order(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Comparisons in which NaN is the largest number, and equal to itself."""
     name = eqn.primitive.name.removesuffix("_to")
-    if eqn.invars[0].aval.dtype.kind != "f":
+    if not is_floating(eqn.invars[0].aval.dtype):
         return [ctx.elementwise(name, args, bool)]
     a_nan, b_nan = (ctx.elementwise("ne", [x, x], bool) for x in args)
     of_nan = {

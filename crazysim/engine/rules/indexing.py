@@ -12,6 +12,7 @@ from jax.lax import GatherScatterMode
 
 from crazysim.engine.ir import Element, constant, is_constant
 from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
+from crazysim.engine.rules.elementwise import is_floating
 from crazysim.engine.rules.movement import move_many, run_now
 
 
@@ -44,7 +45,7 @@ def _dynamic_update_slice(ctx: Lowering, eqn: Any, args: list[Elements]) -> list
     ranges = []
     for start, size, length in zip(starts, update.shape, x.shape, strict=True):
         last = length - size
-        ranges.append([int(np.clip(start, 0, last))] if is_constant(start) or not last else list(range(last + 1)))
+        ranges.append([last and int(np.clip(start, 0, last))] if not last or is_constant(start) else range(last + 1))
     _check_range(int(np.prod([len(options) for options in ranges])))
     out = x
     for corner in itertools.product(*ranges):
@@ -138,10 +139,10 @@ def _gather_filled(eqn: Any, x: Elements, indices: np.ndarray) -> Elements:
 
 def _fill_value(dtype: Any) -> Any:
     """What JAX fills with: NaN, the least signed or the largest unsigned integer, True."""
+    if is_floating(dtype):
+        return np.nan
     kind = np.dtype(dtype).kind
-    return (
-        np.nan if kind == "f" else np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max if kind == "u" else True
-    )
+    return np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max if kind == "u" else True
 
 
 def _inside(ctx: Lowering, row: Elements, limits: list[int]) -> Elements:

@@ -11,6 +11,7 @@ import numpy as np
 
 from crazysim.engine.ir import Element, constant
 from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
+from crazysim.engine.rules.elementwise import is_floating
 from crazysim.engine.rules.movement import run_now
 
 COMBINE = {
@@ -73,13 +74,13 @@ def _sort(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
         raise UnsupportedError(f"primitive 'sort' of {n} elements; written out are up to {MAX_UNROLL}")
     for turn in range(n):
         for i in range(turn % 2, n - 1, 2):
-            first = [np.asarray(c[i], object) for c in columns]
-            second = [np.asarray(c[i + 1], object) for c in columns]
+            first = [c[i, ...].copy() for c in columns]
+            second = [c[i + 1, ...].copy() for c in columns]
             swap, tied = constants(False, bool), constants(True, bool)
             for a, b, dtype in zip(first[:n_keys], second[:n_keys], dtypes, strict=False):
                 above = ctx.elementwise("lt", [b, a], bool)
                 equal = ctx.elementwise("eq", [a, b], bool)
-                if dtype.kind == "f":
+                if is_floating(dtype):
                     a_nan, b_nan = ctx.elementwise("ne", [a, a], bool), ctx.elementwise("ne", [b, b], bool)
                     above = ctx.elementwise(
                         "or",

@@ -29,11 +29,12 @@ UNARY(rsqrt, RSQRTF(x), 1.0 / sqrt(x)) UNARY(tan, tanf(x), tan(x)) UNARY(tanh, t
 UNARY(logistic, 1.0f / (1.0f + expf(-x)), 1.0 / (1.0 + exp(-x)))
 UNARY(round_even, rintf(x), rint(x)) UNARY(round_away, roundf(x), round(x))
 UNARY(neg, -x, -x) UNARY(abs, fabsf(x), fabs(x))
-UNARY(sign, x != x ? x : f32((x > 0) - (x < 0)), x != x ? x : f64((x > 0) - (x < 0)))
+UNARY(sign, x > 0 ? 1.0f : x < 0 ? -1.0f : x, x > 0 ? 1.0 : x < 0 ? -1.0 : x)  // of zero and NaN the same
 FN i32 neg_(i32 x) { return i32(0u - u32(x)); }
 FN u32 neg_(u32 x) { return 0u - x; }
 FN i32 abs_(i32 x) { return x < 0 ? neg_(x) : x; }
 FN i32 sign_(i32 x) { return (x > 0) - (x < 0); }
+FN u32 sign_(u32 x) { return x != 0; }
 FN b1 is_finite_(f32 x) { return fabsf(x) < f32_infinity(); }
 FN b1 is_finite_(f64 x) { return fabs(x) < f64_infinity(); }
 
