@@ -275,6 +275,20 @@ def made_of_nothing(d: Draw) -> str:
     ])  # fmt: skip
 
 
+@template("movement", 3)
+def numbers_that_are_known(d: Draw) -> str:
+    """Constants that the engines fold: what follows is likely to be computed before the program runs."""
+    floats = "0.0 -0.0 1.0 -1.0 0.5 2.5 -3.5 np.nan np.inf -np.inf 1e30 3e9 -3e9 255.5 1e-30 100000.0".split()
+    integers = "0 1 -1 3 -7 127 128 255 256 2147483647 -2147483648 65536".split()
+    return d.choice([
+        f"lax.full((3,), np.float32({d.choice(floats)}))", f"lax.full((), np.int32({d.choice(integers)}))",
+        f"lax.full((3,), np.uint32(np.int64({d.choice(integers)}) & 0xffffffff))", f"lax.full((), {d.choice(['True', 'False'])})",
+        f"np.float32([{d.choice(floats)}, {d.choice(floats)}, {d.choice(floats)}]) + 0 * jnp.arange(3)",
+        f"jnp.asarray(np.float32([{d.choice(floats)}, {d.choice(floats)}, {d.choice(floats)}]))",
+        f"jnp.asarray(np.int32([{d.choice(integers)}, {d.choice(integers)}, {d.choice(integers)}]))",
+    ])  # fmt: skip
+
+
 # Reductions
 REDUCTIONS = "sum prod max min mean var std argmax argmin any all nansum nanmax nanmin nanargmax_ cumsum cumprod "
 REDUCTIONS += "count_nonzero ptp nanmean median sort argsort logical_or.reduce_ nancumsum"
@@ -293,7 +307,7 @@ def reductions(d: Draw) -> str:
         f"lax.{d.choice(['reduce_max', 'reduce_min', 'reduce_sum', 'reduce_prod', 'reduce_and', 'reduce_or', 'reduce_xor'])}({x}, ({axis % n},))",
         f"lax.{d.choice(['argmax', 'argmin'])}({x}, {axis % n}, {d.choice(['np.int32', 'np.uint32', 'np.int8'])})",
         f"lax.reduce({x}, {x}.dtype.type({d.int(0, 2)}), lax.{d.choice(['add', 'mul', 'max', 'min'])}, ({axis % n},))",
-        f"lax.reduce({x}, {x}.dtype.type(1), lambda a, b: a * {x}.dtype.type(2) + b, ({axis % n},))",
+        f"lax.reduce(({x}, {x}), ({x}.dtype.type(1), {x}.dtype.type(0)), lambda a, b: (lax.max(a[0], b[0]), lax.add(a[1], b[1])), ({axis % n},))[{d.int(0, 1)}]",
         f"jnp.linalg.norm({x}, axis={axis})", f"jax.nn.softmax({x}, {axis})", f"jax.nn.logsumexp({x}, {axis})",
         f"jax.nn.log_softmax({x}, {axis})", f"jnp.quantile({x}, 0.3, axis={axis})", f"jnp.cumsum({x}, {axis})",
         f"jax.nn.standardize({x}, {axis})", f"jnp.ptp({x}, {axis})", f"jnp.average({x}, {axis})",

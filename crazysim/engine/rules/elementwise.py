@@ -113,6 +113,13 @@ def _barrier(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     return args
 
 
+@rule("device_put")
+def _device_put(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    if any(device is not None for device in eqn.params["devices"]):
+        raise UnsupportedError("primitive 'device_put' to a device that is named")
+    return args
+
+
 @rule("copy", "copy_p", "stop_gradient", "pvary", "random_clone", "name")
 def _identity(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     return args
