@@ -330,7 +330,13 @@ class Fuzzer:
                 continue
             self.counts["looked at again"] += 1
             values = [*inputs, *other[:j]]
-            lanes = lanes[~_explained(case.program.lines[j], [x[lanes] for x in values], b[lanes], signed)]
+            line = case.program.lines[j]
+            lanes = lanes[~_explained(lambda *v: evaluate(line, v), [x[lanes] for x in values], b[lanes], signed)]  # noqa: B023
+            if not len(lanes):
+                continue
+            # A compiler may compute an operand once more, and round it otherwise there.
+            names = case.program.inputs
+            lanes = lanes[~_explained(lambda *v: case.program.values(dict(zip(names, v)))[n + j], [x[lanes] for x in inputs], b[lanes], signed)]  # noqa: B023, B905
             if not len(lanes):
                 continue
             lane = lanes[0]
@@ -361,9 +367,24 @@ functions."""
 
 
 def _keeps_sign_of_zero(line: str, avals: Sequence[Any]) -> bool:
-    with jax.disable_jit():
-        jaxpr = jax.make_jaxpr(lambda *v: evaluate(line, v))(*avals)
-    return all(eqn.primitive.name in MOVES_ONLY for eqn in jaxpr.jaxpr.eqns)
+    return all(name in MOVES_ONLY for name in _primitives(_written_out(lambda *v: evaluate(line, v), avals).jaxpr))
+
+
+def _primitives(jaxpr: Any) -> Iterator[str]:
+    for eqn in jaxpr.eqns:
+        yield eqn.primitive.name
+        for x in jax.tree.leaves(list(eqn.params.values()), is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")):
+            if hasattr(x, "eqns") or hasattr(x, "jaxpr"):
+                yield from _primitives(getattr(x, "jaxpr", x))
+
+
+def _written_out(fn: Any, args: Sequence[Any]) -> Any:
+    """Return the jaxpr of a function, with the functions that it calls written out if JAX can do that."""
+    try:
+        with jax.disable_jit():
+            return jax.make_jaxpr(fn)(*args)
+    except Exception:  # without jit, JAX sees concrete values and refuses some conversions of them
+        return jax.make_jaxpr(fn)(*args)
 
 
 def _text(x: Any) -> str:
@@ -384,13 +405,13 @@ def _close(a: np.ndarray, b: np.ndarray, signed: bool) -> np.ndarray:
     return ((a == b) & zeros) | (np.isnan(a) & np.isnan(b)) | (near & zeros & np.isfinite(a) & np.isfinite(b))
 
 
-def _explained(line: str, values: list[np.ndarray], found: np.ndarray, signed: bool) -> np.ndarray:
-    """Return for which lanes a value is what the line gives for its operands, within rounding.
+def _explained(fn: Any, values: list[np.ndarray], found: np.ndarray, signed: bool) -> np.ndarray:
+    """Return for which lanes a value is what a function gives for its operands, within rounding.
 
-    The line is computed primitive by primitive, many times, and every result of arithmetic disturbed by a few units in
+    The function is computed primitive by primitive, many times, and every result of arithmetic disturbed by a few units in
     the last place.
     """
-    results = np.asarray(_disturbed(line, values))
+    results = np.asarray(_disturbed(fn, values, len(found)))
     if not jnp.issubdtype(results.dtype, jnp.floating):
         ok = (results == found).any(0)
         return ok.reshape(len(ok), -1).all(1)
@@ -411,18 +432,18 @@ EXACT = MOVES_ONLY | {"max", "min", "sort", "while", "scan", "cond", "reduce_max
 """Primitives whose results are not disturbed: they do not round, or consist of others."""
 
 
-def _disturbed(line: str, values: list[np.ndarray]) -> Any:
-    """Return a line's value with disturbed arithmetic. (SAMPLES, n_lanes, ...)"""
+def _disturbed(fn: Any, values: list[np.ndarray], n_lanes: int) -> Any:
+    """Return a function's value with disturbed arithmetic. (SAMPLES, n_lanes, ...)"""
     rng = np.random.default_rng(0)
     samples = [jnp.broadcast_to(x, (SAMPLES, *x.shape)) for x in values]
-    with jax.disable_jit():  # so that calls are written out
-        jaxpr = jax.make_jaxpr(jax.vmap(jax.vmap(lambda *v: evaluate(line, v))))(*samples)
+    each = jax.vmap(fn, axis_size=n_lanes)
+    jaxpr = _written_out(jax.vmap(each, axis_size=SAMPLES), samples)
     strength = np.linspace(0, 4, SAMPLES)  # the first is not disturbed
 
     def noisy(x: Any) -> Any:
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.extended) or not jnp.issubdtype(x.dtype, jnp.floating):
             return x
-        if x.shape[:2] != samples[0].shape[:2]:
+        if x.shape[:2] != (SAMPLES, n_lanes):
             return x
         noise = rng.uniform(-1, 1, x.shape) * strength.reshape(-1, *[1] * (x.ndim - 1)) * float(jnp.finfo(x.dtype).eps)
         disturbed = (x.astype(np.float32) * (1 + noise.astype(np.float32))).astype(x.dtype)

@@ -136,6 +136,8 @@ def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Element
 def _dot(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     (lhs_axes, rhs_axes), (lhs_batch, rhs_batch) = eqn.params["dimension_numbers"]
     dtype, (a, b) = eqn.outvars[0].aval.dtype, args
+    if any(is_floating(v.aval.dtype) for v in eqn.invars) and not is_floating(dtype):
+        raise UnsupportedError(f"primitive 'dot_general' of floating-point numbers with a result of type {dtype}")
 
     def arranged(x: Elements, batch: Sequence[int], summed: Sequence[int]) -> tuple[Elements, tuple[int, ...]]:
         free = [i for i in range(x.ndim) if i not in (*batch, *summed)]
