@@ -4,7 +4,7 @@ VENV ?= .venv
 RUN = $(VENV)/bin/python
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 
-.PHONY: demo test check format benchmark clean
+.PHONY: demo test check docs format benchmark clean
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -23,6 +23,10 @@ check: $(VENV)/installed
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/pyright
 	$(VENV)/bin/lint-imports --no-cache
+
+docs: $(VENV)/installed
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict  # --quiet would hide its warnings from --strict
+	@echo "wrote out/site/index.html"
 
 format: $(VENV)/installed
 	$(VENV)/bin/ruff format .

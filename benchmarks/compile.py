@@ -1,7 +1,7 @@
-"""How long until the first step? Building, tracing and compiling apart, for each command level and integrator.
+"""Time to the first step: building, tracing and compiling, for each command level and integrator.
 
-Every case runs in a process of its own, so that each compiles everything anew. ``trace_s`` holds the C++ or CUDA
-compiler of ``fused``, which runs while the step is lowered.
+Each case runs in its own process, so that nothing is cached. ``trace_s`` includes the C++ or CUDA compiler of
+``fused``, which runs while the step is lowered.
 
     python benchmarks/compile.py [--engine auto plain lanes fused] [--device gpu] [--worlds 1 1024 16384]
 """
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def measure(control: str, integrator: str, n_worlds: int, engine: str, device: str) -> dict[str, Any]:
-    """Return the figures of one case."""
+    """Return the times of one case."""
     begin = time.perf_counter()
     sim = Sim(n_worlds=n_worlds, control=control, integrator=integrator, engine=engine, device=device)
     hovering(sim, control)

@@ -1,4 +1,4 @@
-"""One program, crazysim or Crazyflow, in a process of its own: ``versus_crazyflow.py`` asks it by JSON lines.
+"""Server process for one program, crazysim or Crazyflow: ``versus_crazyflow.py`` sends requests as JSON lines.
 
 python benchmarks/contestant.py crazysim
 """
@@ -17,7 +17,7 @@ def main(package: str) -> None:
     """Answer requests until standard input ends."""
     begin = time.perf_counter()
     module = importlib.import_module(f"{package}.sim")
-    import jax  # behind the package, whose import it is a part of
+    import jax  # after the package, so that its import counts as part of the package's
     from measure import machine
 
     import_s = time.perf_counter() - begin
@@ -48,7 +48,7 @@ def main(package: str) -> None:
 
 
 def build(package: str, task: str, case: dict[str, Any], device: str) -> Any:
-    """Return what is to be timed: a flight, or its gradient."""
+    """Return the case to time: a flight or its gradient."""
     from measure import Flight
 
     if task == "gym":
@@ -62,10 +62,10 @@ def build(package: str, task: str, case: dict[str, Any], device: str) -> Any:
 
 
 class Gradient:
-    """The gradient of how far drones fly by their attitude commands, timed as ``measure.Flight`` is."""
+    """Gradient of the final positions with respect to attitude commands, timed like ``measure.Flight``."""
 
     def __init__(self, package: str, sim: Any, n_steps: int):
-        """Compile it."""
+        """Compile the gradient."""
         import jax
         import jax.numpy as jnp
         from measure import hovering, seconds
@@ -83,11 +83,11 @@ class Gradient:
         self.first_s = self.seconds()
 
     def seconds(self) -> float:
-        """Return the seconds of a call."""
+        """Return the time of one call, s."""
         return self._seconds(lambda: self._grad(self._cmd))
 
     def require_flying(self) -> None:
-        """Refuse a figure of a gradient that is none.
+        """Check that the gradient is finite and not zero.
 
         Raises:
             SystemExit: If it is zero everywhere, or not finite.
@@ -103,7 +103,7 @@ class GymSteps:
     """Steps of a Gymnasium vector environment that reaches a position: the same drone, model, rates and autoreset."""
 
     def __init__(self, package: str, case: dict[str, Any], device: str):
-        """Make it, and step a few times, which compiles."""
+        """Make the environment and step it a few times, which compiles it."""
         import gymnasium
         import jax
         import numpy as np
@@ -111,9 +111,9 @@ class GymSteps:
         importlib.import_module(f"{package}.envs")
         settings = {"num_envs": case["n_worlds"], "freq": case["freq"], "dynamics": "so_rpy", "device": device}
         if package == "crazysim":
-            settings |= {"drone": "cf2x_L250", "seconds": 10.0}  # what the peer's has
+            settings |= {"drone": "cf2x_L250", "seconds": 10.0}  # the settings of Crazyflow's environment
         self._env = gymnasium.make_vec({"crazysim": "crazysim/Hover-v0"}.get(package, "DroneReachPos-v0"), **settings)
-        # Near hover: no world falls on the floor, so that resets are as rare as they are in use.
+        # Near hover no world crashes, so resets are as rare as in use.
         box = self._env.single_action_space
         action = np.zeros(4) if package == "crazysim" else np.array([0, 0, 0, 0.0319 * 9.81])
         action = np.clip(action, box.low, box.high).astype(np.float32)
@@ -124,7 +124,7 @@ class GymSteps:
         self.seconds()
 
     def seconds(self) -> float:
-        """Return the seconds of some steps, waited for at the end."""
+        """Return the time of several steps with one synchronisation at the end, s."""
         import jax
 
         begin = time.perf_counter()
@@ -134,7 +134,7 @@ class GymSteps:
         return time.perf_counter() - begin
 
     def require_flying(self) -> None:
-        """Refuse a figure of drones that crash all the time.
+        """Check that the drones do not crash all the time.
 
         Raises:
             SystemExit: If they do.
@@ -150,14 +150,14 @@ OBJECTS = {
     "pole": ('<geom type="capsule" size="0.02 0.8"/>', [[3, 1, 1], [3, 2, 1]]),
     "ball": ('<geom type="sphere" size="0.1"/>', [[2, 0, 1.1], [-3, 2, 1]]),
 }
-"""Eight objects that can be moved, none in the way of the drones: what they are, and where."""
+"""Kinds and positions of eight movable objects, none of them in the way of the drones."""
 TURN = 0.25
-"""Seconds of answers in a turn, whose median counts: the first after a pause take longer, for the machine has slept."""
+"""Duration of a batch of queries, s. Their median counts, because the first after a pause are slower."""
 QUESTIONS = ("contacts", "depth", "swarm_build")
 
 
 def scene(module: Any, package: str, n_worlds: int, n_drones: int, device: str) -> Any:
-    """Return hovering drones among the objects, which each program is given in its own way."""
+    """Return a simulation of hovering drones among the objects, built with the API of the program."""
     import mujoco
     from measure import hovering
 
@@ -179,7 +179,7 @@ def scene(module: Any, package: str, n_worlds: int, n_drones: int, device: str) 
 
 
 def memory(sim: Any, package: str) -> int:
-    """Return the bytes that live on the device after a question about contacts."""
+    """Return the bytes in use on the device after a contact query."""
     import jax
 
     sim.step()
@@ -188,10 +188,10 @@ def memory(sim: Any, package: str) -> int:
 
 
 class Question:
-    """A question about the scene after a step, timed without the step; or building a swarm."""
+    """Scene query after a step, timed without the step; or the construction of a swarm."""
 
     def __init__(self, package: str, task: str, case: dict[str, Any], device: str):
-        """Build the scene, and ask once."""
+        """Build the scene and query it once."""
         self._module, self._case, self._device = importlib.import_module(f"{package}.sim"), case, device
         self._task, self._sim = task, None
         if task != "swarm_build":
@@ -206,7 +206,7 @@ class Question:
         self.first_s = self.seconds()
 
     def seconds(self) -> float:
-        """Return the seconds of an answer."""
+        """Return the time of one query, s."""
         import jax
 
         if self._task == "swarm_build":
@@ -223,10 +223,10 @@ class Question:
         return statistics.median(seconds)
 
     def require_flying(self) -> None:
-        """Refuse a figure of drones that lie on the floor.
+        """Check that the drones are still flying.
 
         Raises:
-            SystemExit: If they do.
+            SystemExit: If they are not.
         """
         from measure import still_flies
 

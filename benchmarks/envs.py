@@ -1,9 +1,9 @@
-"""Steps of environments per second: random actions, and a policy, in one compiled rollout with automatic resets.
+"""Environment steps per second, with random actions and with a policy, in one compiled rollout with automatic resets.
 
     python benchmarks/envs.py [--device gpu] [--tasks hover race] [--worlds 4096 1048576]
 
-A step of an environment is ten of physics, at 50 Hz of 500. Worlds that crash begin anew, as in training; the share of
-worlds that end with a step is printed with every figure.
+An environment step at 50 Hz is ten physics steps at 500 Hz. Worlds that crash are reset, as in training; every line
+contains the fraction of worlds whose episode ends per step.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ SIZES = {"cpu": (1024, 16384), "gpu": (4096, 65536, 1048576)}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--tasks", nargs="+", default=["hover"], help="of crazysim.envs.TASKS")
+    parser.add_argument("--tasks", nargs="+", default=["hover"], help="names in crazysim.envs.TASKS")
     parser.add_argument("--worlds", type=int, nargs="+", help="numbers of worlds")
-    parser.add_argument("--steps", type=int, default=50, help="environment steps a call")
+    parser.add_argument("--steps", type=int, default=50, help="environment steps per call")
     parser.add_argument("--repeats", type=int, default=7)
     args = parser.parse_args()
     for task in args.tasks:

@@ -1,6 +1,6 @@
-"""The one way of measuring: compile apart, warm up, wait for the device, repeat, take the median.
+"""Shared timing: compile separately, warm up, synchronise, repeat, take the median.
 
-Neither program is imported here: the peer's environment, which has no crazysim, measures with this as well.
+This module imports neither program, because it also runs in Crazyflow's environment, which has no crazysim.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ COMMANDS = {
     "force_torque": lambda weight, hover_rpm: [weight, 0.0, 0.0, 0.0],
     "rotor_vel": lambda weight, hover_rpm: [hover_rpm] * 4,
 }
-"""A command of each level under which a cf21B_500 hovers: a drone that has crashed is no work to simulate."""
+"""Command of each level that makes a cf21B_500 hover, since a crashed drone costs less to simulate."""
 
 BATCH_STEPS = {"cpu": 100, "gpu": 1000}
-"""Steps between two returns to the start. Hovering without a position controller drifts: 7 cm in 1,000 steps."""
+"""Steps after which the flight restarts; hovering without a position controller drifts by 7 cm in 1,000 steps."""
 
 PATIENCE = 60.0
-"""Seconds after which three repeats are enough."""
+"""Duration after which three repeats are enough, s."""
 
 
 def hovering(sim: Any, control: str) -> None:
-    """Put every drone of a simulation (ours or the peer's) at 1 m with its rotors at hover, and command it so.
+    """Place every drone of a simulation of either program at 1 m with hovering rotors, and command it to hover.
 
-    A weight of 0.0434 kg * 9.81 m/s^2 over four rotors needs 15,864 rpm each by the airframe's thrust curve.
+    A weight of 0.0434 kg * 9.81 m/s^2 needs 15,864 rpm of each of four rotors by the thrust curve of the airframe.
     """
     n_worlds, n_drones = sim.n_worlds, sim.n_drones
     states = sim.data.states
@@ -54,34 +54,34 @@ def hovering(sim: Any, control: str) -> None:
 
 
 def still_flies(sim: Any) -> bool:
-    """Return whether every drone is still in the air near its start: whether the figure is of flying drones."""
+    """Return True if every drone is still flying near its start."""
     pos = np.asarray(sim.data.states.pos)
     return bool(np.all(np.isfinite(pos)) and pos[..., 2].min() > 0.5 and pos[..., 2].max() < 2.0)
 
 
 def engine_of(sim: Any) -> str:
-    """Return the engine that steps a simulation of ours, which ``auto`` leaves open."""
+    """Return the engine that steps a simulation of crazysim, as chosen by ``auto``."""
     return sim.explain().split()[1]
 
 
 class Flight:
-    """A hovering simulation (ours or the peer's), timed in batches of calls that all begin at the same data.
+    """Hovering simulation of either program, timed in batches of calls that start from the same data.
 
     On a GPU the calls of a batch are queued back to back, and waited for once at the end. On a CPU every call is
     waited for.
     """
 
     def __init__(self, sim: Any, control: str, n_steps: int, device: str):
-        """Let the drones hover, and step once, which compiles."""
+        """Make the drones hover, and step once, which compiles."""
         hovering(sim, control)
         self.sim, self.n_steps, self.start = sim, n_steps, sim.data
         self.queued = device != "cpu"
         self.calls = max(BATCH_STEPS["gpu" if self.queued else "cpu"] // n_steps, 1)
         self.first_s = seconds(self._step)
-        self.seconds()  # the peer compiles a second time, for data that a step returned; that is in no figure
+        self.seconds()  # Crazyflow compiles a second time for data that a step returned; no figure includes that
 
     def seconds(self) -> float:
-        """Return the seconds a call takes, in one batch of them."""
+        """Return the time of one call in a batch, s."""
         self.sim.data = self.start
         jax.block_until_ready(self.sim.data.states.pos)
         begin = time.perf_counter()
@@ -93,7 +93,7 @@ class Flight:
         return (time.perf_counter() - begin) / self.calls
 
     def require_flying(self) -> None:
-        """Refuse a figure of drones that do not fly.
+        """Check that the drones still fly.
 
         Raises:
             SystemExit: If one does not.
@@ -107,14 +107,14 @@ class Flight:
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """Return the seconds a call takes, waiting for the device included."""
+    """Return the time of a call including synchronisation, s."""
     begin = time.perf_counter()
     jax.block_until_ready(call())
     return time.perf_counter() - begin
 
 
 def medians(measures: dict[str, Callable[[], float]], repeats: int) -> dict[str, float]:
-    """Return the median of what each measure returns, taken in turns, so that noise meets all of them alike."""
+    """Return the median of each measurement, alternating between them so that noise affects all equally."""
     found: dict[str, list[float]] = {name: [] for name in measures}
     begin = time.perf_counter()
     for done in range(repeats):
@@ -126,23 +126,23 @@ def medians(measures: dict[str, Callable[[], float]], repeats: int) -> dict[str,
 
 
 def alone(function: Any, *args: Any) -> Any:
-    """Return what a function returns in a new process, where nothing is compiled yet."""
+    """Return the result of a function in a new process, where nothing is compiled yet."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(function, *args).result()
 
 
 def digits(value: float, n: int = 3) -> float:
-    """Return a figure with the digits that mean something."""
+    """Return a number rounded to its significant digits."""
     return float(f"{value:.{n}g}")
 
 
 def report(device: str, **line: Any) -> None:
-    """Print one JSON line with what the figure was made on."""
+    """Print one JSON line with the results and the machine."""
     print(json.dumps(line | machine(device)), flush=True)
 
 
 def machine(device: str) -> dict[str, Any]:
-    """Return what a figure depends on besides the program."""
+    """Return device, processor and versions."""
     return {
         "device": "cpu" if device == "cpu" else jax.devices(device)[0].device_kind,
         "processor": _processor(),
@@ -154,7 +154,7 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """Return the name of the processor, as far as the system knows it."""
+    """Return the name of the processor as reported by the system."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

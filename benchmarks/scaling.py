@@ -1,11 +1,11 @@
-"""How does it scale? Steps per second, compile time and bytes, by number of worlds and by drones a world.
+"""Scaling of steps per second, compile time and bytes with the number of worlds and of drones per world.
 
-One JSON line for each engine and size, of two series: ``worlds`` of one drone each, and ``drones`` a world, of which
-there are always as many in all. Every case runs in a process of its own, so that each compiles everything anew.
-``bytes_a_world`` are those of ``sim.data`` that belong to worlds and drones; what all share is not in it.
+One JSON line for each engine and size, in two series: ``worlds`` of one drone each, and ``drones`` per world with a
+constant total. Each case runs in its own process, so that nothing is cached. ``bytes_a_world`` are the bytes of
+``sim.data`` per world, without shared leaves.
 
     python benchmarks/scaling.py [--engine plain lanes fused] [--most-worlds 4194304] [--plot out/scaling.png]
-    python benchmarks/scaling.py --lines out/scaling.jsonl --plot out/scaling.png     # plots what was measured before
+    python benchmarks/scaling.py --lines out/scaling.jsonl --plot out/scaling.png     # plots stored lines
 """
 
 from __future__ import annotations
@@ -31,13 +31,17 @@ def main() -> None:
     parser.add_argument("--engine", nargs="+", default=["plain", "lanes", "fused"], choices=ENGINES)
     parser.add_argument("--controls", nargs="+", default=["attitude"])
     parser.add_argument("--integrator", default="euler")
-    parser.add_argument("--most-worlds", type=int, default=4**11, help="worlds grow from 1 by factors of 4 up to this")
-    parser.add_argument("--most-drones", type=int, default=256, help="drones a world grow likewise; 0 for none")
-    parser.add_argument("--total", type=int, default=65536, help="drones in all while drones a world grow")
-    parser.add_argument("--steps", type=int, default=100, help="physics steps a call")
+    parser.add_argument(
+        "--most-worlds", type=int, default=4**11, help="largest number of worlds, reached from 1 by factors of 4"
+    )
+    parser.add_argument(
+        "--most-drones", type=int, default=256, help="largest number of drones per world, reached likewise; 0 for none"
+    )
+    parser.add_argument("--total", type=int, default=65536, help="total number of drones in the second series")
+    parser.add_argument("--steps", type=int, default=100, help="physics steps per call")
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--plot", type=Path, help="picture to write; needs matplotlib")
-    parser.add_argument("--lines", type=Path, help="plot the lines of this file, and measure nothing")
+    parser.add_argument("--plot", type=Path, help="image to write; needs matplotlib")
+    parser.add_argument("--lines", type=Path, help="file of JSON lines to plot instead of measuring")
     args = parser.parse_args()
     lines = [json.loads(line) for line in args.lines.read_text().splitlines()] if args.lines else measured(args)
     if args.plot:
@@ -45,7 +49,7 @@ def main() -> None:
 
 
 def measured(args: argparse.Namespace) -> list[dict[str, Any]]:
-    """Print and return a line for every case."""
+    """Print and return one line for each case."""
     sizes = [("worlds", n, 1) for n in powers_of_4(args.most_worlds)]
     sizes += [("drones", max(args.total // n, 1), n) for n in powers_of_4(args.most_drones)]
     lines = []
@@ -59,7 +63,7 @@ def measured(args: argparse.Namespace) -> list[dict[str, Any]]:
                 except (
                     BrokenProcessPool,
                     jax.errors.JaxRuntimeError,
-                ) as error:  # too large: the other sizes still count
+                ) as error:  # out of memory: continue with the other sizes
                     line |= {"error": f"{type(error).__name__}: {error}"[:200]}
                 print(json.dumps(line), flush=True)
                 lines.append(line)
@@ -67,12 +71,12 @@ def measured(args: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def powers_of_4(most: int) -> list[int]:
-    """Return 1, 4, 16 and so on, up to the most."""
+    """Return 1, 4, 16, ... up to a maximum."""
     return [4**k for k in range(most.bit_length()) if 4**k <= most]
 
 
 def measure(case: dict[str, Any], n_steps: int, device: str, repeats: int) -> dict[str, Any]:
-    """Return the figures of one case."""
+    """Return the results of one case."""
     sim = Sim(**case, device=device)
     flight = Flight(sim, case["control"], n_steps, device)
     taken = medians({"step": flight.seconds}, repeats)["step"]
@@ -90,7 +94,7 @@ def measure(case: dict[str, Any], n_steps: int, device: str, repeats: int) -> di
 
 
 def bytes_a_world(sim: Sim) -> int:
-    """Return the bytes of ``sim.data`` that grow with the number of worlds, by world."""
+    """Return the bytes of ``sim.data`` per world, without shared leaves."""
     pairs = zip(jax.tree.leaves(scopes(sim.data)), jax.tree.leaves(sim.data), strict=True)
     return sum(x.nbytes for scope, x in pairs if scope in ("drone", "world")) // sim.n_worlds
 
@@ -100,7 +104,7 @@ MARKS = {"plain": ("#9a6a3a", "s"), "lanes": ("#2b7a78", "o"), "fused": ("#c1443
 
 
 def plot(lines: list[dict[str, Any]], path: Path) -> None:
-    """Draw steps per second and compile time over both series, both axes logarithmic, a line for each engine."""
+    """Plot steps per second and compile time of both series on logarithmic axes, one line per engine."""
     import matplotlib
 
     matplotlib.use("Agg")

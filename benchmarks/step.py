@@ -1,9 +1,9 @@
-"""How many physics steps a second? One JSON line for each engine, command level, integrator, size and steps a call.
+"""Physics steps per second: one JSON line for each engine, command level, integrator, size and steps per call.
 
     python benchmarks/step.py [--engine auto plain lanes fused] [--device gpu] [--worlds 1024 16384] [--steps 10 100]
 
-Engines are timed in turns. ``compile_s`` of ``fused`` holds the kernel only where a process meets that kernel for the
-first time; ``scaling.py`` has every size in a process of its own. Other scripts: ``compile.py``, ``scaling.py``,
+Engines alternate. ``compile_s`` of ``fused`` includes the kernel only the first time that a process needs it;
+``scaling.py`` runs each size in its own process. Other scripts: ``compile.py``, ``scaling.py``,
 ``limits.py``, ``versus_crazyflow.py``.
 """
 
@@ -26,12 +26,12 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engine", nargs="+", default=["auto"], choices=ENGINES)
     parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384])
-    parser.add_argument("--drones", type=int, nargs="+", default=[1], help="drones a world")
+    parser.add_argument("--drones", type=int, nargs="+", default=[1], help="drones per world")
     parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"])
     parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"])
-    parser.add_argument("--steps", type=int, nargs="+", default=[100], help="physics steps a call")
-    parser.add_argument("--randomised", action="store_true", help="parameters of its own for every drone")
-    parser.add_argument("--no-drag", action="store_true", help="a drag matrix of zeros")
+    parser.add_argument("--steps", type=int, nargs="+", default=[100], help="physics steps per call")
+    parser.add_argument("--randomised", action="store_true", help="randomise all parameters per drone")
+    parser.add_argument("--no-drag", action="store_true", help="set the drag matrix to zero")
     parser.add_argument("--repeats", type=int, default=7)
     args = parser.parse_args()
     for case in itertools.product(args.controls, args.integrators, args.worlds, args.drones):
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: int, n_drones: int) -> None:
-    """Print a line for each engine and number of steps; one compilation serves every number."""
+    """Print one line for each engine and number of steps; all numbers share one compilation."""
     sims = {engine: build(args, engine, control, integrator, n_worlds, n_drones) for engine in args.engine}
     compile_s: dict[str, float] = {}
     for n_steps in args.steps:
@@ -66,7 +66,7 @@ def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: i
 
 
 def build(args: argparse.Namespace, engine: str, control: str, integrator: str, n_worlds: int, n_drones: int) -> Sim:
-    """Return the simulation that was asked for."""
+    """Return the simulation given by the options."""
     sim = Sim(n_worlds, n_drones, control=control, integrator=integrator, device=args.device, engine=engine)
     if args.no_drag:
         params = sim.data.params
@@ -77,7 +77,7 @@ def build(args: argparse.Namespace, engine: str, control: str, integrator: str, 
 
 
 def randomised(sim: Sim, spread: float = 1e-4) -> None:
-    """Give every drone its own value of every parameter, so little off that all of them hover."""
+    """Give every drone its own value of every parameter, varied so little that all of them still hover."""
     batch, key = (sim.n_worlds, sim.n_drones), jax.random.key(0)
 
     def own(scope: str, x: jax.Array) -> jax.Array:

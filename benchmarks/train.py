@@ -1,9 +1,9 @@
-"""Trainings that users can trust: several seeds a task, judged by held-out starts, with wall time.
+"""Training results: several seeds per task, evaluated on held-out initial states, with wall time.
 
     python benchmarks/train.py [--device gpu] [--tasks hover recover track race] [--seeds 0 1 2 3 4] [--out out/train]
 
-Each training is a process of its own, as ``crazysim train`` is: import, building, compilation and evaluation are part
-of its time. One JSON line each; with ``--plot FILE`` the learning curves of all.
+Each training runs in its own process, like ``crazysim train``, so its time includes imports, building, compilation and
+evaluation. One JSON line each; ``--plot FILE`` plots all learning curves.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=["hover", "recover", "track", "race"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--out", type=Path, default=Path("out/train"), help="folder of the runs")
-    parser.add_argument("--plot", type=Path, help="picture of the learning curves")
-    parser.add_argument("--only-plot", action="store_true", help="train nothing, plot what is there")
+    parser.add_argument("--plot", type=Path, help="image of the learning curves")
+    parser.add_argument("--only-plot", action="store_true", help="plot existing runs without training")
     args = parser.parse_args()
     curves: dict[str, list[Any]] = {task: [] for task in args.tasks}
     for task in args.tasks:
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def plot(curves: dict[str, list[Any]], path: Path) -> None:
-    """Draw success over time, a panel for each task, a line for each seed."""
+    """Plot success over time, with a panel for each task and a line for each seed."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -60,7 +60,7 @@ def plot(curves: dict[str, list[Any]], path: Path) -> None:
 
 
 def train(task: str, seed: int, folder: Path, device: str) -> None:
-    """Train in a process of its own, and print how it went."""
+    """Train in a new process and print the results."""
     command = [sys.executable, "-m", "crazysim", "train", task, "--seed", str(seed), "--out", str(folder), "--no-film"]
     begin = time.perf_counter()
     done = subprocess.run([*command, "--device", device], capture_output=True, text=True)

@@ -1,18 +1,18 @@
-"""Both programs in one run: crazysim here, Crazyflow 0.4.0 in an environment that this script makes.
+"""Comparison of crazysim with Crazyflow 0.4.0, which runs in a virtual environment that this script creates.
 
-Each runs in a process of its own with the same JAX; the two are timed in turns, a batch each, so that the noise of
-a shared machine meets both. Medians, and the ratio of medians, are printed. What is compared:
+Each program runs in its own process with the same JAX. The two alternate batch by batch, so that the noise of a shared
+machine affects both. Medians and the ratios of medians are printed. The cases:
 
     first_step  from Sim(n_worlds=1) to its first step, in fresh processes
-    step        100 physics steps a call, for each command level, integrator and number of worlds
+    step        100 physics steps per call, for each command level, integrator and number of worlds
     call        one step(1) of one world, for each command level
-    gradient    of 100 attitude steps by their commands, 1,024 worlds
-    swarm       64 drones in 1,024 worlds against as many single drones, ours only
-    contacts    asking for contacts after a step, 4,096 worlds of 4 drones with 8 objects
+    gradient    of 100 attitude steps with respect to their commands, 1,024 worlds
+    swarm       64 drones in 1,024 worlds compared with as many single drones, crazysim only
+    contacts    contact query after a step, 4,096 worlds of 4 drones with 8 objects
     depth       64 x 64 depth of 1,024 worlds with 8 objects
     swarm_build Sim(n_drones=1024)
-    gym         steps of the Gymnasium environments that reach a position, 4,096 worlds, 50 Hz of 500
-    memory      bytes a world after a question about contacts, of one drone and four, with 8 objects
+    gym         steps of the Gymnasium environments that reach a position, 4,096 worlds, 50 Hz at 500 Hz physics
+    memory      bytes per world after a contact query, for one drone and four, with 8 objects
 
     python benchmarks/versus_crazyflow.py [--only step call] [--engine auto lanes] [--worlds 1024 16384]
     python benchmarks/versus_crazyflow.py --device gpu --peer-python PATH/OF/python
@@ -43,17 +43,19 @@ LEVELS = ("rotor_vel", "force_torque", "body_rate", "attitude", "state")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=CASES, default=CASES, help="what to compare")
+    parser.add_argument("--only", nargs="+", choices=CASES, default=CASES, help="cases to run")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engine", nargs="+", default=["auto"], help="engines of crazysim")
-    parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384], help="of 'step'")
-    parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"], help="of 'step'")
-    parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"], help="of 'step'")
+    parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384], help="values for 'step'")
+    parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"], help="values for 'step'")
+    parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"], help="values for 'step'")
     parser.add_argument("--batch-worlds", type=int, default=1024, help="worlds of 'gradient' and 'swarm'")
-    parser.add_argument("--swarm", type=int, default=64, help="drones a world of 'swarm'")
+    parser.add_argument("--swarm", type=int, default=64, help="drones per world of 'swarm'")
     parser.add_argument("--gym-worlds", type=int, default=4096, help="worlds of 'gym'")
     parser.add_argument("--repeats", type=int, default=11)
-    parser.add_argument("--peer-python", type=Path, help="interpreter that has Crazyflow 0.4.0; made if left out")
+    parser.add_argument(
+        "--peer-python", type=Path, help="interpreter with Crazyflow 0.4.0; by default a new environment"
+    )
     args = parser.parse_args()
     pythons = {"crazysim": sys.executable}
     if set(args.only) != {"swarm"}:
@@ -89,15 +91,15 @@ def main() -> None:
 
 
 class Versus:
-    """Contests between engines of crazysim and the peer."""
+    """Comparisons of engines of crazysim with Crazyflow."""
 
     def __init__(self, workers: dict[str, Worker], engines: list[str], device: str, repeats: int):
-        """Take the two programs."""
+        """Store the two programs."""
         self.workers, self.engines, self.device, self.repeats = workers, engines, device, repeats
         self.machine = workers["crazysim"].ask(do="machine", device=device)
 
     def compare(self, benchmark: str, **case: Any) -> None:
-        """Print for each engine its steps per second and compile time, the peer's, and the ratio."""
+        """Print steps per second and compile time of each engine and of Crazyflow, and the ratio."""
         ours, peer = self.workers["crazysim"], self.workers["crazyflow"]
         contestants = {engine: (ours, case | {"engine": engine}) for engine in self.engines}
         found = self._measure(benchmark, contestants | {"crazyflow": (peer, case)})
@@ -112,7 +114,7 @@ class Versus:
             print(json.dumps(line | self.machine), flush=True)
 
     def question(self, task: str, **case: Any) -> None:
-        """Print what an answer takes in either program."""
+        """Print the time of a query in both programs."""
         found = self._measure(task, {name: (worker, case) for name, worker in self.workers.items()})
         line: dict[str, Any] = {"benchmark": f"versus_crazyflow/{task}", **case}
         for name, (seconds, compile_s) in found.items():
@@ -122,7 +124,7 @@ class Versus:
         print(json.dumps(line | self.machine), flush=True)
 
     def memory(self, few: int = 64, many: int = 1088) -> None:
-        """Print the bytes that a world more takes, after a question about contacts."""
+        """Print the bytes per additional world after a contact query."""
         for n_drones in (1, 4):
             line: dict[str, Any] = {"benchmark": "versus_crazyflow/memory", "n_drones": n_drones}
             for name, worker in self.workers.items():
@@ -135,7 +137,7 @@ class Versus:
             print(json.dumps(line | self.machine), flush=True)
 
     def swarm(self, n_worlds: int, n_drones: int) -> None:
-        """Print what drones that share worlds cost, against as many in worlds of their own."""
+        """Print the cost of drones that share worlds, compared with as many in separate worlds."""
         case = {"control": "attitude", "integrator": "euler", "n_steps": 100}
         sizes = {"swarm": (n_worlds, n_drones), "single": (n_worlds * n_drones, 1)}
         for engine in self.engines:
@@ -152,7 +154,7 @@ class Versus:
             print(json.dumps(line | self.machine), flush=True)
 
     def _measure(self, task: str, contestants: dict[str, tuple[Worker, Any]]) -> dict[str, tuple[float, float]]:
-        """Return the median seconds of a call, and those of compiling it, taken in turns."""
+        """Return the median time of a call and of its compilation, s, alternating between the programs."""
         first = {
             name: worker.ask(do="build", task=task, name=name, device=self.device, case=case)["seconds"]
             for name, (worker, case) in contestants.items()
@@ -165,7 +167,7 @@ class Versus:
 
 
 def first_steps(pythons: dict[str, str], device: str, repeats: int = 3) -> None:
-    """Print the time from Sim(n_worlds=1) to its first step, each in a fresh process, in turns."""
+    """Print the time from Sim(n_worlds=1) to its first step in fresh processes, alternating."""
     times: dict[str, list[dict[str, float]]] = {name: [] for name in pythons}
     for _ in range(repeats):
         for name, python in pythons.items():
@@ -180,12 +182,12 @@ def first_steps(pythons: dict[str, str], device: str, repeats: int = 3) -> None:
 
 
 class Worker:
-    """One program in a process of its own, asked by JSON lines."""
+    """Client of one program in its own process, with JSON lines as protocol."""
 
     def __init__(self, python: str, name: str):
         """Start the process."""
         command = [python, HERE / "contestant.py", name]
-        # Two processes on one GPU: each takes less than half of its memory, instead of three quarters.
+        # Two processes share one GPU, so each preallocates less than half of its memory instead of three quarters.
         env = {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.45"} | os.environ
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
         self._in, self._out = self._process.stdin, self._process.stdout
@@ -195,7 +197,7 @@ class Worker:
         self._in.write(json.dumps(request) + "\n")
         self._in.flush()
         for line in self._out:
-            if line.startswith("{"):  # whatever the packages print on import is no answer
+            if line.startswith("{"):  # skip anything that the packages print on import
                 return json.loads(line)
         raise SystemExit("a worker ended without an answer; its error stands above")
 

@@ -13,7 +13,7 @@ from crazysim.errors import RenderError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; without one, list what there is."""
+    """Run a command and return the exit status; without a command, print the help."""
     parser = argparse.ArgumentParser(
         prog="crazysim", description="A drone simulator in which thousands of worlds advance in one call."
     )
@@ -25,20 +25,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     demo.add_argument("--worlds", type=int, default=1024, help="number of worlds")
     demo.add_argument("--drones", type=int, default=4, help="drones in each world")
-    demo.add_argument("--seconds", type=float, default=10.0, help="time to fly, s")
-    demo.add_argument("--device", default="cpu", help="where to simulate: cpu, gpu")
+    demo.add_argument("--seconds", type=float, default=10.0, help="duration of the flight, s")
+    demo.add_argument("--device", default="cpu", help="device: cpu, gpu")
     demo.add_argument("--out", type=Path, default=Path("out"), help="folder for the plot and the film")
     demo.add_argument("--no-film", action="store_true", help="write no film")
     replay = commands.add_parser(
         "replay",
-        help="show a recorded flight in a browser, to be played and scrubbed",
+        help="play a recorded flight in a browser",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    replay.add_argument("flight", type=Path, help="what crazysim.media.Flight has saved, an .npz file")
-    replay.add_argument("--world", type=int, help="which world; the first that was recorded if left out")
-    replay.add_argument("--port", type=int, default=8080, help="where the page is served; 0 for any free port")
-    replay.add_argument("--host", default="127.0.0.1", help="who may see it; 0.0.0.0 for everyone")
-    replay.add_argument("--export", type=Path, metavar="FILE", help="write the page into this .html, and serve nothing")
+    replay.add_argument("flight", type=Path, help="flight saved by crazysim.media.Flight, an .npz file")
+    replay.add_argument("--world", type=int, help="world to show; by default the first that was recorded")
+    replay.add_argument("--port", type=int, default=8080, help="port of the server; 0 for any free port")
+    replay.add_argument("--host", default="127.0.0.1", help="address of the server; 0.0.0.0 to accept other machines")
+    replay.add_argument("--export", type=Path, metavar="FILE", help="write the page to an .html file instead")
     _add_training(commands)
     options = parser.parse_args(arguments)
     if options.command is None:
@@ -55,37 +55,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _add_training(commands: Any) -> None:
-    """Add what has to do with policies."""
-    shown = {"formatter_class": argparse.ArgumentDefaultsHelpFormatter}
-    train = commands.add_parser("train", help="train a policy; keep checkpoint, curve, policy and film", **shown)
-    train.add_argument("task", help="hover, track, recover, race and so on; 'list' shows all")
-    train.add_argument("--algorithm", help="ppo or apg; what suits the task if left out")
-    train.add_argument("--seed", type=int, default=0, help="of everything random")
-    train.add_argument("--worlds", type=int, help="worlds that are flown at once; what suits the task if left out")
-    train.add_argument("--iterations", type=int, help="rounds of flying and learning")
-    train.add_argument("--out", type=Path, help="folder of the run; out/TASK if left out")
-    train.add_argument("--resume", action="store_true", help="go on from the checkpoint in that folder")
-    train.add_argument("--device", default="cpu", help="where to train: cpu, gpu")
+    """Add the commands that train, evaluate, export and film policies."""
+    with_defaults = {"formatter_class": argparse.ArgumentDefaultsHelpFormatter}
+    train = commands.add_parser(
+        "train", help="train a policy; write checkpoint, learning curve, policy and film", **with_defaults
+    )
+    train.add_argument("task", help="hover, track, recover, race, ...; 'list' prints all tasks")
+    train.add_argument("--algorithm", help="ppo or apg; by default that of the task's recipe")
+    train.add_argument("--seed", type=int, default=0, help="random seed")
+    train.add_argument("--worlds", type=int, help="number of parallel worlds; by default that of the task's recipe")
+    train.add_argument("--iterations", type=int, help="number of iterations, each a rollout and its updates")
+    train.add_argument("--out", type=Path, help="folder of the run; by default out/TASK")
+    train.add_argument("--resume", action="store_true", help="continue from the checkpoint in that folder")
+    train.add_argument("--device", default="cpu", help="device: cpu, gpu")
     train.add_argument(
         "--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation"
     )
-    train.add_argument("--config", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the algorithm")
-    train.add_argument("--no-film", action="store_true", help="make no film")
-    judge = commands.add_parser("evaluate", help="fly a trained policy from held-out starts", **shown)
-    judge.add_argument("folder", type=Path, help="folder of the run")
-    judge.add_argument("--worlds", type=int, default=1000, help="number of starts")
-    judge.add_argument("--seed", type=int, help="other starts than the held-out ones")
-    judge.add_argument("--device", help="where to fly: cpu, gpu; where it was trained if left out")
-    export = commands.add_parser("export", help="write a trained policy as ONNX or as a C header", **shown)
+    train.add_argument("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm")
+    train.add_argument("--no-film", action="store_true", help="write no film")
+    evaluation = commands.add_parser(
+        "evaluate", help="evaluate a trained policy on held-out initial states", **with_defaults
+    )
+    evaluation.add_argument("folder", type=Path, help="folder of the run")
+    evaluation.add_argument("--worlds", type=int, default=1000, help="number of initial states")
+    evaluation.add_argument("--seed", type=int, help="seed of other initial states than the held-out ones")
+    evaluation.add_argument("--device", help="device: cpu, gpu; by default that of the training")
+    export = commands.add_parser("export", help="write a trained policy as ONNX or as a C header", **with_defaults)
     export.add_argument("folder", type=Path, help="folder of the run")
-    export.add_argument("--onnx", type=Path, metavar="FILE", help="an .onnx file")
-    export.add_argument("--c", type=Path, metavar="FILE", help="a .h file, which needs nothing but math.h")
-    render = commands.add_parser("render", help="film a trained policy", **shown)
+    export.add_argument("--onnx", type=Path, metavar="FILE", help="ONNX file to write")
+    export.add_argument("--c", type=Path, metavar="FILE", help="C header to write; it includes only math.h")
+    render = commands.add_parser("render", help="film a trained policy", **with_defaults)
     render.add_argument("folder", type=Path, help="folder of the run")
-    render.add_argument("--film", type=Path, metavar="FILE", help=".mp4 or .gif; policy.mp4 in the folder if left out")
-    render.add_argument("--worlds", type=int, default=4, help="worlds side by side")
-    render.add_argument("--seed", type=int, default=1, help="of the starts")
-    render.add_argument("--device", help="where to fly: cpu, gpu; where it was trained if left out")
+    render.add_argument("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
+    render.add_argument("--worlds", type=int, default=4, help="number of worlds side by side")
+    render.add_argument("--seed", type=int, default=1, help="seed of the initial states")
+    render.add_argument("--device", help="device: cpu, gpu; by default that of the training")
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -107,12 +111,12 @@ def _replay(options: argparse.Namespace) -> None:
 
 
 def _pairs(texts: Sequence[str]) -> dict[str, Any]:
-    """Return NAME=VALUE as a dict; a value is what JSON reads, else a word."""
+    """Return NAME=VALUE pairs as a dict; a value that is not JSON is a string."""
     pairs = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
-            raise ValueError(f"{text!r} is no NAME=VALUE")
+            raise ValueError(f"expected NAME=VALUE, got {text!r}; write for example seconds=5")
         try:
             pairs[name] = json.loads(value)
         except ValueError:
@@ -127,22 +131,24 @@ def _train(options: argparse.Namespace) -> None:
         for name, entry in TASKS.items():
             print(f"{name:12} {(entry.maker.__doc__ or '').splitlines()[0].removeprefix('Return the task of ')}")
         return
-    from crazysim.train.run import CHECKPOINT, Settings, train
+    from crazysim.train.run import CHECKPOINT, TrainConfig, train
     from crazysim.train.show import film, plot_curve, read_curve
 
-    config = _pairs(options.config) | ({} if options.iterations is None else {"iterations": options.iterations})
-    place = {} if options.device == "cpu" else {"device": options.device}
-    settings = Settings.create(
-        options.task, options.algorithm, options.seed, options.worlds, _pairs(options.set) | place, config
+    hyperparameters = _pairs(options.config)
+    if options.iterations is not None:
+        hyperparameters["iterations"] = options.iterations
+    device = {} if options.device == "cpu" else {"device": options.device}
+    config = TrainConfig.create(
+        options.task, options.algorithm, options.seed, options.worlds, _pairs(options.set) | device, hyperparameters
     )
     folder = options.out or Path("out") / options.task
-    result = train(settings, folder, options.resume)
+    result = train(config, folder, options.resume)
     print(f"wrote {folder / CHECKPOINT}, {folder / 'policy.npz'}")
     try:
         plot_curve({options.task: read_curve(folder)}, folder / "curve.png")
         print(f"wrote {folder / 'curve.png'}")
         if not options.no_film:
-            film(settings.environment(4), result.policy, folder / "policy.mp4", progress=True)
+            film(config.make_env(4), result.policy, folder / "policy.mp4", progress=True)
             print(f"wrote {folder / 'policy.mp4'}")
     except (ImportError, RenderError) as error:
         print(f"no curve or film: {error}")
@@ -154,10 +160,10 @@ def _evaluate(options: argparse.Namespace) -> None:
     from crazysim.train.evaluate import evaluate
     from crazysim.train.run import load_policy
 
-    policy, settings, _ = load_policy(options.folder)
-    env = settings.on(options.device).environment(options.worlds)
-    figures = evaluate(env, policy, None if options.seed is None else jax.random.key(options.seed))
-    print(f"{settings.task}, {options.worlds:,} starts: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
+    policy, config, _ = load_policy(options.folder)
+    env = config.with_device(options.device).make_env(options.worlds)
+    metrics = evaluate(env, policy, None if options.seed is None else jax.random.key(options.seed))
+    print(f"{config.task}, {options.worlds:,} starts: " + ", ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
 
 
 def _export(options: argparse.Namespace) -> None:
@@ -165,7 +171,7 @@ def _export(options: argparse.Namespace) -> None:
     from crazysim.train.run import load_policy
 
     if options.onnx is None and options.c is None:
-        raise ValueError("say what to write: --onnx FILE, --c FILE, or both")
+        raise ValueError("expected a file to write, got none; use --onnx FILE, --c FILE, or both")
     policy, _, meta = load_policy(options.folder)
     for path, write in ((options.onnx, to_onnx), (options.c, to_c)):
         if path is not None:
@@ -177,9 +183,9 @@ def _render(options: argparse.Namespace) -> None:
     from crazysim.train.run import load_policy
     from crazysim.train.show import film
 
-    policy, settings, _ = load_policy(options.folder)
+    policy, config, _ = load_policy(options.folder)
     path = options.film or options.folder / "policy.mp4"
-    env = settings.on(options.device).environment(options.worlds)
+    env = config.with_device(options.device).make_env(options.worlds)
     film(env, policy, path, options.worlds, options.seed, progress=True)
     print(f"wrote {path}")
 
@@ -192,7 +198,7 @@ COMMANDS = {
     "export": _export,
     "render": _render,
 }
-"""What each command runs."""
+"""Functions that run the commands."""
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The main job, end to end: worlds of drones fly figure eights around poles, and are seen."""
+"""End-to-end demonstration: worlds of drones fly figure eights around poles, with figures, a plot and a film."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material
 
 FPS = 25
-"""Pictures, and checks for contacts, per second."""
+"""Rate of frames and of contact checks, Hz."""
 PERIOD = 5.0
-"""Time of one figure eight, s."""
+"""Period of the figure eight, s."""
 SETTLED = 2.0
-"""From here on the tracking error counts, s."""
+"""Start of the interval in which the tracking error is measured, s."""
 WIDTH, DEPTH = 1.4, 0.7
-"""Half sizes of the figure eight, m."""
+"""Amplitudes of the figure eight along x and y, m."""
 POLE = """
 <mujoco><worldbody><body name="pole">
   <geom type="capsule" fromto="0 0 0.035 0 0 2" size="0.03" rgba="0.85 0.35 0.25 1"/>
@@ -40,19 +40,27 @@ POLE = """
 def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, film: bool = True) -> None:
     """Fly, print figures, and write ``flight.npz``, ``tracks.png`` and ``flight.mp4`` into a folder.
 
+    Args:
+        n_worlds: Number of worlds.
+        n_drones: Number of drones per world.
+        seconds: Duration of the flight, s.
+        device: Device of the simulation, such as ``"cpu"``.
+        out: Folder of the files.
+        film: True to write a film.
+
     Raises:
-        ValueError: If an argument cannot be.
+        ValueError: If the flight is shorter than one frame.
     """
     if seconds < 1 / FPS:
-        raise ValueError(f"--seconds is {seconds}; the flight must last at least {1 / FPS} s")
+        raise ValueError(f"expected --seconds of at least {1 / FPS}, got {seconds}; use a longer flight")
     sim = build(n_worlds, n_drones, device)
-    chunk = chunk_of(sim)
-    n_chunks = round(seconds * FPS)
+    fly_frame = build_fly_frame(sim)
+    n_frames = round(seconds * FPS)
     engine = sim.explain().splitlines()[0]
     print(f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
 
     begin = time.perf_counter()
-    compiled = chunk.lower(sim.data).compile()
+    compiled = fly_frame.lower(sim.data).compile()
     compile_s = time.perf_counter() - begin
     begin = time.perf_counter()
     sim.contacts()
@@ -61,7 +69,7 @@ def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, fi
     recorder = Recorder(sim, worlds=[0])
     errors, touching = [], []
     step_s = contacts_s = 0.0
-    for _ in progress(range(n_chunks), "flying"):
+    for _ in progress(range(n_frames), "flying"):
         begin = time.perf_counter()
         data, error = jax.block_until_ready(compiled(sim.data))
         step_s += time.perf_counter() - begin
@@ -72,8 +80,8 @@ def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, fi
         recorder.add()
         errors.append(np.asarray(error))
 
-    n_steps = n_chunks * (sim.freq // FPS)
-    report(np.concatenate(errors), np.stack(touching), n_steps * n_worlds * n_drones, step_s, contacts_s / n_chunks)
+    n_steps = n_frames * (sim.freq // FPS)
+    report(np.concatenate(errors), np.stack(touching), n_steps * n_worlds * n_drones, step_s, contacts_s / n_frames)
     print(f"compile time      {compile_s:.2f} s for the flight, {contacts_compile_s:.2f} s for contacts")
     out.mkdir(parents=True, exist_ok=True)
     flight = recorder.flight()
@@ -85,7 +93,7 @@ def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, fi
 
 
 def build(n_worlds: int, n_drones: int, device: str) -> Sim:
-    """Return worlds with a pole in each loop of the eight, a little elsewhere in each, and drones on their way."""
+    """Return a simulation with two randomly placed poles per world and drones already on the figure eight."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, drone="cf2x_L250", control="state", device=device)
     pole = mujoco.MjSpec.from_string(POLE)
     frame = sim.spec.worldbody.add_frame()
@@ -111,14 +119,14 @@ def build(n_worlds: int, n_drones: int, device: str) -> Sim:
 
 
 def reference(time: Array, n_drones: int) -> Array:
-    """Return the setpoint of every drone: an eight for each, a quarter of a period and 0.25 m apart.
+    """Return the setpoint of every drone: figure eights offset by a quarter of a period and by 0.25 m in height.
 
     Args:
         time: Time of every world, s. (n_worlds, 1)
         n_drones: Number of drones.
 
     Returns:
-        Position, velocity, acceleration, level quaternion, no body rates. (n_worlds, n_drones, 16)
+        Position, velocity, acceleration, identity quaternion, zero body rates. (n_worlds, n_drones, 16)
     """
     rate = 2 * jnp.pi / PERIOD
     drone = jnp.arange(n_drones)
@@ -138,10 +146,10 @@ def reference(time: Array, n_drones: int) -> Array:
     )
 
 
-def chunk_of(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
-    """Return a jitted function that flies 1 / FPS seconds: one setpoint per tick of the state controller.
+def build_fly_frame(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
+    """Return a jitted function that flies for 1 / FPS seconds, with one setpoint per tick of the state controller.
 
-    It returns the data and the distance from the setpoint, m, at every tick. (n_ticks, n_worlds, n_drones)
+    It returns the data, and the distance from the setpoint at every tick, m. (n_ticks, n_worlds, n_drones)
     """
     step = sim.build_step_fn()
     per_tick = sim.freq // sim.control_freq
@@ -155,7 +163,15 @@ def chunk_of(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
 
 
 def report(errors: np.ndarray, touching: np.ndarray, n_steps: int, step_s: float, contact_s: float) -> None:
-    """Print what the flight gave."""
+    """Print step rate, tracking error and contacts of the flight.
+
+    Args:
+        errors: Distances from the setpoint, m. (n_ticks, n_worlds, n_drones)
+        touching: True where the geoms of a contact slot touch. (n_frames, n_worlds, n_slots)
+        n_steps: Number of physics steps of all drones.
+        step_s: Time of all steps, s.
+        contact_s: Time of one contact query, s.
+    """
     first = round(SETTLED * FPS * len(errors) / len(touching))
     settled = 100 * (errors[first:] if first < len(errors) else errors)
     began = touching[1:] & ~touching[:-1]
@@ -168,7 +184,7 @@ def report(errors: np.ndarray, touching: np.ndarray, n_steps: int, step_s: float
 
 
 def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
-    """Write the tracks of world 0 and the error over time of all worlds as a picture."""
+    """Plot the tracks of world 0, and the tracking error of all worlds over time."""
     try:
         import matplotlib
 
@@ -178,8 +194,8 @@ def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
         print("no plot: matplotlib is not installed; pip install 'crazysim[demo]'")
         return
     fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
-    wanted = np.asarray(reference(jnp.linspace(0, PERIOD, 200)[:, None], 1))[:, 0]
-    left.plot(wanted[:, 0], wanted[:, 1], "--", color="0.6", label="setpoint")
+    setpoint = np.asarray(reference(jnp.linspace(0, PERIOD, 200)[:, None], 1))[:, 0]
+    left.plot(setpoint[:, 0], setpoint[:, 1], "--", color="0.6", label="setpoint")
     for i in range(tracks.shape[1]):
         left.plot(tracks[:, i, 0], tracks[:, i, 1], color=COLORS[i % 4], label=f"drone {i}")
     for place in np.asarray(sim.mjx_data.mocap_pos[0, sim.n_drones :]):
@@ -198,10 +214,10 @@ def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
 
 
 def record(sim: Sim, flight: Flight, path: Path) -> None:
-    """Write world 0 as a film; say in one line if this machine cannot."""
+    """Film world 0; print one line and return if this machine cannot render."""
     for i in range(sim.n_drones):
         change_material(sim, "led_top", [i], rgba=COLORS[i % 4], emission=1.0)
-    view = View(width=960, height=544, trail=1.0, cam_config=turning)
+    view = View(width=960, height=544, trail=1.0, cam_config=orbiting_camera)
     try:
         with Film(path, view, fps=FPS, progress=True) as film:
             film.play(sim, flight)
@@ -212,13 +228,13 @@ def record(sim: Sim, flight: Flight, path: Path) -> None:
     print(f"wrote {path}")
 
 
-def turning(time: float) -> dict[str, Any]:
-    """Return a free camera that goes slowly around the scene."""
+def orbiting_camera(time: float) -> dict[str, Any]:
+    """Return the settings of a free camera that orbits the scene slowly."""
     return {"lookat": [0, 0, 0.9], "distance": 3.6, "azimuth": 110 + 3 * time, "elevation": -28}
 
 
 def progress(items: Iterable[Any], label: str) -> Iterable[Any]:
-    """Return the items with a progress bar, where tqdm is installed."""
+    """Return the items with a progress bar, if tqdm is installed."""
     try:
         from tqdm import tqdm
     except ImportError:

@@ -11,10 +11,13 @@ import numpy as np
 
 from crazysim.control import Control
 from crazysim.core.data import SimData
-from crazysim.core.stage import Axes, Stage, as_stages
+from crazysim.core.stage import Axes, as_stages
 from crazysim.engine import symbolic
-from crazysim.engine.lower import UnsupportedError
-from crazysim.engine.program import Program, Slot, is_key
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.lower import is_key
+from crazysim.engine.lower_stages import lower_stages
+from crazysim.engine.passes import fuse
+from crazysim.engine.program import Program, Segment, Slot, UnfusedStage
 from crazysim.errors import ConfigError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -51,7 +54,8 @@ class Vector:
     def of(self, data: SimData, world: int = 0, drone: int = 0) -> np.ndarray:
         """Return the vector of one drone of a simulation. (len(self),)"""
         axes, leaves = Axes(data), jax.tree.leaves(data)
-        parts = [_of_one(axes, leaves, axes.names.index(name), world, drone) for name in self.sizes]
+        places = [axes.names.index(name) for name in self.sizes]
+        parts = [_of_one(axes.scopes[i], leaves[i], world, drone) for i in places]
         return np.concatenate([np.zeros(0), *parts])
 
 
@@ -105,14 +109,13 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
             f"there is no drone {drone} of world {world}: this simulation has {data.core.n_worlds} worlds of "
             f"{data.core.n_drones} drones, counted from 0"
         )
-    program = Program(stages, data)
-    axes, leaves = program.axes, program.leaves
+    program = fuse(lower_stages(stages, data))
+    leaves, names = jax.tree.leaves(data), [leaf.name for leaf in program.leaves]
     command = _command_field(data)
-    state = [axes.names.index(name) for name in STATES]
-    given = [axes.names.index(command), *_parameter_leaves(program, parameters, command)]
-    symbols = {
-        leaf: casadi.SX.sym(axes.names[leaf], program.sizes(leaf)) for leaf in {*state, *given, *program.written}
-    }
+    state = [names.index(name) for name in STATES]
+    given = [names.index(command), *_parameter_leaves(program, parameters, command)]
+    sizes = {leaf: program.leaves[leaf].size for leaf in {*state, *given, *program.written}}
+    symbols = {leaf: casadi.SX.sym(names[leaf], size) for leaf, size in sizes.items()}
     constants: dict[int, Any] = {}
 
     def before(slot: Slot) -> Any:
@@ -120,10 +123,10 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
         if leaf in symbols:
             return symbols[leaf][k]
         if leaf not in constants:
-            constants[leaf] = casadi.SX(casadi.DM(_of_one(axes, leaves, leaf, world, drone)))
+            constants[leaf] = casadi.SX(casadi.DM(_of_one(program.leaves[leaf].scope, leaves[leaf], world, drone)))
         return constants[leaf][k]
 
-    after = _step(program, stages, data, before)
+    after = _step(program, before)
     then = {
         leaf: casadi.vertcat(*(after.get((leaf, k), symbol[k]) for k in range(symbol.numel())))
         for leaf, symbol in symbols.items()
@@ -137,41 +140,41 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
         state += memory
     state = state[: len(STATES)] + sorted(state[len(STATES) :])
     parts = {"x": state, "u": given[:1], "p": given[1:]}
-    names = [name for name, part in parts.items() if part]
-    arguments = [casadi.vertcat(*(symbols[leaf] for leaf in parts[name])) for name in names]
+    given_parts = [part for part, some in parts.items() if some]
+    arguments = [casadi.vertcat(*(symbols[leaf] for leaf in parts[part])) for part in given_parts]
     x_next = casadi.vertcat(*(then[leaf] for leaf in state))
     return CasadiStep(
-        casadi.Function("step", arguments, [x_next], names, ["x_next"]),
-        *(Vector({axes.names[leaf]: program.sizes(leaf) for leaf in part}) for part in parts.values()),
+        casadi.Function("step", arguments, [x_next], given_parts, ["x_next"]),
+        *(Vector({names[leaf]: sizes[leaf] for leaf in part}) for part in parts.values()),
         dt=1 / data.core.freq,
     )
 
 
-def _step(program: Program, stages: Sequence[Stage], data: SimData, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
-    """Return what a step writes, or say which stage stands in the way.
+def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
+    """Return the expressions that a step writes.
 
     Raises:
-        ConfigError: If it cannot be exported.
+        ConfigError: If it cannot be exported; the message names the stage.
     """
     for segment in program.segments:
+        if isinstance(segment, UnfusedStage):
+            raise _refusal(segment.name, segment.error.reason)
         if segment.scope != "drone":
-            why = segment.why or "it sees all drones of its world, and what is exported is the step of one"
-            raise _refusal(segment.stages[0], why)
-    if not program.segments:
-        return {}
-    try:
-        return symbolic.step(program.segments[0], before)
-    except UnsupportedError as error:
-        for stage in stages:
-            try:
-                symbolic.step(Program([stage], data).segments[0], before)
-            except UnsupportedError as reason:
-                raise _refusal(stage, str(reason)) from None
-        raise ConfigError(f"the step cannot be exported: {error}") from None
+            raise _refusal(segment.stages[0], "it sees all drones of its world, and the step of one is exported")
+    after: dict[Slot, Any] = {}
+    for segment in program.segments:
+        assert isinstance(segment, Segment)
+        slots = (*segment.reads, *segment.hoisted_reads)
+        numbers = {slot: after[slot] if slot in after else before(slot) for slot in slots}
+        try:
+            after |= symbolic.step(segment, numbers.__getitem__)
+        except UnsupportedError as error:
+            raise _refusal(error.stage, error.reason) from None
+    return after
 
 
-def _refusal(stage: Stage, why: str) -> ConfigError:
-    return ConfigError(f"the step cannot be exported because of its stage {stage.__name__!r}: {why}")
+def _refusal(stage: str, why: str) -> ConfigError:
+    return ConfigError(f"the step cannot be exported because of its stage {stage!r}: {why}")
 
 
 def _command_field(data: SimData) -> str:
@@ -185,7 +188,7 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
     Raises:
         ConfigError: If a name does not exist, is there twice, or is no parameter of a step.
     """
-    names = program.axes.names
+    names = [leaf.name for leaf in program.leaves]
     if isinstance(parameters, str) or len(set(parameters)) < len(parameters):
         raise ConfigError(f"parameters are a list of different names, not {parameters!r}")
     free = [
@@ -193,7 +196,7 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
         for leaf, name in enumerate(names)
         if name not in (*STATES, command)
         and leaf not in program.written
-        and program.axes.scopes[leaf] in ("drone", "shared")
+        and program.leaves[leaf].scope in ("drone", "shared")
         and jax.numpy.issubdtype(program.leaves[leaf].dtype, jax.numpy.floating)
     ]
     for name in parameters:
@@ -202,9 +205,8 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
     return [names.index(name) for name in parameters]
 
 
-def _of_one(axes: Axes, leaves: Sequence[Any], leaf: int, world: int, drone: int) -> np.ndarray:
+def _of_one(scope: str, x: Any, world: int, drone: int) -> np.ndarray:
     """Return the numbers that one drone has of a leaf, as float64. (size,)"""
-    x = leaves[leaf]
     x = np.asarray(jax.random.key_data(x) if is_key(x) else x)
-    place = {"drone": (world, drone), "world": (world, 0)}.get(axes.scopes[leaf], ())
+    place = {"drone": (world, drone), "world": (world, 0)}.get(scope, ())
     return x[place].astype(np.float64).reshape(-1)

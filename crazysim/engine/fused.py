@@ -13,7 +13,8 @@ from jax.custom_derivatives import SymbolicZero
 
 from crazysim.core.stage import with_leaves
 from crazysim.engine import cuda, kernel, lanes, native
-from crazysim.engine.program import Program, is_key
+from crazysim.engine.lower import is_key
+from crazysim.engine.program import Program
 
 Run = Callable[[list[Any], Array], tuple[list[Any], Array]]
 """Leaves and a number of steps to the written leaves and which worlds are flagged as not finite."""
@@ -81,7 +82,7 @@ def _over_batches(program: Program, run: Run) -> Run:
     @call.def_vmap
     def _(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
         batched, count_batched = in_batched
-        own = [scope in ("drone", "world") for scope in program.axes.scopes]
+        own = [leaf.scope in ("drone", "world") for leaf in program.leaves]
         out_batched = ([True] * len(program.written), True)
         if count_batched or not program.fused or any(b and not o for b, o in zip(batched, own, strict=True)):
             # What the worlds of a batch share is not the same in all batches: one after the other.
@@ -118,7 +119,7 @@ def _one_kernel(program: Program, target: str) -> Run:
 
 def _split(program: Program, target: str) -> Run:
     """Return the same for a step that some stage takes apart: a kernel for what is between such stages."""
-    parts = program.parts()
+    parts = list(program.parts())
     kernels = [kernel.write(p, target) if p.fused else None for p in parts]
     written = program.written
 

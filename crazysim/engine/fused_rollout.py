@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.stage import Stage, with_leaves
 from crazysim.engine import fused, kernel
-from crazysim.engine.lower import UnsupportedError
-from crazysim.engine.program import Program
+from crazysim.engine.build import build_program
 
 
 class Whole:
@@ -48,13 +48,11 @@ class Whole:
         Raises:
             UnsupportedError: If something of it cannot be written out.
         """
-        self.program = program = Program(stages, data, zeros, None, first, last, scratch)
-        split = [s for s in program.segments if s.scope == "batch"]
-        if split:
-            raise UnsupportedError(split[0].unfused)
-        self._n_leaves = len(program.leaves)
-        program.pack()
-        self._rows = program.lay(lay(program.written)) if lay is not None else {}
+        self.program = program = build_program(stages, data, zeros, None, first, last, scratch, lay)
+        if program.unfused_stages:
+            raise program.unfused_stages[0].error
+        self._n_leaves = len(jax.tree.leaves(data))
+        self._rows = {i: list(leaf.rows_of) for i, leaf in enumerate(program.leaves) if leaf.rows_of}
         self.read = [i for i in kernel.needed(program) if i < self._n_leaves]
         """Leaves that are read as they are, not as rows and not with the shared numbers."""
         self._n_steps = n_steps
@@ -86,9 +84,10 @@ class Whole:
         for array, some in zip(rows, self._rows.values(), strict=True):
             first = 0
             for i in some:
-                like, size = program.leaves[i], program.sizes(i)
+                like = program.leaves[i]
+                size = like.size
                 x = array[first : first + size].T.reshape(-1, program.n_drones, *like.shape[2:])
-                out[i] = x[:, :1] if program.axes.scopes[i] == "world" else x
+                out[i] = x[:, :1] if like.scope == "world" else x
                 first += size
         return out
 

@@ -7,9 +7,10 @@ from typing import Any
 
 import jax
 
-from crazysim.engine.ir import Block, Element, Value
-from crazysim.engine.lower import Lowering, UnsupportedError, scalars
-from crazysim.engine.program import input_elements
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import Block, Element, Operation, Value, prune
+from crazysim.engine.lower import Lowering, scalars
+from crazysim.engine.lower import inputs as input_elements
 
 
 def require_apart(fn: Callable[[list[Any]], list[Any]], two: Sequence[Any], sources: Sequence[str], what: str) -> None:
@@ -25,18 +26,17 @@ def require_apart(fn: Callable[[list[Any]], list[Any]], two: Sequence[Any], sour
     Raises:
         UnsupportedError: If one world's result depends on the other's numbers or on its place, or cannot be read.
     """
-    lowering = Lowering(Block())
-    labels: dict[int, tuple[Any, frozenset[Any]]] = {}
+    lowering = Lowering()
+    labels: dict[Value, tuple[Any, frozenset[Any]]] = {}
     inputs = []
     for i, (aval, source) in enumerate(zip(two, sources, strict=True)):
         elements = input_elements(lowering.builder, aval)
         for world, part in enumerate(elements) if source == "worlds" else [(source, elements)]:
             for k, x in enumerate(scalars(part)):
-                labels[id(x)] = (("input", i, k), frozenset() if world == "shared" else frozenset([world]))
+                labels[x] = (("input", i, k), frozenset() if world == "shared" else frozenset([world]))
         inputs.append(elements)
     outputs = lowering.lower(jax.make_jaxpr(fn)(list(two)), inputs)
-    block = lowering.finish(outputs)
-    block.drop_unused()
+    block = prune(lowering.finish(outputs))
     forms = _Forms(labels)
     forms.block(block)
     for out in outputs:
@@ -60,48 +60,44 @@ Known = tuple[Any, frozenset[Any]]
 class _Forms:
     """Finds out of every value what it computes, and from whose numbers."""
 
-    def __init__(self, labels: dict[int, Known]):
-        self.known: dict[int, Any] = dict(labels)
+    def __init__(self, labels: dict[Value, Known]):
+        self.known: dict[Value, Known] = dict(labels)
         self.numbers: dict[Any, int] = {}
 
     def of(self, x: Element) -> Known:
-        return self.known[id(x)] if isinstance(x, Value) else ((x.dtype.name, x.tobytes()), frozenset())
+        return self.known[x] if isinstance(x, Value) else ((x.dtype.name, x.tobytes()), frozenset())
 
     def block(self, block: Block) -> list[Known]:
         """Go through a block whose inputs are known, and return what its outputs are."""
-        for value in block.values:
-            if value.op != "barrier":
-                self.known[id(value)] = self._value(value, [self.of(x) for x in value.args])
+        for op in block.operations:
+            if op.name != "barrier":
+                self.known.update(zip(op.results, self._results(op, [self.of(x) for x in op.args]), strict=True))
         return [self.of(x) for x in block.outputs]
 
-    def _value(self, value: Value, args: list[Known]) -> Any:
-        match value.op:
-            case "item":
-                return self.known[id(value.args[0])][dict(value.params)["index"]]
-            case "threefry2x32":
-                return [self._joined((value.op, k), args) for k in (0, 1)]
+    def _results(self, op: Operation, args: list[Known]) -> list[Known]:
+        match op.name:
             case "custom_jvp":
-                (body,) = value.blocks
-                self.known.update(zip(map(id, body.inputs), args, strict=True))
+                (body,) = op.blocks
+                self.known.update(zip(body.inputs, args, strict=True))
                 return self.block(body)
             case "loop" | "while":
-                return self._repeated(value, args)
-        return self._joined((value.op, value.dtype.name, value.params), args)
+                return self._repeated(op, args)
+        return [self._joined((op.name, x.dtype.name, op.params, k), args) for k, x in enumerate(op.results)]
 
     def _joined(self, what: Any, args: list[Known]) -> Known:
         form = (what, *(f for f, _ in args))
         return self.numbers.setdefault(form, len(self.numbers)), frozenset().union(*(w for _, w in args))
 
-    def _repeated(self, value: Value, carry: list[Known]) -> list[Known]:
+    def _repeated(self, op: Operation, carry: list[Known]) -> list[Known]:
         """Tell what is carried apart by what it begins as and what becomes of it, until no turn tells more apart."""
-        *test, body = value.blocks
+        *test, body = op.blocks
         n_before: Any = None
         while (len({f for f, _ in carry}), sum(len(w) for _, w in carry)) != n_before:
             n_before = (len({f for f, _ in carry}), sum(len(w) for _, w in carry))
-            self.known.update(zip(map(id, body.inputs), carry, strict=True))
+            self.known.update(zip(body.inputs, carry, strict=True))
             after = self.block(body)
             for block in test:
-                self.known.update(zip(map(id, block.inputs), carry, strict=True))
+                self.known.update(zip(block.inputs, carry, strict=True))
                 after = [self._joined("while", [x, *self.block(block)]) for x in after]
-            carry = [self._joined((value.op, value.params), [x, y]) for x, y in zip(carry, after, strict=True)]
+            carry = [self._joined((op.name, op.params), [x, y]) for x, y in zip(carry, after, strict=True)]
         return carry

@@ -1,112 +1,158 @@
-"""A program on single numbers: what one drone computes, as a graph of operations.
+"""The intermediate representation: a block of scalar operations in single-assignment form.
 
-An engine does not see arrays. Every element of every small array is a value of its own, constants are folded, and
-what is computed twice is there once. Three readers turn such a program into something that runs: XLA on lanes,
-CUDA source, and symbolic expressions.
+The engine does not compile arrays. Every element of every small array is a value of its own, constants are folded,
+and a common subexpression is computed once. Blocks are immutable; a ``Builder`` makes one. What operations there are
+is in ``ops``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from crazysim.engine import ops
+from crazysim.engine.simplify import constant_key, simplify
 
 Element = Any
 """A ``Value``, or a NumPy scalar for a constant."""
 
 
+@dataclasses.dataclass(frozen=True, eq=False, slots=True)
 class Value:
-    """One number that is computed at run time."""
+    """One number that is computed at run time; equal only to itself."""
 
-    __slots__ = ("args", "blocks", "dtype", "op", "params")
-
-    def __init__(self, op: str, args: tuple[Element, ...], dtype: Any, params: tuple = (), blocks: tuple = ()):
-        """Name an operation, its operands, its type, its settings and the blocks it contains."""
-        self.op, self.args, self.dtype, self.params, self.blocks = op, args, np.dtype(dtype), params, blocks
+    dtype: np.dtype
+    """Type of the number."""
 
 
+class Operation(NamedTuple):
+    """Results computed from operands."""
+
+    name: str
+    """Name in ``ops.TABLE``."""
+    args: tuple[Element, ...]
+    """Operands."""
+    results: tuple[Value, ...]
+    """Values that it defines."""
+    params: tuple[tuple[str, Any], ...] = ()
+    """Static parameters, as pairs of name and value."""
+    blocks: tuple[Block, ...] = ()
+    """Blocks that it runs. Their operations may use the values that are defined before this one."""
+    stage: str = ""
+    """Stage of the pipeline that it comes from."""
+
+    def param(self, name: str) -> Any:
+        """Return a static parameter."""
+        return dict(self.params)[name]
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of the first result."""
+        return self.results[0].dtype
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Block:
-    """Operations in order, from inputs to outputs; an inner block sees the values of those around it."""
+    """Operations in order, from inputs to outputs. An inner block may use the values of those around it."""
 
-    def __init__(self, outer: Block | None = None):
-        """Open an empty block inside another one."""
+    inputs: tuple[Value, ...] = ()
+    operations: tuple[Operation, ...] = ()
+    outputs: tuple[Element, ...] = ()
+
+    def walk(self) -> Iterator[Operation]:
+        """Iterate over all operations, those of inner blocks included."""
+        for operation in self.operations:
+            yield operation
+            for block in operation.blocks:
+                yield from block.walk()
+
+    def blocks(self) -> Iterator[Block]:
+        """Iterate over the block and its inner blocks."""
+        yield self
+        for operation in self.operations:
+            for block in operation.blocks:
+                yield from block.blocks()
+
+    def uses(self) -> set[Value]:
+        """Return the values that operations and outputs use, those of inner blocks included."""
+        used = {x for x in self.outputs if isinstance(x, Value)}
+        for operation in self.operations:
+            used.update(x for x in operation.args if isinstance(x, Value))
+            for block in operation.blocks:
+                used |= block.uses()
+        return used
+
+
+class Builder:
+    """Builds a block, operation by operation."""
+
+    def __init__(self, outer: Builder | None = None, stage: str = ""):
+        """Begin an empty block, inside another one if that is given.
+
+        Args:
+            outer: Builder of the block around it.
+            stage: Stage that the operations come from.
+        """
         self.outer = outer
+        self.stage = outer.stage if outer is not None else stage
         self.inputs: list[Value] = []
-        self.values: list[Value] = []
-        self.outputs: list[Element] = []
-        self._known: dict[Any, Value] = {}
+        self.operations: list[Operation] = []
+        self._known: dict[Any, tuple[Value, ...]] = {}
 
     def input(self, dtype: Any) -> Value:
         """Add an input."""
-        value = Value("input", (), dtype)
+        value = Value(np.dtype(dtype))
         self.inputs.append(value)
         return value
 
-    def add(
-        self, op: str, args: tuple[Element, ...], dtype: Any, params: tuple = (), blocks: tuple[Block, ...] = ()
-    ) -> Element:
-        """Return the value of an operation: a new one, a known one, or a constant."""
-        dtype = np.dtype(dtype)
-        if not blocks:
-            simple = simplify(op, args, dtype, params)
-            if simple is not None:
-                return simple
-        key = (op, tuple(_key(a) for a in args), dtype, params, blocks)
-        known = None if blocks else self._find(key)
-        if known is not None:
-            return known
-        value = Value(op, args, dtype, params, blocks)
-        self._known[key] = value
-        self.values.append(value)
-        return value
+    def add(self, name: str, args: Sequence[Element], dtype: Any, params: tuple = ()) -> Element:
+        """Return the result of an operation: a new value, one that is known already, or a constant."""
+        args, dtype = tuple(args), np.dtype(dtype)
+        simple = simplify(name, args, dtype, params)
+        return self._add(name, args, (dtype,), params)[0] if simple is None else simple
 
     def add_many(
-        self, op: str, args: tuple[Element, ...], dtypes: Sequence[Any], params: tuple = (), blocks: tuple = ()
-    ) -> list[Element]:
-        """Return the results of an operation that has several."""
-        operation = self.add(op, args, bool, params, blocks)
-        return [self.add("item", (operation,), dtype, (("index", k),)) for k, dtype in enumerate(dtypes)]
+        self,
+        name: str,
+        args: Sequence[Element],
+        dtypes: Sequence[Any],
+        params: tuple = (),
+        blocks: tuple[Block, ...] = (),
+    ) -> tuple[Value, ...]:
+        """Return the results of an operation that has any number of them, or runs blocks."""
+        args, types = tuple(args), tuple(map(np.dtype, dtypes))
+        return self._new(name, args, types, params, blocks) if blocks else self._add(name, args, types, params)
 
     def barrier(self) -> None:
         """Mark a place before which everything that is used after it should be computed once."""
-        if self.values and self.values[-1].op != "barrier":
-            self.values.append(Value("barrier", (), bool))
+        if self.operations and self.operations[-1].name != "barrier":
+            self._new("barrier", (), (), (), ())
 
     def finish(self, outputs: Sequence[Element]) -> Block:
-        """Return the block, with these outputs."""
-        self.outputs = list(outputs)
-        return self
+        """Return the block with these outputs."""
+        return Block(tuple(self.inputs), tuple(self.operations), tuple(outputs))
 
-    def _find(self, key: Any) -> Value | None:
-        block: Block | None = self
-        while block is not None:
-            if key in block._known:
-                return block._known[key]
-            block = block.outer
-        return None
+    def _add(self, name: str, args: tuple, dtypes: tuple[np.dtype, ...], params: tuple) -> tuple[Value, ...]:
+        # NaN differs from itself, and -0.0 equals 0.0: constants are compared by their bytes.
+        key = (name, dtypes, params, *[x if isinstance(x, Value) else constant_key(x) for x in args])
+        builder: Builder | None = self
+        while builder is not None:
+            known = builder._known.get(key)
+            if known is not None:
+                return known
+            builder = builder.outer
+        results = self._known[key] = self._new(name, args, dtypes, params, ())
+        return results
 
-    def drop_unused(self) -> None:
-        """Remove the operations that no output needs."""
-        self._prune(set())
-
-    def _prune(self, needed: set[int]) -> None:
-        needed |= {id(x) for x in self.outputs if isinstance(x, Value)}
-        kept = []
-        for value in reversed(self.values):
-            if id(value) in needed or value.op == "barrier":
-                kept.append(value)
-                needed |= {id(x) for x in value.args if isinstance(x, Value)}
-                for block in value.blocks:
-                    block._prune(needed)
-        self.values = kept[::-1]
-
-    def walk(self) -> Iterator[Value]:
-        """Go through all operations, those of inner blocks included."""
-        for value in self.values:
-            yield value
-            for block in value.blocks:
-                yield from block.walk()
+    def _new(self, name: str, args: tuple, dtypes: tuple, params: tuple, blocks: tuple) -> tuple[Value, ...]:
+        if name not in ops.TABLE:
+            raise KeyError(f"operation {name!r} is not in ops.TABLE")
+        results = tuple([Value(dtype) for dtype in dtypes])
+        self.operations.append(Operation(name, args, results, params, blocks, self.stage))
+        return results
 
 
 def constant(value: Any, dtype: Any) -> np.generic:
@@ -115,97 +161,82 @@ def constant(value: Any, dtype: Any) -> np.generic:
 
 
 def is_constant(x: Element) -> bool:
-    """Return whether an element is known before the program runs."""
+    """Return True where an element is known before the program runs."""
     return isinstance(x, np.generic)
 
 
-def _key(x: Element) -> Any:
-    # NaN differs from itself, and -0.0 equals 0.0: constants are told apart by their bytes.
-    return (x.dtype, x.tobytes()) if isinstance(x, np.generic) else id(x)
+def prune(block: Block, keep_inputs: bool = True) -> Block:
+    """Return a block without the operations that no output needs.
 
-
-def simplify(op: str, args: tuple[Element, ...], dtype: np.dtype, params: tuple) -> Element | None:
-    """Return what an operation comes to without computing it, or None.
-
-    A product with a constant zero is zero, as the zeros of a diagonal inertia are meant; that a state which is
-    infinite or NaN would give NaN is left to its other terms, which stay NaN.
+    Args:
+        block: The block.
+        keep_inputs: False to remove inputs as well that nothing uses.
     """
-    if all(map(is_constant, args)):
-        fold = FOLDS.get(op)
-        if fold is not None:
-            with np.errstate(all="ignore"):
-                return dtype.type(fold(*args, **dict(params)))
-        return None
-    if op in ("add", "sub", "mul", "div") and dtype.kind == "f":
-        a, b = args
-        if op == "mul":
-            if _equals(a, 0) or _equals(b, 0):
-                return dtype.type(0)
-            if _equals(a, 1):
-                return b
-            if _equals(b, 1):
-                return a
-        if op == "add" and _equals(a, 0):
-            return b
-        if op in ("add", "sub") and _equals(b, 0):
-            return a
-        if op == "div" and _equals(b, 1):
-            return a
-        if op == "div" and _equals(a, 0):
-            return dtype.type(0)
-    if op == "select_n":
-        which, *cases = args
-        if is_constant(which):
-            return cases[int(which)]
-        if all(c is cases[0] or (is_constant(c) and _key(c) == _key(cases[0])) for c in cases[1:]):
-            return cases[0]
-    if op == "convert_element_type" and args[0].dtype == dtype:
-        return args[0]
-    if op in ("and", "or") and dtype.kind == "b":
-        for a, b in (args, args[::-1]):
-            if is_constant(a):
-                return b if bool(a) == (op == "and") else a
-    return None
+    block = _prune(block, set())
+    if keep_inputs:
+        return block
+    used = block.uses()
+    return dataclasses.replace(block, inputs=tuple([x for x in block.inputs if x in used]))
 
 
-def _equals(x: Element, number: float) -> bool:
-    return is_constant(x) and x == number
+def _prune(block: Block, needed: set[Value]) -> Block:
+    needed.update(x for x in block.outputs if isinstance(x, Value))
+    kept = []
+    for op in reversed(block.operations):
+        if op.name == "barrier":
+            kept.append(op)
+        elif not needed.isdisjoint(op.results):
+            needed.update(x for x in op.args if isinstance(x, Value))
+            if op.blocks:
+                blocks = tuple([_prune(inner, needed) for inner in op.blocks])
+                kept.append(op._replace(blocks=blocks))
+            else:
+                kept.append(op)
+    return dataclasses.replace(block, operations=tuple(kept[::-1]))
 
 
-def _divide(a: Any, b: Any) -> Any:
-    if np.asarray(a).dtype.kind == "f":
-        return np.divide(a, b)
-    return int(a) // int(b) if (a < 0) == (b < 0) else -(abs(int(a)) // abs(int(b)))  # towards zero
+def substitute(block: Block, new: Mapping[Value, Element]) -> Block:
+    """Return a block in which operands and outputs are replaced; what defines them stays."""
+
+    def replaced(x: Element) -> Element:
+        return new.get(x, x) if isinstance(x, Value) else x
+
+    operations = [
+        op._replace(
+            args=tuple([replaced(x) for x in op.args]),
+            blocks=tuple([substitute(inner, new) for inner in op.blocks]),
+        )
+        for op in block.operations
+    ]
+    return Block(block.inputs, tuple(operations), tuple([replaced(x) for x in block.outputs]))
 
 
-FOLDS: dict[str, Callable[..., Any]] = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": _divide,
-    "rem": np.fmod,
-    "neg": np.negative,
-    "abs": np.abs,
-    "sign": np.sign,
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "sqrt": np.sqrt,
-    "max": np.maximum,
-    "min": np.minimum,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "lt": np.less,
-    "le": np.less_equal,
-    "gt": np.greater,
-    "ge": np.greater_equal,
-    "and": np.bitwise_and,
-    "or": np.bitwise_or,
-    "xor": np.bitwise_xor,
-    "not": np.invert,
-    "shift_left": np.left_shift,
-    "is_finite": np.isfinite,
-    "select_n": lambda which, *cases: cases[int(which)],
-    "clamp": lambda low, x, high: np.minimum(np.maximum(x, low), high),
-    "convert_element_type": lambda x: x,
-}
-"""Operations on constants that NumPy rounds as XLA does."""
+def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
+    """Add a block's operations to a builder once more, simplified by what is known there, and return its outputs.
+
+    Args:
+        builder: Takes the operations.
+        block: The block.
+        values: Elements that stand for the block's inputs and for values around it; those of its own values are added.
+    """
+
+    def mapped(x: Element) -> Element:
+        return values.get(x, x) if isinstance(x, Value) else x
+
+    for op in block.operations:
+        args = [mapped(x) for x in op.args]
+        if op.name == "barrier":
+            builder.barrier()
+        elif len(op.results) == 1 and not op.blocks:
+            values[op.results[0]] = builder.add(op.name, args, op.results[0].dtype, op.params)
+        else:
+            blocks = tuple([_inlined(builder, inner, values) for inner in op.blocks])
+            results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, blocks)
+            values.update(zip(op.results, results, strict=True))
+    return [mapped(x) for x in block.outputs]
+
+
+def _inlined(outer: Builder, block: Block, values: dict[Value, Element]) -> Block:
+    builder = Builder(outer)
+    inside = values | {x: builder.input(x.dtype) for x in block.inputs}
+    return builder.finish(inline(builder, block, inside))

@@ -1,6 +1,7 @@
-"""One kernel for many steps: the source of a whole program, from loads to stores.
+"""One kernel for many steps: the source of a program, from loads to stores.
 
-What one drone has stays in variables, registers for as long as there are enough, from the first step to the last.
+The numbers of one drone stay in variables, which are registers as long as there are enough, from the first step to
+the last.
 """
 
 from __future__ import annotations
@@ -9,10 +10,9 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from importlib import resources
 
-import numpy as np
-
-from crazysim.engine.program import Program, Segment, Slot, is_key
-from crazysim.engine.source import Writer, type_name
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.program import Phase, Program, Segment, Slot
+from crazysim.engine.source import TYPES, Writer, require, type_name
 
 UNBOUNDED = "1 /* blocks at least */"
 
@@ -22,7 +22,7 @@ BLOCK = 64
 
 @dataclasses.dataclass(frozen=True)
 class Kernel:
-    """Source with what goes in and what comes out."""
+    """Source, with its inputs and outputs."""
 
     text: str
     """The source."""
@@ -31,12 +31,12 @@ class Kernel:
     outputs: tuple[int, ...]
     """Leaves that it writes; behind them comes one bool per drone, whether its world is flagged, if that is checked."""
     in_place: tuple[int, ...] = ()
-    """Leaves of rows that it reads where it then writes them: of each, input and output must be the same memory."""
+    """Leaves of rows that it updates in place: input and output of each must be the same memory."""
     group: int = 1
-    """Drones next to each other that must be in one warp or vector, for they look at each other's numbers."""
+    """Neighbouring drones that must be in one warp or vector, because they read each other's numbers."""
 
     def aliases(self) -> dict[int, int]:
-        """Return which operand of a call, behind two numbers, is which of its results."""
+        """Return the result that each operand in place is, by number; two numbers precede the operands."""
         return {2 + self.inputs.index(i): self.outputs.index(i) for i in self.in_place}
 
     def with_blocks(self, n: int) -> Kernel:
@@ -45,14 +45,14 @@ class Kernel:
 
 
 def preamble(target: str) -> str:
-    """Return what the types and functions of a target are."""
+    """Return the types and functions of a target."""
     files = resources.files("crazysim.engine").joinpath("targets")
     text = files.joinpath(f"{target}.h").read_text()
     return text.replace('#include "scalar.h"\n', files.joinpath("scalar.h").read_text())
 
 
 def epilogue(target: str) -> str:
-    """Return what makes the kernel callable."""
+    """Return the code through which a target calls the kernel."""
     if target == "cuda":
         return ""
     return resources.files("crazysim.engine").joinpath("targets", "host_call.h").read_text()
@@ -62,56 +62,70 @@ def write(program: Program, target: str) -> Kernel:
     """Return the source of a program for ``cuda`` or ``host``.
 
     Raises:
-        UnsupportedError: If an operation or a type has no source.
+        UnsupportedError: If there is no source for an operation or a type; the error names the stage.
     """
+    _require(program)
     writer = Writer()
-    segments, check = program.segments, program.check
-    each = program.of("each")
-    checked = check.reads if check else []
-    written = dict.fromkeys(slot for s in segments for slot in program.own(s, s.writes))
-    inside = dict.fromkeys(slot for s in segments for slot in [*program.own(s, s.reads), *s.constants])
-    outputs, whole = tuple(program.written), _whole(program)
-    slots = dict.fromkeys([*inside, *written, *checked, *whole])
+    check = program.check
+    segments = program.fused_segments
+    each = [s for s in segments if s.phase == "each"]
+    checked = check.reads if check else ()
+    written = dict.fromkeys(slot for s in segments for slot in program.per_drone(s, s.writes))
+    inside = dict.fromkeys(slot for s in segments for slot in [*program.per_drone(s, s.reads), *s.hoisted_reads])
+    outputs, stored = tuple(program.written), _stored(program)
+    slots = dict.fromkeys([*inside, *written, *checked, *stored])
     loaded = _loaded(program)
     inputs = needed(program)
 
     names = {slot: f"x{slot[0]}_{slot[1]}" for slot in slots}
     for slot in slots:
-        kind, access = type_name(_dtype(program, slot)), _load(program, slot)
+        kind, access = _type(program, slot[0]), _load(program, slot)
         if slot not in loaded:
             writer.line(f"auto {names[slot]} = {kind}_lanes({kind}(0));", 1)
         elif slot in written:
             writer.line(f"auto {names[slot]} = {kind}_lanes({access});", 1)
-        elif slot not in whole and _is_late(program, slot):
+        elif slot not in stored and _is_deferred(program, slot):
             names[slot] = access
         else:
             writer.line(f"const auto {names[slot]} = {access};", 1)
-    for segment in program.of("first"):
-        _advance(writer, program, segment, names, [], 1)
-    constants = [
-        writer.block(s.before, [names[slot] for slot in s.constants], 1) if s.before is not None else [] for s in each
-    ]
+    _write_phase(writer, program, "first", names, 1)
+    hoisted = [writer.block(s.hoisted, [names[slot] for slot in s.hoisted_reads], 1) for s in each]
     writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
-    for segment, before in zip(each, constants, strict=True):
-        _advance(writer, program, segment, names, before, 2)
+    for segment, constants in zip(each, hoisted, strict=True):
+        _write_segment(writer, program, segment, names, constants, 2)
     writer.line("}", 1)
     if check is not None:
         (flagged,) = writer.block(check.block, [names[slot] for slot in checked], 1)
         writer.line(f"STORE(1, 1, flagged, 0, b1_lanes({flagged}))", 1)
-    for segment in program.of("last"):
-        _advance(writer, program, segment, names, [], 1)
-    for slot in whole:
-        writer.line(_store(program, slot, f"{type_name(_dtype(program, slot))}_lanes({names[slot]})"), 1)
+    _write_phase(writer, program, "last", names, 1)
+    for slot in stored:
+        writer.line(_store(program, slot, f"{_type(program, slot[0])}_lanes({names[slot]})"), 1)
 
-    pointers = [f"const {_kind(program, i)}* __restrict__ p{i}" for i in inputs]
-    pointers += [f"{_kind(program, i)}* __restrict__ q{i}" for i in outputs]
+    pointers = [f"const {_type(program, i)}* __restrict__ p{i}" for i in inputs]
+    pointers += [f"{_type(program, i)}* __restrict__ q{i}" for i in outputs]
     pointers += ["b1* __restrict__ flagged"] if check is not None else []
     frame = {"cuda": _cuda, "host": _host}[target]
-    widest = 8 if any(_kind(program, i) == "f64" for i in (*inputs, *outputs)) else 4
+    widest = 8 if any(_type(program, i) == "f64" for i in (*inputs, *outputs)) else 4
     defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n"
     text = defines + preamble(target) + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
     in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
     return Kernel(text, inputs, outputs, in_place, program.group)
+
+
+def _require(program: Program) -> None:
+    """Check that a program has source.
+
+    Raises:
+        UnsupportedError: If it has none; the error names the stage.
+    """
+    for segment in program.fused_segments:
+        require(segment.hoisted)
+        require(segment.block)
+        for i in {*segment.read, *segment.written}:
+            leaf = program.leaves[i]
+            if leaf.number.name not in TYPES:
+                why = f"kernels have no numbers of type {leaf.number}, which {leaf.name} has"
+                raise UnsupportedError(why, stage=", ".join(segment.stages))
 
 
 def needed(program: Program) -> tuple[int, ...]:
@@ -119,9 +133,9 @@ def needed(program: Program) -> tuple[int, ...]:
     return tuple(sorted({leaf for leaf, _ in _loaded(program)}))
 
 
-def _whole(program: Program) -> list[Slot]:
-    """Return what goes out: a leaf of which some numbers are written goes whole."""
-    return [(leaf, k) for leaf in program.written for k in range(program.sizes(leaf))]
+def _stored(program: Program) -> list[Slot]:
+    """Return the numbers that a kernel writes: all of a leaf of which some are written."""
+    return [(leaf, k) for leaf in program.written for k in range(program.leaves[leaf].size)]
 
 
 def _loaded(program: Program) -> set[Slot]:
@@ -133,102 +147,99 @@ def _loaded(program: Program) -> set[Slot]:
         loaded.update(slot for slot in slots if slot not in known)
 
     def run(segment: Segment) -> None:
-        use(program.own(segment, segment.reads))
+        use(program.per_drone(segment, segment.reads))
         drones: dict[Slot, int] = {}
-        for (leaf, _), slot in zip(segment.writes, program.own(segment, segment.writes), strict=True):
-            of_world = segment.scope == "world" and program.axes.scopes[leaf] == "drone"
+        for (leaf, _), slot in zip(segment.writes, program.per_drone(segment, segment.writes), strict=True):
+            of_world = segment.scope == "world" and program.leaves[leaf].scope == "drone"
             drones[slot] = drones.get(slot, 0) + (1 if of_world else program.n_drones)
         known.update(slot for slot, n in drones.items() if n >= program.n_drones)
 
     for segment in program.of("first"):
         run(segment)
     for segment in program.of("each"):  # there may be no step
-        use([*program.own(segment, [*segment.reads, *segment.writes]), *segment.constants])
+        use([*program.per_drone(segment, [*segment.reads, *segment.writes]), *segment.hoisted_reads])
     if program.check is not None:
         use(program.check.reads)
     for segment in program.of("last"):
         run(segment)
-    use(_whole(program))
+    use(_stored(program))
     return loaded
 
 
-def _advance(
+def _write_phase(writer: Writer, program: Program, phase: Phase, names: dict[Slot, str], depth: int) -> None:
+    for segment in program.of(phase):
+        _write_segment(writer, program, segment, names, [], depth)
+
+
+def _write_segment(
     writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str], depth: int
 ) -> None:
-    """Write what a segment does."""
-    own = program.own(segment, segment.reads)
-    inputs = [names[slot] for slot in own]
-    if segment.scope == "world":  # a drone's numbers are asked of the lane that has them
+    inputs = [names[slot] for slot in program.per_drone(segment, segment.reads)]
+    if segment.scope == "world":  # a drone's numbers come from its lane
         for k, (leaf, number) in enumerate(segment.reads):
-            if program.axes.scopes[leaf] == "drone":
+            if program.leaves[leaf].scope == "drone":
                 name = writer.new()
-                writer.line(f"const auto {name} = of_drone({inputs[k]}, {number // program.sizes(leaf)});", depth)
+                writer.line(f"const auto {name} = of_drone({inputs[k]}, {number // program.leaves[leaf].size});", depth)
                 inputs[k] = name
     outs = writer.block(segment.block, [*inputs, *constants], depth)
     fresh = [writer.new() for _ in outs]
     for name, out in zip(fresh, outs, strict=True):
         writer.line(f"const auto {name} = {out};", depth)
-    for (leaf, number), slot, new in zip(segment.writes, program.own(segment, segment.writes), fresh, strict=True):
-        kind, name = type_name(_dtype(program, slot)), names[slot]
-        if (
-            segment.scope == "world" and program.axes.scopes[leaf] == "drone"
-        ):  # every lane has them all, and keeps its own
-            mine = f"eq_(own, i32({number // program.sizes(leaf)}))"
+    for (leaf, number), slot, new in zip(
+        segment.writes, program.per_drone(segment, segment.writes), fresh, strict=True
+    ):
+        kind, name = _type(program, leaf), names[slot]
+        if segment.scope == "world" and program.leaves[leaf].scope == "drone":  # every lane computes all of them
+            mine = f"eq_(own, i32({number // program.leaves[leaf].size}))"
             writer.line(f"{name} = select_n_({mine}, {name}, {kind}_lanes({new}));", depth)
         else:
             writer.line(f"{name} = {kind}_lanes({new});", depth)
 
 
-def _is_late(program: Program, slot: Slot) -> bool:
-    """Return whether only stages below the step rate, or the check behind the loop, need a number that never changes.
+def _is_deferred(program: Program, slot: Slot) -> bool:
+    """Return True where only stages below the step rate, or the check behind the loop, use a number that never changes.
 
-    It is loaded there, and takes no register.
+    It is loaded there, and takes no register in between.
     """
     check = program.check
     in_check = check is not None and slot in check.reads
     in_blocks = False
-    for segment in program.segments:
-        if slot in segment.constants:
+    for segment in program.fused_segments:
+        if slot in segment.hoisted_reads:
             return False
         block = segment.block
-        now = {id(x) for v in block.values for x in v.args} | {id(x) for x in block.outputs}
-        for x, read in zip(block.inputs, program.own(segment, segment.reads), strict=False):
+        now = {x for op in block.operations for x in op.args} | set(block.outputs)
+        for x, read in zip(block.inputs, program.per_drone(segment, segment.reads), strict=False):
             if read == slot:
-                if segment.scope == "world" or id(x) in now:
+                if segment.scope == "world" or x in now:
                     return False
                 in_blocks = True
     return in_blocks != in_check
 
 
-def _dtype(program: Program, slot: Slot) -> object:
-    leaf = program.leaves[slot[0]]
-    return np.uint32 if is_key(leaf) else leaf.dtype
-
-
-def _kind(program: Program, leaf: int) -> str:
-    return type_name(_dtype(program, (leaf, 0)))
+def _type(program: Program, leaf: int) -> str:
+    return type_name(program.leaves[leaf].number)
 
 
 def _load(program: Program, slot: Slot) -> str:
     leaf, k = slot
-    scope = program.axes.scopes[leaf]
-    if scope not in ("drone", "world"):
+    if program.leaves[leaf].scope not in ("drone", "world"):
         return f"p{leaf}[{k}]"
     if leaf in program.rows:
         return f"LOAD_ROW({'q' if leaf in program.written else 'p'}{leaf}, {k})"
-    return f"LOAD({program.sizes(leaf)}, {_drones(program, leaf)}, p{leaf}, {k})"
+    return f"LOAD({program.leaves[leaf].size}, {_drones(program, leaf)}, p{leaf}, {k})"
 
 
 def _store(program: Program, slot: Slot, value: str) -> str:
     leaf, k = slot
     if leaf in program.rows:
         return f"STORE_ROW(q{leaf}, {k}, {value})"
-    return f"STORE({program.sizes(leaf)}, {_drones(program, leaf)}, q{leaf}, {k}, {value})"
+    return f"STORE({program.leaves[leaf].size}, {_drones(program, leaf)}, q{leaf}, {k}, {value})"
 
 
 def _drones(program: Program, leaf: int) -> int:
     """Return how many lanes have the same number of a leaf."""
-    return program.n_drones if program.axes.scopes[leaf] == "world" else 1
+    return program.n_drones if program.leaves[leaf].scope == "world" else 1
 
 
 def _cuda(pointers: Sequence[str], body: str) -> str:

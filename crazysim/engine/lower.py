@@ -1,48 +1,37 @@
-"""From a function written for one drone to a program on single numbers.
+"""From a jaxpr to a block of scalar operations.
 
-The function is traced by JAX, and its jaxpr read operation by operation. An array is a NumPy object array of
-elements (``ir``). What a primitive means for elements is a rule; there are four kinds, and most primitives need no
-rule of their own:
+A function that is written for one drone is traced by JAX, and its jaxpr lowered equation by equation. An array is a
+NumPy object array of elements (``ir``). A rule says what a primitive means for elements; there are four kinds, and
+most primitives need no rule of their own:
 
 - element-wise: the same operation for every element;
-- movement: nothing is computed, so the primitive is run once on the numbers of the elements;
+- movement: nothing is computed, so the primitive is run once on the indices of the elements;
 - reduction: unrolled;
-- structure: calls are followed, branches become selections, loops stay loops.
+- structure: calls are inlined, branches become selections, loops stay loops.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.extend import core
 
-from crazysim.engine.ir import Block, Element, constant
+from crazysim.engine import ops
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import Block, Builder, Element, constant
+from crazysim.engine.simplify import known_zero
 
 Elements = np.ndarray
-"""An array of elements: of type object, whatever the elements are."""
-
-LOGIC = {
-    "lt": ("and", 0),
-    "gt": ("and", 1),
-    "le": ("or", 0),
-    "ge": ("or", 1),
-    "max": ("or", None),
-    "min": ("and", None),
-}
-"""Order of truth values as logic, and which operand is negated for it."""
+"""An array of elements, of type object. A random key is a pair of elements."""
 
 Rule = Callable[["Lowering", Any, list[Elements]], Sequence[Elements]]
 RULES: dict[str, Rule] = {}
 
 MAX_UNROLL = 64
 """Longest scan with inputs or outputs per iteration, and largest range of a run-time index, that is unrolled."""
-
-
-class UnsupportedError(Exception):
-    """A primitive, or a use of one, that cannot be read; the message names it."""
 
 
 def rule(*names: str) -> Callable[[Rule], Rule]:
@@ -55,12 +44,33 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
     return register
 
 
+class Params(dict[str, Any]):
+    """Parameters of an equation; one that this version of JAX does not have makes the primitive unsupported."""
+
+    def __missing__(self, name: str) -> Any:
+        """Refuse the primitive."""
+        raise UnsupportedError(f"it has no parameter {name!r} in this version of JAX")
+
+
+class Equation(NamedTuple):
+    """An equation of a jaxpr, as rules get it."""
+
+    primitive: Any
+    """JAX's primitive."""
+    params: Params
+    """Its parameters."""
+    invars: Sequence[Any]
+    """Operands, with ``aval`` for shape and type."""
+    outvars: Sequence[Any]
+    """Results, likewise."""
+
+
 class Lowering:
     """Lowers jaxprs into a block of scalar operations."""
 
-    def __init__(self, builder: Block):
-        """Add operations to a block."""
-        self.builder = builder
+    def __init__(self, builder: Builder | None = None):
+        """Add operations to a block, to a new one if none is given."""
+        self.builder = Builder() if builder is None else builder
 
     def lower(self, jaxpr: core.ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
         """Return the results of a jaxpr for arrays of elements.
@@ -85,19 +95,34 @@ class Lowering:
         """Return the results of one equation of a jaxpr."""
         name = eqn.primitive.name
         if name not in RULES:
-            raise UnsupportedError(f"primitive {name!r} has no rule")
-        return RULES[name](self, eqn, args)
+            raise UnsupportedError(f"primitive {name!r} has no rule", name)
+        try:
+            return RULES[name](self, Equation(eqn.primitive, Params(eqn.params), eqn.invars, eqn.outvars), args)
+        except UnsupportedError as error:
+            raise error.located(name) from None
 
     def elementwise(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:
-        """Return an operation on every element; scalars stand for arrays of any shape."""
-        if op in LOGIC and args[0].size and args[0].reshape(-1)[0].dtype == bool:
-            op, negated = LOGIC[op]
-            args = [self.elementwise("not", [x], bool) if k == negated else x for k, x in enumerate(args)]
+        """Return an operation on every element; scalars stand for arrays of any shape.
+
+        Raises:
+            UnsupportedError: If the operation is not defined for elements of these types.
+        """
         shape = np.broadcast_shapes(*(x.shape for x in args))
         rows = [np.broadcast_to(x, shape).reshape(-1) for x in args]
-        if rows[-1].size and isinstance(rows[-1][0], tuple):  # keys: both halves alike
-            pairs = [[self.scalar(op, c[0], *(k[i] for k in c[1:])) for i in (0, 1)] for c in zip(*rows, strict=True)]
-            return as_elements([(a, b) for a, b in pairs], shape)
+        if not rows[-1].size:
+            return np.empty(shape, object)
+        first = [row[0] for row in rows]
+        if isinstance(first[-1], tuple):  # keys: both halves alike
+            halves = [[self.scalar(op, c[0], *(k[i] for k in c[1:])) for i in (0, 1)] for c in zip(*rows, strict=True)]
+            return as_elements([(a, b) for a, b in halves], shape)
+        dtypes = [x.dtype for x in first]
+        if op in ops.BOOLEAN_FORM and dtypes[0].kind == "b":
+            op, negated = ops.BOOLEAN_FORM[op]
+            args = [self.elementwise("not", [x], bool) if k == negated else x for k, x in enumerate(args)]
+            return self.elementwise(op, args, bool)
+        error = ops.unsupported(op, dtypes, dtype)
+        if error is not None:
+            raise error
         return as_elements([self.builder.add(op, column, dtype, params) for column in zip(*rows, strict=True)], shape)
 
     def scalar(self, op: str, *args: Element, dtype: Any = None) -> Element:
@@ -106,7 +131,7 @@ class Lowering:
 
     def inner(self) -> Lowering:
         """Return a lowering into a new block inside this one."""
-        return Lowering(Block(self.builder))
+        return Lowering(Builder(self.builder))
 
     def finish(self, outputs: Sequence[Elements]) -> Block:
         """Return the block, with these outputs."""
@@ -134,3 +159,44 @@ def constants(x: Any, dtype: Any) -> Elements:
         return as_elements([(constant(a, np.uint32), constant(b, np.uint32)) for a, b in halves], np.shape(x))
     array = np.asarray(x)
     return as_elements([constant(item, dtype) for item in array.reshape(-1)], array.shape)
+
+
+def inputs(builder: Builder, aval: Any, zeros: frozenset[int] = frozenset()) -> Elements:
+    """Return an array as new inputs of a block.
+
+    Args:
+        builder: Takes the inputs.
+        aval: Shape and type of the array.
+        zeros: Flat indices of elements that are known to be zero: they are no inputs.
+
+    Raises:
+        UnsupportedError: If the engine has no numbers of this type.
+    """
+    size = int(np.prod(aval.shape, dtype=int))
+    if is_key(aval):
+        return as_elements([(builder.input(np.uint32), builder.input(np.uint32)) for _ in range(size)], aval.shape)
+    if aval.dtype.name not in ops.DTYPES:
+        raise UnsupportedError(f"numbers of type {aval.dtype.name}")
+    zero = known_zero(aval.dtype)
+    items = [zero if k in zeros and zero is not None else builder.input(aval.dtype) for k in range(size)]
+    return as_elements(items, aval.shape)
+
+
+def lower_function(fn: Callable[..., Any], *avals: Any) -> Block:
+    """Return the block of a function of small arrays.
+
+    Args:
+        fn: From arrays to an array, or to any tree of arrays.
+        avals: Shapes and types of the arguments.
+
+    Raises:
+        UnsupportedError: If it has a primitive without a rule.
+    """
+    lowering = Lowering()
+    args = [inputs(lowering.builder, x) for x in jax.tree.leaves(avals)]
+    return lowering.finish(lowering.lower(jax.make_jaxpr(fn)(*avals), args))
+
+
+def is_key(x: Any) -> bool:
+    """Return True for an array of random keys."""
+    return jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)

@@ -1,42 +1,51 @@
-"""A reader of programs (``ir``) that writes them down as source, for CUDA and for the host's C++ compiler alike.
+"""C++ and CUDA source of a block.
 
-A value is a variable that is assigned once, an operation a call of an inline function. What the functions and types
-are, a preamble of each target says (``targets/``); what is written here is the same for both.
+A value is a variable that is assigned once, an operation an operator or a call of an inline function. Types and
+functions are defined by a preamble for each target (``targets/``); the source of a block is the same for both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from crazysim.engine.ir import Block, Element, Value, is_constant
-from crazysim.engine.lower import UnsupportedError
+from crazysim.engine import ops
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import Block, Element, Operation, Value, is_constant
 
 TYPES = {"float32": "f32", "float64": "f64", "int32": "i32", "uint32": "u32", "bool": "b1"}
+"""Types of numbers, and what they are called in the source."""
 
-OPERATIONS = set(
-    "abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp cos cosh div eq erf erfc erf_inv exp exp2 "
-    "expm1 floor ge gt is_finite le log log1p logistic lt max min mul ne neg not or pow rem rsqrt select_n "
-    "shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt sub tan tanh xor".split()
-)
-"""Operations that both preambles have."""
 
-OPERATORS = {"add": "+", "sub": "-", "mul": "*"}
-"""Operations that the language has, for single numbers and for vectors: quicker to compile than calls."""
+def require(block: Block) -> None:
+    """Check that there is source for all operations and types of a block.
+
+    Raises:
+        UnsupportedError: If there is none for one; the error names the stage.
+    """
+    for op in block.walk():
+        row = ops.TABLE[op.name]
+        other = next((x.dtype.name for x in (*op.args, *op.results) if x.dtype.name not in TYPES), None)
+        if other is not None:
+            raise UnsupportedError(f"kernels have no numbers of type {other}", op.name, op.stage)
+        if not row.source and not row.structured:
+            raise UnsupportedError("kernels have no such operation", op.name, op.stage)
+
 
 INDENT = "  "
 
 
 class Writer:
-    """Writes blocks as lines of source."""
+    """Lines of source of blocks."""
 
     def __init__(self) -> None:
-        """Begin with nothing written."""
+        """Begin without lines."""
         self.lines: list[str] = []
-        self.names: dict[int, str] = {}
+        self.names: dict[Value, str] = {}
         self.pairs: dict[str, str] = {}
+        self.tests: dict[Value, Operation] = {}
         self._count = 0
 
     def new(self, prefix: str = "v") -> str:
@@ -49,106 +58,83 @@ class Writer:
         self.lines.append(INDENT * depth + text)
 
     def block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
-        """Write a block's operations, and return the names of its outputs.
-
-        Raises:
-            UnsupportedError: If there is no source for an operation or a type.
-        """
-        self.names.update(zip(map(id, block.inputs), inputs, strict=True))
-        outside = dict(self.pairs)  # what is computed inside a block is not there outside
-        for value in block.values:
-            self._value(value, depth)
+        """Write a block's operations, and return the names of its outputs."""
+        self.names.update(zip(block.inputs, inputs, strict=True))
+        outside = dict(self.pairs)  # what is computed inside a block is not defined outside
+        for op in block.operations:
+            self._operation(op, depth)
         self.pairs = outside
         return [self.element(x) for x in block.outputs]
 
     def element(self, x: Element) -> str:
         """Return an element as an expression."""
-        return self.names[id(x)] if isinstance(x, Value) else literal(x)
+        return self.names[x] if isinstance(x, Value) else literal(x)
 
-    def _value(self, value: Value, depth: int) -> None:
-        args = [self.element(a) for a in value.args]
-        match value.op:
+    def _operation(self, op: Operation, depth: int) -> None:
+        args = [self.element(a) for a in op.args]
+        match op.name:
             case "barrier":
-                return
-            case "item":
-                self.names[id(value)] = f"{args[0]}_{dict(value.params)['index']}"
-                return
+                pass
             case "when":
-                self._when(value, args, depth)
-                return
+                self._when(op, args, depth)
             case "loop":
-                self._loop(value, args, depth)
-                return
+                self._loop(op, args, depth)
             case "while":
-                self._while(value, args, depth)
-                return
+                self._while(op, args, depth)
             case "threefry2x32":
-                name = self.names[id(value)] = self.new()
+                name = self._results(op)
                 self.line(f"auto {name}_0 = u32_lanes({args[2]}), {name}_1 = u32_lanes({args[3]});", depth)
                 self.line(f"threefry2x32({args[0]}, {args[1]}, {name}_0, {name}_1);", depth)
-                return
-            case "sin" | "cos":  # most of the work for one of the two is that for the other
-                if args[0] not in self.pairs:
-                    pair = self.pairs[args[0]] = self.new()
-                    kind = "auto" if isinstance(value.args[0], Value) else type_name(value.dtype)
-                    self.line(f"{kind} {pair}_0 = {args[0]}, {pair}_1 = {args[0]};", depth)
-                    self.line(f"sin_cos({args[0]}, {pair}_0, {pair}_1);", depth)
-                self.names[id(value)] = f"{self.pairs[args[0]]}_{'sin cos'.split().index(value.op)}"
-                return
-            case "custom_jvp":  # the derivative is not asked for here
-                outs = self.block(value.blocks[0], args, depth)
-                name = self.names[id(value)] = self.new()
+            case "sin" | "cos":
+                self._sin_cos(op, args[0], depth)
+            case "custom_jvp":  # no derivative is taken of a kernel
+                outs = self.block(op.blocks[0], args, depth)
+                name = self._results(op)
                 for k, out in enumerate(outs):
                     self.line(f"const auto {name}_{k} = {out};", depth)
-                return
-        self.names[id(value)] = name = self.new()
-        self.line(f"const auto {name} = {self._expression(value, args)};", depth)
+            case _:
+                if op.name in ("lt", "gt"):
+                    self.tests[op.results[0]] = op
+                limit = _limit(op, self.tests)
+                text = expression(op, args) if limit is None else f"{limit}({args[1]}, {args[2]})"
+                name = self.names[op.results[0]] = self.new()
+                self.line(f"const auto {name} = {text};", depth)
 
-    def _expression(self, value: Value, args: list[str]) -> str:
-        kind = type_name(value.dtype)
-        if value.op == "convert_element_type":
-            return f"to_{kind}({args[0]})"
-        if value.op == "bitcast_convert_type":
-            return f"bits_{kind}({args[0]})"
-        if value.op == "integer_pow":
-            return f"integer_pow({args[0]}, {dict(value.params)['y']})"
-        if value.op == "round":
-            even = int(dict(value.params)["rounding_method"]) == 1
-            return f"{'round_even_' if even else 'round_away_'}({args[0]})"
-        limit = _limit(value)
-        if limit is not None:
-            return f"{limit}({args[1]}, {args[2]})"
-        if value.op in OPERATORS and kind != "b1":
-            return f"{args[0]} {OPERATORS[value.op]} {args[1]}"
-        if value.op == "div" and kind in ("f32", "f64"):
-            return f"{args[0]} / {args[1]}"
-        if value.op not in OPERATIONS:
-            raise UnsupportedError(f"operation {value.op!r} has no source")
-        return f"{value.op}_({', '.join(args)})"
+    def _results(self, op: Operation, name: str | None = None) -> str:
+        """Name the results of an operation that has several, and return what their names begin with."""
+        name = name or self.new()
+        self.names.update((x, f"{name}_{k}") for k, x in enumerate(op.results))
+        return name
 
-    def _when(self, value: Value, args: list[str], depth: int) -> None:
+    def _sin_cos(self, op: Operation, x: str, depth: int) -> None:
+        """Write sine and cosine at once: most of the work for one of the two is that for the other."""
+        if x not in self.pairs:
+            pair = self.pairs[x] = self.new()
+            kind = "auto" if isinstance(op.args[0], Value) else type_name(op.dtype)
+            self.line(f"{kind} {pair}_0 = {x}, {pair}_1 = {x};", depth)
+            self.line(f"sin_cos({x}, {pair}_0, {pair}_1);", depth)
+        self.names[op.results[0]] = f"{self.pairs[x]}_{0 if op.name == 'sin' else 1}"
+
+    def _when(self, op: Operation, args: list[str], depth: int) -> None:
         mask, *old = args
-        name = self._carry(value.blocks[0].outputs, old, depth)
-        self.names[id(value)] = name
+        name = self._carry(op, old, depth)
         self.line(f"if (any({mask})) {{", depth)
-        for k, out in enumerate(self.block(value.blocks[0], [], depth + 1)):
+        for k, out in enumerate(self.block(op.blocks[0], [], depth + 1)):
             self.line(f"{name}_{k} = select_n_({mask}, {name}_{k}, {out});", depth + 1)
         self.line("}", depth)
 
-    def _loop(self, value: Value, args: list[str], depth: int) -> None:
-        (body,) = value.blocks
-        name = self._carry(body.outputs, args, depth)
-        self.names[id(value)] = name
+    def _loop(self, op: Operation, args: list[str], depth: int) -> None:
+        (body,) = op.blocks
+        name = self._carry(op, args, depth)
         turn = self.new("n")
-        self.line(f"for (int {turn} = 0; {turn} < {dict(value.params)['length']}; ++{turn}) {{", depth)
+        self.line(f"for (int {turn} = 0; {turn} < {op.param('length')}; ++{turn}) {{", depth)
         outs = self.block(body, [f"{name}_{k}" for k in range(len(args))], depth + 1)
         self._assign(name, outs, None, depth + 1)
         self.line("}", depth)
 
-    def _while(self, value: Value, args: list[str], depth: int) -> None:
-        test, body = value.blocks
-        name = self._carry(body.outputs, args, depth)
-        self.names[id(value)] = name
+    def _while(self, op: Operation, args: list[str], depth: int) -> None:
+        test, body = op.blocks
+        name = self._carry(op, args, depth)
         carry = [f"{name}_{k}" for k in range(len(args))]
         self.line("for (;;) {", depth)
         (goes_on,) = self.block(test, carry, depth + 1)
@@ -156,9 +142,10 @@ class Writer:
         self._assign(name, self.block(body, carry, depth + 1), goes_on, depth + 1)
         self.line("}", depth)
 
-    def _carry(self, like: Sequence[Element], start: Sequence[str], depth: int) -> str:
-        name = self.new()
-        for k, (x, value) in enumerate(zip(like, start, strict=True)):
+    def _carry(self, op: Operation, start: Sequence[str], depth: int) -> str:
+        """Write a variable for each result of an operation that changes them, with the numbers it starts from."""
+        name = self._results(op)
+        for k, (x, value) in enumerate(zip(op.results, start, strict=True)):
             self.line(f"auto {name}_{k} = {type_name(x.dtype)}_lanes({value});", depth)
         return name
 
@@ -171,14 +158,29 @@ class Writer:
             self.line(f"{name}_{k} = {f};", depth)
 
 
-def _limit(value: Value) -> str | None:
-    """Return what a selection is called that keeps its first case above or below its second: ``x < low ? low : x``."""
-    if value.op != "select_n" or value.dtype.kind != "f" or not isinstance(value.args[0], Value):
+def expression(op: Operation, args: Sequence[str]) -> str:
+    """Return the result of an operation as an expression of its operands."""
+    source = ops.TABLE[op.name].source
+    if not isinstance(source, str):
+        source = next(text for kinds, text in source.items() if op.dtype.kind in kinds)
+    return source.format(*args, name=op.name, all=", ".join(args), type=type_name(op.dtype), **dict(op.params))
+
+
+def _limit(op: Operation, tests: Mapping[Value, Operation]) -> str | None:
+    """Return the function that a selection is that keeps its first case above or below its second.
+
+    Such is ``x < low ? low : x``, for which a target may have one instruction.
+
+    Args:
+        op: The selection.
+        tests: Comparisons by their results.
+    """
+    if op.name != "select_n" or op.dtype.kind != "f" or op.args[0] not in tests:
         return None
-    test, x, limit = value.args
-    if test.op not in ("lt", "gt") or test.args[0] is not x or not _same(test.args[1], limit):
+    test, (x, limit) = tests[op.args[0]], op.args[1:]
+    if test.args[0] is not x or not _same(test.args[1], limit):
         return None
-    return "at_least" if test.op == "lt" else "at_most"
+    return "at_least" if test.name == "lt" else "at_most"
 
 
 def _same(a: Element, b: Element) -> bool:

@@ -18,8 +18,9 @@ from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS
 from crazysim.core.stage import as_stages, with_leaves
 from crazysim.engine import fused, lanes, plain
+from crazysim.engine.build import build_program
 from crazysim.engine.lower import UnsupportedError
-from crazysim.engine.program import Program, Segment
+from crazysim.engine.program import Program, UnfusedStage
 from crazysim.errors import ConfigError
 from crazysim.pytree import check_axes, scopes
 
@@ -169,11 +170,10 @@ class Step:
             return self._plain(data, f"with a mesh every stage must be declared, and {undeclared[0]!r} is not")
         kinds = jax.tree.leaves(scopes(data))
         # Zeros that were told may be of data in which a parameter, one per drone by now, was still shared.
-        program = Program(self.stages, data, {i: some for i, some in zeros if kinds[i] == "shared"}, _watched)
-        split = [s for s in program.segments if s.scope == "batch"]
-        if self.mesh is not None and split:
-            return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}")
-        program.pack()
+        known = {i: some for i, some in zeros if kinds[i] == "shared"}
+        program = build_program(self.stages, data, known, _watched)
+        if self.mesh is not None and program.unfused_stages:
+            return self._plain(data, f"with a mesh every stage must be fused, and {program.unfused_stages[0].unfused}")
         engine, why, run = "lanes", "it was asked for", functools.partial(lanes.steps, program)
         if self.engine in ("auto", "fused"):
             why = fused.missing(self.platform) or ""
@@ -222,8 +222,7 @@ class Step:
         if self.mesh is None or not shard or program is None:
             return Plan(engine, why, program, read, packed, written, shown, *_jitted(advance))
         split, whole = PartitionSpec(WORLD_AXIS), PartitionSpec()
-        axes = program.axes.scopes
-        specs = [split if axes[i] in ("drone", "world") else whole for i in range(n_leaves)]
+        specs = [split if leaf.scope in ("drone", "world") else whole for leaf in program.leaves]
         outs = [specs[i] for i in written]
 
         def spread(values: list[Any], n_steps: int | Array) -> list[Any]:
@@ -296,7 +295,7 @@ def _needed(program: Program) -> list[int]:
     """Return the leaves that are watched, and one by which the number of worlds is told."""
     check = program.check
     watched = [leaf for leaf, _ in check.reads] if check is not None else []
-    return [*watched, next(i for i, scope in enumerate(program.axes.scopes) if scope == "drone")]
+    return [*watched, next(i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone")]
 
 
 class _Zeros:
@@ -344,12 +343,12 @@ def explain(step: Step, data: SimData) -> str:
     if plan.program is None:
         return "\n".join([*lines, f"stages: {', '.join(s.__name__ for s in step.stages)}"])
     for segment in plan.program.segments:
-        names = ", ".join(s.__name__ for s in segment.stages)
-        if segment.scope == "batch":
+        if isinstance(segment, UnfusedStage):
             lines.append(f"splits the step: {segment.unfused}")
         else:
-            lines.append(f"fused, for one {segment.scope}: {names} ({_operations(segment)} operations)")
-    split = [s.stages[0].__name__ for s in plan.program.segments if s.scope == "batch"]
+            names = ", ".join(segment.stages)
+            lines.append(f"fused, for one {segment.scope}: {names} ({segment.n_operations} operations)")
+    split = [stage.name for stage in plan.program.unfused_stages]
     if split:
         lines.append(_cost_of_split(step, data, split))
     if plan.engine == "fused":
@@ -372,7 +371,3 @@ def _cost_of_split(step: Step, data: SimData, split: list[str]) -> str:
         f"cost of the split, measured: a step takes {1e6 * whole:.0f} us, and {1e6 * without:.0f} us without "
         f"{', '.join(split)}"
     )
-
-
-def _operations(segment: Segment) -> int:
-    return sum(v.op not in ("barrier", "item") for v in segment.block.walk())

@@ -1,211 +1,146 @@
-"""A reader of programs (``ir``) that gives them to CasADi: every value is an expression on single numbers.
+"""CasADi expressions of a block: every value is an expression of single numbers.
 
-CasADi computes in float64 whatever the program's types are. Integers are whole numbers without an overflow, and a
-number is never NaN: what asks for that is answered with no.
+CasADi computes in float64 whatever the program's types are. Integers are whole numbers without overflow. A number is
+never NaN, so that tests for NaN are false.
 """
 
 from __future__ import annotations
 
-import functools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from crazysim.engine.ir import Block, Element, Value
-from crazysim.engine.lower import UnsupportedError
+from crazysim.engine import ops
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import Block, Element, Operation, Value
 from crazysim.engine.program import Segment, Slot
+
+RANDOM = "it draws random numbers"
 
 Expression = Any
 """A ``casadi.SX`` of one number."""
 
-LONGEST_LOOP = 256
-"""Most turns of a loop that are written out, one after the other."""
-
-UNSIGNED = frozenset("add sub div rem max min select_n eq ne lt le gt ge".split())
-"""Operations on words that whole numbers of 53 bits can follow; a product of two words is longer."""
-
-LARGEST = 1.7976931348623157e308
-"""Largest float64, for CasADi cannot be asked whether a number is finite."""
+MAX_LOOP = 256
+"""Most iterations of a loop that is unrolled."""
 
 
 def step(segment: Segment, number: Callable[[Slot], Expression]) -> dict[Slot, Expression]:
-    """Return what a step makes of the numbers that a segment writes.
+    """Return the expressions that a step writes.
 
     Args:
-        segment: A program of one drone.
-        number: What its inputs are before the step.
+        segment: A segment of one drone.
+        number: Returns the number in a place before the step.
 
     Raises:
-        UnsupportedError: If CasADi has nothing for an operation.
+        UnsupportedError: If CasADi has no form for an operation; the error names the stage.
     """
-    blocks = [segment.block] if segment.before is None else [segment.before, segment.block]
-    if any(value.op == "threefry2x32" for block in blocks for value in block.walk()):
-        raise UnsupportedError("it draws random numbers")
-    constants = [] if segment.before is None else run(segment.before, [number(slot) for slot in segment.constants])
-    outputs = run(segment.block, [*(number(slot) for slot in segment.reads), *constants])
+    require(segment.hoisted)
+    require(segment.block)
+    hoisted = run(segment.hoisted, [number(slot) for slot in segment.hoisted_reads])
+    outputs = run(segment.block, [*(number(slot) for slot in segment.reads), *hoisted])
     return dict(zip(segment.writes, outputs, strict=True))
 
 
-def run(block: Block, inputs: Sequence[Expression]) -> list[Expression]:
-    """Return the outputs of a block.
+def require(block: Block) -> None:
+    """Check that CasADi has a form for all operations of a block.
 
     Raises:
-        UnsupportedError: If CasADi has nothing for an operation.
+        UnsupportedError: If it has none for one; the error names the stage.
     """
-    return _Reader().run(block, inputs)
+    refused = [(op.stage, why) for op in block.walk() if (why := _refusal(op)) is not None]
+    if refused:
+        drawn = [(stage, why) for stage, why in refused if why == RANDOM]  # says more than the arithmetic around it
+        stage, why = (drawn or refused)[0]
+        raise UnsupportedError(why, stage=stage)
 
 
-class _Reader:
-    """Reads blocks into expressions."""
+def _refusal(op: Operation) -> str | None:
+    match op.name:
+        case "threefry2x32":
+            return RANDOM
+        case "while":
+            return "a loop that runs until a condition fails cannot be unrolled"
+        case "loop" if op.param("length") > MAX_LOOP:
+            return f"a loop of {op.param('length')} iterations is too long; at most {MAX_LOOP} are unrolled"
+    row = ops.TABLE[op.name]
+    if row.structured or op.name == "convert_element_type":
+        return None
+    shared = next((x.dtype for x, letter in zip(op.args, row.operands, strict=True) if letter == "T"), op.dtype)
+    if row.casadi is None or shared.kind not in row.casadi_kinds:
+        return f"operation {op.name!r} on {shared.name} has no form in CasADi"
+    return None
+
+
+def run(block: Block, inputs: Sequence[Expression]) -> list[Expression]:
+    """Return the outputs of a block whose operations all have a form."""
+    return _Interpreter().run(block, inputs)
+
+
+class _Interpreter:
+    """Expressions of values."""
 
     def __init__(self) -> None:
-        self.sx = _casadi().SX
-        self.operations = _operations()
-        self.env: dict[int, Any] = {}
+        import casadi  # an extra
+
+        self.casadi = casadi
+        self.env: dict[Value, Expression] = {}
         self.in_custom_jvp = False
 
     def run(self, block: Block, inputs: Sequence[Expression]) -> list[Expression]:
-        self.env.update(zip(map(id, block.inputs), inputs, strict=True))
-        for value in block.values:
-            if value.op != "barrier":
-                self.env[id(value)] = self._value(value, [self._element(x) for x in value.args])
+        self.env.update(zip(block.inputs, inputs, strict=True))
+        for op in block.operations:
+            if op.name != "barrier":
+                self.env.update(zip(op.results, self._results(op, [self._element(x) for x in op.args]), strict=True))
         return [self._element(x) for x in block.outputs]
 
-    def _element(self, x: Element) -> Any:
-        return self.env[id(x)] if isinstance(x, Value) else self.sx(float(x))
+    def _element(self, x: Element) -> Expression:
+        return self.env[x] if isinstance(x, Value) else self.casadi.SX(float(x))
 
-    def _value(self, value: Value, args: list[Any]) -> Any:
-        params = dict(value.params)
-        match value.op:
-            case "item":
-                return args[0][params["index"]]
+    def _results(self, op: Operation, args: list[Expression]) -> list[Expression]:
+        match op.name:
             case "when":
                 mask, *old = args
-                new = self.run(value.blocks[0], [])
-                return [_select(mask, x, y) for x, y in zip(new, old, strict=True)]
+                new = self.run(op.blocks[0], [])
+                return [self.casadi.if_else(mask, x, y) for x, y in zip(new, old, strict=True)]
             case "loop":
-                if params["length"] > LONGEST_LOOP:
-                    raise UnsupportedError(f"a loop of {params['length']} turns; written out are up to {LONGEST_LOOP}")
-                for _ in range(params["length"]):
-                    args = self.run(value.blocks[0], args)
+                for _ in range(op.param("length")):
+                    args = self.run(op.blocks[0], args)
                 return args
-            case "while":
-                raise UnsupportedError("a loop that goes on until a condition fails has no form written out")
             case "custom_jvp":
                 outside, self.in_custom_jvp = self.in_custom_jvp, True
-                outputs = self.run(value.blocks[0], args)
+                outputs = self.run(op.blocks[0], args)
                 self.in_custom_jvp = outside
                 return outputs
             case "convert_element_type":
-                return _convert(value, args[0])
+                return [self._convert(op, args[0])]
             case "sqrt" if self.in_custom_jvp:
-                return _guarded_sqrt(args[0])
-            case "and" | "or" | "xor" | "not" if value.dtype.kind != "b":
-                raise UnsupportedError(
-                    f"operation {value.op!r} on the bits of {value.dtype.name} has no form in CasADi"
-                )
-        unsigned = value.dtype.kind == "u"
-        if value.op not in self.operations or (unsigned and value.op not in UNSIGNED):
-            raise UnsupportedError(f"operation {value.op!r} on {value.dtype.name} has no form in CasADi")
-        out = self.operations[value.op](*args, **params)
-        if value.op == "div" and value.dtype.kind in "iu":
-            return _towards_zero(out)
-        return _wrap(out) if unsigned and value.op in ("add", "sub") else out
+                return [self._guarded_sqrt(args[0])]
+        form = ops.TABLE[op.name].casadi
+        named = isinstance(form, str)
+        out = getattr(self.casadi, form)(*args) if named else form(self.casadi, *args, **dict(op.params))
+        if op.name == "div" and op.dtype.kind in "iu":
+            return [self._towards_zero(out)]
+        return [self._wrap(out) if op.dtype.kind == "u" and op.name in ("add", "sub") else out]
 
+    def _convert(self, op: Operation, x: Expression) -> Expression:
+        before, after = op.args[0].dtype.kind, op.dtype.kind
+        if after == "b":
+            return x != 0
+        if before == "f" and after in "iu":
+            x = self._towards_zero(x)
+        return self._wrap(x) if after == "u" and before != "b" else x
 
-def _convert(value: Value, x: Expression) -> Expression:
-    before, after = value.args[0].dtype.kind, value.dtype.kind
-    if after == "b":
-        return x != 0
-    if before == "f" and after in "iu":
-        x = _towards_zero(x)
-    return _wrap(x) if after == "u" and before != "b" else x
+    def _wrap(self, x: Expression) -> Expression:
+        """Return a whole number as 32 bits without a sign hold it."""
+        return x - 2.0**32 * self.casadi.floor(x / 2.0**32)
 
+    def _towards_zero(self, x: Expression) -> Expression:
+        return self.casadi.if_else(x < 0, self.casadi.ceil(x), self.casadi.floor(x))
 
-def _wrap(x: Expression) -> Expression:
-    """Return a whole number as 32 bits without a sign hold it."""
-    return x - 2.0**32 * _casadi().floor(x / 2.0**32)
+    def _guarded_sqrt(self, x: Expression) -> Expression:
+        """Return a root whose slope at zero is zero.
 
-
-def _inverse_erf(x: Expression) -> Expression:
-    """Return the inverse of the error function; CasADi has six digits, and each step of Newton doubles them."""
-    ca = _casadi()
-    y = ca.erfinv(x)
-    for _ in range(2):
-        y = y - (ca.erf(y) - x) * (math.sqrt(math.pi) / 2) * ca.exp(y * y)
-    return y
-
-
-def _select(which: Expression, yes: Expression, no: Expression) -> Expression:
-    return _casadi().if_else(which, yes, no)
-
-
-def _towards_zero(x: Expression) -> Expression:
-    return _select(x < 0, _casadi().ceil(x), _casadi().floor(x))
-
-
-def _guarded_sqrt(x: Expression) -> Expression:
-    """Return a root whose slope at zero is zero.
-
-    A function that brings a derivative of its own has it for the places where that of its arithmetic is infinite,
-    as a norm at zero.
-    """
-    ca = _casadi()
-    return _select(x > 0, ca.sqrt(_select(x > 0, x, 1.0)), 0.0)
-
-
-def _round(x: Expression, rounding_method: Any) -> Expression:
-    ca = _casadi()
-    if int(rounding_method) == 0:  # halves away from zero
-        return ca.sign(x) * ca.floor(ca.fabs(x) + 0.5)
-    up = ca.floor(x + 0.5)
-    tie_to_odd = ca.logic_and(up == x + 0.5, ca.fmod(up, 2) != 0)
-    return up - tie_to_odd
-
-
-@functools.cache
-def _operations() -> dict[str, Callable[..., Expression]]:
-    """Return what CasADi has for operations on floats, on whole numbers, and on truth values as 0 and 1."""
-    ca = _casadi()
-    same = "floor ceil exp log log1p expm1 tanh sin cos tan asin acos atan atan2 sinh cosh asinh acosh atanh".split()
-    same += "sqrt sign erf".split()
-    return {name: getattr(ca, name) for name in same} | {
-        "add": lambda a, b: a + b,
-        "sub": lambda a, b: a - b,
-        "mul": lambda a, b: a * b,
-        "div": lambda a, b: a / b,
-        "rem": ca.fmod,
-        "neg": lambda x: -x,
-        "abs": ca.fabs,
-        "max": ca.fmax,
-        "min": ca.fmin,
-        "pow": ca.power,
-        "integer_pow": lambda x, y: x**y,
-        "exp2": lambda x: ca.power(2.0, x),
-        "rsqrt": lambda x: 1 / ca.sqrt(x),
-        "cbrt": lambda x: ca.sign(x) * ca.power(ca.fabs(x), 1 / 3),
-        "logistic": lambda x: 1 / (1 + ca.exp(-x)),
-        "erfc": lambda x: 1 - ca.erf(x),
-        "erf_inv": _inverse_erf,
-        "round": _round,
-        "clamp": lambda low, x, high: ca.fmin(ca.fmax(x, low), high),
-        "select_n": lambda which, no, yes: _select(which, yes, no),
-        "is_finite": lambda x: ca.fabs(x) <= LARGEST,
-        "and": ca.logic_and,
-        "or": ca.logic_or,
-        "xor": lambda a, b: a != b,
-        "not": ca.logic_not,
-        "eq": lambda a, b: a == b,
-        "ne": lambda a, b: a != b,
-        "lt": lambda a, b: a < b,
-        "le": lambda a, b: a <= b,
-        "gt": lambda a, b: a > b,
-        "ge": lambda a, b: a >= b,
-    }
-
-
-def _casadi() -> Any:
-    """Return CasADi, which is an extra."""
-    import casadi
-
-    return casadi
+        A function with a derivative of its own has it for places where that of its arithmetic is infinite, such as a
+        norm at zero.
+        """
+        ca = self.casadi
+        return ca.if_else(x > 0, ca.sqrt(ca.if_else(x > 0, x, 1.0)), 0.0)

@@ -1,4 +1,4 @@
-"""A reader of programs (``ir``) that gives them to XLA: every value is a vector over drones, a lane each."""
+"""XLA operations of a block: every value is a vector over drones, a lane each."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ import numpy as np
 from jax import Array, lax
 from jax.extend.random import threefry2x32_p
 
-from crazysim.engine.ir import Block, Element, Value
-from crazysim.engine.rules.elementwise import ELEMENTWISE
+from crazysim.engine import ops
+from crazysim.engine.ir import Block, Element, Operation, Value
+
+Env = dict[Value, Any]
+"""Arrays by the values that they are."""
 
 
-def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: dict[int, Any] | None = None) -> list[Any]:
+def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: Env | None = None) -> list[Any]:
     """Return the outputs of a block.
 
     Args:
-        block: The program.
+        block: The block.
         inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share.
         shape: Shape of the lanes.
         env: Values of the blocks around it.
@@ -28,52 +31,44 @@ def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: dict
         Its outputs, of the lanes' shape or scalars.
     """
     env = dict(env or {})
-    env.update(zip(map(id, block.inputs), inputs, strict=True))
+    env.update(zip(block.inputs, inputs, strict=True))
     last_use = _last_uses(block)
-    for position, value in enumerate(block.values):
-        if value.op == "barrier":
-            _settle(env, block, position, last_use)
+    for position, op in enumerate(block.operations):
+        if op.name == "barrier":
+            _separate(env, block, position, last_use)
         else:
-            env[id(value)] = _apply(value, [_get(env, a) for a in value.args], shape, env)
+            env.update(zip(op.results, _apply(op, [_get(env, a) for a in op.args], shape, env), strict=True))
     return [_get(env, x) for x in block.outputs]
 
 
-def _get(env: dict[int, Any], x: Element) -> Any:
-    return env[id(x)] if isinstance(x, Value) else x
+def _get(env: Env, x: Element) -> Any:
+    return env[x] if isinstance(x, Value) else x
 
 
-def _last_uses(block: Block) -> dict[int, int]:
+def _last_uses(block: Block) -> dict[Value, int]:
     """Return where each value is used last; an output is used after the end."""
-    last: dict[int, int] = {}
-    for position, value in enumerate(block.values):
-        inner = [x for b in value.blocks for v in b.walk() for x in v.args]
-        inner += [x for b in value.blocks for x in _all_outputs(b)]
-        for x in (*value.args, *inner):
-            last[id(x)] = position
-    last.update((id(x), len(block.values)) for x in block.outputs)
+    last: dict[Value, int] = {}
+    for position, op in enumerate(block.operations):
+        used = {x for x in op.args if isinstance(x, Value)}.union(*(b.uses() for b in op.blocks))
+        last.update(dict.fromkeys(used, position))
+    last.update((x, len(block.operations)) for x in block.outputs if isinstance(x, Value))
     return last
 
 
-def _all_outputs(block: Block) -> list[Element]:
-    return [*block.outputs, *(x for v in block.values for b in v.blocks for x in _all_outputs(b))]
-
-
-def _settle(env: dict[int, Any], block: Block, position: int, last_use: dict[int, int]) -> None:
+def _separate(env: Env, block: Block, position: int, last_use: dict[Value, int]) -> None:
     """Compute once what is used beyond this point: XLA's CPU backend repeats shared arithmetic for every result."""
-    live = [id(v) for v in block.values[:position] if last_use.get(id(v), -1) > position and np.ndim(env[id(v)])]
-    env.update(zip(live, lax.optimization_barrier([env[i] for i in live]), strict=True))
+    results = [x for op in block.operations[:position] for x in op.results]
+    live = [x for x in results if last_use.get(x, -1) > position and np.ndim(env[x])]
+    env.update(zip(live, lax.optimization_barrier([env[x] for x in live]), strict=True))
 
 
-def _apply(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int, Any]) -> Any:
-    if value.op in STRUCTURE:
-        return STRUCTURE[value.op](value, args, shape, env)
-    if value.op == "item":
-        return args[0][dict(value.params)["index"]]
-    if value.op == "convert_element_type":
-        return lax.convert_element_type(args[0], value.dtype)
-    if value.op == "bitcast_convert_type":
-        return lax.bitcast_convert_type(args[0], value.dtype)
-    return FUNCTIONS[value.op](*_broadcast(args), **dict(value.params))
+def _apply(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> Sequence[Any]:
+    if op.name in STRUCTURE:
+        return STRUCTURE[op.name](op, args, shape, env)
+    if op.name in ("convert_element_type", "bitcast_convert_type"):
+        return [getattr(lax, op.name)(args[0], op.dtype)]
+    fn = ops.TABLE[op.name].xla or op.name
+    return [(getattr(lax, fn) if isinstance(fn, str) else fn)(*_broadcast(args), **dict(op.params))]
 
 
 def _broadcast(args: Sequence[Any]) -> list[Array]:
@@ -85,19 +80,19 @@ def _lanes(x: Any, shape: tuple[int, ...]) -> Array:
     return jnp.broadcast_to(x, shape)
 
 
-def _loop(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int, Any]) -> list[Any]:
-    (body,) = value.blocks
+def _loop(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    (body,) = op.blocks
     carry = [_lanes(x, shape) for x in args]
 
     def turn(carry: list[Any], _: Any) -> tuple[list[Any], None]:
         return [_lanes(x, shape) for x in run(body, carry, shape, env)], None
 
-    return lax.scan(turn, carry, length=dict(value.params)["length"])[0]
+    return lax.scan(turn, carry, length=op.param("length"))[0]
 
 
-def _while(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int, Any]) -> list[Any]:
-    """Go on while any lane does; the others keep what they have."""
-    test, body = value.blocks
+def _while(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    """Repeat as long as any lane goes on; the others keep their numbers."""
+    test, body = op.blocks
 
     def goes_on(carry: list[Any]) -> Array:
         return _lanes(run(test, carry, shape, env)[0], shape)
@@ -110,9 +105,9 @@ def _while(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int,
     return lax.while_loop(lambda carry: jnp.any(goes_on(carry)), turn, [_lanes(x, shape) for x in args])
 
 
-def _when(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int, Any]) -> list[Any]:
+def _when(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     """Compute a block only if some lane needs it."""
-    (body,) = value.blocks
+    (body,) = op.blocks
     mask, old = args[0], [_lanes(x, shape) for x in args[1:]]
 
     def act(mask: Array, old: list[Array]) -> list[Array]:
@@ -122,9 +117,9 @@ def _when(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int, 
     return lax.cond(jnp.any(mask), act, lambda _, old: old, mask, old)
 
 
-def _custom_jvp(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int, Any]) -> list[Any]:
-    (body,) = value.blocks
-    slope = dict(value.params)["slope"]
+def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    (body,) = op.blocks
+    slope = op.param("slope")
 
     @jax.custom_jvp
     def call(*args: Any) -> list[Any]:
@@ -139,7 +134,7 @@ def _custom_jvp(value: Value, args: list[Any], shape: tuple[int, ...], env: dict
     return call(*(jnp.asarray(x) for x in args))
 
 
-def _threefry(value: Value, args: list[Any], shape: tuple[int, ...], env: dict[int, Any]) -> list[Any]:
+def _threefry(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     return threefry2x32_p.bind(*_broadcast(args))
 
 
@@ -149,11 +144,4 @@ STRUCTURE: dict[str, Callable[..., Any]] = {
     "when": _when,
     "custom_jvp": _custom_jvp,
     "threefry2x32": _threefry,
-}
-
-OTHER_NAMES = {"and": "bitwise_and", "or": "bitwise_or", "xor": "bitwise_xor", "not": "bitwise_not"}
-FUNCTIONS: dict[str, Callable[..., Any]] = {
-    name: getattr(lax, OTHER_NAMES.get(name, name))
-    for name in ELEMENTWISE
-    if name != "square"  # is written as a product
 }

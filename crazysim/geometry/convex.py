@@ -1,14 +1,13 @@
 """Signed distance of two convex shapes that have no closed form: a segment or a box, and another shape.
 
-All is about one body, the Minkowski difference ``{x_a - x_b}``: the shapes overlap where the origin lies in it. Along
-a unit direction n, from b to a, the gap of the two is ``g(n) = n.pos - r_a(n) - r_b(n)``, with ``r`` how far a shape
-reaches. No gap is larger than the signed distance, and the largest is the signed distance itself: where the shapes
-are apart, that of their nearest points, and where they overlap, minus the length of the shortest translation that
-parts them. So every direction that is tried gives a bound, and the best of them is taken; no test is needed whether
-shapes overlap.
+The computation is on the Minkowski difference ``{x_a - x_b}``, which contains the origin if and only if the shapes
+overlap. Along a unit direction n, from b to a, the gap between the shapes is ``g(n) = n.pos - h_a(n) - h_b(n)``, with
+the support function ``h``. The signed distance is the maximum of the gap over all directions: the distance of the
+nearest points of separated shapes, or minus the length of the shortest translation that separates overlapping ones.
+Every direction gives a lower bound, and the best bound is returned, so overlap needs no separate test.
 
-Apart, the direction comes from the algorithm of Gilbert, Johnson and Keerthi (1988), here; overlapping, from a search
-among the normals that the body can have, in ``overlap``.
+For separated shapes the direction comes from the algorithm of Gilbert, Johnson and Keerthi (1988), in this module; for
+overlapping shapes from a search over the normals of the Minkowski difference, in ``overlap``.
 """
 
 from __future__ import annotations
@@ -28,68 +27,68 @@ from crazysim.geometry.triangle import foot, mean, open_foot
 from crazysim.geometry.vector import Vector, along, margin, select, stack, unit
 
 Best = tuple[Array, Vector]
-"""The largest gap so far, m (...), and its direction."""
+"""Largest gap so far, m (...), and its direction."""
 Corner = tuple[Vector, list[Array]]
-"""A corner of the Minkowski difference, m, and which point of the segment or box it belongs to, in its frame, m."""
+"""Support point of the Minkowski difference, m, and the point of the segment or box it comes from, in its frame, m."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """A segment or a box, and another convex shape in whose frame everything is."""
+    """Segment or box, and another convex shape whose frame all vectors are in."""
 
     other: Shape
-    """The other shape: a box, cylinder, ellipsoid or mesh."""
+    """Other shape: a box, cylinder, ellipsoid or mesh."""
     half: tuple[float, ...]
-    """Half lengths of the box, or that of the segment, m. One or three numbers."""
+    """Half lengths of the box, or half length of the segment, m. One or three numbers."""
     edges: list[Vector]
-    """Unit directions of these. As many."""
+    """Unit directions of the edges of the box, or of the segment. One or three vectors."""
     place: Vector
-    """Their middle, m."""
+    """Position of the centre of the box or segment, m."""
 
     def gap(self, n: Vector) -> Array:
-        """Return the gap of the two along a unit direction from the other to this, m. (...)"""
+        """Return the gap between the shapes along a unit direction from the other shape to this one, m. (...)"""
         out = self.place.dot(n) - support.reach(self.other, n)
         for edge, half in zip(self.edges, self.half, strict=True):
             out = out - half * jnp.abs(edge.dot(n))
         return out
 
     def ends(self, n: Vector) -> list[Array]:
-        """Return which point of the segment or box is nearest along a direction, in its own frame, m. (...) each"""
+        """Return the support point of the segment or box against a direction, in its own frame, m. (...) each"""
         return [-end(half, edge.dot(n)) for edge, half in zip(self.edges, self.half, strict=True)]
 
     def at(self, ends: list[Array]) -> Vector:
-        """Return a point of the segment or box by its place in its own frame."""
+        """Return a point of the segment or box, given in its own frame, in the frame of the other shape, m."""
         point = self.place
         for edge, x in zip(self.edges, ends, strict=True):
             point = point + edge * x
         return point
 
     def corner(self, n: Vector) -> Corner:
-        """Return the corner of the Minkowski difference that is nearest along a direction."""
+        """Return the support point of the Minkowski difference against a direction."""
         ends = self.ends(n)
         return self.at(ends) - support.corner(self.other, n), ends
 
     def consider(self, n: Vector, best: Best) -> Best:
-        """Return the better of a direction and the best so far."""
+        """Return the direction with the larger gap: the given one or the best so far."""
         return better((self.gap(n), n), best)
 
 
 def better(new: Best, old: Best) -> Best:
-    """Return which of two directions has the larger gap; of two that tie, the old."""
+    """Return the direction with the larger gap; on a tie, the old one."""
     larger = new[0] > old[0] + margin(old[0].dtype) * jnp.abs(old[0])
     return jnp.where(larger, new[0], old[0]), select(larger, new[1], old[1])
 
 
 def separate(pair: Pair, n: Vector, steps: int) -> tuple[Best, list[Array]]:
-    """Return the direction between the nearest points of two shapes that are apart, and which point of the first it is.
+    """Return the direction between the nearest points of separated shapes, and the nearest point of the first shape.
 
-    A triangle of corners of the Minkowski difference moves towards the origin: the next corner is the nearest along
-    the direction to the triangle's nearest point, and of the three triangles with it the nearest is kept.
+    A triangle of support points of the Minkowski difference moves towards the origin. Each step adds the support point
+    along the direction to the triangle's nearest point, and keeps the nearest of the three triangles that contain it.
 
     Args:
-        pair: The shapes.
-        n: Direction to begin with.
-        steps: Number of corners to add.
+        pair: The two shapes.
+        n: Initial direction.
+        steps: Number of support points to add.
     """
     up = along(2, pair.place.x)
 

@@ -1,7 +1,7 @@
-"""Signed distances: of a point to a shape, and of a drone's shape to another; negative inside.
+"""Signed distances, negative inside: from a point to a shape, and from the shape of a drone to another shape.
 
-A drone's shape has a core, which is a point, a segment or a box, and the radius that is put around it. What has a
-closed form is here; the rest is the work of ``convex``.
+The shape of a drone has a core, which is a point, a segment or a box, and a radius around it. This module has the
+closed forms; ``convex`` computes the rest.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from crazysim.geometry.segments import segment_to_box, segment_to_segment
 from crazysim.geometry.shapes import Shape
 
 DRONE_KINDS = ("sphere", "capsule", "box")
-"""Kinds that a drone's shape may have."""
+"""Kinds that the shape of a drone may have."""
 
 
 def point_distance(shape: Shape, point: Array) -> Array:
-    """Return the signed distance of a point to the surface of a shape, m, negative inside. (...)
+    """Return the signed distance from a point to the surface of a shape, m, negative inside. (...)
 
-    Exact for plane, sphere, capsule, box and cylinder (Ericson 2005, section 5.1) and for a mesh; for an ellipsoid by
-    Newton steps, of which there are enough; for a height field up to the side of a cell, see ``field_distance``.
+    Exact for plane, sphere, capsule, box, cylinder (Ericson 2005, section 5.1) and mesh. For an ellipsoid it is solved
+    by Newton's method; for a height field see ``field_distance``.
 
     Args:
         shape: The shape.
@@ -36,16 +36,16 @@ def point_distance(shape: Shape, point: Array) -> Array:
 
 
 def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
-    """Return the signed distance of two shapes, m: of their nearest points, or minus how deep they overlap. (...)
+    """Return the signed distance between two shapes: that of their nearest points, or minus their overlap, m. (...)
 
-    The depth is the length of the shortest translation that parts them. Exact for spheres, and for capsules and boxes
-    with a plane, sphere, capsule or, a capsule, with a box; for the rest see ``convex_distance`` and, for height
-    fields, ``drone_to_field``. First derivatives are those of the nearest points; in second ones, of what is no
-    sphere, these points stay where they are on their shapes.
+    The overlap is the length of the shortest translation that separates them. Exact for spheres, for capsules and
+    boxes against a plane, sphere or capsule, and for a capsule against a box. For other pairs see ``convex_distance``
+    and, for height fields, ``drone_to_field``. First derivatives are those of the nearest points; second derivatives
+    of shapes other than spheres treat the nearest points as fixed on their shapes.
 
     Args:
-        a: The drone's shape: a sphere, a capsule or a box.
-        b: The other shape, of any kind.
+        a: Shape of the drone: a sphere, capsule or box.
+        b: Other shape, of any kind.
         pos: Position of the centre of ``a`` in the frame of ``b``, m. (..., 3)
         rot: Rotation matrix from the frame of ``a`` to that of ``b``. (..., 3, 3)
 
@@ -53,7 +53,7 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
         ConfigError: If ``a`` is of another kind.
     """
     if a.kind not in DRONE_KINDS:
-        raise ConfigError(f"the distance of a {a.kind} as a drone's shape; it may be a {', '.join(DRONE_KINDS)}")
+        raise ConfigError(f"expected a drone shape of kind {', '.join(DRONE_KINDS)}, got {a.kind}; use one of these")
     pos, rot = jnp.asarray(pos), jnp.asarray(rot)
     if b.kind == "hfield" and a.kind == "sphere":
         return field_distance(b, pos, a.size[0]) - a.size[0]
@@ -78,13 +78,13 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
 
 
 def _inverse(pos: Array, rot: Array) -> Array:
-    """Return the origin of the other frame in the frame that is at ``pos`` and turned by ``rot``. (..., 3)"""
+    """Return the position of the inverse of the pose ``pos``, ``rot``. (..., 3)"""
     x, y, z = components(pos)
     return -jnp.stack([rot[..., 0, k] * x + rot[..., 1, k] * y + rot[..., 2, k] * z for k in range(3)], axis=-1)
 
 
 def _reach(shape: Shape, direction: Array) -> Array:
-    """Return how far a capsule or a box reaches along a unit direction in its own frame, m. (...)"""
+    """Return the support function of a capsule or box along a unit direction in its own frame, m. (...)"""
     x, y, z = (magnitude(d) for d in components(direction))
     if shape.kind == "capsule":
         return shape.size[1] * z + shape.size[0]

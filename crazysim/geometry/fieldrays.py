@@ -1,4 +1,4 @@
-"""Rays to a height field, from cell to cell."""
+"""Ray casting against a height field, cell by cell."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from crazysim.geometry.shapes import Shape
 from crazysim.geometry.vector import Vector, select, unit, vector
 
 PARALLEL = 1e-12
-"""Component of a unit direction below which a ray counts as parallel: its inverse and its square fit float32."""
+"""Component of a unit direction below which a ray counts as parallel; its inverse and square fit into float32."""
 
 Hit = tuple[Array, Vector]
-"""How far a ray goes, m (...), infinite where it misses, and the outward normal of the plane it ends on."""
+"""Distance along a ray, m (...), infinite where it misses, and the outward normal of the plane that it hits."""
 
 
 def field_ray(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Array]:
-    """Return how far rays go before they meet the ground, and its outward normal there.
+    """Return the distance along rays to a height field, and its outward normal at the hit.
 
-    MuJoCo's height field is a box up to z = 0 with the surface above it and walls between; so is this. From inside a
-    ray ends on the surface, on a wall, or at z = 0, also where the ground goes on below.
+    As in MuJoCo, a height field is a box up to z = 0 with a surface above it and walls between. A ray from inside ends
+    on the surface, on a wall, or at z = 0, even where the ground continues below.
 
     Args:
-        shape: The height field.
-        origin: Where rays start, in its frame, m. (..., 3)
-        direction: Their unit directions. (..., 3)
+        shape: Height field.
+        origin: Origin of each ray, in the frame of the field, m. (..., 3)
+        direction: Unit direction of each ray, in the frame of the field. (..., 3)
 
     Returns:
         Distance, m, infinite where it misses. (...)
@@ -34,7 +34,7 @@ def field_ray(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Arr
     o, d = vector(lax.stop_gradient(origin)), vector(lax.stop_gradient(direction))
     t, n = _nearer(_nearer(_base(shape, o, d), _walls(shape, o, d)), _surface(shape, o, d))
     hit = jnp.isfinite(t)
-    # What is met is flat there: the rest of the way changes with both ends of the ray as that to a plane.
+    # The surface is locally flat, so the derivative is that of the distance to the plane of the hit.
     reached = o + d * jnp.where(hit, t, 0.0)
     o, d = vector(origin), vector(direction)
     across = n.dot(d)
@@ -50,7 +50,7 @@ def _nearer(a: Hit, b: Hit) -> Hit:
 
 
 def _faces(half: tuple[float, float], o: Vector, d: Vector) -> list[tuple[Array, Vector, Array, Array]]:
-    """Return for the planes of the four walls: how far, outward normal, and the two places along the wall and z."""
+    """Return for each of the four walls: distance, outward normal, and the x and y of the hit."""
     zero = jnp.zeros_like(o.x)
     out = []
     for side in (-1.0, 1.0):
@@ -65,7 +65,7 @@ def _faces(half: tuple[float, float], o: Vector, d: Vector) -> list[tuple[Array,
 
 
 def _base(shape: Shape, o: Vector, d: Vector) -> Hit:
-    """Return where rays meet the box below z = 0."""
+    """Return the hits of the box below z = 0."""
     x_half, y_half, _, base = shape.size
     zero = jnp.zeros_like(o.x)
     hit = (zero + jnp.inf, Vector(zero, zero, zero))
@@ -81,7 +81,7 @@ def _base(shape: Shape, o: Vector, d: Vector) -> Hit:
 
 
 def _walls(shape: Shape, o: Vector, d: Vector) -> Hit:
-    """Return where rays meet the walls between z = 0 and the surface."""
+    """Return the hits of the walls between z = 0 and the surface."""
     zero = jnp.zeros_like(o.x)
     hit = (zero + jnp.inf, Vector(zero, zero, zero))
     for t, n, x, y in _faces(shape.size[:2], o, d):  # type: ignore[arg-type]
@@ -92,12 +92,12 @@ def _walls(shape: Shape, o: Vector, d: Vector) -> Hit:
 
 
 def _surface(shape: Shape, o: Vector, d: Vector) -> Hit:
-    """Return where rays meet the triangles, by going through the cells that they pass over, in order."""
+    """Return the hits of the triangles, by traversing the cells below each ray in order."""
     ground = shape.array("heights")
     n_rows, n_columns = ground.shape
     heights = jnp.asarray(ground, o.x.dtype)
     side_x, side_y = spacing(shape)
-    # In cells: the place of the origin and the way per metre.
+    # Origin and direction in units of cells.
     u, v = (o.x + shape.size[0]) / side_x, (o.y + shape.size[1]) / side_y
     du, dv = d.x / side_x, d.y / side_y
     start = jnp.zeros_like(o.x)
@@ -116,7 +116,7 @@ def _surface(shape: Shape, o: Vector, d: Vector) -> Hit:
         a, b, c, e = heights[i, j], heights[i, j + 1], heights[i + 1, j + 1], heights[i + 1, j]
         x, y = u - j.astype(u.dtype), v - i.astype(v.dtype)
         for rise_x, rise_y, right in ((b - a, c - b, 1.0), (c - e, e - a, -1.0)):
-            # How high the ray is above the triangle's plane, and how fast it sinks towards it.
+            # Height of the ray's origin above the plane of the triangle, and its rate of descent towards it.
             above, sinks = o.z - a - rise_x * x - rise_y * y, rise_x * du + rise_y * dv - d.z
             meets = jnp.abs(sinks) > PARALLEL
             t = above / jnp.where(meets, sinks, 1.0)
@@ -125,7 +125,7 @@ def _surface(shape: Shape, o: Vector, d: Vector) -> Hit:
             on = on & (right * (at_x - at_y) >= -slack) & meets & inside & (t >= 0)
             n = Vector(-rise_x / side_x, -rise_y / side_y, jnp.ones_like(t))
             hit = _nearer((jnp.where(on, t, jnp.inf), n), hit)
-        # On to the neighbour whose border is nearer.
+        # Continue with the neighbour whose border is nearer.
         right, up = du > 0, dv > 0
         moves_x, moves_y = jnp.abs(du) > PARALLEL, jnp.abs(dv) > PARALLEL
         t_x = jnp.where(moves_x, (jnp.where(right, 1.0, 0.0) - x) / jnp.where(moves_x, du, 1.0), jnp.inf)

@@ -1,8 +1,8 @@
-"""Distances and rays of a height field: the solid below triangles over a grid, with walls and a bottom.
+"""Signed distances to a height field: the solid below triangles over a grid, with walls and a bottom.
 
-The triangles looked at are those of the cells near a point, however large the grid. They are found by numbers that
-are known at run time only. The project's own engine has these written out, for grids of up to 64 heights; with more,
-a stage runs as plain XLA.
+Only the triangles of the cells near a point are examined, independent of the size of the grid. Their indices depend on
+the data. The fused engine supports such indexing for grids of up to 64 heights; with larger grids the stage runs as
+plain XLA.
 """
 
 from __future__ import annotations
@@ -21,28 +21,27 @@ from crazysim.rotation import safe_clip, safe_sqrt
 
 
 def spacing(shape: Shape) -> tuple[float, float]:
-    """Return the sides of a cell along x and y, m."""
+    """Return the side lengths of a cell along x and y, m."""
     n_rows, n_columns = shape.array("heights").shape
     return 2 * shape.size[0] / (n_columns - 1), 2 * shape.size[1] / (n_rows - 1)
 
 
 def field_distance(shape: Shape, point: Array, reach: float = 0.0) -> Array:
-    """Return the signed distance of a point to the ground, m. (...)
+    """Return the signed distance from a point to the ground, m. (...)
 
-    Looked at are the cell below the point and all within ``reach`` of it, one at least: up to there, below zero as
-    above, the distance is exact; a larger one is that to the nearest of these cells, an upper bound. Its sign is
-    always right.
+    The cell below the point and all cells within ``reach`` are examined. Distances of a magnitude up to ``reach`` are
+    exact; larger ones are upper bounds, the distance to the nearest examined cell. The sign is always correct.
 
     Args:
-        shape: The height field.
-        point: Points in its frame, m. (..., 3)
-        reach: Up to which distance it is exact, m; never less than a side of a cell.
+        shape: Height field.
+        point: Points in the frame of the field, m. (..., 3)
+        reach: Distance up to which the result is exact, m; at least one side of a cell.
     """
     place = vector(point)
     x_half, y_half, _, base = shape.size
     grid = corners(shape, place, reach)
     surface = triangles_distance(place, *triangles(grid))
-    # Beside and below the solid, and inside it, its walls and its bottom count too.
+    # The walls and the bottom can be nearer than the surface.
     qx, qy = safe_clip(place.x, -x_half, x_half), safe_clip(place.y, -y_half, y_half)
     below = place.z < height(shape, lax.stop_gradient(qx), lax.stop_gradient(qy), place)
     dx, dy, dz = place.x - qx, place.y - qy, larger(-base - place.z, 0.0)
@@ -54,16 +53,16 @@ def field_distance(shape: Shape, point: Array, reach: float = 0.0) -> Array:
 
 
 def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array) -> Array:
-    """Return the signed distance of a box, or of a segment, to the ground, m. (...)
+    """Return the signed distance from a box or a segment to the ground, m. (...)
 
-    Apart, the nearest points are a corner of the box and a point of the ground, or a point of the box and one on an
-    edge of the ground: exact up to the diagonal of the box and beyond it an upper bound. Overlapping, the depth is
-    that of the deepest corner, or what parts the box from the deepest edge, whichever is more: it is not the shortest
-    translation out of all triangles at once.
+    For separated shapes the nearest points are a corner of the box and a point of the ground, or a point of the box
+    and one on an edge of the ground. The result is exact up to the diagonal of the box, and an upper bound beyond. For
+    overlapping shapes the depth is the larger of that of the deepest corner and that of the deepest edge, which is not
+    the shortest translation out of all triangles at once.
 
     Args:
-        half: Half lengths of the box, m; zeros for a segment. 3 numbers
-        shape: The height field.
+        half: Half lengths of the box, m; zeros for a segment. (3,)
+        shape: Height field.
         pos: Position of the centre of the box in the frame of the field, m. (..., 3)
         rot: Rotation matrix from the frame of the box to that of the field. (..., 3, 3)
     """
@@ -87,7 +86,7 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
 
 
 def corners(shape: Shape, place: Vector, reach: float) -> Vector:
-    """Return the corners of the cells within reach of a point, which carry no derivative. (..., n_y + 1, n_x + 1)"""
+    """Return the corners of the cells within reach of a point, without derivatives, m. (..., n_y + 1, n_x + 1)"""
     heights = shape.array("heights")
     starts, counts = [], []
     for position, half, side, n in (
@@ -109,7 +108,7 @@ def corners(shape: Shape, place: Vector, reach: float) -> Vector:
 
 
 def triangles(grid: Vector) -> tuple[Vector, Vector, Vector]:
-    """Return the corners of both triangles of every cell, in a row. 3 of (..., n_triangles)"""
+    """Return the three corners of both triangles of every cell, concatenated. 3 of (..., n_triangles)"""
 
     def part(rows: slice, columns: slice) -> list[Array]:
         return [v[..., rows, columns].reshape(*v.shape[:-2], -1) for v in (grid.x, grid.y, grid.z)]
@@ -124,7 +123,7 @@ def triangles(grid: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def edges(grid: Vector) -> tuple[Vector, Vector]:
-    """Return the ends of the edges along x, along y and along the diagonals of cells, in a row. 2 of (..., n_edges)"""
+    """Return the ends of all edges along x, y and the diagonals of cells, concatenated. 2 of (..., n_edges)"""
     every, low, high = slice(None), slice(None, -1), slice(1, None)
 
     def join(*parts: tuple[slice, slice]) -> Vector:
@@ -135,13 +134,13 @@ def edges(grid: Vector) -> tuple[Vector, Vector]:
 
 
 def height(shape: Shape, x: Array, y: Array, like: Vector) -> Array:
-    """Return the height of the surface at places within the field, m. (...)"""
+    """Return the height of the surface at positions within the field, m. (...)"""
     grid_x, grid_y, along_x, along_y, origin = plane_at(shape, x, y, like)
     return origin + along_x * grid_x + along_y * grid_y
 
 
 def plane_at(shape: Shape, x: Array, y: Array, like: Vector) -> tuple[Array, Array, Array, Array, Array]:
-    """Return where in its cell a place is, 0 to 1, the rises of its triangle along the cell, and its start, m. (...)"""
+    """Return the position in its cell (0 to 1, x and y), the rises of its triangle and the height of its origin, m."""
     heights = jnp.asarray(shape.array("heights"), like.x.dtype)
     side_x, side_y = spacing(shape)
     u, v = (x + shape.size[0]) / side_x, (y + shape.size[1]) / side_y

@@ -1,9 +1,9 @@
-"""Which direction parts two overlapping convex shapes soonest.
+"""Direction of the shortest translation that separates two overlapping convex shapes.
 
-The surface of the Minkowski difference that is nearest to the origin is flat or smooth there, never an edge: a ball in
-a convex body touches no edge. So what meets there is a face of one shape and a corner of the other, or an edge of the
-first along an edge or a curved side of the second. Its normal is that of a face; or it is somewhere on the circle of
-directions across an edge; or, for an ellipsoid, it belongs to the point nearest to a corner.
+The point of the surface of the Minkowski difference nearest to the origin is on a flat or smooth part, never on an
+edge, because the largest ball inside a convex body touches no edge. It therefore pairs a face of one shape with a
+corner of the other, or an edge of the first shape with an edge or a curved side of the second. Its normal is that of a
+face, or perpendicular to an edge, or, for an ellipsoid, the normal at the point nearest to a corner.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from crazysim.geometry.triangle import THIN
 from crazysim.geometry.vector import Vector, along, select, stack, unit, vector
 
 SEPARATION_STEPS = 16
-"""Steps towards the nearest points of shapes apart: corners, of which polytopes need few and curved shapes more."""
+"""Steps towards the nearest points of separated shapes; polytopes need few, curved shapes more."""
 TOUCH_STEPS = 24
-"""Steps that go on from the best direction, to where the shapes are nearest or touch."""
+"""Further steps from the best direction towards the nearest or touching points."""
 PARTED = 0.02
-"""How far shapes are parted for that, as a part of the moving one's half length."""
+"""Distance to which overlapping shapes are separated for these steps, as a fraction of the moving half length."""
 ARCS = 16
-"""Pieces of a circle of directions, in each of which the least depth is looked for."""
+"""Number of arcs of a circle of directions, each searched for the smallest depth."""
 ARC_STEPS = 6
-"""Steps to the least depth within the best piece."""
+"""Refinement steps within the best arc."""
 
 Flat = tuple[Array, Array]
-"""A vector in the plane of a circle. 2 of (...)"""
+"""Vector in the plane of a circle. 2 of (...)"""
 
 
 def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
-    """Return the signed distance of a segment or a box to a convex shape, m. (...)
+    """Return the signed distance from a segment or box to a convex shape, m. (...)
 
-    Of shapes of up to a few metres, apart or overlapping by little, it errs by less than 1e-3 m. Two boxes overlap
-    exactly, by the 15 normals of the separating axis theorem (Gottschalk 1996); in deep overlap with another shape the
-    depth is an upper bound, that of the best direction found. The gradient is that of the
-    nearest points; deep in a curved shape its direction errs by some hundredths.
+    The error is below 1e-3 m for shapes of up to a few metres that are separated or overlap slightly. The overlap of
+    two boxes is exact, by the 15 normals of the separating axis theorem (Gottschalk 1996). The depth of a deep overlap
+    with another shape is an upper bound, that of the best direction found. The gradient is that of the nearest points;
+    deep inside a curved shape its direction has an error of some hundredths.
 
     Args:
-        a: A box, or a capsule, whose core counts, without its radius.
-        b: A box, cylinder, ellipsoid or mesh.
+        a: Box, or capsule of which only the core counts, without its radius.
+        b: Box, cylinder, ellipsoid or mesh.
         pos: Position of the centre of ``a`` in the frame of ``b``, m. (..., 3)
         rot: Rotation matrix from the frame of ``a`` to that of ``b``. (..., 3, 3)
     """
@@ -55,19 +55,19 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
     up = along(2, place.x)
     best, _ = separate(fixed, unit(fixed.place, up), SEPARATION_STEPS)
     gap, n = overlap(fixed, a.kind == "box", best)
-    # Parted along the direction found, they have nearest points, which are those where they touch.
+    # Separated along the direction found, the shapes have nearest points, which are those of first contact.
     aside = PARTED * max(half)
     parted = dataclasses.replace(fixed, place=fixed.place + n * jnp.where(gap < aside, aside - gap, 0.0))
     (_, m), ends = separate(parted, n, TOUCH_STEPS)
     n = fixed.consider(m, (gap, n))[1]
     n = unit(n, up)
-    # The distance changes with that point of the moving shape, as long as it is the nearest.
+    # The derivative of the distance is that of the nearest point of the moving shape.
     moving = Pair(b, half, edges, place).at(ends).dot(n)
     return moving + lax.stop_gradient(fixed.gap(n) - moving)
 
 
 def overlap(pair: Pair, is_box: bool, best: Best) -> Best:
-    """Return the best of a direction and all that the surface of the Minkowski difference can have."""
+    """Return the best of a direction and all candidate normals of the Minkowski difference."""
     b, edges = pair.other, pair.edges
     own = [along(k, pair.place.x) for k in range(3)]
     sides = {"box": own, "cylinder": own[2:]}.get(b.kind, [])
@@ -86,14 +86,14 @@ def overlap(pair: Pair, is_box: bool, best: Best) -> Best:
 
 
 def _best_of(tried: Best, best: Best) -> Best:
-    """Return the best of directions along the first axis, and of the best so far."""
+    """Return the best of the directions along the first axis and the best so far."""
     for k in range(tried[0].shape[0]):
         best = better((tried[0][k], tried[1][k]), best)
     return best
 
 
 def _best_face(pair: Pair) -> Best:
-    """Return the best of the normals of a mesh."""
+    """Return the best of the face normals of a mesh."""
     normals, offsets = pair.other.array("normals"), pair.other.array("offsets")
     x, y, z = (jnp.asarray(column, pair.place.x.dtype) for column in normals.T)
 
@@ -109,7 +109,7 @@ def _best_face(pair: Pair) -> Best:
 
 
 def _best_at_ends(pair: Pair, best: Best) -> Best:
-    """Return the best of a direction and the normals of an ellipsoid where it is nearest to a corner of the other."""
+    """Return the best of a direction and the normals of an ellipsoid at its points nearest to corners of the other."""
     shortest = min(range(3), key=lambda k: pair.other.size[k])
 
     def at_end(k: Array, best: Best) -> Best:
@@ -117,7 +117,7 @@ def _best_at_ends(pair: Pair, best: Best) -> Best:
         for bit, (edge, half) in enumerate(zip(pair.edges, pair.half, strict=True)):
             point = point + edge * jnp.where((k >> bit) & 1 == 1, -half, half)
         n = unit(Vector(*ellipsoid_normal(pair.other, (point.x, point.y, point.z))), best[1])
-        # The nearest point may be on the wrong side of the ellipsoid: then one near its mirror image counts.
+        # The nearest point may be on the wrong side of the ellipsoid, so the mirror image is tried too.
         sign = [-1.0 if k == shortest else 1.0 for k in range(3)]
         return pair.consider(Vector(n.x * sign[0], n.y * sign[1], n.z * sign[2]), pair.consider(n, best))
 
@@ -125,13 +125,14 @@ def _best_at_ends(pair: Pair, best: Best) -> Best:
 
 
 def _best_across(pair: Pair, axis: Vector) -> Best:
-    """Return the best direction of the circle across an axis, or nearly.
+    """Return the approximately best direction perpendicular to an axis.
 
-    In the plane of the circle the body is a polygon, perhaps with curved sides. Between two directions whose farthest
-    corners differ, the gap is largest at the normal of the side between the corners, if there is no corner between.
-    So each arc gives an estimate, and in the best of them the search goes on, on the side where the gap still rises.
+    Projected onto the plane of these directions, the body is a polygon, possibly with curved sides. Between two
+    directions with different support points the gap is largest at the normal of the side between the two points, if
+    there is no further corner between them. Each arc gives such an estimate, and the search is refined in the best
+    arc, on the side where the gap still increases.
     """
-    # Angles are counted from any direction across the axis: that of the product with the axis it is farthest from.
+    # Angles start at the cross product with the coordinate axis that is closest to perpendicular.
     x, y, z = (jnp.abs(v) for v in (axis.x, axis.y, axis.z))
     own = [along(k, axis.x) for k in range(3)]
     farthest = select((x <= y) & (x <= z), own[0], select(y <= z, own[1], own[2]))
@@ -142,12 +143,12 @@ def _best_across(pair: Pair, axis: Vector) -> Best:
         return e * n[0] + f * n[1]
 
     def corner(n: Flat) -> Flat:
-        """Return the farthest corner, in the plane, along a direction in the plane."""
+        """Return the projected support point along a direction in the plane."""
         point, _ = pair.corner(direction(n))
         return point.dot(e), point.dot(f)
 
     def between(n: Flat, p: Flat, m: Flat, q: Flat) -> Flat:
-        """Return the unit direction between two along which their corners are equally far."""
+        """Return the unit direction between two directions along which their support points are equally far."""
         u, v, middle = q[1] - p[1], p[0] - q[0], (n[0] + m[0], n[1] + m[1])
         sign = jnp.where(u * middle[0] + v * middle[1] < 0, -1.0, 1.0)
         same = u * u + v * v <= 1e-10 * (p[0] * p[0] + p[1] * p[1])
@@ -176,7 +177,7 @@ def _best_across(pair: Pair, axis: Vector) -> Best:
         gap, (n, p, m, q, top) = carry
         middle = between(n, p, m, q)
         r, here = corner(middle), pair.gap(direction(middle))
-        # How the gap changes with the angle is the corner's component along the circle.
+        # The derivative of the gap with the angle is the component of the support point along the circle.
         rises = middle[0] * r[1] - middle[1] * r[0] > 0
         n, p = _choose(rises, middle, n), _choose(rises, r, p)
         m, q = _choose(rises, m, middle), _choose(rises, q, r)

@@ -1,7 +1,7 @@
-"""Signed distance of a point to a shape, negative inside, for each kind.
+"""Signed distances from a point to each kind of shape, negative inside.
 
-Written out in components, with selections in place of branches, so that one drone's share is a few dozen operations
-on single numbers. At a switch the gradient is that of one side.
+The formulas are in components, with selections instead of branches, so that one drone takes a few dozen scalar
+operations. At a switch the gradient is that of one side.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from crazysim.geometry.vector import Vector, vector
 from crazysim.rotation import safe_clip, safe_sqrt
 
 ELLIPSOID_STEPS = 12
-"""Newton steps to the foot of the perpendicular on an ellipsoid: 3e-6 of its size where one semi-axis is a thousand
-times another, rounding where it is ten times another."""
+"""Newton steps for the nearest point of an ellipsoid. The error is 3e-6 of its size for a ratio of semi-axes of 1,000,
+and rounding for a ratio of 10."""
 
 
 Components = tuple[Array, Array, Array]
@@ -30,7 +30,7 @@ def components(x: Array) -> Components:
 
 
 def larger(a: Array | float, b: Array | float) -> Array:
-    """Return the larger of two, with the gradient of one of them also where they are equal. (...)"""
+    """Return the larger of two values; the gradient is that of one of them even where they are equal. (...)"""
     return jnp.where(a > b, a, b)
 
 
@@ -60,7 +60,7 @@ def _box(shape: Shape, point: Array) -> Array:
 
 
 def box_distance(half: tuple[float, ...], point: tuple[Array, Array, Array]) -> Array:
-    """Return the signed distance of a point in components, 3 of (...), to a box of half lengths. (...)"""
+    """Return the signed distance from a point, 3 components of (...), to a box of given half lengths, m. (...)"""
     x, y, z = (magnitude(p) - h for p, h in zip(point, half, strict=True))
     inside = larger(larger(x, y), z)
     x, y, z = larger(x, 0.0), larger(y, 0.0), larger(z, 0.0)
@@ -77,9 +77,9 @@ def _cylinder(shape: Shape, point: Array) -> Array:
 
 
 def _ellipsoid(shape: Shape, point: Array) -> Array:
-    """Return the distance to the plane that touches the ellipsoid where the point is nearest. (...)
+    """Return the distance to the tangent plane of the ellipsoid at the nearest point, m. (...)
 
-    Its normal n known to an error e, the distance ``(n.p - |a n|) / |n|`` is known to e^2.
+    An error e of the normal n gives an error e^2 of the distance ``(n.p - |a n|) / |n|``.
     """
     normal = ellipsoid_normal(shape, components(point))
     along = sum(n * p for n, p in zip(normal, components(point), strict=True))
@@ -88,17 +88,17 @@ def _ellipsoid(shape: Shape, point: Array) -> Array:
 
 
 def ellipsoid_normal(shape: Shape, point: Components) -> Components:
-    """Return the normal of an ellipsoid where it is nearest to a point, of any length. 3 of (...)
+    """Return the normal, not normalised, of an ellipsoid at its point nearest to a point. 3 of (...)
 
-    The foot of p has the normal w_i = p_i / (t + a_i^2), where t solves |a w| = 1 (Eberly 2013, Distance from a Point
-    to an Ellipse, an Ellipsoid, or a Hyperellipsoid). 1 / |a w| is concave in t, so Newton's steps from below never
-    pass the root (Conn, Gould and Toint 2000, section 7.3.3).
+    The nearest point to p has the normal w_i = p_i / (t + a_i^2), where t solves |a w| = 1 (Eberly 2013, Distance from
+    a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid). 1 / |a w| is concave in t, so Newton's steps from below
+    never pass the root (Conn, Gould and Toint 2000, section 7.3.3).
 
-    What is solved for is s = t + min(a)^2, which is small where the point is near the middle and w would be lost.
+    The unknown is s = t + min(a)^2, which keeps its precision where the point is near the centre.
     """
     axes = np.asarray(shape.size)
     gaps = (axes**2 - axes.min() ** 2).tolist()
-    # A point of the middle plane has two feet: it is moved aside by less than a rounding error.
+    # A point of the symmetry plane has two nearest points: it is displaced by less than a rounding error.
     aside = (2 * float(jnp.finfo(point[0].dtype).eps) * axes).tolist()
     moved = [p + jnp.where(p < 0, -e, e) for p, e in zip(point, aside, strict=True)]
     scaled = [a * p for a, p in zip(shape.size, moved, strict=True)]
@@ -121,10 +121,7 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
 
 
 def _mesh(shape: Shape, point: Array) -> Array:
-    """Return the distance to the nearest triangle outside, to the nearest plane inside. (...)
-
-    Where the nearest triangle is, a small move of the point does not move what is nearest on it, to first order.
-    """
+    """Return the distance to the nearest triangle outside, and to the nearest plane inside, m. (...)"""
     place = vector(point)
     inside = plane_distance(shape.array("normals"), shape.array("offsets"), place)
     triangles = shape.array("vertices")[shape.array("faces")]
@@ -133,10 +130,10 @@ def _mesh(shape: Shape, point: Array) -> Array:
 
 
 def plane_distance(normals: np.ndarray, offsets: np.ndarray, place: Vector) -> Array:
-    """Return the signed distance of a point to the plane it is highest above, m. (...)
+    """Return the largest signed distance from a point to planes, m. (...)
 
-    The plane is chosen, and then its distance taken: the gradient of the largest of all these products, in a step
-    under ``vmap``, lacked a component with XLA for the CPU of JAX 0.10.1.
+    The plane is selected first and its distance computed afterwards, because the gradient of the maximum, in a step
+    under ``vmap``, lacked a component with XLA for CPUs in JAX 0.10.1.
     """
     fixed = lax.stop_gradient(place)
     columns = [jnp.asarray(column, place.x.dtype) for column in (*normals.T, offsets)]
@@ -148,7 +145,14 @@ def plane_distance(normals: np.ndarray, offsets: np.ndarray, place: Vector) -> A
 
 
 def triangles_distance(place: Vector, a: Vector, b: Vector, c: Vector) -> Array:
-    """Return the distance of a point to the nearest of triangles, which are along the last axis of their corners."""
+    """Return the distance from a point to the nearest triangle, m. (...)
+
+    Args:
+        place: Point. (...)
+        a: First corners. (..., n_triangles) or (n_triangles,)
+        b: Second corners.
+        c: Third corners.
+    """
     fixed = lax.stop_gradient(place)
     fixed = Vector(fixed.x[..., None], fixed.y[..., None], fixed.z[..., None])
     a, b, c = a - fixed, b - fixed, c - fixed

@@ -1,4 +1,4 @@
-"""Where rays first meet the surface of a shape, and its normal there: what a depth camera sees."""
+"""Ray casting against shapes, for depth cameras and range finders: distance to the first hit, and the normal there."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from crazysim.geometry.shapes import Shape
 from crazysim.rotation import safe_clip, safe_normalize, safe_sqrt
 
 Interval = tuple[Array, Array, Array]
-"""Where a line enters a convex shape, where it leaves it, and whether it meets it at all."""
+"""Distances along a line at which it enters and leaves a convex shape, and True where it meets the shape at all."""
 
 
 def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Array]:
-    """Return how far rays go before they meet the surface, and the outward normal where they do.
+    """Return the distance along rays to the surface of a shape, and its outward normal at the hit.
 
-    As MuJoCo's ``mj_ray`` has it: from inside a solid the ray meets the surface where it leaves, and the normal still
-    points outward; a plane is met from above only; a height field also at z = 0, where the box below its surface ends.
+    The conventions are those of MuJoCo's ``mj_ray``: a ray from inside a solid hits the surface where it leaves, and
+    the normal still points outward; a plane is hit only from above; a height field is also hit at z = 0, where the box
+    below its surface ends.
 
     Args:
-        shape: The shape.
-        origin: Where rays start, in the frame of the shape, m. (..., 3)
-        direction: Their unit directions. (..., 3)
+        shape: Shape.
+        origin: Origin of each ray, in the frame of the shape, m. (..., 3)
+        direction: Unit direction of each ray, in the frame of the shape. (..., 3)
 
     Returns:
         Distance along the ray, m, infinite where it misses. (...)
@@ -38,7 +39,7 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
         near, far, meets = LINE[shape.kind](shape, origin, direction)
         hit = meets & (far >= 0)
         t = jnp.where(near >= 0, near, far)
-    # Where it misses, nothing may come of the rest, in gradients either.
+    # A miss must not contribute NaN, in gradients either.
     t = jnp.where(hit, t, 0.0)
     normal = NORMAL[shape.kind](shape, origin + t[..., None] * direction)
     return jnp.where(hit, t, jnp.inf), jnp.where(hit[..., None], normal, 0.0)
@@ -51,7 +52,7 @@ def _plane(origin: Array, direction: Array) -> tuple[Array, Array]:
 
 
 def slab(origin: Array, direction: Array, half: Array | float) -> Interval:
-    """Return where a line is between two planes at ``-half`` and ``half``, by components across them. 3 of (...)"""
+    """Return the interval of a line between the planes at ``-half`` and ``half``, from its normal components."""
     parallel = jnp.abs(direction) < PARALLEL
     inverse = 1 / jnp.where(parallel, PARALLEL, direction)
     a, b = (-half - origin) * inverse, (half - origin) * inverse
@@ -59,22 +60,22 @@ def slab(origin: Array, direction: Array, half: Array | float) -> Interval:
 
 
 def both(p: Interval, q: Interval) -> Interval:
-    """Return where a line is in two convex shapes at once."""
+    """Return the interval of a line in the intersection of two convex shapes."""
     near, far = jnp.where(p[0] > q[0], p[0], q[0]), jnp.where(p[1] < q[1], p[1], q[1])
     return near, far, p[2] & q[2] & (near <= far)
 
 
 def either(p: Interval, q: Interval) -> Interval:
-    """Return where a line is in the union of two shapes, if it is convex along the line."""
+    """Return the interval of a line in the union of two shapes that is convex along the line."""
     near = jnp.where(p[2] & (~q[2] | (p[0] < q[0])), p[0], q[0])
     far = jnp.where(p[2] & (~q[2] | (p[1] > q[1])), p[1], q[1])
     return near, far, p[2] | q[2]
 
 
 def _ball(origin: list[Array], direction: list[Array], radius: float) -> Interval:
-    """Return where a line is in a ball, or in a cylinder if two components are given.
+    """Return the interval of a line in a ball, or in a cylinder if two components are given.
 
-    The distance of the line to the centre is that of its nearest point: the usual discriminant cancels far away.
+    It uses the point of the line nearest to the centre, because the usual discriminant cancels far from the ball.
     """
     square = sum(d * d for d in direction)
     parallel = square < PARALLEL
@@ -124,7 +125,7 @@ def _planes(shape: Shape, v: Array) -> Array:
 
 
 def _mesh_line(shape: Shape, origin: Array, direction: Array) -> Interval:
-    """Return where a line is below all planes of a mesh (Kay and Kajiya 1986)."""
+    """Return the interval of a line below all planes of a mesh (Kay and Kajiya 1986)."""
     below = jnp.asarray(shape.offsets, origin.dtype) - _planes(shape, origin)
     rises = _planes(shape, direction)
     parallel = jnp.abs(rises) < PARALLEL
@@ -148,7 +149,7 @@ LINE = {
 
 
 def _up(like: Array) -> Array:
-    """Return the unit vector along z, for as many points. (..., 3)"""
+    """Return the unit vector along z, one for each point. (..., 3)"""
     zero = jnp.zeros_like(like[..., 0])
     return jnp.stack([zero, zero, zero + 1], axis=-1)
 
@@ -168,7 +169,7 @@ def _capsule_normal(shape: Shape, point: Array) -> Array:
 
 
 def _box_normal(shape: Shape, point: Array) -> Array:
-    """Return the normal of the side that a point of the surface is least inside of. (..., 3)"""
+    """Return the normal of the side that a point is nearest to. (..., 3)"""
     x, y, z = (jnp.abs(p) - h for p, h in zip(components(point), shape.size, strict=True))
     of_x = (x >= y) & (x >= z)
     of_y = ~of_x & (y >= z)

@@ -1,4 +1,4 @@
-"""Distances of segments: to another segment, and to a box."""
+"""Distances from a segment to another segment, and to a box."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ PARALLEL = 1e-12
 
 
 def segment_to_segment(middle: Components, axis: Components, half: float, other_half: float) -> Array:
-    """Return the distance of a segment to one along z around the origin, m (Ericson 2005, section 5.1.9). (...)
+    """Return the distance from a segment to one along z around the origin, m (Ericson 2005, section 5.1.9). (...)
 
-    Of parallel segments any pair of nearest points will do, and of nearly parallel ones nearly any: no digit is lost.
+    For parallel or nearly parallel segments the choice of the nearest points does not change the distance.
 
     Args:
-        middle: Its middle, m. 3 of (...)
-        axis: Its unit direction. 3 of (...)
-        half: Its half length, m.
-        other_half: Half length of the other, m.
+        middle: Centre of the segment, m. 3 of (...)
+        axis: Unit direction of the segment. 3 of (...)
+        half: Half length of the segment, m.
+        other_half: Half length of the other segment, m.
     """
     (cx, cy, cz), (x, y, z) = map(_fixed, (middle, axis))
     across = x * x + y * y
@@ -35,17 +35,17 @@ def segment_to_segment(middle: Components, axis: Components, half: float, other_
 
 
 def segment_to_box(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
-    """Return the signed distance of a segment to a box, m. (...)
+    """Return the signed distance from a segment to a box, m. (...)
 
-    Outside, the squared distance of a point that runs along the segment has a slope that rises, in straight pieces
-    between the places where it passes a side's plane; the root lies between the last place of negative and the first
-    of positive slope. Inside, the shortest way out is along a normal of one of the faces of the two bodies' Minkowski
-    difference: the box's own, and those across one of its edges and the segment (Gottschalk 1996).
+    Outside, the slope of the squared distance along the segment is increasing and piecewise linear, with kinks at the
+    planes of the sides; its root lies between the last kink of negative and the first of positive slope. Inside, the
+    shortest separating translation is along a face normal of the Minkowski difference: a normal of the box, or a cross
+    product of one of its edges and the segment (Gottschalk 1996).
 
     Args:
-        middle: Middle of the segment in the frame of the box, m. 3 of (...)
-        axis: Its unit direction. 3 of (...)
-        half: Its half length, m.
+        middle: Centre of the segment in the frame of the box, m. 3 of (...)
+        axis: Unit direction of the segment. 3 of (...)
+        half: Half length of the segment, m.
         box: Half lengths of the box, m.
     """
     c, u = _fixed(middle), _fixed(axis)
@@ -74,7 +74,7 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
 
 
 def _inside_box(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
-    """Return the largest gap of a segment and a box along the normals of their Minkowski difference, m. (...)"""
+    """Return the largest gap between a segment and a box along the normals of their Minkowski difference, m. (...)"""
     c, u = [magnitude(p) for p in middle], [magnitude(d) for d in axis]
     faces = [p - h - half * d for p, h, d in zip(c, box, u, strict=True)]
     out = larger(larger(faces[0], faces[1]), faces[2])
@@ -88,6 +88,6 @@ def _inside_box(middle: Components, axis: Components, half: Array | float, box: 
 
 
 def _fixed(vector: Components) -> Components:
-    """Return a vector as a constant to derivatives. 3 of (...)"""
+    """Return a vector without its derivatives. 3 of (...)"""
     x, y, z = vector
     return lax.stop_gradient(x), lax.stop_gradient(y), lax.stop_gradient(z)

@@ -1,4 +1,4 @@
-"""Shapes: what a drone or an obstacle is made of, as constants that a program is compiled with."""
+"""Shapes of drones and obstacles, as compile-time constants."""
 
 from __future__ import annotations
 
@@ -11,69 +11,70 @@ import numpy as np
 from crazysim.errors import ConfigError
 
 SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4}
-"""Every kind, and how many numbers its size has."""
+"""Number of entries of the size of each kind."""
 LARGEST_SEARCH = 64
-"""Most vertices whose hull is found by trying every triangle."""
+"""Largest number of vertices whose convex hull is computed, by trying every triangle."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shape:
-    """A solid in a frame of its own. It is static: compared and hashed by content, a new one recompiles.
+    """Solid in its own frame. It is static for JAX: compared and hashed by content, and a new one recompiles.
 
-    Sizes are MuJoCo's, half lengths in m:
+    Sizes follow MuJoCo, half lengths in m:
 
-    - ``plane``: none; all that lies below z = 0.
+    - ``plane``: none; the half space below z = 0.
     - ``sphere``: radius.
-    - ``capsule``, ``cylinder``: radius, half length of the axis, which is z; a capsule's caps come on top.
+    - ``capsule``, ``cylinder``: radius, half length along the axis z; without the caps of a capsule.
     - ``box``: half lengths along x, y and z.
     - ``ellipsoid``: semi-axes along x, y and z.
     - ``mesh``: none; the convex hull of its vertices. Made by ``hull``.
     - ``hfield``: half extents along x and y, largest height, depth of the ground below z = 0. Made by ``hfield``.
 
     Raises:
-        ConfigError: If the kind is unknown or the size is no size of that kind.
+        ConfigError: If the kind is unknown, or the size is invalid for the kind.
     """
 
     kind: str
-    """One of ``SIZES``."""
+    """Kind of the shape, a key of ``SIZES``."""
     size: tuple[float, ...] = ()
-    """Size in the kind's convention, m; what comes beyond its numbers, as in MuJoCo's ``geom_size``, is left out."""
+    """Size in the convention of the kind, m; further entries, as in MuJoCo's ``geom_size``, are ignored."""
     vertices: np.ndarray | None = None
-    """Corners of a mesh's hull, m. (n_vertices, 3)"""
+    """Vertices of the convex hull of a mesh, m. (n_vertices, 3)"""
     faces: np.ndarray | None = None
-    """Triangles of the hull as numbers of vertices, counter-clockwise from outside. (n_faces, 3)"""
+    """Triangles of the hull as indices of vertices, counter-clockwise from outside. (n_faces, 3)"""
     normals: np.ndarray | None = None
-    """Unit outward normals of the hull's planes, each once. (n_planes, 3)"""
+    """Distinct unit outward normals of the planes of the hull. (n_planes, 3)"""
     offsets: np.ndarray | None = None
     """Distances of these planes from the origin along their normals, m. (n_planes,)"""
     heights: np.ndarray | None = None
-    """Heights of a height field on its grid, rows along y and columns along x, m. (n_rows, n_columns)"""
+    """Heights of a height field, rows along y and columns along x, m. (n_rows, n_columns)"""
 
     def __post_init__(self) -> None:
-        """Check kind and size, and keep the size as plain numbers."""
+        """Check kind and size, and convert the size to floats."""
         if self.kind not in SIZES:
-            raise ConfigError(f"a shape of kind {self.kind!r}; there are {', '.join(SIZES)}")
+            raise ConfigError(f"expected a shape of kind {', '.join(SIZES)}, got {self.kind!r}; use one of these")
         needed = SIZES[self.kind]
         given = np.asarray(self.size, np.float64).reshape(-1)
         size = given[:needed]
         if len(size) < needed or not np.all(np.isfinite(size)) or not np.all(size > 0):
             raise ConfigError(
-                f"a {self.kind} of size {tuple(given.tolist())}; needed are {needed} positive, finite numbers, in m"
+                f"expected {needed} positive, finite numbers as the size of a {self.kind}, m, got "
+                f"{tuple(given.tolist())}; use MuJoCo's conventions"
             )
         for name, kind, maker in (("vertices", "mesh", "hull"), ("heights", "hfield", "hfield")):
             if self.kind == kind and getattr(self, name) is None:
-                raise ConfigError(f"a {kind} without {name}; make it with geometry.{maker}")
+                raise ConfigError(f"expected a {kind} with {name}, got none; make it with geometry.{maker}")
         object.__setattr__(self, "size", tuple(size.tolist()))
 
     def array(self, name: str) -> np.ndarray:
-        """Return an array that shapes of this kind have.
+        """Return an array of the shape by name.
 
         Raises:
-            TypeError: If they have none of that name.
+            TypeError: If shapes of this kind have no such array.
         """
         found = getattr(self, name)
         if found is None:
-            raise TypeError(f"a {self.kind} has no {name}")
+            raise TypeError(f"expected a shape with {name}, got a {self.kind}, which has none")
         return found
 
     def _content(self) -> tuple[Any, ...]:
@@ -81,7 +82,7 @@ class Shape:
         return (self.kind, self.size, *(None if a is None else (a.shape, a.tobytes()) for a in arrays))
 
     def __eq__(self, other: object) -> bool:
-        """Return whether the other is a shape of the same content."""
+        """Return True for a shape of the same content."""
         return isinstance(other, Shape) and self._content() == other._content()
 
     def __hash__(self) -> int:
@@ -93,29 +94,29 @@ def hull(vertices: Any, faces: Any = None) -> Shape:
     """Return a convex mesh.
 
     Args:
-        vertices: Corners, m; without ``faces`` their convex hull is taken. (n_vertices, 3)
-        faces: Triangles of the convex hull as numbers of vertices, in any order of turning; needed beyond 64 vertices.
-            MuJoCo's compiled model holds them. (n_faces, 3)
+        vertices: Vertices, m. (n_vertices, 3)
+        faces: Triangles of the convex hull as indices of vertices, in any orientation, as in a compiled MuJoCo model.
+            None computes the hull, for up to 64 vertices. (n_faces, 3)
 
     Raises:
         ConfigError: If the vertices span no volume, or the faces are not those of their convex hull.
     """
     v = np.asarray(vertices, np.float64)
     if v.ndim != 2 or v.shape[1] != 3 or len(v) < 4 or not np.all(np.isfinite(v)):
-        raise ConfigError(f"vertices of shape {v.shape}; needed are four or more finite points, (n_vertices, 3)")
+        raise ConfigError(f"expected four or more finite vertices, (n_vertices, 3), got shape {v.shape}")
     scale = float(np.max(np.ptp(v, axis=0)))
     spread = np.linalg.svd(v - v.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(v))
     if spread <= 1e-9 * scale:
-        raise ConfigError(f"{len(v)} vertices that lie in one plane; a mesh needs a volume")
+        raise ConfigError(f"expected vertices that span a volume, got {len(v)} in one plane; add one outside of it")
     triangles = _search(v, 1e-9 * scale) if faces is None else np.asarray(faces)
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
-        raise ConfigError(f"faces of shape {triangles.shape}, {triangles.dtype}; needed are integers, (n_faces, 3)")
+        raise ConfigError(f"expected faces as integers, (n_faces, 3), got {triangles.dtype} {triangles.shape}")
     if triangles.min() < 0 or triangles.max() >= len(v):
-        raise ConfigError(f"faces that name vertices {triangles.min()} to {triangles.max()}; there are {len(v)}")
+        raise ConfigError(f"expected faces of vertices 0 to {len(v) - 1}, got {triangles.min()} to {triangles.max()}")
     a, b, c = (v[triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     area = np.linalg.norm(normals, axis=1)
-    # Slivers have no normal of their own; their neighbours close the hull.
+    # A sliver has no normal; its neighbours close the hull.
     keep = area > 1e-12 * scale * scale
     triangles, normals = triangles[keep], normals[keep] / area[keep, None]
     outward = np.sum(normals * (v[triangles[:, 0]] - v.mean(axis=0)), axis=1) > 0
@@ -125,10 +126,10 @@ def hull(vertices: Any, faces: Any = None) -> Shape:
     out = float(np.max(v @ normals.T - offsets)) if len(offsets) else np.inf
     if out > 1e-4 * scale or (keep.all() and not _closed(triangles)):
         raise ConfigError(
-            f"faces that are not closed, or leave a vertex outside, by {out:.3g} m; needed are the triangles of the "
-            f"convex hull. Up to {LARGEST_SEARCH} vertices they are found without being given."
+            f"expected the triangles of the convex hull, got faces that are not closed or leave a vertex {out:.3g} m "
+            f"outside; omit faces for up to {LARGEST_SEARCH} vertices, and they are computed"
         )
-    # Triangles of one flat side share a plane; the offset is that of the outermost vertex, so that all are inside.
+    # Coplanar triangles share a plane; its offset is that of the outermost vertex, so that all vertices are inside.
     planes = _distinct(normals)
     offsets = np.max(v @ planes.T, axis=0)
     used, places = np.unique(triangles, return_inverse=True)
@@ -136,32 +137,32 @@ def hull(vertices: Any, faces: Any = None) -> Shape:
 
 
 def hfield(heights: Any, size: Sequence[float]) -> Shape:
-    """Return the ground below a surface of triangles over a rectangular grid, two to a cell.
+    """Return the ground below a surface of triangles over a rectangular grid, two per cell.
 
-    The diagonal of a cell joins its corners of least and of largest x and y, as in MuJoCo.
+    As in MuJoCo, the diagonal of a cell joins its corners of smallest and of largest x and y.
 
     Args:
         heights: Heights of the surface, rows along y and columns along x, m. (n_rows, n_columns)
         size: Half extents along x and y, largest height, depth of the ground below z = 0, m. (4,)
 
     Raises:
-        ConfigError: If there are fewer than two rows or columns, or a height is not within zero and the largest.
+        ConfigError: If there are fewer than two rows or columns, or a height is not between zero and the largest.
     """
     h = np.asarray(heights, np.float64)
     if h.ndim != 2 or min(h.shape) < 2:
-        raise ConfigError(f"heights of shape {h.shape}; needed are two or more rows and columns")
+        raise ConfigError(f"expected heights of two or more rows and columns, got shape {h.shape}")
     shape = Shape("hfield", tuple(size), heights=_constant(h))
     if not np.all(np.isfinite(h)) or h.min() < 0 or h.max() > shape.size[2] * (1 + 1e-6):
-        raise ConfigError(f"heights from {h.min()} to {h.max()} m; needed are heights within 0 and {shape.size[2]}")
+        raise ConfigError(f"expected heights between 0 and {shape.size[2]} m, got {h.min()} to {h.max()}")
     return shape
 
 
 def _search(v: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return triangles of a convex hull: all whose plane has no vertex above. Flat sides are cut as a fan."""
+    """Return the triangles of a convex hull, those with no vertex above their plane; flat sides become fans."""
     if len(v) > LARGEST_SEARCH:
         raise ConfigError(
-            f"{len(v)} vertices without faces; their hull is found for up to {LARGEST_SEARCH}. Pass faces, the "
-            f"triangles of the convex hull."
+            f"expected faces for more than {LARGEST_SEARCH} vertices, got {len(v)} vertices and no faces; pass the "
+            f"triangles of the convex hull"
         )
     i, j, k = np.array([(i, j, k) for i in range(len(v)) for j in range(i) for k in range(j)]).T
     normals = np.cross(v[j] - v[i], v[k] - v[i])
@@ -185,13 +186,13 @@ def _search(v: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 def _closed(triangles: np.ndarray) -> bool:
-    """Return whether every edge is run through once each way."""
+    """Return True if every edge occurs once in each direction."""
     edges = {(t[k], t[(k + 1) % 3]) for t in triangles.tolist() for k in range(3)}
     return len(edges) == 3 * len(triangles) and all((b, a) in edges for a, b in edges)
 
 
 def _distinct(normals: np.ndarray) -> np.ndarray:
-    """Return unit vectors that differ by more than rounding. (n, 3) -> (m, 3)"""
+    """Return the unit vectors without near duplicates. (n, 3) -> (m, 3)"""
     kept: list[np.ndarray] = []
     for n in normals:
         if not kept or np.min(np.linalg.norm(np.asarray(kept) - n, axis=1)) > 1e-6:
@@ -200,7 +201,7 @@ def _distinct(normals: np.ndarray) -> np.ndarray:
 
 
 def _constant(x: np.ndarray) -> np.ndarray:
-    """Return a copy that nobody can write."""
+    """Return a read-only copy."""
     x = np.array(x)
     x.setflags(write=False)
     return x

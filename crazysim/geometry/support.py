@@ -1,8 +1,8 @@
-"""How far convex shapes reach along a direction, and their farthest corners.
+"""Support functions and support points of convex shapes.
 
-A corner is chosen by the sign of a number that is often zero but for rounding: two sides are parallel, or a face looks
-back along the direction. A compiler that computes such a number twice, rounded differently, would mix two corners into
-a point outside the shape. So within a small angle of a tie the corner runs from one to the other.
+A support point is selected by the sign of a number that is often zero up to rounding, for example where two sides are
+parallel. A compiler that computes such a number twice with different rounding would mix two corners into a point
+outside the shape. Within a small angle of a tie the support point is therefore interpolated between the two.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from crazysim.geometry.vector import Vector
 
 
 def sharpness(dtype: jnp.dtype) -> float:
-    """Return one over the angle, rad, within which two corners count as equally far; far above rounding."""
+    """Return the inverse of the angle, 1/rad, within which two corners count as equally far."""
     return 1e3 if dtype == jnp.float32 else 1e7
 
 
 def end(half: float, along: Array) -> Array:
-    """Return which end of a segment lies along a direction, by its component, m. (...)"""
+    """Return the support point of a segment, by the component of the direction along it, m. (...)"""
     return half * jnp.clip(along * sharpness(along.dtype), -1.0, 1.0)
 
 
 def reach(shape: Shape, n: Vector) -> Array:
-    """Return how far a shape reaches along a unit direction from its origin, m. (...)"""
+    """Return the support function of a shape along a unit direction, m. (...)"""
     return REACH[shape.kind](shape, n)
 
 
 def corner(shape: Shape, n: Vector) -> Vector:
-    """Return the point of a shape that is farthest along a direction, or nearly."""
+    """Return the support point of a shape along a direction, m; interpolated near a tie."""
     return CORNER[shape.kind](shape, n)
 
 
@@ -81,7 +81,7 @@ def _mesh_reach(shape: Shape, n: Vector) -> Array:
 
 
 def _mesh_corner(shape: Shape, n: Vector) -> Vector:
-    """Return the farthest corner, or a mean of those that tie: it takes no index."""
+    """Return the support point of a mesh, a weighted mean near a tie, without indexing."""
     products, columns = _mesh_products(shape, n)
     behind = jnp.max(products, axis=-1, keepdims=True) - products
     weight = jnp.clip(1 - behind * (sharpness(behind.dtype) / float(abs(shape.array("vertices")).max())), 0.0, 1.0)

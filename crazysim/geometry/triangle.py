@@ -1,4 +1,4 @@
-"""The point of a triangle that is nearest to the origin."""
+"""Point of a triangle nearest to the origin, in barycentric coordinates."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from jax import Array
 from crazysim.geometry.vector import Vector, margin
 
 THIN = 1e-10
-"""Square of the sine below which a triangle has no normal: what float32 leaves of it is rounding."""
+"""Square of the sine below which the normal of a triangle is rounding error in float32."""
 
 
 Weights = tuple[Array, Array, Array]
-"""Shares of three corners in a point of their triangle, which add up to one. 3 of (...)"""
+"""Barycentric coordinates of a point of a triangle; they add up to one. 3 of (...)"""
 
 
 def mean(weights: Weights, a: Vector, b: Vector, c: Vector) -> Vector:
-    """Return the point of a triangle that has these shares of its corners: rounding never leaves the triangle."""
+    """Return the point of a triangle with given barycentric coordinates."""
     u, v, w = weights
     return a * u + b * v + c * w
 
 
 def foot(a: Vector, b: Vector, c: Vector) -> Weights:
-    """Return the point of a triangle nearest to the origin, by its shares of the corners."""
+    """Return the barycentric coordinates of the point of a triangle nearest to the origin."""
     t = _along(b, c - b)
     on_third, rest = (jnp.zeros_like(t), 1 - t, t), open_foot(a, b, c)
     return _nearer(on_third, rest, a, b, c)
 
 
 def open_foot(a: Vector, b: Vector, c: Vector) -> Weights:
-    """Return the same, unless it is on the side from ``b`` to ``c``."""
+    """Return the same as ``foot`` without trying the side from ``b`` to ``c``."""
     ab, ac = b - a, c - a
     s, t = _along(a, ab), _along(a, ac)
     on_side = _nearer((1 - t, jnp.zeros_like(t), t), (1 - s, s, jnp.zeros_like(s)), a, b, c)
@@ -41,13 +41,13 @@ def open_foot(a: Vector, b: Vector, c: Vector) -> Weights:
 
 
 def _along(a: Vector, side: Vector) -> Array:
-    """Return how far along the segment from ``a`` to ``a + side`` the origin is nearest, from 0 to 1. (...)"""
+    """Return the parameter, 0 to 1, of the point of a segment nearest to the origin. (...)"""
     square = side.dot(side)
     return jnp.clip(-a.dot(side) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
 
 
 def _nearer(new: Weights, old: Weights, a: Vector, b: Vector, c: Vector) -> Weights:
-    """Return which of two points is nearer to the origin; of two that tie, the old."""
+    """Return the point nearer to the origin; on a tie, the old one."""
     p, q = mean(new, a, b, c), mean(old, a, b, c)
     square = q.dot(q)
     return _choose(p.dot(p) < square * (1 - margin(square.dtype)), new, old)

@@ -1,7 +1,6 @@
-"""A vector as its three components, each an array of any shape.
+"""Vectors as three components, each an array of any shape.
 
-Without an axis of length three there is nothing but element-wise arithmetic, which fuses, and no small sum over an
-axis for a compiler to arrange anew.
+Without an axis of length three all arithmetic is element-wise, which fuses, and a compiler cannot reorder small sums.
 """
 
 from __future__ import annotations
@@ -13,14 +12,14 @@ from crazysim.pytree import PyTree
 
 
 class Vector(PyTree):
-    """A vector in components."""
+    """Vector as three components."""
 
     x: Array
-    """(...)"""
+    """Component along x. (...)"""
     y: Array
-    """(...)"""
+    """Component along y. (...)"""
     z: Array
-    """(...)"""
+    """Component along z. (...)"""
 
     def __add__(self, other: Vector) -> Vector:
         """Return the sum."""
@@ -56,37 +55,37 @@ class Vector(PyTree):
 
 
 def vector(x: Array) -> Vector:
-    """Return vectors from their arrays. (..., 3)"""
+    """Return an array of vectors, (..., 3), as a ``Vector``."""
     return Vector(x[..., 0], x[..., 1], x[..., 2])
 
 
 def stack(vectors: list[Vector]) -> Vector:
-    """Return vectors along a new first axis, so that what is done to all of them is written once."""
+    """Return vectors stacked along a new first axis."""
     return Vector(*(jnp.stack(xs) for xs in zip(*((v.x, v.y, v.z) for v in vectors), strict=True)))
 
 
 def along(axis: int, like: Array) -> Vector:
-    """Return the unit vector along an axis, for as many as a number has. (...)"""
+    """Return the unit vector along an axis, with the batch shape of an array. (...)"""
     zero = jnp.zeros_like(like)
     return Vector(*(zero + 1 if k == axis else zero for k in range(3)))
 
 
 def select(condition: Array, a: Vector, b: Vector) -> Vector:
-    """Return one vector where a condition holds, elsewhere another."""
+    """Return ``a`` where the condition holds, and ``b`` elsewhere."""
     return Vector(*(jnp.where(condition, p, q) for p, q in ((a.x, b.x), (a.y, b.y), (a.z, b.z))))
 
 
 def unit(v: Vector, otherwise: Vector, least: float = 0.0) -> Vector:
-    """Return a vector scaled to length one, or another where its squared length is not above the least."""
+    """Return a vector scaled to unit length, or ``otherwise`` where its squared length is at most ``least``."""
     square = v.dot(v)
     long = square > least
     return select(long, v * lax.rsqrt(jnp.where(long, square, 1.0)), otherwise)
 
 
 def margin(dtype: jnp.dtype) -> float:
-    """Return by which part a number must exceed another to count as larger, however each of them was rounded.
+    """Return the relative margin by which a number must exceed another to count as larger despite rounding.
 
-    A compiler may compute a comparison for each component of a selected vector anew, and round it differently: of two
-    vectors that tie it would make a mixture.
+    A compiler may recompute a comparison for each component of a selected vector with different rounding, and so mix
+    the components of two vectors that tie.
     """
     return 1e-5 if dtype == jnp.float32 else 1e-12

@@ -1,4 +1,4 @@
-"""Analytic policy gradients: the return of a short flight is differentiated through the simulator."""
+"""Analytic policy gradients: the return of a short horizon is differentiated through the simulator."""
 
 from __future__ import annotations
 
@@ -16,48 +16,51 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 from crazysim.train.networks import QUICK, Layers, Policy, init_mlp
 
+STATS_ITERATIONS = 20
+"""Iterations during which the observation statistics are updated."""
+
 
 @dataclass(frozen=True)
 class Config:
-    """Settings of the algorithm."""
+    """Hyperparameters of analytic policy gradients."""
 
     iterations: int = 400
-    """Rounds of flying and learning."""
+    """Number of iterations, each a short rollout and one update."""
     n_steps: int = 40
-    """Environment steps that a gradient looks back over."""
+    """Horizon: environment steps per iteration through which the gradient is propagated."""
     hidden: tuple[int, ...] = (64, 64)
-    """Neurons of the policy."""
+    """Sizes of the hidden layers of the policy."""
     learning_rate: float = 3e-3
-    """Of Adam, falling to zero linearly."""
+    """Initial learning rate of Adam, annealed linearly to zero."""
     discount: float = 0.99
-    """Weight of a reward one step later."""
+    """Discount factor per environment step."""
     max_grad_norm: float = 1.0
-    """Gradients are scaled down to this length."""
+    """Largest global norm of a gradient; larger ones are scaled down to it."""
 
 
 class Learner(PyTree):
-    """Everything that training changes; saved as it is, it goes on as if it had not stopped."""
+    """Complete state of a training run; saving and loading it resumes the run bit for bit."""
 
     policy: Layers
-    """From observations to the action, before tanh."""
+    """Network from normalised observations to the action before tanh."""
     optimizer: Any
     """State of the optimiser."""
     stats: RunningStats
-    """What observations are normalised with."""
+    """Mean and variance with which observations are normalised."""
     key: Array
     """Random key."""
     env: EnvState
-    """Where the worlds are."""
+    """State of the environments at the end of the last iteration."""
     iteration: Array
-    """Rounds done. ()"""
+    """Number of completed iterations. ()"""
 
     def as_policy(self) -> Policy:
-        """Return the policy."""
+        """Return the policy with its observation statistics."""
         return Policy(self.stats, self.policy)
 
 
 def init(env: Env, config: Config, key: Array) -> Learner:
-    """Return a learner that has learnt nothing; ``env`` does not begin new episodes by itself."""
+    """Return an untrained learner; ``env`` has no automatic resets."""
     k_policy, k_env, key = jax.random.split(key, 3)
     state = env.reset(k_env)
     n_obs = flatten(state.obs).shape[-1]
@@ -68,41 +71,41 @@ def init(env: Env, config: Config, key: Array) -> Learner:
 
 @partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK)
 def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
-    """Fly a short way and learn from it; return the learner, and figures of the round.
+    """Return the learner after one rollout and one update, and the metrics of the iteration.
 
-    A round begins where the last has ended, or with a new episode where that one was over. A gradient that is not
-    finite is left out.
+    The rollout starts where the previous one ended; worlds whose episode is over start a new one. A non-finite
+    gradient is skipped. The scan stores its intermediates instead of recomputing them under ``jax.checkpoint``:
+    tens of steps fit in memory.
     """
-    begin = env.restart(learner.env, learner.env.done)
+    start = env.restart(learner.env, learner.env.done)
 
     def loss(policy: Layers) -> tuple[Array, Any]:
         actor = Policy(learner.stats, policy)
 
-        # @jax.checkpoint
         def step(carry: tuple[EnvState, Array], _: None) -> tuple[tuple[EnvState, Array], Any]:
             state, weight = carry
             raw = flatten(state.obs)
             state = env.step(state, actor(state.obs))
-            gain = weight * jnp.mean(state.reward)
-            return (state, weight * config.discount), (gain, raw, jnp.mean(state.reward), state.terminated.mean())
+            discounted = weight * jnp.mean(state.reward)
+            return (state, weight * config.discount), (discounted, raw, jnp.mean(state.reward), state.terminated.mean())
 
-        carry = (begin, jnp.ones((), begin.reward.dtype))
-        (state, _), (gains, raw, reward, crashed) = jax.lax.scan(step, carry, length=config.n_steps)
-        figures = {"reward": reward.mean(), "crashed": crashed.mean(), "error": jnp.nanmean(state.info["error"])}
-        return -gains.mean(), (state, raw, figures)
+        carry = (start, jnp.ones((), start.reward.dtype))
+        (state, _), (rewards, raw, reward, crashed) = jax.lax.scan(step, carry, length=config.n_steps)
+        metrics = {"reward": reward.mean(), "crashed": crashed.mean(), "error": jnp.nanmean(state.info["error"])}
+        return -rewards.mean(), (state, raw, metrics)
 
-    grads, (state, raw, figures) = jax.grad(loss, has_aux=True)(learner.policy)
+    grads, (state, raw, metrics) = jax.grad(loss, has_aux=True)(learner.policy)
     norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
     updates, optimizer = _optimizer(config).update(grads, learner.optimizer, learner.policy)
     new = (optax.apply_updates(learner.policy, updates), optimizer)
     policy, optimizer = jax.tree.map(
         lambda x, old: jnp.where(jnp.isfinite(norm), x, old), new, (learner.policy, learner.optimizer)
     )
-    # Inputs that shift under a policy that is already good would spoil it: the statistics are of the first rounds.
-    seen = learner.stats.update(raw)
-    stats = jax.tree.map(lambda x, old: jnp.where(learner.iteration < 20, x, old), seen, learner.stats)
+    # Normalisation that keeps shifting would degrade a policy that is already good, so it is frozen early.
+    updated = learner.stats.update(raw)
+    stats = jax.tree.map(lambda x, old: jnp.where(learner.iteration < STATS_ITERATIONS, x, old), updated, learner.stats)
     learner = Learner(policy, optimizer, stats, learner.key, state, learner.iteration + 1)
-    return learner, figures | {"gradient": norm}
+    return learner, metrics | {"gradient": norm}
 
 
 def _optimizer(config: Config) -> optax.GradientTransformation:

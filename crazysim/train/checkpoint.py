@@ -1,4 +1,4 @@
-"""Trees of arrays in files: what is loaded is what was saved, bit for bit."""
+"""Pytrees of arrays in ``.npz`` files, restored bit for bit."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from crazysim.errors import ConfigError
 
 T = TypeVar("T")
 META = "meta"
-"""Name of the entry that says what the arrays belong to."""
+"""Name of the entry that holds the metadata as JSON."""
 
 
 def save(path: str | Path, tree: Any, meta: dict[str, Any]) -> None:
-    """Write a tree's arrays and what they belong to; a file that is there is exchanged as a whole, or not at all.
+    """Write the arrays of a pytree and its metadata; an existing file is replaced atomically.
 
     Args:
-        path: An ``.npz``.
-        tree: Any tree of arrays, random keys included.
-        meta: What JSON can hold.
+        path: File to write, ``.npz``.
+        tree: Any pytree of arrays, including random keys.
+        meta: Metadata that JSON can represent.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -36,44 +36,51 @@ def save(path: str | Path, tree: Any, meta: dict[str, Any]) -> None:
 
 
 def read_meta(path: str | Path) -> dict[str, Any]:
-    """Return what the arrays of a file belong to.
+    """Return the metadata of a checkpoint.
 
     Raises:
-        ConfigError: If there is no such file, or it is no checkpoint.
+        ConfigError: If the file does not exist or is not a checkpoint.
     """
     path = Path(path)
     if not path.exists():
-        raise ConfigError(f"there is no checkpoint {path}; 'crazysim train TASK --out {path.parent}' makes one")
+        raise ConfigError(
+            f"expected a checkpoint at {path}, got no file; run 'crazysim train TASK --out {path.parent}'"
+        )
     try:
         with np.load(path) as file:
             return json.loads(str(file[META]))
     except (OSError, KeyError, ValueError) as error:
-        raise ConfigError(f"{path} is no checkpoint of crazysim: {error}") from None
+        raise ConfigError(
+            f"expected a checkpoint of crazysim at {path}, got an unreadable file ({error}); choose another folder"
+        ) from None
 
 
 def load(path: str | Path, like: T) -> T:
-    """Return the tree that a file holds.
+    """Return the pytree stored in a file.
 
     Args:
-        path: What ``save`` has written.
-        like: A tree of the same structure and shapes; arrays or what ``jax.eval_shape`` gives.
+        path: File written by ``save``.
+        like: Pytree of the same structure and shapes, of arrays or of ``jax.ShapeDtypeStruct``.
 
     Raises:
-        ConfigError: If there is no such file, or its arrays are others, as those of another version are.
+        ConfigError: If the file does not exist, or holds arrays of other names, shapes or types.
     """
     read_meta(path)
     leaves = []
     with np.load(path) as file:
         named = list(_named(like))
         if others := {name for name, _ in named} ^ (set(file.files) - {META}):
-            raise ConfigError(f"{path} holds other arrays, of another task or version: {', '.join(sorted(others)[:5])}")
+            raise ConfigError(
+                f"expected the arrays of this task and version in {path}, got others: {', '.join(sorted(others)[:5])}. "
+                f"Use the settings it was saved with, or another folder."
+            )
         for name, x in named:
             is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
             value = jax.random.wrap_key_data(jnp.asarray(file[name])) if is_key else jnp.asarray(file[name])
             if value.shape != x.shape or value.dtype != x.dtype:
                 raise ConfigError(
-                    f"{path} holds {name} as {value.dtype} {value.shape}; needed is {x.dtype} {x.shape}: it was saved "
-                    f"with other settings"
+                    f"expected {name} in {path} as {x.dtype} {x.shape}, got {value.dtype} {value.shape}; use the "
+                    f"settings it was saved with, or another folder"
                 )
             leaves.append(value)
     return jax.tree.unflatten(jax.tree.structure(like), leaves)

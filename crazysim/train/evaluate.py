@@ -1,4 +1,4 @@
-"""How good a policy is, judged by flights from starts that it has not trained on."""
+"""Evaluation of policies on held-out initial states."""
 
 from __future__ import annotations
 
@@ -15,28 +15,29 @@ from crazysim.pytree import PyTree, static
 from crazysim.train.networks import QUICK
 
 HELD_OUT = 0x5EED
-"""Seed of the starts that policies are judged by; training seeds are folded away from it."""
+"""Seed of the held-out initial states; keys of training are folded, so they never coincide with it."""
 
 
-class _Fixed(PyTree):
-    """A policy that is a function of its own, and nothing to be traced."""
+class _FunctionPolicy(PyTree):
+    """Policy given as a plain function, which is static for JAX."""
 
     fn: Callable[[Any], Array] = static()
-    """Observations to actions."""
+    """Function from observations to actions."""
 
     def __call__(self, obs: Any) -> Array:
-        """Return the actions."""
+        """Return the actions for observations."""
         return self.fn(obs)
 
 
 @partial(jax.jit, static_argnames=("env",), compiler_options=QUICK)
 def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
-    """Return what one episode of every world gives.
+    """Fly one episode in every world and return its record.
 
     Returns:
-        ``error`` at the end of every step (n_steps, n_worlds, n_drones), that of the last where an episode is over;
-        ``over``, whether an episode had ended by then because of what happened (n_steps, n_worlds); ``reward`` summed
-        up to that, and ``succeeded``, whether a task that tells had been done by then (n_worlds, n_drones).
+        ``error``: task error after every step, held from the end of the episode on (n_steps, n_worlds, n_drones);
+        ``over``: True once the episode has terminated (n_steps, n_worlds); ``reward``: sum over the episode
+        (n_worlds, n_drones); ``succeeded``: True where a task with ``task.succeeded`` was completed during the
+        episode (n_worlds, n_drones).
     """
 
     def step(carry: Any, _: None) -> Any:
@@ -57,23 +58,23 @@ def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
 
 
 def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None) -> dict[str, float]:
-    """Return how often a policy succeeds: the error stays below the task's tolerance to the episode's end.
+    """Return the success rate of a policy, its crash rate, its mean error and its mean return.
 
-    A task that tells when it is done, ``task.succeeded``, is done if it was by the end of the episode.
+    A drone succeeds if its error stays below ``task.tolerance`` for the last ``task.hold`` seconds of the episode. A
+    task with a criterion of its own, ``task.succeeded``, is judged by that instead.
 
     Args:
-        env: The environment, without automatic resets; each world is one start.
-        policy: Observations to actions: what training gave, or any function.
-        key: Of the starts; None for those that are held out.
+        env: Environment without automatic resets; each world flies from one initial state.
+        policy: Trained policy, or any function from observations to actions.
+        key: Random key of the initial states; None for the held-out ones.
 
     Returns:
-        ``success`` (share of drones), ``crashed`` (share of worlds that ended before their time and not all of whose
-        drones succeeded), ``error`` (mean over the last ``task.hold`` seconds of what did not crash, m; at the
-        end alone of a task that tells when it is done), ``reward`` (mean sum of an episode).
+        ``success``: fraction of drones that succeed; ``crashed``: fraction of worlds that terminated although not all
+        of their drones had succeeded; ``error``: mean error of the other worlds over the last ``task.hold`` seconds,
+        m (at the end of the episode for tasks with ``task.succeeded``); ``reward``: mean return of an episode.
     """
-    flown = fly(
-        env, policy if isinstance(policy, PyTree) else _Fixed(policy), jax.random.key(HELD_OUT) if key is None else key
-    )
+    policy = policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
+    flown = fly(env, policy, jax.random.key(HELD_OUT) if key is None else key)
     last = max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
     over = flown["over"][-1]
     settled = jnp.all(flown["error"][-last:] < env.task.tolerance, axis=0) & ~over[:, None]

@@ -1,7 +1,7 @@
-"""Policies for other programs: a small ONNX file, and a C header that needs nothing but ``math.h``.
+"""Export of policies: an ONNX file, and a C header that includes only ``math.h``.
 
-Both take the observations of one drone, one behind the other by name, and give its action in [-1, 1]; both carry in
-words what the numbers are.
+Both take the observations of one drone, concatenated in the order of their names, and return its action in [-1, 1].
+Both contain a description of their inputs and outputs.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ OBSERVATIONS = {
     "rot": "attitude, body to world, as a rotation matrix, row by row",
     "vel": "velocity, world frame, m/s",
     "ang_vel": "angular velocity, body frame, rad/s",
-    "difference_to_goal": "goal less position, world frame, m",
-    "difference_to_target_vel": "wanted velocity less velocity, world frame, m/s",
+    "difference_to_goal": "goal minus position, world frame, m",
+    "difference_to_target_vel": "target velocity minus velocity, world frame, m/s",
 }
-"""What the usual observations are."""
+"""Descriptions of the common observations, with frame and unit."""
 COMMANDS: dict[Control, Sequence[str]] = {
     Control.state: ("x, m", "y, m", "z, m"),
     Control.attitude: ("roll, rad", "pitch, rad", "yaw, rad", "collective thrust, N"),
     Control.body_rate: ("rate about x, rad/s", "rate about y, rad/s", "rate about z, rad/s", "collective thrust, N"),
     Control.force_torque: ("collective thrust, N", "torque about x, N m", "about y, N m", "about z, N m"),
 }
-"""What the numbers of a command are; at the rotors' own level each is a speed, rpm."""
+"""Components of a command with their units; a rotor command is one speed per rotor, rpm."""
 OPSET, IR_VERSION = 17, 8
-"""Versions of ONNX that files are written in: of 2022, so that older runtimes read them."""
+"""Versions of ONNX operators and of the file format, of 2022, so that older runtimes can read the files."""
 
 
 def describe(env: Env) -> dict[str, Any]:
-    """Return what a policy's inputs and outputs mean, as ``to_onnx`` and ``to_c`` want it."""
+    """Return the description of a policy's inputs and outputs that ``to_onnx`` and ``to_c`` require."""
     shapes = jax.eval_shape(env.reset, jax.random.key(0)).obs
     return {
         "crazysim": crazysim.__version__,
@@ -59,26 +59,26 @@ def describe(env: Env) -> dict[str, Any]:
 def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     """Write a policy as ONNX: input ``observation`` (batch, n_obs), output ``action`` (batch, n_actions), float32.
 
-    What the numbers are is in the model's ``metadata_props``, as JSON: ``observations`` (names and sizes, in order),
-    ``level``, ``centre``, ``scale`` and ``units`` of the actions.
+    The description of inputs and outputs is stored in the model's ``metadata_props`` as JSON: ``observations`` (names
+    and sizes, in order), and ``level``, ``centre``, ``scale`` and ``units`` of the actions.
 
     Args:
         policy: The policy.
         path: File to write.
-        meta: What its inputs and outputs mean, from ``describe(env)``, or from a run's ``load_policy``.
+        meta: Description of its inputs and outputs, from ``describe(env)`` or from ``load_policy``.
 
     Returns:
         The path.
 
     Raises:
-        ConfigError: If the policy is not of that meaning, or is not finite.
+        ConfigError: If the sizes of policy and description differ, or the policy is not finite.
         ImportError: If onnx is not installed.
     """
     try:
         import onnx
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
-        raise ImportError("ONNX files need onnx; pip install 'crazysim[onnx]'") from error
+        raise ImportError("writing ONNX files needs onnx; pip install 'crazysim[onnx]'") from error
     mean, std, layers = _numbers(policy, meta)
     constants = {"mean": mean, "std": std, "low": np.float32(-CLIP), "high": np.float32(CLIP)}
     nodes = [
@@ -97,7 +97,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", len(mean)])],
         [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["batch", len(layers[-1][1])])],
         [numpy_helper.from_array(np.asarray(x), name) for name, x in constants.items()],
-        doc_string="\n".join(_explained(meta)),
+        doc_string="\n".join(_description(meta)),
     )
     model = helper.make_model(
         graph,
@@ -107,9 +107,9 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         producer_version=str(meta.get("crazysim", crazysim.__version__)),
     )
     actions = meta["actions"]
-    told = {"observations": meta["observations"], "units": _units(actions)} | actions
-    told |= {name: meta[name] for name in ("settings",) if name in meta}
-    helper.set_model_props(model, {k: v if isinstance(v, str) else json.dumps(v) for k, v in told.items()})
+    properties = {"observations": meta["observations"], "units": _units(actions)} | actions
+    properties |= {name: meta[name] for name in ("settings",) if name in meta}
+    helper.set_model_props(model, {k: v if isinstance(v, str) else json.dumps(v) for k, v in properties.items()})
     onnx.checker.check_model(model)
     path = Path(path)
     path.write_bytes(model.SerializeToString())
@@ -117,30 +117,32 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
 
 
 def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = "policy") -> Path:
-    """Write a policy as a header in C99, ``void policy(const float observation[n], float action[k])``.
+    """Write a policy as a C99 header that defines ``void policy(const float observation[n], float action[k])``.
 
-    The weights are constants, so that they stay in flash; it allocates nothing, and calls ``tanhf`` alone.
+    The weights are constants, so that they stay in flash memory. The function allocates nothing and calls only
+    ``tanhf``.
 
     Args:
         policy: The policy.
         path: File to write.
-        meta: What its inputs and outputs mean, from ``describe(env)``, or from a run's ``load_policy``.
-        name: Name of the function, with which all that the header defines begins.
+        meta: Description of its inputs and outputs, from ``describe(env)`` or from ``load_policy``.
+        name: Name of the function, and prefix of every definition of the header.
 
     Returns:
         The path.
 
     Raises:
-        ConfigError: If the policy is not of that meaning, or is not finite, or the name is none in C.
+        ConfigError: If the sizes of policy and description differ, the policy is not finite, or the name is not valid
+            in C.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise ConfigError(f"{name!r} is no name of a function in C; take letters, digits and underscores")
+        raise ConfigError(f"expected the name of a C function, got {name!r}; use letters, digits and underscores")
     mean, std, layers = _numbers(policy, meta)
     guard = f"CRAZYSIM_{name.upper()}_H"
     lines = [
-        f"/* A policy, written by crazysim {meta.get('crazysim', crazysim.__version__)}; not to be edited.",
+        f"/* Policy generated by crazysim {meta.get('crazysim', crazysim.__version__)}; do not edit.",
         " *",
-        *(f" * {line}".rstrip() for line in _explained(meta)),
+        *(f" * {line}".rstrip() for line in _description(meta)),
         " */",
         f"#ifndef {guard}",
         f"#define {guard}",
@@ -166,19 +168,19 @@ def _numbers(policy: Policy, meta: Mapping[str, Any]) -> tuple[np.ndarray, np.nd
     """Return mean and standard deviation of the inputs, and the layers, as float32.
 
     Raises:
-        ConfigError: If they do not fit what they are said to mean, or are not finite.
+        ConfigError: If their sizes differ from those of the description, or they are not finite.
     """
     layers = [(np.asarray(weight, np.float32), np.asarray(bias, np.float32)) for weight, bias in policy.layers]
     mean, var = np.asarray(policy.stats.mean, np.float32), np.asarray(policy.stats.var, np.float32)
     n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])
     if (len(mean), len(layers[-1][1])) != (n_obs, n_actions):
         raise ConfigError(
-            f"the policy takes {len(mean)} numbers and gives {len(layers[-1][1])}; these observations are {n_obs} "
-            f"({', '.join(f'{k} {n}' for k, n in meta['observations'].items())}) and these actions {n_actions}: "
-            f"describe the environment that it was trained in"
+            f"expected a policy from {n_obs} observations "
+            f"({', '.join(f'{k} {n}' for k, n in meta['observations'].items())}) to {n_actions} actions, got one from "
+            f"{len(mean)} to {len(layers[-1][1])}; describe the environment that it was trained in"
         )
     if not all(np.isfinite(x).all() for x in (mean, var, *(x for layer in layers for x in layer))):
-        raise ConfigError("the policy has numbers that are NaN or infinite; its training has diverged")
+        raise ConfigError("expected finite weights, got NaN or infinity; the training diverged, so train again")
     return mean, np.sqrt(var + np.float32(EPSILON)), layers
 
 
@@ -188,22 +190,22 @@ def _units(actions: Mapping[str, Any]) -> list[str]:
     return [known[i] if i < len(known) else "?" for i in range(n)]
 
 
-def _explained(meta: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what goes in and what comes out, line by line."""
-    yield "Observation, one behind the other:"
+def _description(meta: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the lines that describe inputs and outputs."""
+    yield "Observation, concatenated:"
     begin = 0
     for name, size in meta["observations"].items():
-        what = f": {OBSERVATIONS[name]}" if name in OBSERVATIONS else ""
-        yield f"  [{begin}..{begin + size - 1}] {name}{what}"
+        description = f": {OBSERVATIONS[name]}" if name in OBSERVATIONS else ""
+        yield f"  [{begin}..{begin + size - 1}] {name}{description}"
         begin += size
     actions = meta["actions"]
-    yield f"Action, each within -1 and 1, for commands of level {actions['level']}:"
+    yield f"Action, between -1 and 1, for commands of level {actions['level']}:"
     for i, (unit, centre, scale) in enumerate(zip(_units(actions), actions["centre"], actions["scale"], strict=True)):
         yield f"  [{i}] {unit} = {centre:.9g} + {scale:.9g} * action[{i}]"
 
 
 def _body(name: str, layers: Sequence[tuple[Any, Any]]) -> Iterator[str]:
-    """Yield what the function does, line by line."""
+    """Yield the lines of the function's body."""
     n_obs = layers[0][0].shape[0]
     limit = _number(CLIP)
     yield f"float x0[{n_obs}];"
@@ -224,7 +226,7 @@ def _body(name: str, layers: Sequence[tuple[Any, Any]]) -> Iterator[str]:
 
 
 def _number(x: Any) -> str:
-    """Return a number as C reads it back bit for bit: nine digits tell any two float32 apart."""
+    """Return a number as a C literal that is read back bit for bit: nine digits identify any float32."""
     text = f"{float(x):.9g}"
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
 

@@ -1,4 +1,4 @@
-"""Small networks as plain arrays: a list of layers, each a weight matrix and a bias."""
+"""Multilayer perceptrons as plain arrays: a list of layers, each a weight matrix and a bias."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 
 QUICK = {"xla_gpu_autotune_level": 0}
-"""Options of compilation: on a GPU, trying out ways to multiply takes longer than networks of this size ever save."""
+"""Compiler options: autotuning matrix products on a GPU takes longer than it saves for networks of this size."""
 
 Layers = list[tuple[Array, Array]]
 """Weights (n_in, n_out) and biases (n_out,), first layer first."""
@@ -27,8 +27,8 @@ def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
 
     Args:
         key: Random key.
-        sizes: Numbers of inputs, of neurons in each hidden layer, of outputs.
-        last_scale: Scale of the last layer's weights; small for a policy, so that it begins near its zero action.
+        sizes: Number of inputs, sizes of the hidden layers, number of outputs.
+        last_scale: Scale of the weights of the last layer; small for a policy, so that it starts near the zero action.
     """
     keys = jax.random.split(key, len(sizes) - 1)
     scales = [np.sqrt(2.0)] * (len(sizes) - 2) + [last_scale]
@@ -37,7 +37,15 @@ def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
 
 
 def mlp(layers: Layers, x: Array) -> Array:
-    """Return the outputs, tanh between layers, computed in the type of the weights. (..., n_in) -> (..., n_out)"""
+    """Return the outputs, with tanh between layers, computed in the dtype of the weights.
+
+    Args:
+        layers: Weights and biases.
+        x: Inputs. (..., n_in)
+
+    Returns:
+        Outputs, in the dtype of the inputs. (..., n_out)
+    """
     dtype = x.dtype
     x = x.astype(layers[0][0].dtype)
     for weight, bias in layers[:-1]:
@@ -47,13 +55,13 @@ def mlp(layers: Layers, x: Array) -> Array:
 
 
 class Policy(PyTree):
-    """A policy as it is flown, evaluated and exported: statistics of its inputs, and layers."""
+    """Deterministic policy: observation statistics and a network."""
 
     stats: RunningStats
-    """What its inputs are normalised with."""
+    """Mean and variance with which observations are normalised."""
     layers: Any
-    """``Layers`` from observations to actions."""
+    """``Layers`` from normalised observations to actions before tanh."""
 
     def __call__(self, obs: dict[str, Array]) -> Array:
-        """Return the action for observations, without noise. (..., n_obs) -> (..., n_actions)"""
+        """Return the action, between -1 and 1, for observations. (..., n_obs) -> (..., n_actions)"""
         return jnp.tanh(mlp(self.layers, self.stats.normalize(flatten(obs))))

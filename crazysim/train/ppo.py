@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (Schulman et al. 2017), with generalised advantages (Schulman et al. 2016)."""
+"""Proximal policy optimisation (Schulman et al. 2017) with generalised advantage estimation (Schulman et al. 2016)."""
 
 from __future__ import annotations
 
@@ -20,80 +20,84 @@ from crazysim.train.networks import QUICK, Layers, Policy, init_mlp, mlp
 
 @dataclass(frozen=True)
 class Config:
-    """Settings of the algorithm."""
+    """Hyperparameters of PPO."""
 
     iterations: int = 200
-    """Rounds of flying and learning."""
+    """Number of iterations, each a rollout and the updates on its samples."""
     n_steps: int = 32
-    """Environment steps of a world in one round."""
+    """Environment steps per world in one rollout."""
     epochs: int = 4
-    """How often a round's samples are learnt from."""
+    """Passes over the samples of a rollout."""
     minibatches: int = 8
-    """Updates an epoch."""
+    """Minibatches, and so updates, per epoch."""
     hidden: tuple[int, ...] = (64, 64)
-    """Neurons of policy and value function."""
+    """Sizes of the hidden layers of policy and value function."""
     learning_rate: float = 1e-3
-    """Of Adam, falling to zero linearly."""
+    """Initial learning rate of Adam, annealed linearly to zero."""
     discount: float = 0.98
-    """Weight of a reward one step later."""
-    trace: float = 0.95
-    """Decay of the advantage's trace, lambda."""
+    """Discount factor per environment step."""
+    gae_lambda: float = 0.95
+    """Lambda of generalised advantage estimation."""
     clip: float = 0.2
-    """How far an update may change a probability."""
+    """Clipping range of the probability ratio."""
     entropy: float = 0.0
-    """Weight of the policy's entropy."""
+    """Coefficient of the entropy bonus."""
     value_weight: float = 0.5
-    """Weight of the value function's error."""
+    """Coefficient of the value loss."""
     max_grad_norm: float = 0.5
-    """Gradients are scaled down to this length."""
+    """Largest global norm of a gradient; larger ones are scaled down to it."""
     init_std: float = 0.5
-    """Standard deviation of the first actions."""
+    """Initial standard deviation of the actions."""
+
+
+RENAMED = {"trace": "gae_lambda"}
+"""Hyperparameters under their names of 0.1, still accepted by ``TrainConfig`` and in stored runs."""
 
 
 class Learner(PyTree):
-    """Everything that training changes; saved as it is, it goes on as if it had not stopped."""
+    """Complete state of a training run; saving and loading it resumes the run bit for bit."""
 
     policy: Layers
-    """From observations to the mean action, before tanh."""
+    """Network from normalised observations to the mean action before tanh."""
     log_std: Array
-    """Logarithm of the actions' standard deviation. (n_actions,)"""
+    """Logarithm of the standard deviation of the actions. (n_actions,)"""
     value: Layers
-    """From observations to the return to come."""
+    """Network from normalised observations to the expected return."""
     optimizer: Any
     """State of the optimiser."""
     stats: RunningStats
-    """What observations are normalised with."""
+    """Mean and variance with which observations are normalised."""
     key: Array
     """Random key."""
     env: EnvState
-    """Where the worlds are, without reward and info."""
+    """State of the environments, without reward and info."""
     iteration: Array
-    """Rounds done. ()"""
+    """Number of completed iterations. ()"""
 
     def as_policy(self) -> Policy:
-        """Return the policy without noise."""
+        """Return the deterministic policy."""
         return Policy(self.stats, self.policy)
 
 
 class Sample(PyTree):
-    """What one step of all worlds has given; leading axes (n_steps, n_worlds, n_drones)."""
+    """Transitions of a rollout; leading axes (n_steps, n_worlds, n_drones)."""
 
     obs: Array
     """Normalised observations."""
     action: Array
-    """Before it was clipped."""
+    """Actions before clipping."""
     log_prob: Array
-    """Of the action."""
+    """Log probability of the action."""
     value: Array
-    """Expected return before the step."""
+    """Value estimate before the step."""
     reward: Array
-    """With what a world that ran out of time would still have given."""
+    """Reward, plus the discounted value of the final state where the episode was truncated."""
     over: Array
-    """Whether the episode ended with the step."""
+    """True where the episode ended with the step."""
 
 
 def init(env: Env, config: Config, key: Array) -> Learner:
-    """Return a learner that has learnt nothing; ``env`` begins new episodes within the step that ends one."""
+    """Return an untrained learner; ``env`` resets automatically within the step that ends an episode."""
     k_policy, k_value, k_env, key = jax.random.split(key, 4)
     state = env.reset(k_env)
     n_obs, n_actions = flatten(state.obs).shape[-1], env.actions.size
@@ -107,19 +111,21 @@ def init(env: Env, config: Config, key: Array) -> Learner:
 
 @partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK)
 def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
-    """Fly a round and learn from it; return the learner, and figures of the round."""
+    """Return the learner after one rollout and its updates, and the metrics of the iteration."""
     key, k_fly, k_learn = jax.random.split(learner.key, 3)
-    state, samples, raw, figures = _fly(learner, env, config, k_fly)
+    state, samples, raw, metrics = _collect(learner, env, config, k_fly)
     advantages, returns = _advantages(samples, _value(learner.value, learner.stats, state.obs), config)
     parameters = (learner.policy, learner.log_std, learner.value)
     parameters, optimizer, losses = _learn(parameters, learner.optimizer, samples, advantages, returns, config, k_learn)
     policy, log_std, value = parameters
     learner = Learner(policy, log_std, value, optimizer, learner.stats.update(raw), key, state, learner.iteration + 1)
-    return learner, figures | losses | {"std": jnp.exp(log_std).mean()}
+    return learner, metrics | losses | {"std": jnp.exp(log_std).mean()}
 
 
-def _fly(learner: Learner, env: Env, config: Config, key: Array) -> tuple[EnvState, Sample, Array, dict[str, Array]]:
-    """Return where the worlds are after a round, its samples, and observations as they came."""
+def _collect(
+    learner: Learner, env: Env, config: Config, key: Array
+) -> tuple[EnvState, Sample, Array, dict[str, Array]]:
+    """Return the state after a rollout, its samples, its observations before normalisation, and metrics."""
 
     def step(state: EnvState, key: Array) -> tuple[EnvState, tuple[Sample, Array, Any]]:
         raw = flatten(state.obs)
@@ -127,9 +133,9 @@ def _fly(learner: Learner, env: Env, config: Config, key: Array) -> tuple[EnvSta
         mean, value = jnp.tanh(mlp(learner.policy, obs)), mlp(learner.value, obs)[..., 0]
         action = mean + jnp.exp(learner.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
         state = env.step(state, action)
-        out_of_time = (state.truncated & ~state.terminated)[:, None]
-        to_come = _value(learner.value, learner.stats, state.info["final_obs"])
-        reward = state.reward + config.discount * jnp.where(out_of_time, to_come, 0.0)
+        truncated = (state.truncated & ~state.terminated)[:, None]
+        final_value = _value(learner.value, learner.stats, state.info["final_obs"])
+        reward = state.reward + config.discount * jnp.where(truncated, final_value, 0.0)
         over = jnp.broadcast_to(state.done[:, None], reward.shape)
         sample = Sample(obs, action, _log_prob(mean, learner.log_std, action), value, reward, over)
         return bare(state), (sample, raw, (state.reward.mean(), state.terminated, state.info["error"].mean()))
@@ -138,22 +144,22 @@ def _fly(learner: Learner, env: Env, config: Config, key: Array) -> tuple[EnvSta
         step, learner.env, jax.random.split(key, config.n_steps)
     )
     over = samples.over.any(axis=-1)
-    figures = {
+    metrics = {
         "reward": reward.mean(),
         "crashed": crashed.sum() / jnp.maximum(over.sum(), 1),
         "error": error.mean(),
     }
-    return state, samples, raw, figures
+    return state, samples, raw, metrics
 
 
 def _advantages(samples: Sample, last: Array, config: Config) -> tuple[Array, Array]:
-    """Return how much better each action was than expected, and the returns."""
+    """Return generalised advantage estimates and value targets. (n_steps, n_worlds, n_drones)"""
 
     def back(carry: tuple[Array, Array], sample: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], Array]:
         advantage, value_after = carry
         reward, value, over = sample
-        goes_on = config.discount * ~over
-        advantage = reward + goes_on * value_after - value + goes_on * config.trace * advantage
+        discount = config.discount * ~over
+        advantage = reward + discount * value_after - value + discount * config.gae_lambda * advantage
         return (advantage, value), advantage
 
     sequence = (samples.reward, samples.value, samples.over)
@@ -164,7 +170,7 @@ def _advantages(samples: Sample, last: Array, config: Config) -> tuple[Array, Ar
 def _learn(
     parameters: Any, optimizer: Any, samples: Sample, advantages: Array, returns: Array, config: Config, key: Array
 ) -> tuple[Any, Any, dict[str, Array]]:
-    """Return the parameters after a round's updates."""
+    """Return parameters, optimiser state and mean losses after the updates on a rollout."""
     data = (samples.obs, samples.action, samples.log_prob, advantages, returns)
     data = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), data)
     n = data[-1].shape[0] // config.minibatches * config.minibatches
@@ -182,16 +188,16 @@ def _learn(
 
     def update(carry: Any, batch: Any) -> tuple[Any, dict[str, Array]]:
         parameters, optimizer = carry
-        grads, figures = jax.grad(loss, has_aux=True)(parameters, batch)
+        grads, losses = jax.grad(loss, has_aux=True)(parameters, batch)
         updates, optimizer = _optimizer(config).update(grads, optimizer, parameters)
-        return (optax.apply_updates(parameters, updates), optimizer), figures
+        return (optax.apply_updates(parameters, updates), optimizer), losses
 
     def epoch(carry: Any, key: Array) -> tuple[Any, dict[str, Array]]:
         order = jax.random.permutation(key, data[-1].shape[0])[:n].reshape(config.minibatches, -1)
         return jax.lax.scan(lambda c, i: update(c, jax.tree.map(lambda x: x[i], data)), carry, order)
 
-    carry, figures = jax.lax.scan(epoch, (parameters, optimizer), jax.random.split(key, config.epochs))
-    return *carry, jax.tree.map(jnp.mean, figures)
+    carry, losses = jax.lax.scan(epoch, (parameters, optimizer), jax.random.split(key, config.epochs))
+    return *carry, jax.tree.map(jnp.mean, losses)
 
 
 def _optimizer(config: Config) -> optax.GradientTransformation:
@@ -205,5 +211,5 @@ def _value(layers: Layers, stats: RunningStats, obs: dict[str, Array]) -> Array:
 
 
 def _log_prob(mean: Array, log_std: Array, action: Array) -> Array:
-    """Return the log density of a normal distribution, up to a constant. (...)"""
+    """Return the log density of a normal distribution up to a constant. (...)"""
     return -jnp.sum(0.5 * jnp.square((action - mean) / jnp.exp(log_std)) + log_std, axis=-1)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import crazysim
+from crazysim.deprecation import renamed, warn_renamed
 from crazysim.envs.env import DroneEnv
 from crazysim.envs.registry import entry_of, make
 from crazysim.envs.statistics import RunningStats
@@ -29,25 +30,25 @@ from crazysim.train.export import describe
 from crazysim.train.networks import Policy
 
 ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg}
-"""Each a module with ``Config``, ``init`` and ``iterate``."""
+"""Algorithms by name: modules with ``Config``, ``init`` and ``iterate``."""
 CHECKPOINT, POLICY, CURVE = "checkpoint.npz", "policy.npz", "curve.json"
-"""Files of a run."""
+"""Names of the files of a run."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Settings with which a task is learnt."""
+    """Algorithm and hyperparameters that are known to solve a task."""
 
     algorithm: str = "ppo"
-    """One of ``ALGORITHMS``."""
+    """Name of the algorithm, a key of ``ALGORITHMS``."""
     n_worlds: int = 1024
-    """Worlds that are flown at once."""
+    """Number of parallel worlds."""
     config: dict[str, Any] = field(default_factory=dict)
-    """What differs from the algorithm's own settings."""
+    """Hyperparameters that differ from the defaults of the algorithm."""
     practice: dict[str, Any] = field(default_factory=dict)
-    """Options of the environment that is learnt in, beyond those of the one that is judged in."""
+    """Options of the training environment that the evaluation environment does not have."""
     evaluate_every: int = 20
-    """Rounds from one evaluation, and checkpoint, to the next."""
+    """Iterations between evaluations; a checkpoint is written at each."""
 
 
 RECIPES: dict[str, Recipe] = {
@@ -60,25 +61,25 @@ RECIPES: dict[str, Recipe] = {
     ),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
 }
-"""What is known to work, by task; every other task begins with ``Recipe()``."""
+"""Recipes by task; the default of other tasks is ``Recipe()``."""
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What a run is made with; a checkpoint goes on only with the same."""
+class TrainConfig:
+    """Complete configuration of a run; a checkpoint resumes only with the same one."""
 
     task: str
     """Name of the task."""
     algorithm: str
-    """Name of the algorithm."""
+    """Name of the algorithm, a key of ``ALGORITHMS``."""
     seed: int
-    """Seed of everything random."""
+    """Random seed."""
     n_worlds: int
-    """Worlds that are flown at once."""
+    """Number of parallel worlds."""
     options: dict[str, Any]
     """Options of ``crazysim.envs.make``."""
     config: dict[str, Any]
-    """Settings of the algorithm."""
+    """Hyperparameters of the algorithm."""
 
     @staticmethod
     def create(
@@ -88,11 +89,19 @@ class Settings:
         n_worlds: int | None = None,
         options: dict[str, Any] | None = None,
         config: dict[str, Any] | None = None,
-    ) -> Settings:
-        """Return the settings of a run, from the task's recipe where nothing else is said.
+    ) -> TrainConfig:
+        """Return the configuration of a run; omitted values come from the recipe of the task.
+
+        Args:
+            task: Name of the task.
+            algorithm: Name of the algorithm, a key of ``ALGORITHMS``.
+            seed: Random seed.
+            n_worlds: Number of parallel worlds.
+            options: Options of ``crazysim.envs.make``.
+            config: Hyperparameters of the algorithm.
 
         Raises:
-            ConfigError: If the algorithm has no such setting.
+            ConfigError: If the algorithm has no such hyperparameter.
             UnknownNameError: If there is no such task or algorithm.
         """
         entry_of(task)
@@ -101,206 +110,232 @@ class Settings:
             recipe = Recipe(algorithm)
         algorithm = recipe.algorithm
         if algorithm not in ALGORITHMS:
-            raise UnknownNameError(f"algorithm {algorithm!r} does not exist; there are {', '.join(ALGORITHMS)}")
+            raise UnknownNameError(f"expected an algorithm of {', '.join(ALGORITHMS)}, got {algorithm!r}")
         known = {f.name: f for f in dataclasses.fields(ALGORITHMS[algorithm].Config)}
-        chosen = recipe.config | (config or {})
+        chosen = recipe.config | _with_new_names(algorithm, config or {})
         if wrong := [name for name in chosen if name not in known]:
-            raise ConfigError(f"{algorithm} has no setting {', '.join(wrong)}; it has {', '.join(known)}")
+            raise ConfigError(
+                f"expected hyperparameters of {algorithm}, got {', '.join(wrong)}; use {', '.join(known)}"
+            )
         full = dataclasses.asdict(ALGORITHMS[algorithm].Config(**chosen))
         full["hidden"] = list(full["hidden"])
-        return Settings(task, algorithm, seed, n_worlds or recipe.n_worlds, dict(options or {}), full)
+        return TrainConfig(task, algorithm, seed, n_worlds or recipe.n_worlds, dict(options or {}), full)
 
-    def environment(self, n_worlds: int | None = None, **options: Any) -> DroneEnv:
-        """Return the environment of the run, or one like it with other worlds, and options that the run leaves open."""
-        return make(self.task, n_worlds or self.n_worlds, **options | self.options)
+    @staticmethod
+    def from_meta(meta: dict[str, Any]) -> TrainConfig:
+        """Return the configuration stored in the metadata of a checkpoint."""
+        stored = meta["settings"]
+        return TrainConfig(**stored | {"config": _with_new_names(stored["algorithm"], stored["config"])})
 
-    def on(self, device: str | None) -> Settings:
-        """Return the same for another device, such as ``"cpu"``; None for that of the run."""
+    def make_env(self, n_worlds: int | None = None, **defaults: Any) -> DroneEnv:
+        """Return an environment of the run.
+
+        Args:
+            n_worlds: Number of worlds; None for that of the run.
+            **defaults: Options of ``crazysim.envs.make`` where the run does not set them.
+        """
+        return make(self.task, n_worlds or self.n_worlds, **defaults | self.options)
+
+    def with_device(self, device: str | None) -> TrainConfig:
+        """Return the same configuration on another device, such as ``"cpu"``; None keeps the device."""
         return self if device is None else dataclasses.replace(self, options=self.options | {"device": device})
 
-    def practice(self) -> dict[str, Any]:
-        """Return options of the environment that is learnt in, as the task's recipe has them."""
+    def practice_options(self) -> dict[str, Any]:
+        """Return the options of the training environment that the recipe of the task adds."""
         return dict(RECIPES.get(self.task, Recipe()).practice)
 
     def algorithm_config(self) -> Any:
-        """Return the settings of the algorithm, as it wants them."""
+        """Return the ``Config`` of the algorithm."""
         return ALGORITHMS[self.algorithm].Config(**self.config | {"hidden": tuple(self.config["hidden"])})
 
 
+def _with_new_names(algorithm: str, config: dict[str, Any]) -> dict[str, Any]:
+    """Return hyperparameters with those of 0.1 under their present names."""
+    renamed = getattr(ALGORITHMS[algorithm], "RENAMED", {})
+    for name in config:
+        if name in renamed:
+            warn_renamed(f"{algorithm} hyperparameter {name}", renamed[name])
+    return {renamed.get(name, name): value for name, value in config.items()}
+
+
 @dataclass
-class Result:
-    """How a run went."""
+class TrainResult:
+    """Outcome of a run."""
 
     folder: Path
-    """Where its files are."""
-    figures: dict[str, float]
-    """``success``, ``crashed``, ``error``, ``reward`` over held-out starts; ``seconds``, and ``compile_seconds`` of
-    these; ``env_steps``, steps of drones."""
+    """Folder of the files of the run."""
+    metrics: dict[str, float]
+    """``success``, ``crashed``, ``error`` and ``reward`` on held-out initial states; ``seconds`` in all and
+    ``compile_seconds`` of them, s; ``env_steps``, environment steps of all drones."""
     policy: Policy
-    """What was learnt."""
+    """Trained policy."""
 
 
 def train(
-    settings: Settings,
+    config: TrainConfig,
     folder: str | Path,
     resume: bool = False,
     evaluation_worlds: int = 1000,
-    say: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
     progress: bool = True,
-) -> Result:
-    """Train a policy, and keep a checkpoint, a learning curve and the policy in a folder.
+) -> TrainResult:
+    """Train a policy and write checkpoint, learning curve and policy into a folder.
 
-    An interrupt (Ctrl-C) writes a checkpoint first. What is learnt after a checkpoint was loaded is bit for bit what
-    would have been learnt without the interruption, on the same machine.
+    An interrupt (Ctrl-C) writes a checkpoint first. A resumed run is bit for bit the same as an uninterrupted one on
+    the same machine.
 
     Args:
-        settings: What is learnt, and how.
-        folder: Where the files go.
-        resume: Whether to go on from the checkpoint that is there.
-        evaluation_worlds: Held-out starts of each evaluation.
-        say: Prints a line.
-        progress: Whether to show a bar, where tqdm is installed.
+        config: Configuration of the run.
+        folder: Folder of the run.
+        resume: True to continue from the checkpoint in the folder.
+        evaluation_worlds: Number of held-out initial states of each evaluation.
+        log: Function that is called with each line of output.
+        progress: True to show a progress bar, if tqdm is installed.
 
     Raises:
-        ConfigError: If there is a run in the folder already and ``resume`` is not said, or it is of other settings.
-        KeyboardInterrupt: After the checkpoint of an interrupted run was written.
+        ConfigError: If the folder holds a run and ``resume`` is False, or the run has another configuration.
+        KeyboardInterrupt: After the checkpoint of an interrupted run has been written.
     """
     folder = Path(folder)
     path = folder / CHECKPOINT
-    begin = time.perf_counter()
-    algorithm, config = ALGORITHMS[settings.algorithm], settings.algorithm_config()
-    # A gradient runs on lanes in any case; a kernel for the way forward would take longer to compile than it saves.
+    started = time.perf_counter()
+    algorithm, hyperparameters = ALGORITHMS[config.algorithm], config.algorithm_config()
+    # A gradient runs on lanes in any case; a kernel for the forward pass would take longer to compile than it saves.
     engine = {"engine": "lanes"} if algorithm is apg else {}
-    base = settings.environment(settings.n_worlds, **engine | settings.practice())
+    base = config.make_env(config.n_worlds, **engine | config.practice_options())
     env = base if algorithm is apg else AutoReset(base)
-    judge = settings.environment(evaluation_worlds)
-    key = jax.random.fold_in(jax.random.key(settings.seed), 1)
+    eval_env = config.make_env(evaluation_worlds)
+    key = jax.random.fold_in(jax.random.key(config.seed), 1)
     curve = []
     if resume:
-        _require_same(path, settings)
+        _require_same(path, config)
         curve = json.loads((folder / CURVE).read_text())
     elif path.exists():
         raise ConfigError(
-            f"there is a run in {folder} already; go on with it with --resume, or choose another folder with --out"
+            f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
+            f"with --out"
         )
-    shapes = jax.eval_shape(lambda k: algorithm.init(env, config, k), key)
+    shapes = jax.eval_shape(lambda k: algorithm.init(env, hyperparameters, k), key)
 
     def start() -> tuple[Any, dict[str, float]]:
         if resume:
             learner = jax.device_put(checkpoint.load(path, shapes), base.sim.device)
         else:
-            learner = jax.jit(lambda k: algorithm.init(env, config, k))(jax.device_put(key, base.sim.device))
-        return learner, evaluate(judge, learner.as_policy())
+            learner = jax.jit(lambda k: algorithm.init(env, hyperparameters, k))(jax.device_put(key, base.sim.device))
+        return learner, evaluate(eval_env, learner.as_policy())
 
-    def compile_round() -> tuple[Any, float]:
+    def compile_iteration() -> tuple[Any, float]:
         compiling = time.perf_counter()
-        return algorithm.iterate.lower(_placed(shapes, base.sim.device), env, config).compile(), (
-            time.perf_counter() - compiling
-        )
+        compiled = algorithm.iterate.lower(_placed(shapes, base.sim.device), env, hyperparameters).compile()
+        return compiled, time.perf_counter() - compiling
 
     with ThreadPoolExecutor(2) as pool:  # each compiles for seconds, mostly on one core
-        starting, rounds = pool.submit(start), pool.submit(compile_round)
-        (learner, figures), (step, compile_s) = starting.result(), rounds.result()
-    done, before = int(learner.iteration), curve[-1]["seconds"] if curve else 0.0
-    per_round = settings.n_worlds * base.sim.n_drones * config.n_steps
-    say(
-        f"{settings.task} by {settings.algorithm}, seed {settings.seed}: {config.iterations} rounds of {per_round:,} "
-        f"steps in {settings.n_worlds:,} worlds, {base.sim.control.value} commands, "
-        f"{base.sim.explain().splitlines()[0]}" + (f"; goes on after round {done}" if done else "")
+        starting, compiling = pool.submit(start), pool.submit(compile_iteration)
+        (learner, metrics), (iterate, compile_s) = starting.result(), compiling.result()
+    done, seconds_before = int(learner.iteration), curve[-1]["seconds"] if curve else 0.0
+    steps_per_iteration = config.n_worlds * base.sim.n_drones * hyperparameters.n_steps
+    log(
+        f"{config.task} by {config.algorithm}, seed {config.seed}: {hyperparameters.iterations} iterations of "
+        f"{steps_per_iteration:,} steps in {config.n_worlds:,} worlds, {base.sim.control.value} commands, "
+        f"{base.sim.explain().splitlines()[0]}" + (f"; continues after iteration {done}" if done else "")
     )
 
-    def keep(learner: Any, figures: dict[str, float] | None = None) -> dict[str, float]:
-        figures = figures or evaluate(judge, learner.as_policy())
-        rounds = int(learner.iteration)
-        seconds = before + time.perf_counter() - begin
-        point = {"round": rounds, "env_steps": rounds * per_round, "seconds": seconds, **figures}
+    def record(learner: Any, metrics: dict[str, float] | None = None) -> dict[str, float]:
+        """Evaluate the policy, and write policy, learning curve and checkpoint."""
+        metrics = metrics or evaluate(eval_env, learner.as_policy())
+        iteration = int(learner.iteration)
+        seconds = seconds_before + time.perf_counter() - started
+        point = {"round": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds, **metrics}
         point["compile_seconds"] = compile_s
         curve.append(point)
-        save_policy(folder / POLICY, learner.as_policy(), base, settings)
+        save_policy(folder / POLICY, learner.as_policy(), base, config)
         (folder / CURVE).write_text(json.dumps(curve, indent=1))
-        checkpoint.save(path, learner, _meta(settings))
+        checkpoint.save(path, learner, _meta(config))
         return point
 
     if not resume:
-        keep(learner, figures)
-    every = RECIPES.get(settings.task, Recipe()).evaluate_every
+        record(learner, metrics)
+    every = RECIPES.get(config.task, Recipe()).evaluate_every
     try:
-        with _bar(config.iterations, done, progress) as show:
-            for i in range(done, config.iterations):
-                learner, figures = step(learner)
-                show(figures if i % 5 == 0 else None)
-                if (i + 1) % every == 0 and i + 1 < config.iterations:
-                    show(keep(learner), 0)
+        with _bar(hyperparameters.iterations, done, progress) as show:
+            for i in range(done, hyperparameters.iterations):
+                learner, metrics = iterate(learner)
+                show(metrics if i % 5 == 0 else None)
+                if (i + 1) % every == 0 and i + 1 < hyperparameters.iterations:
+                    show(record(learner), 0)
     except KeyboardInterrupt:
         jax.block_until_ready(learner)
-        keep(learner)
-        say(f"interrupted after round {int(learner.iteration)}; its checkpoint is {path}; --resume goes on from there")
+        record(learner)
+        log(f"interrupted after iteration {int(learner.iteration)}; wrote {path}; continue with --resume")
         raise
-    point = keep(learner)
-    say(
+    point = record(learner)
+    log(
         f"success {point['success']:.1%} of {evaluation_worlds:,} held-out starts (error below "
         f"{base.task.tolerance:g} for the last {base.task.hold:g} s), mean error {point['error']:.4f}, crashed "
-        f"{point['crashed']:.1%}; {point['env_steps']:,} steps in {point['seconds']:.1f} s, {compile_s:.1f} s of it "
-        f"compiling"
+        f"{point['crashed']:.1%}; {point['env_steps']:,} steps in {point['seconds']:.1f} s, including "
+        f"{compile_s:.1f} s of compilation"
     )
-    return Result(folder, point, learner.as_policy())
+    return TrainResult(folder, point, learner.as_policy())
 
 
 def _placed(shapes: Any, device: jax.Device) -> Any:
-    """Return shapes of arrays that are on a device."""
+    """Return the shapes with a device attached."""
     place = jax.sharding.SingleDeviceSharding(device)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), shapes)
 
 
-def save_policy(path: Path, policy: Policy, env: DroneEnv, settings: Settings) -> None:
-    """Write a policy, with what its inputs and outputs mean."""
-    checkpoint.save(path, policy, _meta(settings) | describe(env))
+def save_policy(path: Path, policy: Policy, env: DroneEnv, config: TrainConfig) -> None:
+    """Write a policy with the description of its inputs and outputs."""
+    checkpoint.save(path, policy, _meta(config) | describe(env))
 
 
-def load_policy(folder: str | Path) -> tuple[Policy, Settings, dict[str, Any]]:
-    """Return a run's policy, its settings, and what its inputs and outputs mean.
+def load_policy(folder: str | Path) -> tuple[Policy, TrainConfig, dict[str, Any]]:
+    """Return the policy of a run, its configuration, and the description of its inputs and outputs.
 
     Raises:
-        ConfigError: If there is none, or it is of another version.
+        ConfigError: If the folder holds no policy that this version can read.
     """
     path = Path(folder) / POLICY
     meta = checkpoint.read_meta(path)
-    settings = Settings(**meta["settings"])
+    config = TrainConfig.from_meta(meta)
     n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])
-    sizes = (n_obs, *settings.config["hidden"], n_actions)
+    sizes = (n_obs, *config.config["hidden"], n_actions)
     dtype = jnp.zeros(()).dtype
     layers = [
         (jax.ShapeDtypeStruct((a, b), dtype), jax.ShapeDtypeStruct((b,), dtype)) for a, b in itertools.pairwise(sizes)
     ]
     stats = jax.eval_shape(lambda: RunningStats.create(n_obs))
-    return checkpoint.load(path, Policy(stats, layers)), settings, meta
+    return checkpoint.load(path, Policy(stats, layers)), config, meta
 
 
-def _meta(settings: Settings) -> dict[str, Any]:
-    return {"crazysim": crazysim.__version__, "settings": dataclasses.asdict(settings)}
+def _meta(config: TrainConfig) -> dict[str, Any]:
+    return {"crazysim": crazysim.__version__, "settings": dataclasses.asdict(config)}
 
 
-def _require_same(path: Path, settings: Settings) -> None:
-    """Check that a checkpoint is of a run with these settings.
+def _require_same(path: Path, config: TrainConfig) -> None:
+    """Check that a checkpoint belongs to a run with this configuration.
 
     Raises:
-        ConfigError: With what differs.
+        ConfigError: With the first difference.
     """
     meta = checkpoint.read_meta(path)
     if meta["crazysim"] != crazysim.__version__:
-        raise ConfigError(f"{path} is of crazysim {meta['crazysim']}, and this is {crazysim.__version__}")
-    now = json.loads(json.dumps(dataclasses.asdict(settings)))
-    for name, value in now.items():
-        if meta["settings"][name] != value:
+        raise ConfigError(
+            f"expected a checkpoint of crazysim {crazysim.__version__}, got {path} of {meta['crazysim']}; start a new "
+            f"run in another folder with --out"
+        )
+    stored = dataclasses.asdict(TrainConfig.from_meta(meta))
+    for name, value in json.loads(json.dumps(dataclasses.asdict(config))).items():
+        if stored[name] != value:
             raise ConfigError(
-                f"{path} was made with {name} = {meta['settings'][name]!r}, and now it is {value!r}; go on with the "
-                f"same, or begin in another folder with --out"
+                f"expected {name} = {stored[name]!r} as in {path}, got {value!r}; resume with the same value, or start "
+                f"a new run in another folder with --out"
             )
 
 
 @contextmanager
 def _bar(total: int, done: int, wanted: bool) -> Iterator[Callable[..., None]]:
-    """Give a function that shows a round's figures on a bar, where there is to be one and tqdm is installed."""
+    """Yield a function that shows metrics on a progress bar; without ``wanted`` or tqdm it does nothing."""
     try:
         if not wanted:
             raise ImportError
@@ -308,14 +343,20 @@ def _bar(total: int, done: int, wanted: bool) -> Iterator[Callable[..., None]]:
     except ImportError:
         yield lambda *_: None
         return
-    with tqdm(total=total, initial=done, unit="round", ncols=100) as bar:
+    with tqdm(total=total, initial=done, unit="iteration", ncols=100) as bar:
         shown: dict[str, str] = {}
 
-        def show(figures: dict[str, Any] | None, rounds: int = 1) -> None:
-            if figures is not None:
-                wanted = {k: figures[k] for k in ("success", "error", "reward") if k in figures}
-                shown.update({k: f"{float(np.asarray(v)):.3f}" for k, v in wanted.items()})
+        def show(metrics: dict[str, Any] | None, iterations: int = 1) -> None:
+            if metrics is not None:
+                known = {k: metrics[k] for k in ("success", "error", "reward") if k in metrics}
+                shown.update({k: f"{float(np.asarray(v)):.3f}" for k, v in known.items()})
                 bar.set_postfix(shown, refresh=False)
-            bar.update(rounds)
+            bar.update(iterations)
 
         yield show
+
+
+__getattr__ = renamed(
+    __name__,
+    {"Settings": "crazysim.train.run:TrainConfig", "Result": "crazysim.train.run:TrainResult"},
+)

@@ -1,4 +1,4 @@
-"""What training gave, to be looked at: a learning curve, and a film of the policy."""
+"""Plots of learning curves, and films of policies."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from crazysim.sim.visualize import draw_points
 from crazysim.train.networks import Policy
 
 TARGET_COLOR = (0.1, 0.8, 0.3, 0.6)
-"""Of the place where a drone is to be."""
+"""Colour of the target of a drone, RGBA."""
 
 
 def plot_curve(curves: dict[str, Any], path: Path) -> None:
-    """Write a picture of success and error over environment steps and over seconds.
+    """Plot success and error over environment steps and over time.
 
     Args:
-        curves: By name, what ``curve.json`` of a run holds.
-        path: A ``.png``.
+        curves: Contents of ``curve.json`` of each run, by the name of the run.
+        path: Image to write, such as a ``.png``.
 
     Raises:
         ImportError: If matplotlib is not installed.
@@ -60,40 +60,45 @@ def plot_curve(curves: dict[str, Any], path: Path) -> None:
 
 
 def read_curve(folder: Path) -> Any:
-    """Return the learning curve of a run."""
+    """Return the learning curve of a run, one point per evaluation."""
     return json.loads((folder / "curve.json").read_text())
 
 
 def film(
     env: DroneEnv, policy: Policy, path: str | Path, worlds: int = 4, seed: int = 1, progress: bool = False
 ) -> int:
-    """Film one episode of a policy in some worlds side by side; return the number of frames.
+    """Film one episode of a policy in several worlds side by side, and return the number of frames.
 
     Args:
-        env: The environment.
-        policy: Observations to actions.
-        path: An ``.mp4`` or a ``.gif``.
-        worlds: How many worlds are seen.
-        seed: Of the starts.
-        progress: Whether to show a bar.
+        env: Environment to fly in.
+        policy: Policy to fly.
+        path: Film to write, ``.mp4`` or ``.gif``.
+        worlds: Number of worlds in the film.
+        seed: Seed of the initial states.
+        progress: True to show a progress bar.
 
     Raises:
         ImportError: If imageio-ffmpeg is not installed.
-        RenderError: If this machine cannot draw.
+        RenderError: If this machine cannot render.
     """
     sim, rate = env.sim, env.freq
     skip = max(rate // 25, 1)
 
-    def mark(sim: Sim, world: int) -> None:
+    def draw_target(sim: Sim, world: int) -> None:
         if env.task.target is not None:
             draw_points(sim, np.asarray(env.task.target(sim.data)[world]), TARGET_COLOR, 0.04)
 
     step = jax.jit(lambda state: env.step(state, policy(state.obs)))
     state = jax.jit(env.reset)(jax.random.key(seed))
     view = View(
-        worlds=range(min(worlds, sim.n_worlds)), width=960, height=720, trail=1.5, text="{time:.1f} s", draw=mark,
+        worlds=range(min(worlds, sim.n_worlds)),
+        width=960,
+        height=720,
+        trail=1.5,
+        text="{time:.1f} s",
+        draw=draw_target,
         cam_config=env.task.camera,
-    )  # fmt: skip
+    )
     n_frames = env.max_steps // skip + 1
     with Film(path, view, fps=rate / skip, progress=progress, total=n_frames) as recording:
         for i in range(env.max_steps + 1):

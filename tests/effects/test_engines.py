@@ -31,9 +31,10 @@ def sim():
 
 
 def test_every_effect_is_fused(sim):
-    segments = sim._step.plan(sim.data).program.segments
-    assert [s.why for s in segments if s.scope == "batch"] == []
-    fused = {stage.__name__ for s in segments for stage in s.stages}
+    program = sim._step.plan(sim.data).program
+    assert program.unfused_stages == ()
+    segments = program.fused_segments
+    fused = {name for s in segments for name in s.stages}
     assert {"wind", "downwash", "battery", "motors"} <= fused
     assert [s.scope for s in segments] == ["drone", "world", "drone"]
 

@@ -130,5 +130,5 @@ def test_too_many_places_are_refused_when_the_step_is_planned(sim):
         far = jnp.zeros(100).at[data.core.steps].set(1.0)
         return data.replace(states=data.states.replace(vel=far[:3]))
 
-    (segment,) = Step({"write": write}, "lanes").plan(sim.data).program.segments
-    assert "100 places" in segment.why
+    (stage_as_it_is,) = Step({"write": write}, "lanes").plan(sim.data).program.unfused_stages
+    assert "100 places" in stage_as_it_is.error.reason

@@ -14,7 +14,7 @@ from crazysim.core.random import drone_key
 from crazysim.core.stage import stage
 from crazysim.dynamics import Dynamics
 from crazysim.engine import Step, cuda, kernel, native, rollout
-from crazysim.engine.program import MAX_UNROLLED_DRONES
+from crazysim.engine.lower_stages import MAX_UNROLLED_DRONES
 from crazysim.engine.step import explain
 from crazysim.pytree import PyTree, leaf
 
@@ -258,7 +258,7 @@ def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
 def test_a_stage_of_one_world_splits_a_large_swarm():
     sim, data = with_stages(MAX_UNROLLED_DRONES + 1, separation)
     step = Step(sim.step_pipeline, "lanes")
-    assert f"written out for up to {MAX_UNROLLED_DRONES} drones" in explain(step, data)
+    assert f"unrolled for at most {MAX_UNROLLED_DRONES} drones" in explain(step, data)
     found, expected = step(data, jnp.int32(3)), Step(sim.step_pipeline, "plain")(data, jnp.int32(3))
     np.testing.assert_allclose(found.states.vel, expected.states.vel, rtol=2e-5, atol=2e-6)
 

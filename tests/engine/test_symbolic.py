@@ -10,12 +10,13 @@ from crazysim import Sim
 from crazysim.core.stage import stage
 from crazysim.engine import symbolic
 from crazysim.engine.lower import UnsupportedError
-from crazysim.engine.program import Program
+from crazysim.engine.lower_stages import lower_stages
+from crazysim.engine.passes import fuse
 
 pytestmark = pytest.mark.usefixtures("casadi", "x64")
 
 REFUSED = {
-    "integers": "'and' on the bits",
+    "integers": "'and' on int32",
     "words": "'shift_left' on uint32",
     "loop_until": "until a condition fails",
 }
@@ -43,8 +44,8 @@ def read(data, fn):
         out = jnp.ravel(fn(data.plugins["given"]))
         return data.replace(plugins=data.plugins | {"results": Results({"out": out})})
 
-    program = Program([case], data)
-    assert program.fused, program.segments[0].why
+    program = fuse(lower_stages([case], data))
+    assert program.fused, program.unfused_stages
     return program, data
 
 
@@ -52,11 +53,11 @@ def expressions(program, data):
     """Return a CasADi function from what the drone reads to the case's results, and the leaves that it reads."""
     import casadi
 
-    symbols = {leaf: casadi.SX.sym(f"x{leaf}", program.sizes(leaf)) for leaf in program.read}
+    symbols = {leaf: casadi.SX.sym(f"x{leaf}", program.leaves[leaf].size) for leaf in program.read}
     (segment,) = program.segments
     after = symbolic.step(segment, lambda slot: symbols[slot[0]][slot[1]])
     (written,) = program.written
-    outs = casadi.vertcat(*(after.get((written, k), 0) for k in range(program.sizes(written))))
+    outs = casadi.vertcat(*(after.get((written, k), 0) for k in range(program.leaves[written].size)))
     return casadi.Function("case", list(symbols.values()), [outs]), list(symbols)
 
 
@@ -69,7 +70,7 @@ def test_a_case_gives_what_jax_gives(data, name):
     for world, drone in ((0, 0), (3, 1), (6, 2)):
         one = jax.tree.map(lambda x, w=world, d=drone: x[w, d], g.replace(table=jnp.tile(g.table, (7, 3, 1))))
         expected = np.asarray(CASES[name](one), float).ravel()
-        inputs = [numbers[i] if program.axes.scopes[i] == "shared" else numbers[i][world, drone] for i in leaves]
+        inputs = [numbers[i] if program.leaves[i].scope == "shared" else numbers[i][world, drone] for i in leaves]
         found = np.asarray(function(*(np.asarray(x, float).ravel() for x in inputs))).ravel()
         assert expected.size
         # Solves multiply the rounding by the condition of the system, below 1e3; what else there is, is rounding.
@@ -113,7 +114,7 @@ def test_conversions_cut_and_wrap_as_in_jax(data):
 
 def test_a_long_loop_is_refused(data):
     program, data = read(data, lambda g: jax.lax.fori_loop(0, 257, lambda k, x: 0.99 * x, g.x))
-    with pytest.raises(UnsupportedError, match="257 turns; written out are up to 256"):
+    with pytest.raises(UnsupportedError, match="257 iterations is too long; at most 256"):
         expressions(program, data)
 
 

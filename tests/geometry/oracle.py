@@ -1,4 +1,4 @@
-"""C MuJoCo's answers to the same questions, one sample after the other, and samples to ask."""
+"""Reference distances and rays from C MuJoCo, and samples to compare them on."""
 
 import functools
 
@@ -22,7 +22,7 @@ SHAPES = {
 
 
 def geom(shape):
-    """Return a shape as MuJoCo's XML; a mesh in its own frame, which MuJoCo would move to the centre of mass."""
+    """Return a shape as MuJoCo's XML."""
     if shape.kind == "mesh":
         return '<geom type="mesh" mesh="mesh"/>'
     if shape.kind == "hfield":
@@ -67,7 +67,7 @@ def distances(a, b, pos, quat):
 
 
 def rays(shape, origin, direction):
-    """Return how far MuJoCo's rays go, infinite where they miss, and the normals there. (n,), (n, 3)"""
+    """Return the distances of MuJoCo's rays, infinite where they miss, and the normals at the hits. (n,), (n, 3)"""
     m = model(Shape("sphere", (1e-3,)), shape)
     d = mujoco.MjData(m)
     d.mocap_pos[0] = [0, 0, -1e4]
@@ -97,7 +97,7 @@ def places(rng, n):
 
 
 def reach(shape, n):
-    """Return how far a shape reaches along directions in its own frame. (..., 3) -> (...)"""
+    """Return the support function of a shape along directions in its own frame, m. (..., 3) -> (...)"""
     x, y, z = np.moveaxis(np.abs(n), -1, 0)
     if shape.kind == "mesh":
         return np.max(n @ shape.vertices.T, axis=-1)
@@ -112,9 +112,9 @@ def reach(shape, n):
 
 
 def overlaps(a, b, pos, rot, rng, n_directions=1500, n_best=6, n_rounds=40):
-    """Return how deep shapes overlap by searching for the shortest way out among directions, then around the best. (n,)
+    """Return the depth of overlaps, m, by a search over directions that is refined around the best. (n,)
 
-    An upper bound, close to the least: MuJoCo has a depth of its own for some pairs, and an estimate for others.
+    It is a tight upper bound; MuJoCo defines the depth differently for some pairs, and estimates it for others.
     """
     k = np.arange(n_directions) + 0.5
     z, angle = 1 - 2 * k / n_directions, np.pi * (1 + 5**0.5) * k
@@ -142,11 +142,11 @@ DRONES = {
     "capsule": Shape("capsule", (0.06, 0.15)),
     "box": Shape("box", (0.15, 0.1, 0.05)),
 }
-"""Shapes that a drone may have."""
+"""Shapes of drones."""
 
 
 def poses(rng, n):
-    """Return positions and attitudes, wxyz; some with axes that are parallel, or at 45 and 90 degrees."""
+    """Return positions and attitudes, wxyz; some with parallel axes, or with axes at 45 and 90 degrees."""
     quat = rng.normal(size=(n, 4))
     quat[: n // 10] = [1, 0, 0, 0]
     quat[n // 10 : n // 5] = rng.choice([-1.0, 0, 1], (n // 5 - n // 10, 4)) + [1e-9, 0, 0, 0]
@@ -155,7 +155,7 @@ def poses(rng, n):
 
 @functools.cache
 def judge(a, b):
-    """Return the function of all poses that gives distances, and their gradients by position and by rotation."""
+    """Return a function from poses to distances and their gradients with respect to position and rotation."""
 
     def total(pos, rot):
         out = distance(a, b, pos, rot)
@@ -171,7 +171,7 @@ def judge(a, b):
 
 
 def check_pair(a, b, rng, n, apart=1e-5, shallow=1e-6, deep=1e-6):
-    """Check distances of shapes apart against MuJoCo's, depths against a search of directions, and all signs."""
+    """Check distances of separated shapes against MuJoCo, depths against a search over directions, and all signs."""
     pos, quat = poses(rng, n)
     rot, answer = rotations(quat), judge(a, b)
     (found, by_pos, _), expected = answer(pos, rot), distances(a, b, pos, quat)
@@ -182,7 +182,7 @@ def check_pair(a, b, rng, n, apart=1e-5, shallow=1e-6, deep=1e-6):
     np.testing.assert_allclose(found[is_apart], expected[is_apart], atol=apart)
     inside = np.flatnonzero(~is_apart)[:200]
     depth = -expected[inside] if b.kind == "plane" else overlaps(a, b, pos[inside], rot[inside], rng)
-    # No translation that the search found may be shorter, and ours must part the shapes, or all but.
+    # The search must not find a shorter translation, and the computed one must separate the shapes.
     limit = np.where(depth < 0.05, shallow, deep)
     assert np.all(-found[inside] - depth < limit), np.max(-found[inside] - depth)
     parted = pos[inside] + by_pos[inside] * (1e-5 - found[inside, None])
@@ -190,9 +190,9 @@ def check_pair(a, b, rng, n, apart=1e-5, shallow=1e-6, deep=1e-6):
 
 
 def check_slopes(a, b, rng, n, deepest=-np.inf):
-    """Return by what gradients miss central differences where these are those of a distance; all must be finite.
+    """Return the errors of gradients against central differences at smooth points; all gradients must be finite.
 
-    Those of shapes that overlap by more than ``-deepest`` are left out.
+    Shapes that overlap by more than ``-deepest`` are excluded.
     """
     pos, quat = poses(rng, n)
     rot, answer, h = rotations(quat), judge(a, b), 1e-6
@@ -216,9 +216,9 @@ def check_slopes(a, b, rng, n, deepest=-np.inf):
 
 
 def check_finite(a, b, dtype, n):
-    """Check that distances and gradients are numbers with centres, faces and edges in line, and far away.
+    """Check that distances and gradients are finite with aligned centres, faces and edges, and far away.
 
-    Of as many poses as another test asks for, so that nothing is compiled anew; 1,250 of them differ.
+    The number of poses is that of another test, so that nothing is compiled twice; 1,250 of them differ.
     """
     size = np.asarray([*b.size, 0.3, 0.3, 0.3])[:3]
     grid = np.stack(np.meshgrid(*[[-1.0, 0.0, 0.5, 1.0, 1e4]] * 3), axis=-1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Pairs of convex shapes without a closed form, against C MuJoCo and a search among directions."""
+"""Pairs of convex shapes without a closed form, compared with C MuJoCo and with a search over directions."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from crazysim.geometry.shapes import SIZES
 PAIRS = [(a, b) for a in ("capsule", "box") for b in ("cylinder", "ellipsoid", "mesh")] + [("box", "box")]
 N = 2000
 DEEP = {("capsule", "ellipsoid"): 1e-2}
-"""How much longer than the shortest a translation out of deep overlap may be, m."""
+"""Tolerance of the depth of a deep overlap, m."""
 
 
 @pytest.mark.parametrize("a, b", PAIRS)
@@ -23,7 +23,7 @@ def test_convex_pairs(x64, rng, a, b):
 @pytest.mark.parametrize("a, b", PAIRS)
 def test_law_08_gradients_equal_central_differences(x64, rng, a, b):
     by_pos, by_rot = check_slopes(DRONES[a], SHAPES[b], rng, N, deepest=-0.05)
-    # A direction is known to the root of what a distance is; of parallel faces any point may be the nearest.
+    # The error of a direction is the square root of that of a distance; on parallel faces any point may be nearest.
     assert np.mean(by_pos > 5e-3) < 0.005
     assert np.mean(by_rot > 5e-3) < 0.02
 
@@ -51,7 +51,7 @@ def test_law_01_one_drone_then_many(x64, rng):
     pos, quat = poses(rng, N)
     rot, pair = rotations(quat), (DRONES["capsule"], SHAPES["mesh"])
     many = judge(*pair)(pos, rot)[0]
-    for i in range(0, N, 200):  # in the company of its likes
+    for i in range(0, N, 200):  # in a batch of equal poses
         one = judge(*pair)(np.broadcast_to(pos[i], (N, 3)), np.broadcast_to(rot[i], (N, 3, 3)))[0]
         np.testing.assert_allclose(one, many[i], atol=1e-6)
     shape = jax.eval_shape(lambda p, r: distance(*pair, p, r), jnp.zeros((2, 4, 3)), jnp.zeros((2, 4, 3, 3)))
@@ -59,7 +59,7 @@ def test_law_01_one_drone_then_many(x64, rng):
 
 
 def test_every_kind_has_a_distance():
-    """What a scene may hold, a drone may meet."""
+    """Every drone shape has a distance to every kind of shape that a scene may contain."""
     shapes = {kind: Shape(kind, (0.3,) * n) for kind, n in SIZES.items() if kind not in ("mesh", "hfield")}
     for b in shapes.values():
         for a in DRONES.values():

@@ -1,4 +1,4 @@
-"""Distances against C MuJoCo, against the gradient that a distance must have, and in every corner."""
+"""Distances compared with C MuJoCo, their gradients, and degenerate cases."""
 
 import jax
 import jax.numpy as jnp
@@ -21,14 +21,14 @@ N = 2000
 
 
 def both_ways(found, expected, at_least=100):
-    """Check signs, and that there is something to check: shapes apart, and overlapping ones."""
+    """Check the signs, with enough separated and enough overlapping samples."""
     assert np.sum(expected > 0) > at_least
     assert np.sum(expected < 0) > at_least
     np.testing.assert_array_equal(found > 0, expected > 0)
 
 
 @pytest.mark.parametrize("kind", [*CLOSED, "ellipsoid", "mesh"])
-def test_a_sphere_is_as_far_as_mujoco_has_it(x64, rng, kind):
+def test_distance_of_a_sphere_equals_that_of_mujoco(x64, rng, kind):
     drone, (pos, quat) = DRONES["sphere"], poses(rng, N)
     found = np.asarray(distance(drone, SHAPES[kind], pos, rotations(quat)))
     expected = distances(drone, SHAPES[kind], pos, quat)
@@ -64,7 +64,7 @@ def test_law_07_no_nan_in_two_shapes(a, b, dtype):
 
 @pytest.mark.parametrize("axes", [(0.5, 0.3, 0.15), (0.3, 0.3, 0.3), (0.1, 0.1, 1.0), (1.0, 0.03, 1.0)])
 def test_distance_to_an_ellipsoid_is_that_of_where_the_point_was_lifted_from(x64, rng, axes):
-    """Outside, any foot and height will do; inside, less than the radius of curvature of the middle section."""
+    """Points are lifted by any height outside, and by less than the smallest radius of curvature inside."""
     a = np.asarray(axes)
     foot = a * unit(rng.normal(size=(N, 3)))
     normal = unit(foot / a**2)
@@ -76,7 +76,7 @@ def test_distance_to_an_ellipsoid_is_that_of_where_the_point_was_lifted_from(x64
 
 
 def test_distance_to_an_ellipsoid_from_its_middle_by_hand(x64):
-    """On the longest axis the nearest point is off the axis up to where the curvature's centre lies."""
+    """For points of the longest axis up to the centre of curvature, the nearest point is off the axis."""
     a, b, c = 0.5, 0.3, 0.2
     x = np.linspace(0, 0.999 * (a * a - c * c) / a, 20)
     expected = -c * np.sqrt(1 - x**2 / (a * a - c * c))
@@ -121,7 +121,7 @@ def test_law_08_gradient_equals_central_differences_and_has_length_one(x64, rng,
 
 
 def test_curvature_of_an_ellipsoid_is_right_too(x64, rng):
-    """The gradient is the contact's normal, so what is differentiated twice is a force."""
+    """The gradient is a contact normal, so the derivative of a contact force is a second derivative."""
     points, h = unit(rng.normal(size=(50, 3))), 1e-5
     one = jax.grad(lambda p: point_distance(SHAPES["ellipsoid"], p))
     normal = jax.jit(jax.grad(lambda p: jnp.sum(point_distance(SHAPES["ellipsoid"], p))))
@@ -132,7 +132,7 @@ def test_curvature_of_an_ellipsoid_is_right_too(x64, rng):
 
 
 def special_points(shape):
-    """Return where something vanishes or ties: the middle, axes, the surface, edges, corners, and very far."""
+    """Return degenerate points: centre, axes, surface, edges, corners, and far away."""
     x = np.asarray([*shape.size, 0.3, 0.3, 0.3])[:3]
     grid = np.stack(np.meshgrid(*[[-1.0, -0.5, -0.0, 0.0, 0.5, 1.0, 1e5]] * 3), axis=-1).reshape(-1, 3)
     return np.concatenate([grid * x, grid * x[[1, 0, 2]], grid * x[0], grid * 1e-20])
@@ -140,7 +140,7 @@ def special_points(shape):
 
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_law_07_no_nan_in_corners(kind, dtype):
+def test_law_07_no_nan_at_degenerate_points(kind, dtype):
     with jax.enable_x64(dtype == np.float64):
         points = jnp.asarray(special_points(SHAPES[kind]), dtype)
         value, slope = jax.vmap(jax.value_and_grad(lambda p: point_distance(SHAPES[kind], p)))(points)
@@ -162,6 +162,6 @@ def test_no_distance_changes_faster_than_its_point(kind, a, b):
     assert change <= np.linalg.norm(a - b) * (1 + 1e-5) + 1e-6
 
 
-def test_a_drone_of_a_kind_that_cannot_be_is_told():
-    with pytest.raises(ConfigError, match="cylinder"):
+def test_a_drone_of_an_unsupported_kind_is_an_error():
+    with pytest.raises(ConfigError, match="expected a drone shape of kind sphere, capsule, box, got cylinder"):
         distance(SHAPES["cylinder"], SHAPES["box"], np.zeros(3), np.eye(3))

@@ -1,6 +1,6 @@
-"""Height fields against the same ground built of prisms, one to a triangle, in C MuJoCo.
+"""Height fields compared with the same ground built of prisms, one per triangle, in C MuJoCo.
 
-MuJoCo's own distances to a height field are no oracle: overlapping shapes come out apart.
+MuJoCo's own distances to a height field cannot serve as reference: it reports overlapping shapes as separated.
 """
 
 import jax
@@ -37,7 +37,7 @@ def prisms():
 
 
 def distances_to_prisms(a, pos, quat):
-    """Return the distance to the nearest prism; where it is negative, only its sign means something. (n,)"""
+    """Return the distance to the nearest prism, m; of a negative distance only the sign is meaningful. (n,)"""
     bodies = prisms()
     meshes = "".join(f'<mesh name="m{k}" vertex="{" ".join(map(str, v.ravel()))}"/>' for k, v in enumerate(bodies))
     geoms = "".join(f'<geom type="mesh" mesh="m{k}"/>' for k in range(len(bodies)))
@@ -92,7 +92,7 @@ def test_depth_below_a_height_field_is_that_of_the_nearest_surface(x64, rng):
 
 
 def test_reach_by_hand(x64):
-    """A peak two cells away is nearer than the plain below: a sphere that large sees it, a point does not."""
+    """A peak two cells away is nearer than the plain below: a sphere of that radius is affected, a point is not."""
     heights = np.zeros((9, 9))
     heights[4, 7] = 1.0  # at x = 0.3, y = 0; along x the slope begins at 0.2
     field, point = hfield(heights, (0.4, 0.4, 1.0, 0.1)), np.array([0.0, 0.0, 0.9])

@@ -1,4 +1,4 @@
-"""Rays against C MuJoCo, and in every corner."""
+"""Rays compared with C MuJoCo, their gradients, and degenerate cases."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ N = 4000
 
 
 def some_rays(rng, n=N):
-    """Return rays from outside that aim at the shape or past it, and from inside."""
+    """Return rays from outside, aimed at the shape or past it, and rays from inside."""
     origin = places(rng, n)
     target = np.where(rng.uniform(size=(n, 1)) < 0.7, rng.uniform(-0.4, 0.4, (n, 3)), 10 * rng.normal(size=(n, 3)))
     direction = target - origin
@@ -39,7 +39,7 @@ def test_rays_end_where_mujoco_has_it(x64, rng, kind):
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_float32_rays_end_on_the_surface(rng, kind):
-    """10 m away a rounding of the origin is 1e-6 m; on a grazing ray it moves the end by more."""
+    """Rounding of an origin 10 m away is 1e-6 m; it moves the hit of a grazing ray by more."""
     origin, direction = some_rays(rng)
     with jax.enable_x64(True):
         exact, normal = map(np.asarray, ray_distance(SHAPES[kind], origin, direction))
@@ -78,8 +78,8 @@ def test_law_08_gradient_equals_central_differences(x64, rng, kind):
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_law_07_no_nan_in_corners(kind):
-    """From the middle, from edges, along faces, past corners: every value and gradient is a number, or a miss."""
+def test_law_07_no_nan_in_degenerate_cases(kind):
+    """From the centre, from edges, along faces, past corners: every value and gradient is finite, or a miss."""
     size = np.asarray([*SHAPES[kind].size, 0.3, 0.3, 0.3])[:3]
     grid = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0, 3.0]] * 3), axis=-1).reshape(-1, 3)
     ways = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Shapes: equal by content, checked when they are made, and a hull that holds all its vertices."""
+"""Shapes are equal by content and checked when they are made, and a hull contains all its vertices."""
 
 import numpy as np
 import pytest
@@ -61,21 +61,21 @@ def test_a_hull_is_closed_and_holds_its_vertices(rng, n):
 
 @pytest.mark.parametrize("make, message", [
     (lambda: Shape("torus", (1, 1)), "torus.*plane, sphere"),
-    (lambda: Shape("box", (1, 2)), r"box of size \(1.0, 2.0\); needed are 3"),
+    (lambda: Shape("box", (1, 2)), r"expected 3 positive.*box.*got \(1.0, 2.0\)"),
     (lambda: Shape("sphere", (0,)), "positive"),
     (lambda: Shape("sphere", (np.nan,)), "finite"),
-    (lambda: Shape("mesh"), "mesh without vertices"),
-    (lambda: Shape("hfield", (1, 1, 1, 1)), "hfield without heights"),
+    (lambda: Shape("mesh"), "expected a mesh with vertices"),
+    (lambda: Shape("hfield", (1, 1, 1, 1)), "expected a hfield with heights"),
     (lambda: hull(CUBE[:3]), r"shape \(3, 3\)"),
     (lambda: hull(CUBE * [1, 1, 0]), "one plane"),
-    (lambda: hull(np.random.default_rng(0).normal(size=(65, 3))), "65 vertices without faces"),
-    (lambda: hull(CUBE, [[0, 1, 8]]), "0 to 8; there are 8"),
+    (lambda: hull(np.random.default_rng(0).normal(size=(65, 3))), "got 65 vertices and no faces"),
+    (lambda: hull(CUBE, [[0, 1, 8]]), "expected faces of vertices 0 to 7, got 0 to 8"),
     (lambda: hull(CUBE, [[0.0, 1, 2]]), "integers"),
-    (lambda: hull(CUBE, [[0, 3, 5]]), "needed are the triangles of the convex hull"),
+    (lambda: hull(CUBE, [[0, 3, 5]]), "expected the triangles of the convex hull"),
     (lambda: hull(CUBE, hull(CUBE).faces[1:]), "not closed"),
     (lambda: hfield(np.zeros((1, 5)), (1, 1, 1, 1)), r"\(1, 5\)"),
-    (lambda: hfield(np.full((2, 5), 2.0), (1, 1, 1, 1)), "from 2.0 to 2.0"),
+    (lambda: hfield(np.full((2, 5), 2.0), (1, 1, 1, 1)), "between 0 and 1.0 m, got 2.0 to 2.0"),
 ])  # fmt: skip
-def test_law_09_wrong_input_is_told_at_once(make, message):
+def test_law_09_wrong_input_is_an_error_at_once(make, message):
     with pytest.raises(ConfigError, match=message):
         make()

@@ -1,4 +1,4 @@
-"""Trainings as runs: they learn, resume bit for bit, refuse what does not fit, and say where they are."""
+"""Training runs: they learn, resume bit for bit, and refuse checkpoints of other configurations."""
 
 import dataclasses
 import json
@@ -17,34 +17,34 @@ from crazysim.errors import UnknownNameError
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import run as runs
 from crazysim.train.evaluate import evaluate
-from crazysim.train.run import CHECKPOINT, POLICY, Settings, load_policy, train
+from crazysim.train.run import CHECKPOINT, POLICY, TrainConfig, load_policy, train
 
 SMALL = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (16, 16)}
 
 
-def settings(iterations=4, **changes):
+def small_config(iterations=4, **changes):
     config = {**SMALL, "iterations": iterations}
     given = {"task": "hover", "n_worlds": 8, "options": {"seconds": 0.4}, "config": config} | changes
-    return Settings.create(**given)
+    return TrainConfig.create(**given)
 
 
 def quiet(*_):
     pass
 
 
-def trained(folder, chosen, **options):
-    return train(chosen, folder, evaluation_worlds=8, say=quiet, progress=False, **options)
+def trained(folder, config, **options):
+    return train(config, folder, evaluation_worlds=8, log=quiet, progress=False, **options)
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A run of four rounds without an interruption."""
+    """Return an uninterrupted run of four iterations."""
     folder = tmp_path_factory.mktemp("run") / "whole"
-    return trained(folder, settings())
+    return trained(folder, small_config())
 
 
 def frames(path):
-    """Return a film's pictures. (n, height, width, 3)"""
+    """Return the frames of a film. (n, height, width, 3)"""
     import imageio_ffmpeg
 
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-vf", "scale=480:360", "-"]
@@ -58,8 +58,8 @@ def arrays(folder):
         return {name: file[name] for name in file.files if name != checkpoint.META}
 
 
-def test_an_interrupted_run_goes_on_bit_for_bit(whole, tmp_path, monkeypatch):
-    """Law of resuming: an interrupt after two of four rounds leaves what the whole run has after four."""
+def test_an_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
+    """Interrupted after two of four iterations and resumed, a run ends with the arrays of an uninterrupted one."""
     shown, real = [0], runs._bar
 
     def interrupting(*args):
@@ -77,14 +77,15 @@ def test_an_interrupted_run_goes_on_bit_for_bit(whole, tmp_path, monkeypatch):
 
         return Bar()
 
-    said = []
+    lines = []
     monkeypatch.setattr(runs, "_bar", interrupting)
     with pytest.raises(KeyboardInterrupt):
-        train(settings(), tmp_path, evaluation_worlds=8, say=said.append, progress=False)
-    assert str(tmp_path / CHECKPOINT) in said[-1]
-    assert "--resume" in said[-1]
+        train(small_config(), tmp_path, evaluation_worlds=8, log=lines.append, progress=False)
+    assert "interrupted after iteration 2" in lines[-1]
+    assert str(tmp_path / CHECKPOINT) in lines[-1]
+    assert "--resume" in lines[-1]
     monkeypatch.setattr(runs, "_bar", real)
-    trained(tmp_path, settings(), resume=True)
+    trained(tmp_path, small_config(), resume=True)
     mine, others = arrays(tmp_path), arrays(whole.folder)
     assert mine.keys() == others.keys()
     for name, x in mine.items():
@@ -92,54 +93,54 @@ def test_an_interrupted_run_goes_on_bit_for_bit(whole, tmp_path, monkeypatch):
     assert [p["round"] for p in json.loads((tmp_path / "curve.json").read_text())][-1] == 4
 
 
-def test_rounds_change_the_policy_and_seeds_differ(whole, tmp_path):
-    other = trained(tmp_path, settings(seed=1))
+def test_iterations_change_the_policy_and_seeds_differ(whole, tmp_path):
+    other = trained(tmp_path, small_config(seed=1))
     first, second = (jax.tree.leaves(r.policy.layers) for r in (whole, other))
     assert all(np.any(a != b) for a, b in zip(first[::2], second[::2], strict=True))
 
 
-def test_what_does_not_fit_is_refused_with_what_differs(whole, tmp_path):
-    with pytest.raises(ConfigError, match=r"there is a run in .* already.*--resume.*--out"):
-        trained(whole.folder, settings())
-    with pytest.raises(ConfigError, match="made with seed = 0, and now it is 5"):
-        trained(whole.folder, settings(seed=5), resume=True)
-    with pytest.raises(ConfigError, match="made with config"):
-        trained(whole.folder, settings(iterations=9), resume=True)
-    with pytest.raises(ConfigError, match=r"no checkpoint.*crazysim train"):
-        trained(tmp_path / "nothing", settings(), resume=True)
-    with pytest.raises(UnknownNameError, match="algorithm 'sac' does not exist; there are ppo, apg"):
-        settings(algorithm="sac")
+def test_resuming_with_another_configuration_is_an_error(whole, tmp_path):
+    with pytest.raises(ConfigError, match=r"expected a folder without a run.*--resume.*--out"):
+        trained(whole.folder, small_config())
+    with pytest.raises(ConfigError, match=r"expected seed = 0 .*, got 5; resume"):
+        trained(whole.folder, small_config(seed=5), resume=True)
+    with pytest.raises(ConfigError, match=r"expected config = .*'iterations': 4.*, got .*'iterations': 9"):
+        trained(whole.folder, small_config(iterations=9), resume=True)
+    with pytest.raises(ConfigError, match=r"expected a checkpoint .*, got no file; .*crazysim train"):
+        trained(tmp_path / "nothing", small_config(), resume=True)
+    with pytest.raises(UnknownNameError, match="expected an algorithm of ppo, apg, got 'sac'"):
+        small_config(algorithm="sac")
     with pytest.raises(UnknownNameError, match="task 'juggle' does not exist; there are hover"):
-        settings(task="juggle")
-    with pytest.raises(ConfigError, match="ppo has no setting learning_speed; it has iterations"):
-        settings(config={"learning_speed": 1})
+        small_config(task="juggle")
+    with pytest.raises(ConfigError, match="expected hyperparameters of ppo, got learning_speed; use iterations"):
+        small_config(config={"learning_speed": 1})
 
 
-def test_a_checkpoint_of_another_version_or_of_rubbish_is_refused(whole, tmp_path):
+def test_a_checkpoint_of_another_version_or_a_corrupt_one_is_refused(whole, tmp_path):
     meta = checkpoint.read_meta(whole.folder / CHECKPOINT)
     learner = {"x": np.zeros(2, np.float32)}
     checkpoint.save(tmp_path / CHECKPOINT, learner, meta | {"crazysim": "0.0.1"})
-    with pytest.raises(ConfigError, match=r"of crazysim 0\.0\.1, and this is"):
-        trained(tmp_path, settings(), resume=True)
+    with pytest.raises(ConfigError, match=r"expected a checkpoint of crazysim .*, got .* of 0\.0\.1"):
+        trained(tmp_path, small_config(), resume=True)
     (tmp_path / POLICY).write_bytes(b"nothing")
-    with pytest.raises(ConfigError, match="is no checkpoint of crazysim"):
+    with pytest.raises(ConfigError, match=r"expected a checkpoint of crazysim .*, got an unreadable file"):
         load_policy(tmp_path)
-    with pytest.raises(ConfigError, match="holds other arrays"):
+    with pytest.raises(ConfigError, match="expected the arrays of this task and version"):
         checkpoint.load(tmp_path / CHECKPOINT, {"y": np.zeros(2, np.float32)})
-    with pytest.raises(ConfigError, match=r"holds \['x'\] as float32 \(2,\); needed is float32 \(3,\)"):
+    with pytest.raises(ConfigError, match=r"expected \['x'\] in .* as float32 \(3,\), got float32 \(2,\)"):
         checkpoint.load(tmp_path / CHECKPOINT, {"x": np.zeros(3, np.float32)})
 
 
 def test_a_policy_comes_back_as_it_was(whole):
-    policy, chosen, meta = load_policy(whole.folder)
-    assert chosen == settings()
+    policy, config, meta = load_policy(whole.folder)
+    assert config == small_config()
     assert sum(meta["observations"].values()) == policy.layers[0][0].shape[0]
     for a, b in zip(jax.tree.leaves(policy), jax.tree.leaves(whole.policy), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_evaluation_judges_by_metres_and_seconds():
-    """A policy of zeros hovers where it began, and so fails unless its goal is there."""
+def test_evaluation_uses_tolerance_and_hold_of_the_task():
+    """A policy of zeros hovers at its start, so it fails unless the goal is there."""
     env = make("hover", 16, seconds=2.0, reach=1.0)
     idle = lambda obs: jnp.zeros((16, 1, 4))  # noqa: E731
     found = evaluate(env, idle)
@@ -151,7 +152,7 @@ def test_evaluation_judges_by_metres_and_seconds():
 
 
 def test_ppo_finds_the_action_that_pays():
-    """Where half a unit of each action pays most, thirty rounds bring the policy there from zero."""
+    """With a reward that is largest at 0.5, thirty iterations move the action from 0 to 0.5."""
     base = make("hover", 128, freq=500, seconds=0.1)
     pays = dataclasses.replace(base.task, reward=lambda data, action, last: -jnp.sum((action - 0.5) ** 2, axis=-1))
     env = AutoReset(DroneEnv(base.sim, pays, freq=500))
@@ -166,19 +167,19 @@ def test_ppo_finds_the_action_that_pays():
 
 
 def test_analytic_gradients_follow_the_eight():
-    """Sixty gradients of 32 worlds more than halve the distance from the trajectory."""
+    """Sixty updates with 32 worlds more than halve the distance from the trajectory."""
     config = apg.Config(iterations=60)
     env = make("track", 32)
     learner = jax.jit(apg.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
     errors = []
     for _ in range(config.iterations):
-        learner, figures = apg.iterate(learner, env, config)
-        errors.append(float(figures["error"]))
-        assert np.isfinite(float(figures["gradient"]))
+        learner, metrics = apg.iterate(learner, env, config)
+        errors.append(float(metrics["error"]))
+        assert np.isfinite(float(metrics["gradient"]))
     assert np.mean(errors[-5:]) < 0.5 * np.mean(errors[:5])
 
 
-def test_the_command_line_trains_judges_and_exports(tmp_path, capsys):
+def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):
     folder = str(tmp_path / "hover")
     few = [f"{k}={json.dumps(v)}" for k, v in SMALL.items()]
     done = main(["train", "hover", "--worlds", "8", "--iterations", "2", "--set", "seconds=0.4", "--out", folder,
@@ -202,14 +203,36 @@ def test_the_command_line_trains_judges_and_exports(tmp_path, capsys):
 
 
 def test_a_film_shows_the_drone_and_its_goal(whole, tmp_path):
-    """The goal's green is in the picture, and drones move from the first frame to the last."""
+    """The green target is in the image, and the image changes from the first frame to the last."""
     from crazysim.train.show import TARGET_COLOR, film
 
-    env = settings().environment(2)
+    env = small_config().make_env(2)
     path = tmp_path / "film.gif"
     assert film(env, whole.policy, path, worlds=1) == 11
-    pictures = frames(path)
-    green = (pictures[0][..., 1] - pictures[0][..., 0] > 40) & (pictures[0][..., 1] - pictures[0][..., 2] > 20)
+    images = frames(path)
+    green = (images[0][..., 1] - images[0][..., 0] > 40) & (images[0][..., 1] - images[0][..., 2] > 20)
     assert TARGET_COLOR[1] > TARGET_COLOR[0]
     assert green.sum() > 20
-    assert np.abs(pictures[-1] - pictures[0]).max() > 60
+    assert np.abs(images[-1] - images[0]).max() > 60
+
+
+def test_hyperparameters_and_names_of_0_1_are_accepted_with_a_warning(whole, tmp_path):
+    with pytest.warns(DeprecationWarning, match="trace is deprecated.*use gae_lambda"):
+        config = small_config(config={"trace": 0.5})
+    assert config.config["gae_lambda"] == 0.5
+    assert "trace" not in config.config
+    for name in (CHECKPOINT, POLICY):  # a run that was stored under the old name
+        with np.load(whole.folder / name) as file:
+            arrays = dict(file)
+        meta = json.loads(str(arrays.pop(checkpoint.META)))
+        meta["settings"]["config"]["trace"] = meta["settings"]["config"].pop("gae_lambda")
+        np.savez(tmp_path / name, **{checkpoint.META: np.array(json.dumps(meta))}, **arrays)
+    with pytest.warns(DeprecationWarning, match="trace"):
+        _, loaded, _ = load_policy(tmp_path)
+    assert loaded == small_config()
+    (tmp_path / "curve.json").write_text((whole.folder / "curve.json").read_text())
+    with pytest.warns(DeprecationWarning, match="trace"):
+        resumed = trained(tmp_path, small_config(), resume=True)
+    assert resumed.metrics["round"] == 4
+    with pytest.warns(DeprecationWarning, match="Settings is deprecated.*TrainConfig"):
+        assert runs.Settings is TrainConfig

@@ -1,4 +1,4 @@
-"""Policies as ONNX and as C: the same actions as JAX gives, and in words what the numbers are."""
+"""Policies as ONNX and as C give the actions of JAX, and describe their inputs and outputs."""
 
 import ctypes
 import json
@@ -27,7 +27,7 @@ def meta():
 
 @pytest.fixture(scope="module")
 def policy(meta):
-    """Weights of a usual size, and inputs whose mean and variance differ by orders of magnitude."""
+    """Return a policy with weights of a typical size, and inputs of very different mean and variance."""
     rng, n = np.random.default_rng(0), sum(meta["observations"].values())
     layers = init_mlp(jax.random.key(0), (n, 64, 32, 4), 1.0)
     layers = [(w, jnp.asarray(rng.normal(size=b.shape), jnp.float32)) for w, b in layers]
@@ -38,7 +38,7 @@ def policy(meta):
 
 @pytest.fixture(scope="module")
 def flights(meta, policy):
-    """Observations, among them some far outside of what was seen, and the actions that JAX gives."""
+    """Return observations, some of them far outside of the statistics, and their actions in JAX."""
     rng = np.random.default_rng(1)
     n = sum(meta["observations"].values())
     x = rng.normal(size=(500, n)) * np.exp(rng.normal(scale=2.0, size=(500, 1)))
@@ -52,7 +52,7 @@ def flights(meta, policy):
 
 
 def compiled(path, folder, name="policy"):
-    """Return the function of a header, as a C compiler makes it."""
+    """Return the function of a header, compiled by the C compiler."""
     source, library = folder / "use.c", folder / "use.so"
     source.write_text(
         f'#include "{path}"\nvoid fly(int n, const float *obs, float *action);\n'
@@ -78,7 +78,7 @@ def test_c_gives_the_actions_of_jax(tmp_path, policy, meta, flights):
     np.testing.assert_allclose(compiled(path, tmp_path)(obs), actions, atol=5e-6)
 
 
-def test_the_header_may_have_another_name_and_serves_cpp(tmp_path, policy, meta, flights):
+def test_the_function_may_have_another_name_and_the_header_compiles_as_cpp(tmp_path, policy, meta, flights):
     obs, actions = flights
     path = to_c(policy, str(tmp_path / "hover.h"), meta, name="hover_v2")
     np.testing.assert_allclose(compiled(path, tmp_path, "hover_v2")(obs[:9]), actions[:9], atol=5e-6)
@@ -88,10 +88,10 @@ def test_the_header_may_have_another_name_and_serves_cpp(tmp_path, policy, meta,
     subprocess.run(["g++", "-std=c++11", *FLAGS, "-fsyntax-only", both], check=True)
 
 
-def test_the_header_says_what_its_numbers_are(tmp_path, policy, meta):
+def test_the_header_describes_inputs_and_outputs(tmp_path, policy, meta):
     text = to_c(policy, tmp_path / "policy.h", meta).read_text()
     assert "[0..2] ang_vel: angular velocity, body frame, rad/s" in text
-    assert "[3..5] difference_to_goal: goal less position, world frame, m" in text
+    assert "[3..5] difference_to_goal: goal minus position, world frame, m" in text
     assert "[9..17] rot" in text
     assert "[18..20] vel" in text
     assert "level attitude" in text
@@ -111,16 +111,16 @@ def test_onnx_gives_the_actions_of_jax(tmp_path, policy, meta, flights):
     assert (y.name, y.shape, y.type) == ("action", ["batch", 4], "tensor(float)")
     np.testing.assert_allclose(session.run(None, {"observation": obs})[0], actions, atol=5e-6)
     np.testing.assert_allclose(session.run(None, {"observation": obs[:1]})[0], actions[:1], atol=5e-6)
-    told = session.get_modelmeta().custom_metadata_map
-    assert json.loads(told["observations"]) == meta["observations"]
-    assert list(json.loads(told["observations"])) == ["ang_vel", "difference_to_goal", "pos", "rot", "vel"]
-    assert told["level"] == "attitude"
-    assert json.loads(told["units"])[0] == "roll, rad"
-    np.testing.assert_allclose(json.loads(told["centre"]), [0, 0, 0, 0.42575404], rtol=1e-6)
-    assert len(json.loads(told["scale"])) == 4
+    properties = session.get_modelmeta().custom_metadata_map
+    assert json.loads(properties["observations"]) == meta["observations"]
+    assert list(json.loads(properties["observations"])) == ["ang_vel", "difference_to_goal", "pos", "rot", "vel"]
+    assert properties["level"] == "attitude"
+    assert json.loads(properties["units"])[0] == "roll, rad"
+    np.testing.assert_allclose(json.loads(properties["centre"]), [0, 0, 0, 0.42575404], rtol=1e-6)
+    assert len(json.loads(properties["scale"])) == 4
 
 
-def test_every_command_level_is_explained(tmp_path, policy, meta):
+def test_every_command_level_is_described(tmp_path, policy, meta):
     for level, unit in {"body_rate": "rate about x, rad/s", "rotor_vel": "speed of rotor 0, rpm",
                         "force_torque": "collective thrust, N"}.items():  # fmt: skip
         other = meta | {"actions": meta["actions"] | {"level": level}}
@@ -128,24 +128,24 @@ def test_every_command_level_is_explained(tmp_path, policy, meta):
 
 
 @pytest.mark.parametrize("write", [to_c, to_onnx])
-def test_a_policy_of_another_meaning_or_of_none_is_refused(tmp_path, policy, meta, write):
+def test_a_policy_of_other_sizes_or_with_nan_is_refused(tmp_path, policy, meta, write):
     path = tmp_path / "policy"
     more = meta | {"observations": meta["observations"] | {"wind": 3}}
-    with pytest.raises(ConfigError, match=r"takes 21 numbers and gives 4; these observations are 24 .*wind 3"):
+    with pytest.raises(ConfigError, match=r"from 24 observations .*wind 3.* got one from 21 to 4"):
         write(policy, path, more)
     broken = [(w, b.at[0].set(jnp.nan)) for w, b in policy.layers]
-    with pytest.raises(ConfigError, match="NaN or infinite; its training has diverged"):
+    with pytest.raises(ConfigError, match="expected finite weights, got NaN or infinity"):
         write(policy.replace(layers=broken), path, meta)
     assert not path.exists()
 
 
 @pytest.mark.parametrize("name", ["", "2fast", "fly away", "a-b", "é"])
-def test_a_name_that_is_none_in_c_is_refused(tmp_path, policy, meta, name):
-    with pytest.raises(ConfigError, match="no name of a function in C"):
+def test_an_invalid_c_name_is_refused(tmp_path, policy, meta, name):
+    with pytest.raises(ConfigError, match="expected the name of a C function"):
         to_c(policy, tmp_path / "policy.h", meta, name)
 
 
-def test_without_onnx_the_way_to_it_is_told(tmp_path, policy, meta, monkeypatch):
+def test_without_onnx_the_error_names_the_extra(tmp_path, policy, meta, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ImportError, match=r"pip install 'crazysim\[onnx\]'"):
         to_onnx(policy, tmp_path / "policy.onnx", meta)

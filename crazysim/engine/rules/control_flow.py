@@ -56,7 +56,7 @@ def _with_derivative(ctx: Lowering, eqn: Any, args: list[Elements], called: core
         single = _as_function(eqn)
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
         traced = jax.make_jaxpr(lambda x, dx: jax.jvp(single, x, dx)[1])(avals, avals)
-        fresh = Lowering(Block())
+        fresh = Lowering()
         inputs = [_inputs(fresh, x) for x in (*args, *args)]
         return fresh.finish(fresh.lower(traced, inputs))
 

@@ -1,34 +1,35 @@
-"""Rules for what is done to every element alike."""
+"""Rules for primitives that do the same to every element."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import jax
 import numpy as np
+from jax.lax import RoundingMethod
 
+from crazysim.engine import ops
 from crazysim.engine.lower import Elements, Lowering, UnsupportedError, constants, rule
 
-ELEMENTWISE: dict[str, tuple[str, ...]] = dict.fromkeys(
-    "add sub mul div rem neg sign abs floor ceil is_finite exp exp2 log log1p expm1 tanh sin cos tan asin acos atan "
-    "sinh cosh asinh acosh atanh atan2 logistic sqrt rsqrt cbrt square pow max min and or xor not eq ne lt le gt ge "
-    "nextafter select_n clamp shift_left shift_right_logical shift_right_arithmetic erf erf_inv erfc lgamma digamma "
-    "population_count clz".split(),
-    (),
-) | {"integer_pow": ("y",), "round": ("rounding_method",), "reduce_precision": ("exponent_bits", "mantissa_bits")}
-"""Primitives, and the settings that matter to the result."""
+OWN_RULE = frozenset("convert_element_type bitcast_convert_type select_n integer_pow pow round_even round_away".split())
+"""Operations that no primitive maps to one to one."""
 
 
-@rule(*ELEMENTWISE)
+@rule(*(name for name, row in ops.TABLE.items() if not row.structured and name not in OWN_RULE))
 def _each(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    name = eqn.primitive.name
-    params = tuple(sorted((k, eqn.params[k]) for k in ELEMENTWISE[name]))
-    return [ctx.elementwise(name, args, eqn.outvars[0].aval.dtype, params)]
+    return [ctx.elementwise(eqn.primitive.name, args, eqn.outvars[0].aval.dtype)]
 
 
-def is_floating(dtype: Any) -> bool:
-    """Return whether numbers are of floating point, bfloat16 included, which NumPy does not count among them."""
-    return jax.dtypes.issubdtype(dtype, np.floating)
+@rule("pow")
+def _pow(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Raise to a power; JAX converts one that is an integer."""
+    dtype = eqn.outvars[0].aval.dtype
+    return [ctx.elementwise("pow", [args[0], ctx.elementwise("convert_element_type", [args[1]], dtype)], dtype)]
+
+
+@rule("round")
+def _round(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    even = RoundingMethod(eqn.params["rounding_method"]) == RoundingMethod.TO_NEAREST_EVEN
+    return [ctx.elementwise("round_even" if even else "round_away", args, eqn.outvars[0].aval.dtype)]
 
 
 @rule("convert_element_type")
@@ -60,13 +61,6 @@ def _bitcast(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     return [ctx.elementwise("bitcast_convert_type", args, after)]
 
 
-@rule("pow")
-def _pow(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """A power, with an integer exponent converted to the type of the base."""
-    dtype = eqn.outvars[0].aval.dtype
-    return [ctx.elementwise("pow", [ctx.elementwise("convert_element_type", [x], dtype) for x in args], dtype)]
-
-
 @rule("square")
 def _square(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     return [ctx.elementwise("mul", [args[0], args[0]], eqn.outvars[0].aval.dtype)]
@@ -96,7 +90,7 @@ def _add_any(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 def _total_order(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Comparisons in which NaN is the largest number, and equal to itself."""
     name = eqn.primitive.name.removesuffix("_to")
-    if not is_floating(eqn.invars[0].aval.dtype):
+    if eqn.invars[0].aval.dtype.kind != "f":
         return [ctx.elementwise(name, args, bool)]
     a_nan, b_nan = (ctx.elementwise("ne", [x, x], bool) for x in args)
     of_nan = {
@@ -123,3 +117,76 @@ def _device_put(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]
 @rule("copy", "copy_p", "stop_gradient", "pvary", "random_clone", "name")
 def _identity(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     return args
+
+
+class _Bits:
+    """Arithmetic on the bits of numbers, as unsigned integers of their size."""
+
+    def __init__(self, ctx: Lowering, dtype: Any):
+        self.ctx, self.dtype = ctx, np.dtype(f"u{np.dtype(dtype).itemsize}")
+        self.n_bits = 8 * self.dtype.itemsize
+
+    def of(self, x: Elements) -> Elements:
+        return self.ctx.elementwise("bitcast_convert_type", [x], self.dtype)
+
+    def do(self, op: str, a: Elements, b: Elements | int) -> Elements:
+        b = constants(b, self.dtype) if isinstance(b, int) else b
+        return self.ctx.elementwise(op, [a, b], self.dtype)
+
+    def count(self, x: Elements) -> Elements:
+        """Return how many bits are set: sums of pairs, of fours, and of eights, which a product adds up."""
+        pairs, fours, eights, ones = (self.mask(byte) for byte in (0x55, 0x33, 0x0F, 0x01))
+        x = self.do("sub", x, self.do("and", self.do("shift_right_logical", x, 1), pairs))
+        x = self.do("add", self.do("and", x, fours), self.do("and", self.do("shift_right_logical", x, 2), fours))
+        x = self.do("and", self.do("add", x, self.do("shift_right_logical", x, 4)), eights)
+        return self.do("shift_right_logical", self.do("mul", x, ones), self.n_bits - 8)
+
+    def mask(self, byte: int) -> int:
+        return int.from_bytes(bytes([byte] * self.dtype.itemsize), "little")
+
+
+@rule("population_count")
+def _population_count(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    dtype = eqn.outvars[0].aval.dtype
+    bits = _Bits(ctx, dtype)
+    return [ctx.elementwise("bitcast_convert_type", [bits.count(bits.of(args[0]))], dtype)]
+
+
+@rule("clz")
+def _leading_zeros(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Set all bits behind the first one, and count those that are left."""
+    dtype = eqn.outvars[0].aval.dtype
+    bits = _Bits(ctx, dtype)
+    x, shift = bits.of(args[0]), 1
+    while shift < bits.n_bits:
+        x = bits.do("or", x, bits.do("shift_right_logical", x, shift))
+        shift *= 2
+    left = bits.do("sub", constants(bits.n_bits, bits.dtype), bits.count(x))
+    return [ctx.elementwise("bitcast_convert_type", [left], dtype)]
+
+
+@rule("reduce_precision")
+def _reduce_precision(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Round the mantissa to nearest even; what the exponent cannot hold becomes infinite, or a zero with its sign."""
+    dtype, exponent, mantissa = eqn.outvars[0].aval.dtype, eqn.params["exponent_bits"], eqn.params["mantissa_bits"]
+    if dtype.name not in ops.DTYPES:
+        raise UnsupportedError(f"numbers of type {dtype.name}")
+    info, bits = np.finfo(dtype), _Bits(ctx, dtype)
+    x = bits.of(args[0])
+    dropped = info.nmant - mantissa
+    if dropped > 0:
+        odd = bits.do("and", bits.do("shift_right_logical", x, dropped), 1)
+        x = bits.do("add", x, bits.do("add", odd, (1 << (dropped - 1)) - 1))
+        x = bits.do("and", x, (1 << bits.n_bits) - (1 << dropped))
+    if exponent < info.nexp:
+        bias, largest = (1 << (info.nexp - 1)) - 1, (1 << (exponent - 1)) - 1
+        infinite = ((1 << info.nexp) - 1) << info.nmant
+        sign = bits.do("and", x, 1 << (bits.n_bits - 1))
+        size = bits.do("and", x, infinite)
+        over = ctx.elementwise("gt", [size, constants((bias + largest) << info.nmant, bits.dtype)], bool)
+        under = ctx.elementwise("le", [size, constants((bias - largest) << info.nmant, bits.dtype)], bool)
+        x = ctx.elementwise("select_n", [over, x, bits.do("or", sign, infinite)], bits.dtype)
+        x = ctx.elementwise("select_n", [under, x, sign], bits.dtype)
+    rounded = ctx.elementwise("bitcast_convert_type", [x], dtype)
+    is_nan = ctx.elementwise("ne", [args[0], args[0]], bool)
+    return [ctx.elementwise("select_n", [is_nan, rounded, args[0]], dtype)]

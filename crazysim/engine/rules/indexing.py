@@ -12,7 +12,6 @@ from jax.lax import GatherScatterMode
 
 from crazysim.engine.ir import Element, constant, is_constant
 from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
-from crazysim.engine.rules.elementwise import is_floating
 from crazysim.engine.rules.movement import move_many, run_now
 
 
@@ -139,9 +138,9 @@ def _gather_filled(eqn: Any, x: Elements, indices: np.ndarray) -> Elements:
 
 def _fill_value(dtype: Any) -> Any:
     """What JAX fills with: NaN, the least signed or the largest unsigned integer, True."""
-    if is_floating(dtype):
-        return np.nan
     kind = np.dtype(dtype).kind
+    if kind == "f":
+        return np.nan
     return np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max if kind == "u" else True
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from crazysim.engine.ir import Element, constant
 from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
-from crazysim.engine.rules.elementwise import is_floating
 from crazysim.engine.rules.movement import run_now
 
 COMBINE = {
@@ -122,7 +121,7 @@ def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Element
     before, tied = constants(False, bool), constants(True, bool)
     for a, b in zip(first, second, strict=True):
         less, equal = ctx.elementwise("lt", [a, b], bool), ctx.elementwise("eq", [a, b], bool)
-        if is_floating(a.reshape(-1)[0].dtype):
+        if a.reshape(-1)[0].dtype.kind == "f":
             a_nan, b_nan = ctx.elementwise("ne", [a, a], bool), ctx.elementwise("ne", [b, b], bool)
             only_b = ctx.elementwise("and", [b_nan, ctx.elementwise("not", [a_nan], bool)], bool)
             less = ctx.elementwise("or", [less, only_b], bool)
@@ -136,7 +135,7 @@ def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Element
 def _dot(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     (lhs_axes, rhs_axes), (lhs_batch, rhs_batch) = eqn.params["dimension_numbers"]
     dtype, (a, b) = eqn.outvars[0].aval.dtype, args
-    if any(is_floating(v.aval.dtype) for v in eqn.invars) and not is_floating(dtype):
+    if any(v.aval.dtype.kind == "f" for v in eqn.invars) and dtype.kind != "f":
         raise UnsupportedError(f"primitive 'dot_general' of floating-point numbers with a result of type {dtype}")
 
     def arranged(x: Elements, batch: Sequence[int], summed: Sequence[int]) -> tuple[Elements, tuple[int, ...]]:

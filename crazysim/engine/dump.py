@@ -1,0 +1,38 @@
+"""Text written for people who look into the engine: ``CRAZYSIM_DUMP=folder``."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+from pathlib import Path
+
+VARIABLE = "CRAZYSIM_DUMP"
+"""Environment variable that names the folder; nothing is written where it is not set."""
+
+_numbers = itertools.count()
+
+
+def enabled() -> bool:
+    """Return True where a folder is set, so that text worth time to make is made."""
+    return bool(os.environ.get(VARIABLE))
+
+
+def write(name: str, text: str) -> Path | None:
+    """Write a text into the folder, under a name with a number in front: in order of time.
+
+    Args:
+        name: What it is, such as ``"attitude_controller.jaxpr"``; other characters than letters and digits become
+            underscores.
+        text: The text.
+
+    Returns:
+        The file, or None if no folder is set.
+    """
+    if not enabled():
+        return None
+    folder = Path(os.environ[VARIABLE])
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"{os.getpid()}-{next(_numbers):03d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}"
+    file.write_text(text)
+    return file

@@ -1,0 +1,121 @@
+"""An interpreter: programs in NumPy, one operation after the other, with nothing compiled.
+
+It is the meaning of the table of operations (``ops``), and slow. Passes, rules and other engines are tested against it,
+and ``Sim(engine="interpret")`` steps with it.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from crazysim.engine import lanes, ops
+from crazysim.engine.ir import Block, Element, Operation, Value
+from crazysim.engine.program import Program
+
+Env = dict[Value, np.ndarray]
+"""Arrays by the values that they are."""
+
+Observer = Callable[[Operation, Sequence[np.ndarray]], None]
+"""Gets every operation with its results."""
+
+
+def run(
+    block: Block,
+    inputs: Sequence[Any],
+    shape: tuple[int, ...],
+    env: Env | None = None,
+    observe: Observer | None = None,
+) -> list[np.ndarray]:
+    """Return the outputs of a block.
+
+    Args:
+        block: The block.
+        inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share.
+        shape: Shape of the lanes.
+        env: Values of the blocks around it.
+        observe: Gets every operation with its results.
+
+    Returns:
+        Its outputs, of the lanes' shape.
+    """
+    env = dict(env or {})
+    given = [np.asarray(x, v.dtype) for x, v in zip(inputs, block.inputs, strict=True)]
+    env.update(zip(block.inputs, (np.broadcast_to(x, shape) for x in given), strict=True))
+    with np.errstate(all="ignore"):
+        for op in block.operations:
+            results = _apply(op, [_get(env, x, shape) for x in op.args], shape, env)
+            env.update(zip(op.results, results, strict=True))
+            if observe is not None:
+                observe(op, results)
+    return [_get(env, x, shape) for x in block.outputs]
+
+
+def _get(env: Env, x: Element, shape: tuple[int, ...]) -> np.ndarray:
+    return env[x] if isinstance(x, Value) else np.broadcast_to(np.asarray(x), shape)
+
+
+def _apply(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: Env) -> list[np.ndarray]:
+    match op.name:
+        case "barrier":
+            return []
+        case "when":
+            mask, *old = args
+            new = run(op.blocks[0], [], shape, env) if mask.any() else old
+            return [np.where(mask, x, y) for x, y in zip(new, old, strict=True)]
+        case "loop":
+            for _ in range(op.param("length")):
+                args = run(op.blocks[0], args, shape, env)
+            return args
+        case "while":
+            test, body = op.blocks
+            while (mask := run(test, args, shape, env)[0]).any():
+                args = [np.where(mask, x, y) for x, y in zip(run(body, args, shape, env), args, strict=True)]
+            return args
+        case "custom_jvp":
+            return run(op.blocks[0], args, shape, env)
+        case "threefry2x32":
+            return list(threefry2x32(*args))
+    numpy, params = ops.TABLE[op.name].numpy, dict(op.params)
+    if op.name in ("convert_element_type", "bitcast_convert_type"):
+        params["dtype"] = op.dtype
+    assert numpy is not None
+    return [np.asarray(numpy(*args, **params)).astype(op.dtype, copy=False)]
+
+
+ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+"""Bits that a round rotates by: J. K. Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC 2011, table 2."""
+
+
+def threefry2x32(k0: np.ndarray, k1: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the two integers of 32 bits that 20 rounds of Threefry make of two, under a key of two."""
+    keys = (k0, k1, k0 ^ k1 ^ np.uint32(0x1BD11BDA))
+    x0, x1 = x0 + keys[0], x1 + keys[1]
+    for n in range(5):
+        for r in ROTATIONS[n % 2]:
+            x0 = x0 + x1
+            x1 = (x1 << np.uint32(r)) | (x1 >> np.uint32(32 - r))
+            x1 = x1 ^ x0
+        x0, x1 = x0 + keys[(n + 1) % 3], x1 + keys[(n + 2) % 3] + np.uint32(n + 1)
+    return x0, x1
+
+
+def call(block: Block, inputs: Sequence[Any], shape: tuple[int, ...]) -> list[Array]:
+    """Return what ``run`` does, inside a function that JAX traces or compiles; it has no derivative."""
+    results = [jax.ShapeDtypeStruct(shape, x.dtype) for x in block.outputs]
+    fn = functools.partial(_of_arrays, block, shape)
+    return list(jax.pure_callback(fn, results, *inputs, vmap_method="sequential"))
+
+
+def _of_arrays(block: Block, shape: tuple[int, ...], *inputs: Any) -> list[np.ndarray]:
+    return [np.array(x) for x in run(block, [np.asarray(x) for x in inputs], shape)]
+
+
+def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+    """Return what ``lanes.steps`` does, every block interpreted; stages that are not fused run in XLA."""
+    return lanes.steps(program, leaves, n_steps, call)

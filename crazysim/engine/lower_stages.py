@@ -1,0 +1,139 @@
+"""From the stages of a pipeline to a program: a segment for each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, Literal
+
+import jax
+
+import crazysim.engine.rules  # noqa: F401  (fills the table of rules)
+from crazysim.core.stage import Axes, Stage
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import Builder, Element, constant, prune
+from crazysim.engine.lower import Elements, Lowering, as_elements, inputs, scalars
+from crazysim.engine.program import Leaf, Phase, Program, Segment, Slot, UnfusedStage
+from crazysim.engine.tracing import TracedStage
+
+MAX_UNROLLED_DRONES = 8
+"""Most drones of a world for which a stage of one world is lowered; its block grows with their square."""
+
+Zeros = Mapping[int, frozenset[int]]
+"""Elements of shared leaves that are known to be zero, by leaf."""
+
+
+def lower_stages(
+    stages: Sequence[Stage],
+    data: Any,
+    zeros: Zeros | None = None,
+    watched: Callable[[Any], list[Any]] | None = None,
+    first: Sequence[Stage] = (),
+    last: Sequence[Stage] = (),
+    scratch: Collection[int] = (),
+) -> Program:
+    """Return the program of a step, each stage a segment of its own.
+
+    A stage that cannot be lowered becomes an ``UnfusedStage``, which says why.
+
+    Args:
+        stages: Stages of a step, in order.
+        data: Data of the simulation, or its shapes and types.
+        zeros: Elements that are known to be zero: their terms are left out.
+        watched: Picks the leaves that are checked for NaN and infinity after the last step.
+        first: Stages that run once, before the first step.
+        last: Stages that run once, after the last step.
+        scratch: Leaves that only carry numbers from one stage to another; what is written there is not kept.
+    """
+    axes, leaves = Axes(data), jax.tree.leaves(data)
+    zeros, n_drones = zeros or {}, data.core.n_drones
+    segments = []
+    phases: dict[Phase, Sequence[Stage]] = {"first": first, "each": stages, "last": last}
+    for phase, some in phases.items():
+        segments += [_lower_stage(stage, phase, axes, leaves, zeros, n_drones) for stage in some]
+    described = tuple([
+        Leaf(name, scope, tuple(x.shape), x.dtype)
+        for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
+    ])  # fmt: skip
+    check = None if watched is None else _finite_check(axes, leaves, data.core.nonfinite, watched(data))
+    return Program(described, n_drones, tuple(segments), check, frozenset(scratch))
+
+
+def _lower_stage(
+    stage: Stage, phase: Phase, axes: Axes, leaves: Sequence[Any], zeros: Zeros, n_drones: int
+) -> Segment | UnfusedStage:
+    try:
+        if stage.scope == "batch":
+            raise UnsupportedError("it is not declared for one drone or one world")
+        traced = TracedStage(stage, axes, leaves)
+        # Where no leaf of a drone takes part, every drone can do it for its world.
+        of_drones = any(axes.scopes[i] == "drone" for i in (*traced.used, *traced.written))
+        scope: Literal["drone", "world"] = "world" if stage.scope == "world" and of_drones else "drone"
+        if scope == "world" and n_drones > MAX_UNROLLED_DRONES:
+            raise UnsupportedError(f"a stage of one world is unrolled for at most {MAX_UNROLLED_DRONES} drones")
+        return _segment(stage, scope, phase, traced, zeros)
+    except UnsupportedError as error:
+        traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)
+        why = error.located(stage=stage.__name__)
+        return UnfusedStage(stage.__name__, phase, traced.fn, tuple(traced.used), tuple(traced.written), why)
+
+
+def _segment(
+    stage: Stage, scope: Literal["drone", "world"], phase: Phase, traced: TracedStage, zeros: Zeros
+) -> Segment:
+    lowering = Lowering(Builder(stage=stage.__name__))
+    before = {i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.used}
+    args = [before[i] for i in traced.used]
+    if traced.when is None:
+        after = lowering.lower(traced.fn, args)
+    else:
+        mask = lowering.lower(traced.when, args)[0][()]
+        for i in traced.written:
+            if i not in before:
+                before[i] = inputs(lowering.builder, traced.avals[i])
+        after = _guarded(lowering, mask, traced, args, [before[i] for i in traced.written])
+    writes: dict[Slot, Element] = {}
+    for i, new in zip(traced.written, after, strict=True):
+        old = scalars(before[i]) if i in before else [None] * len(scalars(new))
+        writes.update({(i, k): b for k, (a, b) in enumerate(zip(old, scalars(new), strict=True)) if a is not b})
+    slots = {x: (i, k) for i, elements in before.items() for k, x in enumerate(scalars(elements))}
+    block = prune(lowering.builder.finish(tuple(writes.values())), keep_inputs=False)
+    return Segment(scope, (stage.__name__,), phase, block, tuple([slots[x] for x in block.inputs]), tuple(writes))
+
+
+def _guarded(
+    lowering: Lowering, mask: Element, traced: TracedStage, args: list[Elements], old: list[Elements]
+) -> list[Elements]:
+    """Return what the written leaves become of a stage that acts where a mask is true."""
+    inner = lowering.inner()
+    new = inner.lower(traced.fn, args)
+    pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(scalars(x), scalars(y), strict=True)]
+    changed = [(a, b) for a, b in pairs if a is not b]
+    block = inner.builder.finish([b for _, b in changed])
+    before = [a for a, _ in changed]
+    results = iter(lowering.builder.add_many("when", (mask, *before), [a.dtype for a in before], (), (block,)))
+    flat = iter([a if a is b else next(results) for a, b in pairs])
+    return [_with_scalars(x, [next(flat) for _ in scalars(x)]) for x in old]
+
+
+def _with_scalars(like: Elements, items: Sequence[Element]) -> Elements:
+    """Return elements of the same shape; of a key, two integers."""
+    row = iter(items)
+    pairs = [(next(row), next(row)) if isinstance(x, tuple) else next(row) for x in like.reshape(-1)]
+    return as_elements(pairs, like.shape)
+
+
+def _finite_check(axes: Axes, leaves: Sequence[Any], flag: Any, watched: Sequence[Any]) -> Segment:
+    """Return a segment that flags a drone: its world was flagged, or a watched number is not finite."""
+    ids = {id(x) for x in watched}
+    builder = Builder(stage="finite_check")
+    reads: list[Slot] = []
+    finite: Element = constant(True, bool)
+    avals = axes.of_one(list(leaves), "drone")
+    for i, x in enumerate(leaves):
+        if id(x) in ids and axes.scopes[i] == "drone" and avals[i].dtype.kind == "f":
+            for k, item in enumerate(scalars(inputs(builder, avals[i]))):
+                reads.append((i, k))
+                finite = builder.add("and", (finite, builder.add("is_finite", (item,), bool)), bool)
+    reads.append((next(i for i, x in enumerate(leaves) if x is flag), 0))
+    flagged = builder.add("or", (builder.input(bool), builder.add("not", (finite,), bool)), bool)
+    return Segment("drone", ("finite_check",), "last", builder.finish([flagged]), tuple(reads), ())

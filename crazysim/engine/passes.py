@@ -1,0 +1,143 @@
+"""Passes: functions from a program to one that does the same in less time."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+from collections.abc import Callable, Iterable
+
+from crazysim.engine import dump, ops
+from crazysim.engine.ir import (
+    Block,
+    Builder,
+    Element,
+    Operation,
+    Value,
+    constant,
+    inline,
+    is_constant,
+    prune,
+    substitute,
+)
+from crazysim.engine.program import Program, Segment, Slot, UnfusedStage
+from crazysim.engine.verify import verify
+
+Pass = Callable[[Program], Program]
+
+VERIFY = "CRAZYSIM_VERIFY"
+"""Environment variable that, set to 1, has every program verified after every pass."""
+
+
+def apply(program: Program, passes: Iterable[Pass]) -> Program:
+    """Return a program after some passes, each of which is verified and written down if that is asked for."""
+    _inspect(program, "lowered")
+    for one in passes:
+        program = one(program)
+        _inspect(program, getattr(one, "__name__", "pass"))
+    return program
+
+
+def _inspect(program: Program, name: str) -> None:
+    if os.environ.get(VERIFY) == "1":
+        verify(program)
+    if dump.enabled():
+        dump.write(f"program.{name}", str(program))
+
+
+def fuse(program: Program) -> Program:
+    """Join neighbouring segments that run at the same time on the same numbers.
+
+    What one stage writes and the next reads is a value then, and what both compute is computed once.
+    """
+    segments: list[Segment | UnfusedStage] = []
+    kinds = itertools.groupby(program.segments, lambda s: (s.scope, s.phase) if isinstance(s, Segment) else id(s))
+    for _, some in kinds:
+        run = list(some)
+        segments += [_joined(run)] if isinstance(run[0], Segment) else run
+    return dataclasses.replace(program, segments=tuple(segments))
+
+
+def _joined(segments: list[Segment]) -> Segment:
+    builder = Builder()
+    before: dict[Slot, Value] = {}
+    now: dict[Slot, Element] = {}
+    for segment in segments:
+        (builder.stage,) = segment.stages
+        values: dict[Value, Element] = {}
+        for x, slot in zip(segment.block.inputs, segment.reads, strict=True):
+            if slot not in now:
+                now[slot] = before[slot] = builder.input(x.dtype)
+            values[x] = now[slot]
+        now.update(zip(segment.writes, inline(builder, segment.block, values), strict=True))
+        builder.barrier()
+    writes = {slot: x for slot, x in now.items() if x is not before.get(slot)}
+    slots = {x: slot for slot, x in before.items()}
+    block = prune(builder.finish(tuple(writes.values())), keep_inputs=False)
+    stages = tuple([name for segment in segments for name in segment.stages])
+    reads = tuple([slots[x] for x in block.inputs])
+    return Segment(segments[0].scope, stages, segments[0].phase, block, reads, tuple(writes))
+
+
+def hoist(program: Program) -> Program:
+    """Move what no step changes, and is expensive, out of the loop over steps.
+
+    A division by such a number becomes a product with its inverse, which is one rounding less exact.
+    """
+    changing = program.changing()
+    return dataclasses.replace(
+        program,
+        segments=tuple([
+            _hoisted(s, changing) if isinstance(s, Segment) and (s.scope, s.phase) == ("drone", "each") else s
+            for s in program.segments
+        ]),
+    )  # fmt: skip
+
+
+def _hoisted(segment: Segment, changing: set[Slot]) -> Segment:
+    block, slots = segment.block, dict(zip(segment.block.inputs, segment.reads, strict=True))
+    fixed = {x for x, slot in slots.items() if slot not in changing}
+    worth: set[Value] = set()
+    operations: list[Operation] = []
+    for op in _with_inverses(block, fixed):
+        operations.append(op)
+        if op.results and not op.blocks and all([is_constant(x) or x in fixed for x in op.args]):
+            fixed.update(op.results)
+            if ops.TABLE[op.name].cost >= ops.EXPENSIVE or not worth.isdisjoint(op.args):
+                worth.update(op.results)
+    rest = Block(block.inputs, tuple([op for op in operations if worth.isdisjoint(op.results)]), block.outputs)
+    used = rest.uses()
+    moved = [x for op in operations for x in op.results if x in worth and x in used]
+    if not moved:
+        return segment
+    # What is cheap stays in both blocks: it depends on nothing that has moved.
+    kept = [op for op in operations if op.results and fixed.issuperset(op.results)]
+    once = prune(Block(block.inputs, tuple(kept), tuple(moved)), keep_inputs=False)
+    further = {x: Value(x.dtype) for x in moved}
+    rest = prune(substitute(rest, further), keep_inputs=False)
+    return dataclasses.replace(
+        segment,
+        block=dataclasses.replace(rest, inputs=(*rest.inputs, *further.values())),
+        reads=tuple([slots[x] for x in rest.inputs]),
+        hoisted=once,
+        hoisted_reads=tuple([slots[x] for x in once.inputs]),
+    )
+
+
+def _with_inverses(block: Block, fixed: set[Value]) -> Iterable[Operation]:
+    """Yield the operations of a block, divisions by fixed numbers as products. ``fixed`` grows as they are taken."""
+    inverses: dict[Element, Element] = {}
+    for op in block.operations:
+        if op.name != "div" or op.dtype.kind != "f":
+            yield op
+            continue
+        a, b = op.args
+        if (not is_constant(b) and b not in fixed) or is_constant(a) or a in fixed:
+            yield op
+            continue
+        if b not in inverses:
+            one = constant(1, op.dtype)
+            inverses[b] = one / b if is_constant(b) else Value(op.dtype)
+            if not is_constant(b):
+                yield Operation("div", (one, b), (inverses[b],), stage=op.stage)
+        yield Operation("mul", (a, inverses[b]), op.results, stage=op.stage)

@@ -1,0 +1,66 @@
+"""Stages as jaxprs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+from jax.extend import core
+
+from crazysim.core.stage import Axes, Stage
+from crazysim.engine import dump
+
+
+class TracedStage:
+    """A stage as jaxprs on flat lists of leaves: its function, and its condition if it has one."""
+
+    def __init__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]):
+        """Trace a stage for the one drone, the one world or the batch that it is declared for.
+
+        Args:
+            stage: The stage.
+            axes: Batch axes of the leaves.
+            leaves: Leaves of all worlds, or their shapes and types.
+        """
+        self.avals = axes.of_one(list(leaves), stage.scope)
+        """Shapes and types of all leaves, as the stage receives them."""
+        self.written: list[int] = []
+        """Leaves that it writes: the outputs of ``fn``."""
+        has_mask = False
+
+        def apply(values: list[Any]) -> list[Any]:
+            after = stage.fn(axes.treedef.unflatten(values))
+            self.written = axes.written(values, after, stage)
+            new = jax.tree.leaves(after)
+            return [new[i] for i in self.written]
+
+        def condition(values: list[Any]) -> Any:
+            nonlocal has_mask
+            mask = stage.when(axes.treedef.unflatten(values)) if stage.when is not None else None
+            has_mask = mask is not None
+            return mask if has_mask else 0
+
+        fn, when = jax.make_jaxpr(apply)(self.avals), jax.make_jaxpr(condition)(self.avals)
+        used = _used(fn) | (_used(when) if has_mask else set())
+        self.used = sorted(used)
+        """Leaves that it reads: the inputs of ``fn`` and ``when``."""
+        self.fn = _with_inputs(fn, self.used)
+        self.when = _with_inputs(when, self.used) if has_mask else None
+        if dump.enabled():
+            dump.write(f"{stage.__name__}.jaxpr", f"{self.fn}\n" + (f"\nwhen\n{self.when}\n" if has_mask else ""))
+
+
+def _used(jaxpr: core.ClosedJaxpr) -> set[int]:
+    inner = jaxpr.jaxpr
+    used = {v for eqn in inner.eqns for v in eqn.invars if not isinstance(v, core.Literal)}
+    used |= {v for v in inner.outvars if not isinstance(v, core.Literal)}
+    return {i for i, v in enumerate(inner.invars) if v in used}
+
+
+def _with_inputs(jaxpr: core.ClosedJaxpr, inputs: Sequence[int]) -> core.ClosedJaxpr:
+    inner = jaxpr.jaxpr
+    invars = [inner.invars[i] for i in inputs]
+    return core.ClosedJaxpr(
+        core.Jaxpr(inner.constvars, invars, inner.outvars, inner.eqns, inner.effects, inner.debug_info), jaxpr.consts
+    )

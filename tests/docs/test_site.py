@@ -1,0 +1,56 @@
+"""The site's navigation holds every page, and links lead to files and headings that exist."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *(ROOT / "docs").rglob("*.md")]
+GENERATED = {"index.md": "README.md", "contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
+"""Pages of the site that come from outside docs/, by their place on the site."""
+LINK = re.compile(r"\]\((?!https?://)([^)#\s]*)(?:#([^)\s]+))?\)")
+FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
+
+
+def prose(page):
+    return FENCE.sub("", page.read_text())
+
+
+def nav():
+    """Return the pages of the navigation in order, without generated ones."""
+    text = (ROOT / "mkdocs.yml").read_text()
+    section = re.search(r"^nav:\n((?: .*\n)+)", text, re.MULTILINE)[1]
+    return [page for page in re.findall(r"(\S+\.md)$", section, re.MULTILINE) if page != "contents.md"]
+
+
+def anchors(page):
+    """Return the anchors of a page's headings as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+def test_every_page_is_in_the_navigation():
+    examples = {f"examples/{path.stem}.md" for path in (ROOT / "docs/examples").glob("*.py")}
+    written = {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")} - {"README.md"}
+    assert sorted(nav()) == sorted(written | examples | set(GENERATED))
+
+
+def test_the_list_of_pages_follows_the_navigation():
+    listed = [target for target, _ in LINK.findall((ROOT / "docs/README.md").read_text())]
+    pages = [page for page in nav() if not page.startswith("examples/") or page == "examples/README.md"]
+    assert listed == [f"../{GENERATED[page]}" if page in GENERATED else page for page in pages]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_to_files_and_headings(page):
+    for target, anchor in LINK.findall(prose(page)):
+        file = page.parent / target if target else page
+        assert file.exists(), target
+        assert not anchor or anchor in anchors(file), f"{target}#{anchor}"
+
+
+def test_there_are_links_and_anchors_to_check():
+    links = [link for page in PAGES for link in LINK.findall(prose(page))]
+    assert len(links) > 50
+    assert sum(bool(anchor) for _, anchor in links) > 5
