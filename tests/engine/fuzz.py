@@ -223,43 +223,53 @@ class Fuzzer:
     def check(self, cases: Sequence[Case]) -> Iterator[Find]:
         """Run programs on all engines, and yield what is wrong."""
         self.counts["programs"] += len(cases)
+        yield from self._check(list(cases))
+
+    def _check(self, cases: list[Case]) -> Iterator[Find]:
+        if not cases:
+            return
+        data, stages = self._step_of(cases)
+        steps = {"lanes": Step(stages, "lanes")}
         try:
-            refused = self._refused(cases)
+            program = steps["lanes"].plan(data).program
         except Exception as error:
             if len(cases) == 1:
-                self.counts["programs not planned"] += 1
                 yield Find(cases[0], "planning", f"{type(error).__name__}: {error}")
             else:
-                self.counts["programs"] -= len(cases)
-                yield from self.check(cases[: len(cases) // 2])
-                yield from self.check(cases[len(cases) // 2 :])
+                yield from self._check(cases[: len(cases) // 2])
+                yield from self._check(cases[len(cases) // 2 :])
             return
-        lowered = [case for k, case in enumerate(cases) if not refused[k]]
-        for why in filter(None, refused):
-            self.refused[why] += 1
-        self.counts["refused"] += len(cases) - len(lowered)
-        no_source = [] if self._has_source(lowered) else [case for case in lowered if not self._has_source([case])]
+        refused = {unfused.name: unfused.error.reason for unfused in program.unfused_stages}
+        if refused:
+            self.counts["refused"] += len(refused)
+            self.refused.update(refused.values())
+            yield from self._check([case for k, case in enumerate(cases) if f"p{k}" not in refused])
+            return
+        no_source = []
+        if "fused" in COMPARED:
+            steps["fused"] = Step(stages, "fused")
+            no_source = self._without_source(cases, steps["fused"], data)
+        if not no_source:
+            yield from self._compare(cases, COMPARED, steps)
+            return
         self.counts["without source"] += len(no_source)
-        yield from self._compare([case for case in lowered if case not in no_source], COMPARED)
+        yield from self._check([case for case in cases if case not in no_source])
         yield from self._compare(no_source, tuple(e for e in COMPARED if e != "fused"))
 
-    def _refused(self, cases: Sequence[Case]) -> list[str]:
-        """Return why programs are not lowered, or empty strings."""
-        data, stages = self._step_of(cases)
-        plan = Step(stages, "lanes").plan(data)
-        whys = {unfused.name: unfused.error.reason for unfused in plan.program.unfused_stages}
-        return [whys.get(f"p{k}", "") for k in range(len(cases))]
-
-    def _has_source(self, cases: Sequence[Case]) -> bool:
-        """Return whether a kernel of programs can be written."""
-        data, stages = self._step_of(cases)
+    def _without_source(self, cases: Sequence[Case], step: Step, data: Any) -> list[Case]:
+        """Return the programs that no kernel can be written of."""
         try:
-            Step(stages, "fused").plan(data)
+            step.plan(data)
+            return []
         except ConfigError as error:
             if len(cases) == 1:
                 self.refused[str(error).partition("(stage")[0]] += 1
-            return False
-        return True
+                return list(cases)
+        found = []
+        for case in cases:
+            data, stages = self._step_of([case])
+            found += self._without_source([case], Step(stages, "fused"), data)
+        return found
 
     def _step_of(self, cases: Sequence[Case]) -> tuple[Any, dict[str, Stage]]:
         stages = {f"p{k}": case.stage(f"p{k}") for k, case in enumerate(cases)} | {"turned": turned}
@@ -269,25 +279,25 @@ class Fuzzer:
         plugins = {"given": self.given, "results": Results(**slots)}
         return self.data.replace(plugins=plugins), stages
 
-    def run(self, cases: Sequence[Case], engine: str) -> list[list[np.ndarray]]:
+    def run(self, cases: Sequence[Case], engine: str, step: Step | None = None) -> list[list[np.ndarray]]:
         """Return the values of programs on an engine."""
         data, stages = self._step_of(cases)
         if engine == "interpret" and engine not in ENGINES:
             with mock.patch("crazysim.engine.step.lanes", interpret):
                 results = Step(stages, "lanes")(data).plugins["results"]
         else:
-            results = Step(stages, engine)(data).plugins["results"]
+            results = (step or Step(stages, engine))(data).plugins["results"]
         slots = {k: np.asarray(x) for k, x in {**results.drone, **results.world}.items()}
         return [case.unpacked(slots[f"p{k}f"], slots[f"p{k}o"]) for k, case in enumerate(cases)]
 
-    def _compare(self, cases: Sequence[Case], engines: Sequence[str]) -> Iterator[Find]:
-        if not cases:
-            return
+    def _compare(
+        self, cases: Sequence[Case], engines: Sequence[str], steps: dict[str, Step] | None = None
+    ) -> Iterator[Find]:
         found: dict[str, list[list[np.ndarray]]] = {}
         for engine in ("plain", *engines):
             try:
                 start = time.perf_counter()
-                found[engine] = self.run(cases, engine)
+                found[engine] = self.run(cases, engine, (steps or {}).get(engine))
                 self.counts[f"ms {engine}"] += int(1e3 * (time.perf_counter() - start))
             except Exception as error:
                 if len(cases) == 1 and engine == "plain":

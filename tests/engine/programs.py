@@ -225,12 +225,12 @@ def powers(d: Draw) -> str:
 @template("types", 5)
 def conversions(d: Draw) -> str:
     """Conversions between types, and of bits."""
-    kind = d.choice(["np.float32", "np.int32", "np.uint32", "bool"] * 2 + ["np.int8", "np.uint8", "np.int16",
+    kind = d.choice(["np.float32", "np.int32", "np.uint32", "bool"] * 12 + ["np.int8", "np.uint8", "np.int16",
                     "np.uint16", "np.float16", "jnp.bfloat16"])  # fmt: skip
     return d.choice([
         f"{d.value()}.astype({kind})", f"lax.convert_element_type({d.value()}, {kind})",
         f"lax.bitcast_convert_type({d.value('iuf')}, {d.choice(['np.float32', 'np.int32', 'np.uint32'])})",
-        f"{d.value()}.view({d.choice(['np.float32', 'np.int32', 'np.uint32', 'np.uint8'])})",
+        f"{d.value()}.view({d.choice(['np.float32', 'np.int32', 'np.uint32', 'np.float32'])})",
     ])  # fmt: skip
 
 
@@ -398,7 +398,7 @@ def gathers(d: Draw) -> str:
         f"{x}[{x} > 0]", f"jnp.choose({i} % 2, [{x}, {x} + 1], mode='wrap')", f"{x}[jnp.argmax({x})]",
         f"{x}[jnp.argsort({x})]", f"jnp.take_along_axis({x}, jnp.argmin({x}, {axis}, keepdims=True), {axis})",
         f"jax.vmap(lambda r, k: r[k], (0, None))({x}, {i})", f"jax.vmap(lambda r, k: r[k])({x}, {x}.astype(int))",
-        f"{x}.astype(jnp.int8)[{i}.astype(jnp.{d.choice(['int8', 'uint8'])})]", f"{x}[1:, {i}]",
+        f"{x}[1:, {i}]",
         f"jax.vmap(lambda r: lax.dynamic_slice(r, ({d.value('iu', 0, 0)},), (2,)))({x})",
     ])  # fmt: skip
 

@@ -86,12 +86,19 @@ def _sort(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("top_k")
 def _top_k(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """The largest in falling order, of equals the first; NaN is the largest."""
-    (x,), k, axis = args, eqn.params["k"], eqn.params["axis"]
+    """The largest in falling order, of equals the first. The order of floats is total, from -NaN over -0 to NaN."""
+    (x,), k, axis, dtype = args, eqn.params["k"], eqn.params["axis"], eqn.invars[0].aval.dtype
     numbers = np.arange(x.shape[axis]).reshape([-1 if i == axis else 1 for i in range(x.ndim)])
     places = constants(np.broadcast_to(numbers, x.shape), np.int32)
-    largest_first = _sorted(ctx, eqn, [x, places], axis, 1, descending=True)
-    return [np.take(y, range(k), axis) for y in largest_first]
+    key = x
+    if dtype.kind == "f":  # the bits are in order but for negative numbers, of which the larger have the larger bits
+        whole = np.dtype(f"i{dtype.itemsize}")
+        key = ctx.elementwise("bitcast_convert_type", [x], whole)
+        turned = ctx.elementwise("xor", [key, constants(np.iinfo(whole).max, whole)], whole)
+        negative = ctx.elementwise("lt", [key, constants(0, whole)], bool)
+        key = ctx.elementwise("select_n", [negative, key, turned], whole)
+    columns = _sorted(ctx, eqn, [key, x, places], axis, 1, descending=True)
+    return [np.take(y, range(k), axis) for y in columns[1:]]
 
 
 def _sorted(
