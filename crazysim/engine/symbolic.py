@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from crazysim.engine import ops
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import Block, Element, Operation, Value
@@ -122,16 +124,20 @@ class _Interpreter:
         return [self._wrap(out) if op.dtype.kind == "u" and op.name in ("add", "sub") else out]
 
     def _convert(self, op: Operation, x: Expression) -> Expression:
-        before, after = op.args[0].dtype.kind, op.dtype.kind
-        if after == "b":
+        before, after = op.args[0].dtype, op.dtype
+        if after.kind == "b":
             return x != 0
-        if before == "f" and after in "iu":
-            x = self._towards_zero(x)
-        return self._wrap(x) if after == "u" and before != "b" else x
+        if after.kind not in "iu" or before.kind == "b":
+            return x
+        limits = np.iinfo(after)
+        if before.kind == "f":
+            return self.casadi.fmin(self.casadi.fmax(self._towards_zero(x), limits.min), limits.max)
+        fits = np.iinfo(before).min >= limits.min and np.iinfo(before).max <= limits.max
+        return x if fits else self._wrap(x, float(limits.min), 2.0 ** (8 * after.itemsize))
 
-    def _wrap(self, x: Expression) -> Expression:
-        """Return a whole number as 32 bits without a sign hold it."""
-        return x - 2.0**32 * self.casadi.floor(x / 2.0**32)
+    def _wrap(self, x: Expression, low: float = 0.0, length: float = 2.0**32) -> Expression:
+        """Return a whole number as one of ``length`` from ``low`` on, as integers of limited size hold it."""
+        return x - length * self.casadi.floor((x - low) / length)
 
     def _towards_zero(self, x: Expression) -> Expression:
         return self.casadi.if_else(x < 0, self.casadi.ceil(x), self.casadi.floor(x))

@@ -34,6 +34,16 @@ def verify(program: Program) -> Program:
     return program
 
 
+def verify_block(block: Block) -> Block:
+    """Return a block unchanged, or say what is wrong with it.
+
+    Raises:
+        VerificationError: If it is not well formed.
+    """
+    _verify_block(block, set())
+    return block
+
+
 def _require(condition: bool, message: str) -> None:
     if not condition:
         raise VerificationError(message)
@@ -50,8 +60,8 @@ def _verify_segment(program: Program, segment: Segment, changing: set[Slot]) -> 
         f"{len(further)} further inputs for {len(segment.hoisted.outputs)} hoisted outputs",
     )
     _require(changing.isdisjoint(segment.hoisted_reads), "a hoisted number changes from step to step")
-    _verify_block(segment.hoisted, set())
-    _verify_block(segment.block, set())
+    verify_block(segment.hoisted)
+    verify_block(segment.block)
 
 
 def _slots(

@@ -1,380 +1,165 @@
-"""Every rule of the reader: what a stage written for one drone gives on lanes and in a kernel is what it gives plain.
-
-Each case is a step of its own: compilers take longer over all of them at once than one after the other.
-"""
+"""Every rule of lowering: what a function of one drone gives in the interpreter is what JAX gives."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from blocks import program_of
+from rule_cases import CASES, N_DRONES, N_WORLDS, RANDOM, given, of_one
 
 from crazysim import Sim
 from crazysim.core.stage import stage
-from crazysim.engine import Step, native
-from crazysim.pytree import PyTree, leaf
-
-FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
-N_WORLDS, N_DRONES = 7, 3  # 21 lanes: not a multiple of any vector's or block's length
-
-
-class Given(PyTree):
-    """What a case is given."""
-
-    x: jax.Array = leaf("drone", 1)
-    """Numbers of both signs, two of them equal. (6,)"""
-    m: jax.Array = leaf("drone", 2)
-    """A matrix. (3, 3)"""
-    big: jax.Array = leaf("drone", 2)
-    """A matrix. (6, 6)"""
-    i: jax.Array = leaf("drone", 1)
-    """Integers from -2 to 8. (4,)"""
-    u: jax.Array = leaf("drone", 1)
-    """Any 32 bits. (3,)"""
-    table: jax.Array = leaf("shared", 1)
-    """Numbers that all drones share. (8,)"""
-    nan: jax.Array = leaf("drone", 1)
-    """Numbers, NaN and infinities. (6,)"""
-
-
-class Results(PyTree):
-    """What the cases gave."""
-
-    values: dict = leaf("drone", 1)
-
-
-CASES = {}
-
-
-def case(fn):
-    CASES[fn.__name__] = fn
-    return fn
-
-
-def spd(m):
-    return m @ m.T + 2.0 * jnp.eye(len(m))
-
-
-# Element-wise
-@case
-def arithmetic(g):
-    x, y = g.x, g.x[::-1] + 0.3
-    return jnp.stack([x + y, x - y, x * y, x / y, -x, jnp.abs(x), jnp.sign(x), jnp.maximum(x, y), jnp.minimum(x, y)])
-
-
-@case
-def functions(g):
-    x, p = g.x, jnp.abs(g.x) + 0.1
-    few = [jnp.sin(x), jnp.cos(x), jnp.tan(x), jnp.exp(x), jnp.log(p), jnp.sqrt(p), jnp.tanh(x), jax.lax.rsqrt(p)]
-    more = [jnp.arctan2(x, x[::-1]), jnp.arcsin(x / 4), jnp.arccos(x / 4), jnp.arctan(x), jnp.sinh(x), jnp.cosh(x)]
-    rest = [jnp.expm1(x), jnp.log1p(p), jnp.cbrt(x), jnp.exp2(x), p**x, x**3, p**-2, jax.nn.sigmoid(x)]
-    last = [jax.lax.erf(x), jax.lax.erf_inv(x / 4), jnp.arcsinh(x), jnp.arctanh(x / 4), jnp.arccosh(p + 1)]
-    return jnp.stack(few + more + rest + last)
-
-
-@case
-def far_angles(g):
-    return jnp.stack([jnp.sin(1e3 * g.x), jnp.cos(1e3 * g.x), jnp.sin(1e5 * g.x), jnp.cos(1e5 * g.x)])
-
-
-@case
-def rounding(g):
-    x = 3 * g.x
-    return jnp.stack([jnp.floor(x), jnp.ceil(x), jnp.round(x), jax.lax.round(x), jnp.fmod(x, 0.7), x % 0.7, x // 0.7])
-
-
-@case
-def comparisons(g):
-    x, y = g.x, g.x[::-1]
-    return jnp.stack([x < y, x <= y, x > y, x >= y, x == y, x != y, (x > 0) & (y > 0), (x > 0) | (y > 0), ~(x > 0)])
-
-
-@case
-def not_finite(g):
-    x, y = g.nan, g.nan[::-1]
-    limits = [jnp.maximum(x, y), jnp.minimum(x, 0.5), jnp.clip(x, -1, 1), jnp.where(x < 0, 0, x), jnp.sign(x)]
-    return jnp.stack([jnp.isfinite(x), jnp.isnan(x), *limits, jnp.where(x > 1, 1.0, x)])
-
-
-@case
-def integers(g):
-    a, b = g.i, g.i[::-1]
-    return jnp.stack([a + b, a - b, a * b, a // b, a % b, jax.lax.div(a, b), jax.lax.rem(a, b), abs(a), a & b, a | b,
-                      ~a, a ^ b, a << 3, a >> 1, jnp.sign(a), -a])  # fmt: skip
-
-
-@case
-def words(g):
-    u, n = g.u, jnp.uint32([0, 5, 31])
-    out = jnp.stack([u << n, u >> n, u + u[::-1], u * jnp.uint32(2654435761), ~u, u ^ n])
-    return jax.lax.bitcast_convert_type(out, jnp.int32)
-
-
-@case
-def conversions(g):
-    x = jnp.concatenate([g.x * 1e3, jnp.stack([g.x[0] * 1e12, jnp.nan + g.x[0]])])
-    return jnp.concatenate([
-        x.astype(jnp.int32), g.i, (g.x > 0).astype(jnp.int32), jax.lax.bitcast_convert_type(g.x, jnp.int32),
-        g.i.astype(jnp.float32).astype(jnp.int32), g.i.astype(bool).astype(jnp.int32),
-    ])  # fmt: skip
-
-
-# Movement
-@case
-def movement(g):
-    m = g.m
-    return jnp.concatenate([
-        m.T.ravel(), m[::-1].ravel(), jnp.pad(m, ((1, 0), (0, 2)), constant_values=2.0).ravel(), jnp.tile(m[0], 2),
-        jnp.roll(g.x, 2), g.big[1:5:2, ::3].ravel(), jnp.repeat(m[:, 0], 2), jnp.diag(m), jnp.rot90(m).ravel(),
-        jnp.stack(jnp.split(g.x, 3)).ravel(), m[jnp.array([2, 0, 2])].ravel(), m.at[1].set(7.0).ravel(),
-        m.at[:, 0].add(g.x[:3]).ravel(), jnp.broadcast_to(g.x[:1], (4,)), jnp.concatenate([g.x, m[0]])[2:5],
-    ])  # fmt: skip
-
-
-# Reductions
-@case
-def reductions(g):
-    m, t = g.m, g.x > 0
-    return jnp.concatenate([m.sum(0), m.prod(1), m.max(0), m.min(1), jnp.stack([t.any(), t.all()]), m.mean()[None],
-                            jnp.linalg.norm(m, axis=0), m.std(1), jnp.array([]).sum()[None]])  # fmt: skip
-
-
-@case
-def argmin_and_sort(g):
-    m, x = g.m, g.x
-    return jnp.concatenate([jnp.argmin(m, 0), jnp.argmax(x)[None], jnp.argmax(g.nan)[None], jnp.sort(x), jnp.argsort(x),
-                            jnp.argsort(jnp.round(x), stable=True), jnp.sort(g.i), jnp.median(x)[None]])  # fmt: skip
-
-
-@case
-def sort_not_finite(g):
-    return jnp.sort(g.nan)
-
-
-@case
-def cumulative(g):
-    return jnp.stack([jnp.cumsum(g.x), jnp.cumprod(g.x), jax.lax.cummax(g.x), jax.lax.cummin(g.x, reverse=True)])
-
-
-@case
-def products(g):
-    batch = jnp.einsum("bij,bjk->bik", jnp.stack([g.m, g.m.T]), jnp.stack([g.m, g.m]))
-    return jnp.concatenate([(g.m @ g.m).ravel(), g.big @ g.x, jnp.vdot(g.x, g.x)[None], batch.ravel(),
-                            jnp.outer(g.x, g.x).ravel(), jnp.cross(g.m[0], g.m[1])])  # fmt: skip
-
-
-@case
-def inner_vmap(g):
-    return jax.vmap(lambda row, s: s * jnp.linalg.norm(row) + row)(g.m, g.x[:3])
-
-
-# Structure
-@case
-def cond(g):
-    two = jax.lax.cond(g.x[0] > 0, lambda x: jnp.sin(x), lambda x: x * x, g.x)
-    three = jax.lax.switch(g.i[0], [lambda x: x, lambda x: 2 * x, lambda x: -x], g.x)
-    return jnp.stack([two, three, jnp.select([g.x > 1, g.x < -1], [g.x, -g.x], 0.0)])
-
-
-@case
-def loops(g):
-    fixed = jax.lax.fori_loop(0, 5, lambda k, x: x * 0.9 + 0.1 * k, g.x)
-    last, each = jax.lax.scan(lambda c, y: (c + y, c * y), g.x[0], g.x)
-    back, _ = jax.lax.scan(lambda c, y: (0.5 * c + y, None), g.x[0], g.x, reverse=True)
-    return jnp.concatenate([fixed, last[None], each, back[None]])
-
-
-@case
-def loop_until(g):
-    x, n = jax.lax.while_loop(
-        lambda c: (jnp.abs(c[0]) > 0.1) & (c[1] < 40), lambda c: (0.7 * c[0], c[1] + 1), (g.x[0], 0)
-    )
-    count = jax.lax.fori_loop(0, g.i[1], lambda k, c: c + k, 0)
-    return jnp.stack([x, n, count])
-
-
-@case
-def index_by_a_number(g):
-    k = g.i[0]
-    clipped = jnp.clip(k, 0, 5)
-    return jnp.concatenate([
-        g.x[clipped][None], g.table[clipped][None], g.m[jnp.clip(k, 0, 2)], jax.lax.dynamic_slice(g.x, (k,), (2,)),
-        g.x.at[clipped].set(9.0), g.x.at[clipped].add(1.0), g.x.at[k].set(5.0, mode="drop"),
-        g.big[jnp.clip(g.i[1], 0, 5), jnp.clip(g.i[2], 0, 5)][None], g.x.at[k].multiply(2.0, mode="clip"),
-        jnp.take(g.x, jnp.clip(g.i, 0, 5)), jnp.take(g.table, g.i, mode="clip"), g.x.at[g.i].max(0.5, mode="drop"),
-        jax.lax.dynamic_update_slice(g.x, g.m[0], (k,)), g.x.at[g.i].get(mode="fill", fill_value=-1.0),
-        jax.lax.dynamic_update_slice(g.m, g.m[:1, :2], (k, g.i[1])).ravel(), g.x[jnp.array([1, -1])],
-    ])  # fmt: skip
-
-
-@case
-def interpolation(g):
-    return jnp.interp(g.x, jnp.linspace(-2, 2, 8), g.table)
-
-
-@case
-def small_systems(g):
-    a, b = spd(g.m), spd(g.big)
-    low = jnp.linalg.cholesky(a)
-    return jnp.concatenate([
-        low.ravel(), jax.scipy.linalg.cho_solve((low, True), g.x[:3]), jnp.linalg.solve(a, g.m[0]),
-        jax.scipy.linalg.solve_triangular(b, g.x, lower=False), jnp.linalg.inv(a).ravel(), jnp.linalg.det(a)[None],
-        jnp.linalg.solve(jnp.roll(b, 1, 0), g.x), jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(b), g.x),
-    ])  # fmt: skip
-
-
-@case
-def nested_calls(g):
-    inner = jax.jit(lambda x: jax.checkpoint(lambda y: jnp.sin(y) * y)(x))
-    return jnp.concatenate(
-        [inner(g.x), jax.nn.relu(g.x), jax.nn.softplus(g.x), jnp.linalg.norm(jax.jacfwd(inner)(g.x), axis=1)]
-    )
-
-
-@case
-def own_gradient(g):
-    return jax.grad(lambda x: jnp.sum(jnp.tanh(g.big @ x) * g.x))(g.x)
-
-
-def random_bits(key, g):
-    """Bits must be those of JAX's own generator, exactly."""
-    a, b = jax.random.split(jax.random.fold_in(key, g.i[0]))
-    c = jax.random.key(g.i[1])
-    bits = [jax.random.bits(a, (5,)), jax.random.bits(c, (2,)), jax.random.key_data(jnp.where(g.x[0] > 0, a, b))]
-    return jax.lax.bitcast_convert_type(jnp.concatenate(bits), jnp.int32)
-
-
-def random_numbers(key, g):
-    a, b, c = jax.random.split(jax.random.fold_in(key, g.u[0]), 3)
-    numbers = [jax.random.uniform(a, (4,)), jax.random.normal(b, (3,)), jax.random.randint(c, (2,), 0, 100)]
-    return jnp.concatenate([*numbers, jax.random.bernoulli(a, 0.3)[None], jax.random.permutation(b, g.x)])
-
-
-RANDOM = {"random_bits": random_bits, "random_numbers": random_numbers}
-
-
-def step_of(name, engine):
-    """Return a step that does nothing but write the result of a case."""
-
-    @stage("drone")
-    def only(data):
-        g, key, results = (data.plugins["given"], data.core.rng_key, data.plugins["results"])
-        x = RANDOM[name](key, g) if name in RANDOM else CASES[name](g)
-        new = results.values | {name: jnp.ravel(x).astype(results.values[name].dtype)}
-        return data.replace(plugins=data.plugins | {"results": Results(new)})
-
-    return Step({name: only}, engine)
-
-
-def given():
-    """Return inputs that differ from drone to drone."""
-    rng = np.random.default_rng(0)
-    shape = (N_WORLDS, N_DRONES)
-    x = rng.uniform(-3, 3, (*shape, 6))
-    x[..., 3] = x[..., 1]
-    special = rng.choice([np.nan, np.inf, -np.inf, 0.5, -2.0, 0.0], (*shape, 6))
-    return Given(
-        x=jnp.asarray(x, jnp.float32),
-        m=jnp.asarray(rng.normal(size=(*shape, 3, 3)), jnp.float32),
-        big=jnp.asarray(rng.normal(size=(*shape, 6, 6)), jnp.float32),
-        i=jnp.asarray(rng.integers(-2, 9, (*shape, 4)), jnp.int32),
-        u=jnp.asarray(rng.integers(0, 2**32, (*shape, 3), dtype=np.uint32)),
-        table=jnp.asarray(rng.normal(size=8), jnp.float32),
-        nan=jnp.asarray(special, jnp.float32),
-    )
-
-
-@pytest.fixture(scope="module")
-def data():
-    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="rotor_vel", rng_key=3)
-    g = given()
-    one = jax.tree.map(lambda s, x: x if s == "shared" else x[0, 0], Given("d", "d", "d", "d", "d", "shared", "d"), g)
-    outs = {name: jax.eval_shape(fn, one) for name, fn in CASES.items()}
-    outs |= {name: jax.eval_shape(fn, sim.data.core.rng_key, one) for name, fn in RANDOM.items()}
-    kinds = {name: np.float32 if x.dtype == bool else x.dtype for name, x in outs.items()}
-    values = {name: jnp.zeros((N_WORLDS, N_DRONES, int(np.prod(x.shape))), kinds[name]) for name, x in outs.items()}
-    return sim.data.replace(plugins={"given": g, "results": Results(values)})
-
-
-# What rounds: library functions of XLA and of the host differ by a few units in the last place, and a solve multiplies
-# that by the condition of the system, here below 1e2. All else is the same arithmetic.
+from crazysim.engine import Step, interpret, native
+from crazysim.engine.fused import build
+from crazysim.engine.lower import lower_function
+from crazysim.engine.verify import verify_block
+
+N_LANES = N_WORLDS * N_DRONES
+
+# What rounds: library functions of XLA and NumPy differ by a few units in the last place, and a solve multiplies that
+# by the condition of the system, here below 1e2. All else is the same arithmetic.
 ULP = 2.0**-23
 TOLERANCE = {"functions": 16 * ULP, "small_systems": 1e3 * ULP, "far_angles": 8 * ULP, "interpolation": 1e2 * ULP}
+TOLERANCE |= dict.fromkeys(["lanes", "fused"], 32 * ULP)  # sums of products that cancel, contracted or not
+
+
+def function(name):
+    """Return a case as a function of one drone's arrays, to a flat array."""
+    fn = (lambda g: RANDOM[name](jax.random.key(3), g)) if name in RANDOM else CASES[name]
+    return lambda g: jnp.ravel(fn(g))
+
+
+def lanes_of(g):
+    """Return the numbers of all drones: of what they share one, of the rest one for each lane."""
+    return [x for name, array in vars(g).items()
+            for x in (np.asarray(array) if name == "table" else np.asarray(array).reshape(N_LANES, -1).T)]  # fmt: skip
+
+
+def plain(name, g):
+    """Return what JAX gives for all drones. (n_lanes, k)"""
+    axes = type(g)(0, 0, 0, 0, 0, None, 0)
+    return np.asarray(jax.jit(jax.vmap(jax.vmap(function(name), (axes,)), (axes,)))(g)).reshape(N_LANES, -1)
+
+
+def agree(found, expected, name):
+    assert found.dtype == expected.dtype
+    if expected.dtype.kind != "f":
+        np.testing.assert_array_equal(found, expected, err_msg=name)
+        return
+    tolerance = TOLERANCE.get(name, 8 * ULP)
+    scale = np.max(np.abs(np.where(np.isfinite(expected), expected, 0)))
+    np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance * min(scale, 1e2), err_msg=name)
 
 
 @pytest.mark.parametrize("name", [*CASES, *RANDOM])
-def test_a_case_gives_what_it_gives_plain(data, name):
-    """Integers, words and random bits exactly; numbers to rounding, for engines may contract a product and a sum."""
-    expected = np.asarray(step_of(name, "plain")(data).plugins["results"].values[name])
-    assert expected.size
-    for engine in FAST:
-        step = step_of(name, engine)
-        plan = step.plan(data)
-        assert plan.engine == engine
-        assert plan.program.fused
-        found = np.asarray(step(data).plugins["results"].values[name])
-        assert found.shape == expected.shape
-        if expected.dtype.kind in "iu":
-            np.testing.assert_array_equal(found, expected, err_msg=engine)
-            continue
-        tolerance = TOLERANCE.get(name, 8 * ULP)
-        scale = np.nanmax(np.abs(np.where(np.isfinite(expected), expected, 0)))
-        np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance * min(scale, 1e2), err_msg=engine)
+def test_a_case_gives_what_jax_gives(name):
+    """Integers, bools and random bits exactly; numbers to rounding."""
+    g = given()
+    block = lower_function(function(name), of_one(g))
+    verify_block(block)
+    assert block.outputs
+    found = interpret.run(block, lanes_of(g), (N_LANES,))
+    agree(np.stack(found, axis=-1), plain(name, g), name)
 
 
-def reason(data, fn):
-    """Return why a stage is not fused."""
-    (unfused,) = Step({"mine": stage("drone")(fn)}, "lanes").plan(data).program.unfused_stages
-    return str(unfused.error)
+@pytest.mark.parametrize("engine", ["lanes", *(["fused"] if native.compiler() else [])])
+def test_loops_branches_and_random_numbers_run_in_every_engine(engine):
+    """One program of the cases whose operations run blocks or have several results: the rest is in test_targets."""
+    names = ["cond", "loops", "loop_until", "nested_calls", "own_gradient", *RANDOM]
+
+    def all_of_them(g):
+        return [function(name)(g) for name in names]
+
+    g = given()
+    block = lower_function(all_of_them, of_one(g))
+    program, leaves = program_of(block, lanes_of(g), N_LANES)
+    expected = interpret.run(block, lanes_of(g), (N_LANES,))
+    run = build(program, "cpu") if engine == "fused" else lambda x, n: interpret.lanes.steps(program, x, n)
+    written, _ = jax.jit(lambda leaves: run(leaves, 1))(leaves)
+    for x, y in zip(written, expected, strict=True):
+        agree(np.asarray(x).reshape(-1), y, engine)
+
+
+# Refusals ------------------------------------------------------------------------------------------------------------
 
 
 def wrote(data, x):
     return data.replace(states=data.states.replace(pos=jnp.zeros(3).at[0].set(jnp.ravel(x)[0])))
 
 
-@pytest.mark.parametrize(
-    "fn, words",
-    [
-        (lambda d: wrote(d, jnp.fft.fft(d.states.pos).real), "numbers of type complex64"),
-        (lambda d: wrote(d, jnp.linalg.eigh(d.states.pos * jnp.eye(3))[0]), "'eigh' has no rule"),
-        (lambda d: wrote(d, jnp.arange(100.0)[d.core.steps % 100]), "100 places; selected from are up to 64"),
-        (lambda d: wrote(d, jnp.linalg.cholesky(jnp.eye(7) + d.states.pos[0])), "'cholesky' of size 7"),
-        (lambda d: wrote(d, jnp.sort(jnp.zeros(65) + d.states.pos[0])), "'sort' of 65 elements"),
-        (lambda d: wrote(d, jax.random.uniform(jax.random.key(0, impl="rbg")) + d.states.pos), "random"),
-        (lambda d: wrote(d, jax.lax.scan(lambda c, y: (c + y, y), d.states.pos[0], jnp.ones(65))[0]), "65 turns"),
-    ],
-)
-def test_what_has_no_rule_is_named_and_runs_as_it_is(data, fn, words):
+REFUSED = {
+    "eigh": (lambda d: wrote(d, jnp.linalg.eigh(d.states.pos * jnp.eye(3))[0]), "primitive 'eigh' has no rule"),
+    "complex": (lambda d: wrote(d, jnp.fft.fft(d.states.pos).real), "numbers of type complex64"),
+    "half": (lambda d: wrote(d, d.states.pos.astype(jnp.bfloat16).astype(jnp.float32)), "numbers of type bfloat16"),
+    "index": (lambda d: wrote(d, jnp.arange(100.0)[d.core.steps % 100]), "100"),
+    "cholesky": (lambda d: wrote(d, jnp.linalg.cholesky(jnp.eye(7) + d.states.pos[0])), "size 7"),
+    "sort": (lambda d: wrote(d, jnp.sort(jnp.zeros(65) + d.states.pos[0])), "65 elements"),
+    "generator": (lambda d: wrote(d, jax.random.uniform(jax.random.key(0, impl="rbg")) + d.states.pos), "random"),
+    "scan": (lambda d: wrote(d, jax.lax.scan(lambda c, y: (c + y, y), d.states.pos[0], jnp.ones(65))[0]), "65"),
+}
+
+
+@pytest.fixture(scope="module")
+def data():
+    return Sim(n_worlds=2, n_drones=1, control="rotor_vel", engine="lanes").data
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused_is_named_with_its_stage(data, name):
+    fn, words = REFUSED[name]
+    (unfused,) = Step({"mine": stage("drone")(fn)}, "lanes").plan(data).program.unfused_stages
+    assert words in str(unfused.error)
+    assert f"stage 'mine', jax {jax.__version__}" in str(unfused.error)
+    assert unfused.error.primitive
+
+
+def test_a_refused_stage_runs_as_it_is_written(data):
     """It splits the step there, and never fails where the plain engine would not."""
-    assert words in reason(data, fn)
-    mine = {"mine": stage("drone")(fn)}
-    for engine in ("lanes", "auto"):
-        out = Step(mine, engine)(data, jnp.int32(2)).states.pos
-        np.testing.assert_allclose(out, Step(mine, "plain")(data, jnp.int32(2)).states.pos, rtol=1e-6)
+    mine = {"mine": stage("drone")(REFUSED["eigh"][0])}
+    expected = Step(mine, "plain")(data, jnp.int32(2)).states.pos
+    np.testing.assert_allclose(Step(mine, "lanes")(data, jnp.int32(2)).states.pos, expected, rtol=1e-6)
 
 
-def test_powers_and_angles_of_special_numbers(data):
+def test_a_parameter_that_a_version_of_jax_does_not_have_makes_a_primitive_unsupported(monkeypatch):
+    from crazysim.engine import lower
+    from crazysim.engine.errors import UnsupportedError
+
+    monkeypatch.setitem(lower.RULES, "tanh", lambda ctx, eqn, args: [eqn.params["renamed"]])
+    with pytest.raises(UnsupportedError, match=r"primitive 'tanh'.*'renamed'"):
+        lower_function(jnp.tanh, jax.ShapeDtypeStruct((2,), np.float32))
+
+
+# Numbers that ordinary arithmetic leaves open -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fn", [
+    lambda x: 0.0 * x, lambda x: x * jnp.zeros(3)[0], lambda x: 0.0 / x, lambda x: x - x, lambda x: x * 1 + 0.0,
+    lambda x: jnp.dot(jnp.zeros(2), jnp.stack([x, x])), lambda x: jnp.maximum(x, 0.0), lambda x: jnp.clip(x, -1, 1),
+])  # fmt: skip
+def test_constants_do_not_hide_what_is_not_finite(fn):
+    """A product with zero is NaN where the other number is infinite, whatever is known when the program is made."""
+    x = np.float32([np.nan, np.inf, -np.inf, 0.0, -2.5])
+    (found,) = interpret.run(lower_function(fn, jax.ShapeDtypeStruct((), np.float32)), [x], x.shape)
+    np.testing.assert_array_equal(found, np.asarray(jax.jit(jax.vmap(fn))(x)))
+
+
+def test_powers_and_angles_of_special_numbers():
     """What kernels of the host compute with vectors of their own: signs of zero, infinities, over- and underflow."""
+    if native.compiler() is None:
+        pytest.skip("no C++ compiler here")
     sides = np.float32([0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -2.0, 1e-30, 1e30])
     y, x = (v.ravel() for v in np.meshgrid(sides, sides))
-    powers = np.float32(
-        [0.0, -0.0, np.inf, -np.inf, np.nan, 88.7, 88.8, -87.0, -95.0, -103.9, -110.0, 1e-8, 200.0, -1e30]
-    )
+    powers = [0.0, -0.0, np.inf, -np.inf, np.nan, 88.7, 88.8, -87.0, -95.0, -103.9, -110.0, 1e-8, 200.0, -1e30]
     z = np.resize(np.float32(powers), y.shape)
-    sim = Sim(n_worlds=len(y), control="rotor_vel")
-    pos = jnp.stack([jnp.asarray(v) for v in (y, x, z)], axis=-1)[:, None]
-    start = sim.data.replace(states=sim.data.states.replace(pos=pos))
-
-    @stage("drone")
-    def functions(data):
-        y, x, z = data.states.pos
-        out = jnp.stack([jnp.arctan2(y, x), jnp.exp(z), jnp.arctan2(z, 2.0)])
-        return data.replace(states=data.states.replace(vel=out))
-
-    found = np.asarray(Step({"functions": functions}, "auto")(start).states.vel)[:, 0]
+    one = jax.ShapeDtypeStruct((), np.float32)
+    block = lower_function(lambda y, x, z: [jnp.arctan2(y, x), jnp.exp(z), jnp.arctan2(z, 2.0)], one, one, one)
+    program, leaves = program_of(block, [y, x, z], len(y))
+    found, _ = jax.jit(lambda leaves: build(program, "cpu")(leaves, 1))(leaves)
     with np.errstate(all="ignore"):
         expected = [f.astype(np.float32) for f in (np.arctan2(*map(np.float64, (y, x))), np.exp(np.float64(z)),
                                                    np.arctan2(np.float64(z), 2.0))]  # fmt: skip
-    for name, a, b in zip(("arctan2", "exp", "arctan2 of one"), found.T, expected, strict=True):
+    for name, a, b in zip(("arctan2", "exp", "arctan2 of one"), found, expected, strict=True):
+        a = np.asarray(a)[:, 0]
         # XLA has its threads take what is below the least normal number for zero.
         np.testing.assert_allclose(a, b, rtol=4 * ULP, atol=np.finfo(np.float32).tiny, err_msg=name)
         known = ~np.isnan(b)

@@ -23,9 +23,9 @@ PAIRS = [("first_principles", c) for c in COMMANDS] + [
 SETTER = {c: getattr(F, f"{c}_control") for c in COMMANDS}
 
 
-def flight(dynamics, control, n_steps=100):
+def flight(dynamics, control, engine, n_steps=100):
     """Return a scalar function of (pos, quat direction, vel, ang_vel, rotor_vel, command), and a start for it."""
-    sim = Sim(dynamics=dynamics, control=control)
+    sim = Sim(dynamics=dynamics, control=control, engine=engine)
     step = sim.build_step_fn()
     n = sim.data.states.rotor_vel.shape[-1]
     hover = 15_864.0 if dynamics == "first_principles" else WEIGHT
@@ -50,14 +50,16 @@ def flight(dynamics, control, n_steps=100):
     return loss, start
 
 
-@pytest.mark.parametrize(("dynamics", "control"), PAIRS)
-def test_gradient_equals_central_differences(dynamics, control, x64):
+@pytest.mark.parametrize(
+    ("dynamics", "control", "engine"), [(*pair, "plain") for pair in PAIRS] + [("first_principles", "attitude", "auto")]
+)
+def test_gradient_equals_central_differences(dynamics, control, engine, x64):
     """100 steps in float64, along a random direction in each input on its own, away from switches.
 
     A central difference with a relative step of 1e-6 is off by about 1e-12 of curvature and 1e-10 of rounding,
     over a gradient of order one: 1e-6 leaves room for both.
     """
-    loss, start = flight(dynamics, control)
+    loss, start = flight(dynamics, control, engine)
     both = jax.jit(jax.value_and_grad(loss))  # one program for all
     gradient = both(start)[1]
     rng = np.random.default_rng(0)

@@ -49,10 +49,14 @@ def tilted(data):
     return command
 
 
+ENGINES = [(*pair, "plain") for pair in PAIRS] + [("first_principles", "state", "auto")]
+"""Every pair on the engine that compiles fastest, and the longest pipeline on the one that users get."""
+
+
 @functools.cache
-def situations(dynamics, control):
+def situations(dynamics, control, engine="auto"):
     """Return a simulation with one situation a world, its data, and the commands."""
-    sim = shared_sim(n_worlds=len(SITUATIONS), dynamics=dynamics, control=control)
+    sim = shared_sim(n_worlds=len(SITUATIONS), dynamics=dynamics, control=control, engine=engine)
     n = len(SITUATIONS)
     pos, quat, rotor_vel = np.zeros((n, 1, 3)), np.zeros((n, 1, 4)), np.zeros((n, 1, 4))
     pos[..., 2], quat[..., 3] = 1.0, 1.0
@@ -78,9 +82,9 @@ def situations(dynamics, control):
 
 
 @functools.cache
-def flight(dynamics, control):
+def flight(dynamics, control, engine):
     """Return a compiled flight: gradients of positions and velocities at its end, and the data there."""
-    step = situations(dynamics, control)[0].build_step_fn()
+    step = situations(dynamics, control, engine)[0].build_step_fn()
 
     @jax.jit
     @functools.partial(jax.grad, has_aux=True)
@@ -99,11 +103,11 @@ def start_of(data, commands):
     return {"command": commands} | {name: getattr(data.states, name) for name in names}
 
 
-@pytest.mark.parametrize("dynamics, control", PAIRS)
-def test_values_and_gradients_are_finite(dynamics, control):
+@pytest.mark.parametrize("dynamics, control, engine", ENGINES)
+def test_values_and_gradients_are_finite(dynamics, control, engine):
     """Law 7: every situation, every kind of dynamics and command, after 50 steps."""
-    _, data, commands = situations(dynamics, control)
-    gradients, end = flight(dynamics, control)(start_of(data, commands), data)
+    _, data, commands = situations(dynamics, control, engine)
+    gradients, end = flight(dynamics, control, engine)(start_of(data, commands), data)
     for world, name in enumerate(SITUATIONS):
         for leaf, x in {**vars(end.states), **{f"gradient of {k}": v for k, v in gradients.items()}}.items():
             assert np.all(np.isfinite(x[world])), f"{leaf} in {name!r}"
@@ -139,11 +143,11 @@ def test_attitudes_that_no_drone_can_take_keep_a_fitted_model_bounded(drone, int
     assert 50 < fastest < 500  # rad/s; handed over from 100 to 200, and a step of 2 ms may overshoot
 
 
-@pytest.mark.parametrize("dynamics, control", PAIRS)
-def test_a_bad_world_touches_no_other(dynamics, control):
+@pytest.mark.parametrize("dynamics, control, engine", ENGINES)
+def test_a_bad_world_touches_no_other(dynamics, control, engine):
     """Law 7: with NaN in world 1 every other world ends bit-equal, its gradients too, and only world 1 is flagged."""
-    _, data, commands = situations(dynamics, control)
-    fly = flight(dynamics, control)
+    _, data, commands = situations(dynamics, control, engine)
+    fly = flight(dynamics, control, engine)
     good_gradients, good = fly(start_of(data, commands), data)
     states = data.states
     for changes in (

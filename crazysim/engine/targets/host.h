@@ -131,12 +131,12 @@ template <class F, class V> FN V each2(F f, V x, V y) {
   return x;
 }
 #define EACH(NAME) LANES1(V) V NAME##_(V x) { typedef typename is_lanes<V>::one T; return each<V>([](T t) { return NAME##_(t); }, x); }
-EACH(acos) EACH(acosh) EACH(asin) EACH(asinh) EACH(atan) EACH(atanh) EACH(cbrt) EACH(ceil) EACH(cosh) EACH(erf) EACH(erfc)
-EACH(erf_inv) EACH(exp2) EACH(expm1) EACH(floor) EACH(log) EACH(log1p) EACH(logistic) EACH(round_even)
+EACH(acos) EACH(acosh) EACH(asin) EACH(asinh) EACH(atan) EACH(atanh) EACH(cbrt) EACH(ceil) EACH(cosh) EACH(digamma) EACH(erf) EACH(erfc)
+EACH(erf_inv) EACH(exp2) EACH(expm1) EACH(floor) EACH(log) EACH(lgamma) EACH(log1p) EACH(logistic) EACH(round_even)
 EACH(round_away) EACH(sign) EACH(sinh) EACH(sqrt) EACH(tan) EACH(tanh)
 #define EACH2(NAME) LANES2(A, B) auto NAME##_(A x, B y) { \
   typedef typename is_lanes<decltype(lift(x))>::one T; return each2([](T s, T t) { return NAME##_(s, t); }, lift(x), lift(y)); }
-EACH2(pow) EACH2(rem) EACH2(shift_right_arithmetic) EACH2(shift_left) EACH2(shift_right_logical)
+EACH2(nextafter) EACH2(pow) EACH2(rem) EACH2(shift_right_arithmetic) EACH2(shift_left) EACH2(shift_right_logical)
 LANES1(V) V neg_(V x) { return -x; }
 LANES1(V) V abs_(V x) { return select_n_(lt_(x, V{}), select_n_(eq_(x, V{}), x, V{}), -x); }
 LANES1(V) V rsqrt_(V x) { return lift(typename is_lanes<V>::one(1)) / sqrt_(x); }

@@ -29,12 +29,13 @@ UNARY(rsqrt, RSQRTF(x), 1.0 / sqrt(x)) UNARY(tan, tanf(x), tan(x)) UNARY(tanh, t
 UNARY(logistic, 1.0f / (1.0f + expf(-x)), 1.0 / (1.0 + exp(-x)))
 UNARY(round_even, rintf(x), rint(x)) UNARY(round_away, roundf(x), round(x))
 UNARY(neg, -x, -x) UNARY(abs, fabsf(x), fabs(x))
-UNARY(sign, x > 0 ? 1.0f : x < 0 ? -1.0f : x, x > 0 ? 1.0 : x < 0 ? -1.0 : x)  // of zero and NaN the same
+UNARY(sign, x > 0 ? 1.0f : x < 0 ? -1.0f : x, x > 0 ? 1.0 : x < 0 ? -1.0 : x)
+UNARY(lgamma, lgammaf(x), lgamma(x))
 FN i32 neg_(i32 x) { return i32(0u - u32(x)); }
 FN u32 neg_(u32 x) { return 0u - x; }
 FN i32 abs_(i32 x) { return x < 0 ? neg_(x) : x; }
 FN i32 sign_(i32 x) { return (x > 0) - (x < 0); }
-FN u32 sign_(u32 x) { return x != 0; }
+FN u32 sign_(u32 x) { return x > 0u; }
 FN b1 is_finite_(f32 x) { return fabsf(x) < f32_infinity(); }
 FN b1 is_finite_(f64 x) { return fabs(x) < f64_infinity(); }
 
@@ -88,6 +89,22 @@ FN f64 erf_inv_(f64 x) {
   return x < 0 ? -y : x > 0 ? y : x;
 }
 
+// M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions (1964): 6.3.7 reflects, 6.3.5 steps up, and beyond
+// 10 the asymptotic series 6.3.18 is exact to float64.
+FN f64 digamma_(f64 x) {
+  f64 y = 0.0;
+  if (x <= 0.0) {
+    if (x == floor(x)) return f64_nan();
+    y = -3.14159265358979323846 / tan(3.14159265358979323846 * (x - rint(x)));
+    x = 1.0 - x;
+  }
+  for (; x < 10.0; x += 1.0) y -= 1.0 / x;
+  const f64 z = 1.0 / (x * x);
+  const f64 series = z * (1.0 / 12 - z * (1.0 / 120 - z * (1.0 / 252 - z * (1.0 / 240 - z * (1.0 / 132 - z * (691.0 / 32760 - z / 12))))));
+  return y + log(x) - 0.5 / x - series;
+}
+FN f32 digamma_(f32 x) { return f32(digamma_(f64(x))); }
+
 #define COMMON(T) \
   FN T add_(T a, T b) { return a + b; } FN T sub_(T a, T b) { return a - b; } FN T mul_(T a, T b) { return a * b; } \
   FN b1 lt_(T a, T b) { return a < b; } FN b1 le_(T a, T b) { return a <= b; } FN b1 gt_(T a, T b) { return a > b; } \
@@ -120,6 +137,8 @@ FN f32 atan2_(f32 a, f32 b) { return atan2f(a, b); }
 FN f64 atan2_(f64 a, f64 b) { return atan2(a, b); }
 FN f32 pow_(f32 a, f32 b) { return powf(a, b); }
 FN f64 pow_(f64 a, f64 b) { return pow(a, b); }
+FN f32 nextafter_(f32 a, f32 b) { return nextafterf(a, b); }
+FN f64 nextafter_(f64 a, f64 b) { return nextafter(a, b); }
 template <class T> FN T integer_pow_positive(T x, int y) { T p = 1; for (; y; y >>= 1, x = x * x) if (y & 1) p = p * x; return p; }
 FN f32 integer_pow(f32 x, int y) { return y < 0 ? 1.0f / integer_pow_positive(x, -y) : integer_pow_positive(x, y); }
 FN i32 integer_pow(i32 x, int y) { return integer_pow_positive(x, y); }

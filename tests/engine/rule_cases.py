@@ -1,0 +1,263 @@
+"""Cases for every rule of lowering: functions of one drone's arrays."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from crazysim.pytree import PyTree, leaf
+
+N_WORLDS, N_DRONES = 7, 3  # 21 lanes: not a multiple of any vector's or block's length
+
+
+class Given(PyTree):
+    """Inputs of a case."""
+
+    x: jax.Array = leaf("drone", 1)
+    """Numbers of both signs, two of them equal. (6,)"""
+    m: jax.Array = leaf("drone", 2)
+    """A matrix. (3, 3)"""
+    big: jax.Array = leaf("drone", 2)
+    """A matrix. (6, 6)"""
+    i: jax.Array = leaf("drone", 1)
+    """Integers from -2 to 8. (4,)"""
+    u: jax.Array = leaf("drone", 1)
+    """Any 32 bits. (3,)"""
+    table: jax.Array = leaf("shared", 1)
+    """Numbers that all drones share. (8,)"""
+    nan: jax.Array = leaf("drone", 1)
+    """Numbers, NaN and infinities. (6,)"""
+
+
+CASES = {}
+
+
+def case(fn):
+    CASES[fn.__name__] = fn
+    return fn
+
+
+def spd(m):
+    return m @ m.T + 2.0 * jnp.eye(len(m))
+
+
+# Element-wise
+@case
+def arithmetic(g):
+    x, y = g.x, g.x[::-1] + 0.3
+    return jnp.stack([x + y, x - y, x * y, x / y, -x, jnp.abs(x), jnp.sign(x), jnp.maximum(x, y), jnp.minimum(x, y)])
+
+
+@case
+def functions(g):
+    x, p = g.x, jnp.abs(g.x) + 0.1
+    few = [jnp.sin(x), jnp.cos(x), jnp.tan(x), jnp.exp(x), jnp.log(p), jnp.sqrt(p), jnp.tanh(x), jax.lax.rsqrt(p)]
+    more = [jnp.arctan2(x, x[::-1]), jnp.arcsin(x / 4), jnp.arccos(x / 4), jnp.arctan(x), jnp.sinh(x), jnp.cosh(x)]
+    rest = [jnp.expm1(x), jnp.log1p(p), jnp.cbrt(x), jnp.exp2(x), p**x, x**3, p**-2, jax.nn.sigmoid(x)]
+    last = [jax.lax.erf(x), jax.lax.erf_inv(x / 4), jnp.arcsinh(x), jnp.arctanh(x / 4), jnp.arccosh(p + 1)]
+    return jnp.stack(few + more + rest + last)
+
+
+@case
+def far_angles(g):
+    return jnp.stack([jnp.sin(1e3 * g.x), jnp.cos(1e3 * g.x), jnp.sin(1e5 * g.x), jnp.cos(1e5 * g.x)])
+
+
+@case
+def rounding(g):
+    x = 3 * g.x
+    return jnp.stack([jnp.floor(x), jnp.ceil(x), jnp.round(x), jax.lax.round(x), jnp.fmod(x, 0.7), x % 0.7, x // 0.7])
+
+
+@case
+def comparisons(g):
+    x, y = g.x, g.x[::-1]
+    return jnp.stack([x < y, x <= y, x > y, x >= y, x == y, x != y, (x > 0) & (y > 0), (x > 0) | (y > 0), ~(x > 0)])
+
+
+@case
+def not_finite(g):
+    x, y = g.nan, g.nan[::-1]
+    limits = [jnp.maximum(x, y), jnp.minimum(x, 0.5), jnp.clip(x, -1, 1), jnp.where(x < 0, 0, x), jnp.sign(x)]
+    return jnp.stack([jnp.isfinite(x), jnp.isnan(x), *limits, jnp.where(x > 1, 1.0, x)])
+
+
+@case
+def integers(g):
+    a, b = g.i, g.i[::-1]
+    return jnp.stack([a + b, a - b, a * b, a // b, a % b, jax.lax.div(a, b), jax.lax.rem(a, b), abs(a), a & b, a | b,
+                      ~a, a ^ b, a << 3, a >> 1, jnp.sign(a), -a])  # fmt: skip
+
+
+@case
+def words(g):
+    u, n = g.u, jnp.uint32([0, 5, 31])
+    out = jnp.stack([u << n, u >> n, u + u[::-1], u * jnp.uint32(2654435761), ~u, u ^ n])
+    return jax.lax.bitcast_convert_type(out, jnp.int32)
+
+
+@case
+def conversions(g):
+    x = jnp.concatenate([g.x * 1e3, jnp.stack([g.x[0] * 1e12, jnp.nan + g.x[0]])])
+    return jnp.concatenate([
+        x.astype(jnp.int32), g.i, (g.x > 0).astype(jnp.int32), jax.lax.bitcast_convert_type(g.x, jnp.int32),
+        g.i.astype(jnp.float32).astype(jnp.int32), g.i.astype(bool).astype(jnp.int32),
+    ])  # fmt: skip
+
+
+# Movement
+@case
+def movement(g):
+    m = g.m
+    return jnp.concatenate([
+        m.T.ravel(), m[::-1].ravel(), jnp.pad(m, ((1, 0), (0, 2)), constant_values=2.0).ravel(), jnp.tile(m[0], 2),
+        jnp.roll(g.x, 2), g.big[1:5:2, ::3].ravel(), jnp.repeat(m[:, 0], 2), jnp.diag(m), jnp.rot90(m).ravel(),
+        jnp.stack(jnp.split(g.x, 3)).ravel(), m[jnp.array([2, 0, 2])].ravel(), m.at[1].set(7.0).ravel(),
+        m.at[:, 0].add(g.x[:3]).ravel(), jnp.broadcast_to(g.x[:1], (4,)), jnp.concatenate([g.x, m[0]])[2:5],
+    ])  # fmt: skip
+
+
+# Reductions
+@case
+def reductions(g):
+    m, t = g.m, g.x > 0
+    return jnp.concatenate([m.sum(0), m.prod(1), m.max(0), m.min(1), jnp.stack([t.any(), t.all()]), m.mean()[None],
+                            jnp.linalg.norm(m, axis=0), m.std(1), jnp.array([]).sum()[None]])  # fmt: skip
+
+
+@case
+def argmin_and_sort(g):
+    m, x = g.m, g.x
+    return jnp.concatenate([jnp.argmin(m, 0), jnp.argmax(x)[None], jnp.argmax(g.nan)[None], jnp.sort(x), jnp.argsort(x),
+                            jnp.argsort(jnp.round(x), stable=True), jnp.sort(g.i), jnp.median(x)[None]])  # fmt: skip
+
+
+@case
+def sort_not_finite(g):
+    return jnp.sort(g.nan)
+
+
+@case
+def cumulative(g):
+    return jnp.stack([jnp.cumsum(g.x), jnp.cumprod(g.x), jax.lax.cummax(g.x), jax.lax.cummin(g.x, reverse=True)])
+
+
+@case
+def products(g):
+    batch = jnp.einsum("bij,bjk->bik", jnp.stack([g.m, g.m.T]), jnp.stack([g.m, g.m]))
+    return jnp.concatenate([(g.m @ g.m).ravel(), g.big @ g.x, jnp.vdot(g.x, g.x)[None], batch.ravel(),
+                            jnp.outer(g.x, g.x).ravel(), jnp.cross(g.m[0], g.m[1])])  # fmt: skip
+
+
+@case
+def inner_vmap(g):
+    return jax.vmap(lambda row, s: s * jnp.linalg.norm(row) + row)(g.m, g.x[:3])
+
+
+# Structure
+@case
+def cond(g):
+    two = jax.lax.cond(g.x[0] > 0, lambda x: jnp.sin(x), lambda x: x * x, g.x)
+    three = jax.lax.switch(g.i[0], [lambda x: x, lambda x: 2 * x, lambda x: -x], g.x)
+    return jnp.stack([two, three, jnp.select([g.x > 1, g.x < -1], [g.x, -g.x], 0.0)])
+
+
+@case
+def loops(g):
+    fixed = jax.lax.fori_loop(0, 5, lambda k, x: x * 0.9 + 0.1 * k, g.x)
+    last, each = jax.lax.scan(lambda c, y: (c + y, c * y), g.x[0], g.x)
+    back, _ = jax.lax.scan(lambda c, y: (0.5 * c + y, None), g.x[0], g.x, reverse=True)
+    return jnp.concatenate([fixed, last[None], each, back[None]])
+
+
+@case
+def loop_until(g):
+    x, n = jax.lax.while_loop(
+        lambda c: (jnp.abs(c[0]) > 0.1) & (c[1] < 40), lambda c: (0.7 * c[0], c[1] + 1), (g.x[0], 0)
+    )
+    count = jax.lax.fori_loop(0, g.i[1], lambda k, c: c + k, 0)
+    return jnp.stack([x, n, count])
+
+
+@case
+def index_by_a_number(g):
+    k = g.i[0]
+    clipped = jnp.clip(k, 0, 5)
+    return jnp.concatenate([
+        g.x[clipped][None], g.table[clipped][None], g.m[jnp.clip(k, 0, 2)], jax.lax.dynamic_slice(g.x, (k,), (2,)),
+        g.x.at[clipped].set(9.0), g.x.at[clipped].add(1.0), g.x.at[k].set(5.0, mode="drop"),
+        g.big[jnp.clip(g.i[1], 0, 5), jnp.clip(g.i[2], 0, 5)][None], g.x.at[k].multiply(2.0, mode="clip"),
+        jnp.take(g.x, jnp.clip(g.i, 0, 5)), jnp.take(g.table, g.i, mode="clip"), g.x.at[g.i].max(0.5, mode="drop"),
+        jax.lax.dynamic_update_slice(g.x, g.m[0], (k,)), g.x.at[g.i].get(mode="fill", fill_value=-1.0),
+        jax.lax.dynamic_update_slice(g.m, g.m[:1, :2], (k, g.i[1])).ravel(), g.x[jnp.array([1, -1])],
+    ])  # fmt: skip
+
+
+@case
+def interpolation(g):
+    return jnp.interp(g.x, jnp.linspace(-2, 2, 8), g.table)
+
+
+@case
+def small_systems(g):
+    a, b = spd(g.m), spd(g.big)
+    low = jnp.linalg.cholesky(a)
+    return jnp.concatenate([
+        low.ravel(), jax.scipy.linalg.cho_solve((low, True), g.x[:3]), jnp.linalg.solve(a, g.m[0]),
+        jax.scipy.linalg.solve_triangular(b, g.x, lower=False), jnp.linalg.inv(a).ravel(), jnp.linalg.det(a)[None],
+        jnp.linalg.solve(jnp.roll(b, 1, 0), g.x), jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(b), g.x),
+    ])  # fmt: skip
+
+
+@case
+def nested_calls(g):
+    inner = jax.jit(lambda x: jax.checkpoint(lambda y: jnp.sin(y) * y)(x))
+    return jnp.concatenate(
+        [inner(g.x), jax.nn.relu(g.x), jax.nn.softplus(g.x), jnp.linalg.norm(jax.jacfwd(inner)(g.x), axis=1)]
+    )
+
+
+@case
+def own_gradient(g):
+    return jax.grad(lambda x: jnp.sum(jnp.tanh(g.big @ x) * g.x))(g.x)
+
+
+def random_bits(key, g):
+    """Bits must be those of JAX's own generator, exactly."""
+    a, b = jax.random.split(jax.random.fold_in(key, g.i[0]))
+    c = jax.random.key(g.i[1])
+    bits = [jax.random.bits(a, (5,)), jax.random.bits(c, (2,)), jax.random.key_data(jnp.where(g.x[0] > 0, a, b))]
+    return jax.lax.bitcast_convert_type(jnp.concatenate(bits), jnp.int32)
+
+
+def random_numbers(key, g):
+    a, b, c = jax.random.split(jax.random.fold_in(key, g.u[0]), 3)
+    numbers = [jax.random.uniform(a, (4,)), jax.random.normal(b, (3,)), jax.random.randint(c, (2,), 0, 100)]
+    return jnp.concatenate([*numbers, jax.random.bernoulli(a, 0.3)[None], jax.random.permutation(b, g.x)])
+
+
+RANDOM = {"random_bits": random_bits, "random_numbers": random_numbers}
+
+
+def given():
+    """Return inputs that differ from drone to drone."""
+    rng = np.random.default_rng(0)
+    shape = (N_WORLDS, N_DRONES)
+    x = rng.uniform(-3, 3, (*shape, 6))
+    x[..., 3] = x[..., 1]
+    special = rng.choice([np.nan, np.inf, -np.inf, 0.5, -2.0, 0.0], (*shape, 6))
+    return Given(
+        x=jnp.asarray(x, jnp.float32),
+        m=jnp.asarray(rng.normal(size=(*shape, 3, 3)), jnp.float32),
+        big=jnp.asarray(rng.normal(size=(*shape, 6, 6)), jnp.float32),
+        i=jnp.asarray(rng.integers(-2, 9, (*shape, 4)), jnp.int32),
+        u=jnp.asarray(rng.integers(0, 2**32, (*shape, 3), dtype=np.uint32)),
+        table=jnp.asarray(rng.normal(size=8), jnp.float32),
+        nan=jnp.asarray(special, jnp.float32),
+    )
+
+
+def of_one(g):
+    """Return the shapes and types of what one drone is given."""
+    kinds = Given("d", "d", "d", "d", "d", "shared", "d")
+    strip = {"d": 2, "shared": 0}
+    return jax.tree.map(lambda s, x: jax.ShapeDtypeStruct(x.shape[strip[s] :], x.dtype), kinds, g)

@@ -1,0 +1,107 @@
+"""The interpreter, against JAX."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import shared_sim
+from jax.extend.random import threefry2x32_p
+
+from crazysim.core.stage import stage
+from crazysim.engine import interpret, lanes
+from crazysim.engine.build import build_program
+from crazysim.engine.lower import lower_function
+from crazysim.engine.program import Segment
+from crazysim.pytree import PyTree, leaf
+
+ONE = jax.ShapeDtypeStruct((), np.float32)
+
+
+def test_random_bits_are_those_of_jax():
+    words = np.random.default_rng(0).integers(0, 2**32, (4, 100), dtype=np.uint32)
+    for found, expected in zip(interpret.threefry2x32(*words), threefry2x32_p.bind(*words), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_lanes_leave_a_loop_one_by_one():
+    def halve(x):
+        return jax.lax.while_loop(lambda c: c[0] > 1, lambda c: (0.5 * c[0], c[1] + 1), (x, jnp.float32(0)))
+
+    x = np.float32([0.5, 3.0, 40.0])
+    halved, n = interpret.run(lower_function(halve, ONE), [x], x.shape)
+    np.testing.assert_array_equal(halved, [0.5, 0.75, 0.625])
+    np.testing.assert_array_equal(n, [0, 2, 6])
+
+
+def test_an_observer_gets_every_operation_with_its_results():
+    seen = []
+    block = lower_function(lambda x: jnp.exp(x) + 1, ONE)
+    interpret.run(
+        block, [np.zeros(2, np.float32)], (2,), observe=lambda op, out: seen.append((op.name, float(out[0][0])))
+    )
+    assert seen == [("exp", 1.0), ("add", 2.0)]
+
+
+@pytest.fixture(scope="module")
+def step():
+    """Return the program of a built-in step, and leaves with what it reads as one array behind them."""
+    sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
+    program = build_program(list(sim._step.stages), sim.data, watched=lambda data: jax.tree.leaves(data.states))
+    leaves = jax.tree.leaves(sim.data)
+    packed = jnp.concatenate([leaves[i].ravel() for i in program.packed])
+    return program, [*leaves, packed]
+
+
+@pytest.mark.parametrize("n_steps", [3, np.int32(3)])
+def test_steps_of_the_interpreter_are_steps_of_lanes(step, n_steps):
+    """Under jit, however the number of steps is given; equal but for contraction of products and sums by XLA."""
+    program, leaves = step
+    found, flagged = jax.jit(lambda x: interpret.steps(program, x, n_steps))(leaves)
+    expected, _ = jax.jit(lambda x: lanes.steps(program, x, n_steps))(leaves)
+    assert not flagged.any()
+    for i, x, y in zip(program.written, found, expected, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6, err_msg=program.leaves[i].name)
+
+
+def test_vmap_is_a_loop(step):
+    program, leaves = step
+    i = next(i for i, leaf in enumerate(program.leaves) if leaf.name == "states.vel")
+    many = jnp.stack([leaves[i], leaves[i] + 1.0])
+    run = jax.jit(jax.vmap(lambda x: interpret.steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0]))
+    one = jax.jit(lambda x: interpret.steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0])(many[1])
+    for x, y in zip(run(many), one, strict=True):
+        np.testing.assert_array_equal(x[1], y)
+
+
+# Leaves --------------------------------------------------------------------------------------------------------------
+
+
+class Own(PyTree):
+    """A random key of each drone's own."""
+
+    key: jax.Array = leaf("drone", 0)
+    """Key of the next draw. ()"""
+    drawn: jax.Array = leaf("drone", 0)
+    """Last draw. ()"""
+
+
+@stage("drone")
+def draw(data):
+    mine = data.plugins["own"]
+    key, use = jax.random.split(mine.key)
+    new = mine.replace(key=key, drawn=jax.random.uniform(use))
+    return data.replace(plugins=data.plugins | {"own": new})
+
+
+@pytest.mark.parametrize("steps", [lanes.steps, interpret.steps])
+def test_a_stage_may_write_random_keys(steps):
+    sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
+    own = Own(jax.random.split(jax.random.key(5), (3, 2)), jnp.zeros((3, 2)))
+    data = sim.data.replace(plugins={"own": own})
+    program = build_program([draw], data)
+    assert isinstance(program.segments[0], Segment)
+    written, _ = steps(program, jax.tree.leaves(data), 2)
+    expected = draw(draw(data)).plugins["own"]
+    found = dict(zip((program.leaves[i].name.split(".")[-1] for i in program.written), written, strict=True))
+    np.testing.assert_array_equal(found["drawn"], expected.drawn)
+    np.testing.assert_array_equal(jax.random.key_data(found["key"]), jax.random.key_data(expected.key))

@@ -1,0 +1,215 @@
+"""Looking into the engine: listings, dumps, source, and the first place at which two engines differ."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from blocks import program_of
+from cases import shared_sim, with_states
+
+from crazysim.core.stage import stage
+from crazysim.engine import Step, compare, dump, lanes, listing, ops, source
+from crazysim.engine.build import build_program
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import Builder
+from crazysim.engine.lower import lower_function
+from crazysim.engine.lower_stages import lower_stages
+
+F = np.float32
+ONE = jax.ShapeDtypeStruct((), F)
+
+
+@stage("drone")
+def sway(data):
+    """Push along x by the sine of the height."""
+    force = data.states.force
+    x = data.params.mass[0] * jnp.sin(data.states.pos[2])
+    return data.replace(states=data.states.replace(force=jnp.stack([x, force[1], force[2]])))
+
+
+@stage("world")
+def follow(data):
+    """Give the second drone the force of the first."""
+    force = data.states.force
+    return data.replace(states=data.states.replace(force=jnp.stack([force[0], force[0]])))
+
+
+def undeclared(data):
+    return data.replace(states=data.states.replace(torque=2 * data.states.torque))
+
+
+@pytest.fixture(scope="module")
+def data():
+    return shared_sim(n_worlds=3, n_drones=2, control="rotor_vel").data
+
+
+def test_a_program_is_listed_with_the_names_of_fields_and_stages(data):
+    text = str(lower_stages([sway], data))
+    assert text == (
+        "segment of one drone, at each step: sway\n"
+        "  %0: float32 = states.pos[2]\n"
+        "  %1: float32 = params.mass[0]\n"
+        "  # sway\n"
+        "  %2: float32 = sin(%0)\n"
+        "  %3: float32 = mul(%1, %2)\n"
+        "  states.force[0] = %3\n"
+    )
+
+
+def test_a_packed_number_keeps_the_name_of_its_field(data):
+    assert "= params.mass[0]\n" in str(build_program([sway], data))
+    rows = build_program([sway], data, rows=lambda written: written)
+    assert "states.force[0] = " in str(rows)
+
+
+def test_segments_of_worlds_name_the_drone_and_unfused_stages_their_reason(data):
+    from crazysim.core.stage import as_stages
+
+    text = str(build_program(as_stages({"follow": follow, "mine": undeclared}), data))
+    assert "states.force[0] of drone 1 = " in text
+    assert "each stage mine of all worlds, unfused: it is not declared for one drone or one world\n" in text
+    assert "  writes states.torque\n" in text
+
+
+def test_blocks_of_operations_are_indented():
+    text = listing.of_block(lower_function(lambda x: jax.lax.fori_loop(0, 70, lambda _, y: y * 0.5, x), ONE))
+    assert "loop(" in text
+    assert "length=70) {\n" in text
+    assert "\n    return " in text
+
+
+# Dumps ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_dump_has_the_jaxprs_and_the_program_after_each_pass(data, tmp_path, monkeypatch):
+    monkeypatch.setenv("CRAZYSIM_DUMP", str(tmp_path / "out"))
+    build_program([sway], data)
+    names = [
+        file.name.split("-", 2)[2] for file in sorted((tmp_path / "out").iterdir(), key=lambda f: f.name.split("-")[1])
+    ]
+    assert names == ["sway.jaxpr", "program.lowered", "program.fuse", "program.hoist", "program.pack_shared"]
+    jaxpr = next((tmp_path / "out").glob("*sway.jaxpr")).read_text()
+    assert "sin" in jaxpr
+
+
+def test_nothing_is_dumped_where_no_folder_is_set(tmp_path, monkeypatch):
+    monkeypatch.delenv("CRAZYSIM_DUMP", raising=False)
+    assert dump.write("a", "text") is None
+    monkeypatch.setenv("CRAZYSIM_DUMP", str(tmp_path))
+    file = dump.write("kernel of 'x'/command", "text")
+    assert file is not None
+    assert file.read_text() == "text"
+    assert file.name.endswith("kernel_of_x_command")
+
+
+# Source --------------------------------------------------------------------------------------------------------------
+
+
+def lines(fn, *inputs):
+    writer = source.Writer()
+    block = lower_function(fn, *[ONE for _ in inputs])
+    outputs = writer.block(block, inputs, 0)
+    return writer.lines, outputs
+
+
+def test_source_is_one_assignment_an_operation():
+    text, outputs = lines(lambda x, y: jnp.exp(x) * y / 2.0, "x", "y")
+    assert text == [
+        "const auto v1 = exp_(x);",
+        "const auto v2 = v1 * y;",
+        "const auto v3 = v2 / f32(0x1.0000000000000p+1);",
+    ]
+    assert outputs == ["v3"]
+
+
+def test_sine_and_cosine_of_the_same_number_are_computed_together():
+    text, outputs = lines(lambda x: jnp.sin(x) + jnp.cos(x), "x")
+    assert sum("sin_cos(" in line for line in text) == 1
+    assert outputs == ["v2"]
+
+
+def test_a_limit_is_one_instruction():
+    assert "at_least(x, f32(0x0.0p+0))" in lines(lambda x: jnp.where(x < 0, 0.0, x), "x")[0][-1]
+    assert "at_most(x, y)" in lines(lambda x, y: jnp.where(x > y, y, x), "x", "y")[0][-1]
+    assert "select_n_(" in lines(lambda x, y: jnp.where(x > y, x, y), "x", "y")[0][-1]
+
+
+@pytest.mark.parametrize("x, text", [
+    (F(0.1), "f32(0x1.99999a0000000p-4)"), (F(np.nan), "f32_nan()"), (np.float64(-np.inf), "-f64_infinity()"),
+    (np.int32(-(2**31)), "i32(-2147483647 - 1)"), (np.uint32(2**32 - 1), "u32(4294967295u)"), (np.bool_(True), "b1(1)"),
+])  # fmt: skip
+def test_constants_are_written_exactly(x, text):
+    assert source.literal(x) == text
+
+
+def test_an_operation_without_source_is_refused_when_the_step_is_planned(data, monkeypatch):
+    """The error names stage, operation and version, before any compiler runs."""
+    import dataclasses
+
+    from crazysim.engine import kernel
+
+    monkeypatch.setitem(ops.TABLE, "sin", dataclasses.replace(ops.TABLE["sin"], source=""))
+    program = build_program([sway], data)
+    with pytest.raises(UnsupportedError, match=r"primitive 'sin'.*stage 'sway', jax") as error:
+        kernel.write(program, "host")
+    assert (error.value.stage, error.value.primitive) == ("sway", "sin")
+
+
+def test_a_leaf_of_a_type_that_kernels_do_not_have_is_named(x64):
+    from crazysim.engine import kernel
+
+    builder = Builder(stage="all")
+    x = builder.input(np.int64)
+    program, _ = program_of(builder.finish([x]), [np.zeros(3, np.int64)], 3)
+    with pytest.raises(UnsupportedError, match=r"type int64, which .* has"):
+        kernel.write(program, "cuda")
+
+
+# Differences ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def moving(data):
+    return with_states(data, pos=[0.1, 0.2, 0.7], vel=[0.3, -0.2, 0.1])
+
+
+def test_equal_engines_do_not_differ(moving):
+    assert compare.first_difference({"sway": sway, "mine": undeclared}, moving, engines=("plain", "lanes")) is None
+
+
+def test_the_first_difference_has_stage_field_element_and_operation(moving, monkeypatch):
+    """A defect in XLA's form of one operation."""
+    import dataclasses
+
+    wrong = dataclasses.replace(ops.TABLE["sin"], xla=lambda x: jax.lax.sin(x) + 0.01)
+    monkeypatch.setitem(ops.TABLE, "sin", wrong)
+    found = compare.first_difference({"mine": undeclared, "sway": sway}, moving, engines=("plain", "lanes"))
+    assert found is not None
+    assert (found.stage, found.leaf, found.index[2:]) == ("sway", "states.force", (0,))
+    assert abs(found.values[1] - found.values[0]) > 1e-4
+    assert "%2: float32 = sin(%0) of stage 'sway'" in found.operation
+    assert str(found).startswith("stage 'sway': states.force")
+
+
+def test_a_program_with_all_values_returns_each_operation(moving):
+    program = lower_stages([sway], moving)
+    seen, operations = compare.with_all_values(program)
+    assert [op.name for op in operations] == ["sin", "mul"]
+    more = [jnp.zeros((3, 2)) for _ in operations]
+    (sine, product), _ = lanes.steps(seen, [*jax.tree.leaves(moving), *more], 1)
+    np.testing.assert_allclose(sine, np.sin(0.7), rtol=1e-6)
+    np.testing.assert_allclose(product, np.sin(0.7) * moving.params.mass[0], rtol=1e-6)
+
+
+def test_nan_is_equal_to_nan_and_nothing_else(moving):
+    bad = moving.replace(states=moving.states.replace(pos=moving.states.pos.at[1, 1, 2].set(jnp.nan)))
+    assert compare.first_difference({"sway": sway}, bad, engines=("plain", "lanes")) is None
+    x = np.float32([[[1.0, np.nan]]])
+    assert compare._differs(x, np.float32([[[1.0, 2.0]]]), 1e-5) == (0, 0, 1)
+    assert compare._differs(x, x.copy(), 1e-5) is None
+
+
+def test_the_stages_of_a_step_are_named_in_its_program():
+    sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
+    program = Step(sim.step_pipeline, "lanes").plan(sim.data).program
+    assert [s.stages for s in program.segments] == [tuple(sim.step_pipeline)]

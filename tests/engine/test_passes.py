@@ -1,0 +1,274 @@
+"""Passes: what a program computes stays, what it takes becomes less. Programs are well formed after each."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import shared_sim
+
+from crazysim.core.stage import as_stages, stage
+from crazysim.engine import interpret, passes
+from crazysim.engine.ir import Builder, Operation, Value
+from crazysim.engine.layout import as_rows, pack_shared
+from crazysim.engine.lower import is_key
+from crazysim.engine.lower_stages import lower_stages
+from crazysim.engine.program import Leaf, Program, Segment
+from crazysim.engine.verify import VerificationError, verify
+
+N_WORLDS = 5
+
+
+def flat(program, leaves):
+    """Return the numbers of one-drone worlds by place. (N_WORLDS,) or ()"""
+    numbers = {}
+    for i, x in enumerate(leaves):
+        leaf, x = program.leaves[i], np.asarray(jax.random.key_data(x) if is_key(x) else x)
+        columns = x.reshape(N_WORLDS, -1).T if leaf.scope in ("drone", "world") else x.ravel()
+        numbers |= {(i, k): column for k, column in enumerate(columns)}
+    return numbers
+
+
+def run(program, numbers, n_steps):
+    """Return all numbers after some steps, by the interpreter alone."""
+    numbers = dict(numbers)
+    shape = (N_WORLDS,)
+    hoisted = {
+        id(s): interpret.run(s.hoisted, [numbers[slot] for slot in s.hoisted_reads], shape) for s in program.segments
+    }
+    for phase, times in (("first", 1), ("each", n_steps), ("last", 1)):
+        for _ in range(times):
+            for s in program.of(phase):
+                out = interpret.run(s.block, [*(numbers[slot] for slot in s.reads), *hoisted[id(s)]], shape)
+                numbers.update(zip(s.writes, out, strict=True))
+    return numbers
+
+
+@pytest.fixture(scope="module", params=["attitude", "state"])
+def pipeline(request):
+    """Return the program of a built-in pipeline before any pass, and numbers to begin with."""
+    settings = {"state_freq": 100} if request.param == "state" else {}
+    sim = shared_sim(n_worlds=N_WORLDS, n_drones=1, control=request.param, **settings)
+    program = lower_stages(as_stages(sim.step_pipeline), sim.data)
+    rng = np.random.default_rng(0)
+    numbers = flat(program, jax.tree.leaves(sim.data))
+    for slot, x in numbers.items():
+        if program.leaves[slot[0]].scope == "drone" and x.dtype == np.float32:
+            numbers[slot] = (x + 0.3 * rng.normal(size=x.shape)).astype(np.float32)
+    return verify(program), numbers
+
+
+def test_fusing_changes_no_number(pipeline):
+    """Bit by bit: the same operations in the same order."""
+    program, numbers = pipeline
+    fused = verify(passes.fuse(program))
+    assert len(fused.segments) == 1 < len(program.segments)
+    assert fused.segments[0].stages == tuple(s.stages[0] for s in program.segments)
+    assert fused.segments[0].n_operations <= sum(s.n_operations for s in program.segments)
+    assert {op.stage for op in fused.segments[0].block.walk()} <= {*fused.segments[0].stages}
+    expected, found = run(program, numbers, 3), run(fused, numbers, 3)
+    for slot, x in expected.items():
+        np.testing.assert_array_equal(found[slot], x, err_msg=str(slot))
+
+
+def test_hoisting_takes_work_out_of_the_loop(pipeline):
+    """Equal to the rounding of a product with an inverse instead of a division."""
+    program, numbers = pipeline
+    fused = passes.fuse(program)
+    hoisted = verify(passes.hoist(fused))
+    (before,), (after,) = fused.segments, hoisted.segments
+    assert after.hoisted.outputs
+    assert after.n_operations < before.n_operations
+    assert {"cos", "sin", "div"} & {op.name for op in after.hoisted.operations}
+    assert hoisted.changing().isdisjoint(after.hoisted_reads)
+    expected, found = run(fused, numbers, 3), run(hoisted, numbers, 3)
+    for slot, x in expected.items():
+        np.testing.assert_allclose(found[slot], x, rtol=2e-4, atol=2e-5, err_msg=str(slot))
+
+
+def test_packing_moves_shared_numbers_into_one_leaf(pipeline):
+    program, numbers = pipeline
+    fused = passes.fuse(program)
+    packed = verify(pack_shared(fused))
+    new = len(program.leaves)
+    assert packed.leaves[new].shape == (sum(program.leaves[i].size for i in packed.packed),)
+    assert not {leaf for leaf, _ in packed.segments[0].reads} & {*packed.packed}
+    row = [numbers[i, k] for i in packed.packed for k in range(program.leaves[i].size)]
+    more = numbers | {(new, k): x for k, x in enumerate(row)}
+    expected, found = run(fused, numbers, 2), run(packed, more, 2)
+    assert all((found[slot] == x).all() for slot, x in expected.items())
+
+
+def test_rows_hold_the_numbers_of_the_leaves_that_are_written(pipeline):
+    program, numbers = pipeline
+    fused = passes.fuse(program)
+    stored = verify(as_rows(fused, lambda written: written))
+    rows = [leaf for leaf in stored.leaves if leaf.rows_of]
+    assert sorted(i for leaf in rows for i in leaf.rows_of) == fused.written
+    assert stored.written == [i for i, leaf in enumerate(stored.leaves) if leaf.rows_of]
+    place = {}
+    for i, leaf in enumerate(stored.leaves):
+        members = [(m, k) for m in leaf.rows_of for k in range(stored.leaves[m].size)]
+        place |= {slot: (i, row) for row, slot in enumerate(members)}
+    more = numbers | {place[slot]: x for slot, x in numbers.items() if slot in place}
+    expected, found = run(fused, numbers, 2), run(stored, more, 2)
+    assert all((found[place.get(slot, slot)] == x).all() for slot, x in expected.items())
+
+
+# Programs of two numbers --------------------------------------------------------------------------------------------
+
+X, Y, Z, SHARED = (0, 0), (1, 0), (2, 0), (3, 0)
+LEAVES = tuple(Leaf(name, "drone", (N_WORLDS, 1), np.dtype(np.float32)) for name in "xyz") + (
+    Leaf("shared", "shared", (1,), np.dtype(np.float32)),
+)
+
+
+def segment(name, reads, writes, fn, scope="drone", phase="each"):
+    """Return a segment of a function of a builder and values."""
+    b = Builder(stage=name)
+    inputs = [b.input(LEAVES[leaf].dtype) for leaf, _ in reads]
+    return Segment(scope, (name,), phase, b.finish(fn(b, *inputs)), tuple(reads), tuple(writes))
+
+
+def op(name):
+    return lambda b, *args: [b.add(name, args, np.float32)]
+
+
+def test_what_one_stage_writes_the_next_reads_as_a_value():
+    program = Program(LEAVES, 1, (segment("a", [X], [Y], op("exp")), segment("b", [Y], [Z], op("neg"))))
+    (fused,) = verify(passes.fuse(program)).segments
+    assert fused.reads == (X,)
+    assert set(fused.writes) == {Y, Z}
+    assert [x.name for x in fused.block.operations] == ["exp", "barrier", "neg", "barrier"]
+    assert [x.stage for x in fused.block.operations][::2] == ["a", "b"]
+
+
+def test_phases_and_scopes_are_not_joined():
+    stages = [segment("a", [X], [Y], op("exp"), phase="first"), segment("b", [Y], [Z], op("neg")),
+              segment("c", [Z], [X], op("exp"), scope="world"), segment("d", [X], [Y], op("exp"))]  # fmt: skip
+    assert len(passes.fuse(Program(LEAVES, 1, tuple(stages))).segments) == 4
+
+
+def test_only_what_never_changes_is_hoisted():
+    def body(b, x, shared):
+        product = b.add("mul", (b.add("exp", (shared,), np.float32), b.add("exp", (x,), np.float32)), np.float32)
+        return [b.add("div", (product, b.add("add", (shared, np.float32(1)), np.float32)), np.float32)]
+
+    program = Program(LEAVES, 1, (segment("a", [X, SHARED], [X], body),))
+    (after,) = verify(passes.hoist(program)).segments
+    assert [x.name for x in after.hoisted.operations] == ["exp", "add", "div"]
+    assert [x.name for x in after.block.operations] == ["exp", "mul", "mul"]
+    numbers = {X: np.full(N_WORLDS, 0.5, np.float32), SHARED: np.float32(2.0)}
+    np.testing.assert_allclose(
+        run(program, numbers, 1)[X], run(verify(passes.hoist(program)), numbers, 1)[X], rtol=3e-7
+    )
+
+
+def test_what_is_cheap_is_computed_again_instead_of_kept():
+    program = Program(LEAVES, 1, (segment("a", [X, SHARED], [X], lambda b, x, s: op("mul")(b, x, *op("neg")(b, s))),))
+    assert passes.hoist(program).segments == program.segments
+
+
+# Verification -------------------------------------------------------------------------------------------------------
+
+
+def broken(**changes):
+    good = segment("a", [X], [Y], op("exp"))
+    return Program(LEAVES, 1, (dataclasses.replace(good, **changes),))
+
+
+def with_block(fn):
+    b = Builder(stage="a")
+    x = b.input(np.float32)
+    return broken(block=dataclasses.replace(b.finish([x]), operations=tuple(fn(x)), outputs=(x,)))
+
+
+def value(dtype=np.float32):
+    return Value(np.dtype(dtype))
+
+
+WELL_FORMED = segment("a", [X], [Y], op("exp"))
+BROKEN = {
+    "used before it is defined": (
+        broken(block=dataclasses.replace(WELL_FORMED.block, outputs=(value(),))),
+        "before it is defined",
+    ),
+    "operand of another block": (
+        with_block(lambda x: [Operation("exp", (value(),), (value(),))]),
+        "'exp' uses a value",
+    ),
+    "defined twice": (
+        with_block(lambda x: [Operation("exp", (x,), (y := value(),)), Operation("neg", (x,), (y,))]),
+        "defined twice",
+    ),
+    "mixed operands": (
+        with_block(lambda x: [Operation("add", (x, np.int32(1)), (value(),))]),
+        "'add' of float32, int32",
+    ),
+    "result type": (with_block(lambda x: [Operation("lt", (x, x), (value(),))]), "'lt' of float32, float32 to float32"),
+    "float logic": (with_block(lambda x: [Operation("not", (x,), (value(),))]), "'not' of float32"),
+    "unknown operation": (with_block(lambda x: [Operation("fft", (x,), (value(),))]), "'fft' is not in the table"),
+    "half precision": (
+        with_block(lambda x: [Operation("neg", (np.float16(1),), (value(np.float16),))]),
+        "type that the engine",
+    ),
+    "too few inputs": (broken(reads=()), "1 further inputs for 0 hoisted"),
+    "too many outputs": (broken(writes=(Y, Z)), "1 outputs for 2 places"),
+    "place read twice": (broken(reads=(X, X)), "1 inputs for 2 places"),
+    "place out of range": (broken(writes=((1, 1),)), "output 1 of y, which has 1 numbers"),
+    "hoisted number changes": (
+        broken(writes=(X,), hoisted_reads=(X,), hoisted=WELL_FORMED.block),
+        "further inputs for 1 hoisted",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_verification_finds(what):
+    program, message = BROKEN[what]
+    with pytest.raises(VerificationError, match=message):
+        verify(program)
+
+
+def test_verification_finds_phases_out_of_order():
+    late, early = segment("a", [X], [Y], op("exp"), phase="last"), segment("b", [X], [Y], op("exp"))
+    with pytest.raises(VerificationError, match="order of their phases"):
+        verify(Program(LEAVES, 1, (late, early)))
+
+
+def test_every_pass_is_verified_if_that_is_asked_for(monkeypatch):
+    monkeypatch.setenv("CRAZYSIM_VERIFY", "1")
+    with pytest.raises(VerificationError):
+        passes.apply(Program(LEAVES, 1, (WELL_FORMED,)), [lambda program: broken(writes=(Y, Z))])
+
+
+# Stages to programs -------------------------------------------------------------------------------------------------
+
+
+def test_a_guarded_stage_reads_what_it_may_leave_as_it_is():
+    sim = shared_sim(n_worlds=N_WORLDS, n_drones=1, control="rotor_vel")
+
+    @stage("drone", when=lambda data: data.core.steps % 2 == 0)
+    def jump(data):
+        pos = jnp.stack([jnp.sin(data.states.vel[0]), data.states.pos[1], data.states.pos[2]])
+        return data.replace(states=data.states.replace(pos=pos))
+
+    program = verify(lower_stages([jump], sim.data))
+    (only,) = program.segments
+    names = {program.leaves[i].name for i, _ in only.reads}
+    assert names == {"core.steps", "states.pos", "states.vel"}
+    assert [program.leaves[i].name + str(k) for i, k in only.writes] == ["states.pos0"]
+    assert [x.name for x in only.block.walk()][-2:] == ["when", "sin"]
+
+
+def test_zeros_of_shared_parameters_are_no_inputs():
+    sim = shared_sim(n_worlds=N_WORLDS, n_drones=1, control="rotor_vel")
+    stages = as_stages(sim.step_pipeline)
+    names = [leaf.name for leaf in lower_stages(stages, sim.data).leaves]
+    J = names.index("params.J")
+    known = lower_stages(stages, sim.data, {J: frozenset({1, 2, 3, 5, 6, 7})})
+    assert {k for s in known.segments for i, k in s.reads if i == J} <= {0, 4, 8}
+    assert sum(s.n_operations for s in known.segments) < sum(
+        s.n_operations for s in lower_stages(stages, sim.data).segments
+    )

@@ -1,0 +1,127 @@
+"""What is known when a program is made: only what no number contradicts."""
+
+import numpy as np
+import pytest
+
+from crazysim.engine import ops
+from crazysim.engine.ir import Builder
+from crazysim.engine.simplify import known_zero, simplify
+
+F = np.float32
+
+
+def build(name, *args, dtype=F):
+    """Return the result of an operation, and the operations that computing it takes."""
+    b = Builder()
+    x = b.input(dtype)
+    out = b.add(name, [x if a is ... else a for a in args], dtype)
+    return out, x, len(b.operations)
+
+
+@pytest.mark.parametrize(
+    "name, args",
+    [
+        ("add", (..., F(0))),
+        ("add", (F(0), ...)),
+        ("sub", (..., F(0))),
+        ("mul", (..., F(1))),
+        ("mul", (F(1), ...)),
+        ("div", (..., F(1))),
+        ("convert_element_type", (...,)),
+        ("bitcast_convert_type", (...,)),
+        ("select_n", (np.bool_(True), F(3), ...)),
+    ],
+)
+def test_neutral_elements_are_left_out(name, args):
+    out, x, n = build(name, *args)
+    assert out is x
+    assert n == 0
+
+
+@pytest.mark.parametrize("name, args", [("mul", (..., F(0))), ("div", (F(0), ...)), ("sub", (F(0), ...))])
+def test_a_constant_zero_is_computed_with(name, args):
+    """A product with zero is NaN where the other number is infinite."""
+    assert build(name, *args)[2] == 1
+
+
+@pytest.mark.parametrize("dtype", [F, np.float64])
+def test_a_zero_of_a_shared_parameter_takes_its_term_with_it(dtype):
+    zero = known_zero(dtype)
+    product, _, n = build("mul", zero, ..., dtype=dtype)
+    assert (product.dtype, float(product), n) == (dtype, 0.0, 0)
+    assert build("add", product, ..., dtype=dtype)[2] == 0
+    assert build("div", product, ..., dtype=dtype)[2] == 0
+    assert build("mul", build("neg", product, dtype=dtype)[0], ..., dtype=dtype)[2] == 0
+    assert build("sub", zero, ..., dtype=dtype)[2] == 1  # of what is left the sign changes
+    assert build("div", ..., zero, dtype=dtype)[2] == 1
+
+
+def test_only_floats_have_known_zeros():
+    assert known_zero(np.int32) is None
+    assert build("mul", ..., np.int32(0), dtype=np.int32)[0] == 0  # no integer is NaN
+
+
+def test_logic_with_a_constant():
+    b = Builder()
+    x = b.input(bool)
+    true, false = np.bool_(True), np.bool_(False)
+    assert b.add("and", (x, true), bool) is x
+    assert b.add("and", (false, x), bool) == false
+    assert b.add("or", (x, true), bool) == true
+    assert b.add("or", (false, x), bool) is x
+    assert b.operations == []
+
+
+def test_a_selection_between_equals_is_one_of_them():
+    b = Builder()
+    mask, x = b.input(bool), b.input(F)
+    assert b.add("select_n", (mask, x, x), F) is x
+    assert b.add("select_n", (mask, F(2), F(2)), F) == F(2)
+    assert b.add("select_n", (mask, F(0.0), F(-0.0)), F) is not F(0)
+    assert len(b.operations) == 1
+
+
+@pytest.mark.parametrize(
+    "name, args, wanted",
+    [
+        ("div", (7, -2), -3),
+        ("div", (-7, 2), -3),
+        ("div", (5, 0), -1),
+        ("div", (-(2**31), -1), -(2**31)),
+        ("rem", (-7, 2), -1),
+        ("rem", (5, 0), 5),
+        ("shift_left", (1, 33), 0),
+        ("shift_right_arithmetic", (-8, 40), -1),
+        ("shift_right_logical", (-1, 1), 2**31 - 1),
+        ("abs", (-(2**31),), -(2**31)),
+    ],
+)
+def test_integers_fold_as_xla_computes_them(name, args, wanted):
+    args = tuple(np.int32(x) for x in args)
+    assert simplify(name, args, np.dtype(np.int32), ()) == wanted
+
+
+@pytest.mark.parametrize(
+    "x, dtype, wanted",
+    [
+        (np.nan, np.int32, 0),
+        (np.inf, np.int32, 2**31 - 1),
+        (-3e9, np.int32, -(2**31)),
+        (-1.5, np.uint32, 0),
+        (5e9, np.uint32, 2**32 - 1),
+        (-1.9, np.int32, -1),
+        (300.0, np.uint8, 255),
+        (1e30, np.int64, 2**63 - 1),
+        (-0.0, bool, False),
+        (np.nan, bool, True),
+    ],
+)
+def test_conversions_fold_as_xla_computes_them(x, dtype, wanted):
+    assert simplify("convert_element_type", (F(x),), np.dtype(dtype), ()) == wanted
+
+
+def test_what_numpy_rounds_otherwise_is_not_folded():
+    inexact = {row.name for row in ops.TABLE.values() if not row.exact and not row.structured}
+    assert {"exp", "sin", "pow", "erf_inv", "integer_pow"} <= inexact
+    assert simplify("exp", (F(1),), np.dtype(F), ()) is None
+    assert simplify("sqrt", (F(2),), np.dtype(F), ()) == np.sqrt(F(2))
