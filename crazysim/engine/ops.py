@@ -157,6 +157,12 @@ def bitcast(x: Any, dtype: Any) -> Any:
     return np.asarray(x).view(dtype)
 
 
+def _power(a: Any, b: Any) -> Any:
+    """Raise to a power; for an exponent of 0.5 NumPy takes the root, which differs at -inf and -0."""
+    root = (b == 0.5) & ((a == 0) | np.isneginf(a))
+    return np.where(root, np.abs(a), np.power(a, b))
+
+
 def _integer_pow(x: Any, y: int) -> Any:
     return x**y if y >= 0 else 1 / x**-y
 
@@ -263,7 +269,7 @@ def _rows() -> list[Row]:
         unary("asinh", np.arcsinh, 16, "asinh"),
         unary("acosh", np.arccosh, 16, "acosh"),
         unary("atanh", np.arctanh, 16, "atanh"),
-        binary("pow", np.power, "f", 16, casadi="power"),
+        binary("pow", _power, "f", 16, casadi="power"),
         unary("erf", _special("erf"), 16, "erf"),
         unary("erfc", _special("erfc"), 16, lambda ca, x: 1 - ca.erf(x)),
         unary("erf_inv", _special("erfinv"), 16, _casadi_erf_inv),
