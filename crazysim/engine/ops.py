@@ -19,7 +19,9 @@ import numpy as np
 
 from crazysim.engine.errors import UnsupportedError
 
-DTYPES = frozenset("bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split())
+DTYPES = frozenset(
+    map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split())
+)
 """Types of numbers. In half precision XLA keeps more digits where it fuses, so that no two engines could agree."""
 
 
@@ -73,7 +75,7 @@ EXPENSIVE = 2
 
 def unsupported(name: str, dtypes: Sequence[np.dtype], result: Any = bool) -> UnsupportedError | None:
     """Return the error of an operation that is not defined for operands and a result of these types, or None."""
-    other = next((x.name for x in (*dtypes, np.dtype(result)) if x.name not in DTYPES), None)
+    other = next((x.name for x in (*dtypes, np.dtype(result)) if x not in DTYPES), None)
     if other is not None:
         return UnsupportedError(f"numbers of type {other}")
     if TABLE[name].accepts(dtypes):
