@@ -19,9 +19,7 @@ import numpy as np
 
 from crazysim.engine.errors import UnsupportedError
 
-DTYPES = frozenset(
-    map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split())
-)
+DTYPES = frozenset(map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split()))
 """Types of numbers. In half precision XLA keeps more digits where it fuses, so that no two engines could agree."""
 
 

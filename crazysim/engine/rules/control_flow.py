@@ -91,7 +91,9 @@ def _platform_index(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Eleme
     platforms = list(eqn.params["platforms"])
     own = sorted({name for names in platforms for name in names or ()} & {"cpu", "gpu", "cuda", "rocm"})
     if own or None not in platforms:
-        raise UnsupportedError(f"primitive 'platform_index' with a branch for {', '.join(own) or 'some platforms only'}")
+        raise UnsupportedError(
+            f"primitive 'platform_index' with a branch for {', '.join(own) or 'some platforms only'}"
+        )
     return [constants(platforms.index(None), np.int32)]
 
 
