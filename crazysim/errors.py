@@ -18,4 +18,4 @@ class RenderError(RuntimeError):
 
 
 class EngineWarning(UserWarning):
-    """A step that runs on a slower engine than asked for, because the faster one does not support it."""
+    """A step that runs on a slower engine than the one that was chosen, which does not support all of it."""

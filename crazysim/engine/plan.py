@@ -92,7 +92,7 @@ class Planner(NamedTuple):
                 stage or the fastest engine is not supported.
         """
         if self.engine == "plain":
-            return self._plain(data, "it was asked for")
+            return self._plain(data, "it was chosen")
         try:
             plan, problems = self._fast(data, zeros)
             trace(plan)
@@ -128,7 +128,7 @@ class Planner(NamedTuple):
         problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
         if self.location.spread and split:
             return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}"), problems
-        engine, why, run = "lanes", "it was asked for", functools.partial(lanes.steps, program)
+        engine, why, run = "lanes", "it was chosen", functools.partial(lanes.steps, program)
         if self.engine == "interpret":
             engine, run = "interpret", functools.partial(interpret.steps, program)
         elif self.engine != "lanes":
@@ -139,8 +139,7 @@ class Planner(NamedTuple):
                     engine = "fused"
                 except UnsupportedError as error:
                     why = str(error)
-                    names = ", ".join(s.__name__ for s in self.stages)
-                    problems.append(f"the kernel of the stages {names} cannot be built: {why}")
+                    problems.append(self._without_kernel(error))
             if why and self.engine == "fused":
                 raise ConfigError(f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'.")
         read = (*program.read, *_needed(program))
@@ -219,6 +218,12 @@ class Planner(NamedTuple):
         if text not in self.reported:
             self.reported.add(text)
             warnings.warn(f"{text}. strict=True raises an error instead.", EngineWarning, stacklevel=2)
+
+    def _without_kernel(self, error: UnsupportedError) -> str:
+        """Return what a kernel does not support, with its stage, or the stages of the kernel, for a message."""
+        if error.stage:
+            return f"stage {error.stage!r} has no kernel: {error.reason}"
+        return f"the kernel of the stages {', '.join(s.__name__ for s in self.stages)} cannot be built: {error.reason}"
 
     def _culprit(self, data: SimData) -> str:
         """Return the stage at which the engine fails, for a message."""

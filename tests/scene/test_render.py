@@ -254,7 +254,7 @@ def test_pictures_are_the_callers_own(sim):
         ({"camera": 4}, "camera 4 does not exist; ids go from 0 to 3"),
         ({"camera": -2}, "camera -2 does not exist"),
         ({"camera": 1.5}, "camera 1.5 does not exist"),
-        ({"world": 2}, "world 2 does not exist; worlds go from 0 to 1"),
+        ({"world": 2}, "world 2 does not exist; choose one from 0 to 1"),
         ({"world": -1}, "world -1 does not exist"),
         ({"width": 0}, "0 x 120 pixels cannot be"),
         ({"height": -5}, "160 x -5 pixels cannot be"),
