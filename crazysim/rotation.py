@@ -145,10 +145,10 @@ def turn(q: Array, rotvec: Array, normalize: bool = True) -> Array:
     """
     s = 0.25 * dot(rotvec, rotvec)
     n_terms = 6 if s.dtype == jnp.float32 else 10
-    sinc = cos = 0.0
-    for n in range(n_terms, -1, -1):  # Horner: every term is one multiply-add
-        sinc = sinc * s + (-1) ** n / math.factorial(2 * n + 1)
-        cos = cos * s + (-1) ** n / math.factorial(2 * n)
+    terms = [((-1) ** n / math.factorial(2 * n + 1), (-1) ** n / math.factorial(2 * n)) for n in range(n_terms + 1)]
+    sinc, cos = terms.pop()
+    for sinc_term, cos_term in terms[::-1]:  # Horner: every term is one multiply-add
+        sinc, cos = sinc * s + sinc_term, cos * s + cos_term
     turned = multiply(q, jnp.concatenate([0.5 * sinc * rotvec, cos], axis=-1))
     return turned * lax.rsqrt(dot(turned, turned)) if normalize else turned
 
