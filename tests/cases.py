@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from crazysim import Sim, load_airframe
 from crazysim.core import functional as F
+from crazysim.core.data import SimControls, create_params
 from crazysim.dynamics import first_principles
 
 FITTED = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
@@ -86,6 +87,23 @@ def with_states(data, **changes):
 def with_params(data, **changes):
     """Return the data with other parameters of its dynamics, as they are given."""
     return data.replace(params=data.params.replace(**{k: jnp.asarray(v) for k, v in changes.items()}))
+
+
+def with_airframes(sim, airframes):
+    """Return the data with the parameters and gains of one airframe in each world, of as many rotors as the sim's."""
+
+    def stacked(shared):
+        return jax.tree.map(lambda *x: jnp.stack(x)[:, None], *shared)
+
+    params = stacked([create_params(sim.dynamics, airframe) for airframe in airframes])
+    each = [SimControls.create(1, 1, sim.control, sim.dynamics, a, sim.configuration.control_freqs) for a in airframes]
+    controls = sim.data.controls
+    for name in ("state", "attitude", "body_rate", "force_torque"):
+        ctrl = getattr(controls, name)
+        if ctrl is not None and ctrl.params is not None:
+            own = stacked([getattr(c, name).params for c in each])
+            controls = controls.replace(**{name: ctrl.replace(params=own)})
+    return sim.data.replace(params=params, controls=controls)
 
 
 def weight(data):

@@ -1,4 +1,4 @@
-"""The cascade of the Crazyflie firmware, outermost first, for one drone with any leading axes."""
+"""Control cascade of the Crazyflie firmware: pure functions for one drone, with any leading axes."""
 
 from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
 from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque

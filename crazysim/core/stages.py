@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -53,7 +54,11 @@ def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integr
     if not fitted_model and control != Control.rotor_vel:
         stages["force_torque_controller"] = force_torque_controller
     stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
-    deriv_fn: DerivFn = fitted_derivative if fitted_model else first_principles_derivative
+    deriv_fn: DerivFn = first_principles_derivative
+    if fitted_model:
+        deriv_fn = fitted_derivative
+    elif integrator.order == 1:
+        deriv_fn = first_principles_euler_derivative
     if integrator != Integrator.euler:
         deriv_fn = held_on_floor(deriv_fn)
     stages["integration"] = Integration(INTEGRATORS[integrator], deriv_fn).stage()
@@ -172,6 +177,12 @@ def clip_thrust_cmd(data: SimData) -> SimData:
 def first_principles_derivative(data: SimData) -> SimStateDeriv:
     """Return the derivative of every drone from first principles."""
     return _derivative(data, first_principles.dynamics, _controls(data).rotor_vel)
+
+
+def first_principles_euler_derivative(data: SimData) -> SimStateDeriv:
+    """Return the derivative of every drone from first principles for an Euler step, stable at any body rate."""
+    dynamics = partial(first_principles.dynamics, dt=1 / data.core.freq)
+    return _derivative(data, dynamics, _controls(data).rotor_vel)
 
 
 def fitted_derivative(data: SimData) -> SimStateDeriv:

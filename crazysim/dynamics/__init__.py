@@ -1,4 +1,4 @@
-"""Pure physics for one drone, with any leading axes."""
+"""Dynamics models: pure functions for one drone, with any leading axes."""
 
 from crazysim.dynamics import first_principles, fitted
 from crazysim.dynamics.core import Dynamics, supported_drones, supported_dynamics

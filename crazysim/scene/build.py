@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from crazysim.drones.airframe import Airframe
-from crazysim.drones.body import LED_MATERIALS, MATERIALS, Part, body_cameras, body_parts
+from crazysim.drones.body import LED_MATERIALS, MATERIALS, BodyGeom, body_cameras, body_geoms
 from crazysim.errors import ConfigError
 from crazysim.scene import mjx
 
@@ -96,11 +96,11 @@ def _no_warnings() -> Iterator[None]:
 
 
 def _add_bodies(spec: mujoco.MjSpec, airframe: Airframe, drones: range) -> None:
-    parts, cameras = body_parts(airframe), body_cameras(airframe)
+    geoms, cameras = body_geoms(airframe), body_cameras(airframe)
     for i in drones:
         body = spec.worldbody.add_body(name=f"drone:{i}", mocap=True)
-        for part in parts:
-            _add_part(body, part, i)
+        for geom in geoms:
+            _add_geom(body, geom, i)
         for camera in cameras:
             mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK if camera.tracks else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
             added = body.add_camera(name=f"{camera.name}:{i}", pos=camera.pos, fovy=camera.fovy, mode=mode)
@@ -108,18 +108,18 @@ def _add_bodies(spec: mujoco.MjSpec, airframe: Airframe, drones: range) -> None:
             added.alt.xyaxes = camera.xyaxes
 
 
-def _add_part(body: mujoco.MjsBody, part: Part, i: int) -> None:
-    geom = body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}"), size=part.size, mass=0)
-    if part.end is None:
-        geom.pos = part.pos
+def _add_geom(body: mujoco.MjsBody, geom: BodyGeom, i: int) -> None:
+    added = body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{geom.kind.upper()}"), size=geom.size, mass=0)
+    if geom.end is None:
+        added.pos = geom.pos
     else:
-        geom.fromto = [*part.pos, *part.end]
-    if part.touches:
-        geom.name, geom.group, geom.condim, geom.rgba = f"{part.name}:{i}", 3, 1, (0.5, 0.5, 0.5, 0.3)
-        _set_touching(geom, part.name == "col_sphere")
+        added.fromto = [*geom.pos, *geom.end]
+    if geom.collides:
+        added.name, added.group, added.condim, added.rgba = f"{geom.name}:{i}", 3, 1, (0.5, 0.5, 0.5, 0.3)
+        _set_touching(added, geom.name == "col_sphere")
     else:
-        geom.group, geom.contype, geom.conaffinity = 2, 0, 0
-        geom.material = f"{part.material}:{i}" if part.material in LED_MATERIALS else part.material
+        added.group, added.contype, added.conaffinity = 2, 0, 0
+        added.material = f"{geom.material}:{i}" if geom.material in LED_MATERIALS else geom.material
 
 
 def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:

@@ -177,7 +177,7 @@ def _nearest(
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
     def gap_at(move: Array, turned: Array) -> Array:
-        q = rotation.turn(quat, turned, normalize=False)
+        q = rotation.turn(quat, turned, 1.0, normalize=False)
         at = into(pos + move + rotation.rotate(q, middle), True)
         columns = [into(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
         return distance(shape, part.shape, at, jnp.stack(columns, axis=-1))
