@@ -14,6 +14,7 @@ from crazysim import ConfigError
 from crazysim.__main__ import main
 from crazysim.envs import AutoReset, DroneEnv, make
 from crazysim.envs.state import bare
+from crazysim.envs.tasks.hover import Hover
 from crazysim.errors import UnknownNameError
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import run as runs
@@ -198,9 +199,16 @@ def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
 
 def test_ppo_finds_the_action_that_pays():
     """With a reward that is largest at 0.5, thirty iterations move the action from 0 to 0.5."""
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Pays(Hover):
+        """Hovering with a reward for the action alone."""
+
+        def rewards(self, data, action, last_action):
+            return {"action": -jnp.sum((action - 0.5) ** 2, axis=-1)}
+
     base = make("hover", 128, freq=500, seconds=0.1)
-    pays = dataclasses.replace(base.task, reward=lambda data, action, last: -jnp.sum((action - 0.5) ** 2, axis=-1))
-    env = AutoReset(DroneEnv(base.sim, pays, freq=500))
+    env = AutoReset(DroneEnv(base.sim, Pays(seconds=0.1), freq=500))
     config = ppo.Config(iterations=30, n_steps=16, minibatches=4, hidden=(16,), init_std=0.3, discount=0.5)
     learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
     assert np.abs(learner.as_policy()(learner.env.obs)).max() < 0.1
