@@ -236,6 +236,11 @@ class DroneEnv(Env):
         return self._step.stages
 
     @property
+    def strict(self) -> bool:
+        """True to raise an error where a step runs unfused for another reason than a documented limit."""
+        return self._step.strict
+
+    @property
     def unfused(self) -> str | None:
         """Reason why its steps cannot be one kernel, as far as it is known without tracing; None if there is none."""
         if self._step.engine not in ("auto", "fused"):

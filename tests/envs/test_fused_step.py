@@ -8,8 +8,10 @@ import pytest
 import crazysim.envs as envs
 from crazysim.core.stage import over_worlds
 from crazysim.engine import fused
+from crazysim.engine.errors import UnsupportedError
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import AutoReset, Wrapper
+from crazysim.errors import EngineWarning
 
 pytestmark = pytest.mark.skipif(fused.missing("cpu") is not None, reason="there is no C++ compiler")
 N = 6
@@ -163,7 +165,7 @@ def with_other_defaults(env):
 REFUSED = {
     "task 'hover' is declared to need all worlds at once": lambda env: AutoReset(envs.DroneEnv(env.sim, Ranked())),
     "wrapper 'Normalize' is declared to need all worlds at once": lambda env: AutoReset(envs.Normalize(env)),
-    "primitive": lambda env: AutoReset(envs.DroneEnv(env.sim, Fourier())),
+    "a stage of one world is unrolled for at most 8 drones": lambda _: AutoReset(envs.make("swarm", 2, n_drones=9)),
     "the engine is 'lanes'": lambda env: AutoReset(envs.make("hover", N, engine="lanes")),
     "'own' of the reset pipeline takes all worlds at once": with_reset_stage,
     "episodes begin from different data in different worlds": with_other_defaults,
@@ -178,6 +180,20 @@ def test_a_step_that_is_not_one_kernel_says_why_in_one_line(hover, why):
     assert line.startswith("a step is not one kernel: ")
     assert "\n" not in line
     assert why in line
+
+
+def test_a_step_that_the_engine_cannot_lower_warns_once_or_raises(hover):
+    env = AutoReset(envs.DroneEnv(hover.sim, Fourier()))
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    with pytest.warns(
+        EngineWarning, match=r"environment steps run unfused: primitive .*complex64 \(stage 'observations'"
+    ):
+        line = env.explain(state)
+    assert line.startswith("a step is not one kernel: primitive ")
+    assert env.explain(state) == line  # without another warning, which would be an error here
+    strict = AutoReset(envs.DroneEnv(envs.make("hover", N, strict=True).sim, Fourier()))
+    with pytest.raises(UnsupportedError, match="complex64"):
+        strict.explain(state)
 
 
 def test_a_task_of_all_worlds_is_rewarded_across_them(hover):
