@@ -30,7 +30,7 @@ VERIFY = "CRAZYSIM_VERIFY"
 
 
 def apply(program: Program, passes: Iterable[Pass]) -> Program:
-    """Return a program after some passes, each of which is verified and written down if that is asked for."""
+    """Return a program after passes; each result is verified and dumped if requested by environment variables."""
     _inspect(program, "lowered")
     for one in passes:
         program = one(program)
