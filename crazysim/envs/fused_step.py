@@ -235,7 +235,7 @@ class _Layout:
 
 def _of_one_world(state: EnvState) -> EnvState:
     """Return shapes and types of a state in one world."""
-    taken = {"drone": 1, "world": 2, "rows": 1}
+    taken = {"drone": 1, "world": 2, "batched": 1}
     return jax.tree.map(
         lambda kind, x: jax.ShapeDtypeStruct(x.shape[taken.get(kind, 0) :], x.dtype), scopes(state), state
     )
