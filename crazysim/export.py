@@ -24,19 +24,19 @@ if TYPE_CHECKING:
     from crazysim.sim.sim import Sim
 
 STATES = ("states.pos", "states.quat", "states.vel", "states.ang_vel", "states.rotor_vel")
-"""What every state vector begins with: m, unit xyzw, m/s, rad/s, rpm (in ``so_rpy_rotor*`` N)."""
+"""Fields that every state vector begins with: m, unit xyzw, m/s, rad/s, rpm (in ``so_rpy_rotor*`` N)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Vector:
-    """What the numbers of a vector are: fields of ``SimData``, one after the other, each in row-major order."""
+    """Layout of a vector: fields of ``SimData``, one after the other, each in row-major order."""
 
     sizes: Mapping[str, int]
-    """How many numbers each field has of one drone, in the vector's order. The names are paths in ``SimData``, and
+    """Number of scalars of each field for one drone, in the vector's order. The names are paths in ``SimData``, and
     the units those of the fields."""
 
     def __len__(self) -> int:
-        """Return how many numbers there are."""
+        """Return the number of scalars."""
         return sum(self.sizes.values())
 
     def __getitem__(self, name: str) -> slice:
@@ -61,16 +61,16 @@ class Vector:
 
 @dataclasses.dataclass(frozen=True)
 class CasadiStep:
-    """A step of one drone as a CasADi function, and what its vectors are."""
+    """A step of one drone as a CasADi function, with the layout of its vectors."""
 
     function: Any
     """``casadi.Function``: ``x_next = step(x, u)``, or ``step(x, u, p)`` if there are parameters."""
     x: Vector
-    """State: position, attitude, velocity, body rates, rotor speeds, then what controllers and effects remember."""
+    """State: position, attitude, velocity, body rates, rotor speeds, then the memory of controllers and effects."""
     u: Vector
-    """Command, as the setter of the simulation's level takes it."""
+    """Command, in the form that the setter of the simulation's command level takes."""
     p: Vector
-    """Parameters that were asked for."""
+    """Requested parameters."""
     dt: float
     """Length of the step, s."""
 
@@ -82,21 +82,20 @@ class CasadiStep:
 def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: int = 0) -> CasadiStep:
     """Return a step of one drone as a CasADi function.
 
-    It is the step pipeline as it stands in ``sim.step_pipeline``, stages and effects of the user's included, read into
-    expressions operation by operation: the same numbers as ``sim.step`` gives in float64, to rounding. Whatever is
-    neither state, nor command, nor a parameter that was asked for is a constant, as the drone has it now. In a
-    simulation of float32 the constants are of that precision.
+    The step is the current ``sim.step_pipeline``, with the stages and effects of the user. The function returns the
+    same numbers as ``sim.step`` in float64, to rounding. Whatever is neither state, nor command, nor a requested
+    parameter is a constant with the drone's current value; in a simulation of float32 the constants have that precision.
 
     Args:
         sim: The simulation.
         parameters: Fields that become the vector ``p``, by their path in ``SimData``, such as ``"params.mass"`` or
             ``"states.force"``.
         world: World of the drone.
-        drone: Which drone of its world.
+        drone: Index of the drone in its world.
 
     Raises:
-        ValueError: If a name or the drone does not exist, or the step is no program of one drone that CasADi could
-            have: the message names the stage and the reason.
+        ValueError: If a name or the drone does not exist, or CasADi has no form of the step; the message names the
+            stage and the reason.
         ImportError: If CasADi is not installed.
     """
     try:
@@ -106,8 +105,8 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     data, stages = sim.data, as_stages(sim.step_pipeline)
     if not (0 <= world < data.core.n_worlds and 0 <= drone < data.core.n_drones):
         raise ConfigError(
-            f"there is no drone {drone} of world {world}: this simulation has {data.core.n_worlds} worlds of "
-            f"{data.core.n_drones} drones, counted from 0"
+            f"expected a world below {data.core.n_worlds} and a drone below {data.core.n_drones}, got world {world} "
+            f"and drone {drone}. Use indices of this simulation, counted from 0."
         )
     program = fuse(lower_stages(stages, data))
     leaves, names = jax.tree.leaves(data), [leaf.name for leaf in program.leaves]
@@ -160,7 +159,9 @@ def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
         if isinstance(segment, UnfusedStage):
             raise _refusal(segment.name, segment.error.reason)
         if segment.scope != "drone":
-            raise _refusal(segment.stages[0], "it sees all drones of its world, and the step of one is exported")
+            raise _refusal(
+                segment.stages[0], "it reads all drones of its world, and only the step of one drone can be exported"
+            )
     after: dict[Slot, Any] = {}
     for segment in program.fused_segments:
         slots = (*segment.reads, *segment.hoisted_reads)
@@ -182,14 +183,14 @@ def _command_field(data: SimData) -> str:
 
 
 def _parameter_leaves(program: Program, parameters: Sequence[str], command: str) -> list[int]:
-    """Return which leaves are asked for as parameters, or say why one cannot be.
+    """Return the leaves that are requested as parameters.
 
     Raises:
         ConfigError: If a name does not exist, is there twice, or is no parameter of a step.
     """
     names = [leaf.name for leaf in program.leaves]
     if isinstance(parameters, str) or len(set(parameters)) < len(parameters):
-        raise ConfigError(f"parameters are a list of different names, not {parameters!r}")
+        raise ConfigError(f"expected a list of different names as parameters, got {parameters!r}. Use paths of fields.")
     free = [
         name
         for leaf, name in enumerate(names)
@@ -200,7 +201,7 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
     ]
     for name in parameters:
         if name not in free:
-            raise UnknownNameError(f"{name!r} is no parameter of this step; what may be one is {', '.join(free)}")
+            raise UnknownNameError(f"{name!r} cannot be a parameter of this step. Use one of {', '.join(free)}.")
     return [names.index(name) for name in parameters]
 
 

@@ -210,13 +210,13 @@ def test_a_stage_of_all_drones_of_a_world_is_named():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"parameters": ["mass"]}, "'mass' is no parameter.*params.mass"),
-        ({"parameters": ["states.pos"]}, "'states.pos' is no parameter"),
-        ({"parameters": ["controls.rotor_vel"]}, "'controls.rotor_vel' is no parameter"),
+        ({"parameters": ["mass"]}, "'mass' cannot be a parameter.*params.mass"),
+        ({"parameters": ["states.pos"]}, "'states.pos' cannot be a parameter"),
+        ({"parameters": ["controls.rotor_vel"]}, "'controls.rotor_vel' cannot be a parameter"),
         ({"parameters": "params.mass"}, "a list of different names"),
         ({"parameters": ["params.mass", "params.mass"]}, "a list of different names"),
-        ({"world": 1}, "no drone 0 of world 1"),
-        ({"drone": -1}, "no drone -1 of world 0"),
+        ({"world": 1}, "got world 1 and drone 0"),
+        ({"drone": -1}, "got world 0 and drone -1"),
     ],
 )
 def test_wrong_input_is_told(options, words):

@@ -22,7 +22,7 @@ def write(name: str, text: str) -> Path | None:
     """Write a text into the folder, under a name with a number in front: in order of time.
 
     Args:
-        name: What it is, such as ``"attitude_controller.jaxpr"``; other characters than letters and digits become
+        name: Name, such as ``"attitude_controller.jaxpr"``; other characters than letters and digits become
             underscores.
         text: The text.
 
