@@ -84,7 +84,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
 
     The step is the current ``sim.step_pipeline``, with the stages and effects of the user. The function returns the
     same numbers as ``sim.step`` in float64, to rounding. Whatever is neither state, nor command, nor a requested
-    parameter is a constant with the drone's current value; in a simulation of float32 the constants have that precision.
+    parameter is a constant with the drone's current value, in the precision of the simulation.
 
     Args:
         sim: The simulation.
