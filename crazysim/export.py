@@ -40,13 +40,13 @@ class Vector:
         return sum(self.sizes.values())
 
     def __getitem__(self, name: str) -> slice:
-        """Return where a field is.
+        """Return the slice of a field.
 
         Raises:
             UnknownNameError: If it is not in the vector.
         """
         if name not in self.sizes:
-            raise UnknownNameError(f"{name!r} is not in this vector; it has {', '.join(self.sizes) or 'nothing'}")
+            raise UnknownNameError(f"{name!r} is not in this vector; it has {', '.join(self.sizes) or 'no fields'}")
         names = list(self.sizes)
         start = sum(self.sizes[n] for n in names[: names.index(name)])
         return slice(start, start + self.sizes[name])
@@ -75,20 +75,20 @@ class CasadiStep:
     """Length of the step, s."""
 
     def __call__(self, *args: Any) -> Any:
-        """Return the next state, for numbers or for symbols of CasADi."""
+        """Return the next state, for numbers or CasADi symbols."""
         return self.function(*args)
 
 
 def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: int = 0) -> CasadiStep:
-    """Return a step of one drone as a CasADi function.
+    """Return the step of one drone as a CasADi function.
 
     The step is the current ``sim.step_pipeline``, with the stages and effects of the user. The function returns the
     same numbers as ``sim.step`` in float64, to rounding. Whatever is neither state, nor command, nor a requested
     parameter is a constant with the drone's current value, in the precision of the simulation.
 
     Args:
-        sim: The simulation.
-        parameters: Fields that become the vector ``p``, by their path in ``SimData``, such as ``"params.mass"`` or
+        sim: Simulation to export.
+        parameters: Fields of the vector ``p``, by their path in ``SimData``, such as ``"params.mass"`` or
             ``"states.force"``.
         world: World of the drone.
         drone: Index of the drone in its world.
@@ -186,7 +186,7 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
     """Return the leaves that are requested as parameters.
 
     Raises:
-        ConfigError: If a name does not exist, is there twice, or is no parameter of a step.
+        ConfigError: If a name does not exist, occurs twice, or is not a parameter of the step.
     """
     names = [leaf.name for leaf in program.leaves]
     if isinstance(parameters, str) or len(set(parameters)) < len(parameters):
@@ -206,7 +206,7 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
 
 
 def _of_one(scope: str, x: Any, world: int, drone: int) -> np.ndarray:
-    """Return the numbers that one drone has of a leaf, as float64. (size,)"""
+    """Return the elements of a leaf that belong to one drone, as float64. (size,)"""
     x = np.asarray(jax.random.key_data(x) if is_key(x) else x)
     place = {"drone": (world, drone), "world": (world, 0)}.get(scope, ())
     return x[place].astype(np.float64).reshape(-1)

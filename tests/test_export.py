@@ -145,7 +145,7 @@ def test_parameters_are_an_input():
     compare(sim, step, with_fields(data, changes))
 
 
-def test_constants_are_those_of_the_drone_that_was_asked_for():
+def test_constants_are_those_of_the_selected_drone():
     sim = Sim(2, 2, control="rotor_vel", engine="plain")
     mass = jnp.asarray([[0.03, 0.04], [0.05, 0.06]])[..., None]
     sim.data = with_fields(sim.data, {"params.mass": mass})
@@ -219,7 +219,7 @@ def test_a_stage_of_all_drones_of_a_world_is_named():
         ({"drone": -1}, "got world 0 and drone -1"),
     ],
 )
-def test_wrong_input_is_told(options, words):
+def test_wrong_input_is_an_error(options, words):
     with pytest.raises(ValueError, match=words):
         to_casadi(Sim(control="rotor_vel"), **options)
 

@@ -32,7 +32,7 @@ class Difference:
     """A difference between two engines."""
 
     stage: str
-    """First stage after which they do."""
+    """First stage after which the engines differ."""
     leaf: str
     """Field that the stage wrote."""
     index: tuple[int, ...]

@@ -19,7 +19,7 @@ def enabled() -> bool:
 
 
 def write(name: str, text: str) -> Path | None:
-    """Write a text into the folder, under a name with a number in front: in order of time.
+    """Write a text into the folder, in a file whose name begins with a running number.
 
     Args:
         name: Name, such as ``"attitude_controller.jaxpr"``; other characters than letters and digits become

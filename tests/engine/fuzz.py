@@ -97,7 +97,9 @@ def given(rng: np.random.Generator) -> Given:
             elif letter == "b":
                 options = [rng.integers(0, 2, size)] * 3
             else:
-                low, extremes = (0, [0, 1, 31, 32, 2**32 - 1, 2**31]) if letter == "u" else (-3, [-(2**31), 2**31 - 1, -1, 0, 33])
+                low, extremes = (
+                    (0, [0, 1, 31, 32, 2**32 - 1, 2**31]) if letter == "u" else (-3, [-(2**31), 2**31 - 1, -1, 0, 33])
+                )
                 options = [rng.integers(low, 9, size), rng.integers(low, 3, size), rng.choice(np.array(extremes), size)]
             third = np.arange(N_WORLDS) * 3 // N_WORLDS
             x = np.choose(third.reshape(-1, *([1] * (len(size) - 1))), options)
@@ -145,9 +147,14 @@ class Case:
 
     def blank(self, name: str) -> dict[str, Any]:
         """Return the slots that the stage writes to, of all worlds."""
-        floats, others = jax.eval_shape(lambda g: packed(self.program.values(g), len(self.program.inputs)), inputs_of(self.scope))
+        floats, others = jax.eval_shape(
+            lambda g: packed(self.program.values(g), len(self.program.inputs)), inputs_of(self.scope)
+        )
         batch = (N_WORLDS, N_DRONES if self.scope == "drone" else 1)
-        return {f"{name}f": jnp.zeros((*batch, *floats.shape), np.float32), f"{name}o": jnp.zeros((*batch, *others.shape), np.int32)}
+        return {
+            f"{name}f": jnp.zeros((*batch, *floats.shape), np.float32),
+            f"{name}o": jnp.zeros((*batch, *others.shape), np.int32),
+        }
 
     def unpacked(self, floats: np.ndarray, others: np.ndarray) -> list[np.ndarray]:
         """Return the values of the lines from slots, of all worlds."""
@@ -336,12 +343,23 @@ class Fuzzer:
                 continue
             # A compiler may compute an operand once more, and round it otherwise there.
             names = case.program.inputs
-            lanes = lanes[~_explained(lambda *v: case.program.values(dict(zip(names, v)))[n + j], [x[lanes] for x in inputs], b[lanes], signed)]  # noqa: B023, B905
+            lanes = lanes[
+                ~_explained(
+                    lambda *v: case.program.values(dict(zip(names, v)))[n + j],
+                    [x[lanes] for x in inputs],
+                    b[lanes],
+                    signed,
+                )
+            ]  # noqa: B023, B905
             if not len(lanes):
                 continue
             lane = lanes[0]
             smaller = kept(case.program, n + j)
-            shown = ", ".join(f"v{m}={_text(v[lane])}" for m, v in enumerate([*inputs, *other[:j]]) if f"v{m}" in case.program.lines[j])
+            shown = ", ".join(
+                f"v{m}={_text(v[lane])}"
+                for m, v in enumerate([*inputs, *other[:j]])
+                if f"v{m}" in case.program.lines[j]
+            )
             what = f"{case.program.lines[j]} with {shown}: plain {_text(a[lane])}, {engine} {_text(b[lane])} ({len(lanes)} lanes)"
             return Find(Case(smaller, case.scope), engine, what)
         return None
@@ -367,7 +385,9 @@ def _keeps_sign_of_zero(line: str, avals: Sequence[Any]) -> bool:
 def _primitives(jaxpr: Any) -> Iterator[str]:
     for eqn in jaxpr.eqns:
         yield eqn.primitive.name
-        for x in jax.tree.leaves(list(eqn.params.values()), is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")):
+        for x in jax.tree.leaves(
+            list(eqn.params.values()), is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")
+        ):
             if hasattr(x, "eqns") or hasattr(x, "jaxpr"):
                 yield from _primitives(getattr(x, "jaxpr", x))
 
@@ -383,7 +403,9 @@ def _written_out(fn: Any, args: Sequence[Any]) -> Any:
 
 def _text(x: Any) -> str:
     x = np.asarray(x)
-    return np.array2string(x.astype(np.float32) if x.dtype.kind == "V" else x, separator=",", precision=9).replace("\n", "")
+    return np.array2string(x.astype(np.float32) if x.dtype.kind == "V" else x, separator=",", precision=9).replace(
+        "\n", ""
+    )
 
 
 def _close(a: np.ndarray, b: np.ndarray, signed: bool) -> np.ndarray:
@@ -470,7 +492,9 @@ def main() -> None:
         for find in fuzzer.check(fuzzer.draw(min(args.batch, args.programs - done))):
             n_finds += 1
             print(find, flush=True)
-        print(f"# {fuzzer.counts['programs']} programs, {n_finds} finds, {time.perf_counter() - start:.0f} s", flush=True)
+        print(
+            f"# {fuzzer.counts['programs']} programs, {n_finds} finds, {time.perf_counter() - start:.0f} s", flush=True
+        )
         jax.clear_caches()
     for why, n in fuzzer.refused.most_common():
         print(f"# refused {n}: {why}")

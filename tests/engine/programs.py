@@ -127,7 +127,9 @@ UNARY_FLOAT = (
     "lax.bessel_i0e lax.bessel_i1e jax.scipy.special.entr jax.scipy.special.ndtr jax.scipy.special.logit"
 ).split()
 UNARY_INT = "lax.abs lax.sign lax.bitwise_not lax.neg lax.square jnp.invert lax.population_count lax.clz".split()
-UNARY_ANY = "jnp.logical_not jnp.ravel jnp.abs jnp.positive lax.stop_gradient jnp.asarray jnp.atleast_1d jnp.atleast_2d "
+UNARY_ANY = (
+    "jnp.logical_not jnp.ravel jnp.abs jnp.positive lax.stop_gradient jnp.asarray jnp.atleast_1d jnp.atleast_2d "
+)
 UNARY_ANY += "jnp.zeros_like jnp.ones_like lax.full_like_ jnp.real jnp.copy jnp.isreal lax.optimization_barrier"
 BINARY_FLOAT = (
     "lax.add lax.sub lax.mul lax.div lax.rem lax.pow lax.max lax.min lax.atan2 lax.nextafter jnp.hypot jnp.fmod "
@@ -560,7 +562,5 @@ def kept(program: Program, last: int) -> Program:
             needed |= {int(m) for m in re.findall(r"\bv(\d+)\b", program.lines[k - n])}
     order = sorted(needed)
     new = {old: k for k, old in enumerate(order)}
-    lines = tuple(
-        re.sub(r"\bv(\d+)\b", lambda m: f"v{new[int(m[1])]}", program.lines[k - n]) for k in order if k >= n
-    )
+    lines = tuple(re.sub(r"\bv(\d+)\b", lambda m: f"v{new[int(m[1])]}", program.lines[k - n]) for k in order if k >= n)
     return Program(tuple(program.inputs[k] for k in order if k < n), lines)

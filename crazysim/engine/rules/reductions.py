@@ -1,4 +1,4 @@
-"""Rules for what makes one element of many, written out: sums, scans, sorts and products of arrays."""
+"""Rules for reductions, unrolled: sums, scans, sorts and products of arrays."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _sorted(
     columns = [np.moveaxis(x, axis, 0).copy() for x in args]
     n = len(columns[0])
     if n > MAX_UNROLL:
-        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of {n} elements; unrolled are up to {MAX_UNROLL}")
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of {n} elements; at most {MAX_UNROLL} are unrolled")
     for turn in range(n):
         for i in range(turn % 2, n - 1, 2):
             first = [c[i, ...].copy() for c in columns]
