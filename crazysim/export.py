@@ -24,19 +24,19 @@ if TYPE_CHECKING:
     from crazysim.sim.sim import Sim
 
 STATES = ("states.pos", "states.quat", "states.vel", "states.ang_vel", "states.rotor_vel")
-"""Fields that every state vector begins with: m, unit xyzw, m/s, rad/s, rpm (in ``so_rpy_rotor*`` N)."""
+"""First fields of every state vector: m, unit xyzw, m/s, rad/s, rpm (in ``so_rpy_rotor*`` N)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Vector:
-    """Layout of a vector: fields of ``SimData``, one after the other, each in row-major order."""
+    """Layout of a vector: fields of ``SimData``, concatenated, each in row-major order."""
 
     sizes: Mapping[str, int]
-    """Number of scalars of each field for one drone, in the vector's order. The names are paths in ``SimData``, and
-    the units those of the fields."""
+    """Size of each field of one drone, in the order of the vector. The names are paths in ``SimData``; the units are
+    those of the fields."""
 
     def __len__(self) -> int:
-        """Return the number of scalars."""
+        """Return the length of the vector."""
         return sum(self.sizes.values())
 
     def __getitem__(self, name: str) -> slice:
@@ -61,14 +61,14 @@ class Vector:
 
 @dataclasses.dataclass(frozen=True)
 class CasadiStep:
-    """A step of one drone as a CasADi function, with the layout of its vectors."""
+    """Step of one drone as a CasADi function, and the layouts of its vectors."""
 
     function: Any
     """``casadi.Function``: ``x_next = step(x, u)``, or ``step(x, u, p)`` if there are parameters."""
     x: Vector
-    """State: position, attitude, velocity, body rates, rotor speeds, then the memory of controllers and effects."""
+    """State: position, attitude, velocity, body rates, rotor speeds, internal states of controllers and effects."""
     u: Vector
-    """Command, in the form that the setter of the simulation's command level takes."""
+    """Command, in the order and units of the setter of the command level."""
     p: Vector
     """Requested parameters."""
     dt: float
@@ -82,20 +82,21 @@ class CasadiStep:
 def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: int = 0) -> CasadiStep:
     """Return the step of one drone as a CasADi function.
 
-    The step is the current ``sim.step_pipeline``, with the stages and effects of the user. The function returns the
-    same numbers as ``sim.step`` in float64, to rounding. Whatever is neither state, nor command, nor a requested
-    parameter is a constant with the drone's current value, in the precision of the simulation.
+    The step pipeline in ``sim.step_pipeline``, including effects and user stages, is converted to expressions operation
+    by operation, so the result equals that of ``sim.step`` in float64 up to rounding. Everything that is neither state,
+    nor command, nor a requested parameter is a constant with its current value for that drone. In a float32 simulation
+    the constants have that precision.
 
     Args:
         sim: Simulation to export.
         parameters: Fields of the vector ``p``, by their path in ``SimData``, such as ``"params.mass"`` or
             ``"states.force"``.
-        world: World of the drone.
+        world: Index of the world.
         drone: Index of the drone in its world.
 
     Raises:
-        ValueError: If a name or the drone does not exist, or CasADi has no form of the step; the message names the
-            stage and the reason.
+        ValueError: If a name or the drone does not exist, or the step cannot be exported; the message names the stage
+            and the reason.
         ImportError: If CasADi is not installed.
     """
     try:
@@ -105,8 +106,8 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     data, stages = sim.data, as_stages(sim.step_pipeline)
     if not (0 <= world < data.core.n_worlds and 0 <= drone < data.core.n_drones):
         raise ConfigError(
-            f"expected a world below {data.core.n_worlds} and a drone below {data.core.n_drones}, got world {world} "
-            f"and drone {drone}. Use indices of this simulation, counted from 0."
+            f"expected a world from 0 to {data.core.n_worlds - 1} and a drone from 0 to {data.core.n_drones - 1}, got "
+            f"world {world} and drone {drone}"
         )
     program = fuse(lower_stages(stages, data))
     leaves, names = jax.tree.leaves(data), [leaf.name for leaf in program.leaves]
@@ -159,9 +160,7 @@ def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
         if isinstance(segment, UnfusedStage):
             raise _refusal(segment.name, segment.error.reason)
         if segment.scope != "drone":
-            raise _refusal(
-                segment.stages[0], "it reads all drones of its world, and only the step of one drone can be exported"
-            )
+            raise _refusal(segment.stages[0], "it reads all drones of its world, but a step of one drone is exported")
     after: dict[Slot, Any] = {}
     for segment in program.fused_segments:
         slots = (*segment.reads, *segment.hoisted_reads)
@@ -183,14 +182,14 @@ def _command_field(data: SimData) -> str:
 
 
 def _parameter_leaves(program: Program, parameters: Sequence[str], command: str) -> list[int]:
-    """Return the leaves that are requested as parameters.
+    """Return the indices of the leaves requested as parameters.
 
     Raises:
         ConfigError: If a name does not exist, occurs twice, or is not a parameter of the step.
     """
     names = [leaf.name for leaf in program.leaves]
     if isinstance(parameters, str) or len(set(parameters)) < len(parameters):
-        raise ConfigError(f"expected a list of different names as parameters, got {parameters!r}. Use paths of fields.")
+        raise ConfigError(f"expected parameters as a list of distinct names, got {parameters!r}")
     free = [
         name
         for leaf, name in enumerate(names)
@@ -201,7 +200,7 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
     ]
     for name in parameters:
         if name not in free:
-            raise UnknownNameError(f"{name!r} cannot be a parameter of this step. Use one of {', '.join(free)}.")
+            raise UnknownNameError(f"expected a parameter of this step, got {name!r}; use one of {', '.join(free)}")
     return [names.index(name) for name in parameters]
 
 

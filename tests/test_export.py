@@ -210,11 +210,11 @@ def test_a_stage_of_all_drones_of_a_world_is_named():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"parameters": ["mass"]}, "'mass' cannot be a parameter.*params.mass"),
-        ({"parameters": ["states.pos"]}, "'states.pos' cannot be a parameter"),
-        ({"parameters": ["controls.rotor_vel"]}, "'controls.rotor_vel' cannot be a parameter"),
-        ({"parameters": "params.mass"}, "a list of different names"),
-        ({"parameters": ["params.mass", "params.mass"]}, "a list of different names"),
+        ({"parameters": ["mass"]}, "got 'mass'; use one of .*params.mass"),
+        ({"parameters": ["states.pos"]}, "got 'states.pos'"),
+        ({"parameters": ["controls.rotor_vel"]}, "got 'controls.rotor_vel'"),
+        ({"parameters": "params.mass"}, "a list of distinct names"),
+        ({"parameters": ["params.mass", "params.mass"]}, "a list of distinct names"),
         ({"world": 1}, "got world 1 and drone 0"),
         ({"drone": -1}, "got world 0 and drone -1"),
     ],

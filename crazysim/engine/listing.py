@@ -50,7 +50,7 @@ def of_operation(program: Program, operation: Operation) -> str:
         list(_of_segment(program, segment, names))
         if any(op is operation for op in segment.block.walk()):
             return f"{_line(operation, names)} of stage {operation.stage!r}"
-    raise ValueError(f"operation {operation.name!r} is not in the program; pass one of its own")
+    raise ValueError("expected an operation of the program, got one of another program")
 
 
 def slot_name(program: Program, segment: Segment, slot: Slot) -> str:

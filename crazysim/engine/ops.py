@@ -200,7 +200,7 @@ def _casadi_round_even(ca: Any, x: Any) -> Any:
 
 
 _LARGEST = float(np.finfo(np.float64).max)
-"""CasADi has no test for finite numbers."""
+"""CasADi has no operation that tests for finite numbers."""
 
 
 def _rows() -> list[Row]:

@@ -1,4 +1,4 @@
-"""Programs: the stages of a step as scalar operations of one drone or one world, ready for an engine.
+"""Programs: what the stages of a step do to the numbers of one drone or one world, ready for an engine.
 
 A program is immutable. Stages are lowered to one (``lower_stages``), and passes make another of it (``passes``,
 ``layout``). ``print(program)`` shows it.
@@ -45,7 +45,7 @@ class Leaf:
 
     @functools.cached_property
     def size(self) -> int:
-        """Number of scalars of one drone (or world); a key is two 32-bit integers."""
+        """Number of scalars per drone (or world); a key is two 32-bit integers."""
         if self.rows_of:
             return self.shape[0]
         shape = self.shape[2:] if self.scope in ("drone", "world") else self.shape
@@ -74,7 +74,7 @@ class Segment:
     writes: tuple[Slot, ...]
     """Places of its outputs."""
     hoisted: Block = dataclasses.field(default_factory=Block)
-    """Block that runs once, before the first step."""
+    """Computations hoisted out of the steps, run once before the first step."""
     hoisted_reads: tuple[Slot, ...] = ()
     """Places of the inputs of ``hoisted``."""
 
@@ -109,7 +109,7 @@ class UnfusedStage:
     written: tuple[int, ...]
     """Leaves that it writes."""
     error: UnsupportedError
-    """Reason why it is not fused."""
+    """Reason for which the stage is not fused."""
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ class UnfusedStage:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Program:
-    """A step, with the stages that run before the first step and after the last."""
+    """Program of a step, and of the stages that run before the first step and after the last."""
 
     leaves: tuple[Leaf, ...]
     """Arrays of the data; behind them those that passes add."""
@@ -176,7 +176,7 @@ class Program:
 
     @functools.cached_property
     def group(self) -> int:
-        """Number of drones that use each other's scalars: those of a world, if some segment is of worlds."""
+        """Number of drones whose scalars are computed together: those of a world, if a segment has that scope."""
         return self.n_drones if any(s.scope == "world" for s in self.fused_segments) else 1
 
     def of(self, phase: Phase) -> list[Any]:

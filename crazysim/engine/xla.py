@@ -90,18 +90,18 @@ def _loop(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> l
 
 
 def _while(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
-    """Repeat as long as any lane continues; the others keep their numbers."""
+    """Repeat until no lane continues; lanes that are finished keep their values."""
     test, body = op.blocks
 
-    def continues(carry: list[Any]) -> Array:
+    def goes_on(carry: list[Any]) -> Array:
         return _lanes(run(test, carry, shape, env)[0], shape)
 
     def turn(carry: list[Any]) -> list[Any]:
-        mask = continues(carry)
+        mask = goes_on(carry)
         new = run(body, carry, shape, env)
         return [jnp.where(mask, _lanes(x, shape), old) for x, old in zip(new, carry, strict=True)]
 
-    return lax.while_loop(lambda carry: jnp.any(continues(carry)), turn, [_lanes(x, shape) for x in args])
+    return lax.while_loop(lambda carry: jnp.any(goes_on(carry)), turn, [_lanes(x, shape) for x in args])
 
 
 def _when(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
