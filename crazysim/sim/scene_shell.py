@@ -19,6 +19,7 @@ from crazysim.scene.scene import Scene
 
 if TYPE_CHECKING:
     from crazysim.core.data import SimData
+    from crazysim.core.registry import PluginRegistry
     from crazysim.engine import Stepper
 
 T = TypeVar("T")
@@ -47,6 +48,8 @@ class SceneShell:
     """Number of worlds."""
     data: SimData
     """Everything that changes."""
+    plugins: PluginRegistry
+    """Plugins, which draw overlays."""
     _scene: Scene
     _stepper: Stepper
     _queries: SceneQueries
@@ -180,6 +183,7 @@ class SceneShell:
             RenderError: If this machine cannot draw.
         """
         self.sync(world)
+        self.plugins.draw(world)
         return self._scene.draw(mode, camera, cam_config, width, height)
 
     def close(self) -> None:

@@ -17,6 +17,7 @@ from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.random import seed_sim
+from crazysim.core.registry import PluginRegistry
 from crazysim.core.settings import as_mask, positive
 from crazysim.core.sharding import shard
 from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
@@ -32,12 +33,13 @@ from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim.commands import Commands
 from crazysim.sim.configuration import Configuration
+from crazysim.sim.plugins import PluginMethods
 from crazysim.sim.scene_shell import SceneShell
 
 __all__ = ["Sim", "clip_floor_pos", "increment_steps", "reset", "seed_sim", "sync_sim2mjx", "use_box_collision"]
 
 
-class Sim(Commands, SceneShell):
+class Sim(Commands, PluginMethods, SceneShell):
     """Worlds of drones that advance together.
 
     ``data`` holds everything that changes, ``step_pipeline`` and ``reset_pipeline`` the stages that change it, ``spec``
@@ -109,6 +111,7 @@ class Sim(Commands, SceneShell):
         self._stepper = Stepper(self.device, mesh, engine, strict)
         self._queries = self._new_queries()
         self._seed = as_key(rng_key)
+        self.plugins = PluginRegistry(self)
         self.build_data()
         self.build_default_data()
 
@@ -172,7 +175,7 @@ class Sim(Commands, SceneShell):
         return F.controllable(self.data)
 
     def build_data(self) -> SimData:
-        """Return new data at rest, as at construction, and make it the simulation's."""
+        """Return new data at rest, as at construction, with a new record of every plugin; make it the simulation's."""
         data = SimData.create(
             self.n_worlds,
             self.n_drones,
@@ -185,6 +188,7 @@ class Sim(Commands, SceneShell):
             self._seed,
         )
         self.data = data.replace(objects=self._scene.objects(None))
+        self.plugins.build_records()
         return self.data
 
     def build_default_data(self) -> SimData:

@@ -63,7 +63,7 @@ def fly(stem, variant, as_the_peer=True):
         **rates,
     )
     if integrator == "rk4" and as_the_peer:
-        deriv_fn = sim.step_pipeline["integration"].fn.keywords["deriv_fn"]
+        deriv_fn = sim.step_pipeline["integration"].fn.deriv_fn
         replace_fn(sim.step_pipeline, stage("drone")(partial(peers_rk4, deriv_fn=deriv_fn)), "integration")
     step = sim.build_step_fn()
 

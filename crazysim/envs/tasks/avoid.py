@@ -8,8 +8,8 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import FunctionPlugin, Placement, Simulation
 from crazysim.core.stage import stage
-from crazysim.effects.core import install
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
 from crazysim.envs.spawn import flying
@@ -17,7 +17,6 @@ from crazysim.envs.tasks.core import NAME, check_collisions, nearest, others_nea
 from crazysim.envs.tracks import ranks
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.contact_log import SimulationWithScene
 
 CELL, IN_CELL = 0.8, 0.15
 """Width of the cells that obstacles stand in, one at most in each, and most of each component of the distance from a
@@ -57,7 +56,7 @@ class Flight(PyTree):
 
 
 def avoid(
-    sim: SimulationWithScene,
+    sim: Simulation,
     n_poles: int = 8,
     n_boxes: int = 4,
     n_seen: int = 4,
@@ -116,7 +115,7 @@ def avoid(
         new = own.replace(disabled=disabled, reached=reached)
         return data.replace(plugins=data.plugins | {NAME: new})
 
-    install(sim, NAME, record, advance, before="increment_steps")
+    sim.add(FunctionPlugin(NAME, record, [Placement(advance, before="increment_steps")]))
     check_collisions(sim)
     n_cells = LENGTH * width
 

@@ -10,10 +10,9 @@ from jax.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.pipeline import insert_fn_before
+from crazysim.core.plugin import FunctionPlugin, Simulation
 from crazysim.core.stage import stage
-from crazysim.effects.core import Simulation, install
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.contact_log import SimulationWithScene
 
 NAME = "task"
 """Name of a task's record in ``data.plugins``."""
@@ -32,7 +31,7 @@ class Goal(PyTree):
 
 def install_goal(sim: Simulation) -> None:
     """Give every drone a goal, ``data.plugins["task"]``, at the origin and at rest."""
-    install(sim, NAME, Goal(jnp.zeros_like(sim.data.states.pos), jnp.zeros_like(sim.data.states.pos)))
+    sim.add(FunctionPlugin(NAME, Goal(jnp.zeros_like(sim.data.states.pos), jnp.zeros_like(sim.data.states.pos))))
 
 
 def goal_of(data: SimData) -> Goal:
@@ -107,7 +106,7 @@ def nearest(distance: Array, x: Array, n: int) -> Array:
     return jnp.stack(out, axis=-2)
 
 
-def check_collisions(sim: SimulationWithScene) -> None:
+def check_collisions(sim: Simulation) -> None:
     """Have drones that touch each other disabled at every step, in the task's record, before its own stage.
 
     Of drones that the record has as ``out`` nothing is noticed: they are neither disabled nor do they disable others.

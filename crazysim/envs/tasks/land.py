@@ -9,15 +9,14 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
 from crazysim.core.pipeline import insert_fn_before
+from crazysim.core.plugin import FunctionPlugin, Placement, Simulation
 from crazysim.core.stage import stage
-from crazysim.effects.core import install
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.core import NAME, pick, state_of
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.contact_log import SimulationWithScene
 
 RADIUS, HEIGHT = 0.25, 0.2
 """Radius of a pad, and height of its upper side, m."""
@@ -57,7 +56,7 @@ class Landing(PyTree):
         return self.landed | self.crashed
 
 
-def land(sim: SimulationWithScene, speed: float = 0.0, radius: float = RADIUS, seconds: float = 6.0) -> Task:
+def land(sim: Simulation, speed: float = 0.0, radius: float = RADIUS, seconds: float = 6.0) -> Task:
     """Return the task of landing on a pad, 0.2 m above the floor.
 
     Landed is who touches the pad from above, within its radius, with at most 0.5 m/s relative to it and a tilt of at
@@ -125,7 +124,7 @@ def land(sim: SimulationWithScene, speed: float = 0.0, radius: float = RADIUS, s
         pos = data.states.pos
         return jnp.any(jnp.abs(pos - around(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)
 
-    install(sim, NAME, record, touch, before="increment_steps")
+    sim.add(FunctionPlugin(NAME, record, [Placement(touch, before="increment_steps")]))
     if speed > 0:
         insert_fn_before(sim.step_pipeline, NAME, move, f"{NAME}_pads")
         sim.build_step_fn()

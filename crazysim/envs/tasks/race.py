@@ -11,8 +11,8 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import FunctionPlugin, Placement, Simulation
 from crazysim.core.stage import stage
-from crazysim.effects.core import install
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
 from crazysim.envs.spawn import flying
@@ -20,7 +20,6 @@ from crazysim.envs.tasks.core import NAME, check_collisions, nearest, others_nea
 from crazysim.envs.tracks import Track, checked, n_random, random_course, start_offsets
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, static
-from crazysim.scene.contact_log import SimulationWithScene
 
 OPENING = 0.45
 """Width and height of a gate's opening, m."""
@@ -85,7 +84,7 @@ class Race(PyTree):
 
 
 def race(
-    sim: SimulationWithScene,
+    sim: Simulation,
     level: int = 0,
     track: Track | None = None,
     sensor_range: float = SENSOR_RANGE,
@@ -229,7 +228,7 @@ def race(
 # The rules, in the step ---------------------------------------------------------------------------------------------
 
 
-def _install(sim: SimulationWithScene, gates: Any, obstacles: Any, course: Track, moved: bool) -> None:
+def _install(sim: Simulation, gates: Any, obstacles: Any, course: Track, moved: bool) -> None:
     """Put the record and the rules into the simulation."""
     shape, n_gates, n_obstacles = (sim.n_worlds, sim.n_drones), len(gates), len(obstacles)
     pos = sim.data.states.pos
@@ -260,7 +259,7 @@ def _install(sim: SimulationWithScene, gates: Any, obstacles: Any, course: Track
         new = record.replace(passed=passed, disabled=disabled, last_pos=pos)
         return data.replace(plugins=data.plugins | {NAME: new})
 
-    install(sim, NAME, record, advance, before="increment_steps")
+    sim.add(FunctionPlugin(NAME, record, [Placement(advance, before="increment_steps")]))
     check_collisions(sim)
 
 

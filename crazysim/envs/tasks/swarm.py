@@ -10,15 +10,14 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import FunctionPlugin, Placement, Simulation
 from crazysim.core.stage import stage
-from crazysim.effects.core import install
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.core import NAME, on_floor, others_near, state_of
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.contact_log import SimulationWithScene
 
 SEPARATION = (0.24, 0.24, 0.6)
 """Half axes of the ellipsoid around a drone that no other's centre may enter, m: twice the radii of 0.12 m across and
@@ -44,7 +43,7 @@ class Swarm(PyTree):
 
 
 def swarm(
-    sim: SimulationWithScene,
+    sim: Simulation,
     formation: Sequence[Sequence[float]] | None = None,
     n_seen: int = 3,
     strict: bool = True,
@@ -88,7 +87,7 @@ def swarm(
         new = own.replace(closest=jnp.minimum(own.closest, separation(data.states.pos)))
         return data.replace(plugins=data.plugins | {NAME: new})
 
-    install(sim, NAME, record, keep, before="increment_steps")
+    sim.add(FunctionPlugin(NAME, record, [Placement(keep, before="increment_steps")]))
 
     def spawn(data: SimData, keys: Array) -> SimData:
         x = uniform(keys, 2 + 9 * n)

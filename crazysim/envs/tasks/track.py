@@ -8,7 +8,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.effects.core import Simulation, install
+from crazysim.core.plugin import FunctionPlugin, Simulation
 from crazysim.envs.env import Task
 from crazysim.envs.random import uniform
 from crazysim.envs.spawn import flying
@@ -52,7 +52,7 @@ def track(
         tolerance: Distance below which the drone counts as on the trajectory, m.
         spread: Most of each component of the distance at the beginning, m.
     """
-    install(sim, NAME, Phase(jnp.zeros_like(sim.data.states.pos[..., :1])))
+    sim.add(FunctionPlugin(NAME, Phase(jnp.zeros_like(sim.data.states.pos[..., :1]))))
     where = figure_eight() if trajectory is None else trajectory
     ahead = spacing * (1 + np.arange(n_samples))
     jitter = np.array([spread] * 3 + [0.2] * 3 + [0.2] * 3)
