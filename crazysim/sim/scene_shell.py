@@ -9,6 +9,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from crazysim.scene import mjx
+from crazysim.scene.build import use_boxes
 from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
 from crazysim.scene.overlays import Marks
@@ -46,6 +47,8 @@ class SceneShell:
 
     n_worlds: int
     """Number of worlds."""
+    n_drones: int
+    """Number of drones in each world."""
     data: SimData
     """Everything that changes."""
     plugins: PluginRegistry
@@ -189,3 +192,12 @@ class SceneShell:
     def close(self) -> None:
         """Close the window and free the renderers."""
         self._scene.close()
+
+
+def use_box_collision(sim: SceneShell, enable: bool = True) -> None:
+    """Let drones touch with boxes instead of spheres, or with spheres again; compiles the scene again.
+
+    Boxes follow the drone's outline more closely and cost more to check.
+    """
+    use_boxes(sim.spec, sim.n_drones, enable)
+    sim.build_mjx()
