@@ -19,7 +19,6 @@ from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Scene
 
 if TYPE_CHECKING:
-    from crazysim.core.data import SimData
     from crazysim.core.registry import PluginRegistry
     from crazysim.engine import Stepper
 
@@ -49,8 +48,6 @@ class SceneShell:
     """Number of worlds."""
     n_drones: int
     """Number of drones in each world."""
-    data: SimData
-    """Everything that changes."""
     plugins: PluginRegistry
     """Plugins, which draw overlays."""
     _scene: Scene

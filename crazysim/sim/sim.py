@@ -110,7 +110,7 @@ class Sim(Commands, PluginMethods, SceneShell):
         self._stepper = Stepper(self.device, mesh, engine, strict)
         self._queries = self._new_queries()
         self._seed = as_key(rng_key)
-        self.plugins = PluginRegistry(self)
+        self.plugins = PluginRegistry(self)  # type: ignore[arg-type]  # properties serve as attributes
         self.build_data()
         self.build_default_data()
 
