@@ -1,4 +1,4 @@
-"""What each primitive of JAX means for single numbers; importing this fills the table of rules (``lower``)."""
+"""Meaning of each JAX primitive on scalars; importing this package fills the table of rules in ``lower``."""
 
 from crazysim.engine.rules import control_flow, elementwise, indexing, linalg, movement, random, reductions
 

@@ -40,7 +40,7 @@ def _high_level(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]
 
 
 def _with_derivative(ctx: Lowering, eqn: Any, args: list[Elements], called: ClosedJaxpr) -> list[Elements]:
-    """Read a call that brings a derivative of its own, which is read when somebody asks for it."""
+    """Lower a call with a custom derivative, which is lowered only when a derivative is requested."""
     body = ctx.inner()
     block = body.finish(body.lower(called, [_inputs(body, x) for x in args]))
 
@@ -87,10 +87,14 @@ def _cond(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("platform_index")
 def _platform_index(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Of code that is written for several platforms, what serves all of them, else what serves the CPU."""
+    """The default branch: a program is lowered once for all platforms."""
     platforms = list(eqn.params["platforms"])
-    cpu = next((k for k, names in enumerate(platforms) if names is not None and "cpu" in names), 0)
-    return [constants(platforms.index(None) if None in platforms else cpu, np.int32)]
+    own = sorted({name for names in platforms for name in names or ()} & {"cpu", "gpu", "cuda", "rocm"})
+    if own or None not in platforms:
+        raise UnsupportedError(
+            f"primitive 'platform_index' with a branch for {', '.join(own) or 'some platforms only'}"
+        )
+    return [constants(platforms.index(None), np.int32)]
 
 
 @rule("scan")
@@ -109,11 +113,11 @@ def _scan(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
         return _results(ctx, "loop", eqn, scalars(*carry), (block,), (("length", length),))
     if length > MAX_UNROLL:
         raise UnsupportedError(
-            f"primitive 'scan' with inputs or outputs for each of {length} turns; written out are {MAX_UNROLL}"
+            f"primitive 'scan' with inputs or outputs for each of {length} turns; at most {MAX_UNROLL} are unrolled"
         )
     stacked: list[list[Elements]] = []
     for i in range(length)[::-1] if p["reverse"] else range(length):
-        outs = ctx.lower(body, [*fixed, *carry, *(np.asarray(x[i], object) for x in xs)])
+        outs = ctx.lower(body, [*fixed, *carry, *(x[i, ...] for x in xs)])
         carry = outs[:n_carry]
         stacked.append(outs[n_carry:])
     if p["reverse"]:

@@ -54,6 +54,8 @@ def _select_n(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 @rule("bitcast_convert_type")
 def _bitcast(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     before, after = eqn.invars[0].aval.dtype, eqn.params["new_dtype"]
+    if before == after:
+        return args
     if before.itemsize != np.dtype(after).itemsize:
         raise UnsupportedError(f"primitive 'bitcast_convert_type' from {before} to {after}, of another size")
     return [ctx.elementwise("bitcast_convert_type", args, after)]
@@ -102,6 +104,13 @@ def _total_order(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements
 @rule("optimization_barrier")
 def _barrier(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     ctx.builder.barrier()
+    return args
+
+
+@rule("device_put")
+def _device_put(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    if any(device is not None for device in eqn.params["devices"]):
+        raise UnsupportedError("primitive 'device_put' to a device that is named")
     return args
 
 
@@ -160,7 +169,7 @@ def _leading_zeros(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elemen
 def _reduce_precision(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Round the mantissa to nearest even; what the exponent cannot hold becomes infinite, or a zero with its sign."""
     dtype, exponent, mantissa = eqn.outvars[0].aval.dtype, eqn.params["exponent_bits"], eqn.params["mantissa_bits"]
-    if dtype.name not in ops.DTYPES:
+    if dtype not in ops.DTYPES:
         raise UnsupportedError(f"numbers of type {dtype.name}")
     info, bits = np.finfo(dtype), _Bits(ctx, dtype)
     x = bits.of(args[0])

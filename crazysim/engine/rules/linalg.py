@@ -1,7 +1,8 @@
-"""Rules for small linear algebra, written out."""
+"""Rules for small linear algebra, unrolled."""
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ LARGEST_SYSTEM = 6
 
 def _check_size(eqn: Any, n: int) -> None:
     if n > LARGEST_SYSTEM:
-        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; written out are up to {LARGEST_SYSTEM}")
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; at most {LARGEST_SYSTEM} is supported")
 
 
 def _matrices(x: Elements) -> list[Elements]:
@@ -24,18 +25,24 @@ def _matrices(x: Elements) -> list[Elements]:
 
 @rule("cholesky")
 def _cholesky(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """The lower factor; all of it is NaN if the matrix is not positive definite."""
     n, dtype = args[0].shape[-1], eqn.outvars[0].aval.dtype
     _check_size(eqn, n)
     zero = constant(0, dtype)
     out = []
     for a in _matrices(args[0]):
-        low = np.full((n, n), zero, object)
+        low, fails = np.full((n, n), zero, object), constant(False, bool)
         for j in range(n):
             for i in range(j, n):
                 rest = a[i, j]
                 for k in range(j):
                     rest = ctx.scalar("sub", rest, ctx.scalar("mul", low[i, k], low[j, k]))
                 low[i, j] = ctx.builder.add("sqrt", (rest,), dtype) if i == j else ctx.scalar("div", rest, low[j, j])
+                if i == j:
+                    positive = ctx.scalar("gt", rest, zero, dtype=bool)
+                    fails = ctx.scalar("or", fails, ctx.scalar("not", positive))
+        for j, i in itertools.combinations_with_replacement(range(n), 2):
+            low[i, j] = ctx.scalar("select_n", fails, low[i, j], constant(np.nan, dtype))
         out.append(low)
     return [as_elements([x for low in out for x in low.reshape(-1)], args[0].shape)]
 
@@ -74,6 +81,7 @@ def _lu(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     if n != m:
         raise UnsupportedError("primitive 'lu' of a matrix that is not square")
     _check_size(eqn, n)
+    zero = constant(0, eqn.outvars[0].aval.dtype)
     factors, all_pivots, permutations = [], [], []
     for a in _matrices(args[0]):
         a = a.copy()
@@ -91,8 +99,10 @@ def _lu(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
                 here = ctx.scalar("eq", pivot, constant(i, np.int32), dtype=bool)
                 for x in (*a.T, rows):  # every column, and the list of rows
                     x[i], x[j] = ctx.scalar("select_n", here, x[i], x[j]), ctx.scalar("select_n", here, x[j], x[i])
+            is_zero = ctx.scalar("eq", a[j, j], zero, dtype=bool)  # then the column is zero, and stays
+            divisor = ctx.scalar("select_n", is_zero, a[j, j], constant(1, a[j, j].dtype))
             for i in range(j + 1, n):
-                a[i, j] = ctx.scalar("div", a[i, j], a[j, j])
+                a[i, j] = ctx.scalar("div", a[i, j], divisor)
                 for k in range(j + 1, n):
                     a[i, k] = ctx.scalar("sub", a[i, k], ctx.scalar("mul", a[i, j], a[j, k]))
         factors.append(a)
