@@ -98,7 +98,10 @@ PROGRAMS = {
     "known and computed": (("f33", "i"), "v0.at[v1, np.array([0, 2])].add(1.0)"),
     "known, from the end": (("f4",), "v0.at[np.array([-1, -4, -5, 4])].add(v0)"),
     "a function, by a computed place": (("f33", "i"), "v0.at[:, v1].apply(jnp.sin)"),
-    "a function with constants": (("f4", "i3"), "v0.at[v1].apply(lambda t: jnp.where(t > 0, jnp.float32(np.pi) * t, 1))"),
+    "a function with constants": (
+        ("f4", "i3"),
+        "v0.at[v1].apply(lambda t: jnp.where(t > 0, jnp.float32(np.pi) * t, 1))",
+    ),
     "integers that wrap": (("i3", "u3"), "v0.at[v1].multiply(np.int32(2**30))"),
     "unsigned places": (("f4", "u3"), "v0[v1] + v0.at[v1].get(mode='fill', fill_value=2.0)"),
     "small places": (("f4", "i3"), "v0[v1.astype(np.int8)]"),

@@ -1,4 +1,4 @@
-"""What each primitive of JAX means for single numbers; importing this fills the table of rules (``lower``)."""
+"""Rules that lower the primitives of JAX to scalar operations; importing the package registers them (``lower``)."""
 
 from crazysim.engine.rules import control_flow, elementwise, indexing, linalg, movement, random, reductions
 

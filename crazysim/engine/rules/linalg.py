@@ -1,4 +1,4 @@
-"""Rules for small linear algebra, written out."""
+"""Rules for linear algebra on small matrices, unrolled."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from crazysim.engine.ir import constant
 from crazysim.engine.lower import Elements, Lowering, UnsupportedError, as_elements, rule
 
 LARGEST_SYSTEM = 6
-"""Largest matrix that is factorised; beyond it the written-out arithmetic is longer than a drone's step."""
+"""Largest matrix that is factorised; beyond it the unrolled arithmetic is longer than the rest of a step."""
 
 
 def _check_size(eqn: Any, n: int) -> None:
     if n > LARGEST_SYSTEM:
-        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; written out are up to {LARGEST_SYSTEM}")
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; unrolled are at most {LARGEST_SYSTEM}")
 
 
 def _matrices(x: Elements) -> list[Elements]:
@@ -25,7 +25,7 @@ def _matrices(x: Elements) -> list[Elements]:
 
 @rule("cholesky")
 def _cholesky(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """The lower factor; all of it is NaN if the matrix is not positive definite."""
+    """Return the lower factor; all of it is NaN if the matrix is not positive definite, as in LAPACK."""
     n, dtype = args[0].shape[-1], eqn.outvars[0].aval.dtype
     _check_size(eqn, n)
     zero = constant(0, dtype)
@@ -76,7 +76,7 @@ def _substitute(ctx: Lowering, a: Elements, b: Elements, lower: bool, unit: bool
 
 @rule("lu")
 def _lu(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Gauss with the largest pivot of each column, rows exchanged by selection."""
+    """Eliminate with the largest pivot of each column; rows are exchanged by selection."""
     n, m = args[0].shape[-2:]
     if n != m:
         raise UnsupportedError("primitive 'lu' of a matrix that is not square")
