@@ -1,6 +1,8 @@
 # `make demo`, `make test` and `make check` set up everything they need in .venv first.
 PYTHON ?= python3
 VENV ?= .venv
+# Further requirements of an environment, such as PINS="jax<0.12"; one environment for each, named by VENV.
+PINS ?=
 RUN = $(VENV)/bin/python
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 
@@ -9,7 +11,7 @@ export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(RUN) -m pip install --quiet --disable-pip-version-check --upgrade pip
-	$(RUN) -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check -e ".[dev]" $(foreach pin,$(PINS),"$(pin)")
 	touch $@
 
 demo: $(VENV)/installed
@@ -39,4 +41,4 @@ benchmark: $(VENV)/installed
 	$(RUN) benchmarks/versus_crazyflow.py
 
 clean:
-	rm -rf $(VENV) .cache out dist build
+	rm -rf .venv .venv-* .cache out dist build

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from measure import alone, engine_of, hovering, machine
 
 from crazysim import Sim, __version__
-from crazysim.engine.step import ENGINES
+from crazysim.engine import ENGINES
 
 
 def main() -> None:

@@ -24,10 +24,9 @@ from measure import Flight, digits, engine_of, medians, report, seconds
 
 from crazysim import PyTree, Sim, __version__, leaf
 from crazysim.core.stage import stage
-from crazysim.engine import fused
+from crazysim.engine import ENGINES, fused
 from crazysim.engine.ir import Block, Operation, Value
 from crazysim.engine.ops import TABLE
-from crazysim.engine.step import ENGINES
 
 BIG = {"cpu": 2**26, "gpu": 2**28}
 """Number of float32 in the copy that measures the bandwidth, larger than any cache."""

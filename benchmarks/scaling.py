@@ -21,7 +21,7 @@ import jax
 from measure import Flight, alone, digits, engine_of, machine, medians
 
 from crazysim import Sim, __version__
-from crazysim.engine.step import ENGINES
+from crazysim.engine import ENGINES
 from crazysim.pytree import scopes
 
 

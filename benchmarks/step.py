@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from measure import Flight, digits, engine_of, medians, report
 
 from crazysim import Sim, __version__
-from crazysim.engine.step import ENGINES
+from crazysim.engine import ENGINES
 from crazysim.pytree import scopes
 
 

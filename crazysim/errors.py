@@ -1,4 +1,4 @@
-"""The errors that a wrong configuration raises, and the one of a machine that cannot draw."""
+"""The errors and warnings of the package."""
 
 
 class ConfigError(ValueError):
@@ -15,3 +15,7 @@ class UnknownNameError(ConfigError, KeyError):
 
 class RenderError(RuntimeError):
     """No picture can be made on this machine: a screen or OpenGL is missing or does not work."""
+
+
+class EngineWarning(UserWarning):
+    """A step that runs on a slower engine than the one that was chosen, which does not support all of it."""

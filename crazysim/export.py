@@ -14,10 +14,10 @@ from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, as_stages
 from crazysim.engine import symbolic
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.lower import is_key
+from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.lower_stages import lower_stages
 from crazysim.engine.passes import fuse
-from crazysim.engine.program import Program, Segment, Slot, UnfusedStage
+from crazysim.engine.program import Program, Slot, UnfusedStage
 from crazysim.errors import ConfigError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -162,8 +162,7 @@ def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
         if segment.scope != "drone":
             raise _refusal(segment.stages[0], "it sees all drones of its world, and the step of one is exported")
     after: dict[Slot, Any] = {}
-    for segment in program.segments:
-        assert isinstance(segment, Segment)
+    for segment in program.fused_segments:
         slots = (*segment.reads, *segment.hoisted_reads)
         numbers = {slot: after[slot] if slot in after else before(slot) for slot in slots}
         try:

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from cases import INTEGRATORS, PAIRS, hover_command, hover_rotor_state
 
-from crazysim import Sim
+from crazysim import Battery, Downwash, Sim
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.core.stage import Axes, stage
-from crazysim.effects import battery, downwash
 from crazysim.export import STATES, to_casadi
 
 pytestmark = pytest.mark.usefixtures("casadi", "x64")
@@ -160,7 +159,7 @@ def test_constants_are_those_of_the_drone_that_was_asked_for():
 def test_stages_of_the_user_are_exported_with_their_memory():
     """A battery, and a stage with a bounded loop and a branch, of one drone."""
     sim = Sim(N_WORLDS, N_DRONES, control="rotor_vel", engine="plain")
-    battery.add(sim, capacity=0.35, resistance=0.1)
+    sim.add(Battery(capacity=0.35, resistance=0.1))
 
     @stage("drone", when=lambda data: data.states.vel[2] > 0)
     def brake(data):
@@ -203,7 +202,7 @@ def test_a_stage_that_stands_in_the_way_is_named(fn, words):
 
 def test_a_stage_of_all_drones_of_a_world_is_named():
     sim = Sim(n_drones=2, control="rotor_vel")
-    downwash.add(sim)
+    sim.add(Downwash())
     with pytest.raises(ValueError, match=r"(?s)'downwash'.*all drones of its world"):
         to_casadi(sim)
 

@@ -1,1 +1,34 @@
-"""What a simulation is made of: records, stages, pipelines, integrators, random numbers and settings."""
+"""The core: records, stages, pipelines, integrators, plugins, random numbers and settings.
+
+Exported here are the functions with which stages and resets are written.
+"""
+
+from crazysim.core.pipeline import append_fn, insert_fn_after, insert_fn_before, prepend_fn, remove_fn, replace_fn
+from crazysim.core.plugin import FunctionPlugin, Placement, Plugin, check_parameter, parameter
+from crazysim.core.random import drone_key, drone_keys, seed_sim, world_key, world_keys
+from crazysim.core.sharding import shard, world_mesh
+from crazysim.pytree import map_batched, scopes, select_worlds
+
+__all__ = [
+    "FunctionPlugin",
+    "Placement",
+    "Plugin",
+    "append_fn",
+    "check_parameter",
+    "drone_key",
+    "drone_keys",
+    "insert_fn_after",
+    "insert_fn_before",
+    "map_batched",
+    "parameter",
+    "prepend_fn",
+    "remove_fn",
+    "replace_fn",
+    "scopes",
+    "seed_sim",
+    "select_worlds",
+    "shard",
+    "world_key",
+    "world_keys",
+    "world_mesh",
+]

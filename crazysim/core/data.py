@@ -68,6 +68,8 @@ class SimStateDeriv(PyTree):
     """Angular acceleration, body frame, rad/s^2. (n_worlds, n_drones, 3)"""
     rotor_acc: Array = leaf("drone", 1)
     """Rotor acceleration, rpm/s; in ``so_rpy_rotor*`` the rate of thrust, N/s. (n_worlds, n_drones, n_rotors)"""
+    plugins: dict[str, dict[str, Array]] = dataclasses.field(default_factory=dict)
+    """Derivatives of plugins' own states, per second: by plugin, then by field of its record."""
 
 
 class StateControlData(PyTree):

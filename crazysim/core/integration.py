@@ -1,8 +1,9 @@
-"""Integrators: from a state and its derivative to the next state."""
+"""Integrators: from a state and its derivative to the next state, plugins' own states included."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import StrEnum
 
 import jax
@@ -10,6 +11,8 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimStateDeriv
+from crazysim.core.plugin import Plugin
+from crazysim.core.stage import Stage
 
 DerivFn = Callable[[SimData], SimStateDeriv]
 
@@ -74,7 +77,13 @@ def advance(data: SimData, deriv: SimStateDeriv, dt: float, rotvec: Array, norma
         ang_vel=s.ang_vel + dt * deriv.ang_acc,
         rotor_vel=s.rotor_vel + dt * deriv.rotor_acc,
     )
-    return data.replace(states=states)
+    if not deriv.plugins:
+        return data.replace(states=states)
+    moved = {}
+    for name, rates in deriv.plugins.items():
+        record = data.plugins[name]
+        moved[name] = record.replace(**{field: getattr(record, field) + dt * rate for field, rate in rates.items()})
+    return data.replace(states=states, plugins=data.plugins | moved)
 
 
 INTEGRATORS: dict[Integrator, Callable[..., SimData]] = {
@@ -82,3 +91,31 @@ INTEGRATORS: dict[Integrator, Callable[..., SimData]] = {
     Integrator.symplectic_euler: symplectic_euler,
     Integrator.rk4: rk4,
 }
+
+
+@dataclass(frozen=True)
+class Integration:
+    """The function of the stage ``integration``: one step of the drones' states and of plugins' own, together."""
+
+    method: Callable[[SimData, DerivFn], SimData]
+    """The integrator, one of ``INTEGRATORS``."""
+    deriv_fn: DerivFn
+    """Derivative of the drones' states."""
+    plugins: tuple[Plugin, ...] = ()
+    """Plugins whose influences and derivatives count, in the order in which they are applied."""
+
+    def __call__(self, data: SimData) -> SimData:
+        """Return the data one step later."""
+        return self.method(data, self.derivative)
+
+    def derivative(self, data: SimData) -> SimStateDeriv:
+        """Return the derivative of the drones' states under all influences, and of the plugins' own states."""
+        for plugin in self.plugins:
+            data = plugin.influence(data)
+        deriv = self.deriv_fn(data)
+        own = {plugin.name: rates for plugin in self.plugins if (rates := dict(plugin.derivative(data)))}
+        return deriv.replace(plugins=own) if own else deriv
+
+    def stage(self) -> Stage:
+        """Return the stage. Plugins are written for one drone, the rest takes any leading axes."""
+        return Stage(self, "drone", batched=not self.plugins, name="integration")

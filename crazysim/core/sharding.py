@@ -1,9 +1,9 @@
-"""Where worlds live: on one device, or spread over several."""
+"""Devices that hold worlds: one, or several that the worlds are spread over."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
@@ -16,8 +16,36 @@ WORLD_AXIS = "worlds"
 """Name of the mesh axis that worlds are spread over."""
 
 
+class Location(NamedTuple):
+    """Devices that hold the data of a simulation, and how worlds are spread over them."""
+
+    platform: str
+    """``"cpu"`` or ``"gpu"``."""
+    devices: tuple[jax.Device, ...] | None = None
+    """The devices; None for any of the platform."""
+    mesh: Mesh | None = None
+    """Mesh of the devices; None for a single one, or where an array's sharding names no mesh."""
+    axis: Any = WORLD_AXIS
+    """Axis of the mesh, or axes, that worlds are split over; None where each device has all of them."""
+
+    @property
+    def spread(self) -> bool:
+        """True where there are several devices."""
+        return self.mesh is not None or (self.devices is not None and len(self.devices) > 1)
+
+
+def locate(x: jax.Array) -> Location:
+    """Return where an array with an axis of worlds in front is."""
+    devices = tuple(sorted(x.sharding.device_set, key=lambda d: d.id))
+    platform = devices[0].platform
+    if len(devices) == 1 or not isinstance(x.sharding, NamedSharding):
+        return Location(platform, devices)
+    spec = x.sharding.spec
+    return Location(platform, devices, x.sharding.mesh, spec[0] if len(spec) else None)
+
+
 def put(tree: Any, device: jax.Device) -> Any:
-    """Return the tree on a device, bound to it; leaves that are so already are not touched."""
+    """Return the tree on a device, committed to it; leaves that already are stay the same arrays."""
     here = SingleDeviceSharding(device)
 
     def place(x: Any) -> Any:
@@ -33,13 +61,13 @@ def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
 
 
 def placement(data: SimData, mesh: Mesh) -> SimData:
-    """Return where every leaf goes: what belongs to a world is split, what is shared is copied to each device.
+    """Return the sharding of every leaf: leaves of worlds are split, shared ones are copied to each device.
 
     Raises:
         ConfigError: If the worlds cannot be split evenly.
     """
     if not isinstance(mesh, Mesh):
-        raise ConfigError(f"a mesh is what world_mesh(jax.devices()) returns, not {mesh!r}")
+        raise ConfigError(f"expected a mesh, as world_mesh(jax.devices()) returns, got {mesh!r}")
     n_devices = mesh.shape.get(WORLD_AXIS)
     if n_devices is None:
         raise ConfigError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +17,7 @@ from crazysim.control import (
     state2attitude,
 )
 from crazysim.core.data import SimData, SimStateDeriv
-from crazysim.core.integration import INTEGRATORS, DerivFn, Integrator
+from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integrator
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.stage import Stage, StageScope
 from crazysim.dynamics import Dynamics, first_principles, fitted
@@ -57,7 +56,7 @@ def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integr
     deriv_fn: DerivFn = fitted_derivative if fitted_model else first_principles_derivative
     if integrator != Integrator.euler:
         deriv_fn = held_on_floor(deriv_fn)
-    stages["integration"] = _built_in("drone")(partial(INTEGRATORS[integrator], deriv_fn=deriv_fn))
+    stages["integration"] = Integration(INTEGRATORS[integrator], deriv_fn).stage()
     stages["clip_floor_pos"] = clip_floor_pos
     stages["increment_steps"] = increment_steps
     return stages

@@ -2,5 +2,6 @@
 
 from crazysim.dynamics import first_principles, fitted
 from crazysim.dynamics.core import Dynamics, supported_drones, supported_dynamics
+from crazysim.dynamics.first_principles import hover_rotor_vel
 
-__all__ = ["Dynamics", "first_principles", "fitted", "supported_drones", "supported_dynamics"]
+__all__ = ["Dynamics", "first_principles", "fitted", "hover_rotor_vel", "supported_drones", "supported_dynamics"]

@@ -1,5 +1,10 @@
-"""Optional physics, each a stage with a record of its own: off until it is added, and then part of every step."""
+"""Effects: optional physics, each a plugin that ``sim.add`` adds."""
 
-from crazysim.effects import battery, downwash, ground_effect, latency, motors, wind
+from crazysim.effects.battery import Battery
+from crazysim.effects.downwash import Downwash
+from crazysim.effects.ground_effect import GroundEffect
+from crazysim.effects.latency import Latency
+from crazysim.effects.motors import MotorFailure
+from crazysim.effects.wind import Wind
 
-__all__ = ["battery", "downwash", "ground_effect", "latency", "motors", "wind"]
+__all__ = ["Battery", "Downwash", "GroundEffect", "Latency", "MotorFailure", "Wind"]

@@ -1,33 +1,36 @@
-"""Battery: charge that is used up, and a voltage that sags under load and takes rotor speed with it."""
+"""Battery with a charge, a voltage that sags under load, and rotor speeds limited by that voltage."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import stage
+from crazysim.deprecation import warn_renamed
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
-from crazysim.effects.core import Simulation, as_setting, controls_of, install, per_drone, require_rotors, zeros
+from crazysim.effects.core import controls_of, per_drone, require_rotors, zeros
 from crazysim.pytree import PyTree, leaf, static
 
 NOMINAL_VOLTAGE = 3.7
-"""Nominal voltage of a lithium-polymer cell, V, as makers print it on the cell."""
+"""Nominal voltage of a lithium-polymer cell, V, as printed on cells."""
 
 
-class Battery(PyTree):
-    """State of the battery of every drone, and what it is."""
+class BatteryData(PyTree):
+    """State and parameters of the battery of every drone."""
 
     charge: Array = leaf("drone", 1)
     """State of charge, 0 to 1. (n_worlds, n_drones, 1)"""
     rounding: Array = leaf("drone", 1)
-    """What rounding has added to the charge so far, and the next step takes back, 1. (n_worlds, n_drones, 1)"""
+    """Rounding error of the charge, subtracted at the next step, 1. (n_worlds, n_drones, 1)"""
     voltage: Array = leaf("drone", 1)
-    """Voltage under the present load, V. (n_worlds, n_drones, 1)"""
+    """Voltage under load, V. (n_worlds, n_drones, 1)"""
     current: Array = leaf("drone", 1)
-    """Present current, A. (n_worlds, n_drones, 1)"""
+    """Current, A. (n_worlds, n_drones, 1)"""
     capacity: Array = leaf("parameter", 1, (1,))
     """Charge of the full battery, A h. (1,)"""
     resistance: Array = leaf("parameter", 1, (1,))
@@ -37,101 +40,107 @@ class Battery(PyTree):
     base_power: Array = leaf("parameter", 1, (1,))
     """Electric power of everything but the motors, W. (1,)"""
     full_speed_voltage: Array = leaf("parameter", 1, (1,))
-    """Voltage from which on the rotors reach the airframe's largest speed, V. (1,)"""
+    """Least voltage at which the rotors reach the airframe's largest speed, V. (1,)"""
     n_cells: int = static()
     """Number of cells in series."""
 
 
-def add(
-    sim: Simulation,
-    capacity: Any,
-    resistance: Any,
-    n_cells: int = 1,
-    efficiency: Any = 1.0,
-    base_power: Any = 0.0,
-    full_speed_voltage: Any = None,
-    charge: Any = 1.0,
-) -> None:
-    """Let drones fly on batteries: rotors draw power, the voltage sags, and the largest rotor speed with it.
+class Battery(Plugin):
+    """Batteries: rotors draw power, the voltage sags, and the largest rotor speed with it; needs rotors.
 
-    Settings are for all drones, (), or for each, (n_worlds, n_drones).
-
-    Args:
-        sim: The simulation, with first-principles dynamics.
-        capacity: Charge of the full battery, A h.
-        resistance: Internal resistance of the whole battery, ohm.
-        n_cells: Number of lithium-polymer cells in series.
-        efficiency: Mechanical power of the propellers per electric power of the motors, above 0, up to 1.
-        base_power: Electric power of everything but the motors, W.
-        full_speed_voltage: Voltage from which on the rotors reach the airframe's largest speed, V; None for the
-            nominal 3.7 V a cell.
-        charge: State of charge at the beginning of an episode, 0 to 1.
-
-    Raises:
-        ConfigError: If a setting cannot be, the dynamics have no rotors, or the drones have batteries already.
+    The no-load speed of a DC motor is proportional to its voltage, and so is taken to be the largest rotor speed below
+    ``full_speed_voltage``. An empty battery turns no rotor. Parameters are for all drones, (), or for each,
+    (n_worlds, n_drones).
     """
-    require_rotors(sim, "battery sag")
-    cells = int(as_setting(sim, "n_cells", n_cells, (1,), 1, dtype=jnp.int32).item())
-    full_speed_voltage = NOMINAL_VOLTAGE * cells if full_speed_voltage is None else full_speed_voltage
-    full = per_drone(sim, as_setting(sim, "charge", charge, (1,), 0.0, 1.0))
-    record = Battery(
-        charge=full,
-        rounding=zeros(sim, 1),
-        voltage=open_circuit_voltage(full, cells),
-        current=zeros(sim, 1),
-        capacity=as_setting(sim, "capacity", capacity, positive=True),
-        resistance=as_setting(sim, "resistance", resistance, positive=True),
-        efficiency=as_setting(sim, "efficiency", efficiency, high=1.0, positive=True),
-        base_power=as_setting(sim, "base_power", base_power, low=0.0),
-        full_speed_voltage=as_setting(sim, "full_speed_voltage", full_speed_voltage, positive=True),
-        n_cells=cells,
-    )
-    install(sim, "battery", record, discharge, limit_rotor_vel)
+
+    capacity: Any = parameter()
+    """Charge of the full battery, A h."""
+    resistance: Any = parameter()
+    """Internal resistance of the whole battery, ohm."""
+    n_cells: int = 1
+    """Number of lithium-polymer cells in series."""
+    efficiency: Any = parameter(default=1.0)
+    """Mechanical power of the propellers per electric power of the motors, above 0, up to 1."""
+    base_power: Any = parameter(default=0.0)
+    """Electric power of everything but the motors, W."""
+    full_speed_voltage: Any = parameter(default=None)
+    """Least voltage at which the rotors reach the airframe's largest speed, V; None for 3.7 V a cell."""
+    charge: Any = parameter(default=1.0)
+    """State of charge at the beginning of an episode, 0 to 1."""
+    name: str = "battery"
+
+    def record(self, sim: Simulation) -> BatteryData:
+        """Return batteries with the initial charge and no load."""
+        require_rotors(sim, "battery sag")
+        cells = int(check_parameter(sim, "n_cells", self.n_cells, (1,), 1, dtype=jnp.int32).item())
+        full_speed_voltage = NOMINAL_VOLTAGE * cells if self.full_speed_voltage is None else self.full_speed_voltage
+        charge = per_drone(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0))
+        return BatteryData(
+            charge=charge,
+            rounding=zeros(sim, 1),
+            voltage=open_circuit_voltage(charge, cells),
+            current=zeros(sim, 1),
+            capacity=check_parameter(sim, "capacity", self.capacity, positive=True),
+            resistance=check_parameter(sim, "resistance", self.resistance, positive=True),
+            efficiency=check_parameter(sim, "efficiency", self.efficiency, high=1.0, positive=True),
+            base_power=check_parameter(sim, "base_power", self.base_power, low=0.0),
+            full_speed_voltage=check_parameter(sim, "full_speed_voltage", full_speed_voltage, positive=True),
+            n_cells=cells,
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that discharges the batteries."""
+        return [Placement(stage("drone")(self.discharge))]
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with rotor commands limited by the voltage."""
+        battery, controls = self.read(data), controls_of(data)
+        share = battery.voltage / battery.full_speed_voltage
+        share = jnp.where(battery.charge > 0, jnp.where(share < 1, share, 1.0), 0.0)
+        limit = share * data.params.rotor_vel_max
+        rotor_vel = jnp.where(controls.rotor_vel > limit, limit, controls.rotor_vel)
+        return data.replace(controls=controls.replace(rotor_vel=rotor_vel))
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the voltage, V, and the state of charge."""
+        battery = self.read(data)
+        return {"voltage": battery.voltage, "charge": battery.charge}
+
+    def discharge(self, data: SimData) -> SimData:
+        """Draw the energy of one step for the rotors and electronics of one drone.
+
+        The power of a rotor is drag torque times angular velocity; the power that accelerates it is neglected. An
+        empty battery supplies nothing.
+        """
+        battery, p, rotor_vel = self.read(data), data.params, data.states.rotor_vel
+        mechanical = jnp.sum(curve(rotor_vel, p.rpm2torque) * rotor_vel * RPM_TO_RAD_S, axis=-1, keepdims=True)
+        power = jnp.where(mechanical > 0, mechanical, 0.0) / battery.efficiency + battery.base_power
+        power = jnp.where(battery.charge > 0, power, 0.0)
+        voltage, current = under_load(power, open_circuit_voltage(battery.charge, battery.n_cells), battery.resistance)
+
+        # Compensated summation (Kahan 1965): a step draws some millionths of the charge, mostly lost in float32.
+        drawn = current / (3600.0 * data.core.freq * battery.capacity) + battery.rounding
+        charge = battery.charge - drawn
+        rounding = drawn - (battery.charge - charge)
+        empty = charge <= 0
+        battery = battery.replace(
+            charge=jnp.where(empty, 0.0, charge),
+            rounding=jnp.where(empty, 0.0, rounding),
+            voltage=voltage,
+            current=current,
+        )
+        return self.write(data, battery)
 
 
-def limit_rotor_vel(data: SimData) -> SimData:
-    """Return the data with rotor commands within what the voltage allows; an empty battery turns no rotor.
-
-    The no-load speed of a DC motor is proportional to its voltage, and so is taken to be the largest speed below
-    ``full_speed_voltage``.
-    """
-    battery, controls = data.plugins["battery"], controls_of(data)
-    share = battery.voltage / battery.full_speed_voltage
-    share = jnp.where(battery.charge > 0, jnp.where(share < 1, share, 1.0), 0.0)
-    limit = share * data.params.rotor_vel_max
-    rotor_vel = jnp.where(controls.rotor_vel > limit, limit, controls.rotor_vel)
-    return data.replace(controls=controls.replace(rotor_vel=rotor_vel))
-
-
-@stage("drone")
-def discharge(data: SimData) -> SimData:
-    """Draw the power of one drone's rotors and electronics from its battery for a step.
-
-    Rotors need drag torque times angular velocity; what speeding them up takes is left out. An empty battery gives
-    nothing.
-    """
-    battery, p, rotor_vel = data.plugins["battery"], data.params, data.states.rotor_vel
-    mechanical = jnp.sum(curve(rotor_vel, p.rpm2torque) * rotor_vel * RPM_TO_RAD_S, axis=-1, keepdims=True)
-    power = jnp.where(mechanical > 0, mechanical, 0.0) / battery.efficiency + battery.base_power
-    power = jnp.where(battery.charge > 0, power, 0.0)
-    voltage, current = under_load(power, open_circuit_voltage(battery.charge, battery.n_cells), battery.resistance)
-
-    # Compensated summation (Kahan 1965): a step draws a few millionths of the charge, of which float32 would lose much.
-    drawn = current / (3600.0 * data.core.freq * battery.capacity) + battery.rounding
-    charge = battery.charge - drawn
-    rounding = drawn - (battery.charge - charge)
-    empty = charge <= 0
-    battery = battery.replace(
-        charge=jnp.where(empty, 0.0, charge),
-        rounding=jnp.where(empty, 0.0, rounding),
-        voltage=voltage,
-        current=current,
-    )
-    return data.replace(plugins=data.plugins | {"battery": battery})
+def add(sim: Simulation, capacity: Any, resistance: Any, n_cells: int = 1, efficiency: Any = 1.0,
+        base_power: Any = 0.0, full_speed_voltage: Any = None, charge: Any = 1.0) -> None:  # fmt: skip
+    """Add batteries. Deprecated: use ``sim.add(Battery(...))``."""
+    warn_renamed("effects.battery.add(sim, ...)", "sim.add(Battery(...))")
+    sim.add(Battery(capacity, resistance, n_cells, efficiency, base_power, full_speed_voltage, charge))
 
 
 def open_circuit_voltage(charge: Array, n_cells: int) -> Array:
-    """Return the voltage of lithium-polymer cells in series without load, V.
+    """Return the open-circuit voltage of lithium-polymer cells in series, V.
 
     Chen and Rincon-Mora 2006 (IEEE Trans. Energy Conversion 21(2)), equation 2, fitted to one cell: 4.10 V when full,
     3.8 V at half charge, with a steep fall below a tenth.
@@ -145,13 +154,13 @@ def open_circuit_voltage(charge: Array, n_cells: int) -> Array:
 
 
 def under_load(power: Array, open_circuit: Array, resistance: Array) -> tuple[Array, Array]:
-    """Return voltage and current of a source with internal resistance that gives a power, V and A.
+    """Return the voltage, V, and current, A, of a source with internal resistance that supplies a power.
 
-    The upper root of ``V = V_0 - R P / V``. No more than ``V_0^2 / (4 R)`` can be had: the load that asks for more gets
-    just that, at half the open-circuit voltage.
+    The upper root of ``V = V_0 - R P / V``. The source supplies ``V_0^2 / (4 R)`` at most, at half the open-circuit
+    voltage; larger loads get that.
 
     Args:
-        power: Power asked for, W. (..., 1)
+        power: Power of the load, W. (..., 1)
         open_circuit: Voltage without load, V. (..., 1)
         resistance: Internal resistance, ohm. (..., 1)
     """

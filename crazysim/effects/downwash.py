@@ -1,8 +1,9 @@
-"""Downwash: the jet of air below every drone, and what it does to the drones in it."""
+"""Downwash: the jets of air below the drones of a world, acting on the others through their drag."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,10 +11,12 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import stage
+from crazysim.deprecation import warn_renamed
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve
-from crazysim.effects.core import Simulation, as_setting, blown_upon, install, require_drag, zeros
+from crazysim.effects.core import require_drag, with_moving_air, zeros
 from crazysim.pytree import PyTree, leaf
 
 DECAY, SPREAD = 5.8, 0.094
@@ -23,55 +26,62 @@ AIR_DENSITY = 1.225
 """Density of air at sea level, kg/m^3 (ISO 2533)."""
 
 
-class Downwash(PyTree):
-    """Velocity of the air that the other drones of its world blow at every drone."""
+class DownwashData(PyTree):
+    """Velocity of the air from the other drones of its world at every drone."""
 
     diameter: Array = leaf("parameter", 1, (1,))
-    """Diameter of the jet of a drone where it is fully contracted, m. (1,)"""
+    """Diameter of the fully contracted jet of a drone, m. (1,)"""
     air_density: Array = leaf("parameter", 1, (1,))
     """Density of air, kg/m^3. (1,)"""
     air_vel: Array = leaf("drone", 1)
-    """Velocity of the air that others blow at the drone, world frame, m/s. (n_worlds, n_drones, 3)"""
+    """Velocity of the air from other drones, world frame, m/s. (n_worlds, n_drones, 3)"""
+
+
+class Downwash(Plugin):
+    """Downwash of the other drones of a world, as drag of the velocity relative to the air; needs a model with drag."""
+
+    propeller_radius: Any = parameter(default=None)
+    """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
+    air_density: Any = parameter(default=AIR_DENSITY)
+    """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
+    name: str = "downwash"
+
+    def record(self, sim: Simulation) -> DownwashData:
+        """Return still air."""
+        require_drag(sim, "downwash")
+        radius = self.propeller_radius
+        if radius is None:
+            radius = sim.airframe.value("shape.propeller_radius", ())
+        radius = check_parameter(sim, "propeller_radius", radius, positive=True)
+        density = check_parameter(sim, "air_density", self.air_density, positive=True)
+        # Far below a rotor the cross-section of its stream is half the rotor's disc (momentum theory).
+        return DownwashData(math.sqrt(2 * sim.airframe.n_rotors) * radius, density, zeros(sim, 3))
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that computes the air velocity, of one world."""
+        return [Placement(stage("world")(self.sum_jets))]
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the force that the air from other drones adds to the drag."""
+        return with_moving_air(data, self.read(data).air_vel)
+
+    def sum_jets(self, data: SimData) -> SimData:
+        """Add up the jets of the drones of one world at each of them; a jet does not act on its own drone."""
+        record, s = self.read(data), data.states
+        axis = rotation.z_axis(s.quat)
+        offset = s.pos[:, None] - s.pos[None]
+        speed = jet(offset, axis, collective_thrust(data), record.diameter, record.air_density)
+        air_vel = jnp.sum(-speed * axis, axis=1)
+        return self.write(data, record.replace(air_vel=air_vel))
 
 
 def add(sim: Simulation, propeller_radius: Any = None, air_density: Any = AIR_DENSITY) -> None:
-    """Let drones feel the downwash of the others of their world, as drag of their velocity relative to the air.
-
-    Args:
-        sim: The simulation; its model must have drag.
-        propeller_radius: Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)
-        air_density: Density of air, kg/m^3. () or (n_worlds, n_drones)
-
-    Raises:
-        ConfigError: If a setting cannot be, the model has no drag, or there is downwash already.
-    """
-    require_drag(sim, "downwash")
-    if propeller_radius is None:
-        propeller_radius = sim.airframe.value("shape.propeller_radius", ())
-    radius = as_setting(sim, "propeller_radius", propeller_radius, positive=True)
-    density = as_setting(sim, "air_density", air_density, positive=True)
-    # Far below a rotor its stream has half the area of its disc (momentum theory).
-    record = Downwash(math.sqrt(2 * sim.airframe.n_rotors) * radius, density, zeros(sim, 3))
-    install(sim, "downwash", record, downwash, drag_in_downwash)
+    """Add downwash. Deprecated: use ``sim.add(Downwash(...))``."""
+    warn_renamed("effects.downwash.add(sim, ...)", "sim.add(Downwash(...))")
+    sim.add(Downwash(propeller_radius, air_density))
 
 
-def drag_in_downwash(data: SimData) -> SimData:
-    """Return the data with the force that the air from other drones adds to the drag."""
-    return blown_upon(data, data.plugins["downwash"].air_vel)
-
-
-@stage("world")
-def downwash(data: SimData) -> SimData:
-    """Sum up the jets of all drones of one world at each of them; none reaches its own drone."""
-    record, s = data.plugins["downwash"], data.states
-    axis = rotation.z_axis(s.quat)
-    apart = s.pos[:, None] - s.pos[None]
-    speed = jet(apart, axis, collective_thrust(data), record.diameter, record.air_density)
-    air_vel = jnp.sum(-speed * axis, axis=1)
-    return data.replace(plugins=data.plugins | {"downwash": record.replace(air_vel=air_vel)})
-
-
-def jet(apart: Array, axis: Array, thrust: Array, diameter: Array, air_density: Array) -> Array:
+def jet(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density: Array) -> Array:
     """Return the speed of the air in the jet of a hovering drone, m/s.
 
     From 2.5 drone diameters downwards the mean flow below a quadrotor is that of one round turbulent jet (Bauersfeld
@@ -81,12 +91,12 @@ def jet(apart: Array, axis: Array, thrust: Array, diameter: Array, air_density: 
         u = u_0 / (1 + s / (B d)) / (1 + (sqrt(2) - 1) (r / b)^2)^2,  b = S (s + B d)
 
     at s below the rotors and r off their axis. Momentum theory gives the speed at the start, ``u_0^2 = 4 T / (pi rho
-    d^2)`` with d the diameter of the contracted stream. That the virtual origin lies where the speed of the jet is u_0
-    in the plane of the rotors, is an assumption, and so is the smooth start from nothing within one diameter below.
-    Above the drone there is no jet.
+    d^2)`` with d the diameter of the contracted stream. Two assumptions: the virtual origin lies where the speed of the
+    jet is u_0 in the plane of the rotors, and the jet starts smoothly from zero within one diameter below. There is no
+    jet above the drone.
 
     Args:
-        apart: Place relative to the drone, world frame, m. (..., 3)
+        offset: Position relative to the drone, world frame, m. (..., 3)
         axis: The drone's body z axis, along which it thrusts, world frame. (..., 3)
         thrust: Its collective thrust, N; below zero counts as none. (..., 1)
         diameter: Diameter d of its contracted stream, m. (..., 1)
@@ -95,8 +105,8 @@ def jet(apart: Array, axis: Array, thrust: Array, diameter: Array, air_density: 
     Returns:
         Speed against the axis. (..., 1)
     """
-    below = -rotation.dot(apart, axis)
-    off_axis = apart + below * axis
+    below = -rotation.dot(offset, axis)
+    off_axis = offset + below * axis
     pushes = thrust > 0
     start = jnp.sqrt(jnp.where(pushes, thrust, 1.0) * 4 / (math.pi * air_density)) / diameter
     # Only below: above, the distance to the virtual origin would pass through zero.
@@ -110,7 +120,7 @@ def jet(apart: Array, axis: Array, thrust: Array, diameter: Array, air_density: 
 
 
 def collective_thrust(data: SimData) -> Array:
-    """Return what the rotors of a drone push by now, N: from their speeds, or as the fitted model has it. (..., 1)"""
+    """Return the collective thrust of a drone, N, from its rotor speeds or by the fitted model. (..., 1)"""
     p: Any = data.params
     rotor_vel = data.states.rotor_vel
     if isinstance(p, first_principles.Params):

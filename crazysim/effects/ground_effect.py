@@ -1,4 +1,4 @@
-"""Ground effect: rotors near the floor push more at the same speed."""
+"""Ground effect: rotors near the floor give more thrust at the same speed."""
 
 from __future__ import annotations
 
@@ -9,53 +9,58 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.effects.core import Simulation, as_setting, install, require_rotors
+from crazysim.core.plugin import Plugin, Simulation, check_parameter, parameter
+from crazysim.deprecation import warn_renamed
+from crazysim.effects.core import require_rotors
 from crazysim.pytree import PyTree, leaf
 
 
-class GroundEffect(PyTree):
-    """What the gain in thrust depends on; nothing of it changes with time."""
+class GroundEffectData(PyTree):
+    """Parameters of the gain in thrust; none changes with time."""
 
     propeller_radius: Array = leaf("parameter", 1, (1,))
     """Radius of a propeller, m. (1,)"""
     rotor_pos: Array = leaf("parameter", 2)
-    """Places of the rotors, body frame, m. (n_rotors, 3)"""
+    """Positions of the rotors, body frame, m. (n_rotors, 3)"""
+
+
+class GroundEffect(Plugin):
+    """Thrust of every rotor that grows near the floor, at z = 0; needs rotors."""
+
+    propeller_radius: Any = parameter(default=None)
+    """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
+    name: str = "ground_effect"
+
+    def record(self, sim: Simulation) -> GroundEffectData:
+        """Return the parameters."""
+        require_rotors(sim, "ground effect")
+        radius = self.propeller_radius
+        if radius is None:
+            radius = sim.airframe.value("shape.propeller_radius", ())
+        radius = check_parameter(sim, "propeller_radius", radius, positive=True)
+        return GroundEffectData(radius, jnp.asarray(sim.airframe.value("rotors.position"), radius.dtype))
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the thrust curves at the height of each rotor."""
+        record, s, p = self.read(data), data.states, data.params
+        height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], record.rotor_pos)[..., 2]
+        upright = rotation.z_axis(s.quat)[..., 2:]
+        gain = thrust_gain(height, upright, record.propeller_radius)
+        return data.replace(params=p.replace(rpm2thrust=gain[..., None] * p.rpm2thrust))
 
 
 def add(sim: Simulation, propeller_radius: Any = None) -> None:
-    """Let the thrust of every rotor grow as it comes near the floor, at z = 0.
-
-    Args:
-        sim: The simulation, with first-principles dynamics.
-        propeller_radius: Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)
-
-    Raises:
-        ConfigError: If a setting cannot be, the dynamics have no rotors, or the effect is on already.
-    """
-    require_rotors(sim, "ground effect")
-    if propeller_radius is None:
-        propeller_radius = sim.airframe.value("shape.propeller_radius", ())
-    radius = as_setting(sim, "propeller_radius", propeller_radius, positive=True)
-    rotor_pos = jnp.asarray(sim.airframe.value("rotors.position"), radius.dtype)
-    install(sim, "ground_effect", GroundEffect(radius, rotor_pos), influence=lift)
-
-
-def lift(data: SimData) -> SimData:
-    """Return the data with the thrust curves that rotors have at their present height."""
-    record, s, p = data.plugins["ground_effect"], data.states, data.params
-    height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], record.rotor_pos)[..., 2]
-    upright = rotation.z_axis(s.quat)[..., 2:]
-    gain = thrust_gain(height, upright, record.propeller_radius)
-    return data.replace(params=p.replace(rpm2thrust=gain[..., None] * p.rpm2thrust))
+    """Add the ground effect. Deprecated: use ``sim.add(GroundEffect(...))``."""
+    warn_renamed("effects.ground_effect.add(sim, ...)", "sim.add(GroundEffect(...))")
+    sim.add(GroundEffect(propeller_radius))
 
 
 def thrust_gain(height: Array, upright: Array, radius: Array) -> Array:
-    """Return the thrust of rotors near the ground over that far from it, at the same speed, 1.
+    """Return the ratio of the thrust of rotors near the ground to that far from it, at the same speed.
 
     ``1 / (1 - (R / 4 z)^2)`` (Cheeseman and Bennett 1955, ARC R&M 3021, for hover). Their image source has a pole at
-    z = R / 4; here ``z^2 + R^2 / 4`` stands in for ``z^2``, so that the gain ends at 4/3 on the floor, and is 1.3 %
-    below theirs at z = R, less farther up. Tilting takes the effect away with the cosine of the tilt. Both are
-    assumptions.
+    z = R / 4; ``z^2 + R^2 / 4`` replaces ``z^2`` here, so that the ratio is at most 4/3, on the floor. At z = R it is
+    1.3 % below theirs, farther up less. The effect decreases with the cosine of the tilt. Both are assumptions.
 
     Args:
         height: Height of the rotors above the floor, m; below zero counts as zero. (..., n_rotors)

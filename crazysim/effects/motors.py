@@ -1,7 +1,8 @@
-"""Motors that have lost strength, and rotors that fail in flight."""
+"""Motor failure: rotors that are weaker than the airframe's, or fail in flight."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -10,93 +11,107 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.random import drone_key
 from crazysim.core.stage import stage
-from crazysim.effects.core import Simulation, as_setting, controls_of, install, per_drone, require_rotors
+from crazysim.deprecation import warn_renamed
+from crazysim.effects.core import controls_of, per_drone, require_rotors
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 
 
-class Motors(PyTree):
-    """What is left of every rotor."""
+class MotorFailureData(PyTree):
+    """Effectiveness of every rotor, and when it fails."""
 
     effectiveness: Array = leaf("drone", 1)
-    """Fraction of its thrust and drag torque that a rotor still has, 1. (n_worlds, n_drones, n_rotors)"""
+    """Fraction of thrust and drag torque left to a rotor, 1. (n_worlds, n_drones, n_rotors)"""
     fail_step: Array | None = leaf("parameter", 1)
     """Step of the episode in which a rotor fails, negative for never; None if none is set. (n_rotors,)"""
     rate: Array | None = leaf("parameter", 1)
     """Failures per second of a rotor that works, 1/s; None if none fails by chance. (n_rotors,)"""
 
 
-def add(sim: Simulation, effectiveness: Any = 1.0, fail_step: Any = None, rate: Any = None) -> None:
-    """Let rotors be weaker than the airframe's, and fail.
+class MotorFailure(Plugin):
+    """Rotors that are weaker than the airframe's, or fail; needs rotors.
 
-    A rotor of effectiveness e gives e times the thrust and the drag torque of its speed. One that has failed gives
-    none, and runs down. What the controllers believe stays as it was.
-
-    Args:
-        sim: The simulation, with first-principles dynamics.
-        effectiveness: Fraction of thrust and drag torque at the beginning of an episode, 0 to 1.
-            (), (n_rotors,) or (n_worlds, n_drones, n_rotors)
-        fail_step: Step of the episode in which a rotor fails, a whole number, negative for never; None if no rotor
-            does. (), (n_rotors,) or (n_worlds, n_drones, n_rotors)
-        rate: Failures per second of a rotor that works, 1/s, by chance; None for no such failures.
-            (), (n_rotors,) or (n_worlds, n_drones, n_rotors)
-
-    Raises:
-        ConfigError: If a setting cannot be, the dynamics have no rotors, or the effect is on already.
+    A rotor of effectiveness e gives e times the thrust and the drag torque of its speed. A failed one gives none, takes
+    no command and runs down. Controllers keep the airframe's parameters.
     """
-    require_rotors(sim, "motor failure")
-    core = (sim.airframe.n_rotors,)
-    record = Motors(
-        effectiveness=per_drone(sim, as_setting(sim, "effectiveness", effectiveness, core, 0.0, 1.0)),
-        fail_step=None if fail_step is None else as_setting(sim, "fail_step", fail_step, core, dtype=jnp.int32),
-        rate=None if rate is None else as_setting(sim, "rate", rate, core, 0.0),
-    )
-    can_fail = fail_step is not None or rate is not None
-    install(sim, "motors", record, failures if can_fail else None, weaken)
+
+    effectiveness: Any = parameter(default=1.0)
+    """Fraction of thrust and drag torque at the beginning of an episode, 0 to 1.
+    (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
+    fail_step: Any = parameter(default=None)
+    """Step of the episode in which a rotor fails, a whole number, negative for never; None if no rotor does.
+    (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
+    rate: Any = parameter(default=None)
+    """Random failures per second of a working rotor, 1/s; None for no random failures.
+    (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
+    name: str = "motors"
+
+    def record(self, sim: Simulation) -> MotorFailureData:
+        """Return the rotors at their initial effectiveness."""
+        require_rotors(sim, "motor failure")
+        core, step, rate = (sim.airframe.n_rotors,), self.fail_step, self.rate
+        return MotorFailureData(
+            effectiveness=per_drone(sim, check_parameter(sim, "effectiveness", self.effectiveness, core, 0.0, 1.0)),
+            fail_step=None if step is None else check_parameter(sim, "fail_step", step, core, dtype=jnp.int32),
+            rate=None if rate is None else check_parameter(sim, "rate", rate, core, 0.0),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that makes rotors fail, if any can."""
+        can_fail = self.fail_step is not None or self.rate is not None
+        return [Placement(stage("drone")(self.fail_in_flight))] if can_fail else []
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the curves and commands of weak and failed rotors."""
+        effectiveness = self.read(data).effectiveness
+        p, scale, controls = data.params, effectiveness[..., None], controls_of(data)
+        params = p.replace(rpm2thrust=scale * p.rpm2thrust, rpm2torque=scale * p.rpm2torque)
+        rotor_vel = jnp.where(effectiveness > 0, controls.rotor_vel, 0.0)
+        return data.replace(params=params, controls=controls.replace(rotor_vel=rotor_vel))
+
+    def fail_in_flight(self, data: SimData) -> SimData:
+        """Make rotors of one drone fail, in their step or at random with probability ``1 - exp(-rate dt)`` a step."""
+        motors = self.read(data)
+        effectiveness = motors.effectiveness
+        if motors.fail_step is not None:
+            due = (motors.fail_step >= 0) & (data.core.steps >= motors.fail_step)
+            effectiveness = jnp.where(due, 0.0, effectiveness)
+        if motors.rate is not None:
+            uniform = jax.random.uniform(drone_key(data, self.name), effectiveness.shape, effectiveness.dtype)
+            effectiveness = jnp.where(uniform < jnp.exp(-motors.rate / data.core.freq), effectiveness, 0.0)
+        return self.write(data, motors.replace(effectiveness=effectiveness))
+
+    def fail(self, data: SimData, mask: Any) -> SimData:
+        """Return the data with failed rotors; a reset of their world restores them.
+
+        Args:
+            data: The simulation, all worlds of it.
+            mask: True for rotors that fail, of type bool. (n_worlds, n_drones, n_rotors)
+
+        Raises:
+            ConfigError: If this plugin has not been added, or the mask has another shape or type.
+        """
+        if self.name not in data.plugins:
+            raise ConfigError(f"{self.name} is not enabled. Use sim.add(MotorFailure(...)) first.")
+        motors, mask = self.read(data), np.asarray(mask)
+        if mask.shape != motors.effectiveness.shape or mask.dtype != bool:
+            raise ConfigError(
+                f"expected a mask of shape {motors.effectiveness.shape} = (n_worlds, n_drones, n_rotors) and type "
+                f"bool, got {mask.shape} and {mask.dtype}"
+            )
+        return self.write(data, motors.replace(effectiveness=jnp.where(mask, 0.0, motors.effectiveness)))
+
+
+def add(sim: Simulation, effectiveness: Any = 1.0, fail_step: Any = None, rate: Any = None) -> None:
+    """Add motor failure. Deprecated: use ``sim.add(MotorFailure(...))``."""
+    warn_renamed("effects.motors.add(sim, ...)", "sim.add(MotorFailure(...))")
+    sim.add(MotorFailure(effectiveness, fail_step, rate))
 
 
 def fail(sim: Simulation, mask: Any) -> None:
-    """Let rotors fail now; a reset of their world restores them.
-
-    Args:
-        sim: The simulation, with this effect.
-        mask: Which, of type bool. (n_worlds, n_drones, n_rotors)
-
-    Raises:
-        ConfigError: If the effect is off, or the mask has another shape or type.
-    """
-    if "motors" not in sim.data.plugins:
-        raise ConfigError("rotors can fail once effects.motors.add(sim) has been called")
-    motors, mask = sim.data.plugins["motors"], np.asarray(mask)
-    if mask.shape != motors.effectiveness.shape or mask.dtype != bool:
-        raise ConfigError(
-            f"the mask has shape {mask.shape} and type {mask.dtype}; needed are {motors.effectiveness.shape} = "
-            f"(n_worlds, n_drones, n_rotors) and bool"
-        )
-    motors = motors.replace(effectiveness=jnp.where(mask, 0.0, motors.effectiveness))
-    sim.data = sim.data.replace(plugins=sim.data.plugins | {"motors": motors})
-
-
-def weaken(data: SimData) -> SimData:
-    """Return the data with the curves and commands that weak and failed rotors have."""
-    effectiveness = data.plugins["motors"].effectiveness
-    p, scale, controls = data.params, effectiveness[..., None], controls_of(data)
-    params = p.replace(rpm2thrust=scale * p.rpm2thrust, rpm2torque=scale * p.rpm2torque)
-    rotor_vel = jnp.where(effectiveness > 0, controls.rotor_vel, 0.0)
-    return data.replace(params=params, controls=controls.replace(rotor_vel=rotor_vel))
-
-
-@stage("drone")
-def failures(data: SimData) -> SimData:
-    """Let the rotors of one drone fail whose step has come, or whom chance hits: ``1 - exp(-rate dt)`` a step."""
-    motors = data.plugins["motors"]
-    effectiveness = motors.effectiveness
-    if motors.fail_step is not None:
-        due = (motors.fail_step >= 0) & (data.core.steps >= motors.fail_step)
-        effectiveness = jnp.where(due, 0.0, effectiveness)
-    if motors.rate is not None:
-        luck = jax.random.uniform(drone_key(data, "motors"), effectiveness.shape, effectiveness.dtype)
-        effectiveness = jnp.where(luck < jnp.exp(-motors.rate / data.core.freq), effectiveness, 0.0)
-    return data.replace(plugins=data.plugins | {"motors": motors.replace(effectiveness=effectiveness)})
+    """Make rotors fail. Deprecated: use ``sim.data = motors.fail(sim.data, mask)``."""
+    warn_renamed("effects.motors.fail(sim, mask)", "sim.data = motors.fail(sim.data, mask), motors from sim.add")
+    sim.data = MotorFailure().fail(sim.data, mask)

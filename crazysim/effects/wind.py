@@ -1,7 +1,8 @@
-"""Wind: a constant mean, and gusts with the spectra of Dryden."""
+"""Wind with a constant mean and Dryden gusts."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -9,92 +10,99 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.random import drone_key
 from crazysim.core.stage import stage
-from crazysim.effects.core import Simulation, as_setting, blown_upon, install, require_drag, zeros
+from crazysim.deprecation import warn_renamed
+from crazysim.effects.core import require_drag, with_moving_air, zeros
 from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import dot, safe_clip, safe_normalize
 
 FOOT = 0.3048
 """Metres per foot: the low-altitude model is stated in feet."""
 LOWEST, HIGHEST = 10.0, 1000.0
-"""Heights between which the low-altitude model holds, ft; below and above, those of the nearer end are taken."""
+"""Range of heights in which the low-altitude model holds, ft; heights outside are clipped to it."""
 MIN_AIRSPEED = 1.0
-"""Airspeed at which gusts pass a drone that drifts along with the mean wind, m/s: an assumption, for the frozen field
-of the model would stand still then."""
+"""Airspeed at which gusts pass a drone that drifts with the mean wind, m/s. An assumption: in the model's frozen field
+the gust at such a drone would never change."""
 
 
-class Wind(PyTree):
+class WindData(PyTree):
     """Velocity of the air at every drone."""
 
     velocity: Array = leaf("parameter", 1, (3,))
     """Mean wind, world frame, m/s. (3,)"""
     speed_20ft: Array | None = leaf("parameter", 1, (1,))
-    """Mean wind speed 20 ft above ground, which sets how strong gusts are, m/s; None without gusts. (1,)"""
+    """Mean wind speed 20 ft above ground, which sets the strength of gusts, m/s; None without gusts. (1,)"""
     filters: Array | None = leaf("drone", 1)
     """States of the shaping filters at unit variance, 1; None without gusts. (n_worlds, n_drones, 5)"""
     gust: Array | None = leaf("drone", 1)
-    """Present gust, world frame, m/s; None without gusts. (n_worlds, n_drones, 3)"""
+    """Gust, world frame, m/s; None without gusts. (n_worlds, n_drones, 3)"""
+
+
+class Wind(Plugin):
+    """Wind that acts through the drag of the velocity relative to the air; needs a model with drag.
+
+    The gusts have the Dryden spectra of MIL-F-8785C (3.7.1.2): white noise through filters, ``1 / (1 + t s)`` along the
+    mean wind, ``(1 + sqrt(3) t s) / (1 + t s)^2`` across and vertically, ``t = L / V``. MIL-HDBK-1797 writes 2 L for L
+    across and vertically and halves these lengths, which is equivalent at low altitude. An episode begins with gusts
+    at full strength, not with calm air.
+    """
+
+    velocity: Any = parameter(default=(0.0, 0.0, 0.0))
+    """Mean wind, world frame, m/s. (3,) or (n_worlds, n_drones, 3)"""
+    speed_20ft: Any = parameter(default=None)
+    """Mean wind speed 20 ft above ground, m/s, which sets the strength of gusts: 15 knots (7.7 m/s) is light, 30
+    moderate, 45 severe turbulence (MIL-F-8785C, 3.7.3.4). None for no gusts. () or (n_worlds, n_drones)"""
+    name: str = "wind"
+
+    def record(self, sim: Simulation) -> WindData:
+        """Return the wind, with filters at rest."""
+        require_drag(sim, "wind")
+        mean = check_parameter(sim, "velocity", self.velocity, (3,))
+        if self.speed_20ft is None:
+            return WindData(mean, None, None, None)
+        return WindData(
+            mean, check_parameter(sim, "speed_20ft", self.speed_20ft, low=0.0), zeros(sim, 5), zeros(sim, 3)
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that advances the gusts, if there are any."""
+        return [] if self.speed_20ft is None else [Placement(stage("drone")(self.advance_gust))]
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the force that the wind adds to the drag."""
+        wind = self.read(data)
+        return with_moving_air(data, wind.velocity if wind.gust is None else wind.velocity + wind.gust)
+
+    def advance_gust(self, data: SimData) -> SimData:
+        """Advance the gust at one drone by a step."""
+        wind, s = self.read(data), data.states
+        length, deviation = low_altitude(s.pos[..., 2:], wind.speed_20ft)
+        relative = s.vel - wind.velocity
+        airspeed = jnp.sqrt(dot(relative, relative) + MIN_AIRSPEED**2)
+        step = airspeed / (data.core.freq * length)
+
+        noise = jax.random.normal(drone_key(data, self.name), (6,), s.vel.dtype)
+        begins = data.core.steps == 0
+        first, second = wind.filters[:3], wind.filters[3:]
+        first = jnp.where(begins, noise[3:], first)
+        filters = shape_noise(first, second, noise[:3], jnp.where(begins, 1.0, step / (1 + step / 2)))
+
+        first, second = filters[:3], filters[3:]
+        across = (3**0.5 * first[1:] + (1 - 3**0.5) * second) / 2**0.5
+        gust = from_wind_axes(deviation * jnp.concatenate([first[:1], across]), wind.velocity)
+        return self.write(data, wind.replace(filters=filters, gust=gust))
 
 
 def add(sim: Simulation, velocity: Any = (0.0, 0.0, 0.0), speed_20ft: Any = None) -> None:
-    """Let wind blow: the drones feel the drag of their velocity relative to the air.
-
-    Args:
-        sim: The simulation; its model must have drag.
-        velocity: Mean wind, world frame, m/s, for all drones or each. (3,) or (n_worlds, n_drones, 3)
-        speed_20ft: Mean wind speed 20 ft above ground, m/s, which sets how strong gusts are: 15 knots (7.7 m/s) is
-            light, 30 moderate, 45 severe turbulence (MIL-F-8785C, 3.7.3.4). None for no gusts.
-            () or (n_worlds, n_drones)
-
-    Raises:
-        ConfigError: If a setting cannot be, the model has no drag, or there is wind already.
-    """
-    require_drag(sim, "wind")
-    mean = as_setting(sim, "velocity", velocity, (3,))
-    if speed_20ft is None:
-        install(sim, "wind", Wind(mean, None, None, None), influence=drag_in_wind)
-        return
-    record = Wind(mean, as_setting(sim, "speed_20ft", speed_20ft, low=0.0), zeros(sim, 5), zeros(sim, 3))
-    install(sim, "wind", record, gusts, drag_in_wind)
-
-
-def drag_in_wind(data: SimData) -> SimData:
-    """Return the data with the force that the wind adds to the drag."""
-    wind = data.plugins["wind"]
-    return blown_upon(data, wind.velocity if wind.gust is None else wind.velocity + wind.gust)
-
-
-@stage("drone")
-def gusts(data: SimData) -> SimData:
-    """Let the gust at one drone go on by a step.
-
-    The Dryden spectra of MIL-F-8785C (3.7.1.2) as white noise through filters: ``1 / (1 + t s)`` along the mean wind,
-    ``(1 + sqrt(3) t s) / (1 + t s)^2`` across and vertically, ``t = L / V``. MIL-HDBK-1797 writes 2 L for L across and
-    vertically and halves these lengths, which at low altitude comes to the same. An episode begins with gusts at full
-    strength, not with calm air.
-    """
-    wind = data.plugins["wind"]
-    s = data.states
-    length, deviation = low_altitude(s.pos[..., 2:], wind.speed_20ft)
-    relative = s.vel - wind.velocity
-    airspeed = jnp.sqrt(dot(relative, relative) + MIN_AIRSPEED**2)
-    step = airspeed / (data.core.freq * length)
-
-    noise = jax.random.normal(drone_key(data, "wind"), (6,), s.vel.dtype)
-    begins = data.core.steps == 0
-    first, second = wind.filters[:3], wind.filters[3:]
-    first = jnp.where(begins, noise[3:], first)
-    filters = shape_noise(first, second, noise[:3], jnp.where(begins, 1.0, step / (1 + step / 2)))
-
-    first, second = filters[:3], filters[3:]
-    across = (3**0.5 * first[1:] + (1 - 3**0.5) * second) / 2**0.5
-    gust = from_wind_axes(deviation * jnp.concatenate([first[:1], across]), wind.velocity)
-    return data.replace(plugins=data.plugins | {"wind": wind.replace(filters=filters, gust=gust)})
+    """Add wind. Deprecated: use ``sim.add(Wind(...))``."""
+    warn_renamed("effects.wind.add(sim, ...)", "sim.add(Wind(...))")
+    sim.add(Wind(velocity, speed_20ft))
 
 
 def low_altitude(height: Array, speed_20ft: Array) -> tuple[Array, Array]:
-    """Return scale lengths and standard deviations of gusts near the ground.
+    """Return the scale lengths and standard deviations of gusts near the ground.
 
     MIL-F-8785C, 3.7.3.4: with h in ft, ``L_w = h``, ``L_u = L_v = h / (0.177 + 0.000823 h)^1.2``,
     ``sigma_w = 0.1 W_20``, ``sigma_u = sigma_v = sigma_w / (0.177 + 0.000823 h)^0.4``.
@@ -117,15 +125,15 @@ def low_altitude(height: Array, speed_20ft: Array) -> tuple[Array, Array]:
 def shape_noise(first: Array, second: Array, noise: Array, loss: Array) -> Array:
     """Return the states of the shaping filters one step later.
 
-    ``x1' + x1 / t = sqrt(2 / t) w`` and ``x2' = (x1 - x2) / t``, both by the trapezoidal rule, which keeps the
-    covariance of the continuous filters, ((1, 1/2), (1/2, 1/2)), exactly, however large or uneven the steps.
+    ``x1' + x1 / t = sqrt(2 / t) w`` and ``x2' = (x1 - x2) / t``, both by the trapezoidal rule, which preserves the
+    covariance of the continuous filters, ((1, 1/2), (1/2, 1/2)), exactly for steps of any and of varying length.
 
     Args:
         first: x1 along the mean wind, across and vertically, 1. (..., 3)
         second: x2 across and vertically, 1. (..., 2)
         noise: Standard normal numbers. (..., 3)
         loss: Fraction of a filter's state that is lost in the step, ``h / (1 + h / 2)`` with h = dt / t; at 1 the new
-            state knows nothing of the old. (..., 3)
+            state is independent of the old. (..., 3)
 
     Returns:
         x1, then x2. (..., 5)
@@ -136,9 +144,9 @@ def shape_noise(first: Array, second: Array, noise: Array, loss: Array) -> Array
 
 
 def from_wind_axes(vector: Array, velocity: Array) -> Array:
-    """Return a vector given along the mean wind, across (left of it) and vertically, in the world frame. (..., 3)
+    """Transform a vector from wind axes (along the mean wind, to its left, up) to the world frame. (..., 3)
 
-    The axes are level, as MIL-F-8785C has them at low altitude; without any mean wind they are those of the world.
+    The axes are level, as in MIL-F-8785C at low altitude; without mean wind they are the world's.
     """
     along = safe_normalize(velocity[..., :2], jnp.asarray([1.0, 0.0], velocity.dtype))
     c, s = along[..., 0], along[..., 1]

@@ -19,7 +19,7 @@ from crazysim.engine import fused, interpret, lanes, listing
 from crazysim.engine.ir import Block, Operation, Value
 from crazysim.engine.lower_stages import lower_stages
 from crazysim.engine.passes import fuse
-from crazysim.engine.program import Leaf, Program, Segment
+from crazysim.engine.program import Leaf, Program
 
 TOLERANCE = 1e-5
 """Largest difference that passes for rounding, relative to the largest component of a drone's vector."""
@@ -152,8 +152,7 @@ def with_all_values(program: Program) -> tuple[Program, list[Operation]]:
 
     Results inside blocks of operations are left out: their block may not have run.
     """
-    (segment,) = program.segments
-    assert isinstance(segment, Segment)
+    (segment,) = program.fused_segments
     operations = [op for op in segment.block.operations for _ in op.results]
     values: list[Value] = [x for op in segment.block.operations for x in op.results]
     n_worlds = next(leaf.shape[0] for leaf in program.leaves if leaf.scope == "drone")

@@ -1,8 +1,8 @@
 """Kernels on NVIDIA GPUs: CUDA source compiled by NVRTC, launched by XLA itself.
 
-This is the one place that knows how a kernel comes to run on a GPU. NVRTC comes with JAX's CUDA packages; the PTX
-that it makes goes into the compiled step as a custom call of XLA (``TARGET``), which hands it to the driver. No other
-package, no compiler on the machine, and nothing of Python at run time takes part.
+NVRTC comes with JAX's CUDA packages. The PTX that it makes is part of the compiled step, as a custom call of XLA
+(``TARGET``), which hands it to the driver; so JAX's own cache never finds a kernel for another GPU. It needs no other
+package, no compiler on the machine, and no Python at run time.
 """
 
 from __future__ import annotations
@@ -20,84 +20,102 @@ import jax
 import numpy as np
 from jax import Array
 
+from crazysim.engine import dump, jaxcompat
+from crazysim.engine.errors import KernelError
 from crazysim.engine.kernel import BLOCK, Kernel
+from crazysim.engine.native import Launch
 
 TARGET = "__gpu$xla.gpu.ptx"
-"""What XLA calls a kernel that is given to it as PTX."""
+"""XLA's name for a kernel that is passed to it as PTX."""
 
 OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false", "--device-as-default-execution-space")
 """Division and square root to 2 and 1 units in the last place, as XLA has them; no other shortcut."""
 
 BLOCKS_AT_ONCE = (8, 6)
-"""How many blocks of 64 threads are tried to fit: 128 or 168 registers for each thread."""
+"""Numbers of blocks of 64 threads to try, the most first: they leave 128 or 168 registers to each thread."""
 
 WARP = 32
-"""Threads that can look at each other's registers."""
+"""Threads that can read each other's registers."""
 
 DEFAULT_ARCHITECTURE = "compute_90"
-"""What is compiled for where there is no GPU to ask."""
+"""Architecture to compile for on a machine without a GPU."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Resources:
-    """What one thread of a compiled kernel takes."""
+    """Registers and memory of one thread of a compiled kernel."""
 
     registers: int
-    """Registers."""
+    """Number of registers."""
     spilled: int
-    """Bytes that did not fit into registers."""
+    """Local memory, bytes: variables that did not fit into registers."""
 
 
-def call(kernel: Kernel, n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
-    """Return what a kernel writes.
+def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Launch:
+    """Compile a kernel for some GPUs, and return the function that launches it.
 
     Args:
         kernel: The kernel.
-        n_lanes: Drones of all worlds.
-        count: Number of steps. (1,)
-        inputs: What it reads.
-        outputs: Shapes and types of what it writes.
+        devices: GPUs that will run it; None for those of this machine.
+
+    Raises:
+        KernelError: If NVRTC is missing, or refuses the source, with its message.
     """
-    kernel = fitted(kernel) if architecture() is not DEFAULT_ARCHITECTURE else kernel
-    of_block = (
-        BLOCK // WARP * (WARP // kernel.group * kernel.group)
-    )  # groups that a warp has no room for go to the next
-    n_blocks = -(-n_lanes // of_block)
-    launch = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1, "block_x": BLOCK, "block_y": 1, "block_z": 1}
-    run = jax.ffi.ffi_call(TARGET, list(outputs), input_output_aliases=kernel.aliases())
-    return list(
-        run(
-            np.asarray([n_lanes], np.int32),
-            count,
-            *inputs,
-            name="advance",
-            kernel_type="ptx",
-            kernel_data=ptx(kernel, architecture()),
-            shared_mem_bytes=np.int32(0),
-            **{name: np.int32(size) for name, size in launch.items()},
+    device = weakest(devices)
+    kernel = kernel if device is None else fitted(kernel, device)
+    text = ptx(kernel, architecture(device))
+    # Groups that do not fit into a warp go to the next one.
+    of_block = BLOCK // WARP * (WARP // kernel.group * kernel.group)
+
+    def launch(n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
+        grid = {"grid_x": -(-n_lanes // of_block), "grid_y": 1, "grid_z": 1}
+        block = {"block_x": BLOCK, "block_y": 1, "block_z": 1}
+        run = jax.ffi.ffi_call(TARGET, list(outputs), input_output_aliases=kernel.aliases())
+        return list(
+            run(
+                np.asarray([n_lanes], np.int32),
+                count,
+                *inputs,
+                name="advance",
+                kernel_type="ptx",
+                kernel_data=text,
+                shared_mem_bytes=np.int32(0),
+                **{name: np.int32(size) for name, size in (grid | block).items()},
+            )
         )
-    )
+
+    return launch
+
+
+def weakest(devices: Sequence[jax.Device] | None = None) -> jax.Device | None:
+    """Return the GPU of the lowest compute capability, whose code runs on all; None if there is no GPU.
+
+    Args:
+        devices: GPUs to choose from; None for those of this machine.
+    """
+    if devices is None:
+        try:
+            devices = jax.local_devices(backend="gpu")
+        except RuntimeError:
+            return None
+    gpus = [d for d in devices if d.platform == "gpu"]
+    return min(gpus, key=jaxcompat.compute_capability) if gpus else None
+
+
+def architecture(device: jax.Device | None) -> str:
+    """Return the virtual architecture of a GPU; ``DEFAULT_ARCHITECTURE`` where there is none."""
+    return DEFAULT_ARCHITECTURE if device is None else f"compute_{jaxcompat.compute_capability(device)}"
 
 
 @functools.cache
-def architecture() -> str:
-    """Return the virtual architecture of the GPU that is there."""
-    try:
-        capability = jax.devices("gpu")[0].compute_capability
-    except RuntimeError:
-        return DEFAULT_ARCHITECTURE
-    return f"compute_{str(capability).replace('.', '')}"
-
-
-@functools.cache
-def fitted(kernel: Kernel) -> Kernel:
+def fitted(kernel: Kernel, device: jax.Device) -> Kernel:
     """Return a kernel with as many blocks at once on a multiprocessor as its registers allow without spilling.
 
     More blocks hide more latency, until registers that no longer fit cost more than that.
     """
     candidates = [kernel, *(kernel.with_blocks(n) for n in BLOCKS_AT_ONCE)]
     with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
-        least, *found = pool.map(resources, candidates)
+        least, *found = pool.map(lambda c: resources(c, device), candidates)
     bearable = 16 if least.registers <= 224 else 256  # measured on an H200: docs/concepts/engine.md
     fitting = (c for c, r in zip(candidates[1:], found, strict=True) if r.spilled <= least.spilled + bearable)
     return next(fitting, kernel)
@@ -108,43 +126,49 @@ def ptx(kernel: Kernel, arch: str) -> str:
     """Return a kernel's PTX.
 
     Raises:
-        RuntimeError: If NVRTC is not there, or refuses the source, with what it said.
+        KernelError: If NVRTC is missing, or refuses the source, with its message.
     """
+    if dump.enabled():
+        dump.write(f"kernel.{arch}.cu", f"// NVRTC --gpu-architecture={arch} {' '.join(OPTIONS)}\n{kernel.text}")
     return _compile(kernel.text, arch, "PTX").decode()
 
 
 @functools.cache
-def resources(kernel: Kernel) -> Resources:
-    """Return what a kernel takes on the GPU that is there, as the driver says."""
-    image = _compile(kernel.text, architecture().replace("compute", "sm"), "CUBIN")
-    driver = ctypes.CDLL("libcuda.so.1")
-    module, function, number = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
-    jax.block_until_ready(jax.device_put(np.zeros(1), jax.devices("gpu")[0]))
-    context = ctypes.c_void_p()
-    _check(driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), 0))
+def resources(kernel: Kernel, device: jax.Device) -> Resources:
+    """Return the registers and memory that a kernel takes on a GPU, as its driver reports them."""
+    image = _compile(kernel.text, architecture(device).replace("compute", "sm"), "CUBIN")
+    try:
+        driver, number = ctypes.CDLL("libcuda.so.1"), device.local_hardware_id
+    except OSError as error:
+        raise KernelError(f"the CUDA driver was not found: {error}") from error
+    module, function, value = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
+    jax.block_until_ready(jax.device_put(np.zeros(1), device))  # the driver's context exists from here on
+    handle, context = ctypes.c_int(), ctypes.c_void_p()
+    _check(driver.cuDeviceGet(ctypes.byref(handle), number))
+    _check(driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), handle))
     _check(driver.cuCtxPushCurrent_v2(context))
     try:
         _check(driver.cuModuleLoadData(ctypes.byref(module), image))
         _check(driver.cuModuleGetFunction(ctypes.byref(function), module, b"advance"))
         found = []
         for attribute in (4, 3):  # CU_FUNC_ATTRIBUTE_NUM_REGS, CU_FUNC_ATTRIBUTE_LOCAL_SIZE_BYTES
-            _check(driver.cuFuncGetAttribute(ctypes.byref(number), attribute, function))
-            found.append(number.value)
+            _check(driver.cuFuncGetAttribute(ctypes.byref(value), attribute, function))
+            found.append(value.value)
         _check(driver.cuModuleUnload(module))
     finally:
         driver.cuCtxPopCurrent_v2(ctypes.byref(context))
-        driver.cuDevicePrimaryCtxRelease(0)
+        driver.cuDevicePrimaryCtxRelease(handle)
     return Resources(*found)
 
 
 def _check(result: int) -> None:
     if result:
-        raise RuntimeError(f"the CUDA driver answered error {result}")
+        raise KernelError(f"the CUDA driver answered error {result}")
 
 
 @functools.cache
 def nvrtc() -> ctypes.CDLL | None:
-    """Return NVIDIA's run-time compiler, from JAX's CUDA packages or the system; None if it is not there."""
+    """Return NVIDIA's run-time compiler, from JAX's CUDA packages or the system; None if it is missing."""
     found: list[str] = []
     for package in ("nvidia.cu13", "nvidia.cuda_nvrtc"):
         try:
@@ -166,7 +190,7 @@ def nvrtc() -> ctypes.CDLL | None:
 def _compile(source: str, arch: str, kind: str) -> bytes:
     library = nvrtc()
     if library is None:
-        raise RuntimeError("NVRTC was not found; it comes with pip install 'jax[cuda13]' or 'jax[cuda12]'")
+        raise KernelError("NVRTC was not found; it comes with pip install 'jax[cuda13]' or 'jax[cuda12]'")
     program = ctypes.c_void_p()
     library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"advance.cu", 0, None, None)
     try:
@@ -179,7 +203,7 @@ def _compile(source: str, arch: str, kind: str) -> bytes:
             library.nvrtcGetProgramLogSize(program, ctypes.byref(size))
             log = ctypes.create_string_buffer(size.value)
             library.nvrtcGetProgramLog(program, log)
-            raise RuntimeError(f"NVRTC refused the kernel:\n{log.value.decode()[:2000]}")
+            raise KernelError(f"NVRTC refused the kernel:\n{log.value.decode()[:2000]}")
         getattr(library, f"nvrtcGet{kind}Size")(program, ctypes.byref(size))
         out = ctypes.create_string_buffer(size.value)
         getattr(library, f"nvrtcGet{kind}")(program, out)

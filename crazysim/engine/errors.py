@@ -1,4 +1,4 @@
-"""The error that says what the engine cannot lower, and where."""
+"""The errors of planning: what the engine does not support, and where."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class UnsupportedError(Exception):
 
     def located(self, primitive: str = "", stage: str = "") -> UnsupportedError:
         """Return the error with a primitive and a stage, where it has none yet."""
-        return UnsupportedError(self.why, self.primitive or primitive, self.stage or stage)
+        return type(self)(self.why, self.primitive or primitive, self.stage or stage)
 
     @property
     def reason(self) -> str:
@@ -41,3 +41,11 @@ class UnsupportedError(Exception):
     def __str__(self) -> str:
         """Return the reason, with the stage and the version of JAX where the stage is known."""
         return f"{self.reason} (stage {self.stage!r}, jax {self.jax_version})" if self.stage else self.reason
+
+
+class LimitError(UnsupportedError):
+    """A documented limit: the stage runs unfused, without a warning."""
+
+
+class KernelError(UnsupportedError):
+    """A kernel that its compiler refused, or did not finish in time."""

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.custom_derivatives import SymbolicZero
 
 from crazysim.core.stage import with_leaves
-from crazysim.engine import cuda, kernel, lanes, native
-from crazysim.engine.lower import is_key
+from crazysim.engine import cuda, jaxcompat, kernel, lanes, native
+from crazysim.engine.native import Launch
 from crazysim.engine.program import Program
 
 Run = Callable[[list[Any], Array], tuple[list[Any], Array]]
-"""Leaves and a number of steps to the written leaves and which worlds are flagged as not finite."""
+"""Leaves and a number of steps to the written leaves and the worlds that are flagged as not finite."""
+
+Compiled = tuple[kernel.Kernel, Launch]
+"""A kernel and the function that calls it."""
 
 
 def missing(platform: str) -> str | None:
-    """Return what keeps kernels from running on a platform, or None."""
+    """Return the reason why kernels cannot run on a platform, or None."""
     if platform == "gpu":
         return (
             None if cuda.nvrtc() else "NVRTC was not found, which comes with pip install 'jax[cuda13]' or 'jax[cuda12]'"
@@ -31,102 +34,115 @@ def missing(platform: str) -> str | None:
     return None if native.compiler() else "no C++ compiler was found (g++, clang++, or the variable CXX)"
 
 
-def build(program: Program, platform: str) -> Callable[[list[Any], int | Array], tuple[list[Any], Array]]:
-    """Return what ``lanes.steps`` is, in kernels: leaves and a number of steps to written leaves and flags.
+def build(
+    program: Program, platform: str, devices: Sequence[jax.Device] | None = None
+) -> Callable[[list[Any], int | Array], tuple[list[Any], Array]]:
+    """Compile a program to kernels, and return the function that runs them, as ``lanes.steps`` does.
+
+    Args:
+        program: The program.
+        platform: ``"cpu"`` or ``"gpu"``.
+        devices: GPUs that will run it; None for those of this machine.
 
     Raises:
-        UnsupportedError: If the program has something that there is no source for.
+        UnsupportedError: If an operation or type has no source.
+        KernelError: If the compiler refuses a kernel or takes too long.
     """
-    target = "cuda" if platform == "gpu" else "host"
-    run = _one_kernel(program, target) if program.fused else _split(program, target)
-    batched = _over_batches(program, run)
+
+    def compiled(part: Program) -> Compiled:
+        source = kernel.write(part, "cuda" if platform == "gpu" else "host")
+        return source, cuda.compiled(source, devices) if platform == "gpu" else native.compiled(source)
+
+    run = _one_kernel(program, compiled(program)) if program.fused else _split(program, compiled)
+    return differentiable(program, _over_batches(program, run))
+
+
+def differentiable(program: Program, run: Run) -> Callable[[list[Any], int | Array], tuple[list[Any], Array]]:
+    """Return a function that runs a program, with the derivative of the same program on lanes."""
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-        """Run the kernel; its derivative is that of the same program on lanes."""
-
         @jax.custom_jvp
-        def advance(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
-            return batched(leaves, count)
+        def forward(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+            return run(leaves, count)
 
-        def slope(primals: Any, tangents: Any) -> Any:
+        def derivative(primals: Any, tangents: Any) -> Any:
             (values, _), (slopes, _) = primals, tangents
-            changing = [i for i, t in enumerate(slopes) if t is not None and not isinstance(t, SymbolicZero)]
+            changing = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
 
             def of(some: list[Any]) -> Any:
                 return lanes.steps(program, with_leaves(values, changing, some), n_steps)
 
             return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
 
-        advance.defjvp(slope, symbolic_zeros=True)  # what does not change has no derivative to be computed
-        return advance(leaves, jnp.asarray(n_steps, jnp.int32))
+        forward.defjvp(derivative, symbolic_zeros=True)  # constant leaves have no derivative to be computed
+        return forward(leaves, jnp.asarray(n_steps, jnp.int32))
 
     return steps
 
 
-def describe(program: Program, platform: str) -> str:
-    """Return what a kernel takes, in a line."""
+def describe(program: Program, platform: str, devices: Sequence[jax.Device] | None = None) -> str:
+    """Return the compiler of a kernel, or on a GPU the registers that it takes, in one line."""
     if platform != "gpu":
         return f"kernel: compiled by {native.compiler()}"
-    source = cuda.fitted(kernel.write(program, "cuda"))
-    used = cuda.resources(source)
+    source, device = kernel.write(program, "cuda"), cuda.weakest(devices)
+    if device is None:
+        return f"kernel: compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"
+    used = cuda.resources(cuda.fitted(source, device), device)
     return f"kernel: {kernel.BLOCK} threads a block, {used.registers} registers, {used.spilled} bytes spilled"
 
 
 def _over_batches(program: Program, run: Run) -> Run:
-    """Return a kernel call that vmap understands: more of the same worlds are more worlds."""
+    """Return a kernel call with a rule for vmap: a batch of the same worlds is more worlds."""
 
-    @jax.custom_batching.custom_vmap
-    def call(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
-        return run(leaves, count)
-
-    @call.def_vmap
-    def _(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
-        batched, count_batched = in_batched
+    def batched(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
+        of_leaves, of_count = in_batched
         own = [leaf.scope in ("drone", "world") for leaf in program.leaves]
         out_batched = ([True] * len(program.written), True)
-        if count_batched or not program.fused or any(b and not o for b, o in zip(batched, own, strict=True)):
-            # What the worlds of a batch share is not the same in all batches: one after the other.
-            whole = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
-                     for x, b in zip(leaves, batched, strict=True)]  # fmt: skip
-            counts = count if count_batched else jnp.broadcast_to(count, (size,))
-            return jax.lax.map(lambda xs: run(*xs), (whole, counts)), out_batched
+        if of_count or not program.fused or any(b and not o for b, o in zip(of_leaves, own, strict=True)):
+            # Shared parameters that differ between batches: one batch after the other.
+            full = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
+                    for x, b in zip(leaves, of_leaves, strict=True)]  # fmt: skip
+            counts = count if of_count else jnp.broadcast_to(count, (size,))
+            return jax.lax.map(lambda xs: run(*xs), (full, counts)), out_batched
 
-        def join(x: Any, b: bool, lies: bool) -> Any:
+        def join(x: Any, b: bool, in_rows: bool) -> Any:
             x = x if b else jnp.broadcast_to(x, (size, *x.shape))
-            return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1) if lies else x.reshape(-1, *x.shape[2:])
+            return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1) if in_rows else x.reshape(-1, *x.shape[2:])
 
-        def part(x: Any, lies: bool) -> Any:
-            return jnp.moveaxis(x.reshape(x.shape[0], size, -1), 1, 0) if lies else x.reshape(size, -1, *x.shape[1:])
+        def part(x: Any, in_rows: bool) -> Any:
+            if in_rows:
+                return jnp.moveaxis(x.reshape(x.shape[0], size, -1), 1, 0)
+            return x.reshape(size, -1, *x.shape[1:])
 
-        lying = [i in program.rows for i in range(len(leaves))]
+        rows = [i in program.rows for i in range(len(leaves))]
         joined = [
-            join(x, b, lies) if o and x is not None else x
-            for x, b, o, lies in zip(leaves, batched, own, lying, strict=True)
+            join(x, b, in_rows) if o and x is not None else x
+            for x, b, o, in_rows in zip(leaves, of_leaves, own, rows, strict=True)
         ]
         written, flagged = run(joined, count)
         return (
-            [part(x, lying[i]) for i, x in zip(program.written, written, strict=True)],
+            [part(x, rows[i]) for i, x in zip(program.written, written, strict=True)],
             part(flagged, False),
         ), out_batched
 
-    return call
+    return jaxcompat.batched_rule(run, batched)
 
 
-def _one_kernel(program: Program, target: str) -> Run:
-    source = kernel.write(program, target)
-    return lambda leaves, count: _call(program, source, leaves, count, target)
+def _one_kernel(program: Program, compiled: Compiled) -> Run:
+    return lambda leaves, count: _call(program, compiled, leaves, count)
 
 
-def _split(program: Program, target: str) -> Run:
-    """Return the same for a step that some stage takes apart: a kernel for what is between such stages."""
+def _split(program: Program, compile_part: Callable[[Program], Compiled]) -> Run:
+    """Return the same for a step that unfused stages split: a kernel for the stages between them."""
     parts = list(program.parts())
-    kernels = [kernel.write(p, target) if p.fused else None for p in parts]
+    with ThreadPoolExecutor() as pool:
+        kernels = list(pool.map(lambda part: compile_part(part) if part.fused else None, parts))
     written = program.written
 
     def turn(leaves: list[Any]) -> list[Any]:
-        for part, source in zip(parts, kernels, strict=True):
-            if source is not None:
-                out, _ = _call(part, source, leaves, jnp.asarray(1, jnp.int32), target)
+        for part, compiled in zip(parts, kernels, strict=True):
+            if compiled is not None:
+                out, _ = _call(part, compiled, leaves, jnp.asarray(1, jnp.int32))
             else:
                 out, _ = lanes.steps(part, leaves, 1)
             leaves = with_leaves(leaves, part.written, out)
@@ -143,23 +159,21 @@ def _split(program: Program, target: str) -> Run:
     return run
 
 
-def _call(
-    program: Program, source: kernel.Kernel, leaves: list[Any], count: Array, target: str
-) -> tuple[list[Any], Array]:
+def _call(program: Program, compiled: Compiled, leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+    source, launch = compiled
     n_worlds, n_drones = lanes.batch(program, leaves)
     n_lanes = n_worlds * n_drones
-    inputs = [_bare(leaves[i]) for i in source.inputs]
+    inputs = [_as_numbers(leaves[i]) for i in source.inputs]
     like = {i: program.leaves[i] for i in source.outputs}
     shapes = {i: (program.rows[i], n_lanes) if i in program.rows else (n_worlds, *x.shape[1:]) for i, x in like.items()}
     outputs = [jax.ShapeDtypeStruct(shapes[i], x.dtype) for i, x in like.items()]
-    call = cuda.call if target == "cuda" else native.call
     if program.check is None:
-        return call(source, n_lanes, count.reshape(1), inputs, outputs), jnp.zeros((n_worlds, 1), bool)
+        return launch(n_lanes, count.reshape(1), inputs, outputs), jnp.zeros((n_worlds, 1), bool)
     flags = jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)
-    *written, flagged = call(source, n_lanes, count.reshape(1), inputs, [*outputs, flags])
+    *written, flagged = launch(n_lanes, count.reshape(1), inputs, [*outputs, flags])
     return written, flagged if n_drones == 1 else jnp.any(flagged, axis=1, keepdims=True)
 
 
-def _bare(x: Any) -> Array:
-    """Return an array of plain numbers: a key as its words."""
-    return jax.random.key_data(x) if is_key(x) else x
+def _as_numbers(x: Any) -> Array:
+    """Return an array of numbers; random keys as their 32-bit integers."""
+    return jax.random.key_data(x) if jaxcompat.is_key(x) else x

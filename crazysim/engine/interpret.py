@@ -84,7 +84,8 @@ def _apply(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: E
     numpy, params = ops.TABLE[op.name].numpy, dict(op.params)
     if op.name in ("convert_element_type", "bitcast_convert_type"):
         params["dtype"] = op.dtype
-    assert numpy is not None
+    if numpy is None:
+        raise RuntimeError(f"operation {op.name!r} has no NumPy function; give it one in ops.TABLE")
     return [np.asarray(numpy(*args, **params)).astype(op.dtype, copy=False)]
 
 

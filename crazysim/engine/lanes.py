@@ -14,11 +14,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.extend import core
 
-from crazysim.engine import xla
+from crazysim.engine import jaxcompat, xla
 from crazysim.engine.ir import Block
-from crazysim.engine.lower import is_key
+from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.program import Phase, Program, Segment, Slot, UnfusedStage
 
 Execute = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
@@ -174,7 +173,7 @@ def _run_worlds(segment: Segment, lanes: Lanes) -> None:
 
 
 def _run_unfused(stage: UnfusedStage, lanes: Lanes) -> None:
-    after = core.jaxpr_as_fun(stage.jaxpr)(*(lanes.array(i) for i in stage.used))
+    after = jaxcompat.jaxpr_as_fun(stage.jaxpr)(*(lanes.array(i) for i in stage.used))
     for i, value in zip(stage.written, after, strict=True):
         lanes.set_array(i, value)
 

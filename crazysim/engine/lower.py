@@ -13,15 +13,15 @@ most primitives need no rule of their own:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
-from jax.extend import core
 
-from crazysim.engine import ops
+from crazysim.engine import jaxcompat, ops
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import Block, Builder, Element, constant
+from crazysim.engine.jaxcompat import ClosedJaxpr, Literal, is_key
 from crazysim.engine.simplify import known_zero
 
 Elements = np.ndarray
@@ -44,27 +44,6 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
     return register
 
 
-class Params(dict[str, Any]):
-    """Parameters of an equation; one that this version of JAX does not have makes the primitive unsupported."""
-
-    def __missing__(self, name: str) -> Any:
-        """Refuse the primitive."""
-        raise UnsupportedError(f"it has no parameter {name!r} in this version of JAX")
-
-
-class Equation(NamedTuple):
-    """An equation of a jaxpr, as rules get it."""
-
-    primitive: Any
-    """JAX's primitive."""
-    params: Params
-    """Its parameters."""
-    invars: Sequence[Any]
-    """Operands, with ``aval`` for shape and type."""
-    outvars: Sequence[Any]
-    """Results, likewise."""
-
-
 class Lowering:
     """Lowers jaxprs into a block of scalar operations."""
 
@@ -72,7 +51,7 @@ class Lowering:
         """Add operations to a block, to a new one if none is given."""
         self.builder = Builder() if builder is None else builder
 
-    def lower(self, jaxpr: core.ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
+    def lower(self, jaxpr: ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
         """Return the results of a jaxpr for arrays of elements.
 
         Raises:
@@ -81,7 +60,7 @@ class Lowering:
         env: dict[Any, Elements] = {}
 
         def value(v: Any) -> Elements:
-            return constants(v.val, v.aval.dtype) if isinstance(v, core.Literal) else env[v]
+            return constants(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
 
         inner = jaxpr.jaxpr
         env.update(zip(inner.constvars, (constants(x, x.dtype) for x in jaxpr.consts), strict=True))
@@ -97,7 +76,8 @@ class Lowering:
         if name not in RULES:
             raise UnsupportedError(f"primitive {name!r} has no rule", name)
         try:
-            return RULES[name](self, Equation(eqn.primitive, Params(eqn.params), eqn.invars, eqn.outvars), args)
+            with jaxcompat.reading(eqn) as equation:
+                return RULES[name](self, equation, args)
         except UnsupportedError as error:
             raise error.located(name) from None
 
@@ -195,8 +175,3 @@ def lower_function(fn: Callable[..., Any], *avals: Any) -> Block:
     lowering = Lowering()
     args = [inputs(lowering.builder, x) for x in jax.tree.leaves(avals)]
     return lowering.finish(lowering.lower(jax.make_jaxpr(fn)(*avals), args))
-
-
-def is_key(x: Any) -> bool:
-    """Return True for an array of random keys."""
-    return jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)

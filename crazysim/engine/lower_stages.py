@@ -9,7 +9,7 @@ import jax
 
 import crazysim.engine.rules  # noqa: F401  (fills the table of rules)
 from crazysim.core.stage import Axes, Stage
-from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir import Builder, Element, constant, prune
 from crazysim.engine.lower import Elements, Lowering, as_elements, inputs, scalars
 from crazysim.engine.program import Leaf, Phase, Program, Segment, Slot, UnfusedStage
@@ -63,13 +63,13 @@ def _lower_stage(
 ) -> Segment | UnfusedStage:
     try:
         if stage.scope == "batch":
-            raise UnsupportedError("it is not declared for one drone or one world")
+            raise LimitError("it is not declared for one drone or one world")
         traced = TracedStage(stage, axes, leaves)
         # Where no leaf of a drone takes part, every drone can do it for its world.
         of_drones = any(axes.scopes[i] == "drone" for i in (*traced.used, *traced.written))
         scope: Literal["drone", "world"] = "world" if stage.scope == "world" and of_drones else "drone"
         if scope == "world" and n_drones > MAX_UNROLLED_DRONES:
-            raise UnsupportedError(f"a stage of one world is unrolled for at most {MAX_UNROLLED_DRONES} drones")
+            raise LimitError(f"a stage of one world is unrolled for at most {MAX_UNROLLED_DRONES} drones")
         return _segment(stage, scope, phase, traced, zeros)
     except UnsupportedError as error:
         traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)

@@ -1,4 +1,4 @@
-"""SceneQueries to the data of all worlds, answered by one kernel for functions of one drone or one world."""
+"""Functions of one drone or one world, evaluated for all by one kernel."""
 
 from __future__ import annotations
 
@@ -11,65 +11,66 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, Stage
-from crazysim.engine.fused_rollout import Whole
+from crazysim.engine.fused_rollout import FusedRollout
 from crazysim.pytree import PyTree, leaf
 
-NAME = "answers"
-"""Where answers are while the kernel runs, in ``data.plugins``."""
+NAME = "results"
+"""Name of the results in ``data.plugins`` while the kernel runs."""
 
-Question = tuple[Literal["drone", "world"], Callable[[SimData], Any]]
-"""What a function sees, and the function: from data of one drone to any tree, of one world to a tree of its drones."""
+Query = tuple[Literal["drone", "world"], Callable[[SimData], Any]]
+"""Scope of a function, and the function: from data of one drone to any tree of arrays, or from data of one world to a
+tree of arrays with its drones in front."""
 
 
-class Answers(PyTree):
-    """Answers in rows of numbers."""
+class Results(PyTree):
+    """Results as rows of numbers."""
 
     rows: dict[str, Array] = leaf("drone", 1)
-    """(n_worlds, n_drones, k) each"""
+    """Results by query and array. (n_worlds, n_drones, k) each"""
 
 
-def ask(questions: Sequence[Question], data: SimData, platform: str) -> list[Any]:
-    """Return what is answered for every drone. (n_worlds, n_drones, ...) each
+def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
+    """Return the results of some functions for every drone. (n_worlds, n_drones, ...) each
 
     Args:
-        questions: What is asked, of stages' data: (n_drones, ...) in front for functions of one world.
+        queries: The functions; their data is that of stages: a function of one world gets (n_drones, ...) in front.
         data: The simulation.
-        platform: Where it runs, ``"cpu"`` or ``"gpu"``.
+        platform: ``"cpu"`` or ``"gpu"``.
 
     Raises:
-        UnsupportedError: If something of it cannot be written out.
+        UnsupportedError: If the engine does not support one of them.
     """
     n_worlds, n_drones = data.states.pos.shape[:2]
     leaves, axes = jax.tree.leaves(data), Axes(data)
-    answers: dict[str, Array] = {}
+    rows: dict[str, Array] = {}
     shapes, trees, stages = [], [], []
-    for number, (scope, fn) in enumerate(questions):
+    for number, (scope, fn) in enumerate(queries):
         one = axes.treedef.unflatten(axes.of_one(leaves, scope))
         outs, treedef = jax.tree.flatten(jax.eval_shape(fn, one))
         names = [f"{number} {k}" for k in range(len(outs))]
         per_drone = [x.shape[1:] if scope == "world" else x.shape for x in outs]
         for name, x, shape in zip(names, outs, per_drone, strict=True):
-            answers[name] = jnp.zeros((n_worlds, n_drones, *shape), x.dtype).reshape(n_worlds, n_drones, -1)
+            rows[name] = jnp.zeros((n_worlds, n_drones, *shape), x.dtype).reshape(n_worlds, n_drones, -1)
         shapes.append(dict(zip(names, per_drone, strict=True)))
         trees.append(treedef)
-        stages.append(Stage(_answering(fn, names, scope), scope, name=f"question {number}"))
-    asked = data.replace(plugins={NAME: Answers(answers)})
-    whole = Whole((), (), stages, asked, {}, 0, platform)
-    found = jax.tree.unflatten(jax.tree.structure(asked), whole(jax.tree.leaves(asked))).plugins[NAME].rows
+        stages.append(Stage(_writing(fn, names, scope), scope, name=f"query {number}"))
+    prepared = data.replace(plugins={NAME: Results(rows)})
+    rollout = FusedRollout((), (), stages, prepared, {}, 0, platform)
+    found = jax.tree.unflatten(jax.tree.structure(prepared), rollout(jax.tree.leaves(prepared))).plugins[NAME].rows
     return [
         tree.unflatten([found[name].reshape(n_worlds, n_drones, *shape) for name, shape in some.items()])
         for tree, some in zip(trees, shapes, strict=True)
     ]
 
 
-def _answering(fn: Callable[[SimData], Any], names: list[str], scope: str) -> Callable[[SimData], SimData]:
-    """Return the stage that writes down what a function answers."""
+def _writing(fn: Callable[[SimData], Any], names: list[str], scope: str) -> Callable[[SimData], SimData]:
+    """Return the stage that writes the results of a function to the data."""
 
-    def answer(data: SimData) -> SimData:
+    def write(data: SimData) -> SimData:
         rows = data.plugins[NAME].rows
         outs = jax.tree.leaves(fn(data.replace(plugins={})))
         shape = (data.core.n_drones, -1) if scope == "world" else (-1,)
         new = {name: x.reshape(shape) for name, x in zip(names, outs, strict=True)}
-        return data.replace(plugins={NAME: Answers(rows | new)})
+        return data.replace(plugins={NAME: Results(rows | new)})
 
-    return answer
+    return write

@@ -13,13 +13,14 @@ from crazysim.control import Control
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.core.stage import with_leaves
-from crazysim.engine.step import Step, Zeros
+from crazysim.engine.flat import Zeros
+from crazysim.engine.step import Step
 from crazysim.errors import ConfigError
 
 Policy = Callable[[Any, SimData], Any]
 """Parameters and data to a command for every drone. (n_worlds, n_drones, k)"""
 Keep = Callable[[SimData], Any]
-"""Data to what is to be kept of it: any tree of arrays."""
+"""Data to the part of it to record: any tree of arrays."""
 
 COMMANDS: dict[Control, Callable[[SimData, Any], SimData]] = {
     Control.state: F.state_control,
@@ -31,7 +32,7 @@ COMMANDS: dict[Control, Callable[[SimData, Any], SimData]] = {
 
 
 def states_of(data: SimData) -> Any:
-    """Return what a rollout keeps if nothing else is asked for."""
+    """Return the states, which a rollout records by default."""
     return data.states
 
 
@@ -46,40 +47,40 @@ def rollout(
     every: int = 1,
     zeros: Zeros | None = None,
 ) -> tuple[SimData, Any]:
-    """Return the data after some control steps, and what was kept on the way.
+    """Return the data after some control steps, and the record of them.
 
-    A control step asks the policy for a command, stages it, and takes ``n_substeps`` physics steps. Pure: for use
-    inside jit, vmap and grad. What no step writes, parameters above all, is a constant of the loop.
+    A control step evaluates the policy, stages its command, and takes ``n_substeps`` physics steps. Pure: for use
+    inside jit, vmap and grad. Leaves that no step writes, parameters above all, are constants of the loop.
 
     Args:
         step: From ``sim.build_step_fn()``.
-        data: Where it begins.
+        data: The simulation at the start.
         policy: ``policy(params, data) -> command``, for all worlds at once.
         params: The policy's parameters.
-        n_control_steps: How many; a multiple of ``every``.
+        n_control_steps: Number of control steps; a multiple of ``every``.
         n_substeps: Physics steps of a control step.
-        keep: What is kept of the data after a control step.
-        every: Control steps from one that is kept to the next.
-        zeros: From ``step.zeros(data)``, if that was asked before ``data`` was traced.
+        keep: ``keep(data)`` returns what to record after a control step.
+        every: Control steps from one record to the next.
+        zeros: Result of ``step.zeros(data)`` from before ``data`` was traced.
 
     Returns:
-        The data, and what was kept with time in front. (n_control_steps // every, ...)
+        The data, and the records with time in front. (n_control_steps // every, ...)
 
     Raises:
-        ConfigError: If a number is no positive int, or does not divide.
+        ConfigError: If a number is not a positive int, or does not divide.
         ValueError: If the policy returns a command of another shape.
     """
     for name, number in (("n_control_steps", n_control_steps), ("n_substeps", n_substeps), ("every", every)):
         if type(number) is not int or number < 1:
             raise ConfigError(f"{name} must be a positive int, not {number!r}")
     if n_control_steps % every:
-        raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}")
+        raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it")
     zeros = step.zeros(data) if zeros is None else zeros
     command = COMMANDS[data.controls.mode]
     leaves, treedef = jax.tree.flatten(data)
     plan = step.plan(data, zeros)
     staged = next(i for i, x in enumerate(leaves) if x is _staged(data))
-    changed = sorted({*plan.written, plan.shown, staged})
+    changed = sorted({*plan.written, plan.synced, staged})
 
     def control_step(carry: list[Any]) -> list[Any]:
         data = unpack(carry)
@@ -89,16 +90,16 @@ def rollout(
     def unpack(carry: list[Any]) -> SimData:
         return treedef.unflatten(with_leaves(leaves, changed, carry))
 
-    def until_kept(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
+    def until_record(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
         carry, _ = jax.lax.scan(lambda c, _: (control_step(c), None), carry, length=every)
         return carry, keep(unpack(carry))
 
-    carry, kept = jax.lax.scan(until_kept, [leaves[i] for i in changed], length=n_control_steps // every)
+    carry, kept = jax.lax.scan(until_record, [leaves[i] for i in changed], length=n_control_steps // every)
     return unpack(carry), kept
 
 
 def _staged(data: SimData) -> Any:
-    """Return the leaf that a command goes to."""
+    """Return the leaf that a command is written to."""
     if data.controls.mode == Control.rotor_vel:
         return data.controls.rotor_vel
     return getattr(data.controls, data.controls.mode.value).staged_cmd
@@ -107,7 +108,7 @@ def _staged(data: SimData) -> Any:
 SETTINGS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")
 
 compiled = functools.partial(jax.jit, static_argnames=SETTINGS)(rollout)
-"""``rollout`` in one compiled call; only the carries of its loops are used again."""
+"""``rollout`` in one compiled call; only the carries of its loops reuse buffers."""
 
 
 def run(
@@ -120,7 +121,7 @@ def run(
     every: int = 1,
     **settings: Any,
 ) -> tuple[SimData, Any]:
-    """Return what ``rollout`` does, compiled; with ``progress`` in pieces, and a bar on the terminal.
+    """Return the results of ``rollout``, compiled; with ``progress`` in pieces, and a bar on the terminal.
 
     No buffer is taken from the caller.
     """

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-from jax.extend import core
 
 from crazysim.core.stage import Axes, Stage
-from crazysim.engine import dump
+from crazysim.engine import dump, jaxcompat
 
 
 class TracedStage:
@@ -45,22 +44,14 @@ class TracedStage:
         used = _used(fn) | (_used(when) if has_mask else set())
         self.used = sorted(used)
         """Leaves that it reads: the inputs of ``fn`` and ``when``."""
-        self.fn = _with_inputs(fn, self.used)
-        self.when = _with_inputs(when, self.used) if has_mask else None
+        self.fn = jaxcompat.with_inputs(fn, self.used)
+        self.when = jaxcompat.with_inputs(when, self.used) if has_mask else None
         if dump.enabled():
             dump.write(f"{stage.__name__}.jaxpr", f"{self.fn}\n" + (f"\nwhen\n{self.when}\n" if has_mask else ""))
 
 
-def _used(jaxpr: core.ClosedJaxpr) -> set[int]:
+def _used(jaxpr: jaxcompat.ClosedJaxpr) -> set[int]:
     inner = jaxpr.jaxpr
-    used = {v for eqn in inner.eqns for v in eqn.invars if not isinstance(v, core.Literal)}
-    used |= {v for v in inner.outvars if not isinstance(v, core.Literal)}
+    used = {v for eqn in inner.eqns for v in eqn.invars if not isinstance(v, jaxcompat.Literal)}
+    used |= {v for v in inner.outvars if not isinstance(v, jaxcompat.Literal)}
     return {i for i, v in enumerate(inner.invars) if v in used}
-
-
-def _with_inputs(jaxpr: core.ClosedJaxpr, inputs: Sequence[int]) -> core.ClosedJaxpr:
-    inner = jaxpr.jaxpr
-    invars = [inner.invars[i] for i in inputs]
-    return core.ClosedJaxpr(
-        core.Jaxpr(inner.constvars, invars, inner.outvars, inner.eqns, inner.effects, inner.debug_info), jaxpr.consts
-    )

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.extend.random import threefry2x32_p
 
-from crazysim.engine import ops
+from crazysim.engine import jaxcompat, ops
 from crazysim.engine.ir import Block, Element, Operation, Value
 
 Env = dict[Value, Any]
@@ -135,7 +134,7 @@ def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
 
 
 def _threefry(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
-    return threefry2x32_p.bind(*_broadcast(args))
+    return jaxcompat.threefry2x32_p.bind(*_broadcast(args))
 
 
 STRUCTURE: dict[str, Callable[..., Any]] = {

@@ -190,8 +190,8 @@ def _body_ids(sim: Sim) -> NDArray:
 
 def _scene(sim: Sim, worlds: list[int]) -> dict[str, Any]:
     """Return what a flight has that does not change."""
-    ids = _body_ids(sim)  # first, as it has a scene that was edited compiled
-    sim._data = sim._scene.sync(sim._data, worlds[0])
+    ids = _body_ids(sim)
+    sim.sync(worlds[0])
     return {
         "worlds": np.array(worlds),
         "drone_ids": np.asarray(sim.data.core.drone_mocap_ids),
@@ -205,6 +205,6 @@ def _bodies(sim: Sim, worlds: list[int]) -> tuple[NDArray, NDArray]:
     ids = _body_ids(sim)
     pos, quat = np.zeros((len(worlds), len(ids), 3)), np.zeros((len(worlds), len(ids), 4))
     for k, world in enumerate(worlds if len(ids) else []):
-        sim._data = sim._scene.sync(sim._data, world)
+        sim.sync(world)
         pos[k], quat[k] = sim.mj_data.mocap_pos[ids], np.roll(sim.mj_data.mocap_quat[ids], -1, axis=-1)
     return pos, quat

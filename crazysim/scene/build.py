@@ -200,6 +200,14 @@ def check_poses(mjx_data: mjx.Data, mj_model: mujoco.MjModel, n_worlds: int) -> 
     return mjx_data.replace(**changes)
 
 
+def spec_mocap_ids(spec: mujoco.MjSpec) -> dict[str, int]:
+    """Return the mocap ids that bodies will have once the spec is compiled, by name.
+
+    MuJoCo numbers mocap bodies, which are children of the world, in their order there.
+    """
+    return {body.name: k for k, body in enumerate(b for b in spec.worldbody.bodies if b.mocap)}
+
+
 def mocap_ids(mj_model: mujoco.MjModel, names: Iterable[str]) -> list[int]:
     """Return the mocap ids of bodies.
 

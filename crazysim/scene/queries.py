@@ -12,7 +12,7 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.engine import fused
 from crazysim.engine.lower import UnsupportedError
-from crazysim.engine.query import Question, ask
+from crazysim.engine.query import Query, query
 from crazysim.scene import report
 from crazysim.scene.depth import Along
 from crazysim.scene.objects import Handle
@@ -63,15 +63,15 @@ class SceneQueries:
         whole, platform = self._scene.contact_fn(objects, floor, drones), self._platform
         if platform is None:
             return whole
-        questions: list[Question] = []
+        queries: list[Query] = []
         if floor or report.choose(self._scene.solids, objects):
-            questions.append(("drone", self._scene.contact_fn(objects, floor, drones=False)))
+            queries.append(("drone", self._scene.contact_fn(objects, floor, drones=False)))
         if drones:
-            questions.append(("world", self._scene.contact_fn((), floor=False)))
+            queries.append(("world", self._scene.contact_fn((), floor=False)))
 
         def contacts(data: SimData) -> ContactReport:
             try:
-                return functools.reduce(ContactReport.joined, ask(questions, data, platform))
+                return functools.reduce(ContactReport.joined, query(queries, data, platform))
             except UnsupportedError:
                 return whole(data)
 

@@ -1,9 +1,10 @@
-"""A range finder: a few rays from every drone, measured in the step itself."""
+"""Range finder: a few rays from every drone, measured within the compiled step."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,14 +12,15 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
-from crazysim.effects.core import install
+from crazysim.deprecation import renamed, warn_renamed
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.contact_log import SimulationWithScene
+from crazysim.scene.collision import CollisionModel
 from crazysim.scene.rays import cast
 
-RANGER = {
+MULTI_RANGER = {
     "front": (1, 0, 0),
     "back": (-1, 0, 0),
     "left": (0, 1, 0),
@@ -26,68 +28,109 @@ RANGER = {
     "up": (0, 0, 1),
     "down": (0, 0, -1),
 }
-"""Directions of a multi-ranger deck, body frame."""
-NAME = "range_finder"
+GREEN = (0.1, 0.8, 0.2, 1.0)
 
 
-class Ranges(PyTree):
-    """What range finders measure."""
+class RangeFinderData(PyTree):
+    """Measurements of the range finders, and their rays."""
 
     distance: Array = leaf("drone", 1)
     """Distance along each ray, m; ``max_range`` where nothing is nearer. (n_worlds, n_drones, n_rays)"""
     direction: Array = leaf("shared", 2)
     """Unit directions of the rays, body frame. (n_rays, 3)"""
     max_range: Array = leaf("shared", 0)
-    """How far they reach, m. ()"""
+    """Largest distance measured, m. ()"""
+
+
+class RangeFinder(Plugin):
+    """Rays from the centre of mass of every drone that measure distances.
+
+    A ray ignores its own drone. Other drones have the shapes that they collide with.
+    """
+
+    MULTI_RANGER: ClassVar[Mapping[str, tuple[int, int, int]]] = MULTI_RANGER
+    """Directions of a multi-ranger deck by name, body frame."""
+
+    directions: Any = parameter(default=None)
+    """Directions, body frame, of any length; None for ``MULTI_RANGER``. (n_rays, 3)"""
+    max_range: float = parameter(default=4.0)
+    """Largest distance measured, m."""
+    freq: int | None = None
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    drones: bool = False
+    """True to measure distances to other drones too, in a stage of one world."""
+    visible: bool = False
+    """True to draw the rays into images."""
+    name: str = "range_finder"
+
+    def record(self, sim: Simulation) -> RangeFinderData:
+        """Return rays that have measured nothing."""
+        rays = np.asarray(list(MULTI_RANGER.values()) if self.directions is None else self.directions, np.float64)
+        if rays.ndim != 2 or rays.shape[1] != 3 or not np.isfinite(rays).all() or not rays.any(axis=-1).all():
+            raise ConfigError(f"expected directions as vectors (n_rays, 3), none of them zero, got {rays.tolist()}")
+        if not self.max_range > 0:
+            raise ConfigError(f"expected max_range to be positive, in m, got {self.max_range}")
+        self._period(sim)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        far = float(self.max_range)
+        distance = jnp.full((sim.n_worlds, sim.n_drones, len(rays)), far)
+        return RangeFinderData(distance, jnp.asarray(rays, float), jnp.asarray(far))
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that measures, of one drone, or of one world if drones are to be measured."""
+        # The outline of a drone is enough for a few rays.
+        solids = dataclasses.replace(sim.scene.visible, drone=sim.scene.solids.drone)
+        period = self._period(sim)
+        when = None if period == 1 else lambda data: data.core.steps % period == 0
+        measure = Stage(lambda data: self._measure(solids, data), "world" if self.drones else "drone", when)
+        return [Placement(measure, before="increment_steps")]
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the distances, m."""
+        return {"distance": self.read(data).distance}
+
+    def draw(self, sim: Simulation, world: int) -> None:
+        """Draw the rays up to what they met."""
+        if not self.visible:
+            return
+        record, states = self.read(sim.data), sim.data.states
+        start = np.asarray(states.pos[world])[:, None]
+        direction = rotation.rotate(states.quat[world][:, None], record.direction)
+        end = start + np.asarray(record.distance[world])[..., None] * np.asarray(direction)
+        for points in np.stack(np.broadcast_arrays(start, end), axis=-2).reshape(-1, 2, 3):
+            sim.scene.marks.line(points, GREEN, 2.0, 2.0)
+
+    def _period(self, sim: Simulation) -> int:
+        """Return the number of steps between measurements."""
+        steps, freq = sim.data.core.freq, self.freq
+        if freq is None:
+            return 1
+        if type(freq) is not int or freq <= 0 or steps % freq:
+            raise ConfigError(f"expected freq to divide the {steps} Hz of the simulation, got {freq}. Use a divisor.")
+        return steps // freq
+
+    def _measure(self, solids: CollisionModel, data: SimData) -> SimData:
+        record, states = self.read(data), data.states
+        pos, quat = (states.pos, states.quat) if self.drones else (states.pos[None], states.quat[None])
+        direction = rotation.rotate(quat[:, None], record.direction)
+        n_rays = direction.shape[1]
+        origin = jnp.broadcast_to(pos[:, None], direction.shape)
+        own = np.repeat(np.arange(direction.shape[0]), n_rays) if self.drones else None
+        hits = cast(solids, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, self.drones)
+        distance = jnp.minimum(hits.distance, record.max_range).reshape(direction.shape[:2])
+        return self.write(data, record.replace(distance=distance if self.drones else distance[0]))
 
 
 def add_range_finder(
-    sim: SimulationWithScene,
+    sim: Simulation,
     directions: Any = None,
     max_range: float = 4.0,
     freq: int | None = None,
     drones: bool = False,
 ) -> None:
-    """Give every drone rays that measure distances, each in the step itself: ``data.plugins["range_finder"]``.
+    """Add range finders. Deprecated: use ``sim.add(RangeFinder(...))``."""
+    warn_renamed("scene.range_finder.add_range_finder(sim, ...)", "sim.add(RangeFinder(...))")
+    sim.add(RangeFinder(directions, max_range, freq, drones))
 
-    They start at the centre of mass and do not see their own drone; others they see as the shapes that drones touch by.
 
-    Args:
-        sim: The simulation.
-        directions: Body frame, of any length; None for ``RANGER``: front, back, left, right, up, down. (n_rays, 3)
-        max_range: How far they reach, m.
-        freq: Measurements per second, Hz, a divisor of ``sim.freq``; None for every step.
-        drones: Whether they see other drones, which makes it a stage of one world.
-
-    Raises:
-        ConfigError: If there is a range finder already, or a number cannot be.
-    """
-    way = np.asarray(list(RANGER.values()) if directions is None else directions, np.float64)
-    if way.ndim != 2 or way.shape[1] != 3 or not np.isfinite(way).all() or not way.any(axis=-1).all():
-        raise ConfigError(f"directions {way.tolist()}; needed are vectors (n_rays, 3), none of them zero")
-    if not max_range > 0:
-        raise ConfigError(f"max_range is {max_range}; it must be positive, in m")
-    steps = sim.data.core.freq
-    period = 1 if freq is None else steps // freq if type(freq) is int and freq > 0 and steps % freq == 0 else 0
-    if not period:
-        raise ConfigError(f"a range finder at {freq} Hz does not fit steps at {steps} Hz; take a divisor")
-    way /= np.linalg.norm(way, axis=-1, keepdims=True)
-    # The few rays of a range finder need no more of a drone than its outline.
-    solids = dataclasses.replace(sim.scene.visible, drone=sim.scene.solids.drone)
-
-    def measure(data: SimData) -> SimData:
-        mine, states = data.plugins[NAME], data.states
-        pos, quat = (states.pos, states.quat) if drones else (states.pos[None], states.quat[None])
-        direction = rotation.rotate(quat[:, None], mine.direction)
-        n_rays = direction.shape[1]
-        origin = jnp.broadcast_to(pos[:, None], direction.shape)
-        own = np.repeat(np.arange(direction.shape[0]), n_rays) if drones else None
-        hits = cast(solids, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, drones)
-        far = jnp.minimum(hits.distance, mine.max_range).reshape(direction.shape[:2])
-        new = mine.replace(distance=far if drones else far[0])
-        return data.replace(plugins=data.plugins | {NAME: new})
-
-    shape = (sim.n_worlds, sim.n_drones, len(way))
-    record = Ranges(jnp.full(shape, float(max_range)), jnp.asarray(way, float), jnp.asarray(float(max_range)))
-    when = None if period == 1 else lambda data: data.core.steps % period == 0
-    install(sim, NAME, record, Stage(measure, "world" if drones else "drone", when), before="increment_steps")
+__getattr__ = renamed(__name__, {"RANGER": "crazysim.scene.range_finder:MULTI_RANGER"})

@@ -1,14 +1,14 @@
-"""Contact response: floor and objects push, brake and bounce drones, instead of the floor that only stops them.
+"""Contact response: floor and objects push, brake and bounce drones. Without it the floor only stops them.
 
-Time stepping on velocities (Moreau 1988; the convex form of Todorov 2014): after a step, impulses at the places that
-touch turn the velocity into one that no longer approaches. What overlaps is pushed apart gently, in a time of its own,
-so that ground is soft and nothing is flung out. A drone is its collision box: each of its corners may touch, and the
-nearest place to each object of its upper and of its lower plate.
+Time stepping on velocities (Moreau 1988; the convex form of Todorov 2014): after a step, impulses at the contact points
+change the velocity into one that no longer approaches. An overlap is pushed out with a time constant, so that the
+ground is soft and no drone is thrown out of it. The contact points of a drone are those of its collision box: the
+corners, and the points of its upper and lower plate that are nearest to each object.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -18,104 +18,111 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.core.data import SimData
-from crazysim.core.pipeline import remove_fn
+from crazysim.core.data import SimData, SimState
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
-from crazysim.effects.core import install
+from crazysim.deprecation import warn_renamed
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape, distance, point_distance
 from crazysim.pytree import PyTree, leaf
 from crazysim.scene.collision import CollisionGeom
-from crazysim.scene.contact_log import SimulationWithScene
 from crazysim.scene.report import Objects, choose
 
-NAME = "contact_response"
-"""Name of the stage, and of its record in ``data.plugins``."""
 FLAT = ("plane", "box", "cylinder", "hfield")
 """Kinds with faces, on which a drone stands by its corners."""
 SLOW = 0.1
-"""Approach below which nothing bounces, m/s: five steps of free fall at 500 Hz."""
+"""Approach speed below which nothing bounces, m/s: five steps of free fall at 500 Hz."""
 STIFFNESS = 300.0
-"""Penalty of the speed into a surface, in masses: a third of a percent of a bounce is lost, and float32 solves it."""
+"""Penalty on the speed into a surface, in masses: costs a third of a percent of a bounce, solvable in float32."""
 STICKING = 1e-4
-"""Slip that counts as none, m/s."""
+"""Slip speed treated as zero, m/s."""
 THIN = 0.05
-"""Share of the height of a drone's box that its upper and lower plates have; both touch what leans along its side."""
+"""Height of the upper and lower plate of a drone's box, as a share of the box; both touch an object along its side."""
 FASTEST_PUSH = 0.25
-"""Speed at which overlapping bodies are parted at most, m/s."""
+"""Largest speed at which an overlap is pushed out, m/s."""
 
 
-class Response(PyTree):
-    """How surfaces answer."""
+class ContactResponseData(PyTree):
+    """Parameters of the surfaces, and the last impulse on each drone."""
 
     friction: Array = leaf("parameter", 1, (1,))
     """Coulomb's coefficient between drone and surface. (1,)"""
     restitution: Array = leaf("parameter", 1, (1,))
-    """Speed after a bounce over speed before. (1,)"""
+    """Ratio of the speeds after and before a bounce. (1,)"""
     softness: Array = leaf("parameter", 1, (1,))
-    """Time in which an overlap is pushed out, s. (1,)"""
+    """Time constant with which an overlap is pushed out, s. (1,)"""
     impulse: Array = leaf("drone", 1)
-    """Impulse of all surfaces in the last step, world frame, N s. (3,)"""
+    """Impulse of all surfaces in the last step, world frame, N s. (n_worlds, n_drones, 3)"""
+
+
+class ContactResponse(Plugin):
+    """Response of floor and objects to contacts with drones; replaces the stage ``clip_floor_pos``.
+
+    Drones do not push each other, and objects do not move. A drone that stands on the floor has its centre half its
+    collision box above it.
+    """
+
+    objects: Objects = None
+    """Handles, or names of bodies; None for all at the time of adding, () for the floor alone."""
+    friction: float = parameter(default=0.6)
+    """Coulomb's coefficient."""
+    restitution: float = parameter(default=0.2)
+    """Ratio of the speeds after and before a bounce, 0 to 1."""
+    softness: float = parameter(default=0.03)
+    """Time constant with which an overlap is pushed out, s; at least two steps."""
+    iterations: int = 8
+    """Iterations of the solver, for simultaneous contact points."""
+    name: str = "contact_response"
+
+    def record(self, sim: Simulation) -> ContactResponseData:
+        """Return the parameters, and no impulse."""
+        for name, most in (("friction", np.inf), ("restitution", 1), ("softness", 10)):
+            if not 0 <= getattr(self, name) <= most:
+                raise ConfigError(f"expected {name} to be from 0 to {most}, got {getattr(self, name)}")
+        dt = 1 / sim.data.core.freq
+        if self.softness < 2 * dt:
+            raise ConfigError(f"expected softness to be two steps at least, {2 * dt:.4g} s, got {self.softness} s")
+        ones = jnp.ones(1)
+        return ContactResponseData(
+            friction=self.friction * ones,
+            restitution=self.restitution * ones,
+            softness=self.softness * ones,
+            impulse=jnp.zeros((sim.n_worlds, sim.n_drones, 3)),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that applies the impulses."""
+        box = np.asarray(sim.airframe.value("shape.collision_box"), np.float64)
+        surfaces = _surfaces(sim, self.objects)
+
+        def respond(data: SimData) -> SimData:
+            states, record = _respond(data, self.read(data), surfaces, box, self.iterations)
+            return self.write(data.replace(states=states), record)
+
+        return [Placement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
 
 
 def add_contact_response(
-    sim: SimulationWithScene,
+    sim: Simulation,
     objects: Objects = None,
     friction: float = 0.6,
     restitution: float = 0.2,
     softness: float = 0.03,
     iterations: int = 8,
 ) -> None:
-    """Let the floor and objects answer when a drone touches them; takes the place of ``clip_floor_pos``.
-
-    Drones do not push each other, and objects are not moved. A drone that stands on the floor has its centre half its
-    collision box above it.
-
-    Args:
-        sim: The simulation.
-        objects: Handles, or names of bodies; None for all there are now, () for the floor alone.
-        friction: Coulomb's coefficient.
-        restitution: Speed after a bounce over speed before, from 0 to 1.
-        softness: Time in which an overlap is pushed out, s; at least a few steps.
-        iterations: Of the solver, for points that touch at once.
-
-    Raises:
-        ConfigError: If it is there already, a number cannot be, or an object is not there or is moved by hand.
-    """
-    limits = {"friction": (friction, np.inf), "restitution": (restitution, 1), "softness": (softness, 10)}
-    for name, (value, most) in limits.items():
-        if not 0 <= value <= most:
-            raise ConfigError(f"{name} is {value}; it must be from 0 to {most}")
-    dt = 1 / sim.data.core.freq
-    if softness < 2 * dt:
-        raise ConfigError(f"softness is {softness} s; pushing out takes two steps at least, {2 * dt:.4g} s")
-    box = np.asarray(sim.airframe.value("shape.collision_box"), np.float64)
-    surfaces = _surfaces(sim, objects)
-
-    def respond(data: SimData) -> SimData:
-        return _respond(data, surfaces, box, iterations)
-
-    ones = jnp.ones(1)
-    record = Response(
-        friction=friction * ones,
-        restitution=restitution * ones,
-        softness=softness * ones,
-        impulse=jnp.zeros((sim.n_worlds, sim.n_drones, 3)),
-    )
-    install(sim, NAME, record, Stage(respond, "drone"), before="increment_steps")
-    if "clip_floor_pos" in sim.step_pipeline:
-        remove_fn(sim.step_pipeline, "clip_floor_pos")
-        sim.build_step_fn()
+    """Add the contact response. Deprecated: use ``sim.add(ContactResponse(...))``."""
+    warn_renamed("scene.response.add_contact_response(sim, ...)", "sim.add(ContactResponse(...))")
+    sim.add(ContactResponse(objects, friction, restitution, softness, iterations))
 
 
 class _Surface(NamedTuple):
-    """A part, and where it is."""
+    """A geom, and the number of the movable object that carries it; None for a fixed one."""
 
     part: CollisionGeom
     place: int | None
 
 
-def _surfaces(sim: SimulationWithScene, objects: Objects) -> list[_Surface]:
+def _surfaces(sim: Simulation, objects: Objects) -> list[_Surface]:
     solids = sim.scene.solids
     found = [_Surface(part, None) for part in solids.floor]
     for solid in choose(solids, objects):
@@ -123,20 +130,20 @@ def _surfaces(sim: SimulationWithScene, objects: Objects) -> list[_Surface]:
     return found
 
 
-class _Touching(NamedTuple):
-    """Places that touch or may, in the drone's body frame."""
+class _ContactPoints(NamedTuple):
+    """Points that are or may come into contact, in the drone's body frame."""
 
     gap: Array
     """Distance to the surface, m. (..., n)"""
     normal: Array
-    """Out of the surface. (..., n, 3)"""
+    """Outward normal of the surface. (..., n, 3)"""
     point: Array
-    """Where on the drone, from its centre of mass, m. (..., n, 3)"""
+    """Position on the drone, from its centre of mass, m. (..., n, 3)"""
     vel: Array
-    """How fast the surface moves, m/s. (..., n, 3)"""
+    """Velocity of the surface, m/s. (..., n, 3)"""
 
 
-def _places(data: SimData, surfaces: list[_Surface], box: np.ndarray) -> _Touching:
+def _contact_points(data: SimData, surfaces: list[_Surface], box: np.ndarray) -> _ContactPoints:
     pos, quat = data.states.pos, data.states.quat
     dtype = pos.dtype
     corners = jnp.asarray(box[:3] + box[3:] * np.array(list(product((-1, 1), repeat=3))), dtype)
@@ -151,17 +158,21 @@ def _places(data: SimData, surfaces: list[_Surface], box: np.ndarray) -> _Touchi
         if part.shape.kind in FLAT:
             gap, pull = jax.vjp(lambda p, s=part.shape: point_distance(s, p), into(in_world, True))
             normal = rotation.rotate_inverse(turn, back(pull(jnp.ones_like(gap))[0]))
-            found.append(_Touching(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
+            found.append(_ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
         if part.shape.kind not in ("plane", "hfield"):
             found += [_nearest(data, part, into, plate, middle, still[..., :1, :]) for middle in middles]
-    return _Touching(*(jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True))))
+    joined = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True)))
+    return _ContactPoints(*joined)
 
 
-def _nearest(data: SimData, part: CollisionGeom, into: Callable, shape: Shape, middle: Array, vel: Array) -> _Touching:
-    """Return where a plate comes nearest to a part.
+def _nearest(
+    data: SimData, part: CollisionGeom, into: Callable, shape: Shape, middle: Array, vel: Array
+) -> _ContactPoints:
+    """Return the point of a plate that is nearest to a geom.
 
-    The gap's slope by the drone's position is the normal, that by its attitude the lever: their product is all that
-    turns the drone, so the place along the normal matters to friction alone, and is taken on the plate's face.
+    The gradient of the gap with respect to the drone's position is the normal, and that with respect to its attitude is
+    the lever times the normal, which is all that turns the drone. The position along the normal affects friction only;
+    the plate's face is used.
     """
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
@@ -176,11 +187,11 @@ def _nearest(data: SimData, part: CollisionGeom, into: Callable, shape: Shape, m
     normal = rotation.rotate_inverse(quat, force)
     reach = jnp.sum(jnp.abs(normal) * jnp.asarray(shape.size, pos.dtype), axis=-1, keepdims=True)
     point = rotation.cross(normal, torque) - reach * normal
-    return _Touching(gap, normal, point, jnp.broadcast_to(vel, normal.shape))
+    return _ContactPoints(gap, normal, point, jnp.broadcast_to(vel, normal.shape))
 
 
 def _frame(data: SimData, part: CollisionGeom, place: int | None) -> tuple[Callable, Callable, Array | None]:
-    """Return what takes points and directions into a part's frame, directions back, and how fast it moves."""
+    """Return functions that take points and directions into a geom's frame, and directions back, and its velocity."""
     dtype = data.states.pos.dtype
     at = jnp.asarray(part.pos, dtype)
     rot = None if part.rot is None else jnp.asarray(part.rot, dtype)
@@ -203,19 +214,21 @@ def _frame(data: SimData, part: CollisionGeom, place: int | None) -> tuple[Calla
     return into, back, vel
 
 
-def _respond(data: SimData, surfaces: list[_Surface], box: np.ndarray, iterations: int) -> SimData:
-    """Return the data with the velocity after contact.
+def _respond(
+    data: SimData, record: ContactResponseData, surfaces: list[_Surface], box: np.ndarray, iterations: int
+) -> tuple[SimState, ContactResponseData]:
+    """Return the states with the velocity after contact, and the record with the impulse.
 
     First compression: the velocity u = (vel, ang_vel) that minimises the kinetic energy of the change, plus a stiff
-    penalty for what goes into a surface or slips on it; the penalty for slipping grows no faster than friction can
-    pull (iteratively reweighted least squares). Every iteration solves one linear system of six unknowns. Then
-    restitution: a share of the normal impulses again (Poisson). Energy that friction and bounces at several places make
-    of nothing (Kane 1984), or places that push against each other, is taken away.
+    penalty on the speed into a surface and on slip; the penalty on slip grows no faster than the friction force allows
+    (iteratively reweighted least squares). Every iteration solves one linear system of six unknowns. Then restitution:
+    a share of the normal impulses again (Poisson). Energy that friction and bounces at several points would create
+    (Kane 1984), or points that push against each other, is removed.
     """
-    states, how, params = data.states, data.plugins[NAME], data.params
-    touching = _places(data, surfaces, box)
-    n, p, s = touching.normal, touching.point, touching.vel
-    active = touching.gap < 0
+    states, params = data.states, data.params
+    points = _contact_points(data, surfaces, box)
+    n, p, s = points.normal, points.point, points.vel
+    active = points.gap < 0
     before = jnp.concatenate([rotation.rotate_inverse(states.quat, states.vel), states.ang_vel], axis=-1)
     inertia = _inertia(params.mass, params.J)
     stiff = STIFFNESS * params.mass
@@ -223,21 +236,21 @@ def _respond(data: SimData, surfaces: list[_Surface], box: np.ndarray, iteration
     along = jnp.sum(n * s, axis=-1)
 
     def slip(u: Array) -> tuple[Array, Array]:
-        """Return how fast each place goes out of its surface, and how it slips on it, m/s."""
+        """Return the speed of each point out of its surface, and its slip speed, m/s."""
         vel = u[..., None, :3] + rotation.cross(u[..., None, 3:], p) - s
         out = jnp.sum(vel * n, axis=-1)
         return out, rotation.safe_norm(vel - out[..., None] * n)[..., 0]
 
     fast = active & (-slip(before)[0] > SLOW)
-    wanted = jnp.where(fast, 0.0, jnp.minimum(-touching.gap / how.softness, FASTEST_PUSH))
+    wanted = jnp.where(fast, 0.0, jnp.minimum(-points.gap / record.softness, FASTEST_PUSH))
 
     def turn(k: Any, u: Array) -> Array:
         out, aside = slip(u)
         pressed = active & (out < wanted)
         push = jnp.where(pressed, stiff * (wanted - out), 0.0)
         w_n = jnp.where(pressed, stiff, 0.0)
-        # The first push is of the whole fall at every place: what friction may pull is known from the second on.
-        w_t = jnp.where(k == 0, 0.0, jnp.minimum(w_n, how.friction * push / (aside + STICKING)))
+        # The first push stops the whole fall at every point: the friction force is known from the second on.
+        w_t = jnp.where(k == 0, 0.0, jnp.minimum(w_n, record.friction * push / (aside + STICKING)))
         rest = w_n - w_t
         steep = jnp.sum(rest[..., None, None] * row[..., None] * row[..., None, :], axis=-3)
         matrix = inertia + _tangential(w_t, p) + steep
@@ -247,8 +260,8 @@ def _respond(data: SimData, surfaces: list[_Surface], box: np.ndarray, iteration
 
     after = jax.lax.fori_loop(0, iterations, turn, before)
     push = jnp.where(active, stiff * jnp.maximum(wanted - slip(after)[0], 0.0), 0.0)
-    after = after + how.restitution * _solve(inertia, jnp.sum(jnp.where(fast, push, 0.0)[..., None] * row, axis=-2))
-    # Energy is counted as seen from the surfaces that push.
+    after = after + record.restitution * _solve(inertia, jnp.sum(jnp.where(fast, push, 0.0)[..., None] * row, axis=-2))
+    # Energy is measured relative to the surfaces that push.
     total = jnp.sum(push, axis=-1, keepdims=True)
     moves = jnp.sum(push[..., None] * s, axis=-2) / jnp.where(total > 0, total, 1.0)
     seen = jnp.concatenate([moves, jnp.zeros_like(moves)], axis=-1)
@@ -260,7 +273,7 @@ def _respond(data: SimData, surfaces: list[_Surface], box: np.ndarray, iteration
     after = jnp.where(jnp.any(active, axis=-1, keepdims=True), after, before)
     impulse = params.mass * rotation.rotate(states.quat, after[..., :3] - before[..., :3])
     states = states.replace(vel=rotation.rotate(states.quat, after[..., :3]), ang_vel=after[..., 3:])
-    return data.replace(states=states, plugins=data.plugins | {NAME: how.replace(impulse=impulse)})
+    return states, record.replace(impulse=impulse)
 
 
 def _inertia(mass: Array, inertia: Array) -> Array:
@@ -271,7 +284,7 @@ def _inertia(mass: Array, inertia: Array) -> Array:
 
 
 def _tangential(weight: Array, p: Array) -> Array:
-    """Return the sum of ``weight * B^T B``, ``B`` from a body's velocity to that of its point ``p``. (..., 6, 6)"""
+    """Return the sum of ``weight * B^T B``; ``B`` maps a body's velocity to that of its point ``p``. (..., 6, 6)"""
     total = jnp.sum(weight, axis=-1)[..., None, None] * jnp.eye(3, dtype=p.dtype)
     x, y, z = (jnp.sum(weight * p[..., k], axis=-1) for k in range(3))
     o = jnp.zeros_like(x)

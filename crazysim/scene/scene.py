@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,25 +31,6 @@ from crazysim.scene.sync import poses_of, sync_one_world, sync_sim2mjx
 
 LARGE_SWARM = 64
 """From this many drones a world on, MJX checks two pairs per drone instead of every pair."""
-
-
-T = TypeVar("T")
-
-
-class Held(Generic[T]):
-    """An attribute of a simulation that its scene holds."""
-
-    def __init__(self, doc: str):
-        self.__doc__ = doc
-
-    def __set_name__(self, _owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, sim: Any, _owner: type) -> T:
-        return getattr(sim._scene, self._name) if sim is not None else self  # type: ignore[return-value]
-
-    def __set__(self, sim: Any, value: T) -> None:
-        setattr(sim._scene, self._name, value)
 
 
 class Scene:
@@ -100,7 +81,8 @@ class Scene:
         self.spec = build.build_spec(xml_path, airframe, n_drones, freq, self.max_geom_pairs)
         self.handles: list[Handle] = []
         self._starts: list[tuple[NDArray, NDArray]] = []
-        self.on_compile: Callable[[], None] | None = None
+        self.revision = 0
+        """Number of changes so far of what the data holds of the scene: its objects and mocap ids."""
         self.compile()
 
     def add(
@@ -150,6 +132,7 @@ class Scene:
         if mocap:
             self._starts.append((poses[0], poses[1]))
         self.edited = True
+        self.revision += 1
         return handle
 
     def compile(self) -> None:
@@ -170,9 +153,8 @@ class Scene:
         self._solids: CollisionModel | None = None
         self._visible: CollisionModel | None = None
         self.edited = False
+        self.revision += 1
         self.invalidate()
-        if self.on_compile is not None:
-            self.on_compile()
 
     def compile_if_edited(self) -> None:
         """Compile, if something was added since."""
@@ -193,9 +175,8 @@ class Scene:
 
     @property
     def drone_mocap_ids(self) -> list[int]:
-        """Mocap id of each drone's body. (n_drones,)"""
-        self.compile_if_edited()
-        return self._drone_ids
+        """Mocap id of each drone's body, as in the next compiled model. (n_drones,)"""
+        return self._ids([f"drone:{i}" for i in range(self.n_drones)]) if self.edited else self._drone_ids
 
     def objects(self, before: Objects | None) -> Objects | None:
         """Return the record of the movable objects: those of one before where they are, new ones at their start."""
@@ -209,7 +190,20 @@ class Scene:
                 jnp.concatenate([old.astype(new.dtype), new[..., n:, :]], axis=-2)
                 for old, new in ((before.pos, pos), (before.quat, quat), (before.vel, vel))
             )
-        return Objects(pos, quat, vel, jnp.asarray(self._object_ids, jnp.int32), self._movable())
+        ids = self._ids(self._movable()) if self.edited else self._object_ids
+        return Objects(pos, quat, vel, jnp.asarray(ids, jnp.int32), self._movable())
+
+    def _ids(self, names: Sequence[str]) -> list[int]:
+        """Return mocap ids in the spec, which are those of the compiled model; nothing is compiled.
+
+        Raises:
+            ConfigError: If the spec has lost one of the bodies.
+        """
+        ids = build.spec_mocap_ids(self.spec)
+        lost = [name for name in names if name not in ids]
+        if lost:
+            raise ConfigError(f"the scene has lost {lost[0]!r}; drones and objects with handles must stay in the spec")
+        return [ids[name] for name in names]
 
     def _movable(self) -> tuple[str, ...]:
         return tuple(body for handle in self.handles if handle.movable for body in handle.bodies)

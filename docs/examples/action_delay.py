@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import PyTree, Sim, leaf
-from crazysim.core.pipeline import replace_fn
+from crazysim.core import replace_fn
 
 
 class Delay(PyTree):

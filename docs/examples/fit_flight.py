@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim import Sim
-from crazysim.core import functional as F
-from crazysim.dynamics.first_principles import hover_rotor_vel
+from crazysim import functional as F
+from crazysim.dynamics import hover_rotor_vel
 
 N_FLIGHTS, SECONDS, RATE = 8, 3.0, 100  # samples and commands per second
 NOISE = {"pos": 1e-3, "quat": 2e-3, "ang_vel": 2e-2}  # m, 1, rad/s

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from crazysim import Sim
-from crazysim.core import functional as F
-from crazysim.dynamics.first_principles import hover_rotor_vel
+from crazysim import functional as F
+from crazysim.dynamics import hover_rotor_vel
 
 N_THRUSTS, HELD = 25, 10  # 25 thrusts, each held for 10 steps of 2 ms
 RISE = 0.2  # m

@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim import Sim
-from crazysim.core.random import drone_keys
-from crazysim.dynamics.first_principles import hover_rotor_vel
-from crazysim.pytree import select_worlds
+from crazysim.core import drone_keys, select_worlds
+from crazysim.dynamics import hover_rotor_vel
 
 
 def randomize_motors(data, default_data, mask=None, spread=0.0):

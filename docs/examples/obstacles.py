@@ -10,10 +10,9 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from crazysim.core import functional as F
-from crazysim.core.data import SimData
-from crazysim.sim import Sim
-from crazysim.sim.sim import sync_sim2mjx
+from crazysim import Sim, SimData
+from crazysim import functional as F
+from crazysim.sim import sync_sim2mjx
 
 N_WORLDS = 8
 SPEED = 0.8

@@ -1,4 +1,4 @@
-"""A race in sixteen worlds: four gates and four poles that stand elsewhere in each, hits and passed gates in the step.
+"""A race in sixteen worlds with four gates and four poles each; hits and passed gates are counted in the step.
 
 Gates and poles have handles, so their poses are data: drawn at random by a reset stage, seen by the policy and by the
 stages of the step. Run as a script it also films the first four worlds.
@@ -11,13 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim import PyTree, Sim, leaf
-from crazysim.core.random import world_keys
-from crazysim.core.stage import stage
-from crazysim.effects.core import install
+from crazysim import ContactLog, Placement, Plugin, PyTree, Sim, leaf, rotation, stage
+from crazysim.core import world_keys
 from crazysim.media import Film, View
-from crazysim.rotation import rotate, rotate_inverse
-from crazysim.scene.contact_log import latch_contacts
 
 N_WORLDS, N_GATES, SECONDS = 16, 4, 16
 OPENING = 0.45  # width and height of a gate's opening, m
@@ -26,13 +22,38 @@ LEG, SPEED = 1.2, 2.0  # time from gate to gate, s, and speed in a gate, m/s
 LOWER = np.array([0, 0, -0.08])  # m: the controller believes in more weight than there is, and holds drones too high
 
 
-class Race(PyTree):
-    """How far a drone has come."""
+class ProgressData(PyTree):
+    """Progress of the drones."""
 
     passed: Array = leaf("drone", 0)
-    """Gates passed, in their order. (n_worlds, n_drones)"""
+    """Number of gates passed, in their order. (n_worlds, n_drones)"""
     before: Array = leaf("drone", 1)
-    """Where it was a step ago, in the frame of its next gate, m. (n_worlds, n_drones, 3)"""
+    """Position one step ago, in the frame of the next gate, m. (n_worlds, n_drones, 3)"""
+
+
+class Progress(Plugin):
+    """Count of the gates that are passed forwards, within the opening."""
+
+    gates: object
+    name: str = "race"
+
+    def record(self, sim):
+        return ProgressData(jnp.zeros((N_WORLDS, 1), jnp.int32), jnp.zeros((N_WORLDS, 1, 3)))
+
+    def stages(self, sim):
+        return [Placement(stage("drone")(self.count), before="increment_steps")]
+
+    def count(self, data):
+        """Count the next gate if its plane was crossed in this step."""
+        race = self.read(data)
+        now = self.in_gate(data, race.passed % N_GATES)
+        passed = race.passed + ((race.before[0] < 0) & (now[0] >= 0) & jnp.all(jnp.abs(now[1:]) < OPENING / 2))
+        return self.write(data, race.replace(passed=passed, before=self.in_gate(data, passed % N_GATES)))
+
+    def in_gate(self, data, number):
+        """Return the position of a drone in the frame of a gate, m. (3,)"""
+        pos, quat = (x[number] for x in self.gates.pose(data))
+        return rotation.rotate_inverse(quat, data.states.pos - pos)
 
 
 def build() -> Sim:
@@ -42,7 +63,7 @@ def build() -> Sim:
     poles = sim.scene.add("pole", count=N_GATES, height=2.0)
 
     def place(data, _default_data, mask=None):
-        """Stand the gates around a circle, each turned and moved a little, and a pole within the curve to each."""
+        """Place the gates on a circle, each turned and moved a little, and a pole on the inside of the way to each."""
         noise = jax.vmap(lambda key: jax.random.uniform(key, (N_GATES, 5), minval=-1.0))(world_keys(data, "course"))
         angle = 2 * jnp.pi * (jnp.arange(N_GATES) + 0.5) / N_GATES + 0.2 * noise[..., 0]
         yaw = angle + jnp.pi / 2 + 0.3 * noise[..., 1]
@@ -51,24 +72,10 @@ def build() -> Sim:
         data = gates.set_pose(data, pos, quat, mask=mask)
         return poles.set_pose(data, (pos + jnp.roll(pos, 1, axis=1)) * jnp.array([0.46, 0.46, 0]), mask=mask)
 
-    def in_gate(data, number):
-        pos, quat = (x[number] for x in gates.pose(data))
-        return rotate_inverse(quat, data.states.pos - pos)
-
-    @stage("drone")
-    def progress(data):
-        """Count a gate as passed when its plane is crossed forwards within the opening."""
-        race = data.plugins["race"]
-        now = in_gate(data, race.passed % N_GATES)
-        passed = race.passed + ((race.before[0] < 0) & (now[0] >= 0) & jnp.all(jnp.abs(now[1:]) < OPENING / 2))
-        race = race.replace(passed=passed, before=in_gate(data, passed % N_GATES))
-        return data.replace(plugins=data.plugins | {"race": race})
-
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.tile(START, (N_WORLDS, 1, 1))))
     sim.build_default_data()
-    latch_contacts(sim, [gates, poles], drones=False)
-    race = Race(jnp.zeros((N_WORLDS, 1), jnp.int32), jnp.zeros((N_WORLDS, 1, 3)))
-    install(sim, "race", race, progress, before="increment_steps")
+    sim.add(ContactLog([gates, poles], drones=False))
+    sim.add(Progress(gates))
     sim.reset_pipeline["place"] = place
     sim.build_reset_fn()
     sim.reset()
@@ -78,7 +85,7 @@ def build() -> Sim:
 def policy(_, data) -> Array:
     """Follow a curve through the middle of every gate, along its axis; a second of hovering first. (n_worlds, 1, 16)"""
     pos, quat = data.objects.pos[:, 0, :N_GATES], data.objects.quat[:, 0, :N_GATES]
-    along = SPEED * LEG * rotate(quat, jnp.array([1.0, 0, 0]))
+    along = SPEED * LEG * rotation.rotate(quat, jnp.array([1.0, 0, 0]))
 
     def place(time):
         """Return where to be: between two gates a cubic with the gates' axes as tangents (Hermite). (n_worlds, 1, 3)"""

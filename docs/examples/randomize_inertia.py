@@ -8,10 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim import Sim
-from crazysim.core.pipeline import append_fn
-from crazysim.core.random import drone_keys
-from crazysim.dynamics.first_principles import hover_rotor_vel
-from crazysim.pytree import select_worlds
+from crazysim.core import append_fn, drone_keys, select_worlds
+from crazysim.dynamics import hover_rotor_vel
 
 
 def randomize_inertia(data, default_data, mask=None):

@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim import Sim
-from crazysim.core.pipeline import append_fn
-from crazysim.core.random import drone_keys
-from crazysim.pytree import select_worlds
+from crazysim.core import append_fn, drone_keys, select_worlds
 
 
 def randomize_mass(data, default_data, mask=None):

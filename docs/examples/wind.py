@@ -1,7 +1,7 @@
-"""Blow at hovering drones: a steady wind and gusts, as a stage that writes the external force.
+"""Gusts on hovering drones, as a plugin of one's own: a steady force and filtered noise.
 
-``states.force`` stays until something changes it, so the stage sets it at every step. The gusts are filtered noise
-(an Ornstein-Uhlenbeck process), remembered in a record of the stage's own, one value per drone.
+The noise (an Ornstein-Uhlenbeck process) has a state in the plugin's record, advanced by a stage. The force is an
+influence: the dynamics see it, and ``states.force`` stays the user's.
 """
 
 import jax
@@ -9,39 +9,47 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim import PyTree, Sim, leaf
-from crazysim.core.pipeline import insert_fn_before
-from crazysim.core.random import drone_keys
+from crazysim import Placement, Plugin, PyTree, Sim, leaf, stage
+from crazysim.core import drone_key
 
 STEADY = np.array([20e-3, 0.0, 0.0])  # N; the drone weighs 426 mN
 GUST, GUST_TIME = 10e-3, 0.5  # N, s
 
 
-class Gusts(PyTree):
-    """What the wind stage remembers."""
+class GustData(PyTree):
+    """State of the gusts."""
 
     force: Array = leaf("drone", 1)
-    """Force of the present gust, world frame, N. (n_worlds, n_drones, 3)"""
+    """Force, world frame, N. (n_worlds, n_drones, 3)"""
 
 
-def wind(data):
-    """Let the gusts wander, and put them and the steady wind on every drone."""
-    dt = 1 / data.core.freq
-    noise = jax.vmap(jax.vmap(lambda key: jax.random.normal(key, (3,))))(drone_keys(data, "wind"))
-    gust = data.plugins["gusts"].force
-    gust = gust - dt / GUST_TIME * gust + GUST * jnp.sqrt(2 * dt / GUST_TIME) * noise
-    states = data.states.replace(force=STEADY.astype(gust.dtype) + gust)
-    return data.replace(states=states, plugins=data.plugins | {"gusts": Gusts(gust)})
+class Gusts(Plugin):
+    """A steady force with gusts."""
+
+    name: str = "gusts"
+
+    def record(self, sim):
+        return GustData(jnp.zeros_like(sim.data.states.force))
+
+    def stages(self, sim):
+        return [Placement(stage("drone")(self.vary))]
+
+    def vary(self, data):
+        """Advance the gust at one drone by a step."""
+        dt, gust = 1 / data.core.freq, self.read(data).force
+        noise = jax.random.normal(drone_key(data, self.name), (3,))
+        return self.write(data, GustData(gust - dt / GUST_TIME * gust + GUST * (2 * dt / GUST_TIME) ** 0.5 * noise))
+
+    def influence(self, data):
+        force = data.states.force + STEADY.astype(data.states.force.dtype) + self.read(data).force
+        return data.replace(states=data.states.replace(force=force))
 
 
 def main() -> None:
     for windy in (False, True):
         sim = Sim(n_worlds=32, control="state", rng_key=5)
         if windy:
-            sim.data = sim.data.replace(plugins={"gusts": Gusts(jnp.zeros_like(sim.data.states.force))})
-            sim.build_default_data()
-            insert_fn_before(sim.step_pipeline, "integration", wind)
-            sim.build_step_fn()
+            sim.add(Gusts())
         setpoint = np.zeros((sim.n_worlds, 1, 16))
         setpoint[..., 2] = 1.0
         sim.state_control(setpoint)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import with_states
-from jax.sharding import AxisType
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from crazysim import ConfigError, Sim
 from crazysim.core import functional as F
@@ -15,6 +15,9 @@ from crazysim.pytree import scopes
 
 SETTINGS = {"n_worlds": 4, "n_drones": 2, "control": "attitude"}
 COMMAND = np.broadcast_to([0.05, -0.02, 0.1, 0.45], (4, 2, 4)).astype(np.float32)
+
+
+COLLECTIVES = ("all-reduce(", "all-gather(", "all-to-all(", "collective-permute(")
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +109,58 @@ def test_a_step_needs_no_word_between_devices(spread):
     """Worlds are independent, so the compiled step holds no collective operation."""
     step = spread.build_step_fn()
     text = step.lower(spread.data, 2).compile().as_text()
-    found = [word for word in ("all-reduce(", "all-gather(", "all-to-all(", "collective-permute(") if word in text]
-    assert not found
+    assert not [word for word in COLLECTIVES if word in text]
+
+
+def test_a_step_built_for_one_device_takes_data_of_several(whole, mesh):
+    """The pattern of the functional guide: build on one device, shard the data, step it; each device its own worlds."""
+    step, reset = whole.build_step_fn(), whole.build_reset_fn()
+    data = F.attitude_control(whole.data, COMMAND)
+    spread = shard(data, mesh)
+    for n_steps in (6, jnp.int32(6)):
+        after, expected = step(spread, n_steps), step(data, n_steps)
+        assert_spread(after, mesh)
+        for name in ("pos", "quat", "vel"):
+            np.testing.assert_allclose(
+                getattr(after.states, name), getattr(expected.states, name), rtol=1e-5, atol=1e-6
+            )
+    assert step.plan(spread).engine == step.plan(data).engine
+    text = step.lower(spread, 2).compile().as_text()
+    assert not [word for word in COLLECTIVES if word in text]
+    assert_spread(reset(after, spread), mesh)
+    again = step(step(spread, jnp.int32(1)), jnp.int32(5))  # what a step returns is where it was
+    np.testing.assert_allclose(again.states.pos, after.states.pos, rtol=1e-5, atol=1e-6)
+
+
+def test_the_mesh_is_that_of_the_data_whatever_its_axes_are_called(whole):
+    """Users of plain JAX name their own axes, and may have more than one."""
+    mesh = jax.make_mesh((2, 1), ("batch", "model"), axis_types=(AxisType.Auto,) * 2, devices=jax.devices("cpu")[:2])
+    data = F.attitude_control(whole.data, COMMAND)
+    split, shared = PartitionSpec("batch"), PartitionSpec()
+    kinds = jax.tree.map(lambda s: split if s in ("drone", "world") else shared, scopes(data))
+    spread = jax.device_put(data, jax.tree.map(lambda spec: NamedSharding(mesh, spec), kinds))
+    step = whole.build_step_fn()
+    after = step(spread, jnp.int32(6))
+    assert after.states.pos.addressable_shards[0].data.shape == (2, 2, 3)
+    np.testing.assert_allclose(after.states.pos, step(data, jnp.int32(6)).states.pos, rtol=1e-5, atol=1e-6)
+
+
+def test_data_copied_to_each_device_is_stepped_on_each(whole, mesh):
+    """A sharding that splits no worlds is legal, and every device computes all of them."""
+    data = F.attitude_control(whole.data, COMMAND)
+    copied = jax.device_put(data, NamedSharding(mesh, PartitionSpec()))
+    step = whole.build_step_fn()
+    after = step(copied, jnp.int32(6))
+    assert after.states.pos.addressable_shards[1].data.shape == (4, 2, 3)
+    np.testing.assert_allclose(after.states.pos, step(data, jnp.int32(6)).states.pos, rtol=1e-5, atol=1e-6)
+
+
+def test_spread_data_inside_jit_means_the_same(whole, mesh):
+    """There the devices of the data are unknown to the step: the numbers are the same all the same."""
+    step = whole.build_step_fn()
+    data = F.attitude_control(whole.data, COMMAND)
+    run = jax.jit(lambda d: step(d, 6).states.pos)
+    np.testing.assert_allclose(run(shard(data, mesh)), run(data), rtol=1e-5, atol=1e-6)
 
 
 def test_a_simulation_can_be_spread_later(whole, mesh):

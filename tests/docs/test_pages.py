@@ -14,7 +14,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 def test_page_runs(page, tmp_path, monkeypatch, opengl):
     monkeypatch.chdir(tmp_path)
     text = page.read_text()
-    for package, sign in (("casadi", "import casadi"), ("viser", "from crazysim.media.web")):
+    for package, sign in (("casadi", "import casadi"), ("viser", "from crazysim.media import web")):
         if sign in text:
             pytest.importorskip(package)
     namespace = {"__name__": "page"}
@@ -40,7 +40,7 @@ PEER_CODE = (
     "if i % 5 == 0:",
     "contacts = sim.contacts()",
     "sim.data.core.mjx_synced",
-    "from crazysim.sim.sim import sync_sim2mjx",
+    "import sync_sim2mjx",
     "_mjx_data = sim.mjx_data",
     "mjx_data = _mjx_data.replace(mocap_pos=obstacle_mocap_pos)",
     "_, mjx_data = sync_sim2mjx(sim_data, mjx_data,",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import hover_rotor_state, with_states
 
-from crazysim import ConfigError, Sim
+from crazysim import Battery, ConfigError, Sim
 from crazysim.effects import battery
 
 RAD_S = 2 * np.pi / 60
@@ -16,7 +16,7 @@ def build(n_worlds=2, n_drones=2, freq=500, **kwargs):
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", freq=freq)
     sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=hover_rotor_state(sim.data))
     sim.build_default_data()
-    battery.add(sim, **{"capacity": 0.25, "resistance": 0.1} | kwargs)
+    sim.add(Battery(**{"capacity": 0.25, "resistance": 0.1} | kwargs))
     return sim
 
 

@@ -10,31 +10,43 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import hover_command, hover_rotor_state, to_all, trees_equal, with_states
+from jax import Array
 
-from crazysim import ConfigError, Sim, effects, load_airframe
+from crazysim import (
+    Battery,
+    ConfigError,
+    Downwash,
+    GroundEffect,
+    Latency,
+    MotorFailure,
+    Sim,
+    Wind,
+    effects,
+    load_airframe,
+)
 from crazysim.core.pipeline import replace_fn
 from crazysim.engine import Step
-from crazysim.pytree import scopes
+from crazysim.pytree import PyTree, leaf, scopes
 
 ON = {
-    "battery": {"capacity": 0.25, "resistance": 0.1},
-    "downwash": {},
-    "ground_effect": {},
-    "latency": {"delay": 2},
-    "motors": {"effectiveness": 0.9, "fail_step": [-1, -1, -1, 30], "rate": 0.1},
-    "wind": {"velocity": (2.0, 1.0, 0.0), "speed_20ft": 7.7},
+    Battery: {"capacity": 0.25, "resistance": 0.1},
+    Downwash: {},
+    GroundEffect: {},
+    Latency: {"delay": 2},
+    MotorFailure: {"effectiveness": 0.9, "fail_step": [-1, -1, -1, 30], "rate": 0.1},
+    Wind: {"velocity": (2.0, 1.0, 0.0), "speed_20ft": 7.7},
 }
 """Every effect, with settings that do something."""
-IDLE = {"battery": {"capacity": 1e6, "resistance": 1e-6}, "latency": {"delay": 0}, "motors": {}, "wind": {}}
+IDLE = {Battery: {"capacity": 1e6, "resistance": 1e-6}, Latency: {"delay": 0}, MotorFailure: {}, Wind: {}}
 """Effects at settings at which they do nothing."""
 
 
 def switch_on(sim, settings=ON):
-    for name, kwargs in settings.items():
+    for effect, kwargs in settings.items():
         n = sim.airframe.n_rotors
-        if name == "motors" and "fail_step" in kwargs:
+        if "fail_step" in kwargs:
             kwargs = kwargs | {"fail_step": [-1] * (n - 1) + [30]}
-        getattr(effects, name).add(sim, **kwargs)
+        sim.add(effect(**kwargs))
 
 
 def hovering(n_worlds=3, n_drones=2, **kwargs):
@@ -64,7 +76,7 @@ def restore(request):
 
 
 def test_every_effect_is_here_and_sorted():
-    assert effects.__all__ == sorted(effects.__all__) == sorted(ON)
+    assert effects.__all__ == sorted(effects.__all__) == sorted(effect.__name__ for effect in ON)
 
 
 def test_off_nothing_is_there_and_without_strength_nothing_changes():
@@ -99,9 +111,9 @@ def test_law_02_shapes_and_types_stay_for_any_number_of_worlds_drones_and_rotors
     for i, (n_worlds, n_drones) in enumerate([(1, 1), (2, 2), (1, 4), (3, 1), (4, 3), (4, 4)]):
         control = ("attitude", "rotor_vel")[i % 2]
         drone = ("cf21B_500", hexacopter)[i // 2 % 2]
-        sim = Sim(n_worlds, n_drones, drone=drone, control=control)
+        sim = Sim(n_worlds, n_drones, drone=drone, control=control, engine="lanes")
         switch_on(sim)
-        after = jax.eval_shape(lambda d, sim=sim: sim._step(d, 1), sim.data)
+        after = jax.eval_shape(lambda d, sim=sim: sim.step_fn(d, 1), sim.data)
         assert signature(after) == signature(sim.data)
         for scope, x in zip(*map(jax.tree.leaves, (scopes(sim.data.plugins), sim.data.plugins)), strict=True):
             assert scope in ("drone", "shared")
@@ -109,10 +121,10 @@ def test_law_02_shapes_and_types_stay_for_any_number_of_worlds_drones_and_rotors
 
 
 def test_float64_stays_float64(x64):
-    sim = Sim(2, 2)
+    sim = Sim(2, 2, engine="lanes")  # random numbers in float64 come from integers of 64 bits, which kernels lack
     switch_on(sim)
     assert all(x.dtype != jnp.float32 for x in jax.tree.leaves(sim.data.plugins))
-    after = jax.eval_shape(lambda d: sim._step(d, 1), sim.data)
+    after = jax.eval_shape(lambda d: sim.step_fn(d, 1), sim.data)
     assert signature(after) == signature(sim.data)
 
 
@@ -175,7 +187,7 @@ def test_law_06_one_trace_whatever_is_reset_and_changed(every):
         sim.reset(np.array([True, False, i % 2 == 0]))
     sim.reset()
     sim.step()
-    assert sim._step._cache_size() == 1
+    assert sim.step_fn._cache_size() == 1
 
 
 def test_the_users_wrench_parameters_and_commands_stay(every):
@@ -240,7 +252,7 @@ def test_law_08_an_integrator_keeps_its_order_in_wind(x64):
         p = sim.data.params
         sim.data = sim.data.replace(params=p.replace(drag_matrix=jnp.diag(jnp.array([-0.01, -0.02, -0.1]))))
         sim.data = with_states(sim.data, pos=[0, 0, 50.0], ang_vel=[3.0, -2.0, 4.0])
-        effects.wind.add(sim, (5.0, -3.0, 2.0))
+        sim.add(Wind((5.0, -3.0, 2.0)))
         sim.step(freq // 2)
         ends.append(np.asarray(sim.data.states.vel))
     errors = [np.abs(x - ends[-1]).max() for x in ends[:-1]]
@@ -248,20 +260,13 @@ def test_law_08_an_integrator_keeps_its_order_in_wind(x64):
     assert abs(slope - 4) < 0.3
 
 
-@pytest.mark.parametrize("name", ON)
-def test_law_09_an_effect_is_added_once(every, name):
-    stages = dict(every.step_pipeline)
-    with pytest.raises(ConfigError, match=f"plugin or stage '{name}' already"):
-        getattr(effects, name).add(every, **ON[name])
-    assert every.step_pipeline == stages
-
-
 def test_law_09_effects_need_the_built_in_integration():
     sim = Sim()
     replace_fn(sim.step_pipeline, lambda data: data, "integration")
-    with pytest.raises(ConfigError, match="before that stage is exchanged"):
-        effects.wind.add(sim, (1.0, 0, 0))
+    with pytest.raises(ConfigError, match="before you replace or remove that stage"):
+        sim.add(Wind((1.0, 0, 0)))
     assert not sim.data.plugins
+    assert not sim.plugins
 
 
 def test_default_data_get_the_record_and_nothing_else():
@@ -272,7 +277,54 @@ def test_default_data_get_the_record_and_nothing_else():
     default = sim.default_data
     switch_on(sim)
     assert trees_equal(sim.default_data.replace(plugins={}), default)
-    assert set(sim.default_data.plugins) == set(ON)
+    assert set(sim.default_data.plugins) == set(sim.plugins) == {effect(**kwargs).name for effect, kwargs in ON.items()}
     sent = np.asarray(sim.data.controls.attitude.staged_cmd)
     np.testing.assert_array_equal(sim.data.plugins["latency"].arrived, sent)
     np.testing.assert_array_equal(sim.default_data.plugins["latency"].arrived, 0 * sent)
+
+
+OLD = {
+    "battery": (Battery, (0.25, 0.1)),
+    "downwash": (Downwash, (0.05, 1.2)),
+    "ground_effect": (GroundEffect, (0.05,)),
+    "latency": (Latency, (1, 3)),
+    "motors": (MotorFailure, (0.9, None, 0.5)),
+    "wind": (Wind, ((1.0, 0.0, 0.0), 5.0)),
+}
+
+
+@pytest.mark.parametrize("name", OLD)
+def test_the_old_functions_warn_and_add_the_same(name):
+    effect, args = OLD[name]
+    old, new = Sim(rng_key=1), Sim(rng_key=1)
+    new.add(effect(*args))
+    with pytest.warns(DeprecationWarning, match=rf"effects.{name}.add\(sim, ...\) is deprecated.*{effect.__name__}\("):
+        getattr(effects, name).add(old, *args)
+    assert trees_equal(old.data.plugins, new.data.plugins)
+    assert list(old.step_pipeline) == list(new.step_pipeline)
+
+
+def test_the_old_ways_of_writing_an_effect_warn_and_work():
+    sim = Sim(n_worlds=2)
+    with pytest.warns(DeprecationWarning, match="use crazysim.core.plugin.check_parameter"):
+        as_setting = effects.core.as_setting
+    record = Spring(as_setting(sim, "stiffness", 0.1))
+
+    def pull(data):
+        force = data.states.force - data.plugins["spring"].stiffness * (data.states.pos - 1.0)
+        return data.replace(states=data.states.replace(force=force))
+
+    with pytest.warns(DeprecationWarning, match="crazysim.Plugin"):
+        effects.core.install(sim, "spring", record, influence=pull)
+    sim.step()
+    np.testing.assert_allclose(sim.data.states.vel[..., 0], 0.002 * 0.1 / 0.0434, rtol=1e-5)  # float32
+    sim.add(MotorFailure())
+    with pytest.warns(DeprecationWarning, match="effects.motors.fail"):
+        effects.motors.fail(sim, np.ones((2, 1, 4), bool))
+    assert not np.any(sim.data.plugins["motors"].effectiveness)
+
+
+class Spring(PyTree):
+    """A spring to (1, 1, 1)."""
+
+    stiffness: Array = leaf("parameter", 1, (1,))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import hover_rotor_state, with_states
 
-from crazysim import ConfigError, Sim
+from crazysim import ConfigError, Downwash, Sim
 from crazysim.effects import downwash
 
 # World by world: one above the other, side by side, upper one tilted by 90 degrees (thrust along x), coincident.
@@ -26,13 +26,13 @@ def sim():
     quat[..., 3] = 1.0
     quat[2, 0] = 0, HALF, 0, HALF
     sim.data = with_states(sim.data, pos=POS, quat=quat, rotor_vel=hover_rotor_state(sim.data))
-    downwash.add(sim)
+    sim.add(Downwash())
     return sim
 
 
 @pytest.fixture(scope="module")
 def air(sim):
-    return np.asarray(downwash.downwash(sim.data).plugins["downwash"].air_vel, np.float64)
+    return np.asarray(sim.step_pipeline["downwash"](sim.data).plugins["downwash"].air_vel, np.float64)
 
 
 def by_hand(below, off, thrust=0.0434 * 9.81):
@@ -91,7 +91,7 @@ def test_the_lower_drone_is_pushed_down_by_its_drag_and_the_users_force_stays(si
 
 def test_still_rotors_blow_nothing(sim):
     data = with_states(sim.data, rotor_vel=0.0)
-    np.testing.assert_array_equal(downwash.downwash(data).plugins["downwash"].air_vel, 0.0)
+    np.testing.assert_array_equal(sim.step_pipeline["downwash"](data).plugins["downwash"].air_vel, 0.0)
 
 
 def test_a_mirrored_or_turned_world_is_blown_at_alike(sim, rng):
@@ -101,7 +101,7 @@ def test_a_mirrored_or_turned_world_is_blown_at_alike(sim, rng):
     c, s = np.cos(1.0), np.sin(1.0)
     for M in (np.eye(3), np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.diag([-1.0, 1, 1])):
         data = with_states(sim.data, pos=pos @ M.T, quat=[0, 0, 0, 1.0])
-        blown.append(np.asarray(downwash.downwash(data).plugins["downwash"].air_vel))
+        blown.append(np.asarray(sim.step_pipeline["downwash"](data).plugins["downwash"].air_vel))
     assert np.abs(blown[0]).max() > 1.0
     np.testing.assert_allclose(blown[1], blown[0], atol=1e-5)  # float32 of places of 0.3 m, gradients of 100 /s
     np.testing.assert_allclose(blown[2], blown[0], atol=1e-5)
@@ -110,7 +110,8 @@ def test_a_mirrored_or_turned_world_is_blown_at_alike(sim, rng):
 def test_law_07_gradients_are_finite_where_drones_coincide_and_rotors_stand(sim):
     def total(pos, rotor_vel, quat):
         states = sim.data.states.replace(pos=pos, rotor_vel=rotor_vel, quat=quat)
-        return jnp.sum(downwash.downwash(sim.data.replace(states=states)).plugins["downwash"].air_vel ** 2)
+        data = sim.step_pipeline["downwash"](sim.data.replace(states=states))
+        return jnp.sum(data.plugins["downwash"].air_vel ** 2)
 
     s = sim.data.states
     for rotor_vel in (s.rotor_vel, 0 * s.rotor_vel):
@@ -132,14 +133,14 @@ def test_fitted_models_blow_too():
     sim = Sim(n_drones=2, dynamics="so_rpy_rotor_drag")
     thrust = 0.4
     sim.data = with_states(sim.data, pos=[[0, 0, 2.0], [0, 0, 1.5]], rotor_vel=thrust)
-    downwash.add(sim)
-    air = downwash.downwash(sim.data).plugins["downwash"].air_vel
+    sim.add(Downwash())
+    air = sim.step_pipeline["downwash"](sim.data).plugins["downwash"].air_vel
     np.testing.assert_allclose(air[0, 1, 2], -by_hand(0.5, 0, 0.959471532998666 * thrust), rtol=1e-4)
 
 
 def test_law_09_a_radius_that_cannot_be_is_told():
     sim = Sim()
     with pytest.raises(ConfigError, match=r"propeller_radius.*positive"):
-        downwash.add(sim, propeller_radius=0.0)
-    with pytest.raises(ConfigError, match="downwash pushes a drone through its drag"):
-        downwash.add(Sim(dynamics="so_rpy"))
+        sim.add(Downwash(propeller_radius=0.0))
+    with pytest.raises(ConfigError, match="downwash acts through drag"):
+        Sim(dynamics="so_rpy").add(Downwash())

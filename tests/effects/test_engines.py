@@ -4,25 +4,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import Sim, effects
+from crazysim import Battery, Downwash, GroundEffect, Latency, MotorFailure, Sim, Wind
 from crazysim.engine import Step, native
 
-EFFECTS = {
-    "wind": lambda sim: effects.wind.add(sim, velocity=[2.0, 0.5, 0.0], speed_20ft=5.0),
-    "downwash": lambda sim: effects.downwash.add(sim),
-    "battery": lambda sim: effects.battery.add(sim, capacity=0.25, resistance=0.05),
-    "motors": lambda sim: effects.motors.add(sim, rate=0.5),
-    "latency": lambda sim: effects.latency.add(sim, delay=2, max_delay=4),
-    "ground_effect": lambda sim: effects.ground_effect.add(sim),
-}
+EFFECTS = [
+    Wind(velocity=[2.0, 0.5, 0.0], speed_20ft=5.0),
+    Downwash(),
+    Battery(capacity=0.25, resistance=0.05),
+    MotorFailure(rate=0.5),
+    Latency(delay=2, max_delay=4),
+    GroundEffect(),
+]
 
 
 @pytest.fixture(scope="module")
 def sim():
     """Return a flight with every effect on."""
     sim = Sim(n_worlds=3, n_drones=2, control="attitude", drone="cf2x_L250", rng_key=5)
-    for add in EFFECTS.values():
-        add(sim)
+    for effect in EFFECTS:
+        sim.add(effect)
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(
         pos=states.pos * 0.2 + jnp.asarray([0, 0, 1.0]), rotor_vel=states.rotor_vel + 14000.0))  # fmt: skip
@@ -31,7 +31,7 @@ def sim():
 
 
 def test_every_effect_is_fused(sim):
-    program = sim._step.plan(sim.data).program
+    program = sim.step_fn.plan(sim.data).program
     assert program.unfused_stages == ()
     segments = program.fused_segments
     fused = {name for s in segments for name in s.stages}
@@ -56,4 +56,4 @@ def test_effects_mean_the_same_on_every_engine(sim):
 def test_an_effect_that_is_off_is_not_there():
     sim = Sim(control="attitude")
     assert sim.data.plugins == {}
-    assert not set(EFFECTS) & set(sim.step_pipeline)
+    assert not {effect.name for effect in EFFECTS} & set(sim.step_pipeline)

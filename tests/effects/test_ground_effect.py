@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import hover_rotor_state, with_states
 
-from crazysim import ConfigError, Sim
+from crazysim import ConfigError, GroundEffect, Sim
 from crazysim.effects import ground_effect
 
 R = 0.0275
@@ -41,7 +41,7 @@ def test_a_drone_that_hovers_near_the_floor_is_lifted_and_levelled():
     quat[..., 3] = 1.0
     quat[2, 0] = np.sin(0.1), 0, 0, np.cos(0.1)
     sim.data = with_states(sim.data, pos=pos, quat=quat, rotor_vel=hover_rotor_state(sim.data))
-    ground_effect.add(sim)
+    sim.add(GroundEffect())
     sim.rotor_vel_control(np.asarray(sim.data.states.rotor_vel))
     sim.step()
     v, w = np.asarray(sim.data.states.vel)[:, 0, 2], np.asarray(sim.data.states.ang_vel)[:, 0]
@@ -63,6 +63,6 @@ def test_law_07_gradients_are_finite_on_the_floor():
 
 def test_law_09_what_has_no_rotors_or_no_radius_is_told():
     with pytest.raises(ConfigError, match="first_principles"):
-        ground_effect.add(Sim(dynamics="so_rpy"))
-    with pytest.raises(ConfigError, match="propeller_radius is -1"):
-        ground_effect.add(Sim(), -1.0)
+        Sim(dynamics="so_rpy").add(GroundEffect())
+    with pytest.raises(ConfigError, match="propeller_radius to be finite and positive, got -1"):
+        Sim().add(GroundEffect(-1.0))

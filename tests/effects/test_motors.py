@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from cases import hover_rotor_state, with_states
 
-from crazysim import ConfigError, Sim
-from crazysim.effects import motors
+from crazysim import ConfigError, MotorFailure, Sim
 
 DT = 1 / 500
 
@@ -16,7 +15,7 @@ def build(n_worlds=3, n_drones=2, **kwargs):
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", rng_key=1)
     sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=hover_rotor_state(sim.data))
     sim.build_default_data()
-    motors.add(sim, **kwargs)
+    sim.add(MotorFailure(**kwargs))
     sim.rotor_vel_control(np.asarray(sim.data.states.rotor_vel))
     return sim
 
@@ -102,7 +101,7 @@ def test_rotors_fail_when_told(weak):
     before = weak.data
     mask = np.zeros((3, 2, 4), bool)
     mask[2, 1, 3] = True
-    motors.fail(weak, mask)
+    weak.data = weak.plugins["motors"].fail(weak.data, mask)
     changed, weak.data = left(weak), before
     np.testing.assert_array_equal(changed != left(weak), mask)
     assert changed[2, 1, 3] == 0
@@ -128,11 +127,11 @@ def test_the_gradient_with_respect_to_effectiveness_is_the_thrust(weak):
 ])  # fmt: skip
 def test_law_09_motors_that_cannot_be_are_told(kwargs, message):
     with pytest.raises(ConfigError, match=message):
-        motors.add(Sim(n_worlds=2, n_drones=3), **kwargs)
+        Sim(n_worlds=2, n_drones=3).add(MotorFailure(**kwargs))
 
 
 def test_law_09_fitted_dynamics_have_no_rotors():
     with pytest.raises(ConfigError, match="first_principles"):
-        motors.add(Sim(dynamics="so_rpy"))
-    with pytest.raises(ConfigError, match="has been called"):
-        motors.fail(Sim(), np.ones((1, 1, 4), bool))
+        Sim(dynamics="so_rpy").add(MotorFailure())
+    with pytest.raises(ConfigError, match="motors is not enabled"):
+        MotorFailure().fail(Sim().data, np.ones((1, 1, 4), bool))

@@ -23,7 +23,6 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 if __name__ == "__main__":  # the environment must be set before JAX is imported
     sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -42,8 +41,7 @@ from rounding import close, explained, keeps_sign_of_zero
 
 from crazysim import Sim
 from crazysim.core.stage import Stage, stage
-from crazysim.engine import Step, interpret, native
-from crazysim.engine.step import ENGINES
+from crazysim.engine import Step, native
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 
@@ -282,11 +280,7 @@ class Fuzzer:
     def run(self, cases: Sequence[Case], engine: str, step: Step | None = None) -> list[list[np.ndarray]]:
         """Return the values of programs on an engine."""
         data, stages = self._step_of(cases)
-        if engine == "interpret" and engine not in ENGINES:
-            with mock.patch("crazysim.engine.step.lanes", interpret):
-                results = Step(stages, "lanes")(data).plugins["results"]
-        else:
-            results = (step or Step(stages, engine))(data).plugins["results"]
+        results = (step or Step(stages, engine))(data).plugins["results"]
         slots = {k: np.asarray(x) for k, x in {**results.drone, **results.world}.items()}
         return [case.unpacked(slots[f"p{k}f"], slots[f"p{k}o"]) for k, case in enumerate(cases)]
 

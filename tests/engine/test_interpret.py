@@ -46,7 +46,7 @@ def test_an_observer_gets_every_operation_with_its_results():
 def step():
     """Return the program of a built-in step, and leaves with what it reads as one array behind them."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
-    program = build_program(list(sim._step.stages), sim.data, watched=lambda data: jax.tree.leaves(data.states))
+    program = build_program(list(sim.step_fn.stages), sim.data, watched=lambda data: jax.tree.leaves(data.states))
     leaves = jax.tree.leaves(sim.data)
     packed = jnp.concatenate([leaves[i].ravel() for i in program.packed])
     return program, [*leaves, packed]

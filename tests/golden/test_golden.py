@@ -63,7 +63,7 @@ def fly(stem, variant, as_the_peer=True):
         **rates,
     )
     if integrator == "rk4" and as_the_peer:
-        deriv_fn = sim.step_pipeline["integration"].fn.keywords["deriv_fn"]
+        deriv_fn = sim.step_pipeline["integration"].fn.deriv_fn
         replace_fn(sim.step_pipeline, stage("drone")(partial(peers_rk4, deriv_fn=deriv_fn)), "integration")
     step = sim.build_step_fn()
 
@@ -71,7 +71,7 @@ def fly(stem, variant, as_the_peer=True):
         return jax.tree.map(lambda *x: jnp.stack(x)[:, None], *shared)
 
     params = stacked([create_params(sim.dynamics, airframe) for airframe in airframes])
-    each = [SimControls.create(1, 1, sim.control, sim.dynamics, a, sim._freqs) for a in airframes]
+    each = [SimControls.create(1, 1, sim.control, sim.dynamics, a, sim.configuration.control_freqs) for a in airframes]
     controls = sim.data.controls
     for name in ("state", "attitude", "body_rate", "force_torque"):
         ctrl = getattr(controls, name)

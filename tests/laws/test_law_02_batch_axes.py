@@ -14,8 +14,7 @@ from cases import LEVELS, PAIRS, shared_sim, with_params, with_states
 
 from crazysim import ConfigError, Control, PyTree, Sim
 from crazysim.core.data import SimData
-from crazysim.engine import Step
-from crazysim.engine.step import ENGINES
+from crazysim.engine import ENGINES, Step
 from crazysim.pytree import scopes
 
 SIZES = [(n, m) for n in (1, 2, 3, 4) for m in (1, 2, 3, 4)]
@@ -105,7 +104,7 @@ def square():
 def test_a_mass_belongs_to_its_world_and_drone(square):
     """Law 2, where lengths could deceive: three worlds, three drones, three axes, and nine masses."""
     mass = 0.01 * np.arange(1, 10).reshape(3, 3, 1)
-    data = square._step(with_params(square.data, mass=np.asarray(mass, np.float32)), jnp.int32(1))
+    data = square.step_fn(with_params(square.data, mass=np.asarray(mass, np.float32)), jnp.int32(1))
     expected = np.array([0.03, -0.02, 0.01]) / mass / square.freq
     # float32: force, mass, quotient, product and sum each round to 6e-8
     np.testing.assert_allclose(data.states.vel, expected, rtol=5e-7)
@@ -116,7 +115,7 @@ def test_a_mass_of_a_world_alone_is_refused(square, shape):
     """Law 2: a parameter is shared or per drone; one per world must be spread over its drones by hand."""
     wrong = with_params(square.data, mass=np.full(shape, 0.03, np.float32))
     with pytest.raises(ConfigError, match=r"params\.mass.*shape.*\(3, 3\)"):
-        square._step(wrong, jnp.int32(1))
+        square.step_fn(wrong, jnp.int32(1))
 
 
 def documented_shapes(record):

@@ -204,11 +204,11 @@ def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two):
     """Whatever the flag is, it is exchanged; one that is known to be clear stays, so that edits cost no transfer."""
     fresh(two, UP, UP)
     two.step()
-    compiled = two._step._cache_size()
+    compiled = two.step_fn._cache_size()
     for flag in (Unreadable(), False, True, jnp.asarray(True), np.asarray(True)):
         two.data = two.data.replace(core=two.data.core.replace(mjx_synced=flag))
         two.step()
-    assert two._step._cache_size() == compiled
+    assert two.step_fn._cache_size() == compiled
     clear = two.data.core.mjx_synced
     two.data = at_height(two.data, UP, UP)
     assert two.data.core.mjx_synced is clear
@@ -291,15 +291,15 @@ def test_asking_reads_no_device(two, syncs):
     """Whether a sync is due is known on the host: a flag that cannot be read does no harm."""
 
     fresh(two, UP, UP)
-    fine = two._data
+    fine = two._stepper.data
     try:
-        two._data = fine.replace(core=fine.core.replace(mjx_synced=Unreadable()))
+        two._stepper.data = fine.replace(core=fine.core.replace(mjx_synced=Unreadable()))
         syncs.clear()
         two.contacts()
         two.contacts("drone:0")
         assert not syncs
     finally:
-        two._data = fine
+        two._stepper.data = fine
 
 
 # What is allocated ----------------------------------------------------------------------------------------------
@@ -314,12 +314,12 @@ def test_nothing_of_the_scene_is_held_per_world_before_it_is_asked_for():
         own = {id(x) for x in jax.tree.leaves((sim.data, sim.default_data))}
         return sum(x.nbytes for x in jax.live_arrays() if x.ndim and x.shape[0] == n_worlds and id(x) not in own)
 
-    assert sim._scene._mjx_data is None
+    assert sim.scene._mjx_data is None
     assert foreign_bytes() == 0
     sim.step(2)
     sim.reset()
     sim.build_mjx()
-    assert sim._scene._mjx_data is None
+    assert sim.scene._mjx_data is None
     assert foreign_bytes() == 0
     assert sim.mjx_data.mocap_pos.shape == (n_worlds, 1, 3)
     assert foreign_bytes() > 1000 * n_worlds
@@ -330,8 +330,8 @@ def test_drawing_one_world_of_several_holds_none_of_the_others(opengl, syncs):
     sim = Sim(n_worlds=2)
     sim.step()
     assert sim.render(**SMALL, world=1).shape == (24, 32, 3)
-    assert sim._scene._mjx_data is None
-    assert sim._scene._mjx_model is None
+    assert sim.scene._mjx_data is None
+    assert sim.scene._mjx_model is None
     assert not syncs
 
 

@@ -53,14 +53,14 @@ def test_ten_commands_one_trace(counted):
         np.testing.assert_array_equal(staged, np.asarray(COMMAND, np.float32), err_msg=name)
         assert staged.dtype == sim.data.states.pos.dtype
         sim.step()
-        assert (len(traces), compilations(sim._step)) == (1, 1), name
+        assert (len(traces), compilations(sim.step_fn)) == (1, 1), name
     assert int(sim.data.core.steps[0, 0]) == 10
 
 
 def test_any_number_of_steps_any_edit_any_reset_one_program(counted):
     """Law 6: the number of steps is no constant of the program, and edits and resets bring no new kind of array."""
     sim, traces = counted
-    program, n_steps = sim._step, 0
+    program, n_steps = sim.step_fn, 0
     sim.reset()
 
     def check(n, why):
@@ -107,7 +107,7 @@ def test_resets_have_one_program_each_way(counted):
         sim.reset(jnp.asarray(mask))
         sim.reset(mask)
         sim.reset()
-    jitted = sim._reset
+    jitted = sim.reset_fn
     assert compilations(jitted) == 2  # one with a mask, one without
 
 

@@ -53,7 +53,7 @@ WRONG_SETTINGS = [
     ({"device": "abacus"}, "'abacus' does not exist", "'cpu' or 'gpu'"),
     ({"device": "cpu:99"}, "'cpu:99' does not exist", "'cpu' or 'gpu'"),
     ({"device": None}, "not None", "jax.Device"),
-    ({"mesh": 2}, "not 2", "world_mesh"),
+    ({"mesh": 2}, "got 2", "world_mesh"),
     ({"xml_path": "/nowhere/scene.xml"}, "/nowhere/scene.xml does not exist", "xml_path="),
     ({"xml_path": 3}, "xml_path is 3", "MJCF"),
     ({"rng_key": "lucky"}, "'lucky'", "an integer"),

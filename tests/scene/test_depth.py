@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from cases import trees_equal
 
-from crazysim import ConfigError, Sim
+from crazysim import ConfigError, RangeFinder, Sim
 from crazysim.scene.depth import pixel_directions
-from crazysim.scene.range_finder import RANGER, add_range_finder
 
 WIDTH, HEIGHT, FOVY = 24, 16, 70.0
 
@@ -150,11 +150,11 @@ def test_a_range_finder_measures_in_the_step(engine):
     sim = Sim(n_worlds=2, n_drones=2, control="attitude", engine=engine)
     sim.scene.add("wall", pos=[2, 0, 0], length=8, height=8)
     sim.scene.add("sphere", pos=[0, 1.2, 1.0], radius=0.2)
-    add_range_finder(sim, max_range=3.0, drones=True)
+    sim.add(RangeFinder(max_range=3.0, drones=True))
     placed(sim, [[[0, 0, 1], [0, -1, 1]], [[1, 0, 2], [1, -0.5, 5]]], np.tile([0, 0, 0, 1.0], (2, 2, 1)))
     sim.step()
     found = np.asarray(sim.data.plugins["range_finder"].distance)
-    names = list(RANGER)
+    names = list(RangeFinder.MULTI_RANGER)
     z = np.asarray(sim.data.states.pos)[..., 2]
     np.testing.assert_allclose(found[..., names.index("down")], np.minimum(z, 3.0), atol=1e-4)
     np.testing.assert_allclose(found[..., names.index("front")], [[1.975, 1.975], [0.975, 0.975]], atol=1e-4)
@@ -167,7 +167,7 @@ def test_a_range_finder_measures_in_the_step(engine):
 
 def test_a_range_finder_measures_at_its_rate():
     sim = Sim(control="attitude")
-    add_range_finder(sim, [[0, 0, -2]], freq=50)
+    sim.add(RangeFinder([[0, 0, -2]], freq=50))
     placed(sim, [[[0, 0, 1]]])
     sim.step(10)
     first = float(sim.data.plugins["range_finder"].distance[0, 0, 0])
@@ -186,9 +186,9 @@ def test_law_09_what_cannot_be_seen_is_refused(room):
         (lambda: sim.depth("fpv_cam", 0, 4), "0 x 4 pixels cannot be"),
         (lambda: sim.depth("fpv_cam", 4, 4.5), "4 x 4.5 pixels cannot be"),
         (lambda: sim.depth("fpv_cam", 4, 4, along="z"), "along='ray'"),
-        (lambda: add_range_finder(sim, [[0, 0, 0]]), "none of them zero"),
-        (lambda: add_range_finder(sim, max_range=0), "must be positive"),
-        (lambda: add_range_finder(sim, freq=333), "take a divisor"),
+        (lambda: sim.add(RangeFinder([[0, 0, 0]])), "none of them zero"),
+        (lambda: sim.add(RangeFinder(max_range=0)), "max_range to be positive"),
+        (lambda: sim.add(RangeFinder(freq=333)), "Use a divisor"),
     ):
         with pytest.raises(ConfigError) as error:
             act()
@@ -206,7 +206,7 @@ def test_rays_are_those_of_c_mujoco(room, rng):
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     rays = (jnp.asarray(np.tile(x, (2, 1, 1)), jnp.float32) for x in (origin, direction))
     hits = cast(sim.scene.visible, data, *rays, drones=False)
-    sim._scene.sync(data, 0)
+    sim.scene.sync(data, 0)
     group = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # drones are in groups 2 and 3
     geom = np.zeros(1, np.int32)
     met = 0
@@ -218,3 +218,16 @@ def test_rays_are_those_of_c_mujoco(room, rng):
             met += 1
             assert float(hits.distance[0, k]) == pytest.approx(far, rel=1e-4, abs=1e-4)
     assert 100 < met < n
+
+
+def test_the_old_range_finder_warns_and_adds_the_same():
+    from crazysim.scene import range_finder
+
+    old, new = Sim(), Sim()
+    new.add(RangeFinder(max_range=2.0))
+    with pytest.warns(DeprecationWarning, match=r"use sim.add\(RangeFinder"):
+        range_finder.add_range_finder(old, max_range=2.0)
+    with pytest.warns(DeprecationWarning, match="MULTI_RANGER"):
+        assert range_finder.RANGER is RangeFinder.MULTI_RANGER
+    assert list(old.step_pipeline) == list(new.step_pipeline)
+    assert trees_equal(old.data.plugins, new.data.plugins)

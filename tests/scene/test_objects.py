@@ -63,10 +63,10 @@ def test_poses_are_those_that_mujoco_has(course, rng):
     pos, quat = rng.normal(size=(3, 2, 3)), rng.normal(size=(3, 2, 4))
     sim.data = tower.set_pose(gates.set_pose(sim.data, pos, quat), pos[:, :1] + 1, quat[:, 1:])
     quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
-    sim.data = sim._scene.sync(sim.data)
+    sim.data = sim.scene.sync(sim.data)
     model = sim.mj_model
     for world in range(3):
-        sim._scene.sync(sim.data, world)
+        sim.scene.sync(sim.data, world)
         for found in (sim.mj_data, jax.tree.map(lambda x, w=world: x[w], sim.mjx_data)):
             for k in range(2):
                 body = model.body(f"gate:{k}").id

@@ -122,7 +122,7 @@ def test_a_body_that_a_user_moved_is_drawn_where_it_is(opengl):
         return columns.mean() + 0.5
 
     assert abs(where(0) - 32) < 1
-    assert sim._scene._mjx_data is None
+    assert sim.scene._mjx_data is None
     k = sim.mj_model.body("ball").mocapid.item()
     sim.mjx_data = sim.mjx_data.replace(mocap_pos=sim.mjx_data.mocap_pos.at[:, k, 0].set(jnp.array([-0.8, 0.8])))
     assert where(0) < 25
@@ -254,7 +254,7 @@ def test_pictures_are_the_callers_own(sim):
         ({"camera": 4}, "camera 4 does not exist; ids go from 0 to 3"),
         ({"camera": -2}, "camera -2 does not exist"),
         ({"camera": 1.5}, "camera 1.5 does not exist"),
-        ({"world": 2}, "world 2 does not exist; worlds go from 0 to 1"),
+        ({"world": 2}, "world 2 does not exist; choose one from 0 to 1"),
         ({"world": -1}, "world -1 does not exist"),
         ({"width": 0}, "0 x 120 pixels cannot be"),
         ({"height": -5}, "160 x -5 pixels cannot be"),

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from cases import trees_equal
 
-from crazysim import ConfigError, Sim
+from crazysim import ConfigError, ContactLog, Sim
 from crazysim.core.stage import stage
 from crazysim.engine import Step
-from crazysim.scene.contact_log import latch_contacts
 from crazysim.scene.report import CHUNK
 from crazysim.sim.sim import use_box_collision
 
@@ -52,7 +52,7 @@ def flown(request):
 
 def oracle(sim, world, names, geom):
     """Return distances of each drone to the floor, to every object and to the nearest drone, by C MuJoCo."""
-    sim._scene.sync(sim.data, world)
+    sim.scene.sync(sim.data, world)
     model, data = sim.mj_model, sim.mj_data
     root = model.body_rootid[model.geom_bodyid]
 
@@ -89,7 +89,7 @@ def test_every_distance_is_that_of_c_mujoco(flown):
 def test_nothing_of_mujoco_is_made_for_it(flown):
     sim, _ = flown
     sim.contact_report()
-    assert sim._scene._mjx_data is None
+    assert sim.scene._mjx_data is None
 
 
 def test_boxes_of_drones_are_taken_when_they_touch_by_boxes():
@@ -191,11 +191,11 @@ def test_a_swarm_of_4096_finds_the_two_that_touch_without_quadratic_memory():
 
 
 @pytest.mark.parametrize("engine", ["plain", "auto"])
-def test_contacts_are_latched_at_the_step_they_begin(engine):
+def test_contacts_are_logged_at_the_step_they_begin(engine):
     """Drones fly past a pole in the first world and into it in the second; the third stands still next to another."""
     sim = Sim(n_worlds=3, n_drones=2, control="rotor_vel", engine=engine)
     pole = sim.scene.add("pole", pos=[0.5, 0, 0], height=3.0, radius=0.02)
-    latch_contacts(sim, pole, floor=False)
+    sim.add(ContactLog(pole, floor=False))
     pos = np.float32([[[0, 0.5, 1], [5, 0, 1]], [[0, 0, 1], [5, 0, 1]], [[0, 5, 1], [0, 5.1, 1]]])
     vel = np.float32([[[1, 0, 0], [0, 0, 0]], [[1, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 0]]])
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos), vel=jnp.asarray(vel)))
@@ -251,3 +251,19 @@ def test_one_kernel_reports_what_xla_does(n_drones):
         assert jax.tree.structure(found) == jax.tree.structure(expected)
         for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(x, y, atol=1e-5)
+
+
+def test_the_old_contact_log_warns_and_adds_the_same():
+    from crazysim.scene import contact_log
+
+    old, new = Sim(n_drones=2), Sim(n_drones=2)
+    new.add(ContactLog((), drones=True))
+    with pytest.warns(DeprecationWarning, match=r"use sim.add\(ContactLog"):
+        contact_log.latch_contacts(old, ())
+    assert list(old.step_pipeline) == list(new.step_pipeline)
+    assert {"contacts", "contacts_of_drones"} <= set(old.step_pipeline)
+    assert trees_equal(old.data.plugins, new.data.plugins)
+    old.remove("contacts")
+    assert not {"contacts", "contacts_of_drones"} & set(old.step_pipeline)
+    with pytest.raises(ConfigError, match="expected something to check for contacts"):
+        old.add(ContactLog((), floor=False, drones=False))

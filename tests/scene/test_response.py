@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from cases import trees_equal
 
-from crazysim import ConfigError, Sim
+from crazysim import ConfigError, ContactResponse, Sim
 from crazysim.core.stage import stage
 from crazysim.engine import Step
-from crazysim.scene.response import add_contact_response
 
 HALF = 0.02
 """Half the height of the collision box of a cf21B_500, m."""
@@ -21,7 +21,7 @@ def without_air(n_worlds=1, objects=(), engine="auto", **settings):
     sim = Sim(n_worlds=n_worlds, control="rotor_vel", engine=engine)
     for kind, options in objects:
         sim.scene.add(kind, **options)
-    add_contact_response(sim, **settings)
+    sim.add(ContactResponse(**settings))
     params = sim.data.params
     sim.data = sim.data.replace(params=params.replace(drag_matrix=0 * params.drag_matrix))
     sim.build_default_data()
@@ -63,7 +63,7 @@ def test_a_drone_on_the_floor_rests():
 
 def test_it_takes_off():
     sim = Sim(control="attitude")
-    add_contact_response(sim)
+    sim.add(ContactResponse())
     throw(sim, pos=[[[0, 0, HALF]]])
     sim.attitude_control(np.array([[[0, 0, 0, 0.3]]]))  # less than its weight of 0.426 N
     sim.step(500)
@@ -139,7 +139,7 @@ def test_flights_with_bounces_lose_what_they_have(rng):
     sim = Sim(n_worlds=n, control="rotor_vel", integrator="rk4")
     sim.scene.add("wall", pos=[0.8, 0, 0], height=6)
     sim.scene.add("pole", pos=[0, 0.5, 0], height=6.0)
-    add_contact_response(sim, restitution=0.6)
+    sim.add(ContactResponse(restitution=0.6))
     quat = rng.normal(size=(n, 1, 4))
     throw(
         sim,
@@ -172,7 +172,7 @@ def test_it_bounces_off_a_wall_and_a_pole():
 def test_it_lands_on_a_moving_pad_and_rides_along():
     sim = Sim(control="rotor_vel")
     pad = sim.scene.add("landing_pad", pos=[0, 0, 0.5], radius=0.4)
-    add_contact_response(sim, friction=0.8)
+    sim.add(ContactResponse(friction=0.8))
     speed = 0.3
 
     @stage("world")
@@ -235,7 +235,7 @@ def test_the_landing_place_has_a_gradient():
     assert float(slope) == pytest.approx(float(difference), rel=0.15)
 
 
-def test_engines_agree_and_the_impulse_is_told():
+def test_engines_agree_and_the_impulse_is_reported():
     ends = []
     for engine in ("plain", "lanes", "auto"):
         sim = without_air(2, engine=engine)
@@ -253,13 +253,25 @@ def test_engines_agree_and_the_impulse_is_told():
 def test_law_09_what_cannot_be_is_refused():
     sim = Sim()
     for settings, words in (
-        ({"friction": -1}, "friction is -1"),
+        ({"friction": -1}, "expected friction to be from 0 to inf, got -1"),
         ({"restitution": 1.5}, "from 0 to 1"),
         ({"softness": 1e-3}, "two steps at least"),
         ({"objects": "tree"}, "no object 'tree'"),
     ):
         with pytest.raises(ConfigError, match=words):
-            add_contact_response(sim, **settings)
-    add_contact_response(sim)
+            sim.add(ContactResponse(**settings))
+    sim.add(ContactResponse())
     with pytest.raises(ConfigError, match="already"):
-        add_contact_response(sim)
+        sim.add(ContactResponse())
+
+
+def test_the_old_function_warns_and_adds_the_same():
+    from crazysim.scene.response import add_contact_response
+
+    old, new = Sim(), Sim()
+    new.add(ContactResponse((), 0.7, restitution=0.1))
+    with pytest.warns(DeprecationWarning, match=r"use sim.add\(ContactResponse"):
+        add_contact_response(old, (), 0.7, restitution=0.1)
+    assert list(old.step_pipeline) == list(new.step_pipeline)
+    assert "clip_floor_pos" not in old.step_pipeline
+    assert trees_equal(old.data.plugins, new.data.plugins)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend import core
 
 from crazysim.engine.ir import Block, Element, constant, is_constant
+from crazysim.engine.jaxcompat import ClosedJaxpr, as_function, closed, expanded
 from crazysim.engine.lower import (
     MAX_UNROLL,
     Elements,
@@ -36,16 +35,11 @@ def _custom_jvp(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]
 @rule("call_hi_primitive")
 def _high_level(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Expand a primitive that is defined by others, which JAX has from 0.12 on."""
-    primitive = eqn.params["_prim"]
-
-    def expanded(*args: Any) -> list[Any]:
-        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, args)))
-
     avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-    return _with_derivative(ctx, eqn, args, jax.make_jaxpr(expanded)(*avals))
+    return _with_derivative(ctx, eqn, args, jax.make_jaxpr(expanded(eqn))(*avals))
 
 
-def _with_derivative(ctx: Lowering, eqn: Any, args: list[Elements], called: core.ClosedJaxpr) -> list[Elements]:
+def _with_derivative(ctx: Lowering, eqn: Any, args: list[Elements], called: ClosedJaxpr) -> list[Elements]:
     """Lower a call with a derivative of its own, which is lowered when it is needed."""
     body = ctx.inner()
     block = body.finish(body.lower(called, [_inputs(body, x) for x in args]))
@@ -53,7 +47,7 @@ def _with_derivative(ctx: Lowering, eqn: Any, args: list[Elements], called: core
     @functools.cache
     def slope() -> Block:
         """Return the block from operands and their tangents to the tangents of the results."""
-        single = _as_function(eqn)
+        single = as_function(eqn)
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
         traced = jax.make_jaxpr(lambda x, dx: jax.jvp(single, x, dx)[1])(avals, avals)
         fresh = Lowering()
@@ -143,16 +137,6 @@ def _while(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     goes_on = test.finish(test.lower(closed(p["cond_jaxpr"]), [*cond_fixed, *(_inputs(test, x) for x in carry)]))
     turn = body.finish(body.lower(closed(p["body_jaxpr"]), [*body_fixed, *(_inputs(body, x) for x in carry)]))
     return _results(ctx, "while", eqn, scalars(*carry), (goes_on, turn))
-
-
-def closed(jaxpr: Any) -> core.ClosedJaxpr:
-    """Return a jaxpr in closed form, whichever form it has."""
-    return jaxpr if isinstance(jaxpr, core.ClosedJaxpr) else core.ClosedJaxpr(jaxpr, ())
-
-
-def _as_function(eqn: Any) -> Callable[..., Any]:
-    """Return an operation as a function of arrays."""
-    return lambda *args: eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(eqn.params))
 
 
 def _inputs(ctx: Lowering, like: Elements) -> Elements:

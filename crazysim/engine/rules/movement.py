@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from crazysim.engine.jaxcompat import bind
 from crazysim.engine.lower import Elements, Lowering, as_elements, constants, rule
 
 MOVEMENT = (
@@ -66,8 +67,7 @@ def move_many(eqn: Any, args: list[Elements], fixed: Sequence[Any] = ()) -> list
 def run_now(eqn: Any, args: Sequence[Any], **params: Any) -> list[np.ndarray]:
     """Return the results of an operation on known numbers."""
     with jax.ensure_compile_time_eval(), jax.default_device(jax.local_devices(backend="cpu")[0]):
-        out = eqn.primitive.bind(*(jax.numpy.asarray(x) for x in args), **(eqn.params | params))
-        return [np.asarray(x) for x in (out if eqn.primitive.multiple_results else [out])]
+        return [np.asarray(x) for x in bind(eqn, *(jax.numpy.asarray(x) for x in args), **params)]
 
 
 @rule("iota", "iota_2x32_shape")

@@ -6,9 +6,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.random import threefry_prng_impl
 
 from crazysim.engine.ir import is_constant
+from crazysim.engine.jaxcompat import bits_generator, threefry_prng_impl
 from crazysim.engine.lower import Elements, Lowering, UnsupportedError, as_elements, rule
 from crazysim.engine.rules.movement import run_now
 
@@ -30,7 +30,7 @@ def _halves(keys: Elements) -> Elements:
 
 
 def _check_generator(impl: Any) -> None:
-    if getattr(impl, "name", str(impl)) != threefry_prng_impl.name:
+    if bits_generator(impl) != threefry_prng_impl.name:
         raise UnsupportedError(f"a random generator other than JAX's default, {threefry_prng_impl.name}: {impl}")
 
 

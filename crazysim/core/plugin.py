@@ -1,0 +1,235 @@
+"""Plugins: optional parts of a simulation, such as effects, sensors and logs, all added with ``sim.add``.
+
+A plugin is a frozen record of settings. Everything that changes, and every number that the compiled step reads, is in
+its record, ``data.plugins[plugin.name]``. Its methods are written for one drone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, Protocol, dataclass_transform
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.pipeline import Pipeline
+from crazysim.drones import Airframe
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree
+
+
+class Simulation(Protocol):
+    """The attributes of ``crazysim.Sim`` that plugins use."""
+
+    data: SimData
+    default_data: SimData
+    step_pipeline: Pipeline
+    airframe: Airframe
+    n_worlds: int
+    n_drones: int
+
+    @property
+    def scene(self) -> Any:
+        """The MuJoCo scene, a ``crazysim.scene.scene.Scene``."""
+        ...
+
+    def add(self, plugin: Any, name: str | None = None) -> Any:
+        """Add a plugin and return it."""
+        ...
+
+    def build_step_fn(self) -> Any:
+        """Compile the step pipeline as it is now."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Placement:
+    """A stage of a plugin and its place in the step pipeline."""
+
+    stage: Callable[[SimData], SimData]
+    """The stage, declared with ``crazysim.stage``."""
+    before: str = "integration"
+    """Name of the stage in front of which it is inserted."""
+    replaces: str | None = None
+    """Name of the stage that it replaces instead, if the pipeline has it; removing the plugin puts that stage back."""
+    name: str | None = None
+    """Name of the stage; None for the plugin's."""
+
+
+def parameter(*, default: Any = dataclasses.MISSING) -> Any:
+    """Declare a field of a plugin whose value only fills numbers of its record.
+
+    ``sim.replace`` exchanges such numbers without compiling the step again. The plugin's stages, ``influence`` and
+    ``derivative`` must read the number from the record, never from the field.
+    """
+    return dataclasses.field(default=default, metadata={"parameter": True})
+
+
+def check_parameter(
+    sim: Simulation,
+    name: str,
+    value: Any,
+    core: tuple[int, ...] = (1,),
+    low: float = -np.inf,
+    high: float = np.inf,
+    dtype: Any = None,
+    positive: bool = False,
+) -> Array:
+    """Return a setting as an array that all drones share, or with one entry per drone.
+
+    Args:
+        sim: The simulation.
+        name: Name of the setting in messages.
+        value: One number for every entry (not for vectors), ``core``, or (n_worlds, n_drones, *core); the last axis
+            may be omitted where it has length one.
+        core: Shape of the value of one drone.
+        low: Least value allowed.
+        high: Largest value allowed.
+        dtype: Type; None for that of the states.
+        positive: Refuse zero and negative values.
+
+    Returns:
+        (*core) or (n_worlds, n_drones, *core)
+
+    Raises:
+        ConfigError: If the shape, the type or a value is invalid.
+    """
+    array = np.asarray(value)
+    batch = sim.data.states.pos.shape[:2]
+    if core == (1,) and array.shape == batch:
+        array = array[..., None]
+    is_number = array.dtype.kind in ("iu" if dtype is not None and np.issubdtype(dtype, np.integer) else "iuf")
+    is_shared = array.shape == core or (array.ndim == 0 and core != (3,))
+    if not is_number or not (is_shared or array.shape == (*batch, *core)):
+        raise ConfigError(
+            f"expected {name} as {'whole' if dtype is not None else 'real'} numbers of shape {core} for all drones, or "
+            f"{(*batch, *core)} = (n_worlds, n_drones, {core[0]}) for each, got shape {array.shape} and type "
+            f"{array.dtype}"
+        )
+    if (
+        not np.all(np.isfinite(array))
+        or np.any(array < low)
+        or np.any(array > high)
+        or (positive and np.any(array <= 0))
+    ):
+        bounds = "positive" if positive else f"from {low} to {high}"
+        raise ConfigError(f"expected {name} to be finite and {bounds}, got {value!r}")
+    dtype = sim.data.states.pos.dtype if dtype is None else dtype
+    return jnp.asarray(np.broadcast_to(array, core) if is_shared else array, dtype)
+
+
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(parameter, dataclasses.field))
+class Plugin:
+    """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.
+
+    A subclass lists its settings as annotated fields, one of which is ``name``; it becomes a frozen dataclass. It
+    overrides what it needs of the methods below. All methods that take ``data`` are written for one drone: leaves of
+    drones and worlds come without batch axes, ``data.states.pos`` is (3,).
+    """
+
+    name: str
+    """Name of the plugin: the key of its record in ``data.plugins``, and the name of its stage."""
+    order: ClassVar[int] = 0
+    """Influences are applied in ascending order, those of the same order by name. Negative: replaces commands that
+    the others limit."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Make every subclass a frozen dataclass."""
+        super().__init_subclass__(**kwargs)
+        dataclasses.dataclass(frozen=True, eq=False)(cls)
+        if "name" not in {f.name for f in dataclasses.fields(cls)}:  # type: ignore[arg-type]
+            raise TypeError(f"plugin {cls.__name__} has no field 'name'; add one, such as name: str = 'my_plugin'")
+
+    @property
+    def is_dynamic(self) -> bool:
+        """True if the integrator must call ``influence`` or ``derivative``."""
+        cls = type(self)
+        return cls.influence is not Plugin.influence or cls.derivative is not Plugin.derivative
+
+    def record(self, sim: Simulation) -> PyTree | None:
+        """Return the plugin's record for all worlds, or None if it has none; check settings and simulation.
+
+        Args:
+            sim: The simulation that the plugin is being added to.
+
+        Raises:
+            ConfigError: If a setting is invalid, or the simulation lacks something the plugin needs.
+        """
+        return None
+
+    def default_record(self, sim: Simulation) -> PyTree | None:
+        """Return the record that resets restore; by default the same as ``record``."""
+        return self.record(sim)
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages of the plugin with their places, in the order in which they are inserted."""
+        return ()
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data of one drone as the dynamics are to use it: other forces, commands or parameters.
+
+        The integrator evaluates it for every time derivative, and discards the changes afterwards: external forces,
+        commands and parameters in ``sim.data`` stay as the user set them.
+        """
+        return data
+
+    def derivative(self, data: SimData) -> Mapping[str, Array]:
+        """Return the time derivatives of fields of the record that are states of the plugin's own, per second.
+
+        The integrator advances them together with the drone's states, in every scheme. ``data`` is of one drone, with
+        all influences applied.
+        """
+        return {}
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return named measurements of one drone. (k,) each"""
+        return {}
+
+    def draw(self, sim: Simulation, world: int) -> None:
+        """Draw overlays into the next image of a world, on ``sim.scene``."""
+
+    def read(self, data: SimData) -> Any:
+        """Return the plugin's record in some data."""
+        return data.plugins[self.name]
+
+    def write(self, data: SimData, record: PyTree) -> SimData:
+        """Return the data with another record of this plugin."""
+        return data.replace(plugins=data.plugins | {self.name: record})
+
+
+class FunctionPlugin(Plugin):
+    """A plugin made of a record and functions, for parts that need no class of their own."""
+
+    name: str
+    data: PyTree | None = None
+    """The record for all worlds."""
+    placements: Sequence[Placement] = ()
+    """The stages with their places."""
+    influence_fn: Callable[[SimData], SimData] | None = None
+    """The influence on the dynamics, for one drone; None for none."""
+    default: PyTree | None = None
+    """The record that resets restore; None for ``data``."""
+
+    @property
+    def is_dynamic(self) -> bool:
+        """True if there is an influence."""
+        return self.influence_fn is not None
+
+    def record(self, sim: Simulation) -> PyTree | None:
+        """Return the record."""
+        return self.data
+
+    def default_record(self, sim: Simulation) -> PyTree | None:
+        """Return the record that resets restore."""
+        return self.data if self.default is None else self.default
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages."""
+        return self.placements
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data as the dynamics are to use it."""
+        return data if self.influence_fn is None else self.influence_fn(data)

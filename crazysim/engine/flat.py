@@ -1,0 +1,106 @@
+"""``SimData`` flattened to a list of arrays, and the caches that make flattening it again cheap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.pytree import scopes
+
+if TYPE_CHECKING:
+    from crazysim.engine.plan import Plan
+
+Zeros = tuple[tuple[int, frozenset[int]], ...]
+"""Leaves with the elements of them that are zero."""
+
+
+class FlatData:
+    """``SimData`` as a list of arrays with the plan that steps it; steps in a row need no record between them."""
+
+    __slots__ = ("leaves", "packed", "plan", "treedef")
+
+    def __init__(self, leaves: list[Any], treedef: Any, plan: Plan, packed: Array | None):
+        """Hold the leaves, and the array of those that are packed."""
+        self.leaves, self.treedef, self.plan, self.packed = leaves, treedef, plan, packed
+
+    def data(self) -> SimData:
+        """Return the data as a record."""
+        return self.treedef.unflatten(self.leaves)
+
+    def inputs(self) -> list[Any]:
+        """Return the arguments of the compiled step besides the number of steps."""
+        values = [self.leaves[i] for i in self.plan.read]
+        if self.packed is not None:
+            values.append(self.packed)
+        return values
+
+
+class PackCache:
+    """Shared parameters concatenated to one array, which is made again only after one of them was replaced."""
+
+    def __init__(self) -> None:
+        self._arrays: Sequence[Any] = ()
+        self._packed: Any = None
+
+    def __call__(self, arrays: list[Any]) -> Array:
+        """Return the arrays as one."""
+        if any(isinstance(x, jax.core.Tracer) for x in arrays):
+            return _concatenated(arrays)
+        if not _same(arrays, self._arrays):
+            with jax.ensure_compile_time_eval():  # inside a user's trace too: a cached value must be an array
+                self._arrays, self._packed = arrays, jax.jit(_concatenated)(arrays)
+        return self._packed
+
+
+def _concatenated(arrays: list[Any]) -> Array:
+    return jnp.concatenate([x.ravel() for x in arrays])
+
+
+class ZerosCache:
+    """Elements of shared parameters that are zero: an inertia without products, a force without a component.
+
+    Values are read once for each array. Under a trace they are unknown, and no element counts as zero.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: Sequence[Any] = ()
+        self._found: Zeros = ()
+        self._shared: dict[Any, list[int]] = {}
+
+    def __call__(self, data: SimData, leaves: list[Any]) -> Zeros:
+        """Return the elements of a simulation's data."""
+        places = self._places(data, leaves)
+        arrays = [leaves[i] for i in places]
+        if _same(arrays, self._arrays):
+            return self._found
+        if any(isinstance(x, jax.core.Tracer) for x in arrays):
+            return ()
+        found = {i: frozenset(np.flatnonzero(np.asarray(x) == 0).tolist()) for i, x in zip(places, arrays, strict=True)}
+        self._arrays, self._found = arrays, tuple((i, zeros) for i, zeros in found.items() if zeros)
+        return self._found
+
+    def _places(self, data: SimData, leaves: list[Any]) -> list[int]:
+        key = tuple([x.ndim for x in jax.tree.leaves((data.params, data.controls))])
+        if key not in self._shared:
+            ids = {id(x) for x in jax.tree.leaves((data.params, data.controls))}
+            self._shared[key] = [
+                i
+                for i, (scope, x) in enumerate(zip(jax.tree.leaves(scopes(data)), leaves, strict=True))
+                if scope == "shared" and id(x) in ids and jnp.issubdtype(x.dtype, jnp.floating)
+            ]
+        return self._shared[key]
+
+
+def _same(some: Sequence[Any], others: Sequence[Any]) -> bool:
+    """Return whether two lists hold the very same arrays."""
+    return len(some) == len(others) and all(map(_is, some, others))
+
+
+def _is(a: Any, b: Any) -> bool:
+    return a is b

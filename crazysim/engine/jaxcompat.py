@@ -1,0 +1,216 @@
+"""All use of JAX beyond its documented, stable interface; a new release of JAX is met here first.
+
+Each name has a test in ``tests/engine/test_jaxcompat.py``, which continuous integration runs on the oldest and the
+newest JAX that are supported.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jaxlib
+from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
+from jax.experimental.layout import Layout, with_layout_constraint
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.extend.random import threefry2x32_p, threefry_prng_impl
+
+from crazysim.engine.errors import UnsupportedError
+
+__all__ = [
+    "ClosedJaxpr",
+    "Equation",
+    "Jaxpr",
+    "Literal",
+    "Parameters",
+    "as_function",
+    "batched_rule",
+    "bind",
+    "bits_generator",
+    "cache_folder",
+    "closed",
+    "compute_capability",
+    "custom_vmap",
+    "expanded",
+    "ffi_include_folder",
+    "is_key",
+    "is_symbolic_zero",
+    "jaxpr_as_fun",
+    "n_compilations",
+    "reading",
+    "register_host_target",
+    "threefry2x32_p",
+    "threefry_prng_impl",
+    "versions",
+    "with_inputs",
+    "with_major_to_minor",
+]
+
+
+# Jaxprs ---------------------------------------------------------------------------------------------------------
+
+
+def closed(jaxpr: Any) -> ClosedJaxpr:
+    """Return a jaxpr in closed form; parameters of primitives hold either form."""
+    return jaxpr if isinstance(jaxpr, ClosedJaxpr) else ClosedJaxpr(jaxpr, ())
+
+
+def with_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
+    """Return a jaxpr that takes only some of its inputs; the others must be unused.
+
+    Args:
+        jaxpr: The jaxpr.
+        inputs: Positions of the inputs to keep.
+    """
+    inner = jaxpr.jaxpr
+    invars = [inner.invars[i] for i in inputs]
+    return ClosedJaxpr(
+        Jaxpr(inner.constvars, invars, inner.outvars, inner.eqns, inner.effects, inner.debug_info), jaxpr.consts
+    )
+
+
+class Parameters(dict):
+    """Parameters of a primitive; reading one that this JAX does not have raises ``UnsupportedError``."""
+
+    def __init__(self, primitive: str, params: dict[str, Any]):
+        super().__init__(params)
+        self._primitive = primitive
+
+    def __missing__(self, name: str) -> Any:
+        raise UnsupportedError(
+            f"it has no parameter {name!r} in JAX {jax.__version__}, only {', '.join(self) or 'none'}", self._primitive
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Equation:
+    """Equation of a jaxpr whose parameters are checked as they are read."""
+
+    primitive: Any
+    """Primitive, with its ``name``."""
+    invars: Sequence[Any]
+    """Operands, variables or literals, with their ``aval``."""
+    outvars: Sequence[Any]
+    """Results."""
+    params: Parameters
+    """Parameters by name."""
+
+
+@contextlib.contextmanager
+def reading(eqn: Any) -> Iterator[Equation]:
+    """Give a rule an equation, and report a parameter that JAX has renamed as unsupported.
+
+    Only a missing parameter, or a missing attribute of a parameter, counts. Any other error is the rule's own.
+
+    Raises:
+        UnsupportedError: If the rule reads a parameter, or an attribute of one, that this JAX does not have.
+    """
+    name = eqn.primitive.name
+    try:
+        yield Equation(eqn.primitive, eqn.invars, eqn.outvars, Parameters(name, eqn.params))
+    except AttributeError as error:
+        owner = next((k for k, v in eqn.params.items() if v is not None and v is error.obj), None)
+        if owner is None:
+            raise
+        raise UnsupportedError(
+            f"its parameter {owner!r} has no {error.name!r} in JAX {jax.__version__}", name
+        ) from error
+
+
+def bind(eqn: Any, *args: Any, **params: Any) -> list[Any]:
+    """Return the results of an equation's primitive for other operands, as a list.
+
+    Args:
+        eqn: The equation.
+        args: The operands.
+        params: Parameters that replace those of the equation.
+    """
+    out = eqn.primitive.bind(*args, **(dict(eqn.params) | params))
+    return list(out) if eqn.primitive.multiple_results else [out]
+
+
+def as_function(eqn: Any) -> Callable[..., Any]:
+    """Return an equation as a function of arrays, with its own rule of differentiation."""
+    return lambda *args: eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(dict(eqn.params)))
+
+
+def expanded(eqn: Any) -> Callable[..., list[Any]]:
+    """Return a ``call_hi_primitive`` of JAX 0.12 as a function of arrays, written in terms of other primitives."""
+    primitive = eqn.params["_prim"]
+    return lambda *args: jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, args)))
+
+
+# Random numbers -------------------------------------------------------------------------------------------------
+
+
+def is_key(x: Any) -> bool:
+    """Return whether an array, or its shape and type, holds random keys."""
+    return jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def bits_generator(dtype: Any) -> str:
+    """Return the name of the generator that a type of random keys belongs to."""
+    impl = getattr(dtype, "_impl", dtype)
+    return getattr(impl, "name", str(impl))
+
+
+# Transformations ------------------------------------------------------------------------------------------------
+
+
+def batched_rule(fn: Callable[..., Any], rule: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function with a rule of its own for ``vmap``.
+
+    Args:
+        fn: The function.
+        rule: ``rule(axis_size, in_batched, *args) -> (results, out_batched)``.
+    """
+    call = custom_vmap(fn)
+    call.def_vmap(rule)
+    return call
+
+
+def is_symbolic_zero(tangent: Any) -> bool:
+    """Return whether the tangent that a rule of ``defjvp(symbolic_zeros=True)`` was given is zero by construction."""
+    return tangent is None or isinstance(tangent, SymbolicZero)
+
+
+def with_major_to_minor(x: Any, order: tuple[int, ...]) -> Any:
+    """Return an array with its axes stored in an order, the slowest first; its logical shape stays."""
+    return with_layout_constraint(x, Layout(major_to_minor=order))
+
+
+# Compilation ----------------------------------------------------------------------------------------------------
+
+
+def n_compilations(jitted: Callable[..., Any]) -> int:
+    """Return how many programs a jitted function holds."""
+    return jitted._cache_size()  # type: ignore[attr-defined]
+
+
+def cache_folder() -> str | None:
+    """Return the folder of JAX's persistent compilation cache; None if there is none."""
+    return jax.config.jax_compilation_cache_dir or None  # type: ignore[attr-defined]
+
+
+def ffi_include_folder() -> str:
+    """Return the folder of the headers of XLA's foreign function interface."""
+    return jax.ffi.include_dir()
+
+
+def register_host_target(name: str, function: Any) -> None:
+    """Make a C function, from ``ctypes``, known to XLA as the target of a custom call on the CPU."""
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform="cpu")
+
+
+def compute_capability(device: Any) -> int:
+    """Return the compute capability of an NVIDIA GPU as a number: 90 for 9.0."""
+    return int(str(device.compute_capability).replace(".", ""))
+
+
+def versions() -> str:
+    """Return the versions of JAX and jaxlib, which compiled code depends on."""
+    return f"jax {jax.__version__} jaxlib {jaxlib.__version__}"

@@ -1,0 +1,252 @@
+"""How data of one structure is stepped: the engine that runs, and the reason why it is not a faster one.
+
+Everything that an engine can refuse it refuses here, before the first step. The outcomes are three:
+
+- A documented limit, such as a stage without a scope or a machine without a compiler: a slower way is taken, and
+  ``explain`` names it.
+- Something unsupported (``UnsupportedError``): a primitive without a rule, a parameter that a new JAX has renamed, a
+  kernel that its compiler refuses. A slower way is taken with one ``EngineWarning``; ``strict`` raises instead.
+- Any other exception is a bug, of the stage or of the engine. If ``plain`` fails too, it is the stage's and is raised.
+  Otherwise ``auto`` runs ``plain`` with a warning that asks for a report; ``strict``, and an engine that was chosen by
+  name, raise it.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+from jax import Array
+from jax.sharding import PartitionSpec
+
+from crazysim.core.data import SimData
+from crazysim.core.sharding import Location
+from crazysim.core.stage import Stage, with_leaves
+from crazysim.engine import fused, interpret, lanes, plain
+from crazysim.engine.build import build_program
+from crazysim.engine.errors import LimitError, UnsupportedError
+from crazysim.engine.flat import Zeros
+from crazysim.engine.program import Program
+from crazysim.errors import ConfigError, EngineWarning
+from crazysim.pytree import scopes
+
+ENGINES = ("auto", "plain", "lanes", "fused", "interpret")
+"""Values of ``engine=``. ``interpret`` runs the program in NumPy: slow, without derivatives, to find bugs with."""
+
+Steps = Callable[[list[Any], int | Array], tuple[list[Any], Array]]
+"""Leaves and a number of steps to the written leaves and the worlds that are flagged as not finite."""
+
+
+class Plan(NamedTuple):
+    """How data of one structure is stepped."""
+
+    engine: str
+    """Engine that runs."""
+    why: str
+    """Reason why it is not a faster one."""
+    program: Program | None
+    """Program that it runs; None for ``plain``."""
+    location: Location
+    """Devices that it runs on."""
+    read: tuple[int, ...]
+    """Leaves that are passed to the compiled step."""
+    packed: tuple[int, ...]
+    """Leaves that are passed as one array behind them."""
+    written: tuple[int, ...]
+    """Leaves that are returned."""
+    synced: int
+    """Leaf ``core.mjx_synced``, which is false after a step."""
+    dynamic: Callable[..., Any]
+    """The compiled step, for a number of steps that is an array."""
+    static: Callable[..., Any]
+    """The same for a number of steps that is a Python number, which can be differentiated in reverse."""
+
+
+class Planner(NamedTuple):
+    """What a plan follows from, besides the data."""
+
+    stages: Sequence[Stage]
+    """Stages of the step, in order."""
+    engine: str
+    """Engine that was chosen, one of ``ENGINES``."""
+    strict: bool
+    """True to raise where a slower engine would be taken with a warning."""
+    location: Location
+    """Devices that hold the data."""
+    reported: set[str]
+    """Warnings that were given before, for data of another structure."""
+
+    def plan(self, data: SimData, zeros: Zeros, trace: Callable[[Plan], None]) -> Plan:
+        """Return the plan of some data.
+
+        Args:
+            data: The data, or its shapes and types.
+            zeros: Elements of shared parameters that are zero.
+            trace: Traces the compiled step of a plan, as its first call would, to find what fails there.
+
+        Raises:
+            ConfigError: If a stage is wrong, if an engine chosen by name cannot run it, or, with ``strict``, if a
+                stage or the fastest engine is not supported.
+        """
+        if self.engine == "plain":
+            return self._plain(data, "it was chosen")
+        try:
+            plan, problems = self._fast(data, zeros)
+            trace(plan)
+        except (ConfigError, MemoryError):
+            raise
+        except Exception as error:
+            if self.strict or self.engine != "auto":
+                raise
+            bug = error
+        else:
+            self._report(problems)
+            return plan
+        plan = self._plain(data, f"the engine failed with {type(bug).__name__}")  # raises what is the stage's own error
+        self._report(
+            [
+                f"the engine failed with {type(bug).__name__}: {bug}{self._culprit(data)}, so the step runs on "
+                f"'plain', which is slower. This is a bug of crazysim: please report it, with the files that "
+                f"CRAZYSIM_DUMP=folder writes; strict=True raises the error"
+            ]
+        )
+        return plan
+
+    def _fast(self, data: SimData, zeros: Zeros) -> tuple[Plan, list[str]]:
+        """Return a plan that runs a program, and what it does not support; that of ``plain`` on several devices."""
+        limit = self._spread_limit(data)
+        if limit:
+            return self._plain(data, limit), []
+        kinds = jax.tree.leaves(scopes(data))
+        # Zeros that a caller found earlier may belong to a parameter that was shared then and is one per drone now.
+        known = {i: some for i, some in zeros if kinds[i] == "shared"}
+        program = build_program(self.stages, data, known, _watched)
+        split = program.unfused_stages
+        problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
+        if self.location.spread and split:
+            return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}"), problems
+        engine, why, run = "lanes", "it was chosen", functools.partial(lanes.steps, program)
+        if self.engine == "interpret":
+            engine, run = "interpret", functools.partial(interpret.steps, program)
+        elif self.engine != "lanes":
+            why = fused.missing(self.location.platform) or ""
+            if not why:
+                try:
+                    run = fused.build(program, self.location.platform, self.location.devices)
+                    engine = "fused"
+                except UnsupportedError as error:
+                    why = str(error)
+                    problems.append(self._without_kernel(error))
+            if why and self.engine == "fused":
+                raise ConfigError(f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'.")
+        read = (*program.read, *_needed(program))
+        plan = self._wrap(engine, why, data, program, read, tuple(program.written), run, len(program.leaves))
+        return plan, problems
+
+    def _spread_limit(self, data: SimData) -> str:
+        """Return why data on several devices is stepped by ``plain``, or nothing."""
+        if not self.location.spread:
+            return ""
+        if self.location.mesh is None:
+            return f"the data is spread over devices by a {type(data.states.pos.sharding).__name__}, not over a mesh"
+        undeclared = [s.__name__ for s in self.stages if s.scope == "batch"]
+        return f"with a mesh every stage must be declared, and {undeclared[0]!r} is not" if undeclared else ""
+
+    def _plain(self, data: SimData, why: str) -> Plan:
+        run, written = plain.build(self.stages, data, by_component=not self.location.spread)
+        everything = tuple(range(len(jax.tree.leaves(data))))
+        # XLA spreads the arrays of ``plain`` over devices by itself.
+        return self._wrap("plain", why, data, None, everything, tuple(written), run, len(everything))
+
+    def _wrap(
+        self,
+        engine: str,
+        why: str,
+        data: SimData,
+        program: Program | None,
+        read: tuple[int, ...],
+        written: tuple[int, ...],
+        run: Steps,
+        n_leaves: int,
+    ) -> Plan:
+        numbers = {id(x): i for i, x in enumerate(jax.tree.leaves(data))}
+        nonfinite, synced = numbers[id(data.core.nonfinite)], numbers[id(data.core.mjx_synced)]
+        everything = tuple(sorted({*read, *written}))
+        written = (*written, nonfinite)
+        packed = program.packed if program else ()
+        read = everything[:-1] if packed else everything  # the packed array is the last
+
+        def advance(values: list[Any], n_steps: int | Array) -> list[Any]:
+            leaves = with_leaves([None] * n_leaves, everything, values)
+            out, flagged = run(leaves, n_steps)
+            return [*out, flagged]
+
+        if program is not None and self.location.mesh is not None:
+            advance = self._over_mesh(advance, program, everything, written)
+        return Plan(engine, why, program, self.location, read, packed, written, synced, *_jitted(advance))
+
+    def _over_mesh(
+        self, advance: Callable[..., Any], program: Program, inputs: Sequence[int], outputs: Sequence[int]
+    ) -> Callable[..., Any]:
+        """Return a step in which every device advances its own worlds."""
+        split, shared = PartitionSpec(self.location.axis), PartitionSpec()
+        specs = [split if leaf.scope in ("drone", "world") else shared for leaf in program.leaves]
+
+        def spread(values: list[Any], n_steps: int | Array) -> list[Any]:
+            count = [] if isinstance(n_steps, int) else [n_steps]
+            local = jax.shard_map(
+                lambda values, *count: advance(values, *(count or [n_steps])),
+                mesh=self.location.mesh,
+                in_specs=([specs[i] for i in inputs], *[shared for _ in count]),
+                out_specs=[specs[i] for i in outputs],
+                check_vma=False,
+            )
+            return local(values, *count)
+
+        return spread
+
+    def _report(self, problems: list[str]) -> None:
+        """Warn of the problems of a plan, all in one warning, or raise them."""
+        if not problems:
+            return
+        text = "; ".join(problems) + f" (JAX {jax.__version__})"
+        if self.strict:
+            raise ConfigError(f"{text}. Write the stage with supported operations, or use strict=False.")
+        if text not in self.reported:
+            self.reported.add(text)
+            warnings.warn(f"{text}. strict=True raises an error instead.", EngineWarning, stacklevel=2)
+
+    def _without_kernel(self, error: UnsupportedError) -> str:
+        """Return what a kernel does not support, with its stage, or the stages of the kernel, for a message."""
+        if error.stage:
+            return f"stage {error.stage!r} has no kernel: {error.reason}"
+        return f"the kernel of the stages {', '.join(s.__name__ for s in self.stages)} cannot be built: {error.reason}"
+
+    def _culprit(self, data: SimData) -> str:
+        """Return the stage at which the engine fails, for a message."""
+        for stage in self.stages:
+            try:
+                build_program([stage], data)
+            except Exception:
+                return f" in stage {stage.__name__!r}"
+        return ""
+
+
+def _jitted(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return the function compiled for any number of steps, and for a Python number."""
+    return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
+
+
+def _watched(data: SimData) -> list[Any]:
+    """Return the leaves whose NaN and infinities flag a world: states and commands."""
+    return jax.tree.leaves((data.states, data.controls))
+
+
+def _needed(program: Program) -> list[int]:
+    """Return the leaves that are watched, and one whose shape gives the number of worlds."""
+    check = program.check
+    watched = [leaf for leaf, _ in check.reads] if check is not None else []
+    return [*watched, next(i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone")]

@@ -1,0 +1,90 @@
+"""The settings of a simulation, checked."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.sharding import Mesh
+
+from crazysim.control import Control
+from crazysim.core.data import require_pair
+from crazysim.core.integration import Integrator
+from crazysim.core.settings import control_freqs, find_device, member, physics_freq, positive
+from crazysim.drones import Airframe, load_airframe
+from crazysim.dynamics import Dynamics
+from crazysim.dynamics.core import require_support
+
+
+@dataclasses.dataclass(frozen=True)
+class Configuration:
+    """Settings that a simulation keeps from its construction on."""
+
+    n_worlds: int
+    """Number of worlds."""
+    n_drones: int
+    """Number of drones in each world."""
+    airframe: Airframe
+    """Airframe of every drone."""
+    dynamics: Dynamics
+    """Dynamics model."""
+    control: Control
+    """Command level."""
+    integrator: Integrator
+    """Integration scheme."""
+    freq: int
+    """Physics steps per second, Hz."""
+    control_freqs: Mapping[Control, int]
+    """Rate of each controller, Hz."""
+    device: jax.Device
+    """Device of the data."""
+    mesh: Mesh | None
+    """Devices that the worlds are spread over at construction; None for the one device."""
+    engine: str
+    """Engine that executes steps, one of ``crazysim.engine.ENGINES``."""
+    strict: bool
+    """True to raise an error where a slower engine would be taken with a warning."""
+
+    @staticmethod
+    def create(
+        n_worlds: Any,
+        n_drones: Any,
+        drone: str | Path | Mapping[str, Any] | Airframe,
+        dynamics: Any,
+        control: Any,
+        integrator: Any,
+        freq: Any,
+        rates: Mapping[Control, int | None],
+        device: str | jax.Device,
+        mesh: Mesh | None,
+        engine: str,
+        strict: bool,
+    ) -> Configuration:
+        """Return the configuration for the arguments of ``Sim``, as users pass them.
+
+        Raises:
+            ValueError: For an argument that is invalid or contradicts another, with what was expected.
+        """
+        n_worlds, n_drones, freq = positive("n_worlds", n_worlds), positive("n_drones", n_drones), physics_freq(freq)
+        dynamics, control = member(Dynamics, "dynamics", dynamics), member(Control, "control", control)
+        integrator = member(Integrator, "integrator", integrator)
+        require_pair(dynamics, control)
+        airframe = load_airframe(drone)
+        require_support(airframe, dynamics)
+        return Configuration(
+            n_worlds,
+            n_drones,
+            airframe,
+            dynamics,
+            control,
+            integrator,
+            freq,
+            control_freqs(control, freq, dict(rates)),
+            find_device(device),
+            mesh,
+            engine,
+            strict,
+        )

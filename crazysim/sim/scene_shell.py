@@ -1,0 +1,191 @@
+"""The scene of a simulation: reading it, editing it, and bringing it up to date before it is read."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+import mujoco
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim.scene import mjx
+from crazysim.scene.contacts import body_id
+from crazysim.scene.depth import Along
+from crazysim.scene.overlays import Marks
+from crazysim.scene.queries import SceneQueries
+from crazysim.scene.render import Viewer
+from crazysim.scene.report import ContactReport, Objects
+from crazysim.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from crazysim.core.data import SimData
+    from crazysim.core.registry import PluginRegistry
+    from crazysim.engine import Stepper
+
+T = TypeVar("T")
+
+
+class SceneAttribute(Generic[T]):
+    """An attribute of a simulation that is one of its scene."""
+
+    def __init__(self, doc: str):
+        self.__doc__ = doc
+
+    def __set_name__(self, _owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, sim: Any, _owner: type) -> T:
+        return getattr(sim.scene, self._name) if sim is not None else self  # type: ignore[return-value]
+
+    def __set__(self, sim: Any, value: T) -> None:
+        setattr(sim.scene, self._name, value)
+
+
+class SceneShell:
+    """The part of ``Sim`` that concerns its scene."""
+
+    n_worlds: int
+    """Number of worlds."""
+    data: SimData
+    """Everything that changes."""
+    plugins: PluginRegistry
+    """Plugins, which draw overlays."""
+    _scene: Scene
+    _stepper: Stepper
+    _queries: SceneQueries
+
+    @property
+    def scene(self) -> Scene:
+        """The MuJoCo scene; ``scene.add`` adds objects."""
+        return self._scene
+
+    spec = SceneAttribute[mujoco.MjSpec]("The editable scene; an edit takes effect with ``build_mjx``.")
+    mj_model = SceneAttribute[mujoco.MjModel]("The compiled scene.")
+    mj_data = SceneAttribute[mujoco.MjData]("State of the one world that was drawn last.")
+    mjx_model = SceneAttribute["mjx.Model"]("The scene's model on the device; made when first read.")
+    max_geom_pairs = SceneAttribute[int]("Cap on the pairs MJX checks per kind of collision, from ``build_mjx`` on.")
+    max_visual_geom = SceneAttribute[int]("Largest number of marks in one picture.")
+    marks = SceneAttribute[Marks]("Marks to draw over the next picture.")
+    viewer = SceneAttribute[Viewer | None]("The renderer; made for the first picture.")
+
+    @property
+    def mjx_data(self) -> mjx.Data:
+        """The scene's state in every world at its last sync; made when first read, and returned as it is.
+
+        Assigning to it makes the scene stale. Poses of bodies other than drones, ``mocap_pos`` and ``mocap_quat``,
+        must be one per world and finite, or it raises a ValueError.
+        """
+        return self._scene.mjx_data
+
+    @mjx_data.setter
+    def mjx_data(self, mjx_data: mjx.Data) -> None:
+        self._scene.mjx_data = mjx_data
+        self.data = self.data
+
+    def build_mjx(self) -> None:
+        """Compile ``spec`` again after an edit; closes the viewer, and leaves the simulation's data as it is.
+
+        Raises:
+            ConfigError: If the spec does not compile or has lost a drone; the old scene stays then.
+        """
+        self._scene.compile()
+
+    def sync(self, world: int | None = None) -> None:
+        """Bring the scene up to date, if anything has changed since the last sync.
+
+        Args:
+            world: World to write into ``mj_data``, without touching the others; None for all, in ``mjx_data``.
+
+        Raises:
+            ValueError: If the world does not exist.
+        """
+        if world is not None and not 0 <= world < self.n_worlds:
+            raise ValueError(f"world {world} does not exist; choose one from 0 to {self.n_worlds - 1}")
+        self._scene.compile_if_edited()
+        self._stepper.data = self._scene.sync(self.data, world)
+
+    def contacts(self, body: str | None = None) -> Array:
+        """Return which contact slots touch, after a sync if anything has changed.
+
+        A slot is a pair of geoms that may touch; ``mj_model`` and MJX decide which pair it is. From 64 drones a world
+        on MJX keeps only ``max_geom_pairs`` pairs, the nearest; set it to -1 and call ``build_mjx`` for all.
+
+        Args:
+            body: Name of a body, such as ``"drone:0"``, to which a slot must belong; None for all.
+
+        Returns:
+            (n_worlds, n_slots), bool
+
+        Raises:
+            ValueError: If the scene has no such body.
+        """
+        if body is not None:
+            body_id(self.mj_model, body)  # a wrong name raises before anything changes
+        self.sync()
+        return self._scene.contacts(body)
+
+    def contact_report(self, objects: Objects = None, floor: bool = True, drones: bool = True) -> ContactReport:
+        """Return what each drone touches, and its distance from the rest: floor, objects, other drones.
+
+        Pure JAX on the drones' poses, without MuJoCo.
+
+        Args:
+            objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.
+            floor: True to report the floor.
+            drones: True to report the other drones of a world. Omitted fields are None and are not computed.
+
+        Raises:
+            ValueError: If nothing is requested, or an object does not exist or is moved by hand.
+        """
+        return self._queries.contact_report(self.data, objects, floor, drones)
+
+    def depth(
+        self,
+        camera: str | int = "fpv_cam",
+        width: int = 64,
+        height: int = 64,
+        drones: bool = True,
+        hide_own: bool = True,
+        along: Along = "axis",
+    ) -> Array:
+        """Return depth images of all worlds, m; see ``scene.depth_fn``. (n_worlds, n_cameras, height, width)
+
+        Infinite where nothing is hit.
+
+        Raises:
+            ValueError: If the camera does not exist, or the resolution is not positive.
+        """
+        return self._queries.depth(self.data, camera, width, height, drones, hide_own, along)
+
+    def render(
+        self,
+        mode: str = "human",
+        world: int = 0,
+        camera: int | str = -1,
+        cam_config: dict[str, Any] | None = None,
+        width: int = 1920,
+        height: int = 1080,
+    ) -> NDArray | tuple[NDArray, NDArray] | None:
+        """Draw one world; every argument counts at every call.
+
+        Args:
+            mode: ``"human"`` draws into a window, which its user may close for good; ``"rgb_array"`` returns a picture
+                (height, width, 3) of type uint8, ``"depth_array"`` the distance along the camera's axis, m
+                (height, width), ``"rgbd_tuple"`` both.
+            world: World to draw.
+            camera: Name or id; -1 is the free camera. Drones carry ``fpv_cam:i`` and ``track_cam:i``.
+            cam_config: Settings of the free camera: lookat, distance, azimuth, elevation.
+            width: Pixels. A window takes it when it opens and when it changes; its user may resize it.
+            height: Pixels.
+
+        Raises:
+            ValueError: If the world, camera, mode or a setting does not exist.
+            RenderError: If this machine cannot draw.
+        """
+        self.sync(world)
+        self.plugins.draw(world)
+        return self._scene.draw(mode, camera, cam_config, width, height)
+
+    def close(self) -> None:
+        """Close the window and free the renderers."""
+        self._scene.close()

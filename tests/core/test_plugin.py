@@ -1,0 +1,415 @@
+"""Plugins: added, replaced and removed without a trace, integrated with the drone, and observed and drawn."""
+
+from functools import partial
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import hover_command, hover_rotor_state, to_all, trees_equal, with_states
+from jax import Array
+from scipy.linalg import expm
+
+from crazysim import (
+    Battery,
+    ConfigError,
+    ContactResponse,
+    Downwash,
+    GroundEffect,
+    Integrator,
+    Latency,
+    MotorFailure,
+    Placement,
+    Plugin,
+    PyTree,
+    RangeFinder,
+    Sim,
+    Wind,
+    leaf,
+    parameter,
+    stage,
+)
+from crazysim.core.integration import INTEGRATORS, Integration
+from crazysim.core.pipeline import replace_fn
+from crazysim.core.plugin import FunctionPlugin
+from crazysim.core.stages import first_principles_derivative
+from crazysim.engine import Step, native
+from crazysim.errors import UnknownNameError
+
+DURATION = 0.5
+STEPS = np.array([32, 64, 128])
+MASS = 0.0434
+
+
+class WakeData(PyTree):
+    """Lagging velocity of the air that a drone drags along."""
+
+    vel: Array = leaf("drone", 1)
+    """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
+    rate: Array = leaf("parameter", 1, (1,))
+    """Decay rate, 1/s. (1,)"""
+
+
+class Wake(Plugin):
+    """A state of its own that the drone drives, and a force back: z' = vel - rate z, F = -strength z."""
+
+    rate: float = parameter(default=6.0)
+    strength: float = 0.8
+    name: str = "wake"
+
+    def record(self, sim):
+        return WakeData(jnp.zeros_like(sim.data.states.pos), self.rate * jnp.ones(1, sim.data.states.pos.dtype))
+
+    def influence(self, data):
+        force = data.states.force - self.strength * self.read(data).vel
+        return data.replace(states=data.states.replace(force=force))
+
+    def derivative(self, data):
+        wake = self.read(data)
+        return {"vel": data.states.vel - wake.rate * wake.vel}
+
+    def observations(self, data):
+        return {"vel": self.read(data).vel, "height": data.states.pos[2:] * 1.0}
+
+
+@partial(jax.jit, static_argnames="integrator")
+def fly(data, integrator):
+    """Return drones that each take another number of steps for the same time, under drag-free first principles."""
+    n_steps = jnp.asarray(STEPS)[None, :, None]
+    integrate = Integration(INTEGRATORS[integrator], first_principles_derivative, (Wake(),))
+
+    def step(k, now):
+        states, vel = now
+        core = data.core.replace(freq=n_steps / DURATION)
+        plugins = {"wake": data.plugins["wake"].replace(vel=vel)}
+        new = integrate(data.replace(states=states, plugins=plugins, core=core))
+        return jax.tree.map(lambda a, b: jnp.where(k < n_steps, a, b), (new.states, new.plugins["wake"].vel), now)
+
+    return jax.lax.fori_loop(0, jnp.max(n_steps), step, (data.states, data.plugins["wake"].vel))
+
+
+@pytest.mark.parametrize("integrator", list(Integrator))
+def test_law_08_states_of_a_plugin_keep_the_order_of_the_integrator(integrator, x64):
+    """p' = v, v' = -s z / m + g, z' = v - r z, solved by a matrix exponential: drone and plugin drive each other."""
+    sim = Sim(n_drones=3, control="rotor_vel")
+    sim.add(Wake())
+    p, v0 = sim.data.params, np.array([3.0, -2.0, 5.0])
+    still = p.replace(drag_matrix=0 * p.drag_matrix, rpm2thrust=0 * p.rpm2thrust, rpm2torque=0 * p.rpm2torque)
+    data = with_states(sim.data, pos=[0, 0, 10.0], vel=v0).replace(params=still)
+    states, wake_vel = fly(data, integrator)
+    system = np.array([[0, 1, 0, 0], [0, 0, -0.8 / float(p.mass[0]), 1], [0, 1, -6.0, 0], [0, 0, 0, 0]])
+    for axis, (start, g) in enumerate(zip([0, 0, 10.0], [0, 0, -9.81], strict=True)):
+        exact = expm(DURATION * system) @ [start, v0[axis], 0.0, g]
+        for found, wanted in ((states.pos, exact[0]), (states.vel, exact[1]), (wake_vel, exact[2])):
+            errors = np.abs(np.asarray(found)[0, :, axis] - wanted)
+            assert np.all(errors > 1e-14), "rounding hides the order"
+            slope = np.polyfit(np.log(1 / STEPS), np.log(errors), 1)[0]
+            assert abs(slope - Integrator(integrator).order) < 0.3, (axis, errors)
+
+
+def hovering(n_worlds=3, n_drones=2, **kwargs):
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, rng_key=4, **kwargs)
+    grid = 0.1 * np.arange(n_worlds * n_drones * 3).reshape(n_worlds, n_drones, 3) + [0, 0, 1.0]
+    sim.data = with_states(sim.data, pos=grid, rotor_vel=hover_rotor_state(sim.data))
+    sim.build_default_data()
+    return sim
+
+
+def fly_on(sim, n_steps=20):
+    sim.attitude_control(to_all(sim.data, hover_command(sim.data) + [0.1, -0.1, 0.2, 0.05]))
+    sim.step(n_steps)
+    return sim.data
+
+
+@pytest.mark.parametrize("integrator", list(Integrator))
+def test_states_of_a_plugin_are_the_same_on_every_engine(integrator):
+    sim = hovering(integrator=integrator)
+    sim.add(Wake())
+    assert "not fused" not in sim.explain()
+    expected = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(20))
+    assert np.abs(expected.plugins["wake"].vel).max() > 1e-4
+    for engine in ("lanes", "fused") if native.compiler() else ("lanes",):
+        found = Step(sim.step_pipeline, engine)(sim.data, jnp.int32(20))
+        # float32 over 20 steps
+        np.testing.assert_allclose(found.plugins["wake"].vel, expected.plugins["wake"].vel, rtol=1e-4, atol=2e-6)
+        np.testing.assert_allclose(found.states.vel, expected.states.vel, rtol=1e-4, atol=2e-5)
+
+
+EVERYTHING = [
+    Wind((2.0, 1.0, 0.0), 7.7),
+    Downwash(),
+    GroundEffect(),
+    Battery(0.25, 0.1),
+    MotorFailure(0.9, rate=0.5),
+    Latency(2),
+    Wake(),
+    ContactResponse(),
+    RangeFinder(),
+]
+
+
+def test_the_order_of_adding_does_not_matter():
+    """One multiplication may come before another: float32 over 20 steps."""
+    flights = []
+    for plugins in (EVERYTHING, EVERYTHING[::-1], EVERYTHING[4:] + EVERYTHING[:4]):
+        sim = hovering(engine="plain")
+        for plugin in plugins:
+            sim.add(plugin)
+        flights.append(fly_on(sim))
+    for flight in flights[1:]:
+        for x, y in zip(jax.tree.leaves(flight.states), jax.tree.leaves(flights[0].states), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-6)
+
+
+def test_remove_restores_what_was_there_before():
+    """In any order: the stages, the records, and every bit of the flight."""
+    sim = hovering()
+    before, data, default = dict(sim.step_pipeline), sim.data, sim.default_data
+    expected = fly_on(sim)
+    sim.data = data
+    for plugin in EVERYTHING:
+        sim.add(plugin)
+    fly_on(sim, 2)
+    for k in (0, 5, 2, 3, 1, 8, 7, 6, 4):
+        sim.remove(EVERYTHING[k] if k % 2 else EVERYTHING[k].name)
+    assert list(sim.step_pipeline) == list(before)
+    for name, fn in before.items():
+        assert name == "integration" or sim.step_pipeline[name] is fn
+    assert not sim.step_pipeline["integration"].fn.plugins
+    assert not sim.plugins
+    assert trees_equal(sim.default_data, default)
+    assert jax.tree.structure(sim.data) == jax.tree.structure(data)
+    sim.data = data
+    assert trees_equal(fly_on(sim), expected)
+
+
+def test_integration_has_one_place_for_all_plugins():
+    sim = hovering()
+    plain = sim.step_pipeline["integration"].fn
+    for plugin in EVERYTHING:
+        sim.add(plugin)
+    integration = sim.step_pipeline["integration"].fn
+    assert integration.deriv_fn is plain.deriv_fn
+    assert integration.method is plain.method
+    names = [p.name for p in integration.plugins]
+    assert names == ["latency", "battery", "downwash", "ground_effect", "motors", "wake", "wind"]
+
+
+def test_replace_changes_numbers_without_compiling_and_keeps_states():
+    sim = hovering()
+    sim.add(Wind((2.0, 0, 0), 7.7))
+    sim.add(Wake())
+    fly_on(sim)
+    flown, step, n = sim.data.plugins, sim.step_pipeline, sim.step_fn._cache_size()
+    wind = sim.replace(Wind(np.full((3, 2, 3), 4.0) * [1, 0, 0], 3.0))
+    sim.replace(Wake(rate=60.0))
+    sim.replace(Wind((4.0, 0, 0), 3.0))
+    assert sim.plugins["wind"] is not wind
+    assert sim.step_pipeline is step
+    np.testing.assert_array_equal(sim.data.plugins["wind"].velocity, [4.0, 0, 0])
+    np.testing.assert_array_equal(sim.data.plugins["wind"].gust, flown["wind"].gust)
+    np.testing.assert_array_equal(sim.data.plugins["wake"].vel, flown["wake"].vel)
+    np.testing.assert_array_equal(sim.default_data.plugins["wind"].velocity, [4.0, 0, 0])
+    np.testing.assert_array_equal(sim.default_data.plugins["wind"].gust, 0.0)
+    fly_on(sim, 60)
+    assert sim.step_fn._cache_size() == n
+    # after 7 time constants the lagging velocity is the drone's over the rate, which changes by some 10% meanwhile
+    np.testing.assert_allclose(sim.data.plugins["wake"].vel, sim.data.states.vel / 60, rtol=0.3, atol=3e-5)
+
+
+def test_replace_changes_the_step_where_it_must():
+    """Gusts that were off, and a strength that is part of the code."""
+    sim = hovering()
+    sim.add(Wind((2.0, 0, 0)))
+    sim.add(Wake())
+    assert "wind" not in sim.step_pipeline
+    fly_on(sim)
+    vel = np.asarray(sim.data.plugins["wake"].vel)
+    sim.replace(Wind((2.0, 0, 0), 20.0))
+    sim.replace(Wake(strength=0.0))
+    assert list(sim.step_pipeline).index("wind") == list(sim.step_pipeline).index("integration") - 1
+    np.testing.assert_array_equal(sim.data.plugins["wake"].vel, vel)
+    data = sim.data
+    fly_on(sim)
+    assert np.abs(sim.data.plugins["wind"].gust).max() > 0.1
+    without = hovering()
+    without.add(Wind((2.0, 0, 0), 20.0))
+    without.data = data.replace(plugins={"wind": data.plugins["wind"]})
+    fly_on(without)
+    # two programs of the same arithmetic, float32
+    np.testing.assert_allclose(sim.data.states.vel, without.data.states.vel, rtol=1e-5, atol=1e-6)
+
+
+def test_replace_finds_the_controller_that_latency_had_wrapped():
+    sim = hovering()
+    controller = sim.step_pipeline["attitude_controller"]
+    sim.add(Latency(3))
+    sim.replace(Latency(2, max_delay=8))
+    sim.attitude_control(to_all(sim.data, hover_command(sim.data)))
+    arrived = []
+    for _ in range(4):
+        sim.step()
+        arrived.append(bool(np.any(np.asarray(sim.data.controls.attitude.cmd))))
+    assert arrived == [False, False, True, True]
+    sim.remove("latency")
+    assert sim.step_pipeline["attitude_controller"] is controller
+
+
+def test_a_replacement_that_fails_changes_nothing():
+    sim = hovering()
+    sim.add(Wind((2.0, 0, 0)))
+    step, plugin, data = sim.step_pipeline, sim.plugins["wind"], sim.data
+    with pytest.raises(ConfigError, match="speed_20ft"):
+        sim.replace(Wind((1.0, 0, 0), -1.0))
+    assert sim.step_pipeline is step
+    assert sim.plugins["wind"] is plugin
+    assert trees_equal(sim.data, data)
+
+
+def test_two_of_a_kind_have_two_names():
+    """Gusts of different names are different, and drag adds up."""
+    sim = hovering()
+    first = sim.add(Wind((1.0, 0, 0), 7.7))
+    second = sim.add(Wind((0, 2.0, 0), 7.7), name="thermal")
+    assert (first.name, second.name) == ("wind", "thermal")
+    assert list(sim.plugins) == ["wind", "thermal"]
+    fly_on(sim, 3)
+    gusts = [np.asarray(plugin.read(sim.data).gust) for plugin in (first, second)]
+    assert np.abs(gusts[0] - gusts[1]).min() > 1e-6
+    sim.remove("wind")
+    assert list(sim.data.plugins) == ["thermal"]
+    sim.step()
+
+
+def test_observations_are_those_of_each_drone():
+    sim = hovering()
+    sim.add(Wake())
+    sim.add(Battery(0.25, 0.1))
+    fly_on(sim)
+    found = sim.plugins.observations(sim.data)
+    assert set(found) == {"wake.vel", "wake.height", "battery.voltage", "battery.charge"}
+    np.testing.assert_array_equal(found["wake.vel"], sim.data.plugins["wake"].vel)
+    np.testing.assert_array_equal(found["wake.height"], sim.data.states.pos[..., 2:])
+    np.testing.assert_array_equal(found["battery.voltage"], sim.data.plugins["battery"].voltage)
+
+
+def test_plugins_draw_into_images():
+    sim = Sim()
+    sim.scene.add("wall", pos=[2, 0, 0], length=8, height=8)
+    finder = sim.add(RangeFinder(visible=True))
+    sim.plugins.draw(0)
+    assert len(sim.marks) == 6
+    sim.marks.clear()
+    sim.replace(RangeFinder())
+    sim.plugins.draw(0)
+    assert len(sim.marks) == 0
+    assert finder.visible
+
+
+def test_a_reset_restores_states_of_plugins_in_its_worlds_alone():
+    sim = hovering()
+    sim.add(Wake())
+    flown = np.asarray(fly_on(sim).plugins["wake"].vel)
+    sim.reset(np.array([True, False, True]))
+    after = np.asarray(sim.data.plugins["wake"].vel)
+    np.testing.assert_array_equal(after[[0, 2]], 0.0)
+    np.testing.assert_array_equal(after[1], flown[1])
+
+
+def test_new_data_has_new_records():
+    sim = hovering()
+    sim.add(Wake())
+    fly_on(sim)
+    sim.build_data()
+    np.testing.assert_array_equal(sim.data.plugins["wake"].vel, 0.0)
+    sim.step()
+
+
+def test_law_01_methods_get_one_drone():
+    shapes = []
+
+    class Probe(Plugin):
+        """Looks at the shapes that it gets."""
+
+        name: str = "probe"
+
+        def influence(self, data):
+            shapes.append((data.states.pos.shape, data.core.steps.shape))
+            return data
+
+        def observations(self, data):
+            shapes.append((data.states.pos.shape, data.core.steps.shape))
+            return {}
+
+    for engine in ("plain", "lanes"):
+        sim = Sim(n_worlds=3, n_drones=2, engine=engine)
+        sim.add(Probe())
+        sim.step()
+    sim.plugins.observations(sim.data)
+    assert set(shapes) == {((3,), ())}
+
+
+def test_a_plugin_of_functions():
+    sim = Sim(n_worlds=2)
+
+    @stage("drone")
+    def count(data):
+        record = data.plugins["count"]
+        return data.replace(plugins=data.plugins | {"count": record.replace(vel=record.vel + 1)})
+
+    def push(data):
+        return data.replace(states=data.states.replace(force=data.states.force + jnp.array([0, 0, 1.0])))
+
+    record = WakeData(jnp.zeros((2, 1, 3)), jnp.ones(1))
+    sim.add(FunctionPlugin("count", record, [Placement(count, before="increment_steps")], push))
+    sim.step(3)
+    np.testing.assert_array_equal(sim.data.plugins["count"].vel, 3.0)
+    # less the drag, which takes 0.57 per s
+    np.testing.assert_allclose(sim.data.states.vel[..., 2], 3 * 0.002 * (1.0 / MASS - 9.81), rtol=2e-3)
+    sim.reset()
+    np.testing.assert_array_equal(sim.data.plugins["count"].vel, 0.0)
+
+
+class Nameless(FunctionPlugin):
+    """A plugin whose stage takes the name of another."""
+
+    name: str = "nameless"
+    order: ClassVar[int] = 3
+
+    def stages(self, sim):
+        return [Placement(lambda data: data, name="clip_floor_pos")]
+
+
+@pytest.mark.parametrize("act, error, words", [
+    (lambda sim: sim.add(Wind()), ConfigError, r"wind is already enabled. Use sim.replace\(Wind\(...\)\)"),
+    (lambda sim: sim.add("wind"), ConfigError, "expected a plugin, got 'wind'"),
+    (lambda sim: sim.add(Wake(), name=""), ConfigError, "non-empty string as name of a Wake"),
+    (lambda sim: sim.add(Wake(), name="mine"), ConfigError, "already has a record 'mine'"),
+    (lambda sim: sim.add(Nameless()), ConfigError, "already has a stage 'clip_floor_pos'"),
+    (lambda sim: sim.add(FunctionPlugin("a", None, [Placement(lambda data: data, before="lunch")])),
+     UnknownNameError, "No stage named 'lunch'"),
+    (lambda sim: sim.remove("wake"), UnknownNameError, "got 'wake'. Added are: wind, latency"),
+    (lambda sim: sim.replace(Wake()), UnknownNameError, "got 'wake'"),
+    (lambda sim: sim.replace(Wake(name="wind")), ConfigError, "expected a Wind to replace 'wind', got a Wake"),
+    (lambda sim: replace_fn(sim.step_pipeline, lambda d: d, "attitude_controller") or sim.remove("latency"),
+     ConfigError, "'attitude_controller' of plugin 'latency' has been replaced since"),
+])  # fmt: skip
+def test_law_09_what_cannot_be_added_replaced_or_removed(act, error, words):
+    sim = Sim()
+    sim.add(Wind((1.0, 0, 0)))
+    sim.add(Latency(2))
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {"mine": WakeData(jnp.zeros((1, 1, 3)), jnp.ones(1))})
+    stages, names = list(sim.step_pipeline), list(sim.plugins)
+    with pytest.raises(error, match=words):
+        act(sim)
+    assert list(sim.step_pipeline) == stages
+    assert list(sim.plugins) == names
+    assert set(sim.data.plugins) == {"wind", "latency", "mine"}
+
+
+def test_law_09_a_plugin_has_a_name():
+    with pytest.raises(TypeError, match="plugin Anonymous has no field 'name'"):
+
+        class Anonymous(Plugin):
+            """A plugin without a name."""

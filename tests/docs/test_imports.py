@@ -1,0 +1,50 @@
+"""What pages and examples import: public names, from at most eight modules."""
+
+import ast
+import importlib.util
+import inspect
+from pathlib import Path
+
+import pytest
+from test_pages import BLOCK, PAGES, ROOT
+
+MODULES = {
+    "crazysim",
+    "crazysim.core",
+    "crazysim.dynamics",
+    "crazysim.envs",
+    "crazysim.export",
+    "crazysim.media",
+    "crazysim.sim",
+    "crazysim.train",
+}
+PEER = ROOT / "docs" / "coming-from-crazyflow.md"
+"""The page that uses Crazyflow's own paths."""
+SOURCES = [page for page in PAGES if page != PEER] + sorted((ROOT / "docs" / "examples").glob("*.py"))
+
+
+def imports(source: Path):
+    """Return (module, names) of every import of the project in a page or an example."""
+    text = source.read_text()
+    blocks = [block[1] for block in BLOCK.finditer(text)] if source.suffix == ".md" else [text]
+    for block in blocks:
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "crazysim":
+                yield node.module, [alias.name for alias in node.names]
+            elif isinstance(node, ast.Import):
+                yield from ((a.name, []) for a in node.names if a.name.split(".")[0] == "crazysim")
+
+
+def test_there_are_at_most_eight_modules():
+    assert len(MODULES) <= 8
+    assert {module for source in SOURCES for module, _ in imports(source)} == MODULES
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: str(source.relative_to(ROOT)))
+def test_pages_import_public_names_of_these_modules(source):
+    for module, names in imports(source):
+        assert module in MODULES, f"{source.name} imports from {module}"
+        for name in names:
+            package = importlib.import_module(module)
+            if name not in getattr(package, "__all__", [name]) and not inspect.ismodule(getattr(package, name, None)):
+                assert importlib.util.find_spec(f"{module}.{name}"), f"{name} is no public name of {module}"

@@ -1,0 +1,71 @@
+"""Kernels for GPUs, as far as they can be made without one: architectures, and the choice between several."""
+
+import dataclasses
+
+import pytest
+from cases import shared_sim
+
+from crazysim.engine import Step, cuda, jaxcompat, kernel
+from crazysim.engine.errors import KernelError
+
+
+@dataclasses.dataclass(frozen=True)
+class Gpu:
+    """A GPU that says what it can do."""
+
+    compute_capability: str
+    local_hardware_id: int = 0
+    platform: str = "gpu"
+
+
+OLD, NEW = Gpu("8.6", 0), Gpu("9.0", 1)
+
+
+@pytest.fixture(scope="module")
+def source():
+    sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
+    return kernel.write(Step(sim.step_pipeline, "lanes").plan(sim.data).program, "cuda")
+
+
+def test_an_architecture_is_that_of_the_device():
+    """Not that of the first device that was ever asked for."""
+    assert [cuda.architecture(d) for d in (NEW, OLD, NEW)] == ["compute_90", "compute_86", "compute_90"]
+    assert cuda.architecture(None) == cuda.DEFAULT_ARCHITECTURE
+    assert jaxcompat.compute_capability(Gpu("12.0")) == 120
+
+
+def test_kernels_for_several_gpus_run_on_the_oldest():
+    """Code for an architecture runs on all later ones, and 10.0 is later than 9.0."""
+    assert cuda.weakest([NEW, OLD]) is OLD
+    assert cuda.weakest([NEW]) is NEW
+    assert cuda.weakest([Gpu("10.0"), NEW]) is NEW
+    assert cuda.weakest([]) is None
+    assert cuda.weakest([Gpu("0", platform="cpu")]) is None
+
+
+def test_each_architecture_has_its_own_code(source, monkeypatch):
+    """The key of what is kept holds the architecture, and fitting asks the device that will run."""
+    made, asked = [], []
+    monkeypatch.setattr(cuda, "_compile", lambda text, arch, kind: made.append((arch, kind)) or b"code")
+    monkeypatch.setattr(cuda, "fitted", lambda k, device: asked.append(device) or k)
+    cuda.ptx.cache_clear()
+    try:
+        for devices in ([NEW], [OLD], [NEW, OLD], [NEW]):
+            cuda.compiled(source, devices)
+    finally:
+        cuda.ptx.cache_clear()
+    assert asked == [NEW, OLD, OLD, NEW]
+    assert made == [("compute_90", "PTX"), ("compute_86", "PTX")]
+
+
+def test_without_nvrtc_the_kernel_is_unsupported(source, monkeypatch):
+    monkeypatch.setattr(cuda, "nvrtc", lambda: None)
+    with pytest.raises(KernelError, match="NVRTC was not found"):
+        cuda._compile(source.text, cuda.DEFAULT_ARCHITECTURE, "PTX")
+
+
+def test_what_nvrtc_refuses_is_unsupported(source):
+    if cuda.nvrtc() is None:
+        pytest.skip("no NVRTC here")
+    with pytest.raises(KernelError, match="NVRTC refused the kernel"):
+        cuda._compile("not CUDA", cuda.DEFAULT_ARCHITECTURE, "PTX")

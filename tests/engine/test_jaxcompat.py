@@ -1,0 +1,245 @@
+"""JAX beyond its public interface: each name that the engine relies on, on every version that is supported."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim.engine import jaxcompat
+from crazysim.engine.errors import UnsupportedError
+
+
+def equation(fn, *args, name=None):
+    """Return the only equation of a function, or the first of a primitive's name."""
+    eqns = jax.make_jaxpr(fn)(*args).jaxpr.eqns
+    return next(e for e in eqns if name is None or e.primitive.name == name)
+
+
+# Jaxprs --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_jaxpr_is_closed_once():
+    jaxpr = jax.make_jaxpr(lambda x: x + 1)(1.0)
+    assert jaxcompat.closed(jaxpr) is jaxpr
+    opened = jaxcompat.closed(jaxpr.jaxpr)
+    assert isinstance(opened, jaxcompat.ClosedJaxpr)
+    assert jaxcompat.jaxpr_as_fun(opened)(2.0)[0] == 3.0
+
+
+def test_literals_are_told_from_variables():
+    eqn = equation(lambda x: x * 2.0, 1.0)
+    kinds = [isinstance(v, jaxcompat.Literal) for v in eqn.invars]
+    assert sorted(kinds) == [False, True]
+    assert next(v for v in eqn.invars if isinstance(v, jaxcompat.Literal)).val == 2.0
+
+
+def test_a_jaxpr_drops_inputs_that_it_does_not_use():
+    jaxpr = jax.make_jaxpr(lambda a, b, c: (a - c,))(1.0, 2.0, 3.0)
+    some = jaxcompat.with_inputs(jaxpr, [0, 2])
+    assert len(some.jaxpr.invars) == 2
+    assert jaxcompat.jaxpr_as_fun(some)(5.0, 3.0)[0] == 2.0
+
+
+def test_parameters_and_operands_of_an_equation_are_read():
+    eqn = equation(lambda x: x.reshape(3, 2), jnp.ones(6), name="reshape")
+    with jaxcompat.reading(eqn) as read:
+        assert read.primitive.name == "reshape"
+        assert read.params["new_sizes"] == (3, 2)
+        assert read.invars[0].aval.shape == (6,)
+        assert read.outvars[0].aval.shape == (3, 2)
+        assert read.params.get("gone") is None
+
+
+def test_a_parameter_that_is_gone_is_unsupported():
+    eqn = equation(lambda x: x.reshape(3, 2), jnp.ones(6), name="reshape")
+    expected = rf"primitive 'reshape': it has no parameter 'old' in JAX {jax.__version__}, only .*new_sizes"
+    with pytest.raises(UnsupportedError, match=expected), jaxcompat.reading(eqn) as read:
+        read.params["old"]
+
+
+def test_an_attribute_of_a_parameter_that_is_gone_is_unsupported():
+    eqn = equation(lambda x, i: x.at[i].add(1.0), jnp.ones(6), jnp.int32(1), name="scatter-add")
+    with jaxcompat.reading(eqn) as read:
+        assert read.params["dimension_numbers"].scatter_dims_to_operand_dims == (0,)
+    expected = f"its parameter 'dimension_numbers' has no 'old' in JAX {jax.__version__}"
+    with pytest.raises(UnsupportedError, match=expected) as error, jaxcompat.reading(eqn) as read:
+        _ = read.params["dimension_numbers"].old
+    assert error.value.primitive == "scatter-add"
+
+
+@pytest.mark.parametrize("slip, kind", [
+    (lambda read: {}["mine"], KeyError), (lambda read: np.zeros(3).nothing, AttributeError),
+    (lambda read: read.nothing, AttributeError), (lambda read: 1 / 0, ZeroDivisionError),
+])  # fmt: skip
+def test_a_slip_of_a_rule_is_not_taken_for_a_new_jax(slip, kind):
+    eqn = equation(lambda x: x.reshape(3, 2), jnp.ones(6), name="reshape")
+    with pytest.raises(kind), jaxcompat.reading(eqn) as read:
+        slip(read)
+
+
+def test_a_primitive_runs_again_on_other_operands():
+    eqn = equation(lambda x: jnp.transpose(x, (1, 0)), jnp.ones((2, 3)), name="transpose")
+    x = np.arange(6.0).reshape(2, 3)
+    np.testing.assert_array_equal(jaxcompat.bind(eqn, x)[0], x.T)
+    np.testing.assert_array_equal(jaxcompat.bind(eqn, x, permutation=(0, 1))[0], x)
+    with jaxcompat.reading(eqn) as read:
+        np.testing.assert_array_equal(jaxcompat.bind(read, x)[0], x.T)
+
+
+def test_a_call_keeps_its_own_derivative():
+    @jax.custom_jvp
+    def f(x):
+        return 2.0 * x
+
+    f.defjvp(lambda primals, tangents: (f(primals[0]), 100.0 * tangents[0]))
+    eqn = equation(lambda x: f(x), 1.0)
+    for read in (eqn, dataclasses.replace(jaxcompat.Equation(eqn.primitive, eqn.invars, eqn.outvars,
+                                                             jaxcompat.Parameters("f", eqn.params)))):  # fmt: skip
+        single = jaxcompat.as_function(read)
+        (out,), (slope,) = jax.jvp(lambda x, f=single: jax.tree.leaves(f(x)), (3.0,), (1.0,))
+        assert (out, slope) == (6.0, 100.0)
+
+
+def test_primitives_written_in_terms_of_others_are_expanded():
+    """``call_hi_primitive`` is there from JAX 0.12 on; what it expands to computes the same."""
+    found = []
+    for fn in (jax.nn.relu, jax.nn.silu, jax.nn.softplus, jnp.linalg.det, jax.scipy.special.logsumexp):
+        x = jnp.eye(3) + 0.1
+        for eqn in jax.make_jaxpr(fn)(x).jaxpr.eqns:
+            if eqn.primitive.name == "call_hi_primitive":
+                found.append(eqn)
+                args = [jnp.ones(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+                expected = jax.tree.leaves(eqn.primitive.bind(*args, **eqn.params))
+                for a, b in zip(jaxcompat.expanded(eqn)(*args), expected, strict=True):
+                    np.testing.assert_allclose(a, b, rtol=1e-6)
+    assert not found or tuple(map(int, jax.__version__.split(".")[:2])) >= (0, 12)
+
+
+# Random numbers ------------------------------------------------------------------------------------------------------
+
+
+def test_keys_are_recognised():
+    key = jax.random.key(0)
+    assert jaxcompat.is_key(key)
+    assert jaxcompat.is_key(jax.ShapeDtypeStruct((3,), key.dtype))
+    assert not jaxcompat.is_key(jnp.zeros(2, jnp.uint32))
+
+
+def test_the_generator_of_a_key_has_a_name():
+    assert jaxcompat.bits_generator(jax.random.key(0).dtype) == jaxcompat.threefry_prng_impl.name
+    assert jaxcompat.bits_generator(jax.random.key(0, impl="rbg").dtype) != jaxcompat.threefry_prng_impl.name
+
+
+def test_the_cipher_is_that_of_random_numbers():
+    """Threefry of key and counter (Salmon et al. 2011): the bits that JAX draws, and its published test vector."""
+    zero = np.uint32(0)
+    words = [int(x[0]) for x in jaxcompat.threefry2x32_p.bind(*(jnp.asarray([zero]) for _ in range(4)))]
+    assert words == [0x6B200159, 0x99BA4EFE]
+    key = jax.random.key(7)
+    bits = jaxcompat.threefry_prng_impl.random_bits(jax.random.key_data(key), 32, (5,))
+    np.testing.assert_array_equal(bits, jax.random.bits(key, (5,), np.uint32))
+
+
+# Transformations -----------------------------------------------------------------------------------------------------
+
+
+def test_a_function_has_a_rule_of_its_own_for_vmap():
+    seen = []
+
+    def rule(size, in_batched, x, y):
+        seen.append((size, in_batched))
+        return x + y + 100, True
+
+    call = jaxcompat.batched_rule(lambda x, y: x + y, rule)
+    assert call(1.0, 2.0) == 3.0
+    np.testing.assert_array_equal(jax.vmap(call, (0, None))(jnp.arange(3.0), 1.0), [101, 102, 103])
+    assert seen == [(3, [True, False])]
+
+
+def test_tangents_that_are_zero_by_construction_are_recognised():
+    seen = []
+
+    @jax.custom_jvp
+    def f(x, y):
+        return x * y
+
+    def rule(primals, tangents):
+        seen.extend(jaxcompat.is_symbolic_zero(t) for t in tangents)
+        return f(*primals), tangents[0] * primals[1]
+
+    f.defjvp(rule, symbolic_zeros=True)
+    assert jax.grad(f)(2.0, 3.0) == 3.0
+    assert seen == [False, True]
+    assert jaxcompat.is_symbolic_zero(None)
+
+
+def test_an_array_is_stored_in_another_order():
+    x = jnp.arange(24.0).reshape(4, 2, 3)
+    run = jax.jit(lambda x: jaxcompat.with_major_to_minor(x + 1, (2, 1, 0)) * 2)
+    np.testing.assert_array_equal(run(x), (x + 1) * 2)
+    assert "{0,1,2}" in run.lower(x).compile().as_text()
+
+
+# Compilation ---------------------------------------------------------------------------------------------------------
+
+
+def test_compilations_are_counted():
+    fn = jax.jit(lambda x: x + 1)
+    assert jaxcompat.n_compilations(fn) == 0
+    for x in (1.0, 2.0, jnp.ones(3)):
+        fn(x)
+    assert jaxcompat.n_compilations(fn) == 2
+
+
+def test_tracing_ahead_is_not_tracing_twice():
+    """Planning traces what the first call runs; JAX keeps the trace."""
+    traces = []
+    fn = jax.jit(lambda x: traces.append(1) or x + 1)
+    x = jnp.ones(3)
+    fn.trace(x)
+    fn(x)
+    jax.jit(lambda x: fn(x))(x)
+    assert (len(traces), jaxcompat.n_compilations(fn)) == (1, 1)
+
+
+def test_the_folder_of_compiled_programs_is_known(tmp_path):
+    before = jaxcompat.cache_folder()
+    try:
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+        assert jaxcompat.cache_folder() == str(tmp_path)
+        jax.config.update("jax_compilation_cache_dir", None)
+        assert jaxcompat.cache_folder() is None
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_versions_are_those_installed():
+    from importlib.metadata import version
+
+    assert jaxcompat.versions() == f"jax {version('jax')} jaxlib {version('jaxlib')}"
+
+
+def test_the_header_of_foreign_functions_is_there():
+    from pathlib import Path
+
+    assert (Path(jaxcompat.ffi_include_folder()) / "xla" / "ffi" / "api" / "c_api.h").is_file()
+
+
+def test_only_one_module_goes_beyond_the_public_interface():
+    """Whatever else a new JAX breaks, it breaks here."""
+    from pathlib import Path
+
+    import crazysim
+
+    private = ("jax.extend", "jax._src", "jax.interpreters", "jax.experimental", "jax.custom_batching", "SymbolicZero",
+               "get_bind_params", "pycapsule", "_cache_size", ".primitive.bind", "jax.core.Jaxpr")  # fmt: skip
+    root = Path(crazysim.__file__).parent
+    found = {
+        f"{path.relative_to(root)}: {word}"
+        for path in root.rglob("*.py")
+        for word in private
+        if path.name != "jaxcompat.py" and word in path.read_text()
+    }
+    assert found == {"engine/step.py: _cache_size"}  # a method of ours by that name, for the tests of law 6

@@ -1,0 +1,234 @@
+"""Compiled host kernels: found again where they fit, and only there."""
+
+import ctypes
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import shared_sim
+
+from crazysim.engine import Step, kernel, kernel_cache, native
+from crazysim.engine.errors import KernelError
+
+COMPILER = native.compiler()
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
+
+
+@pytest.fixture(scope="module")
+def source():
+    """A kernel's source."""
+    sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
+    return kernel.write(Step(sim.step_pipeline, "lanes").plan(sim.data).program, "host")
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """An empty cache folder, and nothing loaded from an earlier one."""
+    monkeypatch.setattr(kernel_cache, "folder", lambda: tmp_path)
+    monkeypatch.setattr(native, "_LOADED", {})
+    monkeypatch.setattr("crazysim.engine.jaxcompat.register_host_target", lambda name, function: None)
+    native.toolchain.cache_clear()
+    yield tmp_path
+    native.toolchain.cache_clear()
+
+
+@pytest.fixture
+def compilations(monkeypatch):
+    """A list that grows by one with every kernel that is compiled."""
+    done = []
+    monkeypatch.setattr(native, "_compile", lambda *args, real=native._compile: done.append(1) or real(*args))
+    return done
+
+
+def again(source):
+    """Return the kernel's name in a process that has loaded nothing yet."""
+    native._LOADED.clear()
+    native.toolchain.cache_clear()
+    return native.target(source)
+
+
+def fake_compiler(folder, monkeypatch, version="1.0", march="znver3"):
+    """Put a script in place of the compiler that says which machine it compiles for."""
+    script = folder / "c++"
+    script.write_text(
+        f'#!/bin/sh\ncase "$*" in *fsyntax-only*) echo "gcc version {version} -march={march}" >&2; exit 0;; esac\n'
+        f'exec {COMPILER} "$@"\n'
+    )
+    script.chmod(0o755)
+    monkeypatch.setattr(native, "compiler", lambda: str(script))
+
+
+def test_a_kernel_is_compiled_once_for_all_processes(source, place, compilations):
+    name = native.target(source)
+    assert again(source) == name
+    assert len(compilations) == 1
+    (library,) = place.iterdir()
+    assert library.name.startswith(name.removeprefix("crazysim_advance_"))
+
+
+def test_the_key_holds_machine_compiler_and_versions(source, place, compilations, monkeypatch, tmp_path_factory):
+    """What ``-march=native`` stands for, the CPU's features, version and options of the compiler, JAX, this package."""
+    folder = tmp_path_factory.mktemp("bin")
+    fake_compiler(folder, monkeypatch)
+    names = [again(source)]
+
+    def changed(why):
+        names.append(again(source))
+        assert len(set(names)) == len(names), why
+        assert len(compilations) == len(names), why
+
+    fake_compiler(folder, monkeypatch, march="skylake")
+    changed("another instruction set")
+    fake_compiler(folder, monkeypatch, version="2.0")
+    changed("another version of the compiler")
+    fake_compiler(folder, monkeypatch)
+    info = folder / "cpuinfo"
+    info.write_text("processor\t: 0\nflags\t\t: fpu sse2 avx512f\n")
+    monkeypatch.setattr(native, "CPU_INFO", info)
+    changed("another CPU")
+    info.write_text("processor\t: 0\nflags\t\t: fpu sse2\n")
+    changed("a CPU with fewer features")
+    info.write_text("processor\t: 0\nFeatures\t: fp asimd\n")
+    changed("an ARM CPU")
+    monkeypatch.setenv("CXXFLAGS", "-O1 -DOTHER")
+    changed("other options")
+    monkeypatch.setattr(native, "__version__", "99.0")
+    changed("another version of this package")
+    monkeypatch.setattr(jax, "__version__", "99.0")
+    changed("another JAX")
+    monkeypatch.setattr(native.platform, "libc_ver", lambda: ("glibc", "9.9"))
+    changed("another C library")
+
+
+@pytest.mark.parametrize("damage", [lambda raw: raw[: len(raw) // 2], lambda raw: b"", lambda raw: raw[:-8] + b"x" * 8])
+def test_a_damaged_file_is_compiled_again(source, place, compilations, damage):
+    """Loading half of a library can end the process, so it is found out before."""
+    native.target(source)
+    (library,) = place.iterdir()
+    raw = library.read_bytes()
+    library.unlink()  # it is loaded: its memory must stay as it is
+    library.write_bytes(damage(raw))
+    again(source)
+    assert len(compilations) == 2
+    assert [native._loaded(path) is not None for path in place.iterdir()] == [True]
+
+
+def test_a_library_that_does_not_load_here_is_compiled_again(source, place, compilations):
+    """Such as one that another machine wrote, which stays for it."""
+    key = native.target(source).removeprefix("crazysim_advance_")
+    (library,) = place.iterdir()
+    library.unlink()
+    foreign = place / f"{key}.tmp"
+    foreign.write_bytes(b"\x7fELF of another machine")
+    foreign = kernel_cache.store(place, key, foreign)
+    again(source)
+    assert len(compilations) == 2
+    assert foreign.exists()
+    again(source)
+    assert len(compilations) == 2
+
+
+def test_a_folder_that_forbids_execution_does_no_harm(source, place, compilations, monkeypatch):
+    real = native._loaded
+    monkeypatch.setattr(native, "_loaded", lambda path: None if path.is_relative_to(place) else real(path))
+    native.target(source)
+    assert len(compilations) == 2  # once more, in a folder of this process
+
+
+def test_a_file_of_the_key_without_a_kernel_is_not_used(place, monkeypatch):
+    path = place / "empty.so"
+    done = subprocess.run(
+        [native.compiler(), "-shared", "-x", "c++", "-", "-o", str(path)], input="int x;", text=True, check=False
+    )
+    assert done.returncode == 0
+    assert ctypes.CDLL(str(path))
+    assert native._loaded(path) is None
+
+
+def test_nothing_partial_is_ever_seen(source, place, monkeypatch, tmp_path_factory):
+    """The name of a library appears when it is complete, and a compiler that fails leaves nothing behind."""
+    listed = []
+
+    def run(words, text, real=native._run):
+        done = real(words, text)
+        listed.append([p.suffix for p in place.iterdir()])
+        return done
+
+    monkeypatch.setattr(native, "_run", run)
+    native.target(source)
+    assert listed == [[], [".tmp"]]
+    assert [p.suffix for p in place.iterdir()] == [".so"]
+
+    monkeypatch.setenv("CXXFLAGS", "-no-such-option")
+    with pytest.raises(KernelError, match="refused the kernel"):
+        again(source)
+    assert [p.suffix for p in place.iterdir()] == [".so"]
+
+
+def test_a_shared_folder_that_cannot_be_written_is_not_used(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("crazysim.engine.jaxcompat.cache_folder", lambda: str(tmp_path / "file"))
+    assert kernel_cache.folder() == kernel_cache.temporary()
+    monkeypatch.setattr("crazysim.engine.jaxcompat.cache_folder", lambda: str(tmp_path))
+    assert kernel_cache.folder() == tmp_path / "crazysim"
+    monkeypatch.setattr("crazysim.engine.jaxcompat.cache_folder", lambda: None)
+    assert kernel_cache.folder() == kernel_cache.temporary()
+
+
+def test_boundaries_between_the_parts_of_a_key_count():
+    assert kernel_cache.digest("ab", "c") != kernel_cache.digest("a", "bc")
+    assert kernel_cache.digest("a", "b") != kernel_cache.digest("b", "a")
+    assert len(kernel_cache.digest("a")) == kernel_cache.LENGTH
+
+
+FLY = """
+import sys, jax
+jax.config.update("jax_compilation_cache_dir", sys.argv[1])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+import numpy as np
+from crazysim import Sim
+sim = Sim(n_worlds=2, control="rotor_vel")
+sim.rotor_vel_control(np.full((2, 1, 4), 2e4))
+sim.step(50)
+assert sim.explain().startswith("engine: fused")
+print(repr(float(sim.data.states.rotor_vel[0, 0, 2])))
+"""
+
+
+def test_two_machines_share_a_home(tmp_path):
+    """JAX's own cache keeps programs that call kernels by name: one of another machine is never called.
+
+    The second process finds another CPU (its key differs) in the same folder, the third one the first's again.
+    """
+    other = tmp_path / "cpuinfo"
+    other.write_text("flags : none of the first machine's\n")
+    swap = f"import pathlib, crazysim.engine.native as n; n.CPU_INFO = pathlib.Path({str(other)!r})\n"
+    speeds, files = [], []
+    for begin in ("", swap, ""):
+        done = subprocess.run(
+            [sys.executable, "-c", begin + FLY, str(tmp_path / "cache")],
+            capture_output=True,
+            text=True,
+            env=os.environ | {"JAX_PLATFORMS": "cpu"},
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
+        speeds.append(float(done.stdout.splitlines()[-1]))
+        files.append(sorted(p.name for p in (tmp_path / "cache" / "crazysim").iterdir()))
+    assert speeds[0] == speeds[1] == speeds[2] > 1000
+    assert [len(names) for names in files] == [1, 2, 2]
+
+
+def test_a_kernel_takes_any_number_of_lanes(source):
+    """The call itself: one launch for each number, one library."""
+    sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
+    step = Step(sim.step_pipeline, "fused")
+    for n_worlds in (1, 5):
+        some = shared_sim(n_worlds=n_worlds, n_drones=1, control="rotor_vel")
+        after = step(some.data, jnp.int32(2))
+        np.testing.assert_array_equal(after.core.steps, np.full((n_worlds, 1), 2))

@@ -1,0 +1,241 @@
+"""Planning a step: everything an engine can refuse is refused there, said once, and never hides a bug."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import shared_sim
+
+from crazysim import ConfigError, Sim
+from crazysim.core.pipeline import append_fn, insert_fn_before
+from crazysim.core.stage import stage
+from crazysim.engine import Step, explain, kernel, lanes, native
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.lower import RULES
+from crazysim.errors import EngineWarning
+
+needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
+
+
+@stage("drone")
+def sway(data):
+    """Push with the sine of the position: the one use of ``sin`` in a pipeline under rotor commands."""
+    return data.replace(states=data.states.replace(force=1e-3 * jnp.sin(data.states.pos)))
+
+
+@stage("drone")
+def roll(data):
+    """Twist with the sine of the body rate."""
+    return data.replace(states=data.states.replace(torque=1e-6 * jnp.sin(data.states.ang_vel)))
+
+
+@pytest.fixture
+def sim():
+    return shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
+
+
+def pipeline(sim, *stages):
+    return {s.__name__: s for s in stages} | dict(sim.step_pipeline)
+
+
+def assert_steps_like_plain(sim, step, stages):
+    """Assert that a step that fell back computes what ``plain`` does."""
+    data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + 1.0))
+    found, expected = step(data, jnp.int32(3)), Step(pipeline(sim, *stages), "plain")(data, jnp.int32(3))
+    for name in ("pos", "vel", "force", "torque"):
+        np.testing.assert_allclose(getattr(found.states, name), getattr(expected.states, name), rtol=1e-5, atol=1e-7)
+    assert float(jnp.abs(found.states.force).max()) > 1e-4
+
+
+def test_a_stage_without_a_rule_is_named_in_one_warning(sim, monkeypatch):
+    monkeypatch.delitem(RULES, "sin")
+    step = Step(pipeline(sim, sway, roll))
+    with pytest.warns(EngineWarning) as caught:
+        plan = step.plan(sim.data)
+    assert len(caught) == 1
+    text = str(caught[0].message)
+    for words in ("stage 'sway'", "stage 'roll'", "'sin'", f"JAX {jax.__version__}", "strict=True"):
+        assert words in text
+    assert plan.engine in ("fused", "lanes")  # the rest of the step stays fast
+    assert_steps_like_plain(sim, step, (sway, roll))
+    step.plan(sim.data.replace(params=sim.data.params.replace(mass=jnp.full((3, 2, 1), 0.03))))  # no second warning
+
+
+@pytest.mark.parametrize("rule, words", [
+    (lambda r, eqn, args: eqn.params["old_name"], "no parameter 'old_name'"),
+    (lambda r, eqn, args: eqn.params["accuracy"] or r.missing, None),
+])  # fmt: skip
+def test_a_parameter_that_jax_renamed_is_unsupported_and_a_wrong_rule_is_a_bug(sim, monkeypatch, rule, words):
+    monkeypatch.setitem(RULES, "sin", rule)
+    step = Step(pipeline(sim, sway))
+    with pytest.warns(EngineWarning, match=words or "This is a bug of crazysim") as caught:
+        plan = step.plan(sim.data)
+    assert "stage 'sway'" in str(caught[0].message)
+    assert (plan.engine == "plain") == (words is None)
+    assert_steps_like_plain(sim, step, (sway,))
+
+
+def test_strict_raises_what_is_not_supported(sim, monkeypatch):
+    monkeypatch.delitem(RULES, "sin")
+    with pytest.raises(ConfigError, match=r"stage 'sway' is not fused: .*'sin'"):
+        Step(pipeline(sim, sway), strict=True).plan(sim.data)
+    strict = Sim(control="rotor_vel", strict=True)
+    insert_fn_before(strict.step_pipeline, "integration", sway)
+    strict.build_step_fn()
+    with pytest.raises(ConfigError, match="'sin'"):
+        strict.step()
+
+
+def broken(*args):
+    raise ZeroDivisionError("a slip")
+
+
+@pytest.mark.parametrize("settings", [{"strict": True}, {"engine": "lanes"}])
+def test_a_bug_is_raised_where_it_is_asked_for(sim, monkeypatch, settings):
+    monkeypatch.setitem(RULES, "sin", broken)
+    with pytest.raises(ZeroDivisionError, match="a slip"):
+        Step(pipeline(sim, sway), **settings).plan(sim.data)
+
+
+def test_a_bug_is_reported_where_auto_can_go_on(sim, monkeypatch):
+    monkeypatch.setitem(RULES, "sin", broken)
+    step = Step(pipeline(sim, sway))
+    with pytest.warns(EngineWarning, match="ZeroDivisionError: a slip in stage 'sway'") as caught:
+        assert step.plan(sim.data).engine == "plain"
+    assert "CRAZYSIM_DUMP" in str(caught[0].message)
+    assert len(caught) == 1
+    assert_steps_like_plain(sim, step, (sway,))
+
+
+def test_a_bug_in_tracing_is_found_at_planning(sim, monkeypatch):
+    """Tracing the program is part of planning, so that the first call finds nothing new."""
+    monkeypatch.setattr(native, "compiler", lambda: None)
+    monkeypatch.setattr(lanes, "steps", broken)
+    with pytest.warns(EngineWarning, match="a slip"):
+        assert Step(sim.step_pipeline).plan(sim.data).engine == "plain"
+
+
+def test_planning_traces_what_the_first_call_runs(sim):
+    """Law 6: the trace of planning is that of the call."""
+    for engine in ("plain", "lanes", *(["fused"] if native.compiler() else [])):
+        for n_steps in (jnp.int32(2), 2):
+            step = Step(sim.step_pipeline, engine)
+            step(sim.data, n_steps)
+            assert step._cache_size() == 1
+
+
+@pytest.mark.parametrize("engine", ["auto", "plain", "lanes"])
+def test_an_error_of_the_stage_is_its_own(sim, engine):
+    """No engine could run it: it is raised as it is, without a warning."""
+
+    @stage("drone")
+    def mine(data):
+        raise KeyError("of the user")
+
+    with pytest.raises(KeyError, match="of the user"):
+        Step(pipeline(sim, mine), engine).plan(sim.data)
+
+
+def test_documented_limits_are_explained_and_warn_of_nothing(sim, monkeypatch):
+    """An undeclared stage, a large swarm, a machine without a compiler."""
+
+    def everything(data):
+        return data.replace(states=data.states.replace(force=0 * data.states.force))
+
+    @stage("world")
+    def crowd(data):
+        return data.replace(states=data.states.replace(force=0 * data.states.pos))
+
+    swarm = Sim(n_drones=9, control="rotor_vel")
+    assert "it is not declared" in explain(Step(pipeline(sim, everything)), sim.data)
+    assert "drones" in explain(Step(pipeline(swarm, crowd)), swarm.data)
+    monkeypatch.setattr(native, "compiler", lambda: None)
+    for strict in (False, True):
+        assert "no C++ compiler" in explain(Step(sim.step_pipeline, strict=strict), sim.data)
+
+
+# Kernels -------------------------------------------------------------------------------------------------------------
+
+
+def use_compiler(monkeypatch, folder, script):
+    path = folder / "compiler"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    monkeypatch.setattr(native, "compiler", lambda: str(path))
+
+
+@pytest.mark.parametrize("script, words", [
+    ("echo 'error: no such register' >&2; exit 1", "error: no such register"),
+    ("exit 0", "left no library"),
+    ('while [ "$1" != -o ]; do shift; done 2>/dev/null; echo junk > "$2"; exit 0', "cannot be loaded"),
+])  # fmt: skip
+def test_a_compiler_that_fails_costs_speed_and_says_so(sim, monkeypatch, tmp_path, script, words):
+    use_compiler(monkeypatch, tmp_path, f'case "$*" in *fsyntax-only*) exit 0;; esac; {script}')
+    step = Step(pipeline(sim, sway))
+    with pytest.warns(EngineWarning, match=re.escape(words)) as caught:
+        plan = step.plan(sim.data)
+    assert plan.engine == "lanes"
+    assert words in plan.why
+    assert "sway, " in str(caught[0].message)
+    assert_steps_like_plain(sim, step, (sway,))
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        Step(pipeline(sim, sway), strict=True).plan(sim.data)
+    with pytest.raises(ConfigError, match=r"engine 'fused' cannot run this pipeline.*Use 'lanes' or 'auto'"):
+        Step(pipeline(sim, sway), "fused").plan(sim.data)
+
+
+def test_a_compiler_that_hangs_is_ended(sim, monkeypatch, tmp_path):
+    """Its children too: a compiler is a driver that runs others."""
+    marker = tmp_path / "done"
+    use_compiler(monkeypatch, tmp_path, f'case "$*" in *fsyntax-only*) exit 0;; esac; (sleep 3; touch {marker}) & wait')
+    monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "0.3")
+    with pytest.warns(EngineWarning, match="took longer than 0.3 s; set CRAZYSIM_COMPILE_TIMEOUT"):
+        assert Step(sim.step_pipeline).plan(sim.data).engine == "lanes"
+    import time
+
+    time.sleep(3.2)
+    assert not marker.exists()
+
+
+@needs_compiler
+def test_an_operation_without_source_runs_on_lanes(sim, monkeypatch):
+    def refuse(program, target):
+        raise UnsupportedError("operation 'zeta' has no source")
+
+    monkeypatch.setattr(kernel, "write", refuse)
+    with pytest.warns(EngineWarning, match="operation 'zeta' has no source"):
+        assert Step(sim.step_pipeline).plan(sim.data).engine == "lanes"
+
+
+@needs_compiler
+def test_the_kernel_is_compiled_when_the_step_is_planned(sim, monkeypatch):
+    seen = []
+    monkeypatch.setattr(native, "target", lambda k, real=native.target: seen.append(k) or real(k))
+    step = Step(pipeline(sim, sway))
+    plan = step.plan(sim.data)
+    assert (plan.engine, len(seen)) == ("fused", 1)
+    step(sim.data, jnp.int32(1))
+    step(sim.data, 2)
+    assert len(seen) == 1
+
+
+# Explaining ----------------------------------------------------------------------------------------------------------
+
+
+def undeclared(data):
+    """Look at all drones of all worlds."""
+    return data.replace(states=data.states.replace(torque=1e-6 * jnp.mean(data.states.pos) + 0 * data.states.torque))
+
+
+def test_explaining_runs_nothing_unless_asked_to_measure():
+    sim = Sim(n_worlds=2, control="rotor_vel")
+    append_fn(sim.step_pipeline, undeclared)
+    step = sim.build_step_fn()
+    text = sim.explain()
+    assert "'undeclared' is not fused" in text
+    assert "cost of the split" not in text
+    assert step._cache_size() == 0
+    assert "cost of the split, measured: a step takes" in sim.explain(measure=True)
+    assert step._cache_size() == 1

@@ -1,0 +1,52 @@
+"""What importing the package and flying import besides JAX and MuJoCo: nothing, until it is used."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+LIST = """
+import json, sys
+import jax, mujoco
+def packages():
+    return {name.split(".")[0] for name in sys.modules} | {name for name in sys.modules if name == "mujoco.mjx"}
+before = packages()
+import crazysim
+sim = crazysim.Sim(n_worlds=2)
+sim.step()
+sim.reset()
+sim.data
+sim.scene.add("gate")
+sim.step()
+print(json.dumps(sorted(packages() - before - set(sys.stdlib_module_names))))
+from crazysim.scene import mjx
+assert mjx.Model is sys.modules["mujoco.mjx"].Model
+assert isinstance(sim.mjx_data, mjx.Data)
+"""
+
+
+@pytest.fixture(scope="module")
+def imported():
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", LIST], capture_output=True, text=True, env=os.environ, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.splitlines()
+
+
+def test_flying_imports_neither_mjx_nor_anything_else(imported):
+    """MJX alone takes over a second; contacts need it, and import it."""
+    assert json.loads(imported[0]) == ["crazysim"]
+
+
+def test_importing_mjx_prints_nothing(imported):
+    assert len(imported) == 1
+
+
+def test_a_name_that_mjx_lends_not_is_no_attribute():
+    from crazysim.scene import mjx
+
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        mjx.nothing  # noqa: B018
