@@ -40,9 +40,11 @@ from programs import Program, draw, evaluate, kept
 from rounding import close, explained, keeps_sign_of_zero
 
 from crazysim import Sim
-from crazysim.core.stage import Stage, stage
+from crazysim.core.stage import Stage, as_stages, stage
 from crazysim.engine import Step, native
-from crazysim.errors import ConfigError
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.lower_stages import lower_stages
+from crazysim.engine.source import require
 from crazysim.pytree import PyTree, leaf
 
 N_WORLDS, N_DRONES = 36, 2
@@ -227,12 +229,11 @@ class Fuzzer:
         if not cases:
             return
         data, stages = self._step_of(cases)
-        steps = {"lanes": Step(stages, "lanes")}
         try:
-            program = steps["lanes"].plan(data).program
+            program = lower_stages(as_stages(stages), data)
         except Exception as error:
             if len(cases) == 1:
-                yield Find(cases[0], "planning", f"{type(error).__name__}: {error}")
+                yield Find(cases[0], "lowering", f"{type(error).__name__}: {error}")
             else:
                 yield from self._check(cases[: len(cases) // 2])
                 yield from self._check(cases[len(cases) // 2 :])
@@ -243,31 +244,18 @@ class Fuzzer:
             self.refused.update(refused.values())
             yield from self._check([case for k, case in enumerate(cases) if f"p{k}" not in refused])
             return
-        no_source = []
         if "fused" in self.engines:
-            steps["fused"] = Step(stages, "fused")
-            no_source = self._without_source(cases, steps["fused"], data)
-        if not no_source:
-            yield from self._compare(cases, self.engines, steps)
-            return
-        self.counts["without source"] += len(no_source)
-        yield from self._check([case for case in cases if case not in no_source])
-        yield from self._compare(no_source, tuple(e for e in self.engines if e != "fused"))
-
-    def _without_source(self, cases: Sequence[Case], step: Step, data: Any) -> list[Case]:
-        """Return the programs that no kernel can be written of."""
-        try:
-            step.plan(data)
-            return []
-        except ConfigError as error:
-            if len(cases) == 1:
-                self.refused[str(error).partition("(stage")[0]] += 1
-                return list(cases)
-        found = []
-        for case in cases:
-            data, stages = self._step_of([case])
-            found += self._without_source([case], Step(stages, "fused"), data)
-        return found
+            try:
+                for segment in program.fused_segments:
+                    require(segment.block)
+            except UnsupportedError as error:
+                (no_source,) = [case for k, case in enumerate(cases) if f"p{k}" == error.stage]
+                self.counts["without source"] += 1
+                self.refused[error.reason] += 1
+                yield from self._check([case for case in cases if case is not no_source])
+                yield from self._compare([no_source], tuple(e for e in self.engines if e != "fused"))
+                return
+        yield from self._compare(cases, self.engines)
 
     def _step_of(self, cases: Sequence[Case]) -> tuple[Any, dict[str, Stage]]:
         stages = {f"p{k}": case.stage(f"p{k}") for k, case in enumerate(cases)} | {"turned": turned}
@@ -277,21 +265,19 @@ class Fuzzer:
         plugins = {"given": self.given, "results": Results(**slots)}
         return self.data.replace(plugins=plugins), stages
 
-    def run(self, cases: Sequence[Case], engine: str, step: Step | None = None) -> list[list[np.ndarray]]:
+    def run(self, cases: Sequence[Case], engine: str) -> list[list[np.ndarray]]:
         """Return the values of programs on an engine."""
         data, stages = self._step_of(cases)
-        results = (step or Step(stages, engine))(data).plugins["results"]
+        results = Step(stages, engine)(data).plugins["results"]
         slots = {k: np.asarray(x) for k, x in {**results.drone, **results.world}.items()}
         return [case.unpacked(slots[f"p{k}f"], slots[f"p{k}o"]) for k, case in enumerate(cases)]
 
-    def _compare(
-        self, cases: Sequence[Case], engines: Sequence[str], steps: dict[str, Step] | None = None
-    ) -> Iterator[Find]:
+    def _compare(self, cases: Sequence[Case], engines: Sequence[str]) -> Iterator[Find]:
         found: dict[str, list[list[np.ndarray]]] = {}
         for engine in ("plain", *engines):
             try:
                 start = time.perf_counter()
-                found[engine] = self.run(cases, engine, (steps or {}).get(engine))
+                found[engine] = self.run(cases, engine)
                 self.counts[f"ms {engine}"] += int(1e3 * (time.perf_counter() - start))
             except Exception as error:
                 if len(cases) == 1 and engine == "plain":

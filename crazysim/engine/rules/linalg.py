@@ -39,8 +39,7 @@ def _cholesky(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
                     rest = ctx.scalar("sub", rest, ctx.scalar("mul", low[i, k], low[j, k]))
                 low[i, j] = ctx.builder.add("sqrt", (rest,), dtype) if i == j else ctx.scalar("div", rest, low[j, j])
                 if i == j:
-                    positive = ctx.scalar("gt", rest, zero, dtype=bool)
-                    fails = ctx.scalar("or", fails, ctx.scalar("not", positive))
+                    fails = ctx.scalar("or", fails, ctx.scalar("le", rest, zero, dtype=bool))
         for j, i in itertools.combinations_with_replacement(range(n), 2):
             low[i, j] = ctx.scalar("select_n", fails, low[i, j], constant(np.nan, dtype))
         out.append(low)
