@@ -48,10 +48,9 @@ def moved(module: str, new: str) -> Callable[[str], Any]:
 
 def warn_renamed(old: str, new: str) -> None:
     """Warn the caller's caller that ``old`` is deprecated in favour of ``new``."""
-    _warn(old, new)
+    _warn(old, new, stacklevel=4)
 
 
-def _warn(old: str, new: str) -> None:
-    warnings.warn(
-        f"{old} is deprecated and will be removed in {REMOVED_IN}; use {new}", DeprecationWarning, stacklevel=3
-    )
+def _warn(old: str, new: str, stacklevel: int = 3) -> None:
+    message = f"{old} is deprecated and will be removed in {REMOVED_IN}; use {new}"
+    warnings.warn(message, DeprecationWarning, stacklevel=stacklevel)

@@ -1,8 +1,8 @@
-"""The errors and warnings of the package."""
+"""Errors and warnings of the package."""
 
 
 class ConfigError(ValueError):
-    """A simulation that cannot be: settings that contradict each other or lack something."""
+    """Settings that are invalid, incomplete or contradict each other."""
 
 
 class UnknownNameError(ConfigError, KeyError):
@@ -14,7 +14,7 @@ class UnknownNameError(ConfigError, KeyError):
 
 
 class RenderError(RuntimeError):
-    """No picture can be made on this machine: a screen or OpenGL is missing or does not work."""
+    """A missing or broken screen or OpenGL."""
 
 
 class EngineWarning(UserWarning):

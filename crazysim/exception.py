@@ -1,5 +1,8 @@
-"""The errors again, where Crazyflow has them; ``crazysim.errors`` is their home."""
+"""Errors, under the path of Crazyflow; they are defined in ``crazysim.errors``."""
 
 from crazysim.errors import ConfigError, RenderError, UnknownNameError
 
-__all__ = ["ConfigError", "RenderError", "UnknownNameError"]
+CrazyflowError = ConfigError
+"""Crazyflow's base class: ``except CrazyflowError`` catches what is wrong with a configuration."""
+
+__all__ = ["ConfigError", "CrazyflowError", "RenderError", "UnknownNameError"]

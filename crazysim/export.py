@@ -24,29 +24,29 @@ if TYPE_CHECKING:
     from crazysim.sim.sim import Sim
 
 STATES = ("states.pos", "states.quat", "states.vel", "states.ang_vel", "states.rotor_vel")
-"""What every state vector begins with: m, unit xyzw, m/s, rad/s, rpm (in ``so_rpy_rotor*`` N)."""
+"""First fields of every state vector: m, unit xyzw, m/s, rad/s, rpm (in ``so_rpy_rotor*`` N)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Vector:
-    """What the numbers of a vector are: fields of ``SimData``, one after the other, each in row-major order."""
+    """Layout of a vector: fields of ``SimData``, concatenated, each in row-major order."""
 
     sizes: Mapping[str, int]
-    """How many numbers each field has of one drone, in the vector's order. The names are paths in ``SimData``, and
-    the units those of the fields."""
+    """Size of each field of one drone, in the order of the vector. The names are paths in ``SimData``; the units are
+    those of the fields."""
 
     def __len__(self) -> int:
-        """Return how many numbers there are."""
+        """Return the length of the vector."""
         return sum(self.sizes.values())
 
     def __getitem__(self, name: str) -> slice:
-        """Return where a field is.
+        """Return the slice of a field.
 
         Raises:
             UnknownNameError: If it is not in the vector.
         """
         if name not in self.sizes:
-            raise UnknownNameError(f"{name!r} is not in this vector; it has {', '.join(self.sizes) or 'nothing'}")
+            raise UnknownNameError(f"{name!r} is not in this vector; it has {', '.join(self.sizes) or 'no fields'}")
         names = list(self.sizes)
         start = sum(self.sizes[n] for n in names[: names.index(name)])
         return slice(start, start + self.sizes[name])
@@ -61,42 +61,42 @@ class Vector:
 
 @dataclasses.dataclass(frozen=True)
 class CasadiStep:
-    """A step of one drone as a CasADi function, and what its vectors are."""
+    """Step of one drone as a CasADi function, and the layouts of its vectors."""
 
     function: Any
     """``casadi.Function``: ``x_next = step(x, u)``, or ``step(x, u, p)`` if there are parameters."""
     x: Vector
-    """State: position, attitude, velocity, body rates, rotor speeds, then what controllers and effects remember."""
+    """State: position, attitude, velocity, body rates, rotor speeds, internal states of controllers and effects."""
     u: Vector
-    """Command, as the setter of the simulation's level takes it."""
+    """Command, in the order and units of the setter of the command level."""
     p: Vector
-    """Parameters that were asked for."""
+    """Requested parameters."""
     dt: float
     """Length of the step, s."""
 
     def __call__(self, *args: Any) -> Any:
-        """Return the next state, for numbers or for symbols of CasADi."""
+        """Return the next state, for numbers or CasADi symbols."""
         return self.function(*args)
 
 
 def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: int = 0) -> CasadiStep:
-    """Return a step of one drone as a CasADi function.
+    """Return the step of one drone as a CasADi function.
 
-    It is the step pipeline as it stands in ``sim.step_pipeline``, stages and effects of the user's included, read into
-    expressions operation by operation: the same numbers as ``sim.step`` gives in float64, to rounding. Whatever is
-    neither state, nor command, nor a parameter that was asked for is a constant, as the drone has it now. In a
-    simulation of float32 the constants are of that precision.
+    The step pipeline in ``sim.step_pipeline``, including effects and user stages, is converted to expressions operation
+    by operation, so the result equals that of ``sim.step`` in float64 up to rounding. Everything that is neither state,
+    nor command, nor a requested parameter is a constant with its current value for that drone. In a float32 simulation
+    the constants have that precision.
 
     Args:
-        sim: The simulation.
-        parameters: Fields that become the vector ``p``, by their path in ``SimData``, such as ``"params.mass"`` or
+        sim: Simulation to export.
+        parameters: Fields of the vector ``p``, by their path in ``SimData``, such as ``"params.mass"`` or
             ``"states.force"``.
-        world: World of the drone.
-        drone: Which drone of its world.
+        world: Index of the world.
+        drone: Index of the drone in its world.
 
     Raises:
-        ValueError: If a name or the drone does not exist, or the step is no program of one drone that CasADi could
-            have: the message names the stage and the reason.
+        ValueError: If a name or the drone does not exist, or the step cannot be exported; the message names the stage
+            and the reason.
         ImportError: If CasADi is not installed.
     """
     try:
@@ -106,8 +106,8 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     data, stages = sim.data, as_stages(sim.step_pipeline)
     if not (0 <= world < data.core.n_worlds and 0 <= drone < data.core.n_drones):
         raise ConfigError(
-            f"there is no drone {drone} of world {world}: this simulation has {data.core.n_worlds} worlds of "
-            f"{data.core.n_drones} drones, counted from 0"
+            f"expected a world from 0 to {data.core.n_worlds - 1} and a drone from 0 to {data.core.n_drones - 1}, got "
+            f"world {world} and drone {drone}"
         )
     program = fuse(lower_stages(stages, data))
     leaves, names = jax.tree.leaves(data), [leaf.name for leaf in program.leaves]
@@ -160,7 +160,7 @@ def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
         if isinstance(segment, UnfusedStage):
             raise _refusal(segment.name, segment.error.reason)
         if segment.scope != "drone":
-            raise _refusal(segment.stages[0], "it sees all drones of its world, and the step of one is exported")
+            raise _refusal(segment.stages[0], "it reads all drones of its world, but a step of one drone is exported")
     after: dict[Slot, Any] = {}
     for segment in program.fused_segments:
         slots = (*segment.reads, *segment.hoisted_reads)
@@ -182,14 +182,14 @@ def _command_field(data: SimData) -> str:
 
 
 def _parameter_leaves(program: Program, parameters: Sequence[str], command: str) -> list[int]:
-    """Return which leaves are asked for as parameters, or say why one cannot be.
+    """Return the indices of the leaves requested as parameters.
 
     Raises:
-        ConfigError: If a name does not exist, is there twice, or is no parameter of a step.
+        ConfigError: If a name does not exist, occurs twice, or is not a parameter of the step.
     """
     names = [leaf.name for leaf in program.leaves]
     if isinstance(parameters, str) or len(set(parameters)) < len(parameters):
-        raise ConfigError(f"parameters are a list of different names, not {parameters!r}")
+        raise ConfigError(f"expected parameters as a list of distinct names, got {parameters!r}")
     free = [
         name
         for leaf, name in enumerate(names)
@@ -200,12 +200,12 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
     ]
     for name in parameters:
         if name not in free:
-            raise UnknownNameError(f"{name!r} is no parameter of this step; what may be one is {', '.join(free)}")
+            raise UnknownNameError(f"expected a parameter of this step, got {name!r}; use one of {', '.join(free)}")
     return [names.index(name) for name in parameters]
 
 
 def _of_one(scope: str, x: Any, world: int, drone: int) -> np.ndarray:
-    """Return the numbers that one drone has of a leaf, as float64. (size,)"""
+    """Return the elements of a leaf that belong to one drone, as float64. (size,)"""
     x = np.asarray(jax.random.key_data(x) if is_key(x) else x)
     place = {"drone": (world, drone), "world": (world, 0)}.get(scope, ())
     return x[place].astype(np.float64).reshape(-1)

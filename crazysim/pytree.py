@@ -15,6 +15,11 @@ from crazysim.errors import ConfigError
 
 Scope = Literal["drone", "world", "rows", "shared", "opaque", "parameter"]
 
+PER_WORLD = ("drone", "world", "batched")
+"""Scopes of leaves that have a first axis over worlds, as ``scopes`` returns them."""
+CORE_NDIM_KEY = "core_ndim"
+"""Key under which the metadata of a field give the number of dimensions without batch axes; Crazyflow's key too."""
+
 T = TypeVar("T")
 
 
@@ -22,15 +27,14 @@ def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None) 
     """Declare an array field, or a dict of such arrays.
 
     Args:
-        scope: Which batch axes the array carries. ``drone``: (n_worlds, n_drones, *core). ``world``:
-            (n_worlds, 1, *core). ``rows``: (n_worlds, ...), with any further axes. ``shared``: core.
-            ``parameter``: shared or drone, told apart by its number of dimensions. ``opaque``: untouched by
-            resets and by sharding.
+        scope: Batch axes of the array. ``drone``: (n_worlds, n_drones, *core). ``world``: (n_worlds, 1, *core).
+            ``rows``: (n_worlds, ...), with any further axes. ``shared``: core. ``parameter``: shared or drone, by its
+            number of dimensions. ``opaque``: undeclared; masked resets and sharding do not change it.
         core_ndim: Number of dimensions of the core shape.
-        core: The core shape, where it can be no other. It keeps one mass for each of three worlds from passing
-            for one along each of three axes.
+        core: The core shape, if it is fixed. It keeps one mass for each of three worlds from passing for one along
+            each of three axes.
     """
-    return dataclasses.field(metadata={"scope": scope, "core_ndim": core_ndim, "core": core})
+    return dataclasses.field(metadata={"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core})
 
 
 def static(**kwargs: Any) -> Any:
@@ -40,14 +44,14 @@ def static(**kwargs: Any) -> Any:
 
 @dataclass_transform(frozen_default=True, field_specifiers=(leaf, static, dataclasses.field))
 class PyTree:
-    """A frozen record of arrays that JAX can look into.
+    """Base class of records: frozen dataclasses that are JAX pytrees.
 
-    Subclasses list annotated fields; an array field says with ``leaf`` which batch axes it carries, a
-    ``static`` field belongs to the type, any other field holds a record of its own.
+    Subclasses list annotated fields. An array field declares its batch axes with ``leaf``, a ``static`` field is part
+    of the type, and any other field holds a record.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Make every subclass a frozen dataclass that is registered with JAX."""
+        """Make the subclass a frozen dataclass and register it with JAX."""
         super().__init_subclass__(**kwargs)
         dataclasses.dataclass(frozen=True, eq=False)(cls)
         fields = dataclasses.fields(cls)  # type: ignore[arg-type]
@@ -58,14 +62,16 @@ class PyTree:
         )
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with the named fields exchanged."""
+        """Return a copy with the given fields replaced."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
 
 
 def scopes(tree: Any) -> Any:
     """Return the same tree with the scope of every leaf in its place.
 
-    A parameter comes out as ``shared`` or ``drone``. What is declared nowhere is ``opaque``.
+    A parameter is returned as ``shared`` or ``drone``. Leaves without a declaration are ``opaque``. A leaf of another
+    dataclass whose field has ``CORE_NDIM_KEY`` in its metadata is ``batched`` if it has more dimensions than that:
+    its first axis is over worlds, and stages receive it like an opaque leaf.
     """
     return _map_declared(lambda x, metadata, _: _scope(x, metadata), tree, {}, "")
 
@@ -82,7 +88,14 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
         scope = _scope(x, metadata)
         if scope == "opaque":
             return
-        shape, batch, core_ndim, core = jnp.shape(x), batches[scope], metadata["core_ndim"], metadata["core"]
+        if scope == "batched":
+            if jnp.shape(x)[0] != n_worlds:
+                raise ConfigError(
+                    f"expected {name} to have a first axis over {n_worlds} worlds, got shape {jnp.shape(x)}. Without "
+                    f"batch axes it would have {metadata[CORE_NDIM_KEY]} dimensions, as its field declares."
+                )
+            return
+        shape, batch, core_ndim, core = jnp.shape(x), batches[scope], metadata[CORE_NDIM_KEY], metadata["core"]
         has_axes = shape[: len(batch)] == batch and len(shape) == len(batch) + core_ndim
         if not has_axes or core not in (None, shape[len(batch) :]):
             is_parameter = metadata["scope"] == "parameter"
@@ -109,24 +122,55 @@ def _map_declared(fn: Callable[[Any, Any, str], Any], node: Any, metadata: Any, 
         return node.replace(**changes)
     if isinstance(node, dict):
         return {k: _map_declared(fn, v, metadata, f"{name}[{k!r}]") for k, v in node.items()}
+    if _is_foreign_record(node):
+        return _map_foreign(fn, node, name)
     return jax.tree.map(
-        lambda x: _map_declared(fn, x, metadata, name) if isinstance(x, PyTree) else fn(x, metadata, name),
+        lambda x: _map_declared(fn, x, metadata, name) if _is_record(x) else fn(x, metadata, name),
         node,
-        is_leaf=lambda x: isinstance(x, PyTree),
+        is_leaf=_is_record,
     )
 
 
+def _map_foreign(fn: Callable[[Any, Any, str], Any], record: Any, name: str) -> Any:
+    """Return a record of another library, such as ``flax.struct``, mapped like ``_map_declared``."""
+    children, treedef = jax.tree_util.tree_flatten_with_path(record, is_leaf=lambda x: x is not record)
+    metadata = {field.name: field.metadata for field in dataclasses.fields(record)}
+    mapped = []
+    for path, child in children:
+        key = getattr(path[0], "name", "")  # absent where the record is registered without names
+        child_name, declared = f"{name}{jax.tree_util.keystr(path)}", metadata.get(key, {})
+        if CORE_NDIM_KEY in declared and _is_record(child):
+            raise ConfigError(
+                f"expected an array in {child_name}, whose metadata have {CORE_NDIM_KEY!r}, got a "
+                f"{type(child).__name__}. Give the metadata to the fields of that record."
+            )
+        mapped.append(_map_declared(fn, child, declared, child_name))
+    return treedef.unflatten(mapped)
+
+
+def _is_record(node: Any) -> bool:
+    return isinstance(node, PyTree) or _is_foreign_record(node)
+
+
+def _is_foreign_record(node: Any) -> bool:
+    """Check for a dataclass of another library that JAX traverses."""
+    is_instance = dataclasses.is_dataclass(node) and not isinstance(node, (type, PyTree))
+    return is_instance and not jax.tree_util.all_leaves([node])
+
+
 def _scope(x: Any, metadata: Any) -> str:
-    scope = metadata.get("scope", "opaque")
-    if scope != "parameter":
-        return scope
-    return "shared" if jnp.ndim(x) == metadata["core_ndim"] else "drone"
+    if "scope" not in metadata:
+        core_ndim = metadata.get(CORE_NDIM_KEY)
+        return "opaque" if core_ndim is None or jnp.ndim(x) <= core_ndim else "batched"
+    if metadata["scope"] != "parameter":
+        return metadata["scope"]
+    return "shared" if jnp.ndim(x) == metadata[CORE_NDIM_KEY] else "drone"
 
 
 def map_batched(fn: Callable[..., Any], tree: T, *others: T) -> T:
-    """Apply ``fn`` to the leaves that belong to a world (scope drone or world), and keep the rest."""
+    """Apply ``fn`` to the leaves that have an axis over worlds (``PER_WORLD``), and keep the rest."""
     return jax.tree.map(
-        lambda scope, x, *rest: fn(x, *rest) if scope in ("drone", "world") else x,
+        lambda scope, x, *rest: fn(x, *rest) if scope in PER_WORLD else x,
         scopes(tree),
         tree,
         *others,
@@ -134,9 +178,12 @@ def map_batched(fn: Callable[..., Any], tree: T, *others: T) -> T:
 
 
 def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
-    """Return ``new`` where ``mask`` says so, ``old`` elsewhere; the mask (n_worlds,), (n_worlds, 1) or of one world ().
+    """Return ``new`` in the worlds of a mask and ``old`` elsewhere, both broadcast to a common shape.
 
-    Both are broadcast to the larger of their shapes; without a mask ``new`` is taken everywhere.
+    Args:
+        mask: True in worlds that take ``new``; None for all. (n_worlds,), (n_worlds, 1), or () for one world
+        new: New values. (n_worlds, ...)
+        old: Old values. (n_worlds, ...)
     """
     shape = jnp.broadcast_shapes(jnp.shape(new), jnp.shape(old))
     if mask is None:
@@ -146,13 +193,13 @@ def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
 
 
 def floating() -> Any:
-    """Return the type of numbers that JAX computes with as it is set now: float32, or float64."""
+    """Return the floating dtype of JAX in its current configuration: float32 or float64."""
     return np.float64 if jax.config.jax_enable_x64 else np.float32  # type: ignore[attr-defined]
 
 
 def as_parameter(value: Any) -> Any:
-    """Return a number or array as a shared parameter: of floating type, and never a bare scalar.
+    """Return a number or array as a shared parameter: of floating dtype, and never zero-dimensional.
 
-    It is an array of the host, which takes no compilation; a simulation puts it on its device with all else.
+    It is a NumPy array, which needs no compilation; the simulation moves it to its device with the other data.
     """
     return np.atleast_1d(np.asarray(value, floating()))

@@ -1,6 +1,7 @@
-"""Rotations as unit quaternions, xyzw, body to world, with gradients that stay finite everywhere.
+"""Rotations as unit quaternions, xyzw, body to world, with finite gradients everywhere.
 
-Written out element by element: a product of small matrices is slow on every device, sums of products fuse.
+Small products are written out element by element: matrix products of this size are slow on every device, and sums of
+products fuse.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from jax import Array, lax
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the scalar product over the last axis, kept with length one. (..., 1)"""
+    """Return the scalar product over the last axis, which is kept with length one. (..., 1)"""
     return jnp.sum(a * b, axis=-1, keepdims=True)
 
 
@@ -24,25 +25,41 @@ def cross(a: Array, b: Array) -> Array:
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
-def matvec(matrix: Array, vector: Array) -> Array:
-    """Return ``matrix @ vector`` for small arrays, written out.
+def along_z(value: Array) -> Array:
+    """Return the vectors along z with these values. (...) -> (..., 3)"""
+    zero = jnp.zeros_like(value)
+    return jnp.stack([zero, zero, value], axis=-1)
+
+
+def add_cross(offset: Array, a: Array, b: Array) -> Array:
+    """Return ``offset + a x b`` as six multiply-adds. (..., 3)"""
+    x, y, z = offset[..., 0], offset[..., 1], offset[..., 2]
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return jnp.stack([x + ay * bz - az * by, y + az * bx - ax * bz, z + ax * by - ay * bx], axis=-1)
+
+
+def matvec(matrix: Array, vector: Array, offset: Array | None = None) -> Array:
+    """Return ``matrix @ vector + offset`` for small arrays, written out.
 
     Args:
         matrix: (..., m, n)
         vector: (..., n)
+        offset: First summand; None for zero. (..., m)
 
     Returns:
         (..., m)
     """
     n_rows, n_columns = matrix.shape[-2:]
     columns = [vector[..., k] for k in range(n_columns)]
-    rows = [sum(matrix[..., i, k] * columns[k] for k in range(n_columns)) for i in range(n_rows)]
+    start = [0 if offset is None else offset[..., i] for i in range(n_rows)]
+    rows = [sum((matrix[..., i, k] * columns[k] for k in range(n_columns)), start[i]) for i in range(n_rows)]
     return jnp.stack(rows, axis=-1)
 
 
 @jax.custom_jvp
 def safe_sqrt(x: Array) -> Array:
-    """Return the square root of what is positive, else zero, with gradient zero there; NaN comes through. (...)"""
+    """Return the square root of positive values and zero, with gradient zero, of all others; NaN passes. (...)"""
     return jnp.sqrt(jnp.maximum(x, 0.0))
 
 
@@ -67,9 +84,9 @@ def safe_normalize(x: Array, fallback: Array) -> Array:
 
 
 def safe_clip(x: Array, low: Array | float, high: Array | float) -> Array:
-    """Return ``x`` within limits, with gradient one at a limit itself: that of the inner side. (...)
+    """Return ``x`` clipped to limits, with gradient one at a limit itself, that of the inner side. (...)
 
-    ``jnp.clip`` gives one half there, which is the slope of neither side.
+    ``jnp.clip`` has one half there, the slope of neither side.
     """
     raised = jnp.where(x < low, low, x)
     return jnp.where(raised > high, high, raised)
@@ -78,7 +95,7 @@ def safe_clip(x: Array, low: Array | float, high: Array | float) -> Array:
 def safe_arctan2(y: Array, x: Array) -> Array:
     """Return the angle of the point (x, y), rad, zero with gradient zero at the origin. (...)
 
-    The origin is where the squared distance, by which the gradient divides, vanishes or underflows.
+    A point counts as the origin where its squared distance, by which the gradient divides, vanishes or underflows.
     """
     at_origin = x * x + y * y == 0
     return jnp.where(at_origin, 0.0, jnp.arctan2(y, jnp.where(at_origin, 1.0, x)))
@@ -107,7 +124,7 @@ def conjugate(q: Array) -> Array:
 def matrix(q: Array) -> Array:
     """Return the rotation matrix of a unit quaternion, body to world. (..., 3, 3)
 
-    A step turns several vectors by the same attitude, so its nine numbers are worth having.
+    Several vectors of a step are rotated by the same attitude, so the matrix pays off.
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     x2, y2, z2 = 2 * x, 2 * y, 2 * z
@@ -120,14 +137,14 @@ def matrix(q: Array) -> Array:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def rotate(q: Array, v: Array) -> Array:
-    """Return a body vector in the world frame, ``R(q) v``. (..., 3)"""
-    return matvec(matrix(q), v)
+def rotate(q: Array, v: Array, offset: Array | None = None) -> Array:
+    """Return a body vector in the world frame, ``R(q) v``, plus an offset. (..., 3)"""
+    return matvec(matrix(q), v, offset)
 
 
-def rotate_inverse(q: Array, v: Array) -> Array:
-    """Return a world vector in the body frame, ``R(q)^T v``. (..., 3)"""
-    return matvec(jnp.swapaxes(matrix(q), -1, -2), v)
+def rotate_inverse(q: Array, v: Array, offset: Array | None = None) -> Array:
+    """Return a world vector in the body frame, ``R(q)^T v``, plus an offset. (..., 3)"""
+    return matvec(jnp.swapaxes(matrix(q), -1, -2), v, offset)
 
 
 def z_axis(q: Array) -> Array:
@@ -135,22 +152,40 @@ def z_axis(q: Array) -> Array:
     return matrix(q)[..., 2]
 
 
-def turn(q: Array, rotvec: Array, normalize: bool = True) -> Array:
-    """Return the attitude after a turn about a body axis by less than half a revolution. (..., 4)
+def turn(q: Array, ang_vel: Array, dt: float, normalize: bool = True) -> Array:
+    """Return the attitude after a rotation with a constant angular velocity, for small angles. (..., 4)
 
-    The turn of one physics step: polynomials of sine and cosine take the place of functions that cost more than
-    the whole rest of the step. Up to ``|rotvec| = pi`` they are exact to rounding: the first term left out is
-    (pi/2)^14 / 14! = 6e-9 in float32 and (pi/2)^22 / 22! = 2e-17 in float64. Renormalising keeps rounding from
-    adding up; an attitude that is used once can do without.
+    The result is ``q (sin(h) ang_vel / |ang_vel|, cos(h))`` with half the angle ``h = |ang_vel| dt / 2``, to rounding
+    up to half a revolution. ``jnp.sin`` and ``jnp.cos`` would cost more than the rest of a physics step. A result that
+    is normalised needs their ratio only, which is that of imaginary and real part of the Pade approximation of
+    ``exp(2ih)``. Otherwise both are Taylor polynomials.
+
+    Args:
+        q: Attitude, body to world, unit, xyzw. (..., 4)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        dt: Duration, s.
+        normalize: True to scale the result to unit length, which keeps rounding errors from accumulating. An attitude
+            that is used once, as in the stages of a Runge-Kutta step, can do without.
     """
-    s = 0.25 * dot(rotvec, rotvec)
-    n_terms = 6 if s.dtype == jnp.float32 else 10
-    sinc = cos = 0.0
-    for n in range(n_terms, -1, -1):  # Horner: every term is one multiply-add
-        sinc = sinc * s + (-1) ** n / math.factorial(2 * n + 1)
-        cos = cos * s + (-1) ** n / math.factorial(2 * n)
-    turned = multiply(q, jnp.concatenate([0.5 * sinc * rotvec, cos], axis=-1))
+    is_float32 = ang_vel.dtype == jnp.float32
+    if normalize:
+        order = 6 if is_float32 else 11
+        coefficients = [2**n * math.comb(order, n) / math.perm(2 * order, n) for n in range(order + 1)]
+    else:
+        coefficients = [1 / math.factorial(n) for n in range(14 if is_float32 else 22)]
+    signed = [(-1) ** (n // 2) * c * (dt / 2) ** n for n, c in enumerate(coefficients)]
+    square = dot(ang_vel, ang_vel)
+    step = jnp.concatenate([_polynomial(square, signed[1::2]) * ang_vel, _polynomial(square, signed[::2])], axis=-1)
+    turned = multiply(q, step)
     return turned * lax.rsqrt(dot(turned, turned)) if normalize else turned
+
+
+def _polynomial(x: Array, coefficients: list[float]) -> Array:
+    """Return the polynomial with these coefficients, constant term first. (...)"""
+    value = jnp.full_like(x, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):  # Horner: one multiply-add for each
+        value = value * x + coefficient
+    return value
 
 
 def from_rpy(rpy: Array) -> Array:
@@ -173,8 +208,8 @@ def from_rpy(rpy: Array) -> Array:
 def to_rpy(q: Array) -> Array:
     """Return roll, pitch, yaw in rad, pitch in [-pi/2, pi/2]. (..., 4) -> (..., 3)
 
-    At a pitch of exactly 90 degrees roll and yaw are not defined on their own; zero is returned for an
-    angle whose sine and cosine both vanish.
+    At a pitch of exactly 90 degrees roll and yaw are not unique; zero is returned for an angle whose sine and cosine
+    both vanish.
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     r00, r10 = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
@@ -186,13 +221,13 @@ def to_rpy(q: Array) -> Array:
 
 
 def yaw(q: Array) -> Array:
-    """Return the yaw angle of a quaternion of any length, rad; the zero quaternion has yaw zero. (...)"""
+    """Return the yaw angle of a quaternion of any length, rad; zero for the zero quaternion. (...)"""
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     return safe_arctan2(2 * (x * y + w * z), x * x + w * w - y * y - z * z)
 
 
 def from_axes(x: Array, y: Array, z: Array) -> Array:
-    """Return roll, pitch, yaw of the frame with these orthonormal axes, rad. (..., 3)"""
+    """Return roll, pitch, yaw of the frame with these orthonormal axes in the world frame, rad. (..., 3)"""
     cos_pitch = safe_norm(jnp.stack([x[..., 0], x[..., 1]], axis=-1))[..., 0]
     return jnp.stack(
         [

@@ -1,4 +1,4 @@
-"""Small helpers for code around a simulation, under the names that users of Crazyflow know."""
+"""Small helpers for code around a simulation, under the names of Crazyflow."""
 
 from __future__ import annotations
 
@@ -6,37 +6,69 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import grid_2d
-from crazysim.pytree import PyTree, select_worlds
+from crazysim.pytree import CORE_NDIM_KEY, PER_WORLD, PyTree, scopes, select_worlds
 
-__all__ = ["enable_cache", "grid_2d", "leaf_replace"]
+__all__ = ["CORE_NDIM_KEY", "enable_cache", "grid_2d", "leaf_replace", "pytree_replace", "world_mask"]
 
 Record = TypeVar("Record", bound=PyTree)
+Tree = TypeVar("Tree")
 
 
 def leaf_replace(record: Record, mask: Array | None = None, **changes: Array) -> Record:
-    """Return a copy of a record with fields exchanged in the worlds of a mask.
+    """Return a copy of a record with fields replaced in the worlds of a mask.
 
     Args:
-        record: Any record whose named fields begin with an axis of worlds, or broadcast to one.
-        mask: Which worlds; None for all. (n_worlds,)
+        record: Record whose named fields begin with an axis over worlds, or broadcast to one.
+        mask: True in the worlds to change; None for all. (n_worlds,)
         **changes: New values. (n_worlds, ...)
     """
     return record.replace(**{name: select_worlds(mask, new, getattr(record, name)) for name, new in changes.items()})
 
 
-def enable_cache(path: str | Path | None = None, **settings: Any) -> Path:
-    """Keep compiled programs on disk from now on, and return where: what was compiled once starts at once.
+def world_mask(tree: Tree) -> Tree:
+    """Return the tree with True in place of every leaf that has an axis over worlds, False in place of others."""
+    return jax.tree.map(lambda scope: scope in PER_WORLD, scopes(tree))
+
+
+def pytree_replace(tree: Tree, new_tree: Tree, batched: Any, mask: Array | None = None) -> Tree:
+    """Return a tree whose batched leaves are those of another tree in the worlds of a mask.
 
     Args:
-        path: Folder; by default ``crazysim/jax`` in the user's cache folder.
-        **settings: Further settings of JAX whose names begin with ``jax_persistent_cache_``, without that part.
+        tree: Tree to change.
+        new_tree: Tree of the same structure with the new values.
+        batched: Tree of bools, True for the leaves to replace, such as ``world_mask`` returns.
+        mask: True in the worlds to change; None for all. (n_worlds,)
     """
-    path = Path.home() / ".cache" / "crazysim" / "jax" if path is None else Path(path)
-    settings = {"min_entry_size_bytes": -1, "min_compile_time_secs": 0.0} | settings
+    return jax.tree.map(
+        lambda old, new, is_batched: select_worlds(mask, jnp.asarray(new), old) if is_batched else old,
+        tree,
+        new_tree,
+        batched,
+    )
+
+
+def enable_cache(
+    cache_path: str | Path | None = None,
+    min_entry_size_bytes: int = -1,
+    min_compile_time_secs: float = 0.0,
+    enable_xla_caches: bool = False,
+) -> Path:
+    """Keep compiled programs on disk from now on, and return the folder.
+
+    Args:
+        cache_path: Folder; None for ``crazysim/jax`` in the user's cache folder.
+        min_entry_size_bytes: Smallest program to keep; -1 for all.
+        min_compile_time_secs: Shortest compilation whose program is kept, s.
+        enable_xla_caches: True to let XLA keep files of its own beside JAX's.
+    """
+    path = Path.home() / ".cache" / "crazysim" / "jax" if cache_path is None else Path(cache_path)
     jax.config.update("jax_compilation_cache_dir", str(path))
-    for name, value in settings.items():
-        jax.config.update(f"jax_persistent_cache_{name}", value)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", min_entry_size_bytes)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", min_compile_time_secs)
+    if enable_xla_caches:
+        jax.config.update("jax_persistent_cache_enable_xla_caches", "all")
     return path

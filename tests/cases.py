@@ -1,4 +1,4 @@
-"""What several tests share: pairs of dynamics and command level, commands that hover, random vectors, scenes."""
+"""Helpers shared by tests: pairs of dynamics and command level, hover commands, random vectors, scenes."""
 
 import functools
 
@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from crazysim import Sim, load_airframe
 from crazysim.core import functional as F
+from crazysim.core.data import SimControls, create_params
 from crazysim.dynamics import first_principles
 
 FITTED = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
@@ -33,7 +34,7 @@ BOX = """
 ABOVE = 2.0
 """Height of the cameras of the plain scene, m."""
 FOVY = 45.0
-"""What they see from top to bottom, degrees."""
+"""Vertical fields of view, degrees."""
 PLAIN_SCENE = f"""
 <mujoco>
   <statistic center="0 0 0.5" extent="2"/>
@@ -88,6 +89,23 @@ def with_params(data, **changes):
     return data.replace(params=data.params.replace(**{k: jnp.asarray(v) for k, v in changes.items()}))
 
 
+def with_airframes(sim, airframes):
+    """Return the data with the parameters and gains of one airframe in each world, of as many rotors as the sim's."""
+
+    def stacked(shared):
+        return jax.tree.map(lambda *x: jnp.stack(x)[:, None], *shared)
+
+    params = stacked([create_params(sim.dynamics, airframe) for airframe in airframes])
+    each = [SimControls.create(1, 1, sim.control, sim.dynamics, a, sim.configuration.control_freqs) for a in airframes]
+    controls = sim.data.controls
+    for name in ("state", "attitude", "body_rate", "force_torque"):
+        ctrl = getattr(controls, name)
+        if ctrl is not None and ctrl.params is not None:
+            own = stacked([getattr(c, name).params for c in each])
+            controls = controls.replace(**{name: ctrl.replace(params=own)})
+    return sim.data.replace(params=params, controls=controls)
+
+
 def weight(data):
     """Return the weight of a drone whose parameters are shared, N."""
     return float(data.params.mass[0]) * 9.81
@@ -119,7 +137,7 @@ def hover_command(data, pos=(0.0, 0.0, 1.0)):
 
 
 def zero_thrust_command(data):
-    """Return the command of one drone that asks for no thrust at all. (k,)
+    """Return the command of one drone for zero thrust. (k,)
 
     For the state level that is a fall with the gravity that the controller believes in, at the place where the drone
     is anyway; for all others the thrust itself.

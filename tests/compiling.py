@@ -1,10 +1,10 @@
-"""How tests compile: without optimising, which takes half the time."""
+"""Compiler options of the tests: without optimisation, which takes half the time."""
 
 from collections.abc import Mapping
 from importlib.metadata import version
 
 HAS_EMITTERS = version("jaxlib").startswith("0.10.")
-"""Whether XLA lets one choose how loops are fused; later ones know one way only, and refuse to be asked."""
+"""True where XLA has an option for the fusion of loops; later versions refuse it."""
 
 
 def options(emitters: bool = False) -> dict[str, bool | int]:

@@ -145,7 +145,7 @@ def test_parameters_are_an_input():
     compare(sim, step, with_fields(data, changes))
 
 
-def test_constants_are_those_of_the_drone_that_was_asked_for():
+def test_constants_are_those_of_the_selected_drone():
     sim = Sim(2, 2, control="rotor_vel", engine="plain")
     mass = jnp.asarray([[0.03, 0.04], [0.05, 0.06]])[..., None]
     sim.data = with_fields(sim.data, {"params.mass": mass})
@@ -210,16 +210,16 @@ def test_a_stage_of_all_drones_of_a_world_is_named():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"parameters": ["mass"]}, "'mass' is no parameter.*params.mass"),
-        ({"parameters": ["states.pos"]}, "'states.pos' is no parameter"),
-        ({"parameters": ["controls.rotor_vel"]}, "'controls.rotor_vel' is no parameter"),
-        ({"parameters": "params.mass"}, "a list of different names"),
-        ({"parameters": ["params.mass", "params.mass"]}, "a list of different names"),
-        ({"world": 1}, "no drone 0 of world 1"),
-        ({"drone": -1}, "no drone -1 of world 0"),
+        ({"parameters": ["mass"]}, "got 'mass'; use one of .*params.mass"),
+        ({"parameters": ["states.pos"]}, "got 'states.pos'"),
+        ({"parameters": ["controls.rotor_vel"]}, "got 'controls.rotor_vel'"),
+        ({"parameters": "params.mass"}, "a list of distinct names"),
+        ({"parameters": ["params.mass", "params.mass"]}, "a list of distinct names"),
+        ({"world": 1}, "got world 1 and drone 0"),
+        ({"drone": -1}, "got world 0 and drone -1"),
     ],
 )
-def test_wrong_input_is_told(options, words):
+def test_wrong_input_is_an_error(options, words):
     with pytest.raises(ValueError, match=words):
         to_casadi(Sim(control="rotor_vel"), **options)
 

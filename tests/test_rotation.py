@@ -60,8 +60,10 @@ def test_rotations_act_on_vectors(p, q, v):
 
 @given(q=unit_quats, rotvec=vectors(3, np.pi / np.sqrt(3)))
 def test_turn_is_a_rotation_about_a_body_axis(q, rotvec):
-    """Up to half a revolution the polynomial is exact: the term it leaves out is 2e-17."""
-    out = rot.turn(jnp.asarray(q), jnp.asarray(rotvec))
+    """Up to half a revolution the approximations are exact to rounding, normalised or not, whatever the duration."""
+    out = rot.turn(jnp.asarray(q), jnp.asarray(rotvec) * 500, 1 / 500)
+    bare = rot.turn(jnp.asarray(q), jnp.asarray(rotvec), 1.0, normalize=False)
+    np.testing.assert_allclose(bare, out, rtol=0, atol=1e-15)
     angle = np.linalg.norm(rotvec)
     by_hand = np.array([*(0.5 * rotvec * np.sinc(angle / 2 / np.pi)), np.cos(angle / 2)])
     np.testing.assert_allclose(out, rot.multiply(q, by_hand), rtol=0, atol=1e-15)
@@ -70,8 +72,17 @@ def test_turn_is_a_rotation_about_a_body_axis(q, rotvec):
 
 
 def test_turn_renormalises():
-    out = rot.turn(jnp.array([0.0, 0.0, 0.0, 1.01]), jnp.array([0.1, 0.2, 0.3]))
+    out = rot.turn(jnp.array([0.0, 0.0, 0.0, 1.01]), jnp.array([0.1, 0.2, 0.3]), 1.0)
     np.testing.assert_allclose(jnp.linalg.norm(out), 1.0, rtol=1e-15)
+
+
+@given(v=vectors(), w=vectors(), offset=vectors())
+def test_offsets_are_added(v, w, offset):
+    q = np.array([0.1, -0.5, 0.7, 0.5])
+    np.testing.assert_allclose(rot.add_cross(offset, v, w), offset + np.cross(v, w), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(rot.rotate(q, v, offset), rot.rotate(q, v) + offset, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(rot.rotate_inverse(q, v, offset), rot.rotate_inverse(q, v) + offset, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(rot.along_z(v), np.stack([0 * v, 0 * v, v], axis=-1))
 
 
 @given(roll=angles, pitch=st.floats(-1.57, 1.57), yaw=angles)
@@ -153,4 +164,4 @@ def test_law_07_jacobians_are_finite_for_tiny_rotations(tiny, dtype):
     np.testing.assert_allclose(JACOBIANS["from_rpy"](jnp.full(3, tiny, dtype))[:3], 0.5 * np.eye(3), rtol=0, atol=1e-3)
     quat = jnp.array([0.0, 0.0, 0.0, 1.0], dtype)
     for argnum in (0, 1):
-        assert np.all(np.isfinite(jax.jacobian(rot.turn, argnum)(quat, jnp.full(3, tiny, dtype))))
+        assert np.all(np.isfinite(jax.jacobian(rot.turn, argnum)(quat, jnp.full(3, tiny, dtype), 1.0)))

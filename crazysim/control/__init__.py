@@ -1,8 +1,9 @@
-"""The cascade of the Crazyflie firmware, outermost first, for one drone with any leading axes."""
+"""Control cascade of the Crazyflie firmware: pure functions for one drone, with any leading axes."""
 
 from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
 from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque
 from crazysim.control.core import COMMAND_FIELDS, Control, command_size
+from crazysim.control.parameters import load_fn_params, load_params
 from crazysim.control.state import StateParams, state2attitude
 
 __all__ = [
@@ -15,5 +16,7 @@ __all__ = [
     "body_rate2force_torque",
     "command_size",
     "force_torque2rotor_vel",
+    "load_fn_params",
+    "load_params",
     "state2attitude",
 ]

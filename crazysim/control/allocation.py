@@ -1,4 +1,4 @@
-"""The last step of the cascade: from a wrench to rotor speeds."""
+"""Allocation, the last step of the cascade: wrench to rotor speeds."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from crazysim.rotation import matvec, safe_clip
 
 
 class AllocationParams(PyTree):
-    """Constants of the allocation; each is shared, or has one value per drone."""
+    """Parameters of the allocation, each shared or one per drone."""
 
     thrust_min: Array = leaf("parameter", 1)
-    """Least thrust of a rotor that turns at all, N. (1,)"""
+    """Minimum thrust of a rotor that is on, N. (1,)"""
     thrust_max: Array = leaf("parameter", 1)
-    """Largest thrust of one rotor, N. (1,)"""
+    """Maximum thrust of one rotor, N. (1,)"""
     arms: Array = leaf("parameter", 1)
-    """Torque per thrust about x, y (arm) and z (drag torque over thrust), m. (3,)"""
+    """Torque per thrust about x and y (arm) and z (drag torque over thrust), m. (3,)"""
     rpm2thrust: Array = leaf("parameter", 2)
-    """Thrust curve the controller believes in, N, N/rpm, N/rpm^2. (1, 3)"""
+    """Thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
     allocation_matrix: Array = leaf("parameter", 2)
-    """Wrench over the arms to rotor thrusts, 1. (n_rotors, 4)"""
+    """Allocation matrix, wrench over the arms to rotor thrusts, 1. (n_rotors, 4)"""
 
     @staticmethod
     def create(airframe: Airframe) -> AllocationParams:
@@ -45,14 +45,14 @@ class AllocationParams(PyTree):
 
 
 def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
-    """Return the rotor speeds that give a wrench, each within its limits.
+    """Return the rotor speeds that produce a wrench, each within its limits.
 
-    Thrusts are shared out with the least-norm inverse of the mixing matrix and clipped one by one, as the
-    firmware's power distribution does. A collective thrust of zero or less stops the motors.
+    The wrench is allocated with the least-norm inverse of the mixing matrix, and each thrust is clipped on its own, as
+    in the firmware's power distribution. A collective thrust of zero or less switches the motors off.
 
     Args:
         cmd: Collective thrust, N, and body torque, N m. (..., 4)
-        params: Constants, shared or with the leading axes of the command.
+        params: Parameters, shared or with the leading axes of the command.
 
     Returns:
         Rotor speeds, rpm. (..., n_rotors)
@@ -61,4 +61,4 @@ def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
     force = cmd[..., :1]
     thrusts = matvec(p.allocation_matrix, jnp.concatenate([force, cmd[..., 1:] / p.arms], axis=-1))
     rotor_vel = rotor_vel_of_thrust(safe_clip(thrusts, p.thrust_min, p.thrust_max), p.rpm2thrust)
-    return jnp.where(force <= 0, 0.0, rotor_vel)  # NaN must come through, to be flagged
+    return jnp.where(force <= 0, 0.0, rotor_vel)  # NaN passes through, so that it is flagged

@@ -1,9 +1,9 @@
-"""The inner loop: from an attitude or body rates and a thrust to a wrench."""
+"""Inner loop of the cascade: attitude or body rates and thrust to a wrench."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from crazysim import rotation
 from crazysim.control.core import allocation_matrix
@@ -13,7 +13,7 @@ from crazysim.rotation import matvec
 
 
 class AttitudeParams(PyTree):
-    """Gains and constants of the attitude and body-rate controllers; each is shared, or one per drone."""
+    """Gains and parameters of the attitude and body-rate controllers, each shared or one per drone."""
 
     kR: Array = leaf("parameter", 1)
     """Gain on the rotation error, PWM. (3,)"""
@@ -28,17 +28,17 @@ class AttitudeParams(PyTree):
     torque_pwm_max: Array = leaf("parameter", 1)
     """Limit of the torque command, PWM. (3,)"""
     thrust_max: Array = leaf("parameter", 1)
-    """Largest thrust of one rotor, N. (1,)"""
+    """Maximum thrust of one rotor, N. (1,)"""
     pwm_min: Array = leaf("parameter", 1)
-    """Least PWM of a rotor that turns at all, PWM. (1,)"""
+    """Minimum PWM of a rotor that is on, PWM. (1,)"""
     pwm_max: Array = leaf("parameter", 1)
-    """Largest PWM, PWM. (1,)"""
+    """Maximum PWM, PWM. (1,)"""
     arms: Array = leaf("parameter", 1)
-    """Torque per thrust about x, y (arm) and z (drag torque over thrust), m. (3,)"""
+    """Torque per thrust about x and y (arm) and z (drag torque over thrust), m. (3,)"""
     mixing_matrix: Array = leaf("parameter", 2)
-    """Rotor thrusts to torque over the arms, 1. (3, n_rotors)"""
+    """Mixing matrix, rotor thrusts to torque over the arms, 1. (3, n_rotors)"""
     torque_allocation: Array = leaf("parameter", 2)
-    """Torque commands to PWM of each rotor, with the firmware's halves for roll and pitch, 1. (n_rotors, 3)"""
+    """Torque commands to PWM of each rotor, with the firmware's factor 1/2 for roll and pitch, 1. (n_rotors, 3)"""
 
     @staticmethod
     def create(airframe: Airframe) -> AttitudeParams:
@@ -49,7 +49,7 @@ class AttitudeParams(PyTree):
         """
         yaw_arm = airframe.value("controller.thrust2torque", ())
         # The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the
-        # least-norm share of a quadrotor in X. The same factors serve any other layout.
+        # least-norm allocation of a quadrotor in X. Other layouts get the same factors.
         allocation = allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0]
         gain = {
             key: as_parameter(airframe.value(f"controller.attitude.{key}", (3,)))
@@ -79,19 +79,19 @@ def attitude2force_torque(
     *,
     params: AttitudeParams,
 ) -> tuple[Array, Array]:
-    """Return the wrench that turns the drone to an attitude, and the new integral.
+    """Return the wrench that rotates the drone to an attitude, and the new integral.
 
-    The attitude part of the controller of Mellinger and Kumar (2011, eq. 10 to 13) as the Crazyflie firmware
-    has it: without the factor one half on the rotation error, with a derivative on the rates, in PWM units
-    that saturate torque by torque and rotor by rotor. A thrust of zero or less stops the motors.
+    The attitude part of the controller of Mellinger and Kumar (2011, eq. 10 to 13) as in the Crazyflie firmware:
+    without the factor one half on the rotation error, with a derivative on the rates, and in PWM units that saturate
+    per torque and per rotor. A thrust of zero or less switches the motors off.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
-        cmd: Wanted roll, pitch, yaw, rad, and collective thrust, N. (..., 4)
-        ang_vel_des: Wanted body rates, rad/s. (..., 3)
+        cmd: Desired roll, pitch, yaw, rad, and collective thrust, N. (..., 4)
+        ang_vel_des: Desired body rates, rad/s. (..., 3)
         prev_ang_vel: Angular velocity at the previous tick, rad/s. (..., 3)
-        prev_ang_vel_des: Wanted body rates at the previous tick, rad/s. (..., 3)
+        prev_ang_vel_des: Desired body rates at the previous tick, rad/s. (..., 3)
         r_int_error: Integral of the rotation error, rad s. (..., 3)
         ctrl_freq: Rate of this controller, Hz.
         params: Gains, shared or with the leading axes of the state.
@@ -100,9 +100,8 @@ def attitude2force_torque(
         Collective thrust, N, and body torque, N m (..., 4); the new integral, rad s (..., 3).
     """
     p = params
-    # Without the barrier XLA computes the six sines and cosines anew for every number that uses them.
-    wanted = lax.optimization_barrier(rotation.from_rpy(cmd[..., :3]))
-    error = rotation.multiply(rotation.conjugate(wanted), quat)
+    desired = rotation.from_rpy(cmd[..., :3])
+    error = rotation.multiply(rotation.conjugate(desired), quat)
     rotation_error = 4 * error[..., 3:] * error[..., :3]  # vee(Rd^T R - R^T Rd)
     rate_error_dot = ((ang_vel_des - prev_ang_vel_des) - (ang_vel - prev_ang_vel)) * ctrl_freq
     r_int_error = rotation.safe_clip(r_int_error - rotation_error / ctrl_freq, -p.int_err_max, p.int_err_max)
@@ -133,13 +132,13 @@ def body_rate2force_torque(
 ) -> tuple[Array, Array]:
     """Return the wrench that follows body rates, and the new integral.
 
-    The firmware has no controller of its own for rates: a rate setpoint enters the attitude controller,
-    which meanwhile levels the drone at its present yaw. Set ``kR`` and ``ki_m`` to zero to follow rates alone.
+    The firmware has no separate rate controller: a rate setpoint enters the attitude controller, which also levels the
+    drone at its present yaw. Set ``kR`` and ``ki_m`` to zero to follow rates only.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
-        cmd: Wanted body rates, rad/s, and collective thrust, N. (..., 4)
+        cmd: Desired body rates, rad/s, and collective thrust, N. (..., 4)
         prev_ang_vel: Angular velocity at the previous tick, rad/s. (..., 3)
         prev_cmd: Command of the previous tick. (..., 4)
         r_int_error: Integral of the rotation error, rad s. (..., 3)

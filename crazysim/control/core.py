@@ -1,4 +1,4 @@
-"""The command levels of the cascade, and what a drone knows of its own rotors."""
+"""Command levels of the control cascade, and the allocation matrix."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from crazysim.drones import Airframe
 
 
 class Control(StrEnum):
-    """Command level: what the user commands; everything below runs on board."""
+    """Command level: the input of the cascade. The levels below it are simulated."""
 
     state = "state"
-    """Position, velocity, acceleration, quaternion (of which yaw counts) and body rates: 16 numbers."""
+    """Position, velocity, acceleration, quaternion (only its yaw is used) and body rates: 16 numbers."""
     attitude = "attitude"
     """Roll, pitch, yaw, rad, and collective thrust, N."""
     body_rate = "body_rate"
@@ -32,19 +32,19 @@ COMMAND_FIELDS = {
     Control.force_torque: "collective thrust [N], tx, ty, tz [N m]",
     Control.rotor_vel: "one rotor speed each [rpm]",
 }
-"""What the numbers of a command are, for messages and docs."""
+"""Entries of a command of each level with their units, for messages and docs."""
 
 
 def command_size(control: Control, n_rotors: int) -> int:
-    """Return how many numbers a command of one drone has."""
+    """Return the number of entries of one drone's command."""
     return {Control.state: 16, Control.rotor_vel: n_rotors}.get(control, 4)
 
 
 def allocation_matrix(airframe: Airframe) -> np.ndarray:
-    """Return the least-norm inverse of thrusts to (collective, torque signs), 1. (n_rotors, 4)
+    """Return the least-norm allocation of collective thrust and torque over the arms to rotor thrusts. (n_rotors, 4)
 
-    For a quadrotor in X this is each rotor's signs over four; for any other layout the pseudoinverse, which
-    shares a wrench out with the smallest thrusts.
+    The pseudoinverse of the mixing matrix with a row of ones. For a quadrotor in X these are the signs of each rotor
+    over four.
     """
     mixing = airframe.mixing_matrix
     return np.linalg.pinv(np.vstack([np.ones(mixing.shape[1]), mixing]))

@@ -1,9 +1,9 @@
-"""The outer loop: from a full-state setpoint to an attitude and a collective thrust."""
+"""Outer loop of the cascade: full-state setpoint to attitude and collective thrust."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from crazysim import rotation
 from crazysim.drones import Airframe
@@ -11,10 +11,10 @@ from crazysim.pytree import PyTree, as_parameter, leaf
 
 
 class StateParams(PyTree):
-    """Gains and constants of the state controller; each is shared, or has one value per drone."""
+    """Gains and parameters of the state controller, each shared or one per drone."""
 
     mass: Array = leaf("parameter", 1, (1,))
-    """Mass the controller believes in, kg. (1,)"""
+    """Mass that the controller assumes, kg. (1,)"""
     kp: Array = leaf("parameter", 1)
     """Gain on position, N/m. (3,)"""
     kd: Array = leaf("parameter", 1)
@@ -22,9 +22,9 @@ class StateParams(PyTree):
     ki: Array = leaf("parameter", 1)
     """Gain on the integral of position, N/(m s). (3,)"""
     gravity_vec: Array = leaf("parameter", 1)
-    """Gravitational acceleration the controller believes in, world frame, m/s^2. (3,)"""
+    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
     thrust_scale: Array = leaf("parameter", 1, (1,))
-    """Thrust that comes out for one newton wanted: the firmware's mass_thrust does not fit its mass, 1. (1,)"""
+    """Actual over desired thrust, 1: the firmware's mass_thrust does not match its mass. (1,)"""
     int_err_max: Array = leaf("parameter", 1)
     """Limit of the integral of position, m s. (3,)"""
 
@@ -60,11 +60,11 @@ def state2attitude(
     *,
     params: StateParams,
 ) -> tuple[Array, Array]:
-    """Return the attitude and thrust that lead to a full-state setpoint, and the new integral.
+    """Return the attitude and thrust that track a full-state setpoint, and the new integral.
 
-    The position part of the controller of Mellinger and Kumar (2011, eq. 6 to 9) as the Crazyflie firmware
-    has it: a force that corrects position, velocity and their integral, a body z axis along it, and the x
-    axis that the wanted yaw leaves. A zero quaternion in the setpoint means yaw zero.
+    The position part of the controller of Mellinger and Kumar (2011, eq. 6 to 9) as in the Crazyflie firmware: a force
+    that corrects position, velocity and the integral of position, a body z axis along that force, and the x axis
+    closest to the desired yaw. A zero quaternion in the setpoint means zero yaw.
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -84,13 +84,10 @@ def state2attitude(
     force = p.mass * (cmd[..., 6:9] - p.gravity_vec) + p.kp * pos_err + p.kd * vel_err + p.ki * pos_err_i
 
     yaw = rotation.yaw(cmd[..., 9:13])
-    # The barriers keep XLA from computing angles and axes anew for every number that uses them.
-    cos, sin, force = lax.optimization_barrier((jnp.cos(yaw), jnp.sin(yaw), force))
-    zero = jnp.zeros_like(yaw)
+    cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
     ahead, left = jnp.stack([cos, sin, zero], axis=-1), jnp.stack([-sin, cos, zero], axis=-1)
     z_axis = rotation.safe_normalize(force, jnp.asarray([0.0, 0.0, 1.0], force.dtype))
     y_axis = rotation.safe_normalize(rotation.cross(z_axis, ahead), left)
-    y_axis, z_axis = lax.optimization_barrier((y_axis, z_axis))
     rpy = rotation.from_axes(rotation.cross(y_axis, z_axis), y_axis, z_axis)
 
     thrust = p.thrust_scale * rotation.dot(force, rotation.z_axis(quat))

@@ -1,4 +1,4 @@
-"""Everything a simulation knows, as records: states, controls, parameters, and what users add."""
+"""Records of a simulation: states, controls, parameters, core and plugins."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class SimState(PyTree):
     ang_vel: Array = leaf("drone", 1)
     """Angular velocity, body frame, rad/s. (n_worlds, n_drones, 3)"""
     force: Array = leaf("drone", 1)
-    """External force on the centre of mass, world frame, N; stays until it is changed. (n_worlds, n_drones, 3)"""
+    """External force on the centre of mass, world frame, N; kept until it is changed. (n_worlds, n_drones, 3)"""
     torque: Array = leaf("drone", 1)
-    """External torque, world frame, N m; stays until it is changed. (n_worlds, n_drones, 3)"""
+    """External torque, world frame, N m; kept until it is changed. (n_worlds, n_drones, 3)"""
     rotor_vel: Array = leaf("drone", 1)
     """Rotor speeds, rpm; in ``so_rpy_rotor*`` the collective thrust, N. (n_worlds, n_drones, n_rotors)"""
 
@@ -71,14 +71,28 @@ class SimStateDeriv(PyTree):
     plugins: dict[str, dict[str, Array]] = dataclasses.field(default_factory=dict)
     """Derivatives of plugins' own states, per second: by plugin, then by field of its record."""
 
+    @staticmethod
+    def create(n_worlds: int, n_drones: int, device: Any = None, n_rotors: int = 4) -> SimStateDeriv:
+        """Return zeros.
+
+        Args:
+            n_worlds: Number of worlds.
+            n_drones: Number of drones per world.
+            device: Device of the arrays; None for arrays of the host.
+            n_rotors: Number of rotors.
+        """
+        sizes = {"vel": 3, "ang_vel": 3, "acc": 3, "ang_acc": 3, "rotor_acc": n_rotors}
+        zeros = {name: of_host(0.0, n_worlds, n_drones, size) for name, size in sizes.items()}
+        return SimStateDeriv(**(zeros if device is None else jax.device_put(zeros, device)))
+
 
 class StateControlData(PyTree):
-    """Command and memory of the state controller."""
+    """Command and internal state of the state controller."""
 
     cmd: Array = leaf("drone", 1)
     """Setpoint in force: position, velocity, acceleration, quaternion, body rates. (n_worlds, n_drones, 16)"""
     staged_cmd: Array = leaf("drone", 1)
-    """Setpoint that the next tick takes over. (n_worlds, n_drones, 16)"""
+    """Setpoint that takes effect at the next tick. (n_worlds, n_drones, 16)"""
     freq: int = static()
     """Rate of the controller, Hz."""
     pos_err_i: Array = leaf("drone", 1)
@@ -88,18 +102,18 @@ class StateControlData(PyTree):
 
 
 class AttitudeControlData(PyTree):
-    """Command and memory of the attitude controller."""
+    """Command and internal state of the attitude controller."""
 
     cmd: Array = leaf("drone", 1)
     """Command in force: roll, pitch, yaw, rad, and collective thrust, N. (n_worlds, n_drones, 4)"""
     staged_cmd: Array = leaf("drone", 1)
-    """Command that the next tick takes over. (n_worlds, n_drones, 4)"""
+    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
     freq: int = static()
     """Rate of the controller, Hz."""
     ang_vel_des: Array | None = leaf("drone", 1)
-    """Wanted body rates in force, rad/s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
+    """Desired body rates in force, rad/s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
     staged_ang_vel_des: Array | None = leaf("drone", 1)
-    """Wanted body rates that the next tick takes over, rad/s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
+    """Desired body rates that take effect at the next tick, rad/s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
     r_int_error: Array | None = leaf("drone", 1)
     """Integral of the rotation error, rad s; None in fitted dynamics. (n_worlds, n_drones, 3)"""
     prev_ang_vel: Array | None = leaf("drone", 1)
@@ -109,12 +123,12 @@ class AttitudeControlData(PyTree):
 
 
 class BodyRateControlData(PyTree):
-    """Command and memory of the body-rate controller."""
+    """Command and internal state of the body-rate controller."""
 
     cmd: Array = leaf("drone", 1)
     """Command in force: body rates, rad/s, and collective thrust, N. (n_worlds, n_drones, 4)"""
     staged_cmd: Array = leaf("drone", 1)
-    """Command that the next tick takes over. (n_worlds, n_drones, 4)"""
+    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
     freq: int = static()
     """Rate of the controller, Hz."""
     r_int_error: Array = leaf("drone", 1)
@@ -131,7 +145,7 @@ class ForceTorqueControlData(PyTree):
     cmd: Array = leaf("drone", 1)
     """Command in force: collective thrust, N, and body torque, N m. (n_worlds, n_drones, 4)"""
     staged_cmd: Array = leaf("drone", 1)
-    """Command that the next tick takes over. (n_worlds, n_drones, 4)"""
+    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
     freq: int = static()
     """Rate of the allocation, Hz."""
     params: AllocationParams
@@ -139,7 +153,7 @@ class ForceTorqueControlData(PyTree):
 
 
 class SimControls(PyTree):
-    """The controllers in use; those that are not are None."""
+    """Controllers of a simulation; those not in use are None."""
 
     mode: Control = static()
     """Command level."""
@@ -166,7 +180,7 @@ class SimControls(PyTree):
         """Return controllers at rest, with the airframe's gains.
 
         Raises:
-            ConfigError: If the fitted dynamics, which have no rotors, are asked to take rotor commands.
+            ConfigError: If the dynamics do not support the command level.
         """
         shape = (n_worlds, n_drones)
         with_rotors = dynamics == Dynamics.first_principles
@@ -178,7 +192,7 @@ class SimControls(PyTree):
         state = attitude = body_rate = force_torque = rotor_vel = None
         if control == Control.state:
             cmd = of_host(np.eye(16)[12], *shape, 16)
-            # A copy, for two leaves that share a buffer cannot both be donated.
+            # A copy, because two leaves that share a buffer cannot both be donated.
             state = StateControlData(cmd, cmd.copy(), freqs[Control.state], zeros(3), StateParams.create(airframe))
         if control in (Control.state, Control.attitude):
             attitude = AttitudeControlData(
@@ -206,31 +220,31 @@ class SimCore(PyTree):
     """Time, sizes, seed and flags."""
 
     freq: int = static()
-    """Physics steps per second, Hz."""
+    """Rate of physics steps, Hz."""
     steps: Array = leaf("world")
-    """Physics steps since the world's last reset. (n_worlds, 1)"""
+    """Number of physics steps since the last reset of the world. (n_worlds, 1)"""
     episode: Array = leaf("world")
-    """How often the world has been reset; enters its random numbers. (n_worlds, 1)"""
+    """Number of resets of the world; enters its random numbers. (n_worlds, 1)"""
     nonfinite: Array = leaf("world")
-    """Whether the world has turned non-finite since its last reset. (n_worlds, 1)"""
+    """True where the world has become non-finite since its last reset. (n_worlds, 1)"""
     n_worlds: int = static()
     """Number of worlds."""
     n_drones: int = static()
     """Number of drones per world."""
     world_id: Array = leaf("world")
-    """Number of the world; enters its random numbers. (n_worlds, 1)"""
+    """Index of the world; enters its random numbers. (n_worlds, 1)"""
     drone_id: Array = leaf("drone")
-    """Number of the drone in its world; enters its random numbers. (n_worlds, n_drones)"""
+    """Index of the drone in its world; enters its random numbers. (n_worlds, n_drones)"""
     drone_mocap_ids: Array = leaf("shared", 1)
-    """MuJoCo mocap ids of the drones' bodies. (n_drones,)"""
+    """MuJoCo mocap ids of the bodies of the drones. (n_drones,)"""
     rng_key: Array = leaf("shared", 0)
-    """The seed's key; a reset leaves it alone. ()"""
+    """Random key of the seed; a reset does not change it. ()"""
     mjx_synced: Array = leaf("shared", 0)
-    """Whether this data is what the scene shows. ()"""
+    """True where the scene matches this data. ()"""
 
     @staticmethod
     def create(freq: int, n_worlds: int, n_drones: int, drone_mocap_ids: Any, rng_key: int | Array) -> SimCore:
-        """Return the core of a simulation that has not begun."""
+        """Return the core of a simulation before its first step."""
         return SimCore(
             freq=freq,
             steps=of_host(0, n_worlds, 1, dtype=np.int32),
@@ -247,36 +261,37 @@ class SimCore(PyTree):
 
 
 class Objects(PyTree):
-    """Movable objects of the scene: each world has them where it likes. ``sim.scene.add`` makes them."""
+    """Poses of the movable objects of the scene in every world; ``sim.scene.add`` creates them."""
 
     pos: Array = leaf("world", 2)
-    """Positions of their frames, world frame, m. (n_worlds, 1, n_objects, 3)"""
+    """Positions of the frames of the objects, world frame, m. (n_worlds, 1, n_objects, 3)"""
     quat: Array = leaf("world", 2)
     """Attitudes, body to world, unit, xyzw. (n_worlds, 1, n_objects, 4)"""
     vel: Array = leaf("world", 2)
-    """Velocities that contacts feel, world frame, m/s; they move nothing. (n_worlds, 1, n_objects, 3)"""
+    """Velocities that contact response uses, world frame, m/s; they do not move the objects.
+    (n_worlds, 1, n_objects, 3)"""
     mocap_ids: Array = leaf("shared", 1)
-    """MuJoCo mocap ids of their bodies. (n_objects,)"""
+    """MuJoCo mocap ids of the bodies of the objects. (n_objects,)"""
     names: tuple[str, ...] = static()
-    """Names of their bodies."""
+    """Names of the bodies of the objects."""
 
 
 class SimData(PyTree):
-    """The whole simulation: what a step takes and returns."""
+    """Complete data of a simulation, which a step takes and returns."""
 
     states: SimState
-    """Where the drones are and how they move."""
+    """Rigid-body and rotor state of the drones."""
     controls: SimControls
-    """What they were told."""
+    """Commands, internal states and gains of the controllers."""
     params: Any
-    """What they are: ``SimParams``, by the dynamics model."""
+    """Physical parameters of the drones; ``SimParams`` of the dynamics model."""
     core: SimCore
-    """When it is."""
+    """Time, sizes, seed and flags."""
     plugins: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Whatever stages of the user keep. Records (``PyTree``) declare the scope of their leaves and are reset with
-    their world; bare arrays are opaque, and no reset touches them."""
+    """Records of plugins and of user stages, by name. Records (``PyTree``) declare the scopes of their leaves and are
+    reset per world; bare arrays are opaque, and only full resets restore them."""
     objects: Objects | None = None
-    """Movable objects of the scene; None where there are none."""
+    """Movable objects of the scene; None if there are none."""
 
     @staticmethod
     def create(
@@ -290,7 +305,7 @@ class SimData(PyTree):
         drone_mocap_ids: Any,
         rng_key: int | Array,
     ) -> SimData:
-        """Return drones at rest that have not begun, without plugins; ``freqs`` are the controllers' rates, Hz."""
+        """Return data of drones at rest, without plugins; ``freqs`` are the rates of the controllers, Hz."""
         return SimData(
             states=SimState.create(n_worlds, n_drones, n_rotor_states(dynamics, airframe)),
             controls=SimControls.create(n_worlds, n_drones, control, dynamics, airframe, freqs),
@@ -300,12 +315,12 @@ class SimData(PyTree):
 
 
 def of_host(value: Any, *shape: int, dtype: Any = None) -> Any:
-    """Return a value repeated to a shape, as an array of the host: making it takes no compilation."""
+    """Return a value broadcast to a shape as a NumPy array, which needs no compilation."""
     return np.array(np.broadcast_to(value, shape), dtype or floating())
 
 
 def require_pair(dynamics: Dynamics, control: Control) -> None:
-    """Check that a command level exists in a dynamics model.
+    """Check that a dynamics model supports a command level.
 
     Raises:
         ConfigError: If it does not.
@@ -318,10 +333,10 @@ def require_pair(dynamics: Dynamics, control: Control) -> None:
 
 
 def create_params(dynamics: Dynamics, airframe: Airframe) -> SimParams:
-    """Return an airframe's shared parameters for a dynamics model.
+    """Return the shared parameters of an airframe for a dynamics model.
 
     Raises:
-        ConfigError: If the airframe has none for it.
+        ConfigError: If the airframe has no parameters for the model.
     """
     if dynamics == Dynamics.first_principles:
         return first_principles.Params.create(airframe)
@@ -329,7 +344,7 @@ def create_params(dynamics: Dynamics, airframe: Airframe) -> SimParams:
 
 
 def n_rotor_states(dynamics: Dynamics, airframe: Airframe) -> int:
-    """Return the length of ``states.rotor_vel``: one per rotor, or four for a fitted model, as its peer has it."""
+    """Return the length of ``states.rotor_vel``: one per rotor, or four for a fitted model, as in Crazyflow."""
     return airframe.n_rotors if dynamics == Dynamics.first_principles else 4
 
 
@@ -340,26 +355,26 @@ def command_shape(data: SimData, control: Control) -> tuple[int, int, int]:
 
 
 def as_key(seed: int | Array) -> Array:
-    """Return a typed random key from a seed, or a key as it is.
+    """Return the typed random key of a seed; a key is returned unchanged.
 
     Raises:
-        ConfigError: If it is neither.
+        ConfigError: If it is neither an integer nor a key.
     """
     dtype = getattr(seed, "dtype", np.dtype(int) if type(seed) is int else None)
     is_key = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
     is_integer = dtype is not None and jnp.issubdtype(dtype, jnp.integer)
     if np.shape(seed) != () or not (is_key or is_integer):
-        raise ConfigError(f"a seed is an integer, or one key as jax.random.key makes, got {seed!r}")
+        raise ConfigError(f"expected an integer or one key as seed, got {seed!r}; use an integer or jax.random.key(0)")
     try:
         return seed if is_key else jax.random.key(seed)  # type: ignore[return-value]
     except OverflowError as error:
-        raise ConfigError(f"the seed {seed} needs more than 64 bits; a smaller integer will do") from error
+        raise ConfigError(f"the seed {seed} needs more than 64 bits; use a smaller integer") from error
 
 
-def grid_2d(n: int, spacing: float = 1.0) -> np.ndarray:
+def grid_2d(n: int, spacing: float = 1.0, center: Any = (0.0, 0.0)) -> np.ndarray:
     """Return the ``n`` points of a square grid nearest to its centre, nearest first, m. (n, 2)"""
     side = math.isqrt(n - 1) + 1
     line = spacing * (np.arange(side) - (side - 1) / 2)
     x, y = np.meshgrid(line, line)
     points = np.stack([x.ravel(), y.ravel()], axis=-1)
-    return points[np.argsort(np.linalg.norm(points, axis=-1), kind="stable")[:n]]
+    return points[np.argsort(np.linalg.norm(points, axis=-1), kind="stable")[:n]] + np.asarray(center)

@@ -1,4 +1,4 @@
-"""What ``Sim`` does, as pure functions on ``SimData``: for use inside jit, vmap, grad and scan."""
+"""Operations of ``Sim`` as pure functions on ``SimData``, for use inside jit, vmap, grad and scan."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ def state_control(data: SimData, controls: Any, check_finite: bool = False) -> S
     """Stage a full-state setpoint for every drone.
 
     Args:
-        data: The simulation, built with ``control="state"``.
+        data: Data of a simulation built with ``control="state"``.
         controls: Position, velocity, acceleration, quaternion (xyzw), body rates. (n_worlds, n_drones, 16)
-        check_finite: Whether to look at device arrays too, which waits for the device; host input is always
-            looked at.
+        check_finite: True to check device arrays too, which waits for the device; host input is always checked.
 
     Raises:
         ValueError: Wrong shape, type or command level, or a NaN or infinite command.
@@ -92,7 +91,7 @@ def controllable(data: SimData) -> Array:
 
 
 def check_command(data: SimData, control: Control, command: Any, check_finite: bool = False) -> Array:
-    """Return a command as an array of the state's type, or say what is wrong with it.
+    """Return a command as an array of the state's dtype.
 
     Raises:
         ValueError: Wrong shape, type or command level, or a NaN or infinite command.
@@ -106,26 +105,26 @@ def check_command(data: SimData, control: Control, command: Any, check_finite: b
     try:
         array = np.asarray(command) if on_host else command
     except ValueError as error:
-        raise ValueError(f"{control.value} command is no regular array: {error}") from error
+        raise ValueError(f"expected the {control.value} command as a regular array, got {command!r}") from error
     shape = command_shape(data, control)
     if array.shape != shape:
         raise ValueError(
-            f"{control.value} command has shape {array.shape}; this simulation needs {shape} = "
+            f"{control.value} command has shape {array.shape}; expected {shape} = "
             f"(n_worlds, n_drones, {shape[-1]}): {COMMAND_FIELDS[control]}. "
             f"For one command to all drones use np.broadcast_to(cmd, {shape})."
         )
     if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise ValueError(f"{control.value} command has type {array.dtype}; needed are real numbers")
+        raise ValueError(f"expected real numbers as {control.value} command, got type {array.dtype}; use float32")
     dtype = data.states.pos.dtype
-    # Host input of any type reaches the device as one type and in one place: nothing is traced or compiled anew.
-    with np.errstate(over="ignore"):  # what is too large for the type becomes infinite, and is told as that below
+    # Host input of any type reaches the device with one dtype and placement, so nothing is traced or compiled again.
+    with np.errstate(over="ignore"):  # a number too large for the dtype becomes infinite, which is reported below
         array = array.astype(dtype)
     is_tracer = isinstance(array, jax.core.Tracer)
     if (on_host or (check_finite and not is_tracer)) and not np.all(np.isfinite(array)):
         worlds = np.unique(np.nonzero(~np.isfinite(np.asarray(array)))[0])[:8]
         raise ValueError(
-            f"{control.value} command is NaN or infinite in world(s) {worlds.tolist()}, as {dtype}; it would poison "
-            f"them until their next reset. Check the computation it comes from."
+            f"{control.value} command is NaN or infinite in world(s) {worlds.tolist()}, as {dtype}, which would last "
+            f"until their next reset; check the computation that returns it"
         )
     inside_jit = is_tracer or isinstance(data.states.pos, jax.core.Tracer)
     return jnp.asarray(array) if inside_jit else jax.device_put(array, data.states.pos.sharding)

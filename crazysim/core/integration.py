@@ -16,6 +16,13 @@ from crazysim.core.stage import Stage
 
 DerivFn = Callable[[SimData], SimStateDeriv]
 
+MAX_ROTATION = 1.0
+"""Largest rotation per step about a body axis, rad: angular velocities are limited to ``MAX_ROTATION * freq``.
+
+No model damps the rate that a constant torque builds up, so this limit does. It is 500 rad/s at 500 Hz. The range of a
+Crazyflie's gyroscope is 35 rad/s (2000 degrees per second; BMI088, data sheet).
+"""
+
 
 class Integrator(StrEnum):
     """Integration scheme."""
@@ -23,9 +30,9 @@ class Integrator(StrEnum):
     euler = "euler"
     """Explicit Euler, order 1: the fastest."""
     symplectic_euler = "symplectic_euler"
-    """Velocities first, then positions with the new ones, order 1: as fast, and keeps energy better."""
+    """Semi-implicit Euler, order 1: positions move with the new velocities. As fast, with less drift of energy."""
     rk4 = "rk4"
-    """Runge and Kutta, order 4; four derivatives a step."""
+    """Runge-Kutta, order 4: four derivatives per step."""
     default = euler
 
     @property
@@ -36,15 +43,15 @@ class Integrator(StrEnum):
 
 def euler(data: SimData, deriv_fn: DerivFn) -> SimData:
     """Return the data one explicit Euler step later."""
-    deriv, dt = deriv_fn(data), 1 / data.core.freq
-    return advance(data, deriv, dt, dt * deriv.ang_vel)
+    return apply_derivative(data, deriv_fn(data), 1 / data.core.freq)
 
 
 def symplectic_euler(data: SimData, deriv_fn: DerivFn) -> SimData:
     """Return the data one semi-implicit Euler step later: positions move with the new velocities."""
     deriv, dt = deriv_fn(data), 1 / data.core.freq
-    vel, ang_vel = deriv.vel + dt * deriv.acc, deriv.ang_vel + dt * deriv.ang_acc
-    return advance(data, deriv.replace(vel=vel), dt, dt * ang_vel)
+    vel = deriv.vel + dt * deriv.acc
+    ang_vel = limit_ang_vel(deriv.ang_vel + dt * deriv.ang_acc, data.core.freq)
+    return apply_derivative(data, deriv.replace(vel=vel, ang_vel=ang_vel), dt)
 
 
 def rk4(data: SimData, deriv_fn: DerivFn) -> SimData:
@@ -56,25 +63,32 @@ def rk4(data: SimData, deriv_fn: DerivFn) -> SimData:
     """
     dt = 1 / data.core.freq
     k1 = deriv_fn(data)
-    r1 = dt * k1.ang_vel
-    k2 = deriv_fn(advance(data, k1, dt / 2, r1 / 2, normalize=False))
-    r2 = dt * k2.ang_vel
-    k3 = deriv_fn(advance(data, k2, dt / 2, r2 / 2 + rotation.cross(r1, r2) / 8, normalize=False))
-    r3 = dt * k3.ang_vel
-    k4 = deriv_fn(advance(data, k3, dt, r3, normalize=False))
-    r4 = dt * k4.ang_vel
+    k2 = deriv_fn(apply_derivative(data, k1, dt / 2, final=False))
+    commutator = dt / 4 * rotation.cross(k1.ang_vel, k2.ang_vel)
+    k3 = deriv_fn(apply_derivative(data, k2.replace(ang_vel=k2.ang_vel + commutator), dt / 2, final=False))
+    k4 = deriv_fn(apply_derivative(data, k3, dt, final=False))
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-    return advance(data, mean, dt, dt * mean.ang_vel + rotation.cross(r1, r4) / 12)
+    commutator = dt / 12 * rotation.cross(k1.ang_vel, k4.ang_vel)
+    return apply_derivative(data, mean.replace(ang_vel=mean.ang_vel + commutator), dt)
 
 
-def advance(data: SimData, deriv: SimStateDeriv, dt: float, rotvec: Array, normalize: bool = True) -> SimData:
-    """Return the data ``dt`` seconds along a derivative, the attitude turned by a body rotation vector, rad."""
+def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, final: bool = True) -> SimData:
+    """Return the data ``dt`` seconds along a derivative.
+
+    Args:
+        data: Data at the start of the step.
+        deriv: Derivative of the states.
+        dt: Duration, s.
+        final: True for the end of a step, where quaternions are normalised and angular velocities limited; False for
+            its intermediate points.
+    """
     s = data.states
+    ang_vel = s.ang_vel + dt * deriv.ang_acc
     states = s.replace(
         pos=s.pos + dt * deriv.vel,
-        quat=rotation.turn(s.quat, rotvec, normalize),
+        quat=rotation.turn(s.quat, deriv.ang_vel, dt, normalize=final),
         vel=s.vel + dt * deriv.acc,
-        ang_vel=s.ang_vel + dt * deriv.ang_acc,
+        ang_vel=limit_ang_vel(ang_vel, data.core.freq) if final else ang_vel,
         rotor_vel=s.rotor_vel + dt * deriv.rotor_acc,
     )
     if not deriv.plugins:
@@ -84,6 +98,12 @@ def advance(data: SimData, deriv: SimStateDeriv, dt: float, rotvec: Array, norma
         record = data.plugins[name]
         moved[name] = record.replace(**{field: getattr(record, field) + dt * rate for field, rate in rates.items()})
     return data.replace(states=states, plugins=data.plugins | moved)
+
+
+def limit_ang_vel(ang_vel: Array, freq: int) -> Array:
+    """Return angular velocities limited to ``MAX_ROTATION`` per step about each axis, rad/s. (..., 3)"""
+    limit = MAX_ROTATION * freq
+    return rotation.safe_clip(ang_vel, -limit, limit)
 
 
 INTEGRATORS: dict[Integrator, Callable[..., SimData]] = {

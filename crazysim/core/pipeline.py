@@ -72,13 +72,13 @@ def remove_fn(pipeline: Pipeline, name: str) -> None:
 
 def _index(pipeline: Pipeline, name: str) -> int:
     if name not in pipeline:
-        raise UnknownNameError(f"No stage named {name!r} in the pipeline; its stages are {', '.join(pipeline)}")
+        raise UnknownNameError(f"No stage named {name!r} in the pipeline; use one of its stages: {', '.join(pipeline)}")
     return list(pipeline).index(name)
 
 
 def _insert(pipeline: Pipeline, index: int, fn: Callable[..., Any], name: str | None) -> None:
     if not callable(fn):
-        raise ValueError(f"a stage is a function, not {fn!r}")
+        raise ValueError(f"expected a stage as a function, got {fn!r}")
     name = name if name is not None else getattr(fn, "__name__", None)
     if name is None or name == "<lambda>":
         raise ValueError(f"{fn!r} has no name of its own and needs an explicit name; pass name=")

@@ -1,13 +1,14 @@
-"""Random numbers that depend on the seed, the world, the drone, the episode, the step and the stage's name.
+"""Random keys that depend on seed, world, drone, episode, step and the name of the stage.
 
-They do not depend on how many worlds there are, on how worlds are spread over devices, or on which other worlds are
-reset along.
+They do not depend on the number of worlds, on the distribution of worlds over devices, or on which other worlds are
+reset at the same time.
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from typing import Any
 
 import jax
 from jax import Array
@@ -15,17 +16,24 @@ from jax import Array
 from crazysim.core.data import SimData, as_key
 
 
-def seed_sim(data: SimData, seed: int | Array) -> SimData:
-    """Return the data with another seed, or key, for all random numbers drawn from now on."""
-    return data.replace(core=data.core.replace(rng_key=as_key(seed)))
+def seed_sim(data: SimData, seed: int | Array, device: Any = None) -> SimData:
+    """Return the data with another seed or key for all random numbers drawn from now on.
+
+    Args:
+        data: Data of the simulation.
+        seed: Seed or key.
+        device: Device of the key; None for the default device.
+    """
+    key = as_key(seed)
+    return data.replace(core=data.core.replace(rng_key=key if device is None else jax.device_put(key, device)))
 
 
 def world_key(data: SimData, name: str) -> Array:
-    """Return a random key for one world, in a stage declared for one drone or one world.
+    """Return the random key of one world, for stages declared for one drone or one world.
 
     Args:
-        data: The data of one drone or world; seed, world, episode and step are taken from it.
-        name: The stage that draws; another name, other numbers.
+        data: Data of one drone or world, which provides seed, world, episode and step.
+        name: Name of the stage; different names give different numbers.
 
     Returns:
         Typed key. ()
@@ -36,16 +44,16 @@ def world_key(data: SimData, name: str) -> Array:
 
 
 def drone_key(data: SimData, name: str) -> Array:
-    """Return a random key for one drone, in a stage declared for one drone; see ``world_key``. ()"""
+    """Return the random key of one drone, for stages declared for one drone; see ``world_key``. ()"""
     return jax.random.fold_in(world_key(data, name), data.core.drone_id)
 
 
 def world_keys(data: SimData, name: str) -> Array:
-    """Return a random key for every world; the same that ``world_key`` gives one of them.
+    """Return the random keys of all worlds, equal to ``world_key`` of each.
 
     Args:
-        data: The simulation; seed, episodes and steps are taken from it.
-        name: The stage that draws; another name, other numbers.
+        data: Data of the simulation, which provides seed, episodes and steps.
+        name: Name of the stage; different names give different numbers.
 
     Returns:
         Typed keys. (n_worlds,)
@@ -54,11 +62,11 @@ def world_keys(data: SimData, name: str) -> Array:
 
 
 def drone_keys(data: SimData, name: str) -> Array:
-    """Return a random key for every drone of every world; the same that ``drone_key`` gives one of them.
+    """Return the random keys of all drones of all worlds, equal to ``drone_key`` of each.
 
     Args:
-        data: The simulation; seed, episodes and steps are taken from it.
-        name: The stage that draws; another name, other numbers.
+        data: Data of the simulation, which provides seed, episodes and steps.
+        name: Name of the stage; different names give different numbers.
 
     Returns:
         Typed keys; draw with ``jax.vmap(jax.vmap(draw))(keys)``. (n_worlds, n_drones)

@@ -1,4 +1,4 @@
-"""What a simulation is asked to be and to do, checked at once."""
+"""Validation of the settings and arguments of a simulation."""
 
 from __future__ import annotations
 
@@ -14,14 +14,22 @@ from crazysim.errors import ConfigError, UnknownNameError
 
 
 def positive(name: str, value: Any) -> int:
-    """Return a positive whole number, or say which argument is none."""
+    """Return a positive integer.
+
+    Raises:
+        ConfigError: If the value is anything else.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ConfigError(f"{name} is {value!r}; it must be a positive whole number")
     return int(value)
 
 
 def physics_freq(freq: Any) -> int:
-    """Return the physics steps per second, Hz, or say why there cannot be so many."""
+    """Return the rate of physics steps, Hz.
+
+    Raises:
+        ConfigError: If it is no positive integer, or too high for float32.
+    """
     freq = positive("freq", freq)
     if freq > 10_000 and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         raise ConfigError(
@@ -32,7 +40,11 @@ def physics_freq(freq: Any) -> int:
 
 
 def member(enum: Any, name: str, value: Any) -> Any:
-    """Return the member of an enum, or say what its members are."""
+    """Return the member of an enum.
+
+    Raises:
+        UnknownNameError: If there is no such member; the message lists all members.
+    """
     try:
         return enum(value)
     except ValueError:
@@ -41,11 +53,17 @@ def member(enum: Any, name: str, value: Any) -> Any:
 
 
 def find_device(device: str | jax.Device) -> jax.Device:
-    """Return the device of a name such as ``cpu`` or ``gpu:1``, or say what there is."""
+    """Return the device with a name such as ``cpu`` or ``gpu:1``.
+
+    Raises:
+        ConfigError: If there is no such device; the message lists all devices.
+    """
     if isinstance(device, jax.Device):
         return device
     if not isinstance(device, str):
-        raise ConfigError(f"a device is a platform such as 'cpu', 'gpu' or 'gpu:1', or a jax.Device, not {device!r}")
+        raise ConfigError(
+            f"expected a platform such as 'cpu', 'gpu' or 'gpu:1', or a jax.Device, got {device!r}; use device='cpu'"
+        )
     platform, _, index = device.partition(":")
     try:
         devices = jax.devices("gpu" if platform == "cuda" else platform)
@@ -53,51 +71,57 @@ def find_device(device: str | jax.Device) -> jax.Device:
     except (RuntimeError, ValueError, IndexError) as error:
         found = ", ".join(str(d) for d in jax.devices())
         raise ConfigError(
-            f"device {device!r} does not exist ({error}); there is {found}. Give a platform such as 'cpu' or 'gpu', "
-            f"or 'gpu:1' for the second of its devices. GPUs need jax's CUDA packages: pip install 'crazysim[gpu]'."
+            f"device {device!r} does not exist ({error}); there is {found}. Use a platform such as 'cpu' or 'gpu', "
+            f"or 'gpu:1' for its second device. GPUs need the CUDA packages of JAX: pip install 'crazysim[gpu]'."
         ) from None
 
 
 def as_mask(mask: Any, n_worlds: int) -> Array | None:
-    """Return which worlds are meant, None for all, or say what a mask must be. (n_worlds,)"""
+    """Return a mask over worlds as an array, None for all worlds. (n_worlds,)
+
+    Raises:
+        ValueError: If it is not one bool per world.
+    """
     if mask is None:
         return None
     try:
         array = mask if isinstance(mask, jax.Array) else np.asarray(mask)
     except ValueError as error:
-        raise ValueError(f"the mask {mask!r} is no regular array; needed is one bool per world") from error
+        raise ValueError(f"expected a mask of one bool per world, got {mask!r}; use a NumPy array") from error
     if array.shape != (n_worlds,) or array.dtype != bool:
         raise ValueError(
-            f"the mask has shape {array.shape} and type {array.dtype}; needed are {(n_worlds,)} and bool, one per world"
+            f"expected a mask of shape {(n_worlds,)} and bool, one per world, got shape {array.shape} and type "
+            f"{array.dtype}; for indices use np.isin(np.arange({n_worlds}), indices)"
         )
     return jnp.asarray(array)
 
 
 def control_freqs(control: Control, freq: int, given: dict[Control, int | None]) -> dict[Control, int]:
-    """Return the rate of every controller, Hz: as given, or the usual one, or the largest below it that divides.
+    """Return the rate of every controller, Hz: as given, or else the largest divisor of ``freq`` up to the default.
 
     Args:
-        control: Command level, from which follows which controllers are in use.
-        freq: Physics steps per second, Hz.
-        given: The rates asked for; None for the usual one.
+        control: Command level, which determines the controllers in use.
+        freq: Rate of physics steps, Hz.
+        given: Requested rates, Hz; None for the default.
 
     Raises:
-        ConfigError: If a controller in use could not fire every whole number of steps.
+        ConfigError: If the rate of a controller in use does not divide ``freq``.
     """
     in_use = {
         Control.state: (Control.state, Control.attitude, Control.force_torque),
         Control.rotor_vel: (),
     }.get(control, (control, Control.force_torque))
     freqs = {}
-    for level, asked in given.items():
-        if asked is None:
+    for level, requested in given.items():
+        if requested is None:
             freqs[level] = _largest_divisor(freq, min(100 if level == Control.state else 500, freq))
             continue
-        freqs[level] = positive(f"{level.value}_freq", asked)
-        if level in in_use and freq % asked:
+        freqs[level] = positive(f"{level.value}_freq", requested)
+        if level in in_use and freq % requested:
+            nearest = _largest_divisor(freq, min(requested, freq))
             raise ConfigError(
-                f"{level.value}_freq is {asked} Hz, which does not divide freq = {freq} Hz, so it cannot fire every "
-                f"whole number of steps. The nearest rate below is {_largest_divisor(freq, min(asked, freq))} Hz."
+                f"{level.value}_freq is {requested} Hz, which does not divide freq = {freq} Hz, so it cannot fire "
+                f"every whole number of steps. Use the nearest rate below, {nearest} Hz."
             )
     return freqs
 

@@ -1,4 +1,4 @@
-"""Devices that hold worlds: one, or several that the worlds are spread over."""
+"""Devices that hold worlds, and the distribution of worlds over them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDev
 
 from crazysim.core.data import SimData
 from crazysim.errors import ConfigError
-from crazysim.pytree import scopes
+from crazysim.pytree import PER_WORLD, scopes
 
 WORLD_AXIS = "worlds"
-"""Name of the mesh axis that worlds are spread over."""
+"""Name of the mesh axis over which worlds are distributed."""
 
 
 class Location(NamedTuple):
@@ -45,7 +45,7 @@ def locate(x: jax.Array) -> Location:
 
 
 def put(tree: Any, device: jax.Device) -> Any:
-    """Return the tree on a device, committed to it; leaves that already are stay the same arrays."""
+    """Return the tree committed to a device; leaves that already are remain the same arrays."""
     here = SingleDeviceSharding(device)
 
     def place(x: Any) -> Any:
@@ -61,30 +61,33 @@ def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
 
 
 def placement(data: SimData, mesh: Mesh) -> SimData:
-    """Return the sharding of every leaf: leaves of worlds are split, shared ones are copied to each device.
+    """Return the sharding of every leaf: leaves of drones and worlds are split, shared leaves are replicated.
 
     Raises:
-        ConfigError: If the worlds cannot be split evenly.
+        ConfigError: If the mesh has no axis of worlds, or the worlds cannot be split evenly.
     """
     if not isinstance(mesh, Mesh):
-        raise ConfigError(f"expected a mesh, as world_mesh(jax.devices()) returns, got {mesh!r}")
+        raise ConfigError(f"expected a mesh, got {mesh!r}; use world_mesh(jax.devices())")
     n_devices = mesh.shape.get(WORLD_AXIS)
     if n_devices is None:
         raise ConfigError(
-            f"the mesh has axes {mesh.axis_names}; needed is one named {WORLD_AXIS!r}, as world_mesh makes"
+            f"expected a mesh with an axis {WORLD_AXIS!r}, got axes {mesh.axis_names}; make it with world_mesh"
         )
     if data.core.n_worlds % n_devices:
-        raise ConfigError(f"{data.core.n_worlds} worlds cannot be split evenly over {n_devices} devices")
+        raise ConfigError(
+            f"{data.core.n_worlds} worlds cannot be split evenly over {n_devices} devices; use a multiple of "
+            f"{n_devices}"
+        )
     split = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
     copied = NamedSharding(mesh, PartitionSpec())
-    return jax.tree.map(lambda scope: split if scope in ("drone", "world") else copied, scopes(data))
+    return jax.tree.map(lambda scope: split if scope in PER_WORLD else copied, scopes(data))
 
 
 def shard(data: SimData, mesh: Mesh) -> SimData:
-    """Return the data spread over a mesh."""
+    """Return the data distributed over a mesh."""
     return jax.device_put(data, placement(data, mesh))
 
 
 def place_scene(mjx_data: Any, mesh: Mesh) -> Any:
-    """Return the scene of every world spread over a mesh."""
+    """Return the MJX data of all worlds distributed over a mesh."""
     return jax.device_put(mjx_data, NamedSharding(mesh, PartitionSpec(WORLD_AXIS)))

@@ -1,4 +1,4 @@
-"""A stage that says what it sees: one drone, or one world. Undeclared, a stage sees the whole batch."""
+"""Stages with a declared scope, one drone or one world, and functions of one world applied to all worlds."""
 
 from __future__ import annotations
 
@@ -60,7 +60,9 @@ class Stage:
 def stage(
     scope: Literal["drone", "world"], when: Callable[..., Array | None] | None = None
 ) -> Callable[[Callable[..., Any]], Stage]:
-    """Declare what a stage sees, so that an engine can fuse it with its neighbours.
+    """Declare the scope of a stage, so that an engine can fuse it with its neighbours.
+
+    A stage without a declared scope receives the full batch.
 
     ``@stage("drone")``: the data of one drone. Leaves of drones and worlds come without batch axes: ``pos`` is (3,),
     ``steps`` (). The stage writes leaves of drones.
@@ -70,15 +72,15 @@ def stage(
 
     Args:
         scope: ``"drone"`` or ``"world"``.
-        when: Tells from the same data whether the stage acts at this step, as a bool (); None for always. An engine
-            spends nothing on a stage at steps where it acts nowhere.
+        when: ``when(data)``: true if the stage acts at this step, (); None for always. An engine skips a stage at
+            steps where it acts nowhere.
 
     Raises:
         ConfigError: If the scope is neither.
     """
     if scope not in ("drone", "world"):
         raise ConfigError(
-            f"a stage is of one 'drone' or one 'world', not {scope!r}; undeclared, it sees the whole batch"
+            f"expected scope 'drone' or 'world', got {scope!r}. A stage of the full batch is left undeclared."
         )
     return lambda fn: Stage(fn, scope, when)
 
@@ -92,10 +94,10 @@ def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
 
 
 class Axes:
-    """Which batch axes every leaf of a simulation's data has, and what it is called."""
+    """Names and batch axes of all leaves of a simulation's data."""
 
     def __init__(self, data: Any):
-        """Read them off the data of all worlds."""
+        """Take the data of all worlds."""
         paths, self.treedef = jax.tree_util.tree_flatten_with_path(data)
         self.names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in paths]
         self.scopes: list[str] = jax.tree.leaves(scopes(data))

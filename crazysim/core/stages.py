@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -21,10 +22,10 @@ from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integra
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.stage import Stage, StageScope
 from crazysim.dynamics import Dynamics, first_principles, fitted
-from crazysim.pytree import map_batched, scopes, select_worlds
+from crazysim.pytree import PER_WORLD, scopes, select_worlds
 
 FLOOR = -0.001
-"""Height below which no drone falls, m: a little under zero, so that a negative height tells a landing."""
+"""Height below which no drone falls, m: a little under zero, so that a negative height marks a landing."""
 
 
 def _built_in(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
@@ -53,7 +54,11 @@ def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integr
     if not fitted_model and control != Control.rotor_vel:
         stages["force_torque_controller"] = force_torque_controller
     stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
-    deriv_fn: DerivFn = fitted_derivative if fitted_model else first_principles_derivative
+    deriv_fn: DerivFn = first_principles_derivative
+    if fitted_model:
+        deriv_fn = fitted_derivative
+    elif integrator.order == 1:
+        deriv_fn = first_principles_euler_derivative
     if integrator != Integrator.euler:
         deriv_fn = held_on_floor(deriv_fn)
     stages["integration"] = Integration(INTEGRATORS[integrator], deriv_fn).stage()
@@ -174,6 +179,12 @@ def first_principles_derivative(data: SimData) -> SimStateDeriv:
     return _derivative(data, first_principles.dynamics, _controls(data).rotor_vel)
 
 
+def first_principles_euler_derivative(data: SimData) -> SimStateDeriv:
+    """Return the derivative of every drone from first principles for an Euler step, stable at any body rate."""
+    dynamics = partial(first_principles.dynamics, dt=1 / data.core.freq)
+    return _derivative(data, dynamics, _controls(data).rotor_vel)
+
+
 def fitted_derivative(data: SimData) -> SimStateDeriv:
     """Return the derivative of every drone under a fitted model."""
     return _derivative(data, fitted.dynamics, data.controls.attitude.cmd)
@@ -232,19 +243,25 @@ def finite(data: SimData) -> Array:
 
 
 def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:
-    """Bring worlds back to the default data: everything that belongs to a world, and nothing else.
+    """Return the data with worlds, or the whole simulation, brought back to the default data.
 
-    What is shared between worlds (parameters that were not randomised, opaque plugin data, the seed's key)
-    stays as it is, with a mask and without. A parameter that has become one per drone goes back to its
-    default in every world that is reset. Plugins that the default does not know stay.
+    With a mask, everything that belongs to the worlds of the mask is restored. What worlds share (parameters that are
+    not one per drone, plugins without declared axes) stays. Without a mask that is restored too. Either way the
+    seed stays, a parameter that has become one per drone stays one per drone, with its default values, and plugins
+    that the default data lack stay as they are.
 
     Args:
         data: The simulation.
-        default_data: What it is brought back to.
-        mask: Which worlds; None for all. (n_worlds,)
+        default_data: The data to return to.
+        mask: True in the worlds to reset; None for all. (n_worlds,)
     """
-    known = {name: default_data.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
-    default_data = default_data.replace(plugins=known)
-    new = map_batched(lambda x, default: select_worlds(mask, default, x), data, default_data)
+    plugins = {name: default_data.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
+
+    def restore(scope: str, x: Any, default: Any) -> Any:
+        if scope in PER_WORLD:
+            return select_worlds(mask, default, x)
+        return default if mask is None else x
+
+    new = jax.tree.map(restore, scopes(data), data, default_data.replace(plugins=plugins))
     episode = select_worlds(mask, data.core.episode + 1, data.core.episode)
-    return new.replace(core=new.core.replace(episode=episode))
+    return new.replace(core=new.core.replace(episode=episode, rng_key=data.core.rng_key))

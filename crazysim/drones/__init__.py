@@ -1,4 +1,4 @@
-"""Airframes: the constants of a drone type, one TOML file each."""
+"""Airframes: the constants of drone types, one TOML file each."""
 
 from crazysim.drones.airframe import Airframe, Drone, airframe_names, load_airframe
 

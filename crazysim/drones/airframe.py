@@ -1,9 +1,10 @@
-"""Load an airframe from a TOML file or a dict, and check that it can fly."""
+"""Airframes: loading the constants of a drone type from a TOML file or a dict, with checks."""
 
 from __future__ import annotations
 
+import difflib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -15,10 +16,30 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError, UnknownNameError
 
 FOLDER = Path(__file__).parent
+GUIDE = "docs/guides/airframes.md"
+
+_NUMBER: tuple[tuple[int, ...], ...] = ((),)
+SHAPE_KEYS: dict[str, tuple[tuple[int, ...], ...]] = {
+    "plate": ((3,),),
+    "battery": ((3,),),
+    "battery_height": _NUMBER,
+    "arm_radius": _NUMBER,
+    "motor_radius": _NUMBER,
+    "motor_height": _NUMBER,
+    "propeller_radius": _NUMBER,
+    "propeller_height": _NUMBER,
+    "led_radius": _NUMBER,
+    "led_heights": ((2,),),
+    "collision_sphere": ((4,),),
+    "collision_box": ((6,),),
+    "fpv_camera": ((3,),),
+    "track_camera": ((3,),),
+}
+"""Keys of the table ``[shape]`` and the shapes of their arrays; every key is optional."""
 
 
 class Drone(StrEnum):
-    """Names of the airframes that come with the package."""
+    """Names of the built-in airframes."""
 
     cf21B_500 = "cf21B_500"
     cf2x_L250 = "cf2x_L250"
@@ -27,16 +48,17 @@ class Drone(StrEnum):
     hb_x500 = "hb_x500"
     crazyflie = "crazyflie"
     bumblebee = "bumblebee"
+    bumblebee_lab = "bumblebee_lab"
 
 
 @dataclass(frozen=True, eq=False)
 class Airframe:
-    """The constants of a drone type, as plain numbers in SI units (rotor speeds in rpm)."""
+    """Constants of a drone type, as plain numbers in SI units (rotor speeds in rpm)."""
 
     name: str
-    """Name; of the file, for one that was loaded from a file."""
+    """Name; the file's stem for an airframe that was loaded from a file."""
     tables: Mapping[str, Any]
-    """Every table of the file with its numbers as float64 arrays, without unit and source."""
+    """All tables of the file with their numbers as float64 arrays, without units and sources."""
 
     def table(self, path: str) -> Mapping[str, Any]:
         """Return a table by its dotted path, such as ``controller.state``.
@@ -49,8 +71,8 @@ class Airframe:
             node = node.get(part) if isinstance(node, Mapping) else None
             if not isinstance(node, Mapping):
                 raise ConfigError(
-                    f"airframe {self.name!r} has no table [{path}]; it has {sorted(self.tables)}. "
-                    f"Add [{path}] to its TOML file, or choose another dynamics or command level."
+                    f"airframe {self.name!r} has no table [{path}], only {sorted(self.tables)}. "
+                    f"Add [{path}] to the airframe; {GUIDE} lists its keys."
                 )
         return node
 
@@ -59,20 +81,17 @@ class Airframe:
 
         Args:
             path: Table and key.
-            shape: The shape it must have; None accepts any.
+            shape: Expected shape; None for any.
 
         Raises:
-            ConfigError: If it is missing or has another shape.
+            ConfigError: If the value is missing or has another shape.
         """
-        table, _, key = path.rpartition(".")
-        found = self.table(table)
-        if key not in found:
-            raise ConfigError(f"airframe {self.name!r} lacks {path!r}; [{table}] has {sorted(found)}")
-        value = found[key]
-        if isinstance(value, Mapping):
-            raise ConfigError(f"airframe {self.name!r}: {path} is a table with {sorted(value)}, needed is a number")
+        paths = dict(_values(self.tables))
+        if path not in paths:
+            raise ConfigError(f"airframe {self.name!r} has no value {path!r}. {_suggestion(path, list(paths))}")
+        value = paths[path]
         if shape is not None and value.shape != shape:
-            raise ConfigError(f"airframe {self.name!r}: {path} has shape {value.shape}, needed is {shape}")
+            raise ConfigError(f"airframe {self.name!r}: expected {path} of shape {shape}, got {value.shape}")
         return value
 
     @property
@@ -93,14 +112,23 @@ class Airframe:
 
     @property
     def mixing_matrix(self) -> NDArray[np.float64]:
-        """Rotor positions and spins as signs and ratios: thrusts to torque. (3, n_rotors)
+        """Rotor thrusts to torque over the arm, 1. (3, n_rotors)
 
-        A rotor at (x, y) with thrust f gives the torque (y f, -x f), so the rows are y / arm, -x / arm and
-        the sign of the torque that its drag puts on the body about z.
+        A rotor at (x, y) with thrust f exerts the torque (y f, -x f), so the rows are y / arm, -x / arm and
+        the sign of the torque that its drag exerts on the body about z.
         """
         position = self.value("rotors.position")
         sign = self.value("rotors.yaw_torque_sign")
         return np.stack([position[:, 1] / self.arm, -position[:, 0] / self.arm, sign])
+
+    @property
+    def full_thrust_voltage(self) -> float | None:
+        """Motor voltage at which a rotor reaches ``rotors.thrust_max``, V; None without a table ``[battery]``."""
+        if "battery" not in self.tables:
+            return None
+        excess = self.value("battery.thrust_over_voltage") - [self.value("rotors.thrust_max"), 0, 0, 0]
+        roots = np.polynomial.polynomial.polyroots(excess)
+        return float(np.min(roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]))
 
     def __repr__(self) -> str:
         """Return the name alone; the tables are long."""
@@ -108,21 +136,21 @@ class Airframe:
 
 
 def airframe_names() -> tuple[str, ...]:
-    """Return the names of the airframes that come with the package."""
+    """Return the names of the built-in airframes."""
     return tuple(drone.value for drone in Drone)
 
 
 def load_airframe(source: str | Path | Mapping[str, Any] | Airframe) -> Airframe:
     """Return the airframe of a name, a TOML file anywhere on disk, or a dict of the same tables.
 
-    A number is either written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as the files
-    of the package have it.
+    A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. With
+    the key ``base``, the name or path of another airframe, only the numbers that differ from it are given.
 
     Args:
         source: Name of a built-in airframe, path of a ``.toml`` file, dict, or an airframe (returned as is).
 
     Raises:
-        UnknownNameError: If the name is no airframe and no file.
+        UnknownNameError: If the source is neither the name of an airframe nor a file.
         ConfigError: If the contents cannot be those of a drone.
     """
     if isinstance(source, Airframe):
@@ -131,21 +159,24 @@ def load_airframe(source: str | Path | Mapping[str, Any] | Airframe) -> Airframe
         name, tables = str(source.get("name", "custom")), dict(source)
     else:
         name, tables = _read(source)
-    tables.pop("sources", None)
-    tables.pop("name", None)
-    airframe = Airframe(name, _numbers(name, tables, ()))
+    base = tables.pop("base", None)
+    tables = {key: table for key, table in tables.items() if key not in ("sources", "name")}
+    numbers = _numbers(name, tables, ())
+    if base is not None:
+        numbers = _merged(load_airframe(base).tables, numbers)
+    airframe = Airframe(name, numbers)
     _check(airframe)
     return airframe
 
 
 def _read(source: str | Path) -> tuple[str, dict[str, Any]]:
     if not isinstance(source, (str, Path)):
-        raise ConfigError(f"a drone is a name, the path of a TOML file, a dict or an airframe, not {source!r}")
+        raise ConfigError(f"expected a drone as a name, the path of a TOML file, a dict or an Airframe, got {source!r}")
     path = FOLDER / f"{source}.toml" if str(source) in airframe_names() else Path(source)
     if not path.is_file():
         raise UnknownNameError(
-            f"unknown drone {str(source)!r}: it is none of {', '.join(airframe_names())}, and no TOML file of "
-            f"that path exists. Give one of these names, the path of a .toml file, or a dict."
+            f"expected a drone as one of {', '.join(airframe_names())}, the path of a .toml file, or a dict, "
+            f"got {str(source)!r}, and no file of that path exists"
         )
     try:
         return path.stem, tomllib.loads(path.read_text(encoding="utf-8"))
@@ -153,69 +184,100 @@ def _read(source: str | Path) -> tuple[str, dict[str, Any]]:
         raise ConfigError(f"{path} is not valid TOML: {error}") from error
 
 
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables of an airframe with some numbers changed or added."""
+    merged = dict(base)
+    for key, new in changes.items():
+        old = merged.get(key)
+        merged[key] = _merged(old, new) if isinstance(old, Mapping) and isinstance(new, Mapping) else new
+    return merged
+
+
 def _numbers(name: str, node: Any, path: tuple[str, ...]) -> Any:
     if isinstance(node, Mapping) and "value" not in node:
         return {key: _numbers(name, item, (*path, key)) for key, item in node.items()}
     value = node["value"] if isinstance(node, Mapping) else node
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"airframe {name!r}: {'.'.join(path)} = {value!r} is not a number or array") from error
+        raise ConfigError(
+            f"airframe {name!r}: expected {'.'.join(path)} as a number or array, got {value!r}"
+        ) from error
     if not np.all(np.isfinite(array)):
-        raise ConfigError(f"airframe {name!r}: {'.'.join(path)} = {value!r} is not finite")
+        raise ConfigError(f"airframe {name!r}: expected {'.'.join(path)} to be finite, got {value!r}")
     array.setflags(write=False)
     return array
 
 
+def _values(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Yield the dotted path and the value of every number."""
+    for key, item in tables.items():
+        if isinstance(item, Mapping):
+            yield from _values(item, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", item
+
+
+def _suggestion(path: str, paths: list[str]) -> str:
+    """Return the paths that are probably meant: those of the same key in another table, then those spelt alike."""
+    key = path.rpartition(".")[2]
+    same_key = [p for p in paths if p.rpartition(".")[2] == key]
+    keys = {p.rpartition(".")[2]: p for p in paths}
+    near = [keys[k] for k in difflib.get_close_matches(key, keys)]
+    found = list(dict.fromkeys([*same_key, *difflib.get_close_matches(path, paths), *near]))[:3]
+    if found:
+        return f"Did you mean {' or '.join(map(repr, found))}? Otherwise add it; {GUIDE} lists all keys."
+    return f"Add it; {GUIDE} lists all keys."
+
+
 def _check(airframe: Airframe) -> None:
-    """Refuse what cannot fly, with the number at fault."""
+    """Check that the numbers are those of a drone that can fly."""
+
+    def refuse(problem: str) -> ConfigError:
+        return ConfigError(f"airframe {airframe.name!r}: {problem}")
+
+    for table in ("rigid_body", "rotors"):
+        airframe.table(table)
     mass = airframe.value("rigid_body.mass", ())
     if mass <= 0:
-        raise ConfigError(f"airframe {airframe.name!r}: mass is {mass} kg, it must be positive")
+        raise refuse(f"expected a positive mass, got {mass} kg")
     inertia = airframe.inertia
     if inertia.shape != (3, 3) or not np.allclose(inertia, inertia.T) or np.min(np.linalg.eigvalsh(inertia)) <= 0:
-        raise ConfigError(
-            f"airframe {airframe.name!r}: inertia {inertia.tolist()} must be three positive moments "
-            f"or a symmetric positive definite 3 x 3 matrix, kg m^2"
+        raise refuse(
+            "expected an inertia of three positive moments or a symmetric positive definite 3 x 3 matrix, kg m^2, "
+            f"got {inertia.tolist()}"
         )
     position = airframe.value("rotors.position")
     if position.ndim != 2 or position.shape[1] != 3:
-        raise ConfigError(f"airframe {airframe.name!r}: rotors.position has shape {position.shape}, needed is (n, 3)")
+        raise refuse(f"expected rotors.position of shape (n, 3), got {position.shape}")
     airframe.value("rotors.yaw_torque_sign", (len(position),))
     low, high = airframe.value("rotors.thrust_min", ()), airframe.value("rotors.thrust_max", ())
     if not 0 <= low < high:
-        raise ConfigError(
-            f"airframe {airframe.name!r}: thrust_min {low} N and thrust_max {high} N must be 0 <= min < max"
-        )
-    for path, shapes in _optional(airframe, len(position)).items():
-        value = airframe.value(path)
-        if value.shape not in shapes:
-            raise ConfigError(
-                f"airframe {airframe.name!r}: {path} has shape {value.shape}, needed is {' or '.join(map(str, shapes))}"
-            )
+        raise refuse(f"expected 0 <= thrust_min < thrust_max, got {low} N and {high} N")
+    unknown = set(airframe.tables.get("shape", {})) - set(SHAPE_KEYS)
+    if unknown:
+        raise refuse(f"expected keys of [shape] among {sorted(SHAPE_KEYS)}, got {sorted(unknown)}")
+    values = dict(_values(airframe.tables))
+    for path, shapes in _optional_shapes(airframe, len(position)).items():
+        if path in values and values[path].shape not in shapes:
+            raise refuse(f"expected {path} of shape {' or '.join(map(str, shapes))}, got {values[path].shape}")
     if len(position) * high <= mass * 9.81:
-        raise ConfigError(
-            f"airframe {airframe.name!r}: {len(position)} rotors of {high} N at most cannot lift {mass} kg"
-        )
+        raise refuse(f"expected rotors that lift {mass} kg, got {len(position)} rotors of at most {high} N")
 
 
-def _optional(airframe: Airframe, n_rotors: int) -> dict[str, tuple[tuple[int, ...], ...]]:
-    """Return the shapes that numbers may have which only some models need, for those that are there."""
+def _optional_shapes(airframe: Airframe, n_rotors: int) -> dict[str, tuple[tuple[int, ...], ...]]:
+    """Return the allowed shapes of numbers that not every airframe has."""
     shapes: dict[str, tuple[tuple[int, ...], ...]] = {
         "rotors.inertia": ((), (n_rotors,)),
         "rotors.thrust_curve": ((3,), (n_rotors, 3)),
         "rotors.torque_curve": ((3,), (n_rotors, 3)),
         "rotors.lag": ((4,), (n_rotors, 4)),
         "drag.coefficients": ((3,), (3, 3)),
+        "battery.thrust_over_voltage": ((4,),),
     }
+    shapes |= {f"shape.{key}": allowed for key, allowed in SHAPE_KEYS.items()}
     for model in airframe.tables.get("fitted", {}):
         shapes |= {f"fitted.{model}.{key}": ((3,),) for key in ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")}
         shapes |= {f"fitted.{model}.{key}": ((),) for key in ("acc_coef", "cmd_f_coef", "thrust_dyn_coef")}
         shapes[f"fitted.{model}.drag_coefficients"] = ((3,), (3, 3))
-    return {path: allowed for path, allowed in shapes.items() if _has(airframe.tables, path)}
-
-
-def _has(tables: Mapping[str, Any], path: str) -> bool:
-    first, _, rest = path.partition(".")
-    node = tables.get(first) if isinstance(tables, Mapping) else None
-    return node is not None and (not rest or _has(node, rest))
+    return shapes

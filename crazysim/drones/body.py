@@ -1,9 +1,8 @@
-"""The drone's body as a list of MJCF primitives: what is seen and touched, never what flies."""
+"""Drone bodies as lists of MJCF primitives, for rendering and contacts; the dynamics do not depend on them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from crazysim.drones.airframe import Airframe
 
 LED_MATERIALS = ("led_top", "led_bot")
-"""Materials of which every drone has its own, so that its colour can be changed alone."""
+"""Materials that each drone has its own copy of, so that its LEDs can have their own colours."""
 
 MATERIALS = {
     "drone_carbon": (0.10, 0.10, 0.11, 1.0),
@@ -23,88 +22,127 @@ MATERIALS = {
 }
 """Colours that all drones share, rgba."""
 
+BATTERY_VOLUME = 1.2e-4
+"""Volume of a derived battery over the mass of the drone, m^3/kg; the built-in airframes have 0.8e-4 to 1.5e-4."""
+
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class BodyGeom:
     """One geom of a drone, in its body frame."""
 
     kind: str
     """Type of the geom: box, sphere, capsule, cylinder or ellipsoid."""
     size: NDArray
-    """Half sizes or radii, m, as MJCF has them."""
+    """Half sizes or radii as in MJCF, m. (3,)"""
     pos: NDArray
     """Centre, m. (3,)"""
     material: str = ""
-    """Name of its material; an LED's is the drone's own."""
+    """Name of the material; each drone has its own copy of those in ``LED_MATERIALS``."""
     end: NDArray | None = None
     """Far end of a capsule that begins at ``pos``, m. (3,)"""
     name: str = ""
-    """Name, which the drone's number is added to; empty for parts that nothing asks for."""
-    touches: bool = False
-    """Whether it is for contacts only, and not part of what is seen."""
+    """Name, to which the drone's number is appended; empty for geoms that are not looked up."""
+    collides: bool = False
+    """True for a geom that is used for contacts and not rendered."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyCamera:
-    """One camera that a drone carries, in its body frame."""
+    """One camera on a drone, in its body frame."""
 
     name: str
-    """Name, which the drone's number is added to."""
+    """Name, to which the drone's number is appended."""
     pos: NDArray
-    """Place, m. (3,)"""
+    """Position, m. (3,)"""
     xyaxes: NDArray
-    """The picture's right and up. (6,)"""
+    """Directions to the right and up in the image. (6,)"""
     fovy: float = 45.0
     """Vertical field of view, degrees."""
     tracks: bool = False
-    """Whether it follows the drone's place but not its attitude."""
+    """True for a camera that follows the drone's position but not its attitude."""
 
 
-def body_parts(airframe: Airframe) -> list[Part]:
-    """Return arms, motors, propeller discs, plate, battery, two LEDs, and the two collision shapes.
+def outline(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
+    """Return the table ``[shape]`` of an airframe, with values for the keys that it lacks.
 
-    ``col_sphere`` and ``col_box`` are the shapes that touch; all others are seen only.
+    They follow from the rotors' positions, and the battery's size from the mass, in the proportions of the built-in
+    airframes. docs/guides/airframes.md describes the keys.
     """
-    shape = partial(_outline, airframe)
-    plate, battery, led = shape("plate") / 2, shape("battery") / 2, float(shape("led_radius"))
-    parts = [
-        Part("box", plate, np.zeros(3), "drone_plate"),
-        Part("box", battery, np.array([0, 0, float(shape("battery_height"))]), "drone_battery"),
-        # A coloured bar over the leading edge: a drone seen from afar must show where it looks.
-        Part("box", plate * [0.1, 0.7, 1.6], np.array([0.95 * plate[0], 0, 0]), "drone_nose"),
+    rotors = airframe.value("rotors.position")
+    reach = float(np.max(np.linalg.norm(rotors[:, :2], axis=-1)))
+    height = float(np.mean(rotors[:, 2]))
+    gaps = np.linalg.norm(rotors[:, None, :2] - rotors[None, :, :2], axis=-1)
+    spacing = float(np.min(gaps[gaps > 0], initial=2 * reach))
+    unit = (BATTERY_VOLUME * float(airframe.value("rigid_body.mass")) / 6) ** (1 / 3)
+    shape = {
+        "battery": np.array([3, 2, 1]) * unit,
+        "plate": np.array([0.75, 0.55, 0.04]) * reach,
+        "arm_radius": 0.04 * reach,
+        "motor_radius": 0.08 * reach,
+        "motor_height": 0.12 * reach,
+        "propeller_radius": 0.37 * spacing,
+        "propeller_height": 0.1 * reach,
+        "led_radius": 0.06 * reach,
+    } | dict(airframe.tables.get("shape", {}))
+
+    plate, battery, led = shape["plate"], shape["battery"], shape["led_radius"]
+    shape = {"battery_height": (plate[2] + battery[2]) / 2} | shape
+    top = shape["battery_height"] + battery[2] / 2
+    half = max(0.5 * shape["motor_height"] + shape["propeller_height"], abs(height) / 2 + battery[2])
+    sides = np.max(np.abs(rotors[:, :2]), axis=0) + shape["propeller_radius"]
+    away = 0.7 + 7 * reach
+    shape = {
+        "led_heights": np.array([max(top, plate[2] / 2), min(shape["battery_height"] - battery[2] / 2, -plate[2] / 2)])
+        + led / 2 * np.array([1, -1]),
+        "collision_sphere": np.array([0, 0, height / 2, reach + shape["propeller_radius"]]),
+        "collision_box": np.array([0, 0, height / 2, *sides, half]),
+        "fpv_camera": np.array([0.9 * plate[0], 0, 0]),
+        "track_camera": np.array([-away, 0, away / 2]),
+    } | shape
+    return {key: np.asarray(value, np.float64) for key, value in shape.items()}
+
+
+def body_geoms(airframe: Airframe) -> list[BodyGeom]:
+    """Return arms, motors, propeller discs, plate, battery, two LEDs, and the two collision geoms.
+
+    Only ``col_sphere`` and ``col_box`` collide; all other geoms are rendered.
+    """
+    shape = outline(airframe)
+    plate, battery, led = shape["plate"] / 2, shape["battery"] / 2, float(shape["led_radius"])
+    geoms = [
+        BodyGeom("box", plate, np.zeros(3), "drone_plate"),
+        BodyGeom("box", battery, np.array([0, 0, float(shape["battery_height"])]), "drone_battery"),
+        # A coloured bar over the leading edge shows the heading of a drone seen from afar.
+        BodyGeom("box", plate * [0.1, 0.7, 1.6], np.array([0.95 * plate[0], 0, 0]), "drone_nose"),
     ]
-    motor, height = float(shape("motor_radius")), float(shape("motor_height"))
-    disc = np.array([float(shape("propeller_radius")), 0.03 * motor + 5e-4, 0])
+    motor, height = float(shape["motor_radius"]), float(shape["motor_height"])
+    disc = np.array([float(shape["propeller_radius"]), 0.03 * motor + 5e-4, 0])
     for rotor in airframe.value("rotors.position"):
-        arm = np.array([float(shape("arm_radius")), 0, 0])
-        hub = rotor + [0, 0, float(shape("propeller_height"))]
-        parts += [
-            Part("capsule", arm, np.zeros(3), "drone_carbon", end=rotor),
-            Part("cylinder", np.array([motor, height / 2, 0]), rotor + [0, 0, 0.3 * height], "drone_metal"),
-            Part("cylinder", disc, hub, "drone_propeller"),
+        arm = np.array([float(shape["arm_radius"]), 0, 0])
+        hub = rotor + [0, 0, float(shape["propeller_height"])]
+        geoms += [
+            BodyGeom("capsule", arm, np.zeros(3), "drone_carbon", end=rotor),
+            BodyGeom("cylinder", np.array([motor, height / 2, 0]), rotor + [0, 0, 0.3 * height], "drone_metal"),
+            BodyGeom("cylinder", disc, hub, "drone_propeller"),
         ]
-    for material, z in zip(LED_MATERIALS, shape("led_heights"), strict=True):
-        parts.append(Part("ellipsoid", np.array([led, led, led / 2]), np.array([0, 0, z]), material))
-    sphere, box = shape("collision_sphere"), shape("collision_box")
+    for material, z in zip(LED_MATERIALS, shape["led_heights"], strict=True):
+        geoms.append(BodyGeom("ellipsoid", np.array([led, led, led / 2]), np.array([0, 0, z]), material))
+    sphere, box = shape["collision_sphere"], shape["collision_box"]
     return [
-        *parts,
-        Part("sphere", np.array([sphere[3], 0, 0]), sphere[:3], name="col_sphere", touches=True),
-        Part("box", box[3:], box[:3], name="col_box", touches=True),
+        *geoms,
+        BodyGeom("sphere", np.array([sphere[3], 0, 0]), sphere[:3], name="col_sphere", collides=True),
+        BodyGeom("box", box[3:], box[:3], name="col_box", collides=True),
     ]
 
 
 def body_cameras(airframe: Airframe) -> list[BodyCamera]:
-    """Return ``fpv_cam``, which looks ahead from the drone, and ``track_cam``, which follows and looks at it."""
-    shape = partial(_outline, airframe)
-    back = shape("track_camera")
-    # Looking from behind with z up: right is body -y, up leans over by as much as the camera looks down.
+    """Return ``fpv_cam``, which looks ahead from the drone, and ``track_cam``, which follows it from behind."""
+    shape = outline(airframe)
+    back = shape["track_camera"]
+    # Looking ahead from behind: right is body -y, and up is tilted forward by as much as the camera looks down.
     up = np.array([-back[2] * np.sign(back[0]), 0, abs(back[0])]) / np.hypot(back[0], back[2])
     right = np.array([0.0, -1.0, 0.0])
     return [
         BodyCamera("track_cam", back, np.concatenate([right, up]), tracks=True),
-        BodyCamera("fpv_cam", shape("fpv_camera"), np.concatenate([right, [0, 0, 1]]), fovy=70.0),
+        BodyCamera("fpv_cam", shape["fpv_camera"], np.concatenate([right, [0, 0, 1]]), fovy=70.0),
     ]
-
-
-def _outline(airframe: Airframe, key: str) -> NDArray[np.float64]:
-    return airframe.value(f"shape.{key}")

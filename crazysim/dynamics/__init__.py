@@ -1,7 +1,17 @@
-"""Pure physics for one drone, with any leading axes."""
+"""Dynamics models: pure functions for one drone, with any leading axes."""
 
 from crazysim.dynamics import first_principles, fitted
 from crazysim.dynamics.core import Dynamics, supported_drones, supported_dynamics
 from crazysim.dynamics.first_principles import hover_rotor_vel
+from crazysim.dynamics.parameters import load_fn_params, load_params
 
-__all__ = ["Dynamics", "first_principles", "fitted", "hover_rotor_vel", "supported_drones", "supported_dynamics"]
+__all__ = [
+    "Dynamics",
+    "first_principles",
+    "fitted",
+    "hover_rotor_vel",
+    "load_fn_params",
+    "load_params",
+    "supported_drones",
+    "supported_dynamics",
+]

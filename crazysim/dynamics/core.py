@@ -1,4 +1,4 @@
-"""The dynamics models a simulation can be asked for."""
+"""Names of the dynamics models, and which airframes support them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.errors import ConfigError, UnknownNameError
 
 GRAVITY = (0.0, 0.0, -9.81)
-"""Gravitational acceleration, world frame, m/s^2: the value of the fits the airframes come from."""
+"""Gravitational acceleration, world frame, m/s^2: the value with which the airframes were identified."""
 
 
 class Dynamics(StrEnum):
@@ -20,16 +20,16 @@ class Dynamics(StrEnum):
     first_principles = "first_principles"
     """Rotors with lag, thrust and torque curves, gyroscopic and reaction torque, drag, full inertia."""
     so_rpy = "so_rpy"
-    """Second-order response of roll, pitch and yaw fitted to flights; thrust at once."""
+    """Second-order response of roll, pitch and yaw, fitted to flights; thrust without lag."""
     so_rpy_rotor = "so_rpy_rotor"
-    """As ``so_rpy``, with a first-order lag of the collective thrust."""
+    """``so_rpy`` with a first-order lag of the collective thrust."""
     so_rpy_rotor_drag = "so_rpy_rotor_drag"
-    """As ``so_rpy_rotor``, with linear drag in the body frame."""
+    """``so_rpy_rotor`` with linear drag in the body frame."""
     default = first_principles
 
 
 def supported_dynamics(drone: str | Path | Mapping[str, Any] | Airframe) -> tuple[Dynamics, ...]:
-    """Return the models for which an airframe, or whatever ``load_airframe`` makes one of, has parameters."""
+    """Return the models for which an airframe, or a source of one as in ``load_airframe``, has parameters."""
     airframe = load_airframe(drone)
     fitted = airframe.tables.get("fitted", {})
     full = "thrust_curve" in airframe.table("rotors")
@@ -40,10 +40,10 @@ def supported_drones(dynamics: Dynamics | str) -> tuple[Drone, ...]:
     """Return the built-in airframes that have parameters for a model.
 
     Raises:
-        UnknownNameError: If there is no such model.
+        UnknownNameError: If the model does not exist.
     """
     if dynamics not in tuple(Dynamics):
-        raise UnknownNameError(f"dynamics is {dynamics!r}; it must be one of {', '.join(Dynamics)}")
+        raise UnknownNameError(f"expected dynamics as one of {', '.join(Dynamics)}, got {dynamics!r}")
     return tuple(drone for drone in Drone if dynamics in supported_dynamics(drone))
 
 
@@ -51,11 +51,11 @@ def require_support(airframe: Airframe, dynamics: Dynamics) -> None:
     """Check that an airframe has the parameters of a model.
 
     Raises:
-        ConfigError: With the models it does have.
+        ConfigError: If it lacks them; the message lists the supported models.
     """
     supported = supported_dynamics(airframe)
     if dynamics not in supported:
         raise ConfigError(
-            f"drone {airframe.name!r} has no parameters for dynamics {dynamics.value!r}; it has "
-            f"{', '.join(supported) or 'none'}. Pass one of these as dynamics=, or add the missing table to its TOML."
+            f"expected dynamics that drone {airframe.name!r} has parameters for ({', '.join(supported) or 'none'}), "
+            f"got {dynamics.value!r}. Pass one of these as dynamics=, or add the missing numbers to the airframe."
         )

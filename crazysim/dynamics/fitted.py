@@ -1,13 +1,12 @@
-"""The three models fitted to flights: roll, pitch and yaw answer a command like damped springs.
+"""Dynamics fitted to flights: roll, pitch and yaw respond to a command like damped springs.
 
     rpy'' = rpy_coef rpy + rpy_rates_coef rpy' + cmd_rpy_coef cmd_rpy
 
-The fit was made near level flight. Euler angles have no value at a pitch of 90 degrees, where the peer's
-formulas divide by zero; here the fit holds as it is up to 80 degrees of pitch, and from there to 88 degrees it
-hands over smoothly to a spring and damper on the attitude error itself, which exists everywhere. It does so
-between 100 and 200 rad/s, too, and between commands of 100 and 200 rad: a drone that is pulled through the
-vertical would gain rate from the singularity at every passage, without end. Beyond these limits no flight was
-fitted: the motion there is bounded and continuous, not identified.
+The fits were made near level flight, and Euler angles are singular at a pitch of 90 degrees. Therefore the fit is used
+up to 80 degrees of pitch and blended into a spring and damper on the attitude error, which exists everywhere, between
+80 and 88 degrees. The same blend happens between 100 and 200 rad/s and between commands of 100 and 200 rad: there a
+drone passes the vertical so often that the singularity would add energy without end. Outside of the fitted range the
+motion is bounded and continuous, not identified.
 """
 
 from __future__ import annotations
@@ -21,29 +20,29 @@ from jax import Array
 from crazysim import rotation
 from crazysim.drones import Airframe
 from crazysim.dynamics.core import GRAVITY, Dynamics, require_support
-from crazysim.dynamics.drag import drag_force
+from crazysim.dynamics.drag import body_drag_force
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import matvec
+from crazysim.rotation import along_z, matvec
 
 FITTED_UP_TO = math.cos(math.radians(80))
-HANDED_OVER_AT = math.cos(math.radians(88))
-FITTED_UP_TO_SIZE = 100.0
-"""Body rate, rad/s, and commanded angles, rad, up to which the fit holds; it is handed over at twice as much.
+BLENDED_AT = math.cos(math.radians(88))
+FITTED_UP_TO_MAGNITUDE = 100.0
+"""Body rate, rad/s, and commanded angles, rad, up to which the fit is used; the blend ends at twice as much.
 
 Three times the 2,000 degrees per second that a Crazyflie's gyroscope can measure (BMI088, data sheet), and sixteen
-turns.
+revolutions.
 """
 
 
 class Params(PyTree):
-    """Parameters of a fitted model; each is shared, or has one value per drone."""
+    """Parameters of a fitted model, each shared or one per drone."""
 
     mass: Array = leaf("parameter", 1, (1,))
     """Mass, kg. (1,)"""
     gravity_vec: Array = leaf("parameter", 1)
     """Gravitational acceleration, world frame, m/s^2. (3,)"""
     J: Array = leaf("parameter", 2)
-    """Inertia about the centre of mass, body frame, kg m^2; enters with external torques only. (3, 3)"""
+    """Inertia about the centre of mass, body frame, kg m^2; affects external torques only. (3, 3)"""
     J_inv: Array = leaf("parameter", 2)
     """Inverse of the inertia, body frame, 1/(kg m^2). (3, 3)"""
     acc_coef: Array = leaf("parameter", 1, (1,))
@@ -55,22 +54,22 @@ class Params(PyTree):
     rpy_rates_coef: Array = leaf("parameter", 1)
     """Damping of roll, pitch and yaw, 1/s. (3,)"""
     cmd_rpy_coef: Array = leaf("parameter", 1)
-    """Pull of the commanded roll, pitch and yaw, 1/s^2. (3,)"""
+    """Gain on the commanded roll, pitch and yaw, 1/s^2. (3,)"""
     thrust_dyn_coef: Array | None = leaf("parameter", 1)
-    """Rate at which the thrust follows its command, 1/s; None where it follows at once. (1,)"""
+    """Rate of the lag of the thrust behind its command, 1/s; None without lag. (1,)"""
     drag_matrix: Array | None = leaf("parameter", 2)
     """Linear drag coefficients, body frame, N s/m; None without drag. (3, 3)"""
     thrust_min: Array = leaf("parameter", 1)
-    """Least collective thrust of rotors that turn at all, N. (1,)"""
+    """Minimum collective thrust of rotors that are on, N. (1,)"""
     thrust_max: Array = leaf("parameter", 1)
-    """Largest collective thrust, N. (1,)"""
+    """Maximum collective thrust, N. (1,)"""
 
     @staticmethod
     def create(airframe: Airframe, dynamics: Dynamics) -> Params:
         """Return the shared parameters of an airframe for one of the fitted models.
 
         Raises:
-            ConfigError: If the airframe was not fitted with that model.
+            ConfigError: If the airframe has no fit of that model.
         """
         require_support(airframe, dynamics)
 
@@ -119,7 +118,7 @@ def dynamics(
         vel: Velocity, world frame, m/s. (..., 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         cmd: Roll, pitch, yaw, rad, and collective thrust, N. (..., 4)
-        rotor_vel: The thrust that the rotors give by now, N, in every entry; unused by ``so_rpy``. (..., k)
+        rotor_vel: Present collective thrust, N, in every entry; unused by ``so_rpy``. (..., k)
         dist_f: External force on the centre of mass, world frame, N. (..., 3)
         dist_t: External torque, world frame, N m. (..., 3)
         params: Parameters, shared or with the leading axes of the state.
@@ -128,18 +127,17 @@ def dynamics(
         Velocity, m/s, acceleration, m/s^2 (both world frame), angular acceleration, rad/s^2 (body frame),
         and the rate of the thrust entries, N/s.
     """
-    del pos  # nothing depends on the place: the argument keeps one signature for every model
+    del pos  # the argument gives all models one signature
     p = params
     thrust_cmd = cmd[..., 3:4]
     if p.thrust_dyn_coef is None:
         thrust, thrust_rate = thrust_cmd, jnp.zeros_like(rotor_vel)
     else:
         thrust, thrust_rate = rotor_vel[..., :1], p.thrust_dyn_coef * (thrust_cmd - rotor_vel)
-    force = (p.acc_coef + p.cmd_f_coef * thrust) * rotation.z_axis(quat)
+    body_force = along_z((p.acc_coef + p.cmd_f_coef * thrust)[..., 0])
     if p.drag_matrix is not None:
-        force = force + drag_force(quat, vel, p.drag_matrix)
-    if dist_f is not None:
-        force = force + dist_f
+        body_force = body_force + body_drag_force(quat, vel, p.drag_matrix)
+    force = rotation.rotate(quat, body_force, offset=dist_f)
 
     ang_acc = _fitted_angular_acceleration(quat, ang_vel, cmd[..., :3], p)
     if dist_t is not None:
@@ -148,22 +146,22 @@ def dynamics(
 
 
 def saturate(cmd: Array, params: Params) -> Array:
-    """Return the attitude command with a thrust that the rotors can give: none, or within its limits. (..., 4)"""
+    """Return the attitude command with its thrust within the limits of the rotors; zero or less is off. (..., 4)"""
     thrust = cmd[..., 3:4]
     within = jnp.where(thrust <= 0, 0.0, rotation.safe_clip(thrust, params.thrust_min, params.thrust_max))
     return jnp.concatenate([cmd[..., :3], within], axis=-1)
 
 
 def _fitted_angular_acceleration(quat: Array, ang_vel: Array, cmd_rpy: Array, p: Params) -> Array:
-    """Return the fit's angular acceleration, handed over to an attitude spring outside of what was flown."""
+    """Return the fit's angular acceleration, blended into an attitude spring outside of the fitted range."""
     x, y, z, w = quat[..., 0:1], quat[..., 1:2], quat[..., 2:3], quat[..., 3:4]
     cos_pitch = rotation.safe_norm(jnp.concatenate([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1))
-    t = jnp.clip((cos_pitch - HANDED_OVER_AT) / (FITTED_UP_TO - HANDED_OVER_AT), 0.0, 1.0)
-    size = jnp.maximum(rotation.dot(ang_vel, ang_vel), rotation.dot(cmd_rpy, cmd_rpy)) / FITTED_UP_TO_SIZE**2
+    t = jnp.clip((cos_pitch - BLENDED_AT) / (FITTED_UP_TO - BLENDED_AT), 0.0, 1.0)
+    size = jnp.maximum(rotation.dot(ang_vel, ang_vel), rotation.dot(cmd_rpy, cmd_rpy)) / FITTED_UP_TO_MAGNITUDE**2
     t = t * jnp.clip((4 - size) / 3, 0.0, 1.0)
     weight = t * t * t * (10 - 15 * t + 6 * t * t)
 
-    # Where the weight is zero the fit must not be evaluated at all: 0 x inf is NaN, in gradients too.
+    # Where the weight is zero the fit is evaluated at rest: 0 * inf is NaN, in gradients too.
     level = jnp.asarray([0.0, 0.0, 0.0, 1.0], quat.dtype)
     fits = weight > 0
     from_angles = _euler_spring(
@@ -176,7 +174,7 @@ def _fitted_angular_acceleration(quat: Array, ang_vel: Array, cmd_rpy: Array, p:
 
 
 def _euler_spring(quat: Array, ang_vel: Array, cmd_rpy: Array, p: Params) -> Array:
-    """Return the angular acceleration of the fit, body frame, away from 90 degrees of pitch. (..., 3)"""
+    """Return the angular acceleration of the fit, body frame; singular at 90 degrees of pitch. (..., 3)"""
     rpy = rotation.to_rpy(quat)
     sin, cos = jnp.sin(rpy), jnp.cos(rpy)
     sr, sp, cr, cp = sin[..., 0], sin[..., 1], cos[..., 0], cos[..., 1]

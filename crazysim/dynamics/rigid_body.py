@@ -1,17 +1,26 @@
-"""Newton and Euler for one rigid body."""
+"""Rigid-body mechanics: the equations of Newton and Euler."""
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 from jax import Array
 
-from crazysim.rotation import cross, matvec
+from crazysim.rotation import add_cross, cross, dot, matvec
+
+EXPLICIT_UP_TO = 0.04
+"""Rotation per step, rad, up to which ``stable_angular_acceleration`` is the exact derivative.
+
+20 rad/s at 500 Hz. A free wobble then grows by at most 0.04^2 / 2 of its size per step.
+"""
+STABLE_FROM = 0.06
+"""Rotation per step, rad, from which ``stable_angular_acceleration`` lets no free wobble grow."""
 
 
 def linear_acceleration(force: Array, mass: Array, gravity_vec: Array) -> Array:
     """Return the acceleration under a force, world frame, m/s^2 (Newton's second law).
 
     Args:
-        force: Sum of all forces but gravity, world frame, N. (..., 3)
+        force: Sum of all forces except gravity, world frame, N. (..., 3)
         mass: Mass, kg. (..., 1)
         gravity_vec: Gravitational acceleration, world frame, m/s^2. (..., 3)
 
@@ -21,18 +30,55 @@ def linear_acceleration(force: Array, mass: Array, gravity_vec: Array) -> Array:
     return force / mass + gravity_vec
 
 
-def angular_acceleration(torque: Array, ang_vel: Array, J: Array, J_inv: Array) -> Array:
+def angular_acceleration(torque: Array, ang_vel: Array, J: Array, J_inv: Array, rotor_momentum: Array) -> Array:
     """Return the angular acceleration under a torque, body frame, rad/s^2 (Euler's equation).
 
-    ``J w' = torque - w x J w``; the second term does no work.
+    ``J w' = torque - w x (J w + h)``
 
     Args:
         torque: Torque about the centre of mass, body frame, N m. (..., 3)
-        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        ang_vel: Angular velocity w, body frame, rad/s. (..., 3)
         J: Inertia about the centre of mass, body frame, kg m^2. (..., 3, 3)
-        J_inv: Its inverse, 1/(kg m^2). (..., 3, 3)
+        J_inv: Inverse of the inertia, 1/(kg m^2). (..., 3, 3)
+        rotor_momentum: Angular momentum h of the rotors relative to the body, body frame, N m s. (..., 3)
 
     Returns:
         Angular acceleration, body frame, rad/s^2. (..., 3)
     """
-    return matvec(J_inv, torque - cross(ang_vel, matvec(J, ang_vel)))
+    return matvec(J_inv, add_cross(torque, matvec(J, ang_vel, rotor_momentum), ang_vel))
+
+
+def stable_angular_acceleration(
+    torque: Array, ang_vel: Array, J: Array, J_inv: Array, rotor_momentum: Array, dt: float
+) -> Array:
+    """Return the angular acceleration for one Euler step, with a gyroscopic torque that cannot feed a wobble.
+
+    A body that spins wobbles at a frequency k below its spin rate (plus what its rotors add). An explicit Euler step
+    of the wobble, ``z = i k dt``, multiplies its size by ``|1 + z| = sqrt(1 + (k dt)^2)``: at 60 rad/s and 500 Hz a
+    quadrotor gains a factor of 175 in 2 s. Here the gyroscopic torque is evaluated where it would itself take the body
+    within ``theta dt``, so that the factor is ``|1 + z + theta z^2|``. With ``theta = 1/2`` that is Heun's method,
+    whose factor exceeds one in fourth order only. With ``theta = (1 + x^2) / 2`` at a rotation of ``x = |w| dt`` per
+    step it stays at most one up to ``k dt = 1``, and the loss of energy is of fourth order.
+
+    Up to ``EXPLICIT_UP_TO`` theta is zero and the result is that of ``angular_acceleration``. From ``STABLE_FROM``
+    on it has the value above. In between it rises with the square of the rate.
+
+    Args:
+        torque: Torque about the centre of mass, body frame, N m. (..., 3)
+        ang_vel: Angular velocity w, body frame, rad/s. (..., 3)
+        J: Inertia about the centre of mass, body frame, kg m^2. (..., 3, 3)
+        J_inv: Inverse of the inertia, 1/(kg m^2). (..., 3, 3)
+        rotor_momentum: Angular momentum h of the rotors relative to the body, body frame, N m s. (..., 3)
+        dt: Duration of the step, s.
+
+    Returns:
+        Mean angular acceleration over the step, body frame, rad/s^2. (..., 3)
+    """
+    square = dot(ang_vel, ang_vel)
+    slope = 0.5 * dt * (1 + STABLE_FROM**2) / (STABLE_FROM**2 - EXPLICIT_UP_TO**2)
+    rising = jnp.maximum(slope * dt**2 * square - slope * EXPLICIT_UP_TO**2, 0.0)
+    theta_dt = jnp.minimum(rising, 0.5 * dt + 0.5 * dt**3 * square)
+
+    ang_momentum = matvec(J, ang_vel, rotor_momentum)
+    impulse = theta_dt * cross(ang_momentum, ang_vel)
+    return matvec(J_inv, add_cross(torque, ang_momentum + impulse, matvec(J_inv, impulse, ang_vel)))

@@ -1,4 +1,4 @@
-"""Rotors: how fast they turn, and what they push and twist."""
+"""Rotors: lag, thrust and drag torque curves, and the torques on the body."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import math
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.rotation import matvec, safe_sqrt
+from crazysim.rotation import along_z, matvec, safe_sqrt
 
 RPM_TO_RAD_S = 2 * math.pi / 60
 
 
 def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> Array:
-    """Return how fast the rotors follow their command, rpm/s.
+    """Return the accelerations of the rotors towards their command, rpm/s.
 
     ``a (cmd - r) + b (cmd^2 - r^2)``: a motor's back-EMF gives the linear term, the propeller's drag the
-    quadratic one. Spinning up is driven, spinning down is coasting, so each has its own pair (a, b).
+    quadratic one. Spinning up is driven and spinning down is coasting, so each has its own pair (a, b).
 
     Args:
         cmd: Commanded rotor speeds, rpm. (..., n_rotors)
@@ -33,57 +33,55 @@ def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> A
 
 
 def curve(rotor_vel: Array, coefficients: Array) -> Array:
-    """Return a quadratic curve over the rotor speed: thrust in N, or drag torque in N m.
+    """Return the value of a quadratic curve over the rotor speed: thrust, N, or drag torque, N m.
 
     Args:
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)
         coefficients: Constant, linear and quadratic term over rpm. (..., 1 or n_rotors, 3)
 
     Returns:
-        The curve's value for each rotor. (..., n_rotors)
+        Value of the curve for each rotor. (..., n_rotors)
     """
     k0, k1, k2 = coefficients[..., 0], coefficients[..., 1], coefficients[..., 2]
     return k0 + rotor_vel * (k1 + rotor_vel * k2)
 
 
 def rotor_torque(thrust: Array, drag_torque: Array, L: Array, mixing_matrix: Array) -> Array:
-    """Return the torque of thrusts off the centre and of the propellers' drag, body frame, N m.
+    """Return the torque of the thrusts' lever arms and the propellers' drag, body frame, N m.
 
     Args:
         thrust: Thrust of each rotor, N. (..., n_rotors)
-        drag_torque: Size of each propeller's drag torque, N m. (..., n_rotors)
+        drag_torque: Magnitude of each propeller's drag torque, N m. (..., n_rotors)
         L: Arm that scales the first two rows of the mixing matrix, m. (..., 1 or n_rotors)
         mixing_matrix: Rotor positions over L, and signs of the drag torque. (..., 3, n_rotors)
 
     Returns:
         Torque about the centre of mass, body frame, N m. (..., 3)
     """
-    tilt = matvec(mixing_matrix[..., :2, :], thrust * L)
+    positions = mixing_matrix[..., :2, :]
+    # One arm scales two sums, which costs less than to scale each thrust.
+    tilt = L * matvec(positions, thrust) if L.shape[-1] == 1 else matvec(positions, L * thrust)
     return jnp.concatenate([tilt, matvec(mixing_matrix[..., 2:, :], drag_torque)], axis=-1)
 
 
-def gyroscopic_torque(ang_vel: Array, rotor_vel: Array, yaw_torque_sign: Array, prop_inertia: Array) -> Array:
-    """Return the torque of spinning rotors on a turning body, ``-ang_vel x h``, body frame, N m.
+def rotor_momentum(rotor_vel: Array, yaw_torque_sign: Array, prop_inertia: Array) -> Array:
+    """Return the angular momentum of the spinning rotors relative to the body, body frame, N m s.
 
-    Their angular momentum h lies along body z, against the sign of their drag torque. Being a cross product
-    with ``ang_vel`` it does no work.
+    It points along body z, against the sign of the drag torques.
 
     Args:
-        ang_vel: Angular velocity of the body, body frame, rad/s. (..., 3)
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)
         yaw_torque_sign: Signs of the rotors' drag torques about body z. (..., n_rotors)
         prop_inertia: Inertia of one propeller with its motor, kg m^2. (..., 1 or n_rotors)
 
     Returns:
-        Torque, body frame, N m. (..., 3)
+        Angular momentum, body frame, N m s. (..., 3)
     """
-    momentum = -RPM_TO_RAD_S * jnp.sum(yaw_torque_sign * prop_inertia * rotor_vel, axis=-1)
-    wx, wy = ang_vel[..., 0], ang_vel[..., 1]
-    return jnp.stack([-wy * momentum, wx * momentum, jnp.zeros_like(momentum)], axis=-1)
+    return along_z(jnp.sum(-RPM_TO_RAD_S * yaw_torque_sign * prop_inertia * rotor_vel, axis=-1))
 
 
 def reaction_torque(rotor_acc: Array, yaw_torque_sign: Array, prop_inertia: Array) -> Array:
-    """Return the torque that speeding rotors up puts on the body, ``-dh/dt``, body frame, N m.
+    """Return the torque that accelerating rotors exert on the body, ``-dh/dt``, body frame, N m.
 
     Args:
         rotor_acc: Rotor accelerations, rpm/s. (..., n_rotors)
@@ -93,15 +91,13 @@ def reaction_torque(rotor_acc: Array, yaw_torque_sign: Array, prop_inertia: Arra
     Returns:
         Torque, body frame, N m. (..., 3)
     """
-    about_z = RPM_TO_RAD_S * jnp.sum(yaw_torque_sign * prop_inertia * rotor_acc, axis=-1)
-    zero = jnp.zeros_like(about_z)
-    return jnp.stack([zero, zero, about_z], axis=-1)
+    return -rotor_momentum(rotor_acc, yaw_torque_sign, prop_inertia)
 
 
 def rotor_vel_of_thrust(thrust: Array, rpm2thrust: Array) -> Array:
-    """Return the rotor speed that gives a thrust, rpm: the upper root of the thrust curve.
+    """Return the rotor speed that produces a thrust, rpm: the upper root of the thrust curve.
 
-    Below the least thrust of the curve, where it has no root, the speed of that least thrust is returned.
+    Below the minimum of the curve, where it has no root, the speed of that minimum is returned.
 
     Args:
         thrust: Thrust of each rotor, N. (..., n_rotors)

@@ -17,7 +17,8 @@ from crazysim.effects.core import controls_of, per_drone, require_rotors, zeros
 from crazysim.pytree import PyTree, leaf, static
 
 NOMINAL_VOLTAGE = 3.7
-"""Nominal voltage of a lithium-polymer cell, V, as printed on cells."""
+"""Nominal voltage of a lithium-polymer cell, V, as printed on cells: assumed for full rotor speed where an airframe has
+no table ``[battery]``."""
 
 
 class BatteryData(PyTree):
@@ -64,7 +65,8 @@ class Battery(Plugin):
     base_power: Any = parameter(default=0.0)
     """Electric power of everything but the motors, W."""
     full_speed_voltage: Any = parameter(default=None)
-    """Least voltage at which the rotors reach the airframe's largest speed, V; None for 3.7 V a cell."""
+    """Least voltage at which the rotors reach the airframe's largest speed, V; None for that of the airframe's table
+    ``[battery]`` (2.8 to 3.4 V for Crazyflies), or else 3.7 V per cell."""
     charge: Any = parameter(default=1.0)
     """State of charge at the beginning of an episode, 0 to 1."""
     name: str = "battery"
@@ -73,7 +75,9 @@ class Battery(Plugin):
         """Return batteries with the initial charge and no load."""
         require_rotors(sim, "battery sag")
         cells = int(check_parameter(sim, "n_cells", self.n_cells, (1,), 1, dtype=jnp.int32).item())
-        full_speed_voltage = NOMINAL_VOLTAGE * cells if self.full_speed_voltage is None else self.full_speed_voltage
+        full_speed_voltage = self.full_speed_voltage
+        if full_speed_voltage is None:
+            full_speed_voltage = sim.airframe.full_thrust_voltage or NOMINAL_VOLTAGE * cells
         charge = per_drone(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0))
         return BatteryData(
             charge=charge,

@@ -29,10 +29,10 @@ Steps = Callable[[Program, list[Any], int], tuple[list[Any], Any]]
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """Where two engines differ."""
+    """First difference between two engines."""
 
     stage: str
-    """First stage after which they do."""
+    """First stage after which the engines differ."""
     leaf: str
     """Field that the stage wrote."""
     index: tuple[int, ...]

@@ -88,7 +88,7 @@ def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Lau
 
 
 def weakest(devices: Sequence[jax.Device] | None = None) -> jax.Device | None:
-    """Return the GPU of the lowest compute capability, whose code runs on all; None if there is no GPU.
+    """Return the GPU of the lowest compute capability, whose code runs on all; None without a GPU.
 
     Args:
         devices: GPUs to choose from; None for those of this machine.

@@ -19,12 +19,12 @@ def enabled() -> bool:
 
 
 def write(name: str, text: str) -> Path | None:
-    """Write a text into the folder, under a name with a number in front: in order of time.
+    """Write a text into the folder, in a file whose name begins with a running number.
 
     Args:
-        name: What it is, such as ``"attitude_controller.jaxpr"``; other characters than letters and digits become
-            underscores.
-        text: The text.
+        name: Name of the text, such as ``"attitude_controller.jaxpr"``; characters other than letters and digits
+            become underscores.
+        text: Text to write.
 
     Returns:
         The file, or None if no folder is set.

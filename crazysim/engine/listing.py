@@ -49,7 +49,7 @@ def of_operation(program: Program, operation: Operation) -> str:
         list(_of_segment(program, segment, names))
         if any(op is operation for op in segment.block.walk()):
             return f"{_line(operation, names)} of stage {operation.stage!r}"
-    raise ValueError("the operation is not in the program")
+    raise ValueError("expected an operation of the program, got one of another program")
 
 
 def slot_name(program: Program, segment: Segment, slot: Slot) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 
 from crazysim.engine.errors import UnsupportedError
 
-DTYPES = frozenset("bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split())
+DTYPES = frozenset(map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split()))
 """Types of numbers. In half precision XLA keeps more digits where it fuses, so that no two engines could agree."""
 
 
@@ -73,7 +73,7 @@ EXPENSIVE = 2
 
 def unsupported(name: str, dtypes: Sequence[np.dtype], result: Any = bool) -> UnsupportedError | None:
     """Return the error of an operation that is not defined for operands and a result of these types, or None."""
-    other = next((x.name for x in (*dtypes, np.dtype(result)) if x.name not in DTYPES), None)
+    other = next((x.name for x in (*dtypes, np.dtype(result)) if x not in DTYPES), None)
     if other is not None:
         return UnsupportedError(f"numbers of type {other}")
     if TABLE[name].accepts(dtypes):
@@ -167,6 +167,10 @@ def _integer_pow(x: Any, y: int) -> Any:
     return x**y if y >= 0 else 1 / x**-y
 
 
+def _log_gamma(x: Any) -> Any:
+    return np.where(np.isinf(x), np.abs(x), _special("gammaln")(x))
+
+
 def _special(name: str) -> Callable[..., Any]:
     """Return a function of ``scipy.special``, which JAX depends on; it is imported when it is called."""
 
@@ -200,7 +204,7 @@ def _casadi_round_even(ca: Any, x: Any) -> Any:
 
 
 _LARGEST = float(np.finfo(np.float64).max)
-"""CasADi cannot be asked whether a number is finite."""
+"""CasADi has no operation that tests for finite numbers."""
 
 
 def _rows() -> list[Row]:
@@ -273,7 +277,7 @@ def _rows() -> list[Row]:
         unary("erf", _special("erf"), 16, "erf"),
         unary("erfc", _special("erfc"), 16, lambda ca, x: 1 - ca.erf(x)),
         unary("erf_inv", _special("erfinv"), 16, _casadi_erf_inv),
-        unary("lgamma", _special("gammaln"), 32),
+        unary("lgamma", _log_gamma, 32),
         unary("digamma", _digamma, 32),
     ]
     comparisons = [

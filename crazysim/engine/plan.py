@@ -1,14 +1,14 @@
-"""How data of one structure is stepped: the engine that runs, and the reason why it is not a faster one.
+"""Plans: the engine that steps data of one structure, and the reason why it is not a faster one.
 
-Everything that an engine can refuse it refuses here, before the first step. The outcomes are three:
+Everything that an engine can refuse it refuses here, before the first step. There are three outcomes:
 
-- A documented limit, such as a stage without a scope or a machine without a compiler: a slower way is taken, and
+- A documented limit, such as a stage without a scope or a machine without a compiler: a slower engine runs, and
   ``explain`` names it.
 - Something unsupported (``UnsupportedError``): a primitive without a rule, a parameter that a new JAX has renamed, a
-  kernel that its compiler refuses. A slower way is taken with one ``EngineWarning``; ``strict`` raises instead.
-- Any other exception is a bug, of the stage or of the engine. If ``plain`` fails too, it is the stage's and is raised.
-  Otherwise ``auto`` runs ``plain`` with a warning that asks for a report; ``strict``, and an engine that was chosen by
-  name, raise it.
+  kernel that its compiler refuses. A slower engine runs, with one ``EngineWarning``; ``strict`` raises instead.
+- Any other exception is a bug of the stage or of the engine. If ``plain`` fails too, it is a bug of the stage and is
+  raised. Otherwise ``auto`` runs ``plain`` with a warning that suggests a report; ``strict``, and an engine that was
+  chosen by name, raise it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Steps = Callable[[list[Any], int | Array], tuple[list[Any], Array]]
 
 
 class Plan(NamedTuple):
-    """How data of one structure is stepped."""
+    """Engine and compiled step for data of one structure."""
 
     engine: str
     """Engine that runs."""
@@ -66,7 +66,7 @@ class Plan(NamedTuple):
 
 
 class Planner(NamedTuple):
-    """What a plan follows from, besides the data."""
+    """Planning of steps: everything besides the data that determines a plan."""
 
     stages: Sequence[Stage]
     """Stages of the step, in order."""

@@ -45,7 +45,7 @@ class Leaf:
 
     @functools.cached_property
     def size(self) -> int:
-        """How many numbers one drone (or world) has of it; a key is two 32-bit integers."""
+        """Number of scalars per drone (or world); a key is two 32-bit integers."""
         if self.rows_of:
             return self.shape[0]
         shape = self.shape[2:] if self.scope in ("drone", "world") else self.shape
@@ -74,7 +74,7 @@ class Segment:
     writes: tuple[Slot, ...]
     """Places of its outputs."""
     hoisted: Block = dataclasses.field(default_factory=Block)
-    """What is computed once, before the first step."""
+    """Computations hoisted out of the steps, run once before the first step."""
     hoisted_reads: tuple[Slot, ...] = ()
     """Places of the inputs of ``hoisted``."""
 
@@ -90,7 +90,7 @@ class Segment:
 
     @property
     def n_operations(self) -> int:
-        """How many operations a step takes."""
+        """Number of operations of a step."""
         return sum(op.name != "barrier" for op in self.block.walk())
 
 
@@ -109,7 +109,7 @@ class UnfusedStage:
     written: tuple[int, ...]
     """Leaves that it writes."""
     error: UnsupportedError
-    """Why it is not fused."""
+    """Reason for which the stage is not fused."""
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ class UnfusedStage:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Program:
-    """What a step does, and what runs before the first step and after the last."""
+    """Program of a step, and of the stages that run before the first step and after the last."""
 
     leaves: tuple[Leaf, ...]
     """Arrays of the data; behind them those that passes add."""
@@ -176,7 +176,7 @@ class Program:
 
     @functools.cached_property
     def group(self) -> int:
-        """How many drones use each other's numbers: those of a world, if some segment is of worlds."""
+        """Number of drones whose scalars are computed together: those of a world, if a segment has that scope."""
         return self.n_drones if any(s.scope == "world" for s in self.fused_segments) else 1
 
     def of(self, phase: Phase) -> list[Any]:

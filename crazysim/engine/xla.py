@@ -90,7 +90,7 @@ def _loop(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> l
 
 
 def _while(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
-    """Repeat as long as any lane goes on; the others keep their numbers."""
+    """Repeat until no lane continues; lanes that are finished keep their values."""
     test, body = op.blocks
 
     def goes_on(carry: list[Any]) -> Array:

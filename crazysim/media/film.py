@@ -1,4 +1,4 @@
-"""Films: pictures at a rate of simulated time, encoded as they come."""
+"""Films: images at a constant rate of simulated time, encoded as they are added."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ from crazysim.errors import ConfigError, RenderError
 from crazysim.media.flight import Flight
 from crazysim.media.recording import Clock, put
 from crazysim.media.view import View
+from crazysim.media.worlds import require_world
 from crazysim.sim.sim import Sim
 
 ENCODERS = {
     ".mp4": ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "22", "-movflags", "+faststart"],
     ".gif": ["-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse"],
 }
-"""How each kind of file is encoded."""
+"""Arguments of ffmpeg for each suffix."""
 
 
 class Film:
-    """A file that takes pictures of a simulation while it flies.
+    """A film of a simulation.
 
         with Film("flight.mp4", View(worlds=[0, 1, 2, 3]), fps=30) as film:
             for _ in range(500):
                 sim.step(10)
                 film.add(sim)
 
-    Its clock is that of the first world shown: of calls that come faster than frames only those are drawn that are
-    due, and where they come slower a picture stays for several frames. A reset does not turn it back.
+    Its clock is the time of the first world shown, which resets do not set back. Calls of ``add`` before the next frame
+    is due draw nothing; after a longer pause the image is repeated for several frames.
     """
 
     n_frames: int
-    """Frames so far."""
+    """Number of frames so far."""
 
     def __init__(
         self,
@@ -48,33 +49,36 @@ class Film:
         progress: bool = False,
         total: int | None = None,
     ):
-        """Prepare a film; the file comes to be with its first frame.
+        """Prepare a film; the first frame creates the file.
 
         Args:
-            path: An ``.mp4`` or a ``.gif``.
-            view: What is seen; world 0 in 1280 x 720 pixels if left out.
+            path: Path of an ``.mp4`` or ``.gif`` file.
+            view: View to film; None for world 0 in 1280 x 720 pixels.
             fps: Frames per second of film.
             speed: Simulated seconds per second of film: 0.1 is slow motion, 10 a time lapse.
-            progress: Whether to show a bar, which needs tqdm.
-            total: How many frames there will be, for the bar.
+            progress: True to show a progress bar, which needs tqdm.
+            total: Expected number of frames, for the bar.
 
         Raises:
-            ConfigError: If no such film can be.
+            ConfigError: If an argument is invalid.
             ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
         """
         self.path, self.view = Path(path), View() if view is None else view
         if self.path.suffix.lower() not in ENCODERS:
-            raise ConfigError(f"{self.path} is no film; its name must end with {' or '.join(ENCODERS)}")
+            raise ConfigError(
+                f"expected the name of a film to end with {' or '.join(ENCODERS)}, got {str(self.path)!r}"
+            )
         if not self.path.parent.is_dir():
-            raise ConfigError(f"{self.path} cannot be written: there is no folder {self.path.parent}")
+            raise ConfigError(f"expected an existing folder, got {str(self.path.parent)!r} for {self.path.name!r}")
         for name, value in (("fps", fps), ("speed", speed)):
             if not np.isfinite(value) or value <= 0:
-                raise ConfigError(f"{name} is {value!r}; it must be positive")
+                raise ConfigError(f"expected a positive {name}, got {value!r}")
         size = self.view.width, self.view.height
         if self.path.suffix.lower() == ".mp4" and any(n % 2 for n in size):
             even = [n + n % 2 for n in size]
             raise ConfigError(
-                f"H.264 has even sizes only, not {size[0]} x {size[1]} pixels; {even[0]} x {even[1]} would do"
+                f"expected an even width and height for .mp4, got {size[0]} x {size[1]} pixels. Use "
+                f"{even[0]} x {even[1]}."
             )
         self.fps, self.speed, self.n_frames = float(fps), float(speed), 0
         self._command = self._encode(*size)
@@ -83,30 +87,29 @@ class Film:
         self._clock = Clock()
 
     def add(self, sim: Sim) -> int:
-        """Take the pictures that are due, and return how many frames that made.
+        """Add the frames that are due, and return their number.
 
         Raises:
-            ValueError: If the view shows what the simulation has not.
+            ValueError: If the view shows a world, camera or drone that does not exist.
             RenderError: If this machine cannot draw, or the file cannot be written.
         """
         first = self.view.worlds[0]
-        if first not in range(sim.n_worlds):
-            raise ConfigError(f"world {first!r} does not exist; worlds go from 0 to {sim.n_worlds - 1}")
+        require_world(sim, first)
         elapsed = self._clock.at(float(sim.time[first, 0]))
         due = int(elapsed * self.fps / self.speed + 1e-4) + 1 - self.n_frames
         if due > 0:
-            self.write(self.view.picture(sim), due)
+            self.write(self.view.render(sim), due)
         return max(due, 0)
 
     def play(self, sim: Sim, flight: Flight) -> int:
-        """Take a whole recorded flight, and return how many frames that made.
+        """Add all frames of a recorded flight, and return their number.
 
         Args:
-            sim: A simulation like the one that was recorded; afterwards its data is what it was.
-            flight: The flight.
+            sim: Simulation like the one that was recorded; its data are restored afterwards.
+            flight: Flight.
 
         Raises:
-            ValueError: If the simulation is another, or the view shows a world that was not recorded.
+            ValueError: If the simulation has other drones or bodies, or the view shows a world that was not recorded.
             RenderError: If this machine cannot draw, or the file cannot be written.
         """
         for world in self.view.worlds:
@@ -118,25 +121,25 @@ class Film:
         try:
             for time in times:
                 put(sim, flight, float(time))
-                self.write(self.view.picture(sim))
+                self.write(self.view.render(sim))
         finally:
             sim.data = data
         return len(times)
 
-    def write(self, picture: ArrayLike, n_frames: int = 1) -> None:
-        """Add a picture of one's own for some frames.
+    def write(self, image: ArrayLike, n_frames: int = 1) -> None:
+        """Add frames that show a given image.
 
         Args:
-            picture: (height, width, 3), uint8, in the view's size.
-            n_frames: For how many.
+            image: Image of the view's size, uint8. (height, width, 3)
+            n_frames: Number of frames.
 
         Raises:
-            ConfigError: If it is no such picture.
+            ConfigError: If the image has another shape or type.
             RenderError: If the file cannot be written.
         """
-        pixels, needed = np.asarray(picture), (self.view.height, self.view.width, 3)
+        pixels, needed = np.asarray(image), (self.view.height, self.view.width, 3)
         if pixels.shape != needed or pixels.dtype != np.uint8:
-            raise ConfigError(f"this film takes pictures of shape {needed}, uint8; got {pixels.shape}, {pixels.dtype}")
+            raise ConfigError(f"expected an image of shape {needed}, uint8, got {pixels.shape}, {pixels.dtype}")
         if self._ffmpeg is None:
             self._ffmpeg = subprocess.Popen(self._command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
         try:
@@ -153,14 +156,16 @@ class Film:
 
         Raises:
             ConfigError: If it has no frame.
-            RenderError: If it could not be written.
+            RenderError: If the file cannot be written.
         """
         if self._bar is not None:
             self._bar.close()
         if self._ffmpeg is not None:
             self._end(self._ffmpeg)
         elif not self.n_frames:
-            raise ConfigError(f"nothing was recorded, so there is no {self.path}; call film.add(sim) between steps")
+            raise ConfigError(
+                f"expected at least one frame of {str(self.path)!r}, got none. Call film.add(sim) between steps."
+            )
 
     def _end(self, ffmpeg: subprocess.Popen[bytes]) -> None:
         self._ffmpeg = None
@@ -169,13 +174,17 @@ class Film:
         message = ffmpeg.stderr.read().decode(errors="replace").strip()
         ffmpeg.stderr.close()
         if ffmpeg.wait() != 0:
-            raise RenderError(f"{self.path} could not be written: {message or 'ffmpeg failed'}")
+            raise RenderError(
+                f"expected a file that can be written, got {str(self.path)!r}: {message or 'ffmpeg failed'}"
+            )
 
     def _encode(self, width: int, height: int) -> list[str]:
         try:
             from imageio_ffmpeg import get_ffmpeg_exe
         except ImportError as error:
-            raise ImportError("films need imageio-ffmpeg; pip install 'crazysim[demo]'") from error
+            raise ImportError(
+                "expected imageio-ffmpeg, which films need, got none. Run pip install 'crazysim[demo]'."
+            ) from error
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self.fps:g}", "-i", "-"]
         encoder = ENCODERS[self.path.suffix.lower()]
         return [get_ffmpeg_exe(), "-loglevel", "error", *raw, *encoder, "-y", str(self.path)]
@@ -189,7 +198,7 @@ class Film:
         if error is None:
             self.close()
             return
-        with contextlib.suppress(ConfigError, RenderError):  # what went wrong before is what matters
+        with contextlib.suppress(ConfigError, RenderError):  # the earlier error is the one to raise
             self.close()
 
 
@@ -197,5 +206,7 @@ def _bar(total: int | None) -> Any:
     try:
         from tqdm import tqdm
     except ImportError as error:
-        raise ImportError("progress=True needs tqdm; pip install 'crazysim[demo]'") from error
+        raise ImportError(
+            "expected tqdm, which progress=True needs, got none. Run pip install 'crazysim[demo]'."
+        ) from error
     return tqdm(total=total, desc="filming", unit="frame", ncols=80)

@@ -1,4 +1,4 @@
-"""Recorded flights: where everything was over time, in one file."""
+"""Recorded flights: poses of drones and bodies over time, in one file."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from crazysim.errors import ConfigError
 from crazysim.scene.visual_geoms import KINDS, VisualGeom
 
 FORMAT = 1
-"""Number of the file's format."""
+"""Version of the file format."""
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """Poses of some worlds over time, and the shapes that stand in them."""
+    """Poses in some worlds over time, and the geoms to draw."""
 
     time: NDArray
-    """Time, s, from 0 on. (n,)"""
+    """Times, s; the first is 0. (n,)"""
     pos: NDArray
     """Positions of the drones, world frame, m. (n, n_worlds, n_drones, 3)"""
     quat: NDArray
@@ -34,13 +34,13 @@ class Flight:
     setpoint: NDArray
     """Positions of state commands, m; no drones with other commands. (n, n_worlds, n_drones or 0, 3)"""
     worlds: NDArray
-    """Which worlds of the simulation they are. (n_worlds,)"""
+    """Indices of the worlds in the simulation. (n_worlds,)"""
     drone_ids: NDArray
     """Mocap id of each drone. (n_drones,)"""
     body_ids: NDArray
     """Mocap id of each other mocap body. (n_bodies,)"""
     shapes: Sequence[VisualGeom]
-    """What is seen, as it was when the recording began."""
+    """Visible geoms as they were when the recording began."""
 
     @property
     def n_drones(self) -> int:
@@ -48,80 +48,80 @@ class Flight:
         return self.pos.shape[2]
 
     def index(self, world: int) -> int:
-        """Return where a world of the simulation is in the recording.
+        """Return the index in the recording of a world of the simulation.
 
         Raises:
             ConfigError: If it was not recorded.
         """
         found = np.flatnonzero(self.worlds == world)
         if not len(found):
-            raise ConfigError(f"world {world!r} was not recorded; recorded are {self.worlds.tolist()}")
+            raise ConfigError(f"expected a recorded world, one of {self.worlds.tolist()}, got {world!r}")
         return int(found[0])
 
     def at(self, time: float) -> dict[str, NDArray]:
-        """Return pos, quat, body_pos, body_quat and setpoint at a time, between two moments interpolated.
+        """Return pos, quat, body_pos, body_quat and setpoint at a time, interpolated.
 
         Args:
-            time: Time, s; before the first and after the last moment that moment's.
+            time: Time, s; clipped to the flight.
         """
         after = int(np.clip(np.searchsorted(self.time, time, side="right"), 1, max(len(self.time) - 1, 1)))
         before, after = after - 1, min(after, len(self.time) - 1)
         span = self.time[after] - self.time[before]
-        part = float(np.clip((time - self.time[before]) / span, 0, 1)) if span > 0 else 0.0
+        weight = float(np.clip((time - self.time[before]) / span, 0, 1)) if span > 0 else 0.0
 
-        def between(values: NDArray) -> NDArray:
-            return (1 - part) * values[before] + part * values[after]
+        def linear(values: NDArray) -> NDArray:
+            return (1 - weight) * values[before] + weight * values[after]
 
-        def turned(quat: NDArray) -> NDArray:
-            # The shorter way round: q and -q are one attitude.
+        def spherical(quat: NDArray) -> NDArray:
+            # q and -q are the same attitude: interpolate along the shorter arc.
             sign = np.where((quat[before] * quat[after]).sum(-1, keepdims=True) < 0, -1, 1)
-            mixed = (1 - part) * quat[before] + part * sign * quat[after]
+            mixed = (1 - weight) * quat[before] + weight * sign * quat[after]
             return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
 
         return {
-            "pos": between(self.pos),
-            "quat": turned(self.quat),
-            "body_pos": between(self.body_pos),
-            "body_quat": turned(self.body_quat),
-            "setpoint": between(self.setpoint),
+            "pos": linear(self.pos),
+            "quat": spherical(self.quat),
+            "body_pos": linear(self.body_pos),
+            "body_quat": spherical(self.body_quat),
+            "setpoint": linear(self.setpoint),
         }
 
     def save(self, path: str | Path) -> None:
-        """Write everything into one ``.npz`` file.
+        """Write the flight to an ``.npz`` file.
 
         Raises:
-            ConfigError: If there is no such folder, or the name ends otherwise.
+            ConfigError: If the folder does not exist, or the name has another suffix.
         """
         path = Path(path)
         if path.suffix != ".npz":
-            raise ConfigError(f"{path} is no recording; its name must end with .npz")
+            raise ConfigError(f"expected the name of a recording to end with .npz, got {str(path)!r}")
         if not path.parent.is_dir():
-            raise ConfigError(f"{path} cannot be written: there is no folder {path.parent}")
+            raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
         shapes = self.shapes
         arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shapes"}
         arrays["shape_kind"] = np.array([KINDS.index(shape.kind) for shape in shapes], int)
         for name in ("size", "rgba", "mocap", "pos", "quat"):
             arrays[f"shape_{name}"] = np.array([getattr(shape, name) for shape in shapes]).reshape(len(shapes), -1)
-        for name in ("vertices", "faces"):  # of all meshes one after the other
+        for name in ("vertices", "faces"):  # of all meshes, concatenated
             arrays[f"shape_{name}"] = np.concatenate([np.zeros((0, 3)), *(getattr(shape, name) for shape in shapes)])
         arrays["shape_n"] = np.array([(len(shape.vertices), len(shape.faces)) for shape in shapes], int).reshape(-1, 2)
         np.savez_compressed(path, format=FORMAT, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Flight:
-        """Read what ``save`` has written.
+        """Return the flight that ``save`` has written.
 
         Raises:
-            ConfigError: If there is no such file, or it is no recorded flight.
+            ConfigError: If the file does not exist or is not a recorded flight.
         """
         path = Path(path)
         if not path.is_file():
-            raise ConfigError(f"there is no file {path}")
+            raise ConfigError(f"expected an existing file, got {str(path)!r}")
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = dict(file)
             if int(arrays["format"]) != FORMAT:
-                raise ConfigError(f"{path} has format {arrays['format']}; this version reads format {FORMAT}")
+                raise ConfigError(f"expected a recording of format {FORMAT}, got format {arrays['format']} in {path}")
             n = arrays["shape_n"]
             vertices = np.split(arrays["shape_vertices"], np.cumsum(n[:, 0])[:-1]) if len(n) else []
             faces = np.split(arrays["shape_faces"].astype(int), np.cumsum(n[:, 1])[:-1]) if len(n) else []
@@ -139,4 +139,4 @@ class Flight:
         except ConfigError:
             raise
         except (KeyError, ValueError, OSError, EOFError) as error:
-            raise ConfigError(f"{path} is no recorded flight: {error}") from error
+            raise ConfigError(f"expected a recorded flight, got {str(path)!r}: {error}") from error

@@ -1,4 +1,4 @@
-"""Where drones have been: the last seconds of their way, as lines that fade towards their beginning."""
+"""Trails: the recent positions of drones, as lines that fade towards their beginning."""
 
 from __future__ import annotations
 
@@ -8,97 +8,97 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 
 COLORS = np.array([[0.90, 0.30, 0.20, 1], [0.15, 0.50, 0.85, 1], [0.20, 0.65, 0.35, 1], [0.85, 0.60, 0.10, 1]])
-"""Colours that tell drones apart, one after the other, rgba. (4, 4)"""
-FAINTEST = 0.15
-"""How much of a trail's beginning is seen, 0 to 1."""
+"""Default colours of drones, repeated in this order, rgba. (4, 4)"""
+MIN_ALPHA = 0.15
+"""Opacity of a trail's beginning, 0 to 1."""
 
 
 def colors_of(n_drones: int, rgba: ArrayLike | None) -> NDArray:
-    """Return a colour for each drone: the given one, those given for each, or else what tells them apart. (n, 4)"""
+    """Return a colour for each drone: the given one, or one of ``COLORS`` if it is None. (n_drones, 4)"""
     return COLORS[np.arange(n_drones) % len(COLORS)] if rgba is None else np.broadcast_to(rgba, (n_drones, 4))
 
 
 class Trail:
-    """The way of the drones of some worlds over the last seconds.
+    """Positions of the drones of some worlds over the last seconds.
 
-    A world whose time goes back has been reset, and leaves its old way behind.
+    A world whose time decreases has been reset, and its trail begins again.
     """
 
     def __init__(self, seconds: float):
-        """Begin without a past.
+        """Begin with an empty trail.
 
         Args:
-            seconds: Time that is kept, s.
+            seconds: Duration of the trail, s.
 
         Raises:
-            ConfigError: If there is no such time.
+            ConfigError: If the duration is not positive.
         """
         if not np.isfinite(seconds) or seconds <= 0:
-            raise ConfigError(f"a trail of {seconds} s cannot be; its time must be positive")
+            raise ConfigError(f"expected a positive duration of a trail, s, got {seconds!r}")
         self.seconds = float(seconds)
-        self._past: deque[tuple[NDArray, NDArray]] = deque()
+        self._samples: deque[tuple[NDArray, NDArray]] = deque()
 
     def __len__(self) -> int:
-        """Return how many moments are kept."""
-        return len(self._past)
+        """Return the number of samples."""
+        return len(self._samples)
 
     def add(self, time: ArrayLike, pos: ArrayLike) -> None:
-        """Keep where the drones are; a second call at the same time replaces the first.
+        """Add a sample; a second one at the same time replaces the first.
 
         Args:
             time: Time of each world, s. (n_worlds,)
-            pos: World frame, m. (n_worlds, n_drones, 3)
+            pos: Positions of the drones, world frame, m. (n_worlds, n_drones, 3)
 
         Raises:
-            ConfigError: If the shapes do not go together, or are not those of earlier calls.
+            ConfigError: If the shapes do not match each other or earlier calls.
         """
-        now, places = np.array(time, float), np.array(pos, float)
-        if places.ndim != 3 or places.shape[2] != 3 or now.shape != places.shape[:1]:
+        now, pos = np.array(time, float), np.array(pos, float)
+        if pos.ndim != 3 or pos.shape[2] != 3 or now.shape != pos.shape[:1]:
             raise ConfigError(
-                f"a trail takes times (n_worlds,) and positions (n_worlds, n_drones, 3), got {now.shape} and "
-                f"{places.shape}"
+                f"expected times of shape (n_worlds,) and positions of shape (n_worlds, n_drones, 3), got {now.shape} "
+                f"and {pos.shape}"
             )
-        if self._past and self._past[-1][1].shape != places.shape:
-            raise ConfigError(f"this trail has positions of shape {self._past[-1][1].shape}, got {places.shape}")
-        if self._past and (self._past[-1][0] == now).all():
-            self._past.pop()
-        self._past.append((now, places))
-        while all(self._gone(self._past[0][0], now)):
-            self._past.popleft()
+        if self._samples and self._samples[-1][1].shape != pos.shape:
+            raise ConfigError(f"expected positions of shape {self._samples[-1][1].shape}, as before, got {pos.shape}")
+        if self._samples and (self._samples[-1][0] == now).all():
+            self._samples.pop()
+        self._samples.append((now, pos))
+        while all(self._has_expired(self._samples[0][0], now)):
+            self._samples.popleft()
 
-    def _gone(self, then: NDArray, now: NDArray) -> NDArray:
+    def _has_expired(self, then: NDArray, now: NDArray) -> NDArray:
         return (then < now - self.seconds - 1e-6) | (then > now)
 
-    def way(self, world: int) -> NDArray:
-        """Return the way of the drones of a world since its last reset, oldest first, m. (n, n_drones, 3)
+    def path(self, world: int) -> NDArray:
+        """Return the positions of the drones of a world since its last reset, oldest first, m. (n, n_drones, 3)
 
         Args:
-            world: Which of the worlds that ``add`` gets, counted from 0.
+            world: Index of the world in the arrays that ``add`` receives.
         """
-        way: list[NDArray] = []
+        path: list[NDArray] = []
         later = np.inf
-        for then, places in reversed(self._past):
-            if then[world] > later or then[world] < self._past[-1][0][world] - self.seconds - 1e-6:
+        for then, pos in reversed(self._samples):
+            if then[world] > later or then[world] < self._samples[-1][0][world] - self.seconds - 1e-6:
                 break
             later = then[world]
-            way.append(places[world])
-        return np.stack(way[::-1]) if way else np.zeros((0, 0, 3))
+            path.append(pos[world])
+        return np.stack(path[::-1]) if path else np.zeros((0, 0, 3))
 
-    def draw(self, marks: Marks, world: int = 0, rgba: ArrayLike | None = None, width: float = 3.0) -> None:
-        """Add the lines to what is drawn into the next picture, ``sim.marks``.
+    def draw(self, overlays: Overlays, world: int = 0, rgba: ArrayLike | None = None, width: float = 3.0) -> None:
+        """Add the trails of a world to overlays.
 
         Args:
-            marks: What they are added to.
-            world: Which of the worlds that ``add`` gets, counted from 0.
-            rgba: Colour, one or one per drone; None for colours that tell drones apart. (4,) or (n_drones, 4)
+            overlays: Overlays of the next image, ``sim.overlays``.
+            world: Index of the world in the arrays that ``add`` receives.
+            rgba: Colour, one or one per drone; None for ``COLORS``. (4,) or (n_drones, 4)
             width: Width at the drone, pixels.
         """
-        way = self.way(world)
-        if len(way) < 2:
+        path = self.path(world)
+        if len(path) < 2:
             return
-        fade = np.linspace(FAINTEST, 1.0, len(way) - 1)[:, None] ** [0, 0, 0, 1]
-        for drone, color in enumerate(colors_of(way.shape[1], rgba)):
-            marks.line(way[:, drone], color * fade, 1.0, width)
+        fade = np.linspace(MIN_ALPHA, 1.0, len(path) - 1)[:, None] ** [0, 0, 0, 1]
+        for drone, color in enumerate(colors_of(path.shape[1], rgba)):
+            overlays.line(path[:, drone], color * fade, 1.0, width)

@@ -1,4 +1,4 @@
-"""Recorded flights in a browser: one page that needs no server, with a bar to play and scrub."""
+"""Recorded flights in a browser: a self-contained page with a bar to play and scrub."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from crazysim.media.trail import colors_of
 from crazysim.scene.visual_geoms import VisualGeom
 
 FPS = 30
-"""Moments per second that a page has."""
-FAR = 20.0
-"""Half the size of a floor that has no end, m."""
+"""Samples per second of a page."""
+PLANE_SIZE = 20.0
+"""Half size of infinite planes, m."""
 FOV = 50.0
-"""Vertical field of view at the beginning, degrees."""
+"""Initial vertical field of view, degrees."""
 
 
 def page(flight: Flight, world: int | None = None) -> str:
-    """Return one world of a flight as a page of HTML: drones, obstacles, setpoints, and the way that was flown.
+    """Return one world of a flight as an HTML page with drones, obstacles, setpoints and trails.
 
-    The page is whole: viewer and flight are in it, and it opens from a file, without a server or a network.
+    The page contains viewer and flight: it opens from a file, without a server or a network.
 
     Args:
-        flight: The flight.
-        world: Which world of the simulation; the first that was recorded if left out.
+        flight: Flight.
+        world: Index of the world in the simulation; None for the first that was recorded.
 
     Raises:
         ConfigError: If that world was not recorded.
@@ -41,7 +41,9 @@ def page(flight: Flight, world: int | None = None) -> str:
     """
     k = 0 if world is None else flight.index(world)
     viser = _viser()
-    with contextlib.redirect_stdout(io.StringIO()):  # what viser prints is about a server that nobody is to visit
+    with contextlib.redirect_stdout(
+        io.StringIO()
+    ):  # viser prints the address of its server, which runs for this call only
         server = viser.ViserServer(host="127.0.0.1", port=_free_port(), verbose=False)
         try:
             return _record(server, flight, k).as_html()
@@ -50,27 +52,27 @@ def page(flight: Flight, world: int | None = None) -> str:
 
 
 def export(flight: Flight, path: str | Path, world: int | None = None) -> None:
-    """Write ``page`` into a file.
+    """Write ``page`` to a file.
 
     Raises:
-        ConfigError: If the world was not recorded, there is no such folder, or the name ends otherwise.
+        ConfigError: If the world was not recorded, the folder does not exist, or the name has another suffix.
         ImportError: If viser is not installed.
     """
     path = Path(path)
     if path.suffix != ".html":
-        raise ConfigError(f"{path} is no page; its name must end with .html")
+        raise ConfigError(f"expected the name of a page to end with .html, got {str(path)!r}")
     if not path.parent.is_dir():
-        raise ConfigError(f"{path} cannot be written: there is no folder {path.parent}")
+        raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
     path.write_text(page(flight, world), encoding="utf-8")
 
 
 def server_of(html: str, port: int, host: str = "127.0.0.1") -> http.server.ThreadingHTTPServer:
-    """Return a server of one page; ``serve_forever`` has it begin.
+    """Return a server of one page; ``serve_forever`` starts it.
 
     Args:
-        html: The page.
-        port: Where it listens; 0 for any that is free.
-        host: Who may see it; ``0.0.0.0`` for everyone.
+        html: Page.
+        port: Port; 0 for any free port.
+        host: Address to listen at; ``0.0.0.0`` for every network.
 
     Raises:
         RenderError: If it cannot listen there.
@@ -91,34 +93,34 @@ def server_of(html: str, port: int, host: str = "127.0.0.1") -> http.server.Thre
     try:
         return http.server.ThreadingHTTPServer((host, port), Handler)
     except (OSError, OverflowError) as error:
-        raise RenderError(f"no page can be served at {host}:{port}: {error}; choose another --port") from error
+        raise RenderError(f"expected a free address, got {host}:{port}: {error}. Choose another --port.") from error
 
 
 def camera_of(flight: Flight, k: int) -> tuple[NDArray, NDArray]:
-    """Return where a page's camera is at first, and where it looks: at all of the k-th world's flight, m. (3,), (3,)"""
-    places = flight.pos[:, k].reshape(-1, 3)
-    places = places[np.isfinite(places).all(-1)]
-    low, high = (places.min(0), places.max(0)) if len(places) else (np.zeros(3), np.ones(3))
+    """Return the initial position of a page's camera and the point it looks at, for a whole flight, m. (3,), (3,)"""
+    points = flight.pos[:, k].reshape(-1, 3)
+    points = points[np.isfinite(points).all(-1)]
+    low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.ones(3))
     middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
     return middle + reach * np.array([0.0, -1.1, 0.7]), middle
 
 
 def serve(flight: Flight, world: int | None = None, port: int = 8080, host: str = "127.0.0.1") -> None:
-    """Show a flight at a port until it is interrupted.
+    """Serve a flight at a port until interrupted.
 
     Raises:
         ConfigError: If the world was not recorded.
         ImportError: If viser is not installed.
-        RenderError: If nothing can be served there.
+        RenderError: If it cannot listen there.
     """
     with server_of(page(flight, world), port, host) as server:
-        print(f"the flight is at http://{host}:{server.server_port}; Ctrl-C ends", flush=True)
+        print(f"serving the flight at http://{host}:{server.server_port}; stop with Ctrl-C", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             server.serve_forever()
 
 
 def _record(server: Any, flight: Flight, k: int) -> Any:
-    """Return viser's recording of the k-th of a flight's worlds."""
+    """Return viser's recording of the k-th world of a flight."""
     scene = server.scene
     scene.set_up_direction("+z")
     camera = server.initial_camera
@@ -128,21 +130,21 @@ def _record(server: Any, flight: Flight, k: int) -> Any:
         int(mocap): scene.add_frame(f"/bodies/{mocap}", show_axes=False)
         for mocap in (*flight.drone_ids, *flight.body_ids)
     }
-    by_look: dict[tuple[int, tuple], list[VisualGeom]] = defaultdict(list)
+    by_color: dict[tuple[int, tuple], list[VisualGeom]] = defaultdict(list)
     for shape in flight.shapes:
-        by_look[shape.mocap, tuple(np.round(shape.rgba, 3))].append(shape)
-    for i, ((mocap, rgba), shapes) in enumerate(by_look.items()):
+        by_color[shape.mocap, tuple(np.round(shape.rgba, 3))].append(shape)
+    for i, ((mocap, rgba), shapes) in enumerate(by_color.items()):
         parent = f"/bodies/{mocap}" if mocap in frames else "/scene"
         _add(scene, f"{parent}/{i}", shapes, rgba)
 
     colors = colors_of(flight.n_drones, None)
     for drone in range(flight.n_drones):
-        way = flight.pos[:, k, drone]
-        way = way[np.isfinite(way).all(-1)]
-        if len(way) > 1:
-            pieces = np.stack([way[:-1], way[1:]], axis=1).astype(np.float32)
+        path = flight.pos[:, k, drone]
+        path = path[np.isfinite(path).all(-1)]
+        if len(path) > 1:
+            segments = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
             scene.add_line_segments(
-                f"/ways/{drone}", pieces, _rgb(colors[drone]), thickness=1.5, thickness_units="screen"
+                f"/trails/{drone}", segments, _rgb(colors[drone]), thickness=1.5, thickness_units="screen"
             )
     balls = [
         scene.add_icosphere(f"/setpoints/{drone}", radius=0.02, color=_rgb(colors[drone]))
@@ -151,13 +153,13 @@ def _record(server: Any, flight: Flight, k: int) -> Any:
 
     recording = server.get_scene_serializer()
     end = float(flight.time[-1])
-    times = np.linspace(0, end, int(np.ceil(FPS * end)) + 1)  # viser itself puts nothing between two moments
+    times = np.linspace(0, end, int(np.ceil(FPS * end)) + 1)  # viser does not interpolate
     shown: dict[Any, NDArray] = {}
 
     def move(handle: Any, pos: NDArray, quat: NDArray | None = None) -> None:
         pose = np.concatenate([pos, [] if quat is None else np.roll(quat, 1)])
         if not np.isfinite(pose).all() or np.array_equal(shown.get(handle.name, np.inf), pose):
-            return  # what stands still is sent once, and a world that broke stays where it was last seen
+            return  # unchanged poses are sent once, and non-finite ones not at all
         shown[handle.name] = pose
         handle.position = pose[:3]
         if quat is not None:
@@ -179,25 +181,25 @@ def _record(server: Any, flight: Flight, k: int) -> Any:
 
 
 def _add(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> None:
-    """Add shapes of one body and one colour: the planes each, all others as one mesh."""
+    """Add geoms of one body and one colour: planes one by one, all others as one mesh."""
     import trimesh
 
     meshes = []
     for i, shape in enumerate(shapes):
         if shape.kind == "plane":
-            width, height = (2 * FAR if size == 0 else 2 * float(size) for size in shape.size[:2])
+            width, height = (2 * PLANE_SIZE if size == 0 else 2 * float(size) for size in shape.size[:2])
             scene.add_grid(
                 f"{name}/plane{i}", width, height, cell_size=1.0, cell_color=_rgb(rgba, 0.9), section_size=5.0,
                 section_color=_rgb(rgba, 0.8), plane_color=_rgb(rgba), plane_opacity=float(rgba[3]),
-                infinite_grid=not shape.size[:2].any(), fade_distance=2 * FAR,
+                infinite_grid=not shape.size[:2].any(), fade_distance=2 * PLANE_SIZE,
                 position=shape.pos, wxyz=np.roll(shape.quat, 1),
             )  # fmt: skip
             continue
         mesh = _mesh(shape)
-        turn = np.eye(4)
-        turn[:3, :3] = trimesh.transformations.quaternion_matrix(np.roll(shape.quat, 1))[:3, :3]
-        turn[:3, 3] = shape.pos
-        meshes.append(mesh.apply_transform(turn))
+        pose = np.eye(4)
+        pose[:3, :3] = trimesh.transformations.quaternion_matrix(np.roll(shape.quat, 1))[:3, :3]
+        pose[:3, 3] = shape.pos
+        meshes.append(mesh.apply_transform(pose))
     if meshes:
         mesh = trimesh.util.concatenate(meshes)
         scene.add_mesh_simple(
@@ -212,7 +214,7 @@ def _add(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> None:
 
 
 def _mesh(shape: VisualGeom) -> Any:
-    """Return a shape as triangles, in its own frame."""
+    """Return a geom as triangles, in its own frame."""
     import trimesh
 
     radius, half = float(shape.size[0]), float(shape.size[1])
@@ -237,7 +239,7 @@ def _viser() -> Any:
     try:
         import viser
     except ImportError as error:
-        raise ImportError("flights in a browser need viser; pip install 'crazysim[web]'") from error
+        raise ImportError("expected viser, which pages need, got none. Run pip install 'crazysim[web]'.") from error
     return viser
 
 

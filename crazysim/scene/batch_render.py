@@ -1,4 +1,4 @@
-"""Colour pictures of many worlds in one call, traced by MuJoCo Warp, which MJX brings and which needs warp-lang."""
+"""Images of many worlds in one call, ray-traced by MuJoCo Warp, which comes with MJX and needs warp-lang."""
 
 from __future__ import annotations
 
@@ -14,42 +14,42 @@ from jax import Array
 from crazysim.errors import ConfigError
 from crazysim.scene.render import camera_id, require_size
 
-MISSING = "pictures of many worlds at once need MuJoCo Warp; pip install 'crazysim[warp]'"
+MISSING = "expected MuJoCo Warp to render many worlds at once, got no warp-lang. Run pip install 'crazysim[warp]'."
 
 
 def installed() -> bool:
-    """Return whether MuJoCo Warp can run here."""
+    """Return True if MuJoCo Warp is installed."""
     return importlib.util.find_spec("warp") is not None
 
 
 class BatchRenderer:
-    """One camera of many worlds, with the lights, shadows and materials of the scene; marks are not drawn.
+    """Renderer of one camera in many worlds, with lights, shadows and materials, without overlays.
 
-    Its memory is that of the pictures, and of the scene in so many worlds.
+    Its memory is that of the images and of the scene in as many worlds.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: str | int, width: int, height: int, n_worlds: int, device: Any):
-        """Prepare; MuJoCo Warp compiles its kernels when it first runs on a machine, which takes some seconds.
+        """Prepare. MuJoCo Warp compiles its kernels at its first run on a machine, which takes some seconds.
 
         Args:
-            model: The scene.
+            model: Compiled scene.
             camera: Name or id of a camera.
-            width: Of each picture, pixels.
-            height: Of each picture, pixels.
-            n_worlds: How many worlds are drawn at once.
-            device: JAX's device whose memory the poses are in.
+            width: Width of each image, pixels.
+            height: Height of each image, pixels.
+            n_worlds: Number of worlds.
+            device: JAX device of the poses.
 
         Raises:
             ImportError: If warp-lang is not installed.
             UnknownNameError: If there is no such camera.
-            ConfigError: If it is the free one, or the size cannot be.
+            ConfigError: If it is the free camera, or the size is invalid.
         """
         if not installed():
             raise ImportError(MISSING)
         require_size(width, height)
         number = camera_id(model, camera)
         if number < 0:
-            raise ConfigError("MuJoCo Warp draws what a camera of the scene sees, and not the free camera; name one")
+            raise ConfigError("expected a camera of the scene, got the free camera, which MuJoCo Warp cannot render")
         import mujoco.mjx.third_party.mujoco_warp as mjw
         import warp as wp
 
@@ -72,12 +72,12 @@ class BatchRenderer:
             )
 
     def __call__(self, mocap_pos: Array, mocap_quat: Array, qpos: Array) -> Array:
-        """Return the pictures, on JAX's device. (n_worlds, height, width, 3), uint8
+        """Return the images, on the JAX device. (n_worlds, height, width, 3), uint8
 
         Args:
             mocap_pos: Positions of all mocap bodies, m. (n_worlds, n_mocap, 3)
-            mocap_quat: Their attitudes, wxyz. (n_worlds, n_mocap, 4)
-            qpos: Positions of joints. (n_worlds, n_qpos)
+            mocap_quat: Attitudes of all mocap bodies, wxyz. (n_worlds, n_mocap, 4)
+            qpos: Joint positions. (n_worlds, n_qpos)
         """
         wp, mjw, d = self._wp, self._mjw, self._data
         with wp.ScopedDevice(self._device):
@@ -97,11 +97,11 @@ class BatchRenderer:
             return _unpacked(wp.to_jax(self._context.rgb_data), self._shape)
 
 
-def _unpacked(words: Array, shape: tuple[int, int, int]) -> Array:
-    """Return pixels of four bytes as three colours; a copy, for the words will be written to."""
-    return _bytes(words).reshape(*shape, 3)
+def _unpacked(pixels: Array, shape: tuple[int, int, int]) -> Array:
+    """Return packed pixels as three colours; a copy, because the next call writes to the same buffer."""
+    return _bytes(pixels).reshape(*shape, 3)
 
 
 @jax.jit
-def _bytes(words: Array) -> Array:
-    return jnp.stack([words >> shift for shift in np.array([16, 8, 0], np.uint32)], axis=-1).astype(jnp.uint8)
+def _bytes(pixels: Array) -> Array:
+    return jnp.stack([pixels >> shift for shift in np.array([16, 8, 0], np.uint32)], axis=-1).astype(jnp.uint8)

@@ -1,4 +1,4 @@
-"""Build the scene: a base file, one mocap body per drone, and what the user adds; then compile it."""
+"""Construction of the scene: a base file, one mocap body per drone, and what the user adds."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import mujoco
 import numpy as np
 
 from crazysim.drones.airframe import Airframe
-from crazysim.drones.body import LED_MATERIALS, MATERIALS, Part, body_cameras, body_parts
+from crazysim.drones.body import LED_MATERIALS, MATERIALS, BodyGeom, body_cameras, body_geoms
 from crazysim.errors import ConfigError
 from crazysim.scene import mjx
 
 SCENE = Path(__file__).parents[1] / "scene.xml"
 
 CHUNK = 128
-"""Drones that are added to a spec one by one."""
+"""Most drones that are added to a spec one by one."""
 
 
 def build_spec(
@@ -29,29 +29,31 @@ def build_spec(
     """Return the scene as an editable spec, with the drones ``drone:0`` to ``drone:{n_drones - 1}`` in it.
 
     Args:
-        xml_path: A MJCF scene without drones; None for the package's own floor, light and sky.
-        airframe: What the drones look like.
-        n_drones: How many there are.
+        xml_path: MJCF scene without drones; None for the package's own floor, light and sky.
+        airframe: Airframe of the drones.
+        n_drones: Number of drones.
         freq: Physics steps per second, Hz.
-        max_geom_pairs: Cap on the pairs MJX checks per kind of collision; -1 for none.
+        max_geom_pairs: Most pairs that MJX checks per kind of collision; -1 for all.
 
     Raises:
-        ConfigError: If the file does not exist, is no MJCF, or holds names the drones need.
+        ConfigError: If the file does not exist, cannot be read, or has names that are reserved for drones.
     """
     if xml_path is not None and not isinstance(xml_path, (str, Path)):
-        raise ConfigError(f"xml_path is {xml_path!r}; it must be the path of an MJCF file, or None")
+        raise ConfigError(f"expected the path of an MJCF file or None as xml_path, got {xml_path!r}")
     path = SCENE if xml_path is None else Path(xml_path)
     if not path.is_file():
-        raise ConfigError(f"scene file {path} does not exist; pass xml_path= of an MJCF file, or leave it out")
+        raise ConfigError(f"expected an existing MJCF file as xml_path, got {str(path)!r}")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise ConfigError(f"scene file {path} is not a scene MuJoCo can read: {error}") from error
+        raise ConfigError(f"expected a scene that MuJoCo can read, got {str(path)!r}: {error}") from error
     spec.option.timestep = 1 / freq
     spec.add_numeric(name="max_geom_pairs", data=[max_geom_pairs])
     taken = [body.name for body in spec.bodies if body.name.startswith("drone:")]
     if taken:
-        raise ConfigError(f"scene file {path} has bodies named {taken}; names that begin with 'drone:' are the drones'")
+        raise ConfigError(
+            f"expected no bodies named 'drone:...', which are reserved for the drones, got {taken} in {str(path)!r}"
+        )
     _add_drones(spec, airframe, n_drones)
     # mjx.kinematics refuses a model without any degree of freedom, and mocap bodies have none.
     dummy = spec.worldbody.add_body(name="_dummy", mass=1e-6, inertia=[1e-9] * 3)
@@ -94,11 +96,11 @@ def _no_warnings() -> Iterator[None]:
 
 
 def _add_bodies(spec: mujoco.MjSpec, airframe: Airframe, drones: range) -> None:
-    parts, cameras = body_parts(airframe), body_cameras(airframe)
+    geoms, cameras = body_geoms(airframe), body_cameras(airframe)
     for i in drones:
         body = spec.worldbody.add_body(name=f"drone:{i}", mocap=True)
-        for part in parts:
-            _add_part(body, part, i)
+        for geom in geoms:
+            _add_geom(body, geom, i)
         for camera in cameras:
             mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK if camera.tracks else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
             added = body.add_camera(name=f"{camera.name}:{i}", pos=camera.pos, fovy=camera.fovy, mode=mode)
@@ -106,22 +108,22 @@ def _add_bodies(spec: mujoco.MjSpec, airframe: Airframe, drones: range) -> None:
             added.alt.xyaxes = camera.xyaxes
 
 
-def _add_part(body: mujoco.MjsBody, part: Part, i: int) -> None:
-    geom = body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}"), size=part.size, mass=0)
-    if part.end is None:
-        geom.pos = part.pos
+def _add_geom(body: mujoco.MjsBody, geom: BodyGeom, i: int) -> None:
+    added = body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{geom.kind.upper()}"), size=geom.size, mass=0)
+    if geom.end is None:
+        added.pos = geom.pos
     else:
-        geom.fromto = [*part.pos, *part.end]
-    if part.touches:
-        geom.name, geom.group, geom.condim, geom.rgba = f"{part.name}:{i}", 3, 1, (0.5, 0.5, 0.5, 0.3)
-        _set_touching(geom, part.name == "col_sphere")
+        added.fromto = [*geom.pos, *geom.end]
+    if geom.collides:
+        added.name, added.group, added.condim, added.rgba = f"{geom.name}:{i}", 3, 1, (0.5, 0.5, 0.5, 0.3)
+        _set_touching(added, geom.name == "col_sphere")
     else:
-        geom.group, geom.contype, geom.conaffinity = 2, 0, 0
-        geom.material = f"{part.material}:{i}" if part.material in LED_MATERIALS else part.material
+        added.group, added.contype, added.conaffinity = 2, 0, 0
+        added.material = f"{geom.material}:{i}" if geom.material in LED_MATERIALS else geom.material
 
 
 def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:
-    """Let drones touch with their boxes, or with their spheres, once the spec is compiled again."""
+    """Make the boxes or the spheres of drones collide, once the spec is compiled again."""
     for i in range(n_drones):
         for kind in ("col_sphere", "col_box"):
             geom = spec.geom(f"{kind}:{i}")
@@ -145,24 +147,24 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
             warnings.filterwarnings("ignore", message="Attaching a spec with an empty prefix")
             return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise ConfigError(f"the scene does not compile: {error}") from error
+        raise ConfigError(f"expected a scene that compiles, got: {error}") from error
 
 
 def put_model(mj_model: mujoco.MjModel, device: jax.Device) -> mjx.Model:
     """Return the model as arrays on a device.
 
     Raises:
-        ConfigError: With MJX's message, if it cannot hold something of the scene.
+        ConfigError: With MJX's message, if MJX does not support the scene.
     """
     with _limits_of_mjx():
         return mjx.put_model(mj_model, device=device)
 
 
 def make_data(mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device) -> mjx.Data:
-    """Return the state of the scene for every world, as the model has it. (n_worlds, ...)
+    """Return the initial state of the scene in every world. (n_worlds, ...)
 
     Raises:
-        ConfigError: With MJX's message, if it cannot hold something of the scene.
+        ConfigError: With MJX's message, if MJX does not support the scene.
     """
     with _limits_of_mjx():
         one = mjx.put_data(mj_model, mujoco.MjData(mj_model), device=device)
@@ -175,8 +177,8 @@ def _limits_of_mjx() -> Iterator[None]:
         yield
     except (NotImplementedError, ValueError) as error:
         raise ConfigError(
-            f"MJX cannot hold this scene, so contacts cannot be asked for: {error}. A geom that need not touch "
-            f"anything takes part in no pair with contype='0' conaffinity='0'."
+            f"expected a scene that MJX supports, which contacts need, got: {error}. Give geoms that need not touch "
+            f"anything contype='0' conaffinity='0', or use contact_report."
         ) from error
 
 
@@ -191,11 +193,11 @@ def check_poses(mjx_data: mjx.Data, mj_model: mujoco.MjModel, n_worlds: int) -> 
         value, needed = getattr(mjx_data, name), (n_worlds, mj_model.nmocap, size)
         if np.shape(value) != needed:
             raise ConfigError(
-                f"mjx_data.{name} has shape {np.shape(value)}; this scene needs {needed} = (n_worlds, mocap bodies, "
-                f"{size}). To move some bodies write sim.mjx_data.{name}.at[:, ids].set(...)."
+                f"expected mjx_data.{name} of shape {needed} = (n_worlds, mocap bodies, {size}), got "
+                f"{np.shape(value)}. To move some bodies use sim.mjx_data.{name}.at[:, ids].set(...)."
             )
         if not isinstance(value, jax.Array) and not np.isfinite(value).all():
-            raise ConfigError(f"mjx_data.{name} holds numbers that are not finite")
+            raise ConfigError(f"expected finite numbers in mjx_data.{name}, got NaN or infinity")
         changes[name] = jnp.asarray(value, dtype=float)
     return mjx_data.replace(**changes)
 
@@ -218,6 +220,8 @@ def mocap_ids(mj_model: mujoco.MjModel, names: Iterable[str]) -> list[int]:
     for name in names:
         body = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name)
         if body < 0 or mj_model.body_mocapid[body] < 0:
-            raise ConfigError(f"the scene has no mocap body {name!r}; edits of sim.spec must leave it")
+            raise ConfigError(
+                f"expected a mocap body {name!r}, got none. Edits of sim.spec must leave it in the scene."
+            )
         ids.append(int(mj_model.body_mocapid[body]))
     return ids

@@ -1,9 +1,9 @@
-"""What contacts and rays see of a compiled scene: shapes on the floor, on objects and on drones, as constants."""
+"""Collision and visual models of a compiled scene: geoms of floor, objects and drones, as constants."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -13,125 +13,153 @@ from crazysim.geometry import Shape, hfield, hull
 
 KINDS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind for kind in
          ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")}  # fmt: skip
+DRONE_BITS = (3, 1)
+"""Bits contype and conaffinity of the geoms by which drones touch."""
+VISIBLE_GROUPS = range(3)
+"""Groups of geoms that are drawn, as in MuJoCo's own pictures."""
+OPAQUE = 0.5
+"""Least alpha of geoms that rays hit."""
 
 Matrix = tuple[tuple[float, float, float], ...]
 
 
 @dataclasses.dataclass(frozen=True)
 class CollisionGeom:
-    """A shape in the frame of what it belongs to."""
+    """A shape and its pose in the frame of a body, or in the world frame."""
 
     shape: Shape
-    """The shape, in a frame of its own."""
+    """Shape, in its own frame."""
     pos: tuple[float, float, float]
-    """Where that frame is, m."""
+    """Origin of the shape's frame, m."""
     rot: Matrix | None
-    """How it is turned, as rows of a matrix; None if it is not."""
+    """Rows of the rotation matrix from the shape's frame; None for the identity."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CollisionBody:
-    """An object of the scene."""
+    """An object: a body below the world, with all that is attached to it."""
 
     name: str
-    """Name of its body."""
-    place: int | None
-    """Where its pose is in ``data.objects``; None if its parts are where they are in every world."""
-    parts: tuple[CollisionGeom, ...]
-    """What it is made of."""
+    """Name of the body."""
+    row: int | None
+    """Row of its pose in ``data.objects``, as ``with_mocap_bodies`` extends it; None for a body that cannot move."""
+    geoms: tuple[CollisionGeom, ...]
+    """Geoms in the frame of the body; in the world frame where ``row`` is None."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CollisionModel:
-    """Everything that drones can touch."""
+    """Geoms of a scene that drones touch, or that cameras see."""
 
     floor: tuple[CollisionGeom, ...]
-    """Planes and height fields of the world itself."""
+    """Planes and height fields of the world body."""
     objects: tuple[CollisionBody, ...]
-    """Every body with something to touch; what else belongs to the world itself is ``world``."""
-    drone: tuple[CollisionGeom, ...]
-    """The shapes by which a drone touches."""
-    by_hand: tuple[str, ...]
-    """Bodies that a user can move by hand, of which only ``mjx_data`` knows where they are."""
+    """Objects with at least one geom; other geoms of the world body are an object ``world``."""
+    drone_geoms: tuple[CollisionGeom, ...]
+    """Geoms of a drone, in its body frame."""
+    mocap_bodies: tuple[str, ...]
+    """Mocap bodies without a handle, whose poses are in ``mjx_data`` only; they follow the rows of ``data.objects``."""
+    mocap_ids: tuple[int, ...]
+    """Mocap ids of those bodies."""
+
+    def without_mocap_bodies(self) -> CollisionModel:
+        """Return the model for data that ``with_mocap_bodies`` has extended by the poses of those bodies."""
+        return dataclasses.replace(self, mocap_bodies=(), mocap_ids=())
 
 
-def read(model: mujoco.MjModel, movable: Sequence[str], touching: bool = True) -> CollisionModel:
-    """Return what a compiled scene is made of.
+def collision_model(model: mujoco.MjModel, handles: Sequence[str]) -> CollisionModel:
+    """Return the geoms that drones touch.
 
     Args:
-        model: The scene.
-        movable: Bodies with handles, in the order of ``data.objects``.
-        touching: Whether to take what drones touch; else what cameras see.
+        model: Compiled scene.
+        handles: Bodies with handles, in the order of ``data.objects``.
 
     Raises:
-        ConfigError: If a geom is of a kind that there is no shape for.
+        ConfigError: If a geom has an unsupported type.
     """
+
+    def touches(geom: int) -> bool:
+        return bool(DRONE_BITS[0] & model.geom_conaffinity[geom] or DRONE_BITS[1] & model.geom_contype[geom])
+
+    def touches_of_drone(geom: int) -> bool:
+        return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
+
+    return _model(model, handles, touches, touches_of_drone)
+
+
+def visual_model(model: mujoco.MjModel, handles: Sequence[str]) -> CollisionModel:
+    """Return the geoms that cameras see: meshes as convex hulls, without geoms that are more than half transparent.
+
+    Args:
+        model: Compiled scene.
+        handles: Bodies with handles, in the order of ``data.objects``.
+
+    Raises:
+        ConfigError: If a geom has an unsupported type.
+    """
+
+    def is_seen(geom: int) -> bool:
+        material = model.geom_matid[geom]
+        alpha = model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3]
+        return model.geom_group[geom] in VISIBLE_GROUPS and alpha >= OPAQUE
+
+    return _model(model, handles, is_seen, is_seen)
+
+
+def _model(
+    model: mujoco.MjModel, handles: Sequence[str], is_taken: Callable[[int], bool], of_drone: Callable[[int], bool]
+) -> CollisionModel:
+    """Return the geoms of the scene and of the first drone for which the predicates hold."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    drone_geoms = [g for g in range(model.ngeom) if _root(model, g).startswith("drone:")]
-    first = [g for g in drone_geoms if _root(model, g) == "drone:0"]
-    if touching:
-        first = [g for g in first if model.geom_contype[g] or model.geom_conaffinity[g]]
-    else:
-        first = [g for g in first if model.geom_group[g] <= VISIBLE_GROUPS and _alpha(model, g) >= OPAQUE]
-    of_drone = (3, 1)
-    floor, bodies = [], dict[str, list[int]]()
-    for g in sorted(set(range(model.ngeom)) - set(drone_geoms)):
-        kind = KINDS.get(int(model.geom_type[g]))
-        if touching:
-            meets = (of_drone[0] & model.geom_conaffinity[g]) or (of_drone[1] & model.geom_contype[g])
-        else:
-            meets = model.geom_group[g] <= VISIBLE_GROUPS and _alpha(model, g) >= OPAQUE
-        if not meets:
+    floor, drone_geoms = [], []
+    geoms_of = dict[int, list[int]]()
+    for geom in range(model.ngeom):
+        root = int(model.body_rootid[model.geom_bodyid[geom]])
+        name = body_name(model, root)
+        if name.startswith("drone:"):
+            if name == "drone:0" and of_drone(geom):
+                drone_geoms.append(_geom(model, data, geom, root))
             continue
+        if not is_taken(geom):
+            continue
+        kind = KINDS.get(int(model.geom_type[geom]))
         if kind is None:
-            raise ConfigError(f"geom {model.geom(g).name!r} is of a type that contacts and rays know no shape for")
-        root = _root(model, g)
-        if kind in ("plane", "hfield") and root == "world":
-            floor.append(_part(model, data, g, None))
+            raise ConfigError(
+                f"expected a geom of type {', '.join(KINDS.values())}, got geom {model.geom(geom).name!r} of type "
+                f"{int(model.geom_type[geom])}. Give it contype='0' conaffinity='0', or another type."
+            )
+        if root == 0 and kind in ("plane", "hfield"):
+            floor.append(_geom(model, data, geom, None))
         else:
-            bodies.setdefault(root, []).append(g)
-    numbers = {name: k for k, name in enumerate(movable)}
+            geoms_of.setdefault(root, []).append(geom)
+    mocap = {
+        name: int(mocap_id)
+        for body, mocap_id in enumerate(model.body_mocapid)
+        if mocap_id >= 0 and not (name := body_name(model, body)).startswith("drone:") and name not in handles
+    }
+    rows = {name: row for row, name in enumerate((*handles, *mocap))}
     objects = []
-    for name, geoms in bodies.items():
-        body = model.body(name).id if name in numbers else None
-        parts = tuple(_part(model, data, g, body) for g in geoms)
-        objects.append(CollisionBody(name, numbers.get(name), parts))
-    by_hand = tuple(o.name for o in objects if o.place is None and o.name != "world" and _moves(model, o.name))
-    drone = model.body("drone:0").id
-    return CollisionModel(tuple(floor), tuple(objects), tuple(_part(model, data, g, drone) for g in first), by_hand)
+    for root, geoms in geoms_of.items():
+        row = rows.get(body_name(model, root))
+        frame = None if row is None else root
+        objects.append(CollisionBody(body_name(model, root), row, tuple(_geom(model, data, g, frame) for g in geoms)))
+    return CollisionModel(tuple(floor), tuple(objects), tuple(drone_geoms), tuple(mocap), tuple(mocap.values()))
 
 
-VISIBLE_GROUPS = 2
-"""Last group of geoms that pictures show."""
-OPAQUE = 0.5
-"""How opaque a geom must be to be seen by rays."""
+def body_name(model: mujoco.MjModel, body: int) -> str:
+    """Return the name of a body; one without a name is called by its id."""
+    return model.body(body).name or f"body {body}"
 
 
-def _root(model: mujoco.MjModel, geom: int) -> str:
-    """Return the body below the world that a geom belongs to, or ``world``."""
-    root = model.body_rootid[model.geom_bodyid[geom]]
-    return model.body(root).name or f"body {root}"
-
-
-def _alpha(model: mujoco.MjModel, geom: int) -> float:
-    material = model.geom_matid[geom]
-    return float(model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3])
-
-
-def _moves(model: mujoco.MjModel, name: str) -> bool:
-    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
-    return body >= 0 and bool(model.body_mocapid[body] >= 0)
-
-
-def _part(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | None) -> CollisionGeom:
+def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | None) -> CollisionGeom:
     """Return a geom in the frame of a body, or of the world."""
     pos, rot = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
     if body is not None:
-        turned = data.xmat[body].reshape(3, 3).T
-        pos, rot = turned @ (pos - data.xpos[body]), turned @ rot
+        to_body = data.xmat[body].reshape(3, 3).T
+        pos, rot = to_body @ (pos - data.xpos[body]), to_body @ rot
     rot = np.where(np.abs(rot) < 1e-12, 0.0, rot)
-    # Poses go through float32 of no file, but through a quaternion: what is right-angled is kept so.
+    # The compiler stores attitudes as quaternions, whose rounding would turn axis-aligned boxes.
     rot = np.where(np.abs(np.abs(rot) - 1) < 1e-9, np.sign(rot), rot)
     rows = None if np.allclose(rot, np.eye(3), rtol=0, atol=1e-9) else tuple(tuple(map(float, row)) for row in rot)
     return CollisionGeom(_shape(model, geom), tuple(map(float, pos)), rows)  # type: ignore[arg-type]
@@ -151,10 +179,10 @@ def _shape(model: mujoco.MjModel, geom: int) -> Shape:
 
 
 def _hull(model: mujoco.MjModel, mesh: int) -> Shape:
-    """Return a mesh's convex hull, which is what MuJoCo touches with as well.
+    """Return the convex hull of a mesh, by which MuJoCo too computes contacts.
 
-    The graph of the hull is numbers of vertices and faces, an address for each vertex, the vertices' numbers in the
-    mesh, edges, and three vertices for each face (MuJoCo's ``mesh_graph``).
+    MuJoCo's ``mesh_graph`` of a hull holds the numbers of vertices and faces, an address for each vertex, the indices
+    of the vertices in the mesh, edges, and three vertices for each face.
     """
     first, n = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     vertices = np.asarray(model.mesh_vert[first : first + n], np.float64)

@@ -79,7 +79,7 @@ class ContactLog(Plugin):
         return found
 
     def _names(self, sim: Simulation) -> tuple[str, ...]:
-        return tuple(body.name for body in choose(sim.scene.solids, self.objects))
+        return tuple(body.name for body in choose(sim.scene.collision_model, self.objects))
 
     def _stage(self, contacts: Callable[[SimData], ContactReport], scope: StageScope) -> Stage:
         def check(data: SimData) -> SimData:

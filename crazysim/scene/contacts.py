@@ -1,4 +1,4 @@
-"""Read contacts from a synced scene. The only place that touches MJX's private contact record."""
+"""Contact slots of a synced scene. The only module that reads MJX's private contact record."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from crazysim.scene import mjx
 
 
 def contact_flags(mjx_data: mjx.Data) -> Array:
-    """Return for every contact slot whether its two geoms touch. (n_worlds, n_slots)"""
+    """Return True for every contact slot whose two geoms touch. (n_worlds, n_slots)"""
     return mjx_data._impl.contact.dist < 0
 
 
 def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) -> Array:
-    """Return for every contact slot whether its two geoms touch and one is of a body. (n_worlds, n_slots)
+    """Return True for every contact slot whose two geoms touch and one of which is part of a body. (n_worlds, n_slots)
 
     Raises:
         UnknownNameError: If the scene has no such body.
     """
-    of_body = jnp.asarray(np.flatnonzero(mj_model.geom_bodyid == body_id(mj_model, body)))
+    geoms = jnp.asarray(np.flatnonzero(mj_model.geom_bodyid == body_id(mj_model, body)))
     contact = mjx_data._impl.contact
     geom = jnp.stack([contact.geom1, contact.geom2], axis=-1)
-    return (contact.dist < 0) & jnp.any(geom[..., None] == of_body, axis=(-1, -2))
+    return (contact.dist < 0) & jnp.any(geom[..., None] == geoms, axis=(-1, -2))
 
 
 def body_id(mj_model: mujoco.MjModel, body: str) -> int:
@@ -37,6 +37,6 @@ def body_id(mj_model: mujoco.MjModel, body: str) -> int:
     found = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body) if isinstance(body, str) else -1
     if found < 0:
         names = [name for name in (mj_model.body(i).name for i in range(mj_model.nbody)) if not name.startswith("_")]
-        shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-        raise UnknownNameError(f"the scene has no body {body!r}; it has {shown}")
+        listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise UnknownNameError(f"expected a body of the scene, {listed}, got {body!r}")
     return found

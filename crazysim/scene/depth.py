@@ -15,39 +15,47 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.scene.collision import CollisionModel
+from crazysim.scene.collision import CollisionModel, body_name
+from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.rays import Hits, cast
 
-RAYS_AT_ONCE = 1 << 22
-"""Rays whose numbers are held at once; more worlds go one piece after the other."""
+MAX_RAYS = 1 << 22
+"""Most rays that are cast at a time; larger batches of worlds are split."""
 
 Along = Literal["axis", "ray"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """A camera of the scene, by what it hangs on."""
+    """A camera of the scene, relative to the body that carries it."""
 
-    on: Literal["world", "drone", "object"]
-    """What it hangs on."""
-    place: int
-    """Which drone, or which of ``data.objects``."""
+    carrier: Literal["world", "drone", "object"]
+    """Kind of that body."""
+    body: str
+    """Name of that body."""
+    row: int
+    """Index of the drone, or row of the object in ``data.objects``."""
     pos: tuple[float, ...]
-    """Where it is on that, m."""
+    """Position in the frame of that body, m. (3,)"""
     rot: tuple[tuple[float, ...], ...]
-    """Its axes there, as columns: right, up, back."""
+    """Columns right, up and back of the camera in that frame. (3, 3)"""
     turns: bool
-    """Whether it turns with what it hangs on."""
+    """True if it turns with that body; false if it follows its position only."""
     fovy: float
-    """What it sees from top to bottom, degrees."""
+    """Vertical field of view, degrees."""
 
 
-def find_cameras(model: mujoco.MjModel, name: str | int, movable: Sequence[str]) -> list[Camera]:
-    """Return the camera of a name or id, or, for a name without number such as ``fpv_cam``, every drone's.
+def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str]) -> list[Camera]:
+    """Return the camera of a name or id, or every drone's camera for a name without index, such as ``fpv_cam``.
+
+    Args:
+        model: Compiled scene.
+        name: Name or id.
+        objects: Bodies whose poses are in ``data.objects``, then those that are moved through ``mjx_data``.
 
     Raises:
-        UnknownNameError: If there is none.
-        ConfigError: If it hangs on a body that only ``mjx_data`` knows the place of, or aims at another body.
+        UnknownNameError: If there is no such camera.
+        ConfigError: If it aims at a body.
     """
     known = [model.camera(i).name for i in range(model.ncam)]
     if isinstance(name, (int, np.integer)) and 0 <= name < model.ncam:
@@ -57,45 +65,41 @@ def find_cameras(model: mujoco.MjModel, name: str | int, movable: Sequence[str])
     else:
         ids = [i for i, camera in enumerate(known) if isinstance(name, str) and camera.rpartition(":")[0] == name]
     if not ids:
-        shown = ", ".join(dict.fromkeys(camera.rpartition(":")[0] or camera for camera in known))
-        raise UnknownNameError(f"the scene has no camera {name!r}; it has {shown or 'none'}")
-    return [_camera(model, i, movable) for i in ids]
+        listed = ", ".join(dict.fromkeys(camera.rpartition(":")[0] or camera for camera in known))
+        raise UnknownNameError(f"expected a camera of the scene, {listed or 'which has none'}, got {name!r}")
+    return [_camera(model, i, objects) for i in ids]
 
 
-def _camera(model: mujoco.MjModel, i: int, movable: Sequence[str]) -> Camera:
+def _camera(model: mujoco.MjModel, i: int, objects: Sequence[str]) -> Camera:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_camlight(model, data)
     fixed, track = int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
-    mode, body = int(model.cam_mode[i]), int(model.cam_bodyid[i])
-    root = int(model.body_rootid[body])
-    name = model.body(root).name
+    mode, root = int(model.cam_mode[i]), int(model.body_rootid[model.cam_bodyid[i]])
+    name = body_name(model, root)
     if mode not in (fixed, track):
-        raise ConfigError(f"camera {model.camera(i).name!r} aims at a body; depth is there for fixed and track cameras")
-    place, rot = data.cam_xpos[i], data.cam_xmat[i].reshape(3, 3)
-    on, number = "world", 0
-    if name.startswith("drone:") or name in movable:
-        on = "drone" if name.startswith("drone:") else "object"
-        number = int(name.split(":")[1]) if on == "drone" else list(movable).index(name)
-        place = place - data.xpos[root]
-        if mode == fixed:
-            turned = data.xmat[root].reshape(3, 3).T
-            place, rot = turned @ place, turned @ rot
-    elif model.body_mocapid[root] >= 0:
         raise ConfigError(
-            f"camera {model.camera(i).name!r} hangs on {name!r}, which is moved by hand through sim.mjx_data; add the "
-            f"body with sim.scene.add"
+            f"expected a camera of mode 'fixed' or 'track', got {model.camera(i).name!r}, which aims at a body"
         )
-    rows = tuple(tuple(map(float, row)) for row in rot)
-    return Camera(on, number, tuple(map(float, place)), rows, mode == fixed, float(model.cam_fovy[i]))  # type: ignore[arg-type]
+    pos, rot = data.cam_xpos[i], data.cam_xmat[i].reshape(3, 3)
+    carrier, row = "world", 0
+    if name.startswith("drone:") or name in objects:
+        carrier = "drone" if name.startswith("drone:") else "object"
+        row = int(name.split(":")[1]) if carrier == "drone" else list(objects).index(name)
+        pos = pos - data.xpos[root]
+        if mode == fixed:
+            to_body = data.xmat[root].reshape(3, 3).T
+            pos, rot = to_body @ pos, to_body @ rot
+    columns = tuple(tuple(map(float, line)) for line in rot)
+    return Camera(carrier, name, row, tuple(map(float, pos)), columns, mode == fixed, float(model.cam_fovy[i]))  # type: ignore[arg-type]
 
 
 def pixel_directions(fovy: float, width: int, height: int) -> np.ndarray:
-    """Return where each pixel's middle looks, camera frame (x right, y up, z back), unit. (height, width, 3)
+    """Return unit directions of the pixel centres, camera frame (x right, y up, z back). (height, width, 3)
 
     Args:
-        fovy: Field of view from top to bottom, degrees.
+        fovy: Vertical field of view, degrees.
         width: Pixels.
         height: Pixels.
     """
@@ -106,69 +110,78 @@ def pixel_directions(fovy: float, width: int, height: int) -> np.ndarray:
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
+DepthFn = Callable[..., Hits]
+"""``depth(data, mocap=None) -> Hits``."""
+
+
 def build(
-    solids: CollisionModel,
+    model: CollisionModel,
     cameras: Sequence[Camera],
     width: int,
     height: int,
     drones: bool,
     hide_own: bool,
     along: Along,
-) -> Callable[[SimData], Hits]:
-    """Return ``depth(data) -> Hits`` of pictures (n_worlds, n_cameras, height, width); see ``Scene.depth_fn``."""
+) -> DepthFn:
+    """Return ``depth(data, mocap=None) -> Hits`` (n_worlds, n_cameras, height, width); see ``Scene.depth_fn``.
+
+    Raises:
+        ConfigError: If ``along``, the width or the height is invalid.
+    """
     if along not in ("axis", "ray"):
-        raise ConfigError(f"depth is measured along='axis' of the camera or along='ray', not {along!r}")
+        raise ConfigError(f"expected along='axis' of the camera or along='ray', got {along!r}")
     for name, n in (("width", width), ("height", height)):
         if type(n) is not int or n < 1:
-            raise ConfigError(f"a picture of {width} x {height} pixels cannot be; {name} must be a positive int")
-    looks = np.stack([pixel_directions(c.fovy, width, height).reshape(-1, 3) for c in cameras])
-    own = np.repeat([c.place if c.on == "drone" and hide_own else -1 for c in cameras], width * height)
-    rays = len(cameras) * width * height
+            raise ConfigError(f"expected an image of positive integer {name}, got {width} x {height} pixels")
+    pixels = np.stack([pixel_directions(c.fovy, width, height).reshape(-1, 3) for c in cameras])
+    own = np.repeat([c.row if c.carrier == "drone" and hide_own else -1 for c in cameras], width * height)
+    n_rays = len(cameras) * width * height
 
     def of_worlds(data: SimData) -> Hits:
         poses = [_pose(camera, data) for camera in cameras]
         eye = jnp.stack([pos for pos, _ in poses], axis=1)  # (n_worlds, n_cameras, 3)
         axes = jnp.stack([rot for _, rot in poses], axis=1)
-        pixels = jnp.asarray(looks, eye.dtype)
-        direction = sum(axes[:, :, None, :, k] * pixels[..., None, k] for k in range(3))
+        rays = jnp.asarray(pixels, eye.dtype)
+        direction = sum(axes[:, :, None, :, k] * rays[..., None, k] for k in range(3))
         origin = jnp.broadcast_to(eye[:, :, None], direction.shape)
-        flat = (direction.shape[0], rays, 3)
-        hits = cast(solids, data, origin.reshape(flat), direction.reshape(flat), own, drones)
-        ahead = jnp.asarray(-looks[..., 2].reshape(-1), eye.dtype) if along == "axis" else 1.0
-        hits = hits.replace(distance=hits.distance * ahead)
+        flat = (direction.shape[0], n_rays, 3)
+        hits = cast(in_data, data, origin.reshape(flat), direction.reshape(flat), own, drones)
+        cosine = jnp.asarray(-pixels[..., 2].reshape(-1), eye.dtype) if along == "axis" else 1.0
+        hits = hits.replace(distance=hits.distance * cosine)
         shape = (flat[0], len(cameras), height, width)
         return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), hits)
 
-    def depth(data: SimData) -> Hits:
-        n = data.core.n_worlds
-        piece = max(1, RAYS_AT_ONCE // rays)
-        if n <= piece:
-            return of_worlds(data)
-        needed = (
-            data.states.pos,
-            data.states.quat,
-            None if data.objects is None else data.objects.replace(mocap_ids=None),
-        )
+    # Their poses become part of the data before the rays are cast.
+    in_data = model.without_mocap_bodies()
 
-        def of_one(some: Any) -> Hits:
-            pos, quat, objects = jax.tree.map(lambda x: x[None], some)
+    def depth(data: SimData, mocap: MocapPoses = None) -> Hits:
+        require_poses(model, [*(body.name for body in model.objects), *(c.body for c in cameras)], mocap)
+        data = with_mocap_bodies(model, data, mocap)
+        n_worlds, at_a_time = data.core.n_worlds, max(1, MAX_RAYS // n_rays)
+        if n_worlds <= at_a_time:
+            return of_worlds(data)
+        objects = None if data.objects is None else data.objects.replace(mocap_ids=None)
+
+        def of_one(poses: Any) -> Hits:
+            pos, quat, objects = jax.tree.map(lambda x: x[None], poses)
             states = data.states.replace(pos=pos, quat=quat)
             return jax.tree.map(lambda x: x[0], of_worlds(data.replace(states=states, objects=objects)))
 
-        return jax.lax.map(of_one, needed, batch_size=piece)
+        return jax.lax.map(of_one, (data.states.pos, data.states.quat, objects), batch_size=at_a_time)
 
     return depth
 
 
 def _pose(camera: Camera, data: SimData) -> tuple[Array, Array]:
-    """Return where a camera is in every world, m (n_worlds, 3), and its axes as columns (n_worlds, 3, 3)."""
+    """Return the camera's position in every world, m (n_worlds, 3), and its axes as columns (n_worlds, 3, 3)."""
     states, n = data.states, data.states.pos.shape[0]
     pos, rot = (jnp.asarray(x, states.pos.dtype) for x in (camera.pos, camera.rot))
-    if camera.on == "world":
+    if camera.carrier == "world":
         return jnp.broadcast_to(pos, (n, 3)), jnp.broadcast_to(rot, (n, 3, 3))
-    held = (states.pos, states.quat) if camera.on == "drone" else (data.objects.pos[:, 0], data.objects.quat[:, 0])
-    at, quat = (x[:, camera.place] for x in held)
+    objects = data.objects
+    poses = (states.pos, states.quat) if camera.carrier == "drone" else (objects.pos[:, 0], objects.quat[:, 0])
+    at, quat = (x[:, camera.row] for x in poses)
     if not camera.turns:
         return at + pos, jnp.broadcast_to(rot, (n, 3, 3))
-    # Written out: a matrix product may be rounded to 10 bits on a GPU.
+    # By components: a GPU may round matrix products to 10 bits.
     return at + rotation.rotate(quat, pos), jnp.stack([rotation.rotate(quat, rot[:, k]) for k in range(3)], axis=-1)

@@ -1,4 +1,4 @@
-"""Marks that a user draws into the next picture: lines, points, capsules, labels and text."""
+"""Overlays of the next image: lines, points, capsules, labels and text."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.errors import ConfigError, UnknownNameError
 
 RED = (1.0, 0.0, 0.0, 1.0)
+"""Default colour, rgba."""
 
 CORNERS = {
     "top left": mujoco.mjtGridPos.mjGRID_TOPLEFT,
@@ -18,66 +19,73 @@ CORNERS = {
     "bottom left": mujoco.mjtGridPos.mjGRID_BOTTOMLEFT,
     "bottom right": mujoco.mjtGridPos.mjGRID_BOTTOMRIGHT,
 }
-"""Where text may stand."""
-LONGEST_LABEL = 99
-"""Letters that MuJoCo keeps of a label."""
+"""Corners of an image for text."""
+MAX_LABEL = 99
+"""Most characters of a label, which MuJoCo cuts off there."""
 
 
 @dataclass
-class Marks:
-    """What is drawn over the scene in the next picture only."""
+class Overlays:
+    """Geoms and text that are drawn over the scene in the next image only."""
 
     limit: int = 10_000
-    """Most marks that one picture takes."""
+    """Most geoms of one image."""
     _geoms: list[tuple] = field(default_factory=list)
     _texts: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Return how many marks wait for the next picture, text aside."""
+        """Return the number of geoms for the next image."""
         return len(self._geoms)
 
     def line(self, points: NDArray, rgba: ArrayLike, start_size: float, end_size: float) -> None:
-        """Add a line through points (n, 3), its width in pixels going from one size to the other.
+        """Add a line through points.
 
-        Its colour is one for all of it, (4,), or one for each piece, (n - 1, 4).
+        Args:
+            points: World frame, m. (n, 3)
+            rgba: Colour, one or one per segment. (4,) or (n - 1, 4)
+            start_size: Width at the first point, pixels.
+            end_size: Width at the last point, pixels.
         """
         widths = np.linspace(start_size, end_size, max(len(points) - 1, 1))
-        pieces = zip(points[:-1], points[1:], widths, strict=False)
-        self._add([(mujoco.mjtGeom.mjGEOM_LINE, width, a, b) for a, b, width in pieces], rgba)
+        segments = zip(points[:-1], points[1:], widths, strict=False)
+        self._add([(mujoco.mjtGeom.mjGEOM_LINE, width, a, b) for a, b, width in segments], rgba)
 
     def points(self, points: NDArray, rgba: ArrayLike, size: float) -> None:
-        """Add spheres of a radius, m, at points (n, 3)."""
+        """Add spheres of radius ``size``, m, at points in the world frame, m. (n, 3)"""
         self._add([(mujoco.mjtGeom.mjGEOM_SPHERE, size, point, None) for point in points], rgba)
 
     def capsule(self, p1: NDArray, p2: NDArray, radius: float, rgba: ArrayLike, cylinder: bool) -> None:
-        """Add a capsule or cylinder of a radius, m, between two points."""
+        """Add a capsule or cylinder between two points, world frame, m. (3,)"""
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER if cylinder else mujoco.mjtGeom.mjGEOM_CAPSULE
         self._add([(kind, radius, p1, p2)], rgba)
 
     def label(self, text: str, point: NDArray) -> None:
-        """Add a line of text that is seen at a point (3,), in front of everything."""
-        self._add([(mujoco.mjtGeom.mjGEOM_LABEL, 0.0, point, _readable(text, LONGEST_LABEL))], (1, 1, 1, 1))
+        """Add a line of text at a point, world frame, m, in front of everything. (3,)"""
+        self._add([(mujoco.mjtGeom.mjGEOM_LABEL, 0.0, point, _readable(text, MAX_LABEL))], (1, 1, 1, 1))
 
     def text(self, text: str, corner: str) -> None:
-        """Add text to a corner of the picture, below what is there already."""
+        """Add text to a corner of the image, below earlier text."""
         if corner not in CORNERS:
-            raise UnknownNameError(f"a picture has no corner {corner!r}; its corners are {', '.join(CORNERS)}")
+            raise UnknownNameError(f"expected corner {' or '.join(map(repr, CORNERS))}, got {corner!r}")
         above = self._texts.get(corner)
         self._texts[corner] = _readable(text) if above is None else f"{above}\n{_readable(text)}"
 
     def _add(self, geoms: list[tuple], rgba: ArrayLike) -> None:
         if len(self) + len(geoms) > self.limit:
             raise ValueError(
-                f"a picture takes {self.limit} marks at most; draw fewer, or raise sim.max_visual_geom before drawing"
+                f"expected at most {self.limit} overlays in one image, got {len(self) + len(geoms)}. Increase "
+                f"sim.max_visual_geom before drawing."
             )
         colors = np.broadcast_to(np.asarray(rgba, np.float32), (len(geoms), 4))
         self._geoms += [(*geom, color) for geom, color in zip(geoms, colors, strict=True)]
 
     def write(self, scene: mujoco.MjvScene) -> None:
-        """Append the marks to a scene that is about to be drawn."""
+        """Append the geoms to a scene that is about to be drawn."""
         for kind, size, a, b, rgba in self._geoms:
             if scene.ngeom >= scene.maxgeom:
-                raise ValueError(f"the picture is full: {scene.maxgeom} geoms; raise sim.max_visual_geom")
+                raise ValueError(
+                    f"expected at most {scene.maxgeom} geoms in one image, got more. Increase sim.max_visual_geom."
+                )
             geom = scene.geoms[scene.ngeom]
             mujoco.mjv_initGeom(geom, kind, np.full(3, size), a, np.eye(3).ravel(), rgba)
             if isinstance(b, str):
@@ -88,39 +96,39 @@ class Marks:
 
     @property
     def has_text(self) -> bool:
-        """Whether there is text in a corner."""
+        """True if a corner has text."""
         return bool(self._texts)
 
     def write_text(self, pixels: mujoco.MjrRect, context: mujoco.MjrContext) -> None:
-        """Write the text of the corners over a picture that has just been drawn."""
+        """Write the text of the corners over an image that has just been drawn."""
         for corner, text in self._texts.items():
             mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, CORNERS[corner], pixels, text, "", context)
 
     def clear(self) -> None:
-        """Forget the marks."""
+        """Remove all geoms and text."""
         self._geoms.clear()
         self._texts.clear()
 
-    def copy(self) -> Marks:
-        """Return marks of their own that are the same."""
-        return Marks(self.limit, list(self._geoms), dict(self._texts))
+    def copy(self) -> Overlays:
+        """Return a copy that later changes leave alone."""
+        return Overlays(self.limit, list(self._geoms), dict(self._texts))
 
-    def restore(self, marks: Marks) -> None:
-        """Have these marks instead of what is there, as they were when ``copy`` was asked."""
-        self._geoms[:], self._texts = marks._geoms, dict(marks._texts)
+    def restore(self, overlays: Overlays) -> None:
+        """Replace geoms and text by those of a copy."""
+        self._geoms[:], self._texts = overlays._geoms, dict(overlays._texts)
 
 
 def _readable(text: str, longest: int | None = None) -> str:
     """Return text that MuJoCo's font can show.
 
     Raises:
-        ConfigError: If it cannot.
+        ConfigError: If it is empty, too long, or has characters that the font lacks.
     """
     if not isinstance(text, str) or not text:
-        raise ConfigError(f"text must be a string with something in it, not {text!r}")
-    strange = sorted({letter for letter in text if letter != "\n" and not 32 <= ord(letter) < 127})
-    if strange:
-        raise ConfigError(f"pictures have ASCII letters only; {text!r} has {''.join(strange)!r}")
+        raise ConfigError(f"expected a string that is not empty as text, got {text!r}")
+    missing = sorted({letter for letter in text if letter != "\n" and not 32 <= ord(letter) < 127})
+    if missing:
+        raise ConfigError(f"expected ASCII text, got {text!r} with {''.join(missing)!r}")
     if longest is not None and (len(text) > longest or "\n" in text):
-        raise ConfigError(f"a label is one line of {longest} letters at most, got {len(text)} letters: {text!r}")
+        raise ConfigError(f"expected a label of one line and at most {longest} characters, got {len(text)}: {text!r}")
     return text

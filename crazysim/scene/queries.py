@@ -1,4 +1,4 @@
-"""SceneQueries of a simulation to its scene, each compiled once: contact reports and depth of all worlds."""
+"""Compiled queries of a simulation to its scene: contact reports and depth of all worlds."""
 
 from __future__ import annotations
 
@@ -14,84 +14,88 @@ from crazysim.engine import fused
 from crazysim.engine.lower import UnsupportedError
 from crazysim.engine.query import Query, query
 from crazysim.scene import report
+from crazysim.scene.collision import CollisionModel
 from crazysim.scene.depth import Along
+from crazysim.scene.mocap import with_mocap_bodies
 from crazysim.scene.objects import Handle
 from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Scene
 
 
 class SceneQueries:
-    """What was asked of a scene, compiled for as long as the scene stays as it is."""
+    """Queries with the arguments seen so far, compiled until the scene changes."""
 
     def __init__(self, scene: Scene, platform: str | None):
-        """Take the scene, and the platform whose kernels may answer; None for answers by XLA alone."""
+        """Take the scene, and the platform whose kernels may run the queries; None to use XLA only."""
         self._scene = scene
         self._platform = None if platform is None or fused.missing(platform) else platform
         self._model: Any = None
-        self._compiled: dict[tuple[Any, ...], Any] = {}
+        self._compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}
 
     def contact_report(self, data: SimData, objects: Objects, floor: bool, drones: bool) -> ContactReport:
-        """Return what each drone touches; see ``Sim.contact_report``."""
-        asked = objects if isinstance(objects, (Handle, str, type(None))) else tuple(objects)
-        answer = self._answer("report", data, lambda: self._contacts(asked, floor, drones), asked, floor, drones)
-        return answer(*_poses(data))
+        """Return the contacts of every drone; see ``Sim.contact_report``."""
+        key = objects if isinstance(objects, (Handle, str, type(None))) else tuple(objects)
+        settings = (key, floor, drones)
+        return self._run("contacts", lambda: self._contacts(*settings), self._scene.collision_model, data, *settings)
 
     def depth(
         self, data: SimData, camera: str | int, width: int, height: int, drones: bool, hide_own: bool, along: Along
     ) -> Array:
-        """Return what cameras measure, m; see ``Sim.depth``. (n_worlds, n_cameras, height, width)"""
+        """Return the depth that cameras measure, m; see ``Sim.depth``. (n_worlds, n_cameras, height, width)"""
         settings = (camera, width, height, drones, hide_own, along)
 
-        def build() -> Callable[[SimData], Array]:
+        def build() -> Callable[..., Array]:
             look = self._scene.depth_fn(*settings)
-            return lambda data: look(data).distance
+            return lambda data, mocap: look(data, mocap).distance
 
-        return self._answer("depth", data, build, *settings)(*_poses(data))
+        return self._run("depth", build, self._scene.visual_model, data, *settings)
 
-    def _answer(
-        self, question: str, data: SimData, build: Callable[[], Callable[[SimData], Any]], *settings: Any
-    ) -> Callable[..., Any]:
-        """Return a question about poses to the scene as it is now, compiled once for each setting."""
+    def _run(
+        self, name: str, build: Callable[[], Callable[..., Any]], model: CollisionModel, data: SimData, *settings: Any
+    ) -> Any:
+        """Return the result of a query about poses, which is compiled once for its settings."""
         if self._model is not self._scene.mj_model:
             self._model, self._compiled = self._scene.mj_model, {}
-        if (question, *settings) not in self._compiled:
-            self._compiled[question, *settings] = jax.jit(_of_poses(build(), data))
-        return self._compiled[question, *settings]
+        if (name, *settings) not in self._compiled:
+            self._compiled[name, *settings] = jax.jit(_of_poses(build(), data))
+        states, objects = data.states, data.objects
+        # Only what the query needs: a compiled call costs by the number of its arrays.
+        poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
+        mocap = self._scene.mocap_poses() if model.mocap_bodies else None
+        return self._compiled[name, *settings](*poses, mocap)
 
-    def _contacts(self, objects: Objects, floor: bool, drones: bool) -> Callable[[SimData], ContactReport]:
-        """Return the report of all worlds, by one kernel where it can be written out."""
-        whole, platform = self._scene.contact_fn(objects, floor, drones), self._platform
+    def _contacts(self, objects: Objects, floor: bool, drones: bool) -> Callable[..., ContactReport]:
+        """Return the contacts of all worlds as a function of data and mocap poses, by one kernel where possible."""
+        by_xla, platform = self._scene.contact_fn(objects, floor, drones), self._platform
         if platform is None:
-            return whole
+            return by_xla
+        model = self._scene.collision_model
+        # Their poses become part of the data before the kernel runs, which is for data alone.
+        in_data = model.without_mocap_bodies()
         queries: list[Query] = []
-        if floor or report.choose(self._scene.solids, objects):
-            queries.append(("drone", self._scene.contact_fn(objects, floor, drones=False)))
+        if floor or report.choose(in_data, objects):
+            queries.append(("drone", report.build(in_data, objects, floor, drones=False)))
         if drones:
-            queries.append(("world", self._scene.contact_fn((), floor=False)))
+            queries.append(("world", report.build(in_data, (), floor=False)))
 
-        def contacts(data: SimData) -> ContactReport:
+        def contacts(data: SimData, mocap: Any) -> ContactReport:
             try:
-                return functools.reduce(ContactReport.joined, query(queries, data, platform))
+                found = query(queries, with_mocap_bodies(model, data, mocap), platform)
+                return functools.reduce(ContactReport.joined, found)
             except UnsupportedError:
-                return whole(data)
+                return by_xla(data, mocap)
 
         return contacts
 
 
-def _poses(data: SimData) -> tuple[Array | None, ...]:
-    """Return all that questions about poses look at: a compiled call costs by the number of its arrays."""
-    states, objects = data.states, data.objects
-    return states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat))
-
-
-def _of_poses(fn: Callable[[SimData], Any], data: SimData) -> Callable[..., Any]:
-    """Return a function of data as one of its poses; nothing else of the data is there."""
+def _of_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
+    """Return a function of data and mocap poses as one of poses alone; the rest of the data is left out."""
     bare = jax.tree.map(lambda _: None, data)
 
-    def of_poses(pos: Array, quat: Array, objects_pos: Array | None, objects_quat: Array | None) -> Any:
+    def of_poses(pos: Array, quat: Array, objects_pos: Array | None, objects_quat: Array | None, mocap: Any) -> Any:
         states, objects = bare.states.replace(pos=pos, quat=quat), bare.objects
         if objects is not None:
             objects = objects.replace(pos=objects_pos, quat=objects_quat)
-        return fn(bare.replace(states=states, objects=objects, plugins={}))
+        return fn(bare.replace(states=states, objects=objects, plugins={}), mocap)
 
     return of_poses

@@ -79,10 +79,10 @@ class RangeFinder(Plugin):
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that measures, of one drone, or of one world if drones are to be measured."""
         # The outline of a drone is enough for a few rays.
-        solids = dataclasses.replace(sim.scene.visible, drone=sim.scene.solids.drone)
+        model = dataclasses.replace(sim.scene.visual_model, drone_geoms=sim.scene.collision_model.drone_geoms)
         period = self._period(sim)
         when = None if period == 1 else lambda data: data.core.steps % period == 0
-        measure = Stage(lambda data: self._measure(solids, data), "world" if self.drones else "drone", when)
+        measure = Stage(lambda data: self._measure(model, data), "world" if self.drones else "drone", when)
         return [Placement(measure, before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
@@ -98,7 +98,7 @@ class RangeFinder(Plugin):
         direction = rotation.rotate(states.quat[world][:, None], record.direction)
         end = start + np.asarray(record.distance[world])[..., None] * np.asarray(direction)
         for points in np.stack(np.broadcast_arrays(start, end), axis=-2).reshape(-1, 2, 3):
-            sim.scene.marks.line(points, GREEN, 2.0, 2.0)
+            sim.scene.renderer.overlays.line(points, GREEN, 2.0, 2.0)
 
     def _period(self, sim: Simulation) -> int:
         """Return the number of steps between measurements."""
@@ -109,14 +109,14 @@ class RangeFinder(Plugin):
             raise ConfigError(f"expected freq to divide the {steps} Hz of the simulation, got {freq}. Use a divisor.")
         return steps // freq
 
-    def _measure(self, solids: CollisionModel, data: SimData) -> SimData:
+    def _measure(self, model: CollisionModel, data: SimData) -> SimData:
         record, states = self.read(data), data.states
         pos, quat = (states.pos, states.quat) if self.drones else (states.pos[None], states.quat[None])
         direction = rotation.rotate(quat[:, None], record.direction)
         n_rays = direction.shape[1]
         origin = jnp.broadcast_to(pos[:, None], direction.shape)
         own = np.repeat(np.arange(direction.shape[0]), n_rays) if self.drones else None
-        hits = cast(solids, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, self.drones)
+        hits = cast(model, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, self.drones)
         distance = jnp.minimum(hits.distance, record.max_range).reshape(direction.shape[:2])
         return self.write(data, record.replace(distance=distance if self.drones else distance[0]))
 

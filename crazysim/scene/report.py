@@ -1,7 +1,7 @@
-"""The contact report: what each drone touches, and how far it is from the rest, in pure JAX.
+"""The contact report: contacts and distances of every drone, in pure JAX.
 
-The same function serves all worlds at once, one world, or one drone, so that it can be asked at every substep in a
-stage of the step. Nothing of MuJoCo takes part, and nothing is held per world.
+One function serves all worlds, one world, or one drone, so it also works in a stage of the step. It does not use MuJoCo
+and allocates nothing per world.
 """
 
 from __future__ import annotations
@@ -22,219 +22,227 @@ from crazysim.errors import ConfigError
 from crazysim.geometry import distance
 from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionBody, CollisionGeom, CollisionModel
+from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.objects import Handle
 
 CHUNK = 64
-"""Drones whose distances to all others of their world are held at once."""
+"""Drones whose distances to all others of their world are computed at a time."""
 
 
 class ContactReport(PyTree):
-    """What touches what. Distances are signed: negative where two overlap, by the depth of the overlap.
+    """Contacts of every drone, and signed distances: negative where two bodies overlap, by the depth of the overlap.
 
-    Of one drone the arrays come without (n_worlds, n_drones), of one world without (n_worlds,). What was not asked for
-    is None.
+    In a stage of one world the arrays lack the axis ``n_worlds``, in a stage of one drone ``n_drones`` too. Fields that
+    were not requested are None.
     """
 
     floor: Array | None
-    """Whether a drone touches the floor. (n_worlds, n_drones)"""
+    """True where a drone touches the floor. (n_worlds, n_drones)"""
     floor_distance: Array | None
     """Distance to the floor, m. (n_worlds, n_drones)"""
     objects: Array | None
-    """Whether it touches an object. (n_worlds, n_drones, n_objects)"""
+    """True where a drone touches an object. (n_worlds, n_drones, n_objects)"""
     object_distance: Array | None
-    """Distance to the object, m. (n_worlds, n_drones, n_objects)"""
+    """Distance to each object, m. (n_worlds, n_drones, n_objects)"""
     nearest_object: Array | None
-    """Number of the nearest object, in ``object_names``. (n_worlds, n_drones)"""
+    """Index of the nearest object in ``object_names``. (n_worlds, n_drones)"""
     drones: Array | None
-    """Whether it touches another drone. (n_worlds, n_drones)"""
+    """True where a drone touches another drone. (n_worlds, n_drones)"""
     drone_distance: Array | None
     """Distance to the nearest other drone, m; infinite for a single drone. (n_worlds, n_drones)"""
     nearest_drone: Array | None
-    """Number of that drone; its own for a single drone. (n_worlds, n_drones)"""
+    """Index of that drone; the drone's own for a single drone. (n_worlds, n_drones)"""
     object_names: tuple[str, ...] = static()
     """Names of the objects' bodies."""
 
     def joined(self, other: ContactReport) -> ContactReport:
-        """Return what both report; what both were asked for is this one's."""
+        """Return the fields of both reports; those that both have are taken from this one."""
         names = (f.name for f in dataclasses.fields(self))  # type: ignore[arg-type]
         mine = {name: x for name in names if (x := getattr(self, name)) is not None}
         return other.replace(**mine | {"object_names": self.object_names or other.object_names})
 
     @property
     def any(self) -> Array:
-        """Whether a drone touches anything that was asked for. (n_worlds, n_drones)"""
+        """True where a drone touches anything that was requested. (n_worlds, n_drones)"""
         found = [x for x in (self.floor, self.drones) if x is not None]
         if self.objects is not None:
             found.append(jnp.any(self.objects, axis=-1))
-        touches = found[0]
-        for x in found[1:]:
-            touches = touches | x
-        return touches
+        return functools.reduce(jnp.logical_or, found)
 
 
 Objects = Iterable[Handle | str] | Handle | str | None
-"""Objects that a report is about: handles, names of bodies; None for all."""
+"""Objects of a report: handles, names of bodies; None for all."""
+ContactFn = Callable[..., ContactReport]
+"""``contacts(data, mocap=None) -> ContactReport``."""
 
 
-def build(
-    solids: CollisionModel, objects: Objects = None, floor: bool = True, drones: bool = True
-) -> Callable[[SimData], ContactReport]:
-    """Return ``report(data) -> ContactReport``, pure: for all worlds, one world, or one drone.
+def build(model: CollisionModel, objects: Objects = None, floor: bool = True, drones: bool = True) -> ContactFn:
+    """Return ``contacts(data, mocap=None) -> ContactReport``, pure: for all worlds, one world, or one drone.
 
     Args:
-        solids: What the scene is made of.
+        model: Collision model of the scene.
         objects: Handles or names of the objects to report; None for all, () for none.
-        floor: Whether to report the floor.
-        drones: Whether to report other drones; in a stage of one drone there are none to be seen.
+        floor: True to report the floor.
+        drones: True to report other drones; a stage of one drone has no access to them.
 
     Raises:
-        ConfigError: If nothing is asked for, or an object is not there or is moved by hand.
+        ConfigError: If nothing is requested, or an object does not exist.
     """
-    chosen = choose(solids, objects)
+    chosen = choose(model, objects, in_data=False)
+    names = tuple(body.name for body in chosen)
     if not (chosen or floor or drones):
-        raise ConfigError("a contact report of nothing; ask for floor, drones or some object")
-    groups = [list(some) for _, some in groupby(chosen, _alike)]
+        raise ConfigError("expected floor, drones or at least one object, got a contact report of nothing")
+    groups = [list(group) for _, group in groupby(chosen, _group_key)]
 
-    def report(data: SimData) -> ContactReport:
+    def contacts(data: SimData, mocap: MocapPoses = None) -> ContactReport:
+        require_poses(model, names, mocap)
+        data = with_mocap_bodies(model, data, mocap)
         pos, quat = data.states.pos, data.states.quat
-        turned = rotation.matrix(quat) if any(p.shape.kind != "sphere" for p in solids.drone) else None
-        own = [(part, pos + rotation.rotate(quat, jnp.asarray(part.pos, pos.dtype))) for part in solids.drone]
+        drone_rot = rotation.matrix(quat) if any(g.shape.kind != "sphere" for g in model.drone_geoms) else None
+        own = [(geom, pos + rotation.rotate(quat, jnp.asarray(geom.pos, pos.dtype))) for geom in model.drone_geoms]
         found: dict[str, Array | None] = dict.fromkeys(
             ("floor", "floor_distance", "objects", "object_distance", "nearest_object", "drones", "drone_distance",
              "nearest_drone")
         )  # fmt: skip
         if floor:
-            gap = _nearest([_gap(mine, at, turned, part) for mine, at in own for part in solids.floor], pos)
+            gap = _smallest([_gap(mine, at, drone_rot, geom) for mine, at in own for geom in model.floor], pos)
             found |= {"floor": gap < 0, "floor_distance": gap}
         if chosen:
-            gap = jnp.concatenate([_to_group(own, turned, some, data) for some in groups], axis=-1)
+            gap = jnp.concatenate([_to_group(own, drone_rot, group, data) for group in groups], axis=-1)
             found |= {"objects": gap < 0, "object_distance": gap, "nearest_object": jnp.argmin(gap, axis=-1)}
         if drones:
             if pos.ndim == 1:
                 raise ConfigError(
-                    "a stage of one drone does not see the others; declare it @stage('world'), or ask with drones=False"
+                    "expected the data of a world, got those of one drone, which do not contain the other drones. "
+                    "Declare the stage @stage('world'), or build the contacts with drones=False."
                 )
-            gap, who = _to_drones(own, turned)
-            found |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": who}
-        return ContactReport(**found, object_names=tuple(s.name for s in chosen))
+            gap, nearest = _to_drones(own, drone_rot)
+            found |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": nearest}
+        return ContactReport(**found, object_names=names)
 
-    return report
+    return contacts
 
 
-def choose(solids: CollisionModel, objects: Objects) -> list[CollisionBody]:
-    """Return the objects that are meant.
+def choose(model: CollisionModel, objects: Objects, in_data: bool = True) -> list[CollisionBody]:
+    """Return the objects of a model that are named.
+
+    Args:
+        model: Collision model of the scene.
+        objects: Handles or names; None for all, () for none.
+        in_data: True to refuse bodies whose poses are not part of the data, for use in a step.
 
     Raises:
-        ConfigError: If one is not there, or is moved by hand, so that the data does not know where it is.
+        ConfigError: If an object does not exist or, with ``in_data``, is moved through ``mjx_data``.
     """
-    by_name = {solid.name: solid for solid in solids.objects}
+    by_name = {body.name: body for body in model.objects}
     if objects is None:
-        wanted = list(by_name)
+        names = list(by_name)
     else:
-        some = [objects] if isinstance(objects, (Handle, str)) else list(objects)
-        wanted = [name for x in some for name in (x.bodies if isinstance(x, Handle) else (x,))]
-    for name in wanted:
+        listed = [objects] if isinstance(objects, (Handle, str)) else list(objects)
+        names = [name for x in listed for name in (x.bodies if isinstance(x, Handle) else (x,))]
+    for name in names:
         if name not in by_name:
             raise ConfigError(
-                f"the scene has no object {name!r} that drones can touch; it has {', '.join(by_name) or 'none'}"
+                f"expected an object that drones can touch, {', '.join(by_name) or 'of which there are none'}, got "
+                f"{name!r}"
             )
-        if name in solids.by_hand:
+        if in_data and name in model.mocap_bodies:
             raise ConfigError(
-                f"body {name!r} is moved by hand through sim.mjx_data, which a contact report does not look at. Add it "
-                f"with sim.scene.add, which returns a handle to move it by; or leave it out with objects="
+                f"expected objects whose poses are in the data, got body {name!r}, which is moved through "
+                f"sim.mjx_data. Add it with sim.scene.add, or leave it out with objects=."
             )
-    return [by_name[name] for name in wanted]
+    return [by_name[name] for name in names]
 
 
-def _alike(solid: CollisionBody) -> tuple[bool, tuple[CollisionGeom, ...] | str]:
-    """Return what objects must have in common to be computed side by side."""
-    return (True, solid.parts) if solid.place is not None else (False, solid.name)
+def _group_key(body: CollisionBody) -> tuple[bool, tuple[CollisionGeom, ...] | str]:
+    """Return equal keys for objects whose distances can be computed side by side."""
+    return (True, body.geoms) if body.row is not None else (False, body.name)
 
 
 Own = Sequence[tuple[CollisionGeom, Array]]
-"""The drone's parts with their positions in the world, m. (..., 3)"""
+"""Geoms of the drone with their positions, world frame, m. (..., 3)"""
 
 
-def _to_group(own: Own, turned: Array | None, some: list[CollisionBody], data: SimData) -> Array:
-    """Return the distances to objects that are made alike, m. (..., n)"""
-    parts = some[0].parts
-    if some[0].place is None:
-        return _nearest([_gap(mine, at, turned, part) for mine, at in own for part in parts], own[0][1])[..., None]
+def _to_group(own: Own, drone_rot: Array | None, group: list[CollisionBody], data: SimData) -> Array:
+    """Return the distances to objects with equal geoms, m. (..., n)"""
+    geoms = group[0].geoms
+    if group[0].row is None:
+        return _smallest([_gap(mine, at, drone_rot, geom) for mine, at in own for geom in geoms], own[0][1])[..., None]
     objects = data.objects
-    places = [s.place for s in some if s.place is not None]
-    run = slice(places[0], places[-1] + 1) if places == list(range(places[0], places[-1] + 1)) else np.array(places)
+    rows = [body.row for body in group if body.row is not None]
+    run = slice(rows[0], rows[-1] + 1) if rows == list(range(rows[0], rows[-1] + 1)) else np.array(rows)
     pos, quat = objects.pos[..., run, :], objects.quat[..., run, :]
     rot = None
-    if turned is not None:
-        rot = _product(jnp.swapaxes(rotation.matrix(quat), -1, -2), turned[..., None, :, :])
+    if drone_rot is not None:
+        rot = _product(jnp.swapaxes(rotation.matrix(quat), -1, -2), drone_rot[..., None, :, :])
     gaps = []
     for mine, at in own:
         inside = rotation.rotate_inverse(quat, at[..., None, :] - pos)
-        gaps += [_gap(mine, inside, rot, part) for part in parts]
-    return _nearest(gaps, own[0][1])
+        gaps += [_gap(mine, inside, rot, geom) for geom in geoms]
+    return _smallest(gaps, own[0][1])
 
 
-def _gap(mine: CollisionGeom, at: Array, turned: Array | None, part: CollisionGeom) -> Array:
-    """Return the distance of a drone's part to another part, m. (...)
+def _gap(mine: CollisionGeom, at: Array, drone_rot: Array | None, geom: CollisionGeom) -> Array:
+    """Return the distance of a drone's geom to another geom, m. (...)
 
     Args:
-        mine: The drone's part.
-        at: Where it is, in the frame that the other is described in, m. (..., 3)
-        turned: The drone's attitude in that frame, where a part of it is no sphere. (..., 3, 3)
-        part: The other.
+        mine: Geom of the drone.
+        at: Its position in the frame in which the other is given, m. (..., 3)
+        drone_rot: Attitude of the drone in that frame; None if all its geoms are spheres. (..., 3, 3)
+        geom: The other geom.
     """
-    inside = at - jnp.asarray(part.pos, at.dtype)
-    rot = turned
-    if part.rot is not None:
-        columns = jnp.asarray(part.rot, at.dtype)
+    inside = at - jnp.asarray(geom.pos, at.dtype)
+    rot = drone_rot
+    if geom.rot is not None:
+        columns = jnp.asarray(geom.rot, at.dtype)
         x, y, z = (inside[..., k, None] * columns[k] for k in range(3))
         inside = x + y + z
-        rot = None if turned is None else _product(columns.T, turned)
+        rot = None if drone_rot is None else _product(columns.T, drone_rot)
     if rot is not None and mine.rot is not None:
         rot = _product(rot, jnp.asarray(mine.rot, at.dtype))
-    return distance(mine.shape, part.shape, inside, jnp.eye(3) if rot is None else rot)
+    return distance(mine.shape, geom.shape, inside, jnp.eye(3) if rot is None else rot)
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Return ``a @ b`` of 3 x 3 matrices, written out: on a GPU a product may be rounded to 10 bits. (..., 3, 3)"""
+    """Return ``a @ b`` of 3 x 3 matrices, by components: a GPU may round matrix products to 10 bits. (..., 3, 3)"""
     return jnp.stack([rotation.matvec(a, b[..., k]) for k in range(3)], axis=-1)
 
 
-def _nearest(gaps: list[Array], pos: Array) -> Array:
-    """Return the least of some distances, infinite if there are none. (...)"""
+def _smallest(gaps: list[Array], pos: Array) -> Array:
+    """Return the smallest of some distances, infinite if there are none. (...)"""
     if not gaps:
         return jnp.full(pos.shape[:-1], jnp.inf, pos.dtype)
     return functools.reduce(lambda a, b: jnp.where(b < a, b, a), gaps)
 
 
-def _to_drones(own: Own, turned: Array | None) -> tuple[Array, Array]:
-    """Return the distance to the nearest other drone, m, and its number. (..., n_drones)
+def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:
+    """Return the distance to the nearest other drone, m, and its index. (..., n_drones)
 
-    Of a large swarm, distances of ``CHUNK`` drones to all others are held at once: memory grows with the swarm, not
-    with its square.
+    In a large swarm the distances of ``CHUNK`` drones to all others are computed at a time, so memory grows linearly
+    with the swarm.
     """
     n = own[0][1].shape[-2]
-    numbers = jnp.arange(n)
+    indices = jnp.arange(n)
 
-    def of_some(some: Array) -> tuple[Array, Array]:
+    def of_chunk(chunk: Array) -> tuple[Array, Array]:
         gaps = []
         for mine, at in own:
-            here = jnp.take(at, some, axis=-2)[..., :, None, :]
-            for part, other in own:
-                apart = here - other[..., None, :, :]
-                if turned is None:
-                    gaps.append(distance(mine.shape, part.shape, apart, jnp.eye(3)))
+            here = jnp.take(at, chunk, axis=-2)[..., :, None, :]
+            for geom, other in own:
+                offset = here - other[..., None, :, :]
+                if drone_rot is None:
+                    gaps.append(distance(mine.shape, geom.shape, offset, jnp.eye(3)))
                     continue
-                back = jnp.swapaxes(turned, -1, -2)[..., None, :, :, :]
-                inside = rotation.matvec(back, apart)
-                rot = _product(back, jnp.take(turned, some, axis=-3)[..., :, None, :, :])
-                gaps.append(distance(mine.shape, part.shape, inside, rot))
-        gap = jnp.where(some[:, None] == numbers, jnp.inf, _nearest(gaps, own[0][1]))
+                inverse = jnp.swapaxes(drone_rot, -1, -2)[..., None, :, :, :]
+                inside = rotation.matvec(inverse, offset)
+                rot = _product(inverse, jnp.take(drone_rot, chunk, axis=-3)[..., :, None, :, :])
+                gaps.append(distance(mine.shape, geom.shape, inside, rot))
+        gap = jnp.where(chunk[:, None] == indices, jnp.inf, _smallest(gaps, own[0][1]))
         return jnp.min(gap, axis=-1), jnp.argmin(gap, axis=-1)
 
     if n <= CHUNK:
-        return of_some(numbers)
+        return of_chunk(indices)
     n_chunks = -(-n // CHUNK)
     padded = jnp.minimum(jnp.arange(n_chunks * CHUNK), n - 1).reshape(n_chunks, CHUNK)
-    gap, who = jax.lax.map(of_some, padded)
-    return tuple(jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :n] for x in (gap, who))  # type: ignore[return-value]
+    gap, nearest = jax.lax.map(of_chunk, padded)
+    return tuple(jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :n] for x in (gap, nearest))  # type: ignore[return-value]

@@ -123,10 +123,10 @@ class _Surface(NamedTuple):
 
 
 def _surfaces(sim: Simulation, objects: Objects) -> list[_Surface]:
-    solids = sim.scene.solids
-    found = [_Surface(part, None) for part in solids.floor]
-    for solid in choose(solids, objects):
-        found += [_Surface(part, solid.place) for part in solid.parts]
+    model = sim.scene.collision_model
+    found = [_Surface(geom, None) for geom in model.floor]
+    for body in choose(model, objects):
+        found += [_Surface(geom, body.row) for geom in body.geoms]
     return found
 
 
@@ -177,7 +177,7 @@ def _nearest(
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
     def gap_at(move: Array, turned: Array) -> Array:
-        q = rotation.turn(quat, turned, normalize=False)
+        q = rotation.turn(quat, turned, 1.0, normalize=False)
         at = into(pos + move + rotation.rotate(q, middle), True)
         columns = [into(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
         return distance(shape, part.shape, at, jnp.stack(columns, axis=-1))
@@ -296,7 +296,7 @@ def _tangential(weight: Array, p: Array) -> Array:
 
 
 def _solve(matrix: Array, b: Array) -> Array:
-    """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive, written out. (..., n)
+    """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive definite, unrolled. (..., n)
 
     Scaled to a unit diagonal first: mass and moments of inertia are four orders apart.
     """

@@ -1,4 +1,4 @@
-"""Copy the drones' poses into the scene: for every world at once with MJX, or for one world to be drawn."""
+"""Copies of poses from the data to the scene: for every world at once with MJX, or for one world to be drawn."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import SimData
 from crazysim.scene import mjx
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
-"""Cameras that follow a centre of mass, which nothing else needs."""
+"""Modes of cameras that follow a centre of mass; a sync computes it for them only."""
 
 
 @jax.jit
 def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
-    """Return the data with its flag set, and the scene as the data has it.
+    """Return the data with ``core.mjx_synced`` set, and the scene brought up to date with the data.
 
     Writes the poses of drones and of objects with handles, and computes the transforms of all bodies, the cameras and
     lights, and the contacts. Other mocap bodies stay where ``mjx_data`` has them.
 
     Args:
-        data: The simulation. Quaternions are xyzw here and wxyz in MuJoCo.
-        mjx_data: The scene of every world.
-        mjx_model: The model, shared by all worlds.
+        data: Simulation. Quaternions are xyzw here and wxyz in MuJoCo.
+        mjx_data: State of the scene in every world.
+        mjx_model: Compiled scene, shared by all worlds.
     """
     for ids, pos, quat in _poses(data):
         mjx_data = mjx_data.replace(
@@ -48,7 +48,7 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
 
 
 def _poses(data: SimData) -> list[tuple[Any, Any, Any]]:
-    """Return mocap ids, positions and attitudes of what the simulation owns: drones, and objects with handles."""
+    """Return mocap ids, positions and attitudes of drones and of objects with handles."""
     owned = [(data.core.drone_mocap_ids, data.states.pos, data.states.quat)]
     if data.objects is not None:
         owned.append((data.objects.mocap_ids, data.objects.pos[:, 0], data.objects.quat[:, 0]))
@@ -56,9 +56,9 @@ def _poses(data: SimData) -> list[tuple[Any, Any, Any]]:
 
 
 def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
-    """Return a model whose mocap bodies stand where this world has them, if some carry bodies of their own.
+    """Return a model with the mocap bodies at this world's poses, if any of them has children.
 
-    MJX 3.17 places mocap bodies after it has gone down the tree, and leaves their children where the model has them.
+    MJX 3.17 applies mocap poses after it has traversed the tree, which leaves the children at the model's poses.
     """
     mocap = np.flatnonzero(mjx_model.body_mocapid >= 0)
     if not np.isin(mjx_model.body_parentid, mocap).any():
@@ -70,28 +70,15 @@ def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
     )
 
 
-def poses_of(
-    data: SimData, mjx_data: mjx.Data | None, worlds: NDArray, mj_model: mujoco.MjModel
-) -> tuple[Array, Array, Array]:
-    """Return where everything of some worlds is, for who computes the rest himself.
+def with_poses_of(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    """Return poses of bodies and joints in some worlds, with those of drones and handles as the data have them.
 
     Args:
-        data: The simulation.
-        mjx_data: The scene of every world, if there is one yet: it knows where the user moved other bodies.
-        worlds: Which worlds. (n,)
-        mj_model: The model.
-
-    Returns:
-        Positions of mocap bodies, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), positions of joints (n, n_qpos).
+        data: Simulation.
+        worlds: Indices of worlds. (n,)
+        poses: Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), joint positions (n, n_qpos).
     """
-    if mjx_data is not None:
-        mocap_pos, mocap_quat, qpos = mjx_data.mocap_pos[worlds], mjx_data.mocap_quat[worlds], mjx_data.qpos[worlds]
-    else:
-        rest, n = mujoco.MjData(mj_model), len(worlds)
-        mocap_pos, mocap_quat, qpos = (
-            jnp.asarray(np.broadcast_to(x, (n, *x.shape)), jnp.float32)
-            for x in (rest.mocap_pos, rest.mocap_quat, mj_model.qpos0)
-        )
+    mocap_pos, mocap_quat, qpos = map(jnp.asarray, poses)
     for ids, pos, quat in _poses(data):
         mocap_pos = mocap_pos.at[:, ids].set(pos[worlds])
         mocap_quat = mocap_quat.at[:, ids].set(jnp.roll(quat[worlds], 1, axis=-1))
@@ -99,21 +86,23 @@ def poses_of(
 
 
 def sync_one_world(
-    data: SimData, mjx_data: mjx.Data | None, world: int, mj_model: mujoco.MjModel, mj_data: mujoco.MjData
+    data: SimData,
+    world: int,
+    poses: tuple[ArrayLike, ArrayLike, ArrayLike],
+    mj_model: mujoco.MjModel,
+    mj_data: mujoco.MjData,
 ) -> None:
-    """Write one world into ``mj_data``, ready to be drawn; nothing is allocated or computed for the others.
+    """Write one world into ``mj_data``, ready to be drawn, without work for the others.
 
     Args:
-        data: The simulation.
-        mjx_data: The scene of every world, if there is one yet: it knows where the user moved other bodies.
-        world: Which world.
-        mj_model: The model.
-        mj_data: Where it is written to.
+        data: Simulation.
+        world: Index of the world.
+        poses: Mocap positions, m (n_mocap, 3), attitudes, wxyz (n_mocap, 4), joint positions (n_qpos,): those of bodies
+            that are moved through ``mjx_data`` are used.
+        mj_model: Compiled scene.
+        mj_data: State to write.
     """
-    if mjx_data is not None:
-        mj_data.mocap_pos[:] = mjx_data.mocap_pos[world]
-        mj_data.mocap_quat[:] = mjx_data.mocap_quat[world]
-        mj_data.qpos[:] = mjx_data.qpos[world]
+    mj_data.mocap_pos[:], mj_data.mocap_quat[:], mj_data.qpos[:] = poses
     for ids, pos, quat in _poses(data):
         mj_data.mocap_pos[np.asarray(ids)] = pos[world]
         mj_data.mocap_quat[np.asarray(ids)] = np.roll(quat[world], 1, axis=-1)

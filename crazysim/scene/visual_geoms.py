@@ -1,4 +1,4 @@
-"""What is seen of a scene, as plain arrays: for viewers that know no MuJoCo."""
+"""Visible geoms of a scene as plain arrays, for viewers without MuJoCo."""
 
 from __future__ import annotations
 
@@ -8,47 +8,47 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-SEEN_GROUPS = 3
-"""Geoms of groups below this one are seen, as in MuJoCo's own pictures."""
+from crazysim.scene.collision import VISIBLE_GROUPS
+
 KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
-"""Kinds of shapes, called as MJCF calls them."""
+"""Types of geoms, by MJCF's names."""
 UNCOLORED = (0.5, 0.5, 0.5, 1.0)
-"""The colour of a geom that has none of its own."""
+"""Colour that MuJoCo gives to geoms without a colour, rgba."""
 
 
 @dataclass(frozen=True, eq=False)
 class VisualGeom:
-    """One geom, in the frame of the body that carries it."""
+    """One visible geom, in the frame of the mocap body that carries it, or in the world frame."""
 
     kind: str
     """One of ``KINDS``."""
     size: NDArray
-    """Radii and half sizes, m, as MJCF has them. (3,)"""
+    """Radii and half sizes, m, as in MJCF. (3,)"""
     rgba: NDArray
     """Colour, 0 to 1. (4,)"""
     mocap: int
-    """Mocap id of the body that it moves with; -1 if it stands still."""
+    """Mocap id of that body; -1 for a geom that does not move."""
     pos: NDArray
-    """Place in the frame of that body, or in the world, m. (3,)"""
+    """Position in that frame, m. (3,)"""
     quat: NDArray
     """Attitude in that frame, xyzw. (4,)"""
     vertices: NDArray
     """Vertices of a mesh, m. (n, 3)"""
     faces: NDArray
-    """Vertices of each triangle of a mesh. (n, 3)"""
+    """Indices of the vertices of each triangle of a mesh. (n, 3)"""
 
 
-def shapes_of(model: mujoco.MjModel, data: mujoco.MjData) -> list[VisualGeom]:
-    """Return the shapes of every geom that is seen, as ``data`` has them; height fields are left out.
+def visual_geoms(model: mujoco.MjModel, data: mujoco.MjData) -> list[VisualGeom]:
+    """Return all visible geoms except height fields.
 
     Args:
-        model: The scene.
-        data: One world of it, its kinematics up to date.
+        model: Compiled scene.
+        data: State of one world, with its kinematics up to date.
     """
     return [
-        _shape(model, data, geom)
+        _geom(model, data, geom)
         for geom in range(model.ngeom)
-        if model.geom_group[geom] < SEEN_GROUPS and _kind(model, geom) in KINDS and _color(model, geom)[3] > 0
+        if model.geom_group[geom] in VISIBLE_GROUPS and _kind(model, geom) in KINDS and _color(model, geom)[3] > 0
     ]
 
 
@@ -56,16 +56,16 @@ def _kind(model: mujoco.MjModel, geom: int) -> str:
     return mujoco.mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
 
 
-def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualGeom:
+def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualGeom:
     body = int(model.geom_bodyid[geom])
     while body and model.body_mocapid[body] < 0:
         body = int(model.body_parentid[body])
     pos, quat = np.zeros(3), np.zeros(4)
-    turned = np.zeros(4)
-    mujoco.mju_mat2Quat(turned, data.geom_xmat[geom])
+    geom_quat = np.zeros(4)
+    mujoco.mju_mat2Quat(geom_quat, data.geom_xmat[geom])
     inverse, back = np.zeros(4), np.zeros(3)
     mujoco.mju_negPose(back, inverse, data.xpos[body], data.xquat[body])
-    mujoco.mju_mulPose(pos, quat, back, inverse, data.geom_xpos[geom], turned)
+    mujoco.mju_mulPose(pos, quat, back, inverse, data.geom_xpos[geom], geom_quat)
     vertices, faces = _mesh(model, geom)
     return VisualGeom(
         kind=_kind(model, geom),
@@ -80,7 +80,7 @@ def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualGeom:
 
 
 def _color(model: mujoco.MjModel, geom: int) -> NDArray:
-    """Return a geom's own colour, or its material's, mixed with what its texture is on average. (4,)"""
+    """Return a geom's own colour, or its material's times the mean colour of its texture. (4,)"""
     material = int(model.geom_matid[geom])
     if material < 0 or not np.allclose(model.geom_rgba[geom], UNCOLORED):
         return model.geom_rgba[geom].astype(float)

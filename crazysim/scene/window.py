@@ -1,4 +1,4 @@
-"""A window of the program's own: it draws when told to, in the thread that asks, and the mouse turns the view."""
+"""A window that draws within ``draw``, in the thread of its caller, and whose view the mouse moves."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from typing import Any
 import mujoco
 
 from crazysim.errors import RenderError
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 
 
 class Window:
     """A window that shows one model.
 
-    MuJoCo's own passive viewer draws in a thread of its own, and ends the process with a fault now and then when it
-    is closed; here everything happens within ``draw``.
+    MuJoCo's passive viewer draws in a thread of its own, and sometimes crashes the process when it is closed.
     """
 
     def __init__(self, model: mujoco.MjModel, max_geom: int, width: int, height: int):
@@ -28,23 +27,23 @@ class Window:
         """
         self._model = model
         self._glfw = glfw = _glfw()
-        # A process that also draws in memory with EGL cannot have contexts of two kinds current in one thread.
+        # A thread cannot use an EGL context for images in memory beside one of another kind.
         egl = os.environ.get("MUJOCO_GL", "").lower() == "egl"
         glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API if egl else glfw.NATIVE_CONTEXT_API)
         glfw.window_hint(glfw.VISIBLE, True)
         glfw.window_hint(glfw.SAMPLES, model.vis.quality.offsamples)
-        with warnings.catch_warnings(action="ignore"):  # GLFW's warning and an error would say one thing twice
+        with warnings.catch_warnings(action="ignore"):  # the error below replaces GLFW's warning
             self._window = glfw.create_window(width, height, "crazysim", None, None)
         glfw.default_window_hints()
         if not self._window:
-            raise RenderError("no window could be opened; without a working screen use mode='rgb_array'")
+            raise RenderError("expected a screen that can open a window, got none. Use mode='rgb_array' without one.")
         glfw.make_context_current(self._window)
         glfw.swap_interval(0)  # a simulation that draws often must not wait for the screen
         self._context: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         self._scene = mujoco.MjvScene(model, max_geom)
         self._option = mujoco.MjvOption()
         self._camera = mujoco.MjvCamera()
-        self._asked: Any = None
+        self._settings: Any = None
         self._size = (width, height)
         self._cursor = (0.0, 0.0)
         glfw.set_cursor_pos_callback(self._window, self._on_move)
@@ -52,19 +51,19 @@ class Window:
 
     @property
     def is_open(self) -> bool:
-        """Whether the window is there; false once its user or ``close`` has closed it."""
+        """True until the user or ``close`` closes the window."""
         return self._window is not None
 
-    def draw(self, data: mujoco.MjData, camera: mujoco.MjvCamera, marks: Marks, width: int, height: int) -> None:
-        """Show ``data``; a camera or a size other than at the last call is taken over, the mouse does the rest."""
+    def draw(self, data: mujoco.MjData, camera: mujoco.MjvCamera, overlays: Overlays, width: int, height: int) -> None:
+        """Show ``data``. A camera or size that differs from the last call replaces the view that the mouse has set."""
         glfw = self._glfw
         if self._window is not None and glfw.window_should_close(self._window):
             self.close()
         if self._window is None:
             return
-        asked = _settings(camera)
-        if asked != self._asked:
-            self._asked, self._camera = asked, camera
+        settings = _settings(camera)
+        if settings != self._settings:
+            self._settings, self._camera = settings, camera
         if (width, height) != self._size:
             self._size = (width, height)
             glfw.set_window_size(self._window, width, height)
@@ -72,15 +71,15 @@ class Window:
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
-        marks.write(self._scene)
+        overlays.write(self._scene)
         glfw.make_context_current(self._window)
         pixels = mujoco.MjrRect(0, 0, *glfw.get_framebuffer_size(self._window))
         mujoco.mjr_render(pixels, self._scene, self._context)
-        marks.write_text(pixels, self._context)
+        overlays.write_text(pixels, self._context)
         glfw.swap_buffers(self._window)
 
     def close(self) -> None:
-        """Close the window and free what it held."""
+        """Close the window and free its context."""
         if self._window is None:
             return
         self._glfw.make_context_current(self._window)
@@ -105,21 +104,21 @@ class Window:
         self._move(mujoco.mjtMouse.mjMOUSE_ZOOM, 0.0, -0.05 * dy)
 
     def _move(self, action: mujoco.mjtMouse, dx: float, dy: float) -> None:
-        mujoco.mjv_moveCamera(self._model, action, dx, dy, self._scene, self._camera)
+        mujoco.mjv_moveCamera(self._model, action, dx, dy, self._camera)
 
 
 def _glfw() -> Any:
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise RenderError(
-            "render('human') needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; without a screen use "
-            "mode='rgb_array'"
+            "expected a screen for render('human'), got neither DISPLAY nor WAYLAND_DISPLAY. Use mode='rgb_array' "
+            "without a screen."
         )
-    import glfw  # comes with mujoco; pictures in memory do without
+    import glfw  # comes with mujoco; images in memory do not need it
 
     with warnings.catch_warnings(action="ignore"):
         works = glfw.init()
     if not works:
-        raise RenderError("no screen can be reached (GLFW does not start); without a screen use mode='rgb_array'")
+        raise RenderError("expected a screen, got one that GLFW cannot reach. Use mode='rgb_array' without a screen.")
     return glfw
 
 

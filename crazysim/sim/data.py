@@ -13,9 +13,13 @@ from crazysim.core.data import (
     StateControlData,
 )
 
+ControlData = StateControlData | AttitudeControlData | BodyRateControlData | ForceTorqueControlData
+"""Records of controllers."""
+
 __all__ = [
     "AttitudeControlData",
     "BodyRateControlData",
+    "ControlData",
     "ForceTorqueControlData",
     "SimControls",
     "SimCore",

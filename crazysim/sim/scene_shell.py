@@ -8,10 +8,11 @@ import mujoco
 from jax import Array
 from numpy.typing import NDArray
 
+from crazysim.deprecation import warn_renamed
 from crazysim.scene import mjx
 from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 from crazysim.scene.queries import SceneQueries
 from crazysim.scene.render import Viewer
 from crazysim.scene.report import ContactReport, Objects
@@ -26,19 +27,24 @@ T = TypeVar("T")
 
 
 class SceneAttribute(Generic[T]):
-    """An attribute of a simulation that is one of its scene."""
+    """An attribute of ``Sim`` that reads and writes an attribute of ``sim.scene``, or of its renderer."""
 
-    def __init__(self, doc: str):
+    def __init__(self, doc: str, of_renderer: bool = False):
+        """Take the documentation of the attribute, and where it is."""
         self.__doc__ = doc
+        self._of_renderer = of_renderer
 
     def __set_name__(self, _owner: type, name: str) -> None:
         self._name = name
 
     def __get__(self, sim: Any, _owner: type) -> T:
-        return getattr(sim.scene, self._name) if sim is not None else self  # type: ignore[return-value]
+        return getattr(self._holder(sim), self._name) if sim is not None else self  # type: ignore[return-value]
 
     def __set__(self, sim: Any, value: T) -> None:
-        setattr(sim.scene, self._name, value)
+        setattr(self._holder(sim), self._name, value)
+
+    def _holder(self, sim: Any) -> Any:
+        return sim.scene.renderer if self._of_renderer else sim.scene
 
 
 class SceneShell:
@@ -59,14 +65,22 @@ class SceneShell:
         """The MuJoCo scene; ``scene.add`` adds objects."""
         return self._scene
 
-    spec = SceneAttribute[mujoco.MjSpec]("The editable scene; an edit takes effect with ``build_mjx``.")
-    mj_model = SceneAttribute[mujoco.MjModel]("The compiled scene.")
-    mj_data = SceneAttribute[mujoco.MjData]("State of the one world that was drawn last.")
-    mjx_model = SceneAttribute["mjx.Model"]("The scene's model on the device; made when first read.")
-    max_geom_pairs = SceneAttribute[int]("Cap on the pairs MJX checks per kind of collision, from ``build_mjx`` on.")
-    max_visual_geom = SceneAttribute[int]("Largest number of marks in one picture.")
-    marks = SceneAttribute[Marks]("Marks to draw over the next picture.")
-    viewer = SceneAttribute[Viewer | None]("The renderer; made for the first picture.")
+    spec = SceneAttribute[mujoco.MjSpec]("Editable scene; ``build_mjx`` makes edits take effect.")
+    mj_model = SceneAttribute[mujoco.MjModel]("Compiled scene.")
+    mj_data = SceneAttribute[mujoco.MjData]("State of the world that was drawn last.")
+    mjx_model = SceneAttribute["mjx.Model"]("Compiled scene on the device; made when first read.")
+    max_geom_pairs = SceneAttribute[int](
+        "Most pairs that MJX checks per kind of collision, from the next ``build_mjx`` on; -1 for all."
+    )
+    max_visual_geom = SceneAttribute[int]("Most overlays of one image.", of_renderer=True)
+    overlays = SceneAttribute[Overlays]("Lines, points, labels and text of the next image.", of_renderer=True)
+    viewer = SceneAttribute[Viewer | None]("Renderer of one world; None before the first image.", of_renderer=True)
+
+    @property
+    def marks(self) -> Overlays:
+        """Deprecated name of ``overlays``."""
+        warn_renamed("Sim.marks", "Sim.overlays")
+        return self.overlays
 
     @property
     def mjx_data(self) -> mjx.Data:
@@ -100,7 +114,7 @@ class SceneShell:
             ValueError: If the world does not exist.
         """
         if world is not None and not 0 <= world < self.n_worlds:
-            raise ValueError(f"world {world} does not exist; choose one from 0 to {self.n_worlds - 1}")
+            raise ValueError(f"expected a world from 0 to {self.n_worlds - 1}, got {world}")
         self._scene.compile_if_edited()
         self._stepper.data = self._scene.sync(self.data, world)
 
@@ -125,17 +139,18 @@ class SceneShell:
         return self._scene.contacts(body)
 
     def contact_report(self, objects: Objects = None, floor: bool = True, drones: bool = True) -> ContactReport:
-        """Return what each drone touches, and its distance from the rest: floor, objects, other drones.
+        """Return the contacts and distances of every drone: to the floor, to objects, to other drones.
 
-        Pure JAX on the drones' poses, without MuJoCo.
+        Computed by JAX from the poses in the data. Bodies that were attached to ``spec`` and are moved through
+        ``mjx_data`` are where ``mjx_data`` has them. Fields that were not requested are None and are not computed.
 
         Args:
             objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.
             floor: True to report the floor.
-            drones: True to report the other drones of a world. Omitted fields are None and are not computed.
+            drones: True to report the other drones of a world.
 
         Raises:
-            ValueError: If nothing is requested, or an object does not exist or is moved by hand.
+            ValueError: If nothing is requested, or an object does not exist.
         """
         return self._queries.contact_report(self.data, objects, floor, drones)
 
@@ -166,16 +181,16 @@ class SceneShell:
         width: int = 1920,
         height: int = 1080,
     ) -> NDArray | tuple[NDArray, NDArray] | None:
-        """Draw one world; every argument counts at every call.
+        """Render one world; all arguments take effect at every call.
 
         Args:
-            mode: ``"human"`` draws into a window, which its user may close for good; ``"rgb_array"`` returns a picture
+            mode: ``"human"`` draws into a window until the user closes it; ``"rgb_array"`` returns an image
                 (height, width, 3) of type uint8, ``"depth_array"`` the distance along the camera's axis, m
                 (height, width), ``"rgbd_tuple"`` both.
-            world: World to draw.
+            world: Index of the world.
             camera: Name or id; -1 is the free camera. Drones carry ``fpv_cam:i`` and ``track_cam:i``.
             cam_config: Settings of the free camera: lookat, distance, azimuth, elevation.
-            width: Pixels. A window takes it when it opens and when it changes; its user may resize it.
+            width: Pixels. A window is resized when it changes; the user may resize it too.
             height: Pixels.
 
         Raises:
@@ -183,8 +198,13 @@ class SceneShell:
             RenderError: If this machine cannot draw.
         """
         self.sync(world)
-        self.plugins.draw(world)
-        return self._scene.draw(mode, camera, cam_config, width, height)
+        before = self.overlays.copy()
+        try:
+            self.plugins.draw(world)
+            return self._scene.render(mode, camera, cam_config, width, height)
+        except Exception:
+            self.overlays.restore(before)  # without what plugins have drawn, which draw again for the next image
+            raise
 
     def close(self) -> None:
         """Close the window and free the renderers."""

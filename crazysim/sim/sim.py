@@ -23,6 +23,7 @@ from crazysim.core.sharding import shard
 from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
 from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
+from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.engine import Step, Stepper, build_reset, explain
 from crazysim.engine.plain import ResetFn
 from crazysim.engine.rollout import Keep, Policy, states_of
@@ -36,7 +37,16 @@ from crazysim.sim.configuration import Configuration
 from crazysim.sim.plugins import PluginMethods
 from crazysim.sim.scene_shell import SceneShell
 
-__all__ = ["Sim", "clip_floor_pos", "increment_steps", "reset", "seed_sim", "sync_sim2mjx", "use_box_collision"]
+__all__ = [
+    "Sim",
+    "clip_floor_pos",
+    "increment_steps",
+    "reset",
+    "rotor_vel_limits",
+    "seed_sim",
+    "sync_sim2mjx",
+    "use_box_collision",
+]
 
 
 class Sim(Commands, PluginMethods, SceneShell):

@@ -1,6 +1,7 @@
-"""Let commands arrive late, and see a controller lose its grip as the delay grows.
+"""Delay the commands, and measure how a height controller degrades as the delay grows.
 
-The commands under way are kept in a record that declares one queue per drone, so a masked reset resets those alone.
+The pending commands are in a record that declares one queue per drone, so a masked reset resets only the queues of
+its worlds.
 """
 
 import jax.numpy as jnp
@@ -12,14 +13,14 @@ from crazysim.core import replace_fn
 
 
 class Delay(PyTree):
-    """Commands on their way to the drone."""
+    """Commands that have not reached the drone yet."""
 
     queue: Array = leaf("drone", 2)
-    """Oldest first. (n_worlds, n_drones, delay in steps, 4)"""
+    """Pending commands, oldest first. (n_worlds, n_drones, delay in steps, 4)"""
 
 
 def add_delay(sim: Sim, n_steps: int) -> None:
-    """Hand the attitude controller what was commanded some steps ago."""
+    """Pass the oldest pending command to the attitude controller."""
     controller = sim.step_pipeline["attitude_controller"]
 
     def staged(data, cmd):
@@ -45,14 +46,14 @@ def main() -> None:
         if delay:
             add_delay(sim, delay)
         weight, heights = 9.81 * float(sim.data.params.mass[0]), []
-        for _ in range(300):  # a spring and a damper on the height, at 50 Hz
+        for _ in range(300):  # spring and damper on the height, at 50 Hz
             z, vz = np.asarray(sim.data.states.pos[..., 2]), np.asarray(sim.data.states.vel[..., 2])
             sim.attitude_control(np.stack([0 * z, 0 * z, 0 * z, weight * (1 + 1.2 * (1 - z) - 0.5 * vz)], axis=-1))
             sim.step(10)
             heights.append(z[0, 0])
         print(f"{2 * delay:3d} ms: last second between {min(heights[-50:]):.3f} and {max(heights[-50:]):.3f} m")
     sim.reset(np.array([True, False]))
-    print("commands under way after a reset of world 0:", np.abs(sim.data.plugins["delay"].queue).sum((1, 2, 3)))
+    print("pending commands after a reset of world 0:", np.abs(sim.data.plugins["delay"].queue).sum((1, 2, 3)))
 
 
 if __name__ == "__main__":

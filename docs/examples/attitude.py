@@ -1,7 +1,7 @@
-"""Fly to a point with a position controller of one's own that sends attitude and thrust.
+"""Fly to a point with your own position controller, which sends attitude and thrust.
 
-Everything below the command (attitude controller, allocation, rotors) is simulated. The controller here is a spring
-and a damper; roll and pitch follow from the acceleration it wants.
+Everything below the command (attitude controller, allocation, rotors) is simulated. The position controller is a spring
+and a damper; roll and pitch follow from the desired acceleration.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ SECONDS = 4
 
 
 def command(pos: np.ndarray, vel: np.ndarray, mass: float) -> np.ndarray:
-    """Return roll, pitch, yaw, rad, and collective thrust, N, with the nose along x. (..., 4)"""
+    """Return roll, pitch and zero yaw, rad, and collective thrust, N. (..., 4)"""
     wanted = STIFFNESS * (TARGET - pos) - DAMPING * vel + [0.0, 0.0, 9.81]
     roll = np.arctan2(-wanted[..., 1], wanted[..., 2])
     pitch = np.arctan2(wanted[..., 0], np.hypot(wanted[..., 1], wanted[..., 2]))

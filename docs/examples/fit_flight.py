@@ -1,8 +1,8 @@
-"""Find the mass, inertia and thrust curve of a drone from logged flights, with Gauss and Newton through the simulator.
+"""Identify mass, inertia and thrust curve of a drone from flight logs, by Gauss-Newton through the simulator.
 
-The log is made here, by a drone that is heavier and weaker than the data sheet says, with the noise of a motion
-capture and a gyroscope. Every flight is a world. Mass, inertia and thrust in one proportion fly alike but for the air
-drag and the drag of the rotors, which are taken as known: the error of a common factor is larger than those of ratios.
+The log is synthetic: a drone that is heavier and weaker than its data sheet, with the noise of motion capture and a
+gyroscope. Every flight is a world. Scaling mass, inertia and thrust by a common factor changes the flight only through
+the drag of air and rotors, which is assumed to be known, so a common factor has a larger error than the ratios.
 """
 
 import jax
@@ -15,7 +15,7 @@ from crazysim.dynamics import hover_rotor_vel
 
 N_FLIGHTS, SECONDS, RATE = 8, 3.0, 100  # samples and commands per second
 NOISE = {"pos": 1e-3, "quat": 2e-3, "ang_vel": 2e-2}  # m, 1, rad/s
-SPEEDS = jnp.array([12e3, 16e3, 20e3])  # rpm: a parabola is given by its values there
+SPEEDS = jnp.array([12e3, 16e3, 20e3])  # rpm; the values at these speeds define a parabola
 ROUNDS = 8
 NAMES = ["mass [g]", "Jxx [1e-6 kg m^2]", "Jyy [1e-6 kg m^2]", "Jzz [1e-6 kg m^2]"]
 NAMES += [f"thrust at {speed / 1e3:.0f} krpm [mN]" for speed in SPEEDS]
@@ -24,7 +24,7 @@ TRUE_OVER_DATA_SHEET = jnp.array([1.08, 1.15, 0.9, 1.1, 0.96, 0.95, 0.94])
 
 
 def physical(params) -> jax.Array:
-    """Return what is looked for: mass, three moments of inertia, thrust of a rotor at three speeds."""
+    """Return the unknowns: mass, three moments of inertia, thrust of a rotor at three speeds."""
     thrust = jnp.polyval(params.rpm2thrust[0, ::-1], SPEEDS)
     return jnp.concatenate([params.mass, jnp.diag(params.J), thrust])
 
@@ -37,7 +37,7 @@ def with_physical(params, x: jax.Array):
 
 
 def commands(weight: float, rng: np.random.Generator) -> jax.Array:
-    """Return roll, pitch, yaw and thrust that shake the drone: sums of sines. (n_samples, N_FLIGHTS, 1, 4)"""
+    """Return commands of roll, pitch, yaw and thrust, sums of sines. (n_samples, N_FLIGHTS, 1, 4)"""
     t = np.arange(int(SECONDS * RATE)) / RATE
     freq, phase = rng.uniform(0.3, 3.0, (4, N_FLIGHTS, 1, 4)), rng.uniform(0, 2 * np.pi, (4, N_FLIGHTS, 1, 4))
     waves = np.sin(2 * np.pi * freq * t[:, None, None, None, None] + phase).mean(axis=1)
@@ -45,7 +45,7 @@ def commands(weight: float, rng: np.random.Generator) -> jax.Array:
 
 
 def main() -> dict[str, tuple[float, float, float]]:
-    """Return what was found, what is true, and the standard deviation, by name."""
+    """Return estimate, true value and standard deviation by name."""
     rng = np.random.default_rng(0)
     sim = Sim(n_worlds=N_FLIGHTS, control="attitude")
     step = sim.build_step_fn()
@@ -56,7 +56,7 @@ def main() -> dict[str, tuple[float, float, float]]:
     start = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(20.0), rotor_vel=rotor_vel))
 
     def fly(ratio: jax.Array) -> dict[str, jax.Array]:
-        """Return what is measured in flights of a drone of these parameters, relative to the data sheet."""
+        """Return the measurements of flights with these parameters, which are relative to the data sheet."""
 
         def sample(data, cmd):
             data = step(F.attitude_control(data, cmd), sim.freq // RATE)
@@ -69,17 +69,19 @@ def main() -> dict[str, tuple[float, float, float]]:
     log = {name: x + NOISE[name] * rng.normal(size=x.shape) for name, x in flown.items()}
 
     def misfit(ratio: jax.Array) -> jax.Array:
-        """Return how far the simulation is from the log, in units of the noise."""
+        """Return the residuals of simulation and log, in units of the noise."""
         return jnp.concatenate([((x - log[name]) / NOISE[name]).ravel() for name, x in fly(ratio).items()])
 
     jacobian = jax.jit(lambda ratio: (misfit(ratio), jax.jacfwd(misfit)(ratio)))
     ratio = jnp.ones_like(data_sheet)
     for i in range(ROUNDS):
         r, slope = jacobian(ratio)
-        print(f"round {i}: the misfit is {jnp.sqrt(jnp.mean(r**2)):8.3f} times the noise")
+        print(f"iteration {i}: the misfit is {jnp.sqrt(jnp.mean(r**2)):8.3f} times the noise")
         ratio = ratio - jnp.linalg.lstsq(slope, r)[0]
 
-    sigma = jnp.linalg.norm(jnp.linalg.inv(jnp.linalg.qr(slope, mode="r")), axis=1)  # what the noise leaves open
+    sigma = jnp.linalg.norm(
+        jnp.linalg.inv(jnp.linalg.qr(slope, mode="r")), axis=1
+    )  # standard deviations due to the noise
     found, true, sigma = (np.asarray(x * data_sheet) / UNITS for x in (ratio, TRUE_OVER_DATA_SHEET, sigma))
     sheet = np.asarray(data_sheet) / UNITS
     print(f"\n{'':22} data sheet     found  +- sigma      true     error")

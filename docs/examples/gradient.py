@@ -1,4 +1,4 @@
-"""Find thrusts that lift a drone by 20 cm in half a second and leave it at rest, with ``jax.grad``.
+"""Optimise thrusts that lift a drone by 20 cm in half a second and leave it at rest, with ``jax.grad``.
 
 The gradient goes through 250 physics steps: attitude controller, allocation, rotor lag and rigid body.
 """
@@ -19,7 +19,7 @@ def main() -> None:
     sim = Sim(control="attitude")
     step = sim.build_step_fn()
     weight = 9.81 * sim.data.params.mass[0]
-    # The flight begins in hover, away from the floor: rotors at rest would fall first.
+    # The flight starts in hover and above the floor, because a drone whose rotors are at rest falls first.
     states = sim.data.states
     rotor_vel = jnp.broadcast_to(hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
     start = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0), rotor_vel=rotor_vel))
@@ -40,7 +40,7 @@ def main() -> None:
     for i in range(ROUNDS + 1):
         (value, (rise, climb)), grad = value_and_grad(thrusts)
         if i % 15 == 0:
-            print(f"round {i:2d}: cost {value:.5f}, norm of the gradient {jnp.linalg.norm(grad):.4f}")
+            print(f"iteration {i:2d}: cost {value:.5f}, norm of the gradient {jnp.linalg.norm(grad):.4f}")
         velocity = 0.9 * velocity - 6e-2 * grad
         thrusts = jnp.clip(thrusts + velocity, 0.1 * weight, 1.8 * weight)
     print(f"rises by {rise:.3f} m and leaves with {climb:+.3f} m/s")

@@ -1,7 +1,7 @@
-"""Send drones to a height with the state controller, and see where they hover.
+"""Command heights with the state controller, and print the steady-state offsets.
 
-The firmware's controller believes in a mass and a thrust that are not quite the drone's own. Its integral makes up a
-part of that; the offset that remains is printed, not hidden.
+The controller of the firmware uses a mass and a thrust that differ slightly from those of the drone. Its integral
+compensates a part of the difference, and an offset remains.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ def main() -> None:
     height = np.asarray(sim.data.states.pos[:, 0, 2])
     speed = np.linalg.norm(sim.data.states.vel[:, 0], axis=-1)
     for wanted, reached, v in zip(HEIGHTS, height, speed, strict=True):
-        print(f"wanted {wanted:.1f} m, reached {reached:.3f} m, off by {reached - wanted:+.3f} m at {v:.3f} m/s")
+        print(f"target {wanted:.1f} m, reached {reached:.3f} m, off by {reached - wanted:+.3f} m at {v:.3f} m/s")
 
 
 if __name__ == "__main__":

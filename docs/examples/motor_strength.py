@@ -1,7 +1,7 @@
-"""Let every motor be a little weak or strong, and see what that does to a hover that knows nothing of it.
+"""Randomise the strength of every motor, and measure the offset of a hover without compensation.
 
-The thrust curve may be one for all rotors, (1, 3), or one per rotor, (n_rotors, 3), with the axes of worlds and drones
-in front. Here each rotor of each drone gets its own; the controllers keep believing in the airframe's curve.
+There is one thrust curve for all rotors, (1, 3), or one per rotor, (n_rotors, 3), with the axes of worlds and drones in
+front. Here each rotor of each drone has its own, while the controllers still use the curve of the airframe.
 """
 
 from functools import partial

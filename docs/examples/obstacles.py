@@ -1,7 +1,7 @@
-"""Eight worlds, one drone each, flying past two poles that stand elsewhere in every world: who touches them?
+"""Fly past two poles at a different place in each of eight worlds, and print which drones touch them.
 
-The poles are mocap bodies, so they are moved without compiling the scene anew. The check for contacts is compiled
-into the flight: it closes over the scene, and takes only the simulation's data and the places of the poles.
+The poles are mocap bodies, so they move without recompiling the scene. The contact check is compiled into the flight:
+it closes over the scene and takes only the data of the simulation and the positions of the poles.
 """
 
 import jax
@@ -16,7 +16,7 @@ from crazysim.sim import sync_sim2mjx
 
 N_WORLDS = 8
 SPEED = 0.8
-"""How fast the drones fly along x, m/s."""
+"""Speed of the drones along x, m/s."""
 SECONDS = 3.0
 CHECKS_PER_SECOND = 50
 POLE = """
@@ -31,9 +31,9 @@ POLE = """
 
 
 def build() -> tuple[Sim, Array]:
-    """Return worlds with two poles, and where they stand: from world to world they move 4 cm across the way.
+    """Return a simulation with two poles, and their positions, which shift sideways by 4 cm from world to world.
 
-    The drone and a pole touch within 11.6 cm of each other.
+    A drone and a pole touch within 11.6 cm of each other.
     """
     sim = Sim(n_worlds=N_WORLDS, control="state")
     pole = mujoco.MjSpec.from_string(POLE).body("pole")
@@ -55,7 +55,7 @@ def build() -> tuple[Sim, Array]:
 
 
 def main() -> None:
-    """Fly past the poles, and print which worlds touched which pole, and when first."""
+    """Fly past the poles, and print the first contact with each pole in each world."""
     sim, mocap_pos = build()
     step = sim.build_step_fn()
     _mjx_data, mjx_model = sim.mjx_data, sim.mjx_model

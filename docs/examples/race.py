@@ -1,7 +1,7 @@
 """A race in sixteen worlds with four gates and four poles each; hits and passed gates are counted in the step.
 
-Gates and poles have handles, so their poses are data: drawn at random by a reset stage, seen by the policy and by the
-stages of the step. Run as a script it also films the first four worlds.
+Gates and poles have handles, so their poses are data: a reset stage draws them at random, and the policy and the stages
+of the step read them. Run as a script it also films the first four worlds.
 """
 
 import sys
@@ -19,7 +19,7 @@ N_WORLDS, N_GATES, SECONDS = 16, 4, 16
 OPENING = 0.45  # width and height of a gate's opening, m
 START = np.array([1.5, -0.5, 1.0])  # m
 LEG, SPEED = 1.2, 2.0  # time from gate to gate, s, and speed in a gate, m/s
-LOWER = np.array([0, 0, -0.08])  # m: the controller believes in more weight than there is, and holds drones too high
+LOWER = np.array([0, 0, -0.08])  # m; the controller assumes a larger weight and hovers too high
 
 
 class ProgressData(PyTree):
@@ -57,7 +57,7 @@ class Progress(Plugin):
 
 
 def build() -> Sim:
-    """Return the course, with everything that the race is made of."""
+    """Return the simulation with gates, poles and the stages of the race."""
     sim = Sim(n_worlds=N_WORLDS, control="state", rng_key=3)
     gates = sim.scene.add("gate", count=N_GATES, width=OPENING, height=OPENING)
     poles = sim.scene.add("pole", count=N_GATES, height=2.0)
@@ -83,12 +83,12 @@ def build() -> Sim:
 
 
 def policy(_, data) -> Array:
-    """Follow a curve through the middle of every gate, along its axis; a second of hovering first. (n_worlds, 1, 16)"""
+    """Return setpoints along a curve through the centre of every gate, after a second of hovering. (n_worlds, 1, 16)"""
     pos, quat = data.objects.pos[:, 0, :N_GATES], data.objects.quat[:, 0, :N_GATES]
     along = SPEED * LEG * rotation.rotate(quat, jnp.array([1.0, 0, 0]))
 
     def place(time):
-        """Return where to be: between two gates a cubic with the gates' axes as tangents (Hermite). (n_worlds, 1, 3)"""
+        """Return positions on a cubic Hermite curve between two gates, tangent to their axes, m. (n_worlds, 1, 3)"""
         number = jnp.floor(time / LEG)
         u, k = (time / LEG - number)[..., None], number.astype(int)[..., None]
         last, target = (lambda x, i=i: jnp.take_along_axis(x, i % N_GATES, axis=1) for i in (k - 1, k))
@@ -104,7 +104,7 @@ def policy(_, data) -> Array:
 
 
 def main(film: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Race, print how far each world came, and return the gates passed and what was hit in each."""
+    """Race, print the progress of each world, and return gates passed and hits of each."""
     sim = build()
     if film is None:
         sim.rollout(policy, None, SECONDS * sim.control_freq)

@@ -1,6 +1,6 @@
-"""Scale the inertia of every drone, and see how fast each begins to roll.
+"""Scale the inertia of every drone, and measure how fast each starts to roll.
 
-Inertia and its inverse are two parameters: change both, or the drone turns by the old one.
+Inertia and its inverse are separate parameters and must change together.
 """
 
 import jax
@@ -13,7 +13,7 @@ from crazysim.dynamics import hover_rotor_vel
 
 
 def randomize_inertia(data, default_data, mask=None):
-    """Draw every axis' moment between half and twice the airframe's."""
+    """Draw the moment about every axis between half and twice that of the airframe."""
     keys = drone_keys(data, "randomize_inertia")
     log_scale = jax.vmap(jax.vmap(lambda key: jax.random.uniform(key, (3,), minval=-1.0, maxval=1.0)))(keys)
     root = jnp.exp2(0.5 * log_scale)
@@ -33,12 +33,15 @@ def main() -> None:
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(2.0), rotor_vel=rotor_vel))
 
     cmd = np.zeros((sim.n_worlds, 1, 4))
-    cmd[..., 0], cmd[..., 3] = 0.3, 9.81 * float(sim.data.params.mass[0])  # roll by 0.3 rad at the weight's thrust
+    cmd[..., 0], cmd[..., 3] = (
+        0.3,
+        9.81 * float(sim.data.params.mass[0]),
+    )  # roll by 0.3 rad, with the thrust of hovering
     sim.attitude_control(cmd)
     arrived = np.full(sim.n_worlds, np.nan)
     for k in range(60):
         sim.step()
-        roll = 2 * np.asarray(sim.data.states.quat[:, 0, 0])  # of a drone that only rolls, and not far
+        roll = 2 * np.asarray(sim.data.states.quat[:, 0, 0])  # valid for a small rotation about x only
         arrived[np.isnan(arrived) & (roll > 0.1)] = 1e3 * (k + 1) / sim.freq
 
     scale = np.asarray(sim.data.params.J[:, 0, 0, 0] / sim.default_data.params.J[0, 0])

@@ -1,7 +1,7 @@
-"""Give every drone a mass of its own at every reset, and see it in how fast the drones climb.
+"""Draw the mass of every drone at every reset, and measure its effect on the rate of climb.
 
-A reset stage draws the masses. It writes only into the worlds that are reset, and its numbers depend on seed, world,
-drone and episode alone: resetting a world by itself or with others gives the same mass.
+A reset stage draws the masses. It writes only into the worlds that are reset, and its random numbers depend only on
+seed, world, drone and episode: resetting a world alone or with others gives the same mass.
 """
 
 import jax
@@ -13,7 +13,7 @@ from crazysim.core import append_fn, drone_keys, select_worlds
 
 
 def randomize_mass(data, default_data, mask=None):
-    """Draw masses between 90 % and 110 % of the airframe's."""
+    """Draw masses between 90 % and 110 % of that of the airframe."""
     keys = drone_keys(data, "randomize_mass")
     scale = jax.vmap(jax.vmap(lambda key: jax.random.uniform(key, (1,), minval=0.9, maxval=1.1)))(keys)
     mass = select_worlds(mask, scale * default_data.params.mass, data.params.mass)

@@ -1,7 +1,6 @@
-"""Let sixteen drones of one world change sides of a circle: straight through its middle, and around it.
+"""Fly sixteen drones of one world to the opposite side of a circle, straight through its centre and around it.
 
-Ten times a second MuJoCo is asked whether any drone touches anything; the scene is brought up to date for that
-question alone.
+Contacts are queried ten times per second; the MuJoCo scene is updated only for these queries.
 """
 
 import numpy as np
@@ -12,7 +11,7 @@ N_DRONES, SECONDS, RADIUS, HEIGHT = 16, 4, 1.5, 1.0
 
 
 def places(along: float, around: bool) -> np.ndarray:
-    """Return where the drones should be after a part of the way, 0 to 1, m. (n_drones, 3)"""
+    """Return the target positions after a fraction of the way, 0 to 1, m. (n_drones, 3)"""
     angle = np.linspace(0, 2 * np.pi, N_DRONES, endpoint=False) + (np.pi * along if around else 0)
     radius = RADIUS if around else RADIUS * (1 - 2 * along)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(N_DRONES, HEIGHT)], axis=-1)

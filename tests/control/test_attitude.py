@@ -23,10 +23,10 @@ body_rate = jax.jit(body_rate2force_torque, static_argnames="ctrl_freq")
 params = functools.partial(controller_params, AttitudeParams)
 
 
-def hold(cmd, quat=LEVEL, rates=ZERO, wanted=ZERO, before=None, wanted_before=None, integral=ZERO, freq=500, p=None):
+def hold(cmd, quat=LEVEL, rates=ZERO, desired=ZERO, before=None, desired_before=None, integral=ZERO, freq=500, p=None):
     before = rates if before is None else before
-    wanted_before = wanted if wanted_before is None else wanted_before
-    args = (quat, rates, np.asarray(cmd, float), wanted, before, wanted_before, integral, freq)
+    desired_before = desired if desired_before is None else desired_before
+    args = (quat, rates, np.asarray(cmd, float), desired, before, desired_before, integral, freq)
     return attitude(*args, params=params() if p is None else p)
 
 
@@ -63,19 +63,19 @@ def test_rotation_error_is_that_of_mellinger_and_kumar(quat, rpy):
     """Eq. 10 without its one half; small gains keep every limit far."""
     p = params(kR=[100.0, 100, 100], ki_m=ZERO)
     quat = quat / np.linalg.norm(quat)
-    now, wanted = Rotation.from_quat(quat).as_matrix(), Rotation.from_euler("ZYX", rpy[::-1]).as_matrix()
-    difference = wanted.T @ now - now.T @ wanted
+    now, desired = Rotation.from_quat(quat).as_matrix(), Rotation.from_euler("ZYX", rpy[::-1]).as_matrix()
+    difference = desired.T @ now - now.T @ desired
     error = np.array([difference[2, 1], difference[0, 2], difference[1, 0]])
     wrench, integral = hold([*rpy, HALF], quat, p=p)
     np.testing.assert_allclose(wrench[1:], torque_of_pwm(*(-100 * error)), atol=1e-9)
     np.testing.assert_allclose(integral, np.clip(-error / 500, -p.int_err_max, p.int_err_max), atol=1e-12)
 
 
-@given(rates=vectors(3, 0.3), wanted=vectors(3, 0.3))
-def test_rate_error_is_damped(rates, wanted):
+@given(rates=vectors(3, 0.3), desired=vectors(3, 0.3))
+def test_rate_error_is_damped(rates, desired):
     p = params(kd_omega=ZERO, ki_m=ZERO)
-    wrench, _ = hold([0, 0, 0, HALF], rates=rates, wanted=wanted, p=p)
-    np.testing.assert_allclose(wrench[1:], torque_of_pwm(*(np.asarray(p.kw) * (wanted - rates))), atol=1e-12)
+    wrench, _ = hold([0, 0, 0, HALF], rates=rates, desired=desired, p=p)
+    np.testing.assert_allclose(wrench[1:], torque_of_pwm(*(np.asarray(p.kw) * (desired - rates))), atol=1e-12)
 
 
 @pytest.mark.parametrize("freq", [100, 500])
@@ -85,8 +85,8 @@ def test_the_derivative_acts_on_roll_and_pitch_and_knows_its_rate(freq):
     wrench, _ = hold([0, 0, 0, HALF], rates=now, before=before, freq=freq, p=p)
     pwm = -200 * (now - before) * freq * [1, 1, 0]
     np.testing.assert_allclose(wrench[1:], torque_of_pwm(*pwm), atol=1e-12)
-    # A jump of the wanted rates counts the other way round, so following them exactly costs nothing.
-    wrench, _ = hold([0, 0, 0, HALF], rates=now, before=before, wanted=now, wanted_before=before, freq=freq, p=p)
+    # A jump of the desired rates counts the other way round, so following them exactly costs nothing.
+    wrench, _ = hold([0, 0, 0, HALF], rates=now, before=before, desired=now, desired_before=before, freq=freq, p=p)
     np.testing.assert_allclose(wrench[1:], ZERO, atol=1e-15)
 
 
@@ -129,7 +129,7 @@ def test_body_rate_is_the_attitude_controller_at_level_with_the_present_yaw(rate
     before, cmd_before = 0.5 * rates, np.append(0.5 * cmd, 0.3)
     out, integral = body_rate(quat, rates, np.append(cmd, HALF), before, cmd_before, ZERO, 500, params=params())
     expected, expected_integral = hold(
-        [0, 0, yaw, HALF], quat, rates, wanted=cmd, before=before, wanted_before=cmd_before[:3]
+        [0, 0, yaw, HALF], quat, rates, desired=cmd, before=before, desired_before=cmd_before[:3]
     )
     np.testing.assert_allclose(out, expected, atol=1e-12)
     np.testing.assert_allclose(integral, expected_integral, atol=1e-12)

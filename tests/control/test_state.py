@@ -56,15 +56,15 @@ def test_it_leans_towards_where_it_should_be(start, axis, angle, sign):
 def test_body_z_points_along_the_force_and_the_thrust_is_its_part_along_the_present_z(force, yaw, quat):
     """Mellinger and Kumar 2011, eq. 6 to 9, by their geometry: the force is asked for through an acceleration."""
     p = params(mass=[0.04], thrust_scale=[1.0])
-    wanted = force + [0, 0, 0.04 * 9.81]
+    desired = force + [0, 0, 0.04 * 9.81]
     quat = quat / np.linalg.norm(quat)
     cmd, _ = answer(setpoint(acc=force / 0.04, quat=Rotation.from_euler("z", yaw).as_quat()), quat=quat, p=p)
     axes = Rotation.from_euler("ZYX", np.asarray(cmd[:3])[::-1]).as_matrix().T
-    np.testing.assert_allclose(axes[2], wanted / np.linalg.norm(wanted), atol=1e-9)
-    # The new x axis lies in the plane of the wanted heading and the new z axis.
+    np.testing.assert_allclose(axes[2], desired / np.linalg.norm(desired), atol=1e-9)
+    # The new x axis lies in the plane of the desired heading and the new z axis.
     heading = np.array([np.cos(yaw), np.sin(yaw), 0])
     assert abs(np.dot(axes[1], heading)) < 1e-9
-    np.testing.assert_allclose(cmd[3], wanted @ Rotation.from_quat(quat).apply([0, 0, 1]), atol=1e-12)
+    np.testing.assert_allclose(cmd[3], desired @ Rotation.from_quat(quat).apply([0, 0, 1]), atol=1e-12)
 
 
 @pytest.mark.parametrize("freq", [50, 100, 500])

@@ -1,4 +1,4 @@
-"""What a simulation knows at the start: places, sizes, rates and which controllers there are."""
+"""Initial data of a simulation: positions, sizes, rates and the controllers in use."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The functional API: commands are staged for their own level, and what is told of ticks is what happens."""
+"""The functional API stages commands for their own level, and reports ticks correctly."""
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ def test_a_command_does_not_alias_the_callers_array():
     np.testing.assert_array_equal(staged, np.ones((2, 2, 4)))
 
 
-def test_law_09_a_number_too_large_for_the_state_is_told_as_infinite():
+def test_law_09_a_number_too_large_for_the_state_is_reported_as_infinite():
     """1e300 is finite in float64 and infinite in the float32 of the state."""
     data = sim_of("first_principles", "attitude").data
     command = np.zeros((2, 2, 4))
@@ -54,7 +54,7 @@ def test_device_arrays_of_any_real_type_are_cast():
         np.testing.assert_array_equal(staged, np.ones((2, 2, 4)))
 
 
-def test_check_finite_is_harmless_inside_jit_where_nothing_can_be_looked_at():
+def test_check_finite_does_nothing_inside_jit():
     data = sim_of("first_principles", "attitude").data
     command = jnp.full((2, 2, 4), jnp.nan)
     staged = jax.jit(lambda c: F.attitude_control(data, c, check_finite=True).controls.attitude.staged_cmd)(command)
@@ -62,7 +62,7 @@ def test_check_finite_is_harmless_inside_jit_where_nothing_can_be_looked_at():
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
-def test_controllable_is_told_per_world(dynamics, control):
+def test_controllable_is_per_world(dynamics, control):
     data = sim_of(dynamics, control).data
     freq = 500 if control == "rotor_vel" else getattr(data.controls, control).freq
     period = 500 // freq

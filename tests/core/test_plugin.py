@@ -299,11 +299,11 @@ def test_plugins_draw_into_images():
     sim.scene.add("wall", pos=[2, 0, 0], length=8, height=8)
     finder = sim.add(RangeFinder(visible=True))
     sim.plugins.draw(0)
-    assert len(sim.marks) == 6
-    sim.marks.clear()
+    assert len(sim.overlays) == 6
+    sim.overlays.clear()
     sim.replace(RangeFinder())
     sim.plugins.draw(0)
-    assert len(sim.marks) == 0
+    assert len(sim.overlays) == 0
     assert finder.visible
 
 

@@ -1,4 +1,4 @@
-"""Keys for stages: one per world or drone, drawn inside jit as outside."""
+"""Keys for stages: one per world or drone, the same inside and outside of jit."""
 
 import jax
 import numpy as np
@@ -34,7 +34,7 @@ def test_keys_are_the_same_inside_jit(data):
 
 
 @given(step=st.integers(0, 10**6), episode=st.integers(0, 10**6), world=st.integers(0, 2))
-def test_law_10_only_the_world_whose_time_moves_draws_anew(data, step, episode, world):
+def test_law_10_only_the_world_whose_time_changes_draws_other_numbers(data, step, episode, world):
     """Law 10: another world's episode and step change nothing."""
     core = data.core.replace(
         steps=data.core.steps.at[world].set(step), episode=data.core.episode.at[world].set(episode)
@@ -47,7 +47,7 @@ def test_law_10_only_the_world_whose_time_moves_draws_anew(data, step, episode, 
     np.testing.assert_array_equal(changed, expected)
 
 
-def test_numbers_are_spread_as_they_should_be(data):
+def test_numbers_are_uniform_and_uncorrelated(data):
     """Uniform draws over 3,000 steps: mean 1/2 within 4 standard errors, 4 / sqrt(12 * 18,000) = 0.0086."""
 
     def draw(step):
@@ -56,7 +56,7 @@ def test_numbers_are_spread_as_they_should_be(data):
 
     numbers = jax.jit(jax.vmap(draw))(np.arange(3000, dtype=np.int32))
     assert abs(float(numbers.mean()) - 0.5) < 0.0086
-    # Neighbouring steps, drones and worlds know nothing of each other: correlations within 4 / sqrt(18,000).
+    # Neighbouring steps, drones and worlds are uncorrelated, within 4 / sqrt(18,000).
     centred = np.asarray(numbers) - 0.5
     for a, b in ((centred[1:], centred[:-1]), (centred[:, 1:], centred[:, :-1]), (centred[..., 1:], centred[..., :-1])):
         assert abs(np.mean(a * b)) * 12 < 4 / np.sqrt(a.size)

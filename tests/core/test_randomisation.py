@@ -56,7 +56,7 @@ def build(*reset_stages, control="rotor_vel"):
     return sim, nominal
 
 
-def test_a_drawn_mass_sinks_or_climbs_as_newton_has_it():
+def test_a_drawn_mass_sinks_or_climbs_by_newtons_law():
     """At the thrust that carries the nominal mass m0 a mass m accelerates by g (m0 / m - 1), less drag."""
     sim, nominal = build(drawn_mass)
     mass = np.asarray(sim.data.params.mass, np.float64)
@@ -73,7 +73,7 @@ def test_a_drawn_mass_sinks_or_climbs_as_newton_has_it():
     assert not heavier.all()
     np.testing.assert_array_equal(np.asarray(sim.data.states.vel[..., 2]) < 0, heavier)
 
-    # A reset of one world draws there anew, and leaves the masses of the others.
+    # A reset of one world draws new masses there and keeps those of the others.
     sim.reset(np.array([False, True, False]))
     again = np.asarray(sim.data.params.mass, np.float64)
     np.testing.assert_array_equal(again[::2], mass[::2])
@@ -88,7 +88,7 @@ def test_under_attitude_commands_the_heavier_drone_hangs_lower():
     assert np.ptp(height) > 0.05
 
 
-def test_a_drawn_inertia_answers_a_torque_in_proportion():
+def test_angular_acceleration_is_inverse_to_a_drawn_inertia():
     """A small external torque turns a drone at rest by J w' = tau: twice the inertia, half the rate."""
     sim, nominal = build(drawn_inertia)
     p = sim.data.params
@@ -104,7 +104,7 @@ def test_a_drawn_inertia_answers_a_torque_in_proportion():
     np.testing.assert_allclose(nominal.params.J[0, 0], 25e-6, rtol=1e-6)
 
 
-def test_drawn_motors_push_and_tilt_as_their_thrusts_have_it():
+def test_drawn_motors_accelerate_and_tilt_by_their_thrusts():
     """Rotors at hover speed with thrusts off by drawn factors: acceleration by their mean, roll by left over right."""
     sim, nominal = build(drawn_motors)
     scale = np.asarray(sim.data.params.rpm2thrust[..., 2] / nominal.params.rpm2thrust[0, 2], np.float64)
@@ -124,7 +124,7 @@ def test_drawn_motors_push_and_tilt_as_their_thrusts_have_it():
 
 
 def gusts(data):
-    """Blow on each world with a force of its own, drawn anew every step."""
+    """Apply a force to each world that is drawn at every step."""
     one = lambda key: jax.random.normal(key, (1, 3)) * jnp.asarray([1e-3, 1e-3, 0.0])  # noqa: E731
     force = jax.vmap(one)(world_keys(data, "gusts"))
     return data.replace(states=data.states.replace(force=jnp.broadcast_to(force, data.states.force.shape)))

@@ -1,4 +1,4 @@
-"""Worlds over two devices: where each leaf goes, and that nothing but the place changes."""
+"""Worlds distributed over two devices: the placement of each leaf, and the same results as on one device."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ COLLECTIVES = ("all-reduce(", "all-gather(", "all-to-all(", "collective-permute(
 @pytest.fixture(scope="module")
 def mesh():
     devices = jax.devices("cpu")
-    assert len(devices) >= 2, "tests/conftest.py asks for two host devices"
+    assert len(devices) >= 2, "tests/conftest.py requests two host devices"
     return world_mesh(devices[:2])
 
 
@@ -42,7 +42,7 @@ def whole():
 
 
 def assert_spread(data, mesh):
-    """Assert that each device holds its half of the worlds, and all of what is shared."""
+    """Assert that each device holds its half of the worlds and a copy of every shared leaf."""
     for scope, x in zip(jax.tree.leaves(scopes(data)), jax.tree.leaves(data), strict=True):
         assert set(x.sharding.device_set) == set(mesh.devices.flat)
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -105,11 +105,14 @@ def test_law_06_sharded_steps_trace_once(spread):
     assert len(traces) == 1
 
 
-def test_a_step_needs_no_word_between_devices(spread):
+def test_a_step_needs_no_communication_between_devices(spread):
     """Worlds are independent, so the compiled step holds no collective operation."""
     step = spread.build_step_fn()
     text = step.lower(spread.data, 2).compile().as_text()
     assert not [word for word in COLLECTIVES if word in text]
+    # A program that does combine worlds is recognised.
+    text = jax.jit(jnp.sum).lower(spread.data.states.pos).compile().as_text()
+    assert [word for word in COLLECTIVES if word in text]
 
 
 def test_a_step_built_for_one_device_takes_data_of_several(whole, mesh):
@@ -181,7 +184,7 @@ def test_law_09_worlds_that_cannot_be_split_evenly_are_refused(mesh):
 
 def test_law_09_a_mesh_with_another_axis_is_refused(whole):
     other = jax.make_mesh((2,), ("batch",), axis_types=(AxisType.Auto,), devices=jax.devices("cpu")[:2])
-    with pytest.raises(ConfigError, match=f"axes \\('batch',\\); needed is one named '{WORLD_AXIS}'"):
+    with pytest.raises(ConfigError, match=f"an axis '{WORLD_AXIS}', got axes \\('batch',\\)"):
         placement(whole.data, other)
     with pytest.raises(ConfigError, match="batch"):
         Sim(**SETTINGS, mesh=other)

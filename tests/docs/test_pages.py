@@ -46,7 +46,7 @@ PEER_CODE = (
     "_, mjx_data = sync_sim2mjx(sim_data, mjx_data,",
     "return mjx_data._impl.contact.dist < 0",
 )
-"""What code written for Crazyflow does with its scene; each is on a page, in a block that runs."""
+"""Scene code written for Crazyflow; each line is in an executed block of a page."""
 
 
 def test_the_peers_way_with_the_scene_is_on_the_pages():

@@ -69,7 +69,9 @@ def test_derivatives_agree_with_the_same_physics_in_numpy(name, quat, vel, ang_v
         np.testing.assert_allclose(value, wanted, rtol=1e-10, atol=atol)
 
 
-@pytest.mark.parametrize("name", ["cf2x_L250", "cf2x_P250", "cf2x_T350", "cf21B_500", "crazyflie", "bumblebee"])
+@pytest.mark.parametrize(
+    "name", ["cf2x_L250", "cf2x_P250", "cf2x_T350", "cf21B_500", "crazyflie", "bumblebee", "bumblebee_lab"]
+)
 def test_nothing_accelerates_at_hover(name):
     params = first_principles.Params.create(load_airframe(name))
     rotor_vel = first_principles.hover_rotor_vel(params)

@@ -78,6 +78,14 @@ def test_a_sagging_battery_slows_the_rotors_and_leaves_the_command():
     np.testing.assert_array_equal(sim.data.controls.rotor_vel, np.full((2, 2, 4), top))
 
 
+@pytest.mark.parametrize("name, expected", [("cf21B_500", 3.1257), ("cf2x_T350", 2.8166), ("bumblebee", 2 * 3.7)])
+def test_full_speed_needs_the_voltage_of_the_airframe(name, expected):
+    """A Crazyflie's is that of the firmware's thrust curve; an airframe without a curve gets 3.7 V per cell."""
+    sim = Sim(drone=name, control="rotor_vel")
+    sim.add(Battery(capacity=0.25, resistance=0.1, n_cells=2 if name == "bumblebee" else 1))
+    np.testing.assert_allclose(record(sim).full_speed_voltage, expected, atol=1e-4)
+
+
 def test_above_full_speed_voltage_nothing_is_limited():
     strong, plain = build(resistance=1e-3, full_speed_voltage=3.0), build()
     assert len(plain.step_pipeline) == len(strong.step_pipeline)

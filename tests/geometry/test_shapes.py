@@ -60,7 +60,7 @@ def test_a_hull_is_closed_and_holds_its_vertices(rng, n):
 
 
 @pytest.mark.parametrize("make, message", [
-    (lambda: Shape("torus", (1, 1)), "torus.*plane, sphere"),
+    (lambda: Shape("torus", (1, 1)), "kind plane, sphere.*got 'torus'"),
     (lambda: Shape("box", (1, 2)), r"expected 3 positive.*box.*got \(1.0, 2.0\)"),
     (lambda: Shape("sphere", (0,)), "positive"),
     (lambda: Shape("sphere", (np.nan,)), "finite"),
@@ -73,6 +73,7 @@ def test_a_hull_is_closed_and_holds_its_vertices(rng, n):
     (lambda: hull(CUBE, [[0.0, 1, 2]]), "integers"),
     (lambda: hull(CUBE, [[0, 3, 5]]), "expected the triangles of the convex hull"),
     (lambda: hull(CUBE, hull(CUBE).faces[1:]), "not closed"),
+    (lambda: hull(CUBE, [[0, 3, 5], [0, 5, 6], [0, 6, 3], [3, 6, 5]]), "leave a vertex 1.15 m outside"),
     (lambda: hfield(np.zeros((1, 5)), (1, 1, 1, 1)), r"\(1, 5\)"),
     (lambda: hfield(np.full((2, 5), 2.0), (1, 1, 1, 1)), "between 0 and 1.0 m, got 2.0 to 2.0"),
 ])  # fmt: skip

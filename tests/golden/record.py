@@ -89,7 +89,7 @@ MIN_HEIGHT = 0.2
 MAX_TILT = np.deg2rad(70.0)
 # Nothing controls the tilt of an open-loop flight, so it has to leave more room.
 MAX_TILT_OPEN_LOOP = np.deg2rad(60.0)
-# The last step up to which a controller may ask for more than the rotors can give.
+# Last step up to which a controller may command more than the rotors can give.
 LAST_CLIPPED_STEP = 150
 
 
@@ -399,7 +399,7 @@ def main() -> None:
                 **os.environ,
                 "JAX_ENABLE_X64": x64,
                 "JAX_PLATFORMS": "cpu",
-                # The peer wants this set before anything imports SciPy.
+                # Crazyflow needs this before anything imports SciPy.
                 "SCIPY_ARRAY_API": "1",
             }
             command = [sys.executable, str(Path(__file__).resolve()), *args.pairs, "--pass-file", str(path)]

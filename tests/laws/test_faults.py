@@ -1,4 +1,4 @@
-"""Faults of the peer that are right here, each named by its number in the list of what not to inherit."""
+"""Faults of Crazyflow that crazysim does not have, each with its number in the list of faults not to inherit."""
 
 import functools
 
@@ -35,7 +35,7 @@ def program(dynamics="first_principles", control="attitude", **settings):
 
 
 def run(step, data, n_steps):
-    # Bound to one device, whatever an edit was bound to: else the step is compiled anew.
+    # Committed to one device, whatever an edit was committed to, or the step would be compiled again.
     return step(jax.device_put(data, jax.devices()[0]), jnp.int32(n_steps))
 
 
@@ -101,7 +101,7 @@ def test_fault_03_nan_commands_are_refused_flagged_and_healed(dynamics, control)
         assert not clean.core.nonfinite.any()
         np.testing.assert_array_equal(poisoned.core.nonfinite[:, 0], [False, True, False], err_msg=f"{component}")
         for x, y in zip(jax.tree.leaves(poisoned.states), jax.tree.leaves(clean.states), strict=True):
-            np.testing.assert_array_equal(x[::2], y[::2])  # the other worlds know nothing of it
+            np.testing.assert_array_equal(x[::2], y[::2])  # the other worlds are not affected
     still = run(step, send(poisoned, good), 1)
     assert still.core.nonfinite[1, 0], "only a reset clears the flag"
     healed = reset(still, data, jnp.asarray([False, True, False]))
@@ -116,7 +116,7 @@ def test_fault_03_nan_commands_are_refused_flagged_and_healed(dynamics, control)
     "level, freq, given", [("state", 500, 300), ("attitude", 500, 333), ("attitude", 400, 500), ("body_rate", 100, 40)]
 )
 def test_fault_05_rates_that_do_not_divide_are_refused(level, freq, given):
-    """The peer runs such a controller at another rate than the one its integrals and derivatives believe in."""
+    """Crazyflow runs such a controller at another rate than the one its integrals and derivatives use."""
     with pytest.raises(ConfigError, match=f"{level}_freq is {given} Hz, which does not divide freq = {freq} Hz"):
         Sim(control=level, freq=freq, **{f"{level}_freq": given})
 
@@ -150,7 +150,7 @@ def test_fault_06_zero_thrust_stops_the_motors_at_every_level(dynamics, control)
     data = with_states(data, pos=[0, 0, 100.0], rotor_vel=hover_rotor_state(data))
     zero = zero_thrust_command(data)
     if control == "state":
-        # Told to be where it is, and to fall as it falls, the controller wants no force: tick by tick.
+        # A setpoint equal to the current position and velocity at every tick makes the controller command zero force.
         for _ in range(50):
             cmd = np.broadcast_to(zero, (3, 2, 16)).copy()
             cmd[..., 0:3], cmd[..., 3:6] = data.states.pos, data.states.vel

@@ -92,14 +92,16 @@ def arguments(module, function, model, rng, per_drone):
 def test_a_batch_is_its_drones(module, function, model, per_drone, x64, rng):
     """Law 1 for every function of dynamics and control, with parameters shared and one per drone."""
     batched, common = arguments(module, function, model, rng, per_drone)
-    # Nothing has batch axes where all there is to pass are shared parameters.
-    axes = BATCH if batched else ()
+    if not batched:  # a function of parameters alone: without batch axes there is nothing to compare
+        assert not per_drone
+        batched, common = arguments(module, function, model, rng, per_drone=True)
     compiled = jax.jit(lambda batched: function(**batched, **common))
     whole = jax.tree.leaves(compiled(batched))
-    for i in np.ndindex(axes):
+    assert whole
+    for i in np.ndindex(BATCH):
         alone = jax.tree.leaves(compiled(jax.tree.map(lambda x, i=i: x[i], batched)))
         for many, one in zip(whole, alone, strict=True):
-            assert many.shape == (*axes, *one.shape)
+            assert many.shape == (*BATCH, *one.shape)
             assert np.all(np.isfinite(one))
             # float64 rounding: one drone and many may be vectorised and contracted (FMA) differently
             scale = 1e-13 * max(1.0, float(np.abs(many).max()))
@@ -107,11 +109,11 @@ def test_a_batch_is_its_drones(module, function, model, per_drone, x64, rng):
 
 
 def test_the_cases_cover_dynamics_and_control():
-    """No module of physics or control that computes arrays is missing above."""
+    """No module of physics or control that computes arrays is missing above; ``parameters`` only loads them."""
     covered = {m.__name__ for m in MODULES}
     for path in sources():
         name = "crazysim." + ".".join(path.relative_to(Path(crazysim.__file__).parent).with_suffix("").parts)
-        assert name in covered or path.stem in ("__init__", "core"), name
+        assert name in covered or path.stem in ("__init__", "core", "parameters"), name
     assert len(CASES) >= 17
 
 
@@ -123,7 +125,7 @@ def sources():
     return paths
 
 
-def test_physics_and_control_know_no_batch():
+def test_physics_and_control_contain_no_batching():
     """Law 1: they contain no vmap, no loop of JAX, and no batch index."""
     forbidden = {"vmap", "pmap", "shard_map", "scan", "fori_loop", "while_loop", "n_worlds", "n_drones"}
     for path in sources():

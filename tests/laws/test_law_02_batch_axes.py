@@ -66,7 +66,7 @@ def test_a_step_keeps_every_shape_and_type(dynamics, control):
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
-def test_scopes_say_the_axes(dynamics, control):
+def test_scopes_determine_the_axes(dynamics, control):
     """Law 2: drone leaves are (n_worlds, n_drones, *core), world leaves (n_worlds, 1, *core), shared ones core."""
     sim = shared_sim(dynamics=dynamics, control=control)
     one = resized(sim, 1, 1)
@@ -131,8 +131,8 @@ def documented_shapes(record):
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
-def test_docstrings_tell_the_shapes(dynamics, control):
-    """Law 2: every array field of every record says its shape, and tells the truth."""
+def test_docstrings_give_the_shapes(dynamics, control):
+    """Law 2: every array field of every record documents its shape correctly."""
     data = resized(shared_sim(dynamics=dynamics, control=control), 2, 3)
     sizes = {"n_worlds": 2, "n_drones": 3, "n_rotors": 4}
     n_arrays = 0
@@ -145,7 +145,7 @@ def test_docstrings_tell_the_shapes(dynamics, control):
             if isinstance(value, PyTree):
                 check(value)
             elif isinstance(value, (jax.Array, np.ndarray)):
-                assert shape is not None, f"{type(record).__name__}.{field.name} does not say its shape"
+                assert shape is not None, f"{type(record).__name__}.{field.name} has no shape in its docstring"
                 words = [word.strip() for word in shape.split(",") if word.strip()]
                 assert tuple(sizes.get(w) or int(w) for w in words) == value.shape, (type(record), field.name)
                 n_arrays += 1

@@ -13,7 +13,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-import crazysim.scene.scene as place
+import crazysim.scene.mjx_scene as place
 from crazysim.core import functional as F
 from crazysim.sim import Sim
 from crazysim.sim.sim import sync_sim2mjx, use_box_collision
@@ -314,12 +314,12 @@ def test_nothing_of_the_scene_is_held_per_world_before_it_is_asked_for():
         own = {id(x) for x in jax.tree.leaves((sim.data, sim.default_data))}
         return sum(x.nbytes for x in jax.live_arrays() if x.ndim and x.shape[0] == n_worlds and id(x) not in own)
 
-    assert sim.scene._mjx_data is None
+    assert not sim.scene.is_allocated
     assert foreign_bytes() == 0
     sim.step(2)
     sim.reset()
     sim.build_mjx()
-    assert sim.scene._mjx_data is None
+    assert not sim.scene.is_allocated
     assert foreign_bytes() == 0
     assert sim.mjx_data.mocap_pos.shape == (n_worlds, 1, 3)
     assert foreign_bytes() > 1000 * n_worlds
@@ -330,8 +330,8 @@ def test_drawing_one_world_of_several_holds_none_of_the_others(opengl, syncs):
     sim = Sim(n_worlds=2)
     sim.step()
     assert sim.render(**SMALL, world=1).shape == (24, 32, 3)
-    assert sim.scene._mjx_data is None
-    assert sim.scene._mjx_model is None
+    assert not sim.scene.is_allocated
+    assert sim.scene._mjx._model is None
     assert not syncs
 
 

@@ -1,6 +1,7 @@
 """Law 7: no NaN from valid input, in values or gradients, and one bad world never touches another."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +15,14 @@ from cases import (
     send,
     shared_sim,
     trees_equal,
+    with_airframes,
     with_states,
     zero_thrust_command,
 )
 
-from crazysim import Sim
+from crazysim import Drone, Sim, load_airframe
 from crazysim.core.stages import FLOOR
+from crazysim.dynamics import supported_dynamics
 
 HALF = np.sqrt(0.5)
 SITUATIONS = (
@@ -141,6 +144,54 @@ def test_attitudes_that_no_drone_can_take_keep_a_fitted_model_bounded(drone, int
         assert np.isfinite(fastest)
     assert not sim.data.core.nonfinite.any()
     assert 50 < fastest < 500  # rad/s; handed over from 100 to 200, and a step of 2 ms may overshoot
+
+
+EXTREMES = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))
+"""Least, zero and largest of three numbers, all combinations. (27, 3)"""
+
+
+def extreme_commands(airframe, control):
+    """Return constant legal commands of a level for one airframe, up to what its rotors can give and beyond. (n, k)"""
+    n_rotors, most = airframe.n_rotors, float(airframe.value("rotors.thrust_max"))
+    hover = float(airframe.value("rigid_body.mass")) * 9.81
+    if control == "rotor_vel":
+        return 1e6 * np.array(list(itertools.product((0.0, 1.0), repeat=n_rotors)))
+    torque = [n_rotors * most * airframe.arm] * 2 + [2 * most * float(airframe.value("controller.thrust2torque"))]
+    if control == "force_torque":
+        small = [hover, 0.0, 0.0, 2e-3 * hover / 0.4257]  # 2 mN m for a cf21B_500, which lets no rotor saturate
+        return np.array([[force, *(torque * t)] for force in (hover, n_rotors * most) for t in EXTREMES] + [small])
+    if control == "state":
+        away = 100 * EXTREMES
+        return np.concatenate([away, np.roll(away, 1, 0), away, np.eye(4)[np.arange(27) % 4], away[::-1]], axis=-1)
+    largest = np.pi * np.array([1.0, 0.5, 1.0]) if control == "attitude" else np.full(3, 100.0)
+    return np.array([[*(largest * t), force] for force in (hover, n_rotors * most) for t in EXTREMES])
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("dynamics, control", [*PAIRS[:5], ("so_rpy", "attitude"), ("so_rpy_rotor_drag", "attitude")])
+def test_a_minute_of_any_constant_command_stays_finite(dynamics, control, integrator):
+    """Law 7: the extremes of every command level on every airframe, as the worlds of one batch.
+
+    Nothing damps a body rate, so a constant torque raises it to the integrators' limit of 1 rad per step and axis.
+    """
+    airframes = [load_airframe(name) for name in Drone if dynamics in supported_dynamics(name)]
+    commands = [extreme_commands(airframe, control) for airframe in airframes]
+    of_world = [airframe for airframe, mine in zip(airframes, commands, strict=True) for _ in mine]
+    sim = Sim(len(of_world), dynamics=dynamics, control=control, integrator=integrator)
+    sim.data = with_states(with_airframes(sim, of_world), pos=[0.0, 0.0, 100.0])
+    getattr(sim, f"{control}_control")(np.concatenate(commands)[:, None])
+    fastest = np.zeros(sim.n_worlds)
+    for _ in range(60):
+        sim.step(sim.freq)
+        fastest = np.maximum(fastest, np.abs(sim.data.states.ang_vel[:, 0]).max(-1))
+    for name, x in vars(sim.data.states).items():
+        assert np.all(np.isfinite(x)), (
+            name,
+            {a.name for a, ok in zip(of_world, np.isfinite(x), strict=True) if not ok.all()},
+        )
+    assert not sim.data.core.nonfinite.any()
+    assert fastest.max() <= sim.freq
+    assert (fastest == sim.freq).any() == (control in ("force_torque", "rotor_vel")), "some command reaches the limit"
 
 
 @pytest.mark.parametrize("dynamics, control, engine", ENGINES)

@@ -1,4 +1,4 @@
-"""Law 9: wrong input is told at once, with what came and what is needed, and the simulation stays as it was."""
+"""Law 9: wrong input is an error at once, with expected, given and remedy, and the simulation does not change."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def broken(tmp_path, text):
     return path
 
 
-# What is passed, and what the message must contain: what came, then what was needed or what to do.
+# Arguments, and parts of the message: the given value, then the expected one or the remedy.
 WRONG_SETTINGS = [
     ({"n_worlds": 0}, "n_worlds is 0", "positive whole number"),
     ({"n_worlds": 2.5}, "n_worlds is 2.5", "positive whole number"),
@@ -39,8 +39,8 @@ WRONG_SETTINGS = [
     ({"control": "body_rate", "body_rate_freq": 300}, "body_rate_freq is 300", "250 Hz"),
     ({"control": "force_torque", "force_torque_freq": 400}, "force_torque_freq is 400", "250 Hz"),
     ({"drone": "cf99"}, "'cf99'", "cf21B_500"),
-    ({"drone": "/nowhere/mine.toml"}, "/nowhere/mine.toml", "no TOML file"),
-    ({"drone": 3}, "not 3", "a dict or an airframe"),
+    ({"drone": "/nowhere/mine.toml"}, "/nowhere/mine.toml", "no file of that path"),
+    ({"drone": 3}, "got 3", "a dict or an Airframe"),
     ({"drone": {}}, "no table [rigid_body]", "Add [rigid_body]"),
     ({"dynamics": "quadratic"}, "'quadratic'", "'first_principles', 'so_rpy'"),
     ({"dynamics": None}, "None", "'first_principles'"),
@@ -49,13 +49,13 @@ WRONG_SETTINGS = [
     ({"dynamics": "so_rpy", "control": "rotor_vel"}, "'rotor_vel'", "dynamics='first_principles'"),
     ({"dynamics": "so_rpy_rotor", "control": "force_torque"}, "'force_torque'", "dynamics='first_principles'"),
     ({"dynamics": "so_rpy_rotor_drag", "control": "body_rate"}, "'body_rate'", "dynamics='first_principles'"),
-    ({"drone": "hb_x500"}, "'hb_x500' has no parameters for dynamics 'first_principles'", "so_rpy"),
+    ({"drone": "hb_x500"}, "expected dynamics that drone 'hb_x500' has parameters for", "so_rpy"),
     ({"device": "abacus"}, "'abacus' does not exist", "'cpu' or 'gpu'"),
     ({"device": "cpu:99"}, "'cpu:99' does not exist", "'cpu' or 'gpu'"),
-    ({"device": None}, "not None", "jax.Device"),
+    ({"device": None}, "got None", "jax.Device"),
     ({"mesh": 2}, "got 2", "world_mesh"),
-    ({"xml_path": "/nowhere/scene.xml"}, "/nowhere/scene.xml does not exist", "xml_path="),
-    ({"xml_path": 3}, "xml_path is 3", "MJCF"),
+    ({"xml_path": "/nowhere/scene.xml"}, "expected an existing MJCF file as xml_path", "/nowhere/scene.xml"),
+    ({"xml_path": 3}, "as xml_path, got 3", "MJCF"),
     ({"rng_key": "lucky"}, "'lucky'", "an integer"),
     ({"rng_key": 1.5}, "1.5", "an integer"),
     ({"rng_key": 2**70}, str(2**70), "64 bits"),
@@ -63,7 +63,7 @@ WRONG_SETTINGS = [
 
 
 @pytest.mark.parametrize("case", WRONG_SETTINGS, ids=lambda case: "-".join(f"{k}={v}" for k, v in case[0].items()))
-def test_wrong_settings_are_told_at_construction(case):
+def test_wrong_settings_are_errors_at_construction(case):
     settings, *fragments = case
     with pytest.raises(ValueError) as error:
         Sim(**settings)
@@ -74,14 +74,14 @@ def test_wrong_settings_are_told_at_construction(case):
 @pytest.mark.parametrize(
     "text, fragment",
     [
-        ("<mujoco><worldbody>", "is not a scene MuJoCo can read"),
-        ("no XML at all", "is not a scene MuJoCo can read"),
-        ("<mujoco><worldbody><geom type='teapot'/></worldbody></mujoco>", "is not a scene MuJoCo can read"),
-        ("<mujoco><worldbody><geom type='sphere'/></worldbody></mujoco>", "does not compile"),
+        ("<mujoco><worldbody>", "expected a scene that MuJoCo can read"),
+        ("no XML at all", "expected a scene that MuJoCo can read"),
+        ("<mujoco><worldbody><geom type='teapot'/></worldbody></mujoco>", "expected a scene that MuJoCo can read"),
+        ("<mujoco><worldbody><geom type='sphere'/></worldbody></mujoco>", "expected a scene that compiles"),
         ("<mujoco><worldbody><body name='drone:0'/></worldbody></mujoco>", "'drone:0'"),
     ],
 )
-def test_a_broken_scene_file_is_told_at_construction(text, fragment, tmp_path):
+def test_a_broken_scene_file_is_an_error_at_construction(text, fragment, tmp_path):
     with pytest.raises(ConfigError) as error:
         Sim(xml_path=broken(tmp_path, text))
     assert fragment in str(error.value)
@@ -103,20 +103,20 @@ def airframe(**changes):
 @pytest.mark.parametrize(
     "changes, fragments",
     [
-        ({"rigid_body__mass": 0.0}, ("mass is 0.0 kg", "positive")),
-        ({"rigid_body__mass": -1.0}, ("mass is -1.0 kg", "positive")),
-        ({"rigid_body__mass": "heavy"}, ("'heavy'", "not a number")),
-        ({"rigid_body__mass": np.nan}, ("rigid_body.mass", "not finite")),
-        ({"rigid_body__mass": 5.0}, ("cannot lift 5.0 kg",)),
-        ({"rigid_body__mass": [1.0, 2.0]}, ("rigid_body.mass has shape (2,)", "needed is ()")),
+        ({"rigid_body__mass": 0.0}, ("positive mass", "got 0.0 kg")),
+        ({"rigid_body__mass": -1.0}, ("positive mass", "got -1.0 kg")),
+        ({"rigid_body__mass": "heavy"}, ("as a number", "got 'heavy'")),
+        ({"rigid_body__mass": np.nan}, ("expected rigid_body.mass to be finite", "got nan")),
+        ({"rigid_body__mass": 5.0}, ("expected rotors that lift 5.0 kg", "got 4 rotors")),
+        ({"rigid_body__mass": [1.0, 2.0]}, ("expected rigid_body.mass of shape ()", "got (2,)")),
         ({"rigid_body__inertia": [1e-5, -1e-5, 1e-5]}, ("-1e-05", "positive")),
         ({"rigid_body__inertia": [1e-5, 1e-5]}, ("inertia", "three positive moments")),
         ({"rotors__position": [[0.1, 0.1]]}, ("(1, 2)", "(n, 3)")),
-        ({"rotors__yaw_torque_sign": [1, -1]}, ("yaw_torque_sign has shape (2,)", "(4,)")),
-        ({"rotors__thrust_min": 0.3}, ("thrust_min 0.3 N", "0 <= min < max")),
-        ({"rotors__thrust_max": -0.1}, ("thrust_max -0.1 N", "0 <= min < max")),
-        ({"rotors__lag": [1.0, 2.0]}, ("rotors.lag has shape (2,)", "(4,)")),
-        ({"drag__coefficients": [1.0]}, ("drag.coefficients has shape (1,)", "(3,)")),
+        ({"rotors__yaw_torque_sign": [1, -1]}, ("yaw_torque_sign of shape (4,)", "got (2,)")),
+        ({"rotors__thrust_min": 0.3}, ("0 <= thrust_min < thrust_max", "got 0.3 N")),
+        ({"rotors__thrust_max": -0.1}, ("0 <= thrust_min < thrust_max", "and -0.1 N")),
+        ({"rotors__lag": [1.0, 2.0]}, ("rotors.lag of shape (4,)", "got (2,)")),
+        ({"drag__coefficients": [1.0]}, ("drag.coefficients of shape (3,)", "got (1,)")),
     ],
 )
 def test_airframes_that_cannot_fly_are_refused(changes, fragments):
@@ -149,7 +149,7 @@ def wrong_commands(shape):
     yield np.zeros((2, 3, shape[2])), str((2, 3, shape[2])), needed
     yield 0.0, "()", "n_worlds, n_drones"
     yield None, "()", "n_worlds, n_drones"
-    yield [[1.0, 2.0], [3.0]], "no regular array", "command"
+    yield [[1.0, 2.0], [3.0]], "a regular array, got", "command"
     yield zeros[..., :0].tolist(), str((3, 2, 0)), needed
     yield np.full(shape, "up"), "<U2", "real numbers"
     yield np.zeros(shape, bool), "bool", "real numbers"
@@ -190,8 +190,8 @@ def test_a_command_of_another_level_names_both(at_level):
         assert sim.data is before
 
 
-def test_device_commands_are_looked_at_only_when_asked(at_level):
-    """Looking at a device array would wait for the device, so it is done with ``check_finite=True`` only."""
+def test_device_commands_are_checked_only_on_request(at_level):
+    """Reading a device array waits for the device, so it is done only with ``check_finite=True``."""
     sim, before = at_level, at_level.data
     set_command = getattr(sim, f"{sim.control.value}_control")
     command = jnp.zeros(command_shape(sim.data, sim.control)).at[2, 0, 1].set(jnp.nan)
@@ -224,7 +224,7 @@ def stage_that_is_none(data):
     return data
 
 
-# What is called, and what the message must contain.
+# Calls, and parts of the message.
 WRONG_CALLS = [
     (lambda sim: sim.step(0), "n_steps is 0", "positive whole number"),
     (lambda sim: sim.step(-5), "n_steps is -5", "positive whole number"),
@@ -241,8 +241,8 @@ WRONG_CALLS = [
     (lambda sim: sim.seed(1.5), "1.5", "an integer"),
     (lambda sim: sim.seed("7"), "'7'", "an integer"),
     (lambda sim: sim.seed(None), "None", "an integer"),
-    (lambda sim: sim.render("rgb_array", world=3), "world 3 does not exist", "0 to 2"),
-    (lambda sim: sim.render("rgb_array", world=-1), "world -1 does not exist", "0 to 2"),
+    (lambda sim: sim.render("rgb_array", world=3), "expected a world from 0 to 2", "got 3"),
+    (lambda sim: sim.render("rgb_array", world=-1), "expected a world from 0 to 2", "got -1"),
     (lambda sim: setattr(sim, "max_visual_geom", 0), "max_visual_geom is 0", "positive whole number"),
     (lambda sim: remove_fn(sim.step_pipeline, "wind"), "No stage named 'wind'", "integration"),
     (lambda sim: replace_fn(sim.step_pipeline, stage_that_is_none, "wind"), "No stage named 'wind'", "integration"),
@@ -256,7 +256,7 @@ WRONG_CALLS = [
         "'integration' already exists",
         "name=",
     ),
-    (lambda sim: append_fn(sim.step_pipeline, None), "not None", "a function"),
+    (lambda sim: append_fn(sim.step_pipeline, None), "got None", "a function"),
 ]
 
 
@@ -307,7 +307,7 @@ def test_a_spec_that_does_not_compile_leaves_the_old_scene():
     sim = Sim()
     before, model = sim.data, sim.mj_model
     geom = sim.spec.worldbody.add_geom(name="bad", size=[-1.0, 0, 0])
-    with pytest.raises(ConfigError, match="the scene does not compile"):
+    with pytest.raises(ConfigError, match="expected a scene that compiles"):
         sim.build_mjx()
     assert sim.data is before
     assert sim.mj_model is model
@@ -315,8 +315,8 @@ def test_a_spec_that_does_not_compile_leaves_the_old_scene():
     sim.build_mjx()
 
 
-def test_no_assertion_checks_what_users_pass():
-    """Under ``python -O`` an assert is gone."""
+def test_no_assert_statement_checks_user_input():
+    """``python -O`` removes assert statements."""
     from pathlib import Path
 
     import crazysim

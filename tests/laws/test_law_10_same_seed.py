@@ -1,4 +1,4 @@
-"""Law 10: same seed, same numbers, whatever else is simulated along and on however many devices."""
+"""Law 10: same seed, same numbers, independent of the other worlds and of the number of devices."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from crazysim.pytree import select_worlds
 
 
 def randomise_mass(data, default_data, mask=None):
-    """Draw the mass of every drone anew, between 30 and 60 g, in the worlds that are reset."""
+    """Draw the mass of every drone between 30 and 60 g in the worlds that are reset."""
     draw = jax.vmap(jax.vmap(lambda key: jax.random.uniform(key, (1,), minval=0.03, maxval=0.06)))
     mass = select_worlds(mask, draw(drone_keys(data, "mass")), data.params.mass)
     return data.replace(params=data.params.replace(mass=mass))

@@ -1,4 +1,4 @@
-"""Law 11: no buffer is taken from a caller. What was handed in stays readable and as it was."""
+"""Law 11: no buffer is taken from a caller; arguments stay readable and unchanged."""
 
 import jax
 import jax.numpy as jnp
@@ -86,7 +86,7 @@ def test_one_state_can_be_stepped_twice(sim):
 
 
 def test_nothing_is_donated_in_the_compiled_programs(sim):
-    """On CPU a donated buffer may happen to survive, so the programs themselves are looked at."""
+    """On CPU a donated buffer may survive, so the compiled programs are examined."""
     step, reset = sim.build_step_fn(), sim.build_reset_fn()
     programs = [
         step.lower(sim.data, jnp.int32(1)),
@@ -98,6 +98,6 @@ def test_nothing_is_donated_in_the_compiled_programs(sim):
         assert "func.func public @main" in text
         for mark in ("donated", "tf.aliasing_output", "jax.buffer_donor"):
             assert mark not in text
-    # The marks are the right ones: this is how a program looks that does take a buffer.
+    # Positive control: a program that does donate a buffer has one of the marks.
     taking = jax.jit(lambda x: x + 1, donate_argnums=0).lower(jnp.ones(3)).as_text()
     assert "tf.aliasing_output" in taking or "jax.buffer_donor" in taking

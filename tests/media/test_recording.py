@@ -67,7 +67,7 @@ def test_it_has_what_was_flown(flight):
 
 
 def test_shapes_are_those_of_the_scene(flight, sim):
-    """The ball is red and rides on its body, the floor stands, and what is only touched is not seen."""
+    """The ball is red and moves with its body, the floor is fixed, and collision geoms are left out."""
     balls = [shape for shape in flight.shapes if shape.mocap == flight.body_ids[0]]
     assert [(ball.kind, ball.size[0]) for ball in balls] == [("sphere", 0.1)]
     np.testing.assert_allclose(balls[0].rgba, [1, 0, 0, 1])
@@ -106,7 +106,7 @@ def test_meshes_and_children_of_moving_bodies_are_shapes():
 
 
 def test_between_two_moments_it_is_interpolated(flight):
-    """Half way in time is half way up and half way round; beyond the ends it is at the ends."""
+    """At half the time it is at half the height and half the turn; times beyond the ends are clipped."""
     half = flight.at(0.25)
     np.testing.assert_allclose(half["pos"][0, 1], [0.5, 0, 1.5])
     angle = np.arctan2(0.6, 0.8) / 2
@@ -139,7 +139,7 @@ def test_another_simulation_is_put_where_the_flight_was(flight, opengl):
     np.testing.assert_allclose(other.mjx_data.mocap_quat[2, k], np.roll(ROLL[1], 1), atol=1e-6)
     above = {"lookat": [2, 0, 0.3], "distance": 2.0, "azimuth": 90, "elevation": -89}
     for world, seen in ((2, True), (0, False)):
-        picture = View(worlds=world, width=64, height=48, cam_config=above).picture(other).astype(int)
+        picture = View(worlds=world, width=64, height=48, cam_config=above).render(other).astype(int)
         red = picture[..., 0] > picture[..., 1:].max(-1) + 60
         assert red[23:25, 31:33].all() == red.any() == seen
     other.close()
@@ -182,7 +182,7 @@ def test_a_reset_does_not_turn_the_recording_back(sim):
 
 
 def test_what_a_rollout_kept_is_a_flight(flight):
-    """States of a rollout become the flight that was flown, of the worlds asked for."""
+    """States of a rollout become a flight of the requested worlds."""
     sim = Sim(n_worlds=2, control="attitude")
     thrust = 1.2 * sim.data.params.mass.ravel()[0] * 9.81
 
@@ -200,36 +200,36 @@ def test_what_a_rollout_kept_is_a_flight(flight):
 # Wrong input ----------------------------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_recorded_is_told(sim):
-    with pytest.raises(ConfigError, match="world 3 does not exist"):
+def test_invalid_recordings_are_refused(sim):
+    with pytest.raises(ConfigError, match="expected a world from 0 to 2, got 3"):
         Recorder(sim, worlds=[0, 3])
-    with pytest.raises(ConfigError, match="worlds is empty"):
+    with pytest.raises(ConfigError, match="at least one world, got none"):
         Recorder(sim, worlds=[])
-    with pytest.raises(ConfigError, match=r"nothing was recorded; call recorder\.add\(\)"):
+    with pytest.raises(ConfigError, match=r"at least one sample, got none\. Call recorder\.add\(\)"):
         Recorder(sim).flight()
-    with pytest.raises(ConfigError, match=r"needed is time in front of \(3, 2, 3\)"):
+    with pytest.raises(ConfigError, match=r"expected positions of shape \(n, \*\(3, 2, 3\)\)"):
         flight_of(sim, sim.data.states, dt=0.1)
 
 
-def test_what_cannot_be_put_back_is_told(flight):
-    with pytest.raises(ConfigError, match="world 2 does not exist"):
+def test_a_flight_of_another_simulation_is_refused(flight):
+    with pytest.raises(ConfigError, match="got 2"):
         put(Sim(n_worlds=2, n_drones=2), flight, 0.0)
-    with pytest.raises(ConfigError, match="has 2 drones and 1 other mocap bodies; the simulation has 2 and 0"):
+    with pytest.raises(ConfigError, match="2 drones and 1 other mocap bodies, as the flight has, got 2 and 0"):
         put(Sim(n_worlds=3, n_drones=2), flight, 0.0)
-    with pytest.raises(ConfigError, match=r"world 1 was not recorded; recorded are \[2, 0\]"):
+    with pytest.raises(ConfigError, match=r"one of \[2, 0\], got 1"):
         flight.index(1)
 
 
-def test_files_that_cannot_be_are_told(flight, tmp_path):
-    with pytest.raises(ConfigError, match=r"must end with \.npz"):
+def test_invalid_files_are_refused(flight, tmp_path):
+    with pytest.raises(ConfigError, match=r"to end with \.npz"):
         flight.save(tmp_path / "flight.zip")
-    with pytest.raises(ConfigError, match="there is no folder"):
+    with pytest.raises(ConfigError, match="expected an existing folder"):
         flight.save(tmp_path / "nowhere" / "flight.npz")
-    with pytest.raises(ConfigError, match="there is no file"):
+    with pytest.raises(ConfigError, match="expected an existing file"):
         Flight.load(tmp_path / "flight.npz")
     (tmp_path / "flight.npz").write_text("no flight")
-    with pytest.raises(ConfigError, match=r"flight\.npz is no recorded flight"):
+    with pytest.raises(ConfigError, match=r"expected a recorded flight, got .*flight\.npz"):
         Flight.load(tmp_path / "flight.npz")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    with pytest.raises(ConfigError, match=r"other\.npz is no recorded flight"):
+    with pytest.raises(ConfigError, match=r"expected a recorded flight, got .*other\.npz"):
         Flight.load(tmp_path / "other.npz")

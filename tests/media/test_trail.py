@@ -1,11 +1,11 @@
-"""A trail remembers as long as it was told to, and forgets a world's way when it is reset."""
+"""Trails keep their duration, and begin again when a world is reset."""
 
 import numpy as np
 import pytest
 
 from crazysim.errors import ConfigError
 from crazysim.media import Trail
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 
 
 def moments(trail, times, n_worlds=2, n_drones=1):
@@ -18,7 +18,7 @@ def moments(trail, times, n_worlds=2, n_drones=1):
 def test_it_keeps_its_time_and_no_more():
     trail = Trail(1.0)
     moments(trail, 0.25 * np.arange(9))
-    np.testing.assert_allclose(trail.way(0)[:, 0, 0], [1.0, 1.25, 1.5, 1.75, 2.0])
+    np.testing.assert_allclose(trail.path(0)[:, 0, 0], [1.0, 1.25, 1.5, 1.75, 2.0])
     assert len(trail) == 5
 
 
@@ -27,30 +27,30 @@ def test_a_reset_world_leaves_its_way_behind_and_others_keep_theirs():
     moments(trail, [0.0, 1.0, 2.0])
     trail.add([0.0, 3.0], [[[7, 0, 0]], [[3, 0, 0]]])
     trail.add([1.0, 4.0], [[[8, 0, 0]], [[4, 0, 0]]])
-    np.testing.assert_allclose(trail.way(0)[:, 0, 0], [7, 8])
-    np.testing.assert_allclose(trail.way(1)[:, 0, 0], [0, 1, 2, 3, 4])
+    np.testing.assert_allclose(trail.path(0)[:, 0, 0], [7, 8])
+    np.testing.assert_allclose(trail.path(1)[:, 0, 0], [0, 1, 2, 3, 4])
 
 
 def test_a_second_call_at_one_time_replaces_the_first():
     trail = Trail(5.0)
     moments(trail, [0.0, 1.0])
     trail.add([1.0, 1.0], np.full((2, 1, 3), 9.0))
-    np.testing.assert_allclose(trail.way(1)[:, 0, 0], [0, 9])
+    np.testing.assert_allclose(trail.path(1)[:, 0, 0], [0, 9])
 
 
 def test_lines_fade_towards_their_beginning():
-    trail, marks = Trail(5.0), Marks()
+    trail, overlays = Trail(5.0), Overlays()
     moments(trail, np.arange(5.0), n_drones=2)
-    trail.draw(marks, 1, rgba=[[1, 0, 0, 1], [0, 0, 1, 0.5]])
-    assert len(marks) == 8
-    alphas = np.array([geom[-1][3] for geom in marks._geoms]).reshape(2, 4)
+    trail.draw(overlays, 1, rgba=[[1, 0, 0, 1], [0, 0, 1, 0.5]])
+    assert len(overlays) == 8
+    alphas = np.array([geom[-1][3] for geom in overlays._geoms]).reshape(2, 4)
     np.testing.assert_allclose(alphas[:, -1], [1.0, 0.5])
     assert (np.diff(alphas) > 0.05).all()
 
 
 @pytest.mark.parametrize("seconds", [0, -1.0, np.nan, np.inf])
-def test_a_time_that_cannot_be_is_told(seconds):
-    with pytest.raises(ConfigError, match="must be positive"):
+def test_a_duration_that_is_not_positive_is_refused(seconds):
+    with pytest.raises(ConfigError, match="expected a positive duration"):
         Trail(seconds)
 
 
@@ -59,10 +59,10 @@ def test_a_time_that_cannot_be_is_told(seconds):
     [
         ([0.0], np.zeros((2, 1, 3)), r"got \(1,\) and \(2, 1, 3\)"),
         ([0.0, 0.0], np.zeros((2, 3)), r"got \(2,\) and \(2, 3\)"),
-        ([0.0] * 3, np.zeros((3, 1, 3)), r"positions of shape \(2, 1, 3\), got \(3, 1, 3\)"),
+        ([0.0] * 3, np.zeros((3, 1, 3)), r"positions of shape \(2, 1, 3\), as before, got \(3, 1, 3\)"),
     ],
 )
-def test_positions_of_another_shape_are_told(time, pos, message):
+def test_positions_of_another_shape_are_refused(time, pos, message):
     trail = Trail(1.0)
     moments(trail, [0.0])
     with pytest.raises(ConfigError, match=message):

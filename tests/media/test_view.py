@@ -8,7 +8,7 @@ import pytest
 from cases import ABOVE, FOVY
 
 from crazysim.errors import ConfigError
-from crazysim.media import View, pictures_of
+from crazysim.media import View, render_worlds
 from crazysim.sim import Sim
 from crazysim.sim.visualize import draw_points
 
@@ -60,10 +60,10 @@ def view(**options):
 
 
 def test_each_tile_shows_its_world(sim):
-    """Tile k of a grid is the picture of world k alone, in the order asked for, and borders lie between."""
+    """Tile k of a grid is the image of the k-th requested world alone, with borders between."""
     worlds = [2, 0, 3, 1]
     grid = view(worlds=worlds, width=2 * WIDTH + 4, height=2 * HEIGHT + 4, border=4)
-    picture = grid.picture(sim)
+    picture = grid.render(sim)
     assert picture.shape == (2 * HEIGHT + 4, 2 * WIDTH + 4, 3)
     assert picture.dtype == np.uint8
     upper, lower, left, right = slice(HEIGHT), slice(HEIGHT + 4, None), slice(WIDTH), slice(WIDTH + 4, None)
@@ -99,55 +99,55 @@ def test_grids_are_filled_row_by_row(n, columns, grid, size):
 def test_what_a_user_drew_is_in_every_tile_and_only_once(sim):
     grid = view(worlds=[0, 1], width=2 * WIDTH, border=0)
     draw_points(sim, [[0, 0, 1.0]], rgba=GREEN, size=0.05)
-    picture = grid.picture(sim)
+    picture = grid.render(sim)
     for k in range(2):
         rows, columns = np.nonzero(of_colour(picture[grid.tile(k)], GREEN))
         np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [HEIGHT / 2, WIDTH / 2], atol=0.5)
-    assert not of_colour(grid.picture(sim), GREEN).any()
+    assert not of_colour(grid.render(sim), GREEN).any()
 
 
-def test_what_a_user_drew_waits_when_a_picture_fails(sim):
+def test_overlays_are_kept_when_an_image_fails(sim):
     draw_points(sim, [[0, 0, 1.0]], rgba=GREEN, size=0.05)
-    with pytest.raises(ConfigError, match="no camera 'up'"):
-        view(camera="up", text="failed").picture(sim)
-    picture = view().picture(sim)
+    with pytest.raises(ConfigError, match="got 'up'"):
+        view(camera="up", text="failed").render(sim)
+    picture = view().render(sim)
     assert of_colour(picture, GREEN).any()
-    np.testing.assert_array_equal(view().picture(sim), sim.render("rgb_array", 0, "down", None, WIDTH, HEIGHT))
+    np.testing.assert_array_equal(view().render(sim), sim.render("rgb_array", 0, "down", None, WIDTH, HEIGHT))
 
 
 # Cameras --------------------------------------------------------------------------------------------------------
 
 
-def test_a_batch_holds_a_picture_of_each_world_in_the_order_asked_for(sim):
-    batch = pictures_of(sim, [2, 0, 3], "down", width=WIDTH, height=HEIGHT)
+def test_a_batch_holds_an_image_of_each_world_in_the_requested_order(sim):
+    batch = render_worlds(sim, [2, 0, 3], "down", width=WIDTH, height=HEIGHT)
     assert batch.shape == (3, HEIGHT, WIDTH, 3)
     assert batch.dtype == np.uint8
     for picture, world in zip(batch, (2, 0, 3), strict=True):
         np.testing.assert_allclose(dark(picture), pixel(PLACES[world]), atol=2)
-    every = pictures_of(sim, camera="down", width=WIDTH, height=HEIGHT)
+    every = render_worlds(sim, camera="down", width=WIDTH, height=HEIGHT)
     np.testing.assert_array_equal(every[[2, 0, 3]], batch)
     free = {"lookat": [0, 0, 0], "distance": ABOVE, "azimuth": 90, "elevation": -90}
     draw_points(sim, np.array([[0, 0, 0.5]]), rgba=RED, size=0.05)
-    marked = pictures_of(sim, [1, 1], cam_config=free, width=WIDTH, height=HEIGHT)
+    marked = render_worlds(sim, [1, 1], cam_config=free, width=WIDTH, height=HEIGHT)
     for picture in marked:
         rows, columns = np.nonzero(of_colour(picture, RED))
         np.testing.assert_allclose([rows.mean() + 0.5, columns.mean() + 0.5], [HEIGHT / 2, WIDTH / 2], atol=1)
-    assert not of_colour(pictures_of(sim, [1], "down"), RED).any()
+    assert not of_colour(render_worlds(sim, [1], "down"), RED).any()
 
 
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        ({"worlds": []}, "worlds is empty"),
-        ({"worlds": [4]}, "world 4 does not exist"),
+        ({"worlds": []}, "at least one world, got none"),
+        ({"worlds": [4]}, "got 4"),
         ({"height": 0}, "height"),
         ({"width": 1.5}, "width"),
-        ({"camera": "nose"}, "no camera 'nose'"),
+        ({"camera": "nose"}, "got 'nose'"),
     ],
 )
-def test_law_09_a_batch_that_cannot_be_is_told(sim, wrong, message):
+def test_law_09_invalid_batches_are_refused(sim, wrong, message):
     with pytest.raises(ConfigError, match=message):
-        pictures_of(sim, **wrong)
+        render_worlds(sim, **wrong)
 
 
 def test_a_camera_that_follows_keeps_each_worlds_drone_in_its_middle(sim):
@@ -156,20 +156,20 @@ def test_a_camera_that_follows_keeps_each_worlds_drone_in_its_middle(sim):
     follow = view(worlds=[0, 2], camera=-1, cam_config=down, follow=0, lag=0, width=2 * WIDTH, border=0)
     fixed = view(worlds=[0, 2], camera=-1, cam_config=down | {"lookat": [0, 0, 0.5]}, width=2 * WIDTH, border=0)
     for k in range(2):
-        np.testing.assert_allclose(dark(follow.picture(sim)[follow.tile(k)]), [HEIGHT / 2, WIDTH / 2], atol=2)
-        assert abs(dark(fixed.picture(sim)[fixed.tile(k)])[1] - WIDTH / 2) > 20
+        np.testing.assert_allclose(dark(follow.render(sim)[follow.tile(k)]), [HEIGHT / 2, WIDTH / 2], atol=2)
+        assert abs(dark(fixed.render(sim)[fixed.tile(k)])[1] - WIDTH / 2) > 20
 
 
 def test_a_camera_that_follows_lags_behind(sim):
-    """After a jump of 0.2 m its middle has gone 1 - exp(-t / lag) of the way; after a reset all of it."""
+    """After a jump of 0.2 m its centre has moved by 1 - exp(-t / lag) of it; after a reset by all of it."""
     config = {"distance": 1.5, "azimuth": 90, "elevation": -90}
     follow = view(camera=-1, cam_config=config, follow=0, lag=0.5)
     place(sim, PLACES, 1.0)
-    follow.picture(sim)
+    follow.render(sim)
     place(sim, PLACES + [0.2, 0, 0], 1.5)
-    moved = dark(follow.picture(sim))[1] - WIDTH / 2
+    moved = dark(follow.render(sim))[1] - WIDTH / 2
     place(sim, PLACES + [0.1, 0, 0], 0.0)
-    after_reset = dark(follow.picture(sim))[1] - WIDTH / 2
+    after_reset = dark(follow.render(sim))[1] - WIDTH / 2
     place(sim, PLACES, 0.0)
     focal = 0.5 * HEIGHT / np.tan(np.deg2rad(sim.mj_model.vis.global_.fovy / 2))
     np.testing.assert_allclose(moved, focal * 0.2 * np.exp(-1) / 1.5, atol=1.5)
@@ -185,7 +185,7 @@ def test_a_camera_may_move_with_time(sim):
     columns = []
     for time in (0.0, 2.0):
         place(sim, PLACES, time)
-        columns.append(dark(moving.picture(sim))[1])
+        columns.append(dark(moving.render(sim))[1])
     place(sim, PLACES, 0.0)
     focal = 0.5 * HEIGHT / np.tan(np.deg2rad(sim.mj_model.vis.global_.fovy / 2))
     np.testing.assert_allclose(columns[0] - columns[1], focal * 0.2 / 1.5, atol=1.5)
@@ -195,14 +195,14 @@ def test_a_camera_may_move_with_time(sim):
 
 
 def test_a_trail_follows_the_way_of_each_worlds_drone(sim):
-    """Its pixels lie on the way that was flown, from end to end, in its own world only, and fade to its beginning."""
+    """Its pixels lie on the flown path, from end to end, in its own world only, and fade towards its beginning."""
     shown = view(worlds=[0, 1], width=2 * WIDTH, border=0, trail=5.0, rgba=BLUE)
     x = np.linspace(-0.5, 0.5, 11)
     for k in range(11):
         pos = PLACES.copy()
         pos[0], pos[1] = [x[k], 0.1, 1.0], [0.3, 0.6 * x[k], 1.0]
         place(sim, pos, 0.1 * k)
-        picture = shown.picture(sim)
+        picture = shown.render(sim)
     place(sim, PLACES, 0.0)
     east, north = (of_colour(picture[shown.tile(k)], BLUE) for k in range(2))
     rows, columns = np.nonzero(east)
@@ -218,7 +218,7 @@ def test_a_trail_follows_the_way_of_each_worlds_drone(sim):
     assert 20 < old < new - 60
 
 
-def test_setpoints_are_seen_where_commands_want_the_drones(sim):
+def test_setpoints_are_drawn_at_the_commanded_positions(sim):
     """Each world's tile has a green sphere at its own setpoint."""
     command = np.zeros((4, 1, 16))
     command[..., 12] = 1
@@ -226,7 +226,7 @@ def test_setpoints_are_seen_where_commands_want_the_drones(sim):
     data = sim.data
     sim.state_control(command)
     shown = view(worlds=[0, 1, 2, 3], width=2 * WIDTH, height=2 * HEIGHT, border=0, setpoints=True, rgba=GREEN)
-    picture = shown.picture(sim)
+    picture = shown.render(sim)
     sim.data = data
     for k in range(4):
         rows, columns = np.nonzero(of_colour(picture[shown.tile(k)], GREEN))
@@ -237,7 +237,7 @@ def test_text_changes_its_corner_and_nothing_else(sim):
     """Text stands at the top left of each tile, says which world it is, and leaves every other pixel alone."""
     options = {"worlds": [0, 1], "width": 2 * WIDTH, "border": 0}
     plain, shown = view(**options), view(**options, text="world {world}  {time:.2f} s")
-    before, after = plain.picture(sim), shown.picture(sim)
+    before, after = plain.render(sim), shown.render(sim)
     tiles = []
     for k in range(2):
         changed = (before != after)[shown.tile(k)].any(-1)
@@ -249,8 +249,8 @@ def test_text_changes_its_corner_and_nothing_else(sim):
     assert (tiles[0] != tiles[1]).any(), "the number of the world is another"
     bright = tiles[0].min(-1) > 230
     assert 30 < bright.sum() < 600, "letters are bright on a dark ground"
-    np.testing.assert_array_equal(shown.picture(sim), after)
-    np.testing.assert_array_equal(plain.picture(sim), before)
+    np.testing.assert_array_equal(shown.render(sim), after)
+    np.testing.assert_array_equal(plain.render(sim), before)
 
 
 # Wrong input ----------------------------------------------------------------------------------------------------
@@ -260,32 +260,32 @@ def test_text_changes_its_corner_and_nothing_else(sim):
     ("wrong", "message"),
     [
         ({"worlds": []}, "at least one world"),
-        ({"worlds": [0, 4]}, "world 4 does not exist; worlds go from 0 to 3"),
-        ({"worlds": [0.5]}, "world 0.5 does not exist"),
-        ({"worlds": range(100), "width": 20}, "100 worlds do not fit into a picture of 20 x 120"),
+        ({"worlds": [0, 4]}, "expected a world from 0 to 3, got 4"),
+        ({"worlds": [0.5]}, "got 0.5"),
+        ({"worlds": range(100), "width": 20}, "expected an image that 100 worlds fit into, got 20 x 120"),
         ({"width": 0}, "width is 0; it must be a positive"),
         ({"height": -2}, "height is -2; it must be a positive"),
-        ({"border": -1}, "border is -1"),
+        ({"border": -1}, "pixels, got -1"),
         ({"columns": 0}, "columns is 0"),
-        ({"camera": "up"}, "no camera 'up'"),
-        ({"follow": 0}, "only the free camera, -1, can follow a drone; camera is 'down'"),
-        ({"camera": -1, "follow": 1}, "drone 1 does not exist; drones go from 0 to 0"),
-        ({"camera": -1, "follow": 0, "lag": -1.0}, "lag is -1.0 s"),
-        ({"trail": -1.0}, "a trail of -1.0 s cannot be"),
-        ({"text": "{drone}"}, "'{drone}' cannot be filled in"),
-        ({"text": "Zürich"}, "ASCII letters only; 'Zürich' has 'ü'"),
+        ({"camera": "up"}, "got 'up'"),
+        ({"follow": 0}, "to follow a drone, got 'down'"),
+        ({"camera": -1, "follow": 1}, "expected a drone from 0 to 0 to follow, got 1"),
+        ({"camera": -1, "follow": 0, "lag": -1.0}, "expected a lag of 0 s or more, got -1.0"),
+        ({"trail": -1.0}, "expected a positive duration of a trail, s, got -1.0"),
+        ({"text": "{drone}"}, "only, got '{drone}'"),
+        ({"text": "Zürich"}, "expected ASCII text, got 'Zürich' with 'ü'"),
     ],
 )
-def test_a_view_that_cannot_be_is_told(sim, wrong, message):
+def test_invalid_views_are_refused(sim, wrong, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        view(**wrong).picture(sim)
-    assert len(sim.marks) == 0
+        view(**wrong).render(sim)
+    assert len(sim.overlays) == 0
 
 
 def test_setpoints_need_state_commands(opengl):
     sim = Sim(control="attitude")
     with pytest.raises(ConfigError, match="control='attitude'"):
-        View(width=32, height=24, setpoints=True).picture(sim)
+        View(width=32, height=24, setpoints=True).render(sim)
 
 
 # Many worlds at once ----------------------------------------------------------------------------------------------
@@ -298,7 +298,7 @@ def test_warp_draws_what_the_plain_renderer_draws(opengl, plain_scene):
     sim.scene.add("box", "lamp", pos=[0.0, 0.1, 0.2], size=(0.1, 0.1, 0.1), rgba=(1, 0, 0, 1))
     place(sim, PLACES, 0.0)
     size = {"camera": "down", "width": WIDTH, "height": HEIGHT}
-    plain, warp = (pictures_of(sim, [2, 0, 3], renderer=name, **size) for name in ("plain", "warp"))
+    plain, warp = (render_worlds(sim, [2, 0, 3], renderer=name, **size) for name in ("plain", "warp"))
     assert warp.shape == plain.shape
     assert warp.dtype == plain.dtype
     for picture, expected, world in zip(warp, plain, (2, 0, 3), strict=True):
@@ -306,14 +306,14 @@ def test_warp_draws_what_the_plain_renderer_draws(opengl, plain_scene):
         places = [np.argwhere(of_colour(x, RED)).mean(axis=0) for x in (picture, expected)]
         np.testing.assert_allclose(*places, atol=1)
     assert np.abs(warp.astype(int) - plain).mean() < 6, "of 255: floor and sky are the same"
-    moved = pictures_of(sim, [0, 0, 0], renderer="warp", **size)
+    moved = render_worlds(sim, [0, 0, 0], renderer="warp", **size)
     np.testing.assert_array_equal(moved[0], moved[2])
     np.testing.assert_array_equal(moved[0], warp[1])
-    with pytest.raises(ConfigError, match="not the free camera"):
-        pictures_of(sim, [0], renderer="warp")
-    with pytest.raises(ConfigError, match="no camera 'nose'"):
-        pictures_of(sim, [0], "nose", renderer="warp")
-    with pytest.raises(ConfigError, match="0 x 8 pixels"):
-        pictures_of(sim, [0], "down", width=0, height=8, renderer="warp")
-    with pytest.raises(ConfigError, match="renderer 'cycles' does not exist"):
-        pictures_of(sim, [0], "down", renderer="cycles")
+    with pytest.raises(ConfigError, match="got the free camera"):
+        render_worlds(sim, [0], renderer="warp")
+    with pytest.raises(ConfigError, match="got 'nose'"):
+        render_worlds(sim, [0], "nose", renderer="warp")
+    with pytest.raises(ConfigError, match="got 0 x 8 pixels"):
+        render_worlds(sim, [0], "down", width=0, height=8, renderer="warp")
+    with pytest.raises(ConfigError, match="got 'cycles'"):
+        render_worlds(sim, [0], "down", renderer="cycles")

@@ -99,7 +99,7 @@ class Browser:
         )
 
     def open(self, url):
-        """Open a page with a flight, and wait until its bar and its picture are there."""
+        """Open a page with a flight, and wait until its bar and its image are there."""
         self.call("Page.navigate", url=url)
         wait_for(lambda: self.box(".mantine-Slider-track") and self.box("canvas"))
         self.scrub(0.5)  # from here on it stands still
@@ -178,7 +178,7 @@ def pixel(browser, flight, point, world):
 
 
 def test_a_served_flight_is_scrubbed_in_a_browser(viser, browser, flight, tmp_path):
-    """Wherever the bar is clicked, forwards and backwards, the drone is seen where it was at that time."""
+    """Wherever the bar is clicked, forwards and backwards, the drone is shown where it was at that time."""
     flight.save(tmp_path / "flight.npz")
     command = [sys.executable, "-m", "crazysim", "replay", "flight.npz", "--world", "1", "--port", "0"]
     program = subprocess.Popen(
@@ -198,7 +198,7 @@ def test_a_served_flight_is_scrubbed_in_a_browser(viser, browser, flight, tmp_pa
 
 
 def test_an_exported_flight_opens_from_its_file(viser, browser, flight, tmp_path, capsys):
-    """One file, no server: it has what was recorded of the world asked for, here a drone and a box that stand still."""
+    """One file, no server: it has what was recorded of the requested world, here a drone and a box at rest."""
     flight.save(tmp_path / "flight.npz")
     out = tmp_path / "flight.html"
     assert main(["replay", str(tmp_path / "flight.npz"), "--export", str(out)]) == 0
@@ -216,14 +216,14 @@ def test_an_exported_flight_opens_from_its_file(viser, browser, flight, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere.npz"], "there is no file nowhere.npz"),
-        (["flight.npz", "--world", "5"], "world 5 was not recorded; recorded are [0, 1]"),
-        (["flight.npz", "--export", "flight.txt"], "must end with .html"),
-        (["flight.npz", "--export", "nowhere/flight.html"], "there is no folder nowhere"),
-        (["flight.npz", "--port", "99999"], "choose another --port"),
+        (["nowhere.npz"], "expected an existing file, got 'nowhere.npz'"),
+        (["flight.npz", "--world", "5"], "expected a recorded world, one of [0, 1], got 5"),
+        (["flight.npz", "--export", "flight.txt"], "to end with .html"),
+        (["flight.npz", "--export", "nowhere/flight.html"], "expected an existing folder, got 'nowhere'"),
+        (["flight.npz", "--port", "99999"], "Choose another --port"),
     ],
 )
-def test_a_replay_that_cannot_be_is_one_line(viser, flight, tmp_path, monkeypatch, capsys, arguments, message):
+def test_an_invalid_replay_is_refused_in_one_line(viser, flight, tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     flight.save("flight.npz")
     assert main(["replay", *arguments]) == 2

@@ -14,7 +14,7 @@ from crazysim.envs.sb3 import DroneVecEnv
 
 N_ENVS, N_STEPS = 64, 4
 POS = slice(6, 9)
-"""Where the position is among the observations: behind ``ang_vel`` and ``difference_to_goal``."""
+"""Slice of the position in the observations, after ``ang_vel`` and ``difference_to_goal``."""
 
 
 def raises(error, fn, *args):

@@ -234,8 +234,8 @@ def test_a_scene_of_ones_own_finds_its_files(scene_file, as_type):
     assert [bool(x) for x in sim.contacts().ravel()] == [True], "the drone stands on this scene's ground"
 
 
-def test_the_files_of_a_scene_are_seen(scene_file, opengl):
-    """The mesh is drawn with its texture, red, in the middle of its camera's picture."""
+def test_meshes_and_textures_of_a_scene_file_are_drawn(scene_file, opengl):
+    """The mesh is drawn with its texture, red, in the middle of its camera's image."""
     sim = Sim(n_worlds=2, xml_path=scene_file)
     picture = sim.render("rgb_array", camera="above", width=64, height=48).astype(int)
     red = (picture[..., 0] > 60) & (picture[..., 0] > 2 * picture[..., 1]) & (picture[..., 0] > 2 * picture[..., 2])
@@ -252,34 +252,37 @@ def broken_scene(tmp_path, text):
 
 WORLD = "<mujoco><worldbody>{}</worldbody></mujoco>"
 BROKEN = {
-    "no XML": ("this is no XML", "is not a scene MuJoCo can read"),
-    "empty": ("", "is not a scene MuJoCo can read"),
-    "cut off": ("<mujoco><worldbody>", "is not a scene MuJoCo can read"),
-    "unknown element": (WORLD.format("<wall/>"), "is not a scene MuJoCo can read"),
-    "include that is not there": ("<mujoco><include file='none.xml'/></mujoco>", "is not a scene MuJoCo can read"),
+    "no XML": ("this is no XML", "expected a scene that MuJoCo can read"),
+    "empty": ("", "expected a scene that MuJoCo can read"),
+    "cut off": ("<mujoco><worldbody>", "expected a scene that MuJoCo can read"),
+    "unknown element": (WORLD.format("<wall/>"), "expected a scene that MuJoCo can read"),
+    "include that is not there": (
+        "<mujoco><include file='none.xml'/></mujoco>",
+        "expected a scene that MuJoCo can read",
+    ),
     "mesh that is not there": (
         "<mujoco><asset><mesh name='m' file='none.stl'/></asset></mujoco>",
-        "does not compile.*none.stl",
+        "expected a scene that compiles.*none.stl",
     ),
-    "geom without size": (WORLD.format("<geom type='sphere'/>"), "does not compile"),
-    "a drone of its own": (WORLD.format("<body name='drone:0'/>"), "has bodies named .'drone:0'."),
+    "geom without size": (WORLD.format("<geom type='sphere'/>"), "expected a scene that compiles"),
+    "a drone of its own": (WORLD.format("<body name='drone:0'/>"), "reserved for the drones, got .'drone:0'."),
     "a drone deep in the tree": (
         WORLD.format("<body name='a'><body name='drone:7'/></body>"),
-        "has bodies named .'drone:7'.",
+        "reserved for the drones, got .'drone:7'.",
     ),
 }
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_a_broken_scene_is_told_at_once(tmp_path, case):
+def test_a_broken_scene_is_refused_at_construction(tmp_path, case):
     text, message = BROKEN[case]
     with pytest.raises(ValueError, match=message):
         Sim(xml_path=broken_scene(tmp_path, text))
 
 
 @pytest.mark.parametrize("path", ["nowhere.xml", "."])
-def test_a_missing_scene_is_told_at_once(path):
-    with pytest.raises(ValueError, match="does not exist"):
+def test_a_missing_scene_is_refused_at_construction(path):
+    with pytest.raises(ValueError, match="expected an existing MJCF file"):
         Sim(xml_path=path)
 
 
@@ -302,7 +305,7 @@ def test_a_spec_that_does_not_compile_leaves_the_old_scene(sim):
     sim = Sim()
     model, data = sim.mj_model, sim.data
     wrong = sim.spec.worldbody.add_geom(name="wrong", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0, 0, 0])
-    with pytest.raises(ValueError, match="does not compile"):
+    with pytest.raises(ValueError, match="expected a scene that compiles"):
         sim.build_mjx()
     assert sim.mj_model is model
     assert sim.data is data
@@ -317,14 +320,14 @@ def test_a_spec_that_has_lost_a_drone_is_refused():
     sim = Sim(n_drones=2)
     model = sim.mj_model
     sim.spec.body("drone:1").mocap = False
-    with pytest.raises(ValueError, match="no mocap body 'drone:1'"):
+    with pytest.raises(ValueError, match="expected a mocap body 'drone:1', got none"):
         sim.build_mjx()
     assert sim.mj_model is model
 
 
 @pytest.fixture(scope="module")
 def not_for_mjx():
-    """A world that MJX cannot check for contacts: a box and a cylinder that are moved by hand."""
+    """A world that MJX cannot check for contacts: a box and a cylinder that are moved through mjx_data."""
     sim = Sim()
     shapes = [(mujoco.mjtGeom.mjGEOM_BOX, [0.1, 0.1, 0.1]), (mujoco.mjtGeom.mjGEOM_CYLINDER, [0.1, 0.1, 0])]
     for i, (kind, size) in enumerate(shapes):
@@ -334,13 +337,13 @@ def not_for_mjx():
     return sim
 
 
-def test_shapes_that_mjx_cannot_check_are_told_when_contacts_are_asked_for(not_for_mjx):
-    """MJX has no box against cylinder: the scene flies, and says so when it is asked what touches."""
+def test_contacts_are_refused_for_geoms_that_mjx_does_not_support(not_for_mjx):
+    """MJX does not support a box against a cylinder: stepping works, and contacts raise an error."""
     not_for_mjx.step()
-    with pytest.raises(ValueError, match="MJX cannot hold this scene"):
+    with pytest.raises(ValueError, match="expected a scene that MJX supports"):
         not_for_mjx.contacts()
 
 
-def test_shapes_that_mjx_cannot_check_are_drawn_all_the_same(not_for_mjx, opengl):
+def test_geoms_that_mjx_does_not_support_are_drawn(not_for_mjx, opengl):
     assert not_for_mjx.render("rgb_array", width=32, height=24).shape == (24, 32, 3)
     not_for_mjx.close()

@@ -1,4 +1,4 @@
-"""Depth cameras and range finders against geometry worked out by hand, C MuJoCo's rays and its depth pictures."""
+"""Depth cameras and range finders against formulas, C MuJoCo's rays and its depth images."""
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +72,7 @@ def test_depth_along_the_axis_of_a_wall_is_one_number(room):
     np.testing.assert_allclose(depth[:, 1, 0], 3 - 0.025 - eye - 0.5, rtol=1e-5)
 
 
-def test_objects_are_seen_where_they_are_in_each_world(room):
+def test_depth_follows_the_objects_of_each_world(room):
     sim, _, box = room
     data = box.set_pose(sim.data, np.array([[[1.0, 0, 1.0]], [[0, 0, -50.0]]]))
     hits = jax.jit(sim.scene.depth_fn("fpv_cam:0", WIDTH, HEIGHT))(data)
@@ -99,7 +99,7 @@ def test_a_drone_sees_others_and_not_itself(room):
 
 @pytest.mark.usefixtures("opengl")
 @pytest.mark.parametrize("camera", ["fpv_cam:0", "track_cam:1"])
-def test_depth_is_that_of_the_picture(room, camera):
+def test_depth_equals_that_of_the_renderer(room, camera):
     """MuJoCo's renderer, at any attitude; but for edges, and for what is half transparent, they are the same."""
     sim, _, box = room
     before = sim.data
@@ -178,13 +178,13 @@ def test_a_range_finder_measures_at_its_rate():
     )
 
 
-def test_law_09_what_cannot_be_seen_is_refused(room):
+def test_law_09_wrong_cameras_and_resolutions_are_refused(room):
     sim, _, _ = room
     for act, words in (
-        (lambda: sim.depth("nose"), "no camera 'nose'; it has track_cam, fpv_cam"),
-        (lambda: sim.depth(99), "no camera 99"),
-        (lambda: sim.depth("fpv_cam", 0, 4), "0 x 4 pixels cannot be"),
-        (lambda: sim.depth("fpv_cam", 4, 4.5), "4 x 4.5 pixels cannot be"),
+        (lambda: sim.depth("nose"), "expected a camera of the scene, track_cam, fpv_cam, got 'nose'"),
+        (lambda: sim.depth(99), "got 99"),
+        (lambda: sim.depth("fpv_cam", 0, 4), "positive integer width, got 0 x 4 pixels"),
+        (lambda: sim.depth("fpv_cam", 4, 4.5), "positive integer height, got 4 x 4.5 pixels"),
         (lambda: sim.depth("fpv_cam", 4, 4, along="z"), "along='ray'"),
         (lambda: sim.add(RangeFinder([[0, 0, 0]])), "none of them zero"),
         (lambda: sim.add(RangeFinder(max_range=0)), "max_range to be positive"),
@@ -205,7 +205,7 @@ def test_rays_are_those_of_c_mujoco(room, rng):
     origin, direction = rng.uniform([-2, -2, 0.2], [2, 2, 2], (n, 3)), rng.normal(size=(n, 3))
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     rays = (jnp.asarray(np.tile(x, (2, 1, 1)), jnp.float32) for x in (origin, direction))
-    hits = cast(sim.scene.visible, data, *rays, drones=False)
+    hits = cast(sim.scene.visual_model, data, *rays, drones=False)
     sim.scene.sync(data, 0)
     group = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # drones are in groups 2 and 3
     geom = np.zeros(1, np.int32)

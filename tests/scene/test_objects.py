@@ -1,4 +1,4 @@
-"""Objects with handles: their poses live in SimData, and the scene is compiled when it is next used."""
+"""Objects with handles: their poses are part of SimData, and the scene is compiled at its next use."""
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ def test_a_handle_stays_valid_when_more_is_added(course):
     np.testing.assert_allclose(gates.pose(sim.data)[0], np.tile([[1, 0, 1], [2, 0, 1]], (3, 1, 1)))
     np.testing.assert_allclose(tower.pose(sim.data)[0][:, 0, 2], [1, 2, 3])
     data = gates[1].set_pose(sim.data, [5, 5, 5])
-    more = sim.scene.add("sphere", f"ball-{len(sim.scene.handles)}", pos=[7, 0, 0])
+    more = sim.scene.add("sphere", f"ball-{len(sim.scene.object_names)}", pos=[7, 0, 0])
     data2 = sim.data
     np.testing.assert_allclose(more.pose(data2)[0], np.tile([[7, 0, 0]], (3, 1, 1)))
     np.testing.assert_allclose(gates[1].pose(data)[0][0], [[5, 5, 5]])
@@ -58,7 +58,7 @@ def test_everything_is_compiled_once_at_the_next_use(monkeypatch):
 
 
 def test_poses_are_those_that_mujoco_has(course, rng):
-    """In a picture's world and in MJX, quaternions converted, parts that hang on an object moved along."""
+    """In the drawn world and in MJX, with quaternions converted and children moved along."""
     sim, gates, _, tower = course
     pos, quat = rng.normal(size=(3, 2, 3)), rng.normal(size=(3, 2, 4))
     sim.data = tower.set_pose(gates.set_pose(sim.data, pos, quat), pos[:, :1] + 1, quat[:, 1:])
@@ -139,27 +139,33 @@ def test_every_primitive_is_there_and_touched_by_drones_only(what):
 
 
 BAD = {
-    "taken": (lambda s: s.scene.add("gate"), "has a body 'gate:0' already"),
-    "drone": (lambda s: s.scene.add("box", "drone"), "has a body 'drone:0' already"),
-    "unknown": (lambda s: s.scene.add("tree"), "no object and no file 'tree'; objects are gate, box"),
+    "taken": (lambda s: s.scene.add("gate"), "got 'gate:0', a body of the scene"),
+    "drone": (lambda s: s.scene.add("box", "drone"), "got 'drone:0', a body of the scene"),
+    "unknown": (
+        lambda s: s.scene.add("tree"),
+        "landing_pad, an MJCF file, MJCF text, an MjSpec or a body of one, got 'tree'",
+    ),
     "mjcf": (
         lambda s: s.scene.add("<mujoco><worldbody><geom type='box'/></worldbody></mujoco>", "q"),
         "size 0 must be",
     ),
-    "text": (lambda s: s.scene.add("<mujoco><worldbody>", "q"), "does not compile"),
-    "what": (lambda s: s.scene.add(3, "q"), "an object cannot be 3"),
-    "setting": (lambda s: s.scene.add("box", "q", length=3), "Its settings: size="),
-    "size": (lambda s: s.scene.add("sphere", "q", radius=-1), "every length must be positive"),
-    "mjcf setting": (lambda s: s.scene.add(TOWER, "q", radius=1), "only the primitives"),
+    "text": (lambda s: s.scene.add("<mujoco><worldbody>", "q"), "expected an object that compiles"),
+    "what": (lambda s: s.scene.add(3, "q"), "or a body of one, got 3"),
+    "setting": (lambda s: s.scene.add("box", "q", length=3), "expected settings size=(0.2, 0.2, 0.2), rgba"),
+    "size": (lambda s: s.scene.add("sphere", "q", radius=-1), "expected positive lengths"),
+    "mjcf setting": (lambda s: s.scene.add(TOWER, "q", radius=1), "expected no settings, which only gate"),
     "count": (lambda s: s.scene.add("box", "q", count=0), "count"),
-    "pos": (lambda s: s.scene.add("box", "q", count=2, pos=[[0, 0]]), "needed is one of (3,), (2, 3), (1, 2, 3)"),
-    "stand": (lambda s: s.scene.add("gate", "q", stand=0.1), "lower bar"),
+    "pos": (
+        lambda s: s.scene.add("box", "q", count=2, pos=[[0, 0]]),
+        "expected pos of shape (3,) or (2, 3) or (1, 2, 3), got (1, 2)",
+    ),
+    "stand": (lambda s: s.scene.add("gate", "q", stand=0.1), "expected stand above 0.275 m"),
     "pole": (lambda s: s.scene.add("pole", "q", height=0.1, radius=0.1), "higher than it is thick"),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_law_09_what_cannot_be_added_is_refused(name):
+def test_law_09_invalid_objects_are_refused(name):
     act, words = BAD[name]
     sim = Sim()
     sim.scene.add("gate")
@@ -169,15 +175,15 @@ def test_law_09_what_cannot_be_added_is_refused(name):
     sim.step()  # and the simulation goes on
 
 
-def test_law_09_a_pose_that_cannot_be_is_refused(course):
+def test_law_09_invalid_poses_are_refused(course):
     sim, gates, pole, _ = course
     for act, words in (
-        (lambda: gates.set_pose(sim.data, [0, 0]), "shape (2,); needed is one of (3,), (2, 3), (3, 2, 3)"),
+        (lambda: gates.set_pose(sim.data, [0, 0]), "expected pos of shape (3,) or (2, 3) or (3, 2, 3), got (2,)"),
         (lambda: gates.set_pose(sim.data, [0, 0, np.nan]), "finite numbers"),
         (lambda: gates.set_pose(sim.data, None, [0, 0, 0, 0]), "not all zero"),
-        (lambda: gates.set_pose(sim.data, "here"), "needed are numbers"),
-        (lambda: pole.set_pose(sim.data, [0, 0, 0]), "mocap=False"),
-        (lambda: gates.set_pose(Sim().data, [0, 0, 0]), "of another simulation"),
+        (lambda: gates.set_pose(sim.data, "here"), "expected numbers for pos, got 'here'"),
+        (lambda: pole.set_pose(sim.data, [0, 0, 0]), "added with mocap=True, got 'pole'"),
+        (lambda: gates.set_pose(Sim().data, [0, 0, 0]), "expected a handle of this simulation"),
     ):
         with pytest.raises(ConfigError) as error:
             act()
@@ -206,7 +212,7 @@ def test_a_scene_loads_whole_with_mesh_texture_and_height_field(tmp_path):
 
 
 def _png(pixels):
-    """Return a picture as the bytes of a PNG file."""
+    """Return an image as the bytes of a PNG file."""
     import struct
     import zlib
 

@@ -1,11 +1,11 @@
-"""What is drawn into a picture is there in its colour and at its place, and in that picture only."""
+"""Overlays: drawn with their colours at their positions, in one image only."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import ABOVE, FOVY
 
-from crazysim.scene.overlays import Marks
+from crazysim.scene.overlays import Overlays
 from crazysim.sim import Sim
 from crazysim.sim.visualize import (
     change_material,
@@ -51,7 +51,7 @@ def seen_at(mask):
 
 
 def test_points_are_spheres_of_their_radius(sim):
-    """Two green points: each a disc in the picture, of its radius and at its place, and gone in the next picture."""
+    """Two green points are discs of their radii at their positions, and absent from the next image."""
     plain = shoot(sim)
     draw_points(sim, [[0.0, 0.2, 1.0], [0.0, -0.3, 1.0]], rgba=GREEN, size=0.05)
     marked = shoot(sim)
@@ -74,7 +74,7 @@ def test_a_line_goes_through_its_points(sim):
     np.testing.assert_allclose([y[second].min(), y[second].max()], [-0.3, 0.3], atol=0.02)
 
 
-def test_a_line_is_as_wide_as_it_is_told(sim):
+def test_a_line_has_the_requested_width(sim):
     """Its width in pixels grows from piece to piece, as a trail's does."""
     points = np.linspace([-0.5, 0.3, 1.0], [0.5, 0.3, 1.0], 13)
     draw_line(sim, points, rgba=BLUE, start_size=2, end_size=8)
@@ -94,7 +94,7 @@ def test_a_capsule_reaches_from_end_to_end(sim, cylinder):
     np.testing.assert_allclose([y.min(), y.max()], [0.24, 0.36], atol=0.02)
 
 
-def test_marks_are_red_unless_told(sim):
+def test_overlays_are_red_by_default(sim):
     nose = of_colour(shoot(sim), RED)
     draw_points(sim, [0.0, 0.3, 1.0], size=0.05)
     draw_line(sim, [[-0.4, -0.3, 1], [0.4, -0.3, 1]])
@@ -104,8 +104,8 @@ def test_marks_are_red_unless_told(sim):
         assert (np.hypot(x - at[0], y - at[1]) < 0.03).sum() > 20, at
 
 
-def test_marks_are_paint(sim):
-    """The colour picture has them, the depth beside it is that of the bodies."""
+def test_overlays_are_not_in_depth_images(sim):
+    """The colour image has them; the depth image is that of the bodies."""
     plain = sim.render("depth_array", camera="down", width=WIDTH, height=HEIGHT)
     draw_points(sim, [[0.0, 0.0, 1.0]], rgba=GREEN, size=0.1)
     color, depth = sim.render("rgbd_tuple", camera="down", width=WIDTH, height=HEIGHT)
@@ -113,7 +113,7 @@ def test_marks_are_paint(sim):
     np.testing.assert_array_equal(depth, plain)
 
 
-def test_marks_drawn_before_the_first_picture_are_in_it(opengl):
+def test_overlays_drawn_before_the_first_image_are_in_it(opengl):
     """The peer's draw functions do nothing until something has been rendered."""
     sim = Sim(n_worlds=2)
     draw_points(sim, [[0.0, 0.0, 0.5]], rgba=GREEN, size=0.2)
@@ -122,8 +122,8 @@ def test_marks_drawn_before_the_first_picture_are_in_it(opengl):
     sim.close()
 
 
-def test_marks_wait_through_steps_and_wrong_pictures(sim):
-    """They go into the next picture that comes to be, not into the next attempt."""
+def test_overlays_are_kept_through_steps_and_failed_images(sim):
+    """They appear in the next image that succeeds."""
     data = sim.data
     draw_points(sim, [[0.0, 0.4, 1.0]], rgba=GREEN, size=0.05)
     sim.step()
@@ -172,7 +172,7 @@ def test_text_is_not_in_depth_and_is_beside_it(sim):
 
 
 def test_a_label_stands_at_its_point(sim):
-    """Letters begin at the point, wherever that is in the picture, and are bright on a dark outline."""
+    """Letters begin at the point, anywhere in the image, and are bright on a dark outline."""
     plain = shoot(sim)
     for east, north in ((-0.3, 0.3), (0.2, -0.2)):
         draw_label(sim, [east, north, 1.0], "gate 3")
@@ -204,7 +204,7 @@ def test_setpoints_are_where_the_last_command_of_a_world_is(opengl, plain_scene)
         x, y = seen_at(of_colour(picture, rgba))
         np.testing.assert_allclose([x.mean(), y.mean()], [east, north], atol=0.01)
         np.testing.assert_allclose(len(x) / FOCAL**2, np.pi * 0.05**2, rtol=0.15)
-    with pytest.raises(ValueError, match="world 2 does not exist"):
+    with pytest.raises(ValueError, match="expected a world from 0 to 1, got 2"):
         draw_setpoints(sim, world=2)
     sim.close()
 
@@ -244,7 +244,7 @@ def test_colours_may_be_one_for_each_drone(sim):
     np.testing.assert_array_equal(shoot(sim), before)
 
 
-def test_the_lower_led_is_seen_from_below(opengl):
+def test_the_lower_led_is_visible_from_below(opengl):
     sim = Sim(n_worlds=2)
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.full((2, 1, 3), 1.0)))
     shot = {"mode": "rgb_array", "width": 256, "height": 192}
@@ -271,15 +271,15 @@ def test_the_lower_led_is_seen_from_below(opengl):
         (lambda sim: draw_capsule(sim, [0, 0], [1, 1]), r"shape \(3,\), got \(2,\) and \(2,\)"),
         (lambda sim: draw_capsule(sim, np.zeros((2, 3)), [1, 1, 1]), r"shape \(3,\), got \(2, 3\)"),
         (lambda sim: draw_points(sim, np.zeros((4, 3)), rgba=[1, 0]), "broadcast|shape"),
-        (lambda sim: draw_text(sim, "x", "middle"), "no corner 'middle'; its corners are top left"),
-        (lambda sim: draw_text(sim, ""), "text must be a string with something in it"),
-        (lambda sim: draw_text(sim, 3), "text must be a string"),
-        (lambda sim: draw_text(sim, "5 µm"), "ASCII letters only; '5 µm' has 'µ'"),
-        (lambda sim: draw_label(sim, [0, 0, 0], "x" * 100), "99 letters at most, got 100"),
-        (lambda sim: draw_label(sim, [0, 0, 0], "two\nlines"), "a label is one line"),
+        (lambda sim: draw_text(sim, "x", "middle"), "expected corner 'top left' or .*, got 'middle'"),
+        (lambda sim: draw_text(sim, ""), "expected a string that is not empty as text, got ''"),
+        (lambda sim: draw_text(sim, 3), "expected a string .*, got 3"),
+        (lambda sim: draw_text(sim, "5 µm"), "expected ASCII text, got '5 µm' with 'µ'"),
+        (lambda sim: draw_label(sim, [0, 0, 0], "x" * 100), "at most 99 characters, got 100"),
+        (lambda sim: draw_label(sim, [0, 0, 0], "two\nlines"), "a label of one line"),
         (lambda sim: draw_label(sim, [0, 0], "x"), r"shape \(3,\), got \(2,\)"),
         (lambda sim: draw_setpoints(sim), "control='attitude'"),
-        (lambda sim: draw_points(sim, np.zeros((20_000, 3))), "10000 marks at most"),
+        (lambda sim: draw_points(sim, np.zeros((20_000, 3))), "at most 10000 overlays in one image, got 20000"),
         (
             lambda sim: change_material(sim, "led_top", [2], rgba=RED),
             r"drone_ids must be in range \[0, 1\], got \[-?\d",
@@ -289,32 +289,35 @@ def test_the_lower_led_is_seen_from_below(opengl):
             r"drone_ids must be in range \[0, 1\], got \[-?\d",
         ),
         (lambda sim: change_material(sim, "led_top", 0, rgba=RED), "drone_ids must be 1D array.* of integers"),
-        (lambda sim: change_material(sim, "led_top", [0.5], rgba=RED), "drone_ids must be 1D array.* of integers"),
-        (lambda sim: change_material(sim, "lamp", [0], rgba=RED), "no material 'lamp'"),
+        (
+            lambda sim: change_material(sim, "led_top", [0.5], rgba=RED),
+            "drone_ids must be 1D array.* of integers",
+        ),
+        (lambda sim: change_material(sim, "lamp", [0], rgba=RED), "got 'lamp'"),
         (lambda sim: change_material(sim, "led_top", [0], rgba=[1, 0]), "broadcast|shape"),
     ],
 )
-def test_what_cannot_be_drawn_is_told_and_leaves_no_mark(sim, draw, message):
+def test_wrong_overlays_are_refused_and_nothing_is_drawn(sim, draw, message):
     with pytest.raises(ValueError, match=message):
         draw(sim)
-    assert len(sim.marks) == 0
-    assert not sim.marks.has_text
+    assert len(sim.overlays) == 0
+    assert not sim.overlays.has_text
 
 
-def test_the_limit_of_marks_can_be_raised():
-    """A picture takes as many marks as it was told to, and no more."""
-    marks = Marks(limit=3)
-    marks.points(np.zeros((3, 3)), RED, 0.1)
-    with pytest.raises(ValueError, match=r"3 marks at most; draw fewer, or raise sim\.max_visual_geom"):
-        marks.points(np.zeros((1, 3)), RED, 0.1)
-    assert len(marks) == 3
-    marks.limit = 4
-    marks.points(np.zeros((1, 3)), RED, 0.1)
-    assert len(marks) == 4
+def test_the_limit_of_overlays_can_be_raised():
+    """An image takes as many geoms as the limit allows."""
+    overlays = Overlays(limit=3)
+    overlays.points(np.zeros((3, 3)), RED, 0.1)
+    with pytest.raises(ValueError, match=r"at most 3 overlays in one image, got 4. Increase sim\.max_visual_geom"):
+        overlays.points(np.zeros((1, 3)), RED, 0.1)
+    assert len(overlays) == 3
+    overlays.limit = 4
+    overlays.points(np.zeros((1, 3)), RED, 0.1)
+    assert len(overlays) == 4
 
 
-def test_as_many_marks_as_allowed_fit_into_a_picture(sim):
-    """The limit is for marks: bodies of the scene take none of it."""
+def test_as_many_overlays_as_allowed_fit_into_an_image(sim):
+    """The limit is for overlays: bodies of the scene take none of it."""
     limit = sim.max_visual_geom
     try:
         sim.max_visual_geom = 200

@@ -1,4 +1,4 @@
-"""Pictures are looked at, not only measured: what is in them, where, how far away, and of which world."""
+"""Images: what they contain, where, at which distance, and of which world."""
 
 import os
 import select
@@ -39,7 +39,7 @@ def sim(opengl, plain_scene):
 
 @pytest.fixture(scope="module")
 def empty(sim):
-    """The picture from above without any drone in it."""
+    """The image from above without any drone in it."""
     place(sim, PLACES + [100, 0, 0])
     picture = sim.render(**SHOT)
     place(sim, PLACES)
@@ -57,11 +57,11 @@ def difference(picture, empty):
     return np.abs(picture.astype(int) - empty.astype(int)).sum(-1) > 30
 
 
-# What is in the picture -----------------------------------------------------------------------------------------
+# Contents of an image -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("world", [0, 1])
-def test_the_drone_of_the_world_is_seen_where_it_is(sim, empty, world):
+def test_the_drone_of_the_world_is_drawn_where_it_is(sim, empty, world):
     """Pixels that differ from the empty floor lie around the drone's projection, as wide as the drone is there."""
     changed = difference(sim.render(**SHOT, world=world), empty)
     rows, columns = np.nonzero(changed)
@@ -73,7 +73,7 @@ def test_the_drone_of_the_world_is_seen_where_it_is(sim, empty, world):
     assert 0.5 * reach < np.abs(np.stack([rows - row, columns - column])).max() < reach + 1
 
 
-def test_the_empty_picture_is_plain_floor(empty):
+def test_the_empty_image_is_plain_floor(empty):
     assert empty.shape == (HEIGHT, WIDTH, 3)
     assert empty.dtype == np.uint8
     assert empty.min() > 100
@@ -81,7 +81,7 @@ def test_the_empty_picture_is_plain_floor(empty):
 
 
 def test_a_drone_that_moved_is_drawn_at_its_new_place(sim, empty):
-    """Whatever way the state has changed, the next picture shows it."""
+    """The next image shows every change of the state."""
     place(sim, [[[0.0, 0.4, 0.3]], [[0.0, 0.0, 0.3]]])
     rows, columns = np.nonzero(difference(sim.render(**SHOT), empty))
     place(sim, PLACES)
@@ -107,7 +107,7 @@ def test_a_drone_that_rolled_shows_its_side(sim, empty):
 
 
 def test_a_body_that_a_user_moved_is_drawn_where_it_is(opengl):
-    """Bodies moved through mjx_data are seen in each world where that world has them; without it, where they began."""
+    """Bodies moved through mjx_data are drawn where each world has them; before that, at their initial poses."""
     sim = Sim(n_worlds=2)
     ball = sim.spec.worldbody.add_body(name="ball", pos=[0, 0, 1], mocap=True)
     ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.3, 0, 0], rgba=[1, 0, 0, 1])
@@ -122,7 +122,7 @@ def test_a_body_that_a_user_moved_is_drawn_where_it_is(opengl):
         return columns.mean() + 0.5
 
     assert abs(where(0) - 32) < 1
-    assert sim.scene._mjx_data is None
+    assert not sim.scene.is_allocated
     k = sim.mj_model.body("ball").mocapid.item()
     sim.mjx_data = sim.mjx_data.replace(mocap_pos=sim.mjx_data.mocap_pos.at[:, k, 0].set(jnp.array([-0.8, 0.8])))
     assert where(0) < 25
@@ -139,7 +139,7 @@ def test_a_camera_by_name_is_the_camera_of_its_id(sim):
         np.testing.assert_array_equal(sim.render(**SHOT | {"camera": name}), by_id)
 
 
-def test_the_free_camera_looks_where_it_is_told(sim, empty):
+def test_the_free_camera_follows_cam_config(sim, empty):
     """A free camera at the place of the fixed one sees what it sees; every call may tell another place."""
     free = {"lookat": [0, 0, 0], "distance": ABOVE, "azimuth": 90, "elevation": -90}
     sim.mj_model.vis.global_.fovy = FOVY
@@ -188,7 +188,7 @@ def test_every_argument_counts_at_every_call(sim, empty):
 
 
 def test_many_sizes_follow_each_other(sim):
-    """More sizes than are kept at once, larger than any before among them, come out as first asked."""
+    """More sizes than contexts are kept, some larger than any before, give the same images again."""
     sizes = [(48, 32), (2000, 40), (64, 64), (33, 17), (40, 1100), (160, 120), (48, 32)]
     for width, height in sizes:
         assert sim.render(**SHOT | {"width": width, "height": height}).shape == (height, width, 3)
@@ -196,7 +196,7 @@ def test_many_sizes_follow_each_other(sim):
 
 
 def test_a_second_simulation_draws_beside_the_first(sim):
-    """Two simulations draw in turns, each its own drones; one that is closed draws again when asked."""
+    """Two simulations draw in turns, each its own drones; a closed one can draw again."""
     before = sim.render(**SHOT)
     other = Sim(n_worlds=1, n_drones=3)
     shot = {"mode": "rgb_array", "camera": "track_cam:2", "width": WIDTH, "height": HEIGHT}
@@ -235,8 +235,8 @@ def test_colour_and_depth_together_are_colour_and_depth_alone(sim):
     np.testing.assert_array_equal(depth, sim.render(**SHOT | {"mode": "depth_array"}))
 
 
-def test_pictures_are_the_callers_own(sim):
-    """A later picture does not write into an earlier one."""
+def test_images_belong_to_the_caller(sim):
+    """A later image does not overwrite an earlier one."""
     first = sim.render(**SHOT)
     copy = first.copy()
     sim.render(**SHOT, world=1)
@@ -249,22 +249,22 @@ def test_pictures_are_the_callers_own(sim):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"mode": "film"}, "unknown render mode 'film'; the modes are human"),
-        ({"camera": "up"}, "no camera 'up'; it has down, aside, track_cam:0, fpv_cam:0"),
-        ({"camera": 4}, "camera 4 does not exist; ids go from 0 to 3"),
-        ({"camera": -2}, "camera -2 does not exist"),
-        ({"camera": 1.5}, "camera 1.5 does not exist"),
-        ({"world": 2}, "world 2 does not exist; choose one from 0 to 1"),
-        ({"world": -1}, "world -1 does not exist"),
-        ({"width": 0}, "0 x 120 pixels cannot be"),
-        ({"height": -5}, "160 x -5 pixels cannot be"),
-        ({"width": 40.5}, "40.5 x 120 pixels cannot be"),
-        ({"camera": -1, "cam_config": {"zoom": 2}}, "no setting 'zoom'"),
-        ({"camera": -1, "cam_config": {"lookat": [1, 2]}}, "lookat cannot be"),
-        ({"camera": -1, "cam_config": {"distance": "far"}}, "distance cannot be"),
+        ({"mode": "film"}, "expected mode 'human' or .*, got 'film'"),
+        ({"camera": "up"}, "expected -1 or a camera of the scene, down, aside, track_cam:0, fpv_cam:0, got 'up'"),
+        ({"camera": 4}, "expected a camera id from 0 to 3, .*got 4"),
+        ({"camera": -2}, "got -2"),
+        ({"camera": 1.5}, "got 1.5"),
+        ({"world": 2}, "expected a world from 0 to 1, got 2"),
+        ({"world": -1}, "got -1"),
+        ({"width": 0}, "got 0 x 120 pixels"),
+        ({"height": -5}, "got 160 x -5 pixels"),
+        ({"width": 40.5}, "got 40.5 x 120 pixels"),
+        ({"camera": -1, "cam_config": {"zoom": 2}}, "in cam_config, got 'zoom'"),
+        ({"camera": -1, "cam_config": {"lookat": [1, 2]}}, "expected numbers for lookat"),
+        ({"camera": -1, "cam_config": {"distance": "far"}}, "expected numbers for distance"),
     ],
 )
-def test_a_picture_that_cannot_be_is_told(sim, wrong, message):
+def test_wrong_arguments_of_render_are_refused(sim, wrong, message):
     with pytest.raises(ValueError, match=message):
         sim.render(**SHOT | wrong)
 
@@ -294,7 +294,7 @@ def screen(tmp_path_factory):
 def screen_pixels(path):
     """Return what a screen shows once it is at rest, read from its X window dump. (height, width, 3)"""
     raw, before, deadline = path.read_bytes(), b"", time.monotonic() + 20
-    while raw != before and time.monotonic() < deadline:  # the server draws a picture strip by strip
+    while raw != before and time.monotonic() < deadline:  # the server draws an image strip by strip
         time.sleep(0.3)
         raw, before = path.read_bytes(), raw
     header = np.frombuffer(raw[:100], ">u4").astype(int)
@@ -343,7 +343,7 @@ WINDOW = textwrap.dedent("""
 
 @pytest.mark.parametrize("backend", ["glfw", "egl"])
 def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
-    """A window follows the simulation from call to call, beside pictures in memory, and its end is no crash."""
+    """A window shows the simulation from call to call, beside images in memory, and closes without a crash."""
     display, pixels = screen
     environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": backend, "PYTHONWARNINGS": "error"}
     program = subprocess.Popen(
@@ -351,7 +351,7 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
     )
 
     def seen(word):
-        """Return the screen once it shows the mark of this colour: a screen server draws when it gets to it."""
+        """Return the screen once it shows the point of this colour: a screen server draws with a delay."""
         assert program.stdout.readline().strip() == word
         for _ in range(100):
             picture = screen_pixels(pixels).astype(int)
@@ -390,7 +390,7 @@ def test_a_window_shows_the_world_and_closes(screen, backend, opengl):
 
 
 PRINTED = textwrap.dedent("""
-    import crazysim.scene.scene as place
+    import crazysim.scene.mjx_scene as place
     from crazysim.sim.sim import sync_sim2mjx as whole
     syncs = []
     place.sync_sim2mjx = lambda *args: syncs.append(1) or whole(*args)
@@ -461,7 +461,7 @@ PRINTED = textwrap.dedent("""
 
 
 def test_code_written_for_the_peer_runs_as_printed(screen, opengl):
-    """Boxes, sync loop, grouped and interleaved questions in a window, and the fused check, line for line."""
+    """Boxes, sync loop, grouped and interleaved calls in a window, and the compiled check, line for line."""
     display, _ = screen
     cache = str(jax.config.jax_compilation_cache_dir)
     environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": "glfw", "JAX_COMPILATION_CACHE_DIR": cache}
@@ -484,7 +484,7 @@ def test_without_a_screen_a_window_is_refused_in_one_line(display, monkeypatch):
     sim.step()
 
 
-def test_without_opengl_a_picture_is_refused_in_one_line(monkeypatch):
+def test_without_opengl_an_image_is_refused_in_one_line(monkeypatch):
     """Whatever the OpenGL bindings raise becomes one error that says what to install."""
 
     def broken(*args, **kwargs):

@@ -19,7 +19,7 @@ SPHERE = 1e-5
 
 
 def course():
-    """Return a simulation among one object of every kind, some that move and some that stand, and the handles."""
+    """Return a simulation with objects of every kind, movable and fixed, and the handles."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude")
     handles = {
         "gate": sim.scene.add("gate", count=2, pos=[[1, 0, 1], [2, 0, 1]], stand=1.0),
@@ -86,13 +86,13 @@ def test_every_distance_is_that_of_c_mujoco(flown):
     np.testing.assert_array_equal(report.any, report.floor | report.drones | report.objects.any(axis=-1))
 
 
-def test_nothing_of_mujoco_is_made_for_it(flown):
+def test_a_report_allocates_nothing_of_mujoco(flown):
     sim, _ = flown
     sim.contact_report()
-    assert sim.scene._mjx_data is None
+    assert not sim.scene.is_allocated
 
 
-def test_boxes_of_drones_are_taken_when_they_touch_by_boxes():
+def test_box_collision_changes_the_distances():
     sim = Sim(n_worlds=2, control="attitude")
     sim.scene.add("box", pos=[0, 0, 1.0], size=(1, 1, 1))
     half = np.asarray(sim.airframe.value("shape.collision_box"))[5]
@@ -104,7 +104,7 @@ def test_boxes_of_drones_are_taken_when_they_touch_by_boxes():
     np.testing.assert_allclose(sim.contact_report().object_distance[:, 0, 0], [0.01 + offset, offset - 0.01], atol=1e-5)
 
 
-def test_filters_leave_out_what_is_not_asked_for(flown):
+def test_fields_that_were_not_requested_are_none(flown):
     sim, handles = flown
     all_of_it, some = sim.contact_report(), sim.contact_report(handles["box"], floor=False, drones=False)
     assert some.object_names == ("box:0", "box:1")
@@ -155,7 +155,7 @@ def test_the_distance_has_the_slope_of_the_way_to_the_object(flown):
     np.testing.assert_allclose(np.linalg.norm(slope, axis=-1), 1.0, atol=1e-4)
 
 
-def test_large_swarms_are_asked_piece_by_piece():
+def test_large_swarms_are_computed_in_chunks():
     n = CHUNK + 9
     sim = Sim(n_worlds=2, n_drones=n, control="attitude")
     rng = np.random.default_rng(1)
@@ -216,21 +216,122 @@ def test_contacts_are_logged_at_the_step_they_begin(engine):
     assert sim.data.plugins["contacts"].any.tolist() == [[False, False], [False, False], [True, True]]
 
 
-def test_law_09_what_cannot_be_asked_is_refused():
-    sim = Sim(n_worlds=1)
-    body = mujoco.MjSpec.from_string(
-        "<mujoco><worldbody><body name='rock'><geom type='sphere' size='.1'/></body></worldbody></mujoco>"
+@pytest.fixture(scope="module")
+def attached():
+    """Two worlds with bodies of three kinds: with a handle, attached and moved through mjx_data, attached and fixed."""
+    sim = Sim(n_worlds=2, n_drones=2)
+    ball = sim.scene.add("sphere", "ball", pos=[0, 2, 1], radius=0.1)
+    rock = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><body name='rock'><geom type='box' size='.1 .2 .3'/><camera name='eye' pos='0 0 1'/>"
+        "</body></worldbody></mujoco>"
     ).body("rock")
-    sim.spec.worldbody.add_frame().attach_body(body, "", "").mocap = True
+    frame = sim.spec.worldbody.add_frame()
+    for k in range(3):
+        frame.attach_body(rock, "", f":{k}").pos = [k, 0, 1]
+        sim.spec.body(f"rock:{k}").mocap = k != 1
     sim.build_mjx()
-    with pytest.raises(ConfigError, match="'rock' is moved by hand"):
-        sim.contact_report()
-    sim.contact_report((), drones=False)
-    with pytest.raises(ConfigError, match="no object 'tree'"):
+    pos = jnp.broadcast_to(jnp.float32([[0.1, 0, 0.8], [1.6, 0.4, 1]]), (2, 2, 3))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    return sim, ball
+
+
+def move_rocks(sim, shift):
+    """Shift and turn the rocks that can move through mjx_data, in each world otherwise."""
+    ids = np.array([sim.mj_model.body(f"rock:{k}").mocapid[0] for k in (0, 2)])
+    pos = np.float32([[[0, 0, 1], [2, 0, 1]], [[0.2, 0, 1], [2, 0.3, 1]]]) + np.float32(shift)
+    half = np.float32([np.cos(0.3), 0, 0, np.sin(0.3)])  # wxyz, by 0.6 rad about z
+    data = sim.mjx_data
+    sim.mjx_data = data.replace(
+        mocap_pos=data.mocap_pos.at[:, ids].set(pos), mocap_quat=data.mocap_quat.at[:, ids].set(half)
+    )
+
+
+def test_bodies_moved_through_mjx_data_are_reported_where_they_are(attached):
+    """Distances follow every move, in every world, as C MuJoCo has them; nothing is compiled anew for a move."""
+    sim, ball = attached
+    touches = []
+    for shift in ([0, 0, 0], [0.3, -0.2, 0.1], [0, 1.0, 0]):
+        move_rocks(sim, shift)
+        report = sim.contact_report()
+        assert set(report.object_names) == {"ball:0", "rock:0", "rock:1", "rock:2"}
+        for world in range(2):
+            _, objects, _ = oracle(sim, world, report.object_names, "col_sphere")
+            np.testing.assert_allclose(report.object_distance[world], objects, atol=SPHERE)
+        touches.append(int(report.objects.sum()))
+    assert touches[0] > 0
+    assert touches[2] == 0
+    one = sim.contact_report(["rock:2", ball], floor=False, drones=False)
+    columns = [report.object_names.index(name) for name in ("rock:2", "ball:0")]
+    np.testing.assert_allclose(one.object_distance, report.object_distance[..., columns], atol=1e-6)
+    jitted = [fn._cache_size() for fn in sim._queries._compiled.values()]
+    assert jitted == [1] * len(jitted), "a move compiles nothing"
+
+
+def test_before_mjx_data_is_read_such_bodies_are_where_the_spec_has_them():
+    sim = Sim(n_worlds=2)
+    body = sim.spec.worldbody.add_body(name="rock", pos=[0, 0, 2], mocap=True)
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
+    sim.build_mjx()
+    centre = np.asarray(sim.airframe.value("shape.collision_sphere"))
+    np.testing.assert_allclose(sim.contact_report("rock").object_distance, 2 - centre[2] - centre[3] - 0.1, atol=SPHERE)
+    assert not sim.scene.is_allocated
+
+
+def test_a_pure_function_takes_poses_of_such_bodies(attached):
+    """Race code that keeps poses of its own passes them, as mjx_data or as a pair, to all worlds or to one."""
+    sim, _ = attached
+    move_rocks(sim, [0.1, 0.1, 0])
+    expected = sim.contact_report().object_distance
+    contacts, mjx_data = jax.jit(sim.scene.contact_fn()), sim.mjx_data
+    pair = (mjx_data.mocap_pos, mjx_data.mocap_quat)
+    for mocap in (mjx_data, pair):
+        np.testing.assert_allclose(contacts(sim.data, mocap).object_distance, expected, atol=1e-6)
+    moved = contacts(sim.data, (pair[0] + jnp.float32([0, 0, 5]), pair[1]))
+    column = moved.object_names.index("rock:0")
+    assert (moved.object_distance[..., column] > expected[..., column] + 1).all()
+    alone = sim.scene.contact_fn(["rock:0"], floor=False, drones=False)
+
+    def gap(pos):
+        return alone(sim.data, (pair[0].at[:, :].set(pos), pair[1])).object_distance[0, 0, 0]
+
+    assert float(jnp.abs(jax.grad(gap)(pair[0][0, 0])).sum()) > 0.5, "the distance has a slope by the body's position"
+    seen = Step({"one": stage("world")(
+        lambda d: d.replace(states=d.states.replace(force=d.states.force.at[:, 0].set(
+            alone(d, (pair[0][0], pair[1][0])).object_distance[:, 0])))
+    )}, "lanes")(sim.data, 1).states.force[0, :, 0]  # fmt: skip
+    np.testing.assert_allclose(seen, expected[0, :, column], atol=1e-5)
+
+
+def test_cameras_see_such_bodies_and_hang_on_them(attached):
+    sim, _ = attached
+    move_rocks(sim, [0, 0, 0])
+    look = {"camera": "eye:0", "width": 4, "height": 4, "drones": False}
+    first = sim.depth(**look)
+    hits = sim.scene.depth_fn(**look)(sim.data, sim.mjx_data)
+    np.testing.assert_allclose(hits.distance, first, atol=1e-6)
+    assert "rock:0" in {hits.names[k] for k in np.unique(hits.number)}
+    np.testing.assert_allclose(first.min(), 1 - 0.3, atol=1e-5)  # from 1 m over its middle to its upper side
+    move_rocks(sim, [0, 0, 3])
+    np.testing.assert_allclose(sim.depth(**look).min(), 0.7, atol=1e-5)
+    assert sim.depth(**look).max() > 3.9, "beside it, the floor is 3 m further away"
+
+
+def test_law_09_wrong_queries_are_refused(attached):
+    sim, _ = attached
+    for refused in (lambda: sim.scene.contact_fn()(sim.data), lambda: sim.scene.depth_fn("fpv_cam", 2, 2)(sim.data)):
+        with pytest.raises(
+            ConfigError, match=r"'rock:0', which is moved through sim.mjx_data.*Pass mocap=sim.mjx_data"
+        ):
+            refused()
+    with pytest.raises(ConfigError, match=r"expected mocap_pos of shape \(2, n_mocap, 3\), got \(5, 3\)"):
+        sim.scene.contact_fn()(sim.data, (jnp.zeros((5, 3)), jnp.zeros((5, 4))))
+    with pytest.raises(ConfigError, match="objects whose poses are in the data, got body 'rock:0'"):
+        sim.add(ContactLog())
+    with pytest.raises(ConfigError, match="got 'tree'"):
         sim.contact_report("tree")
     with pytest.raises(ConfigError, match="report of nothing"):
         sim.contact_report((), floor=False, drones=False)
-    with pytest.raises(ConfigError, match="does not see the others"):
+    with pytest.raises(ConfigError, match="do not contain the other drones"):
         jax.eval_shape(
             Step({"mine": stage("drone")(lambda d: (sim.scene.contact_fn(())(d), d)[1])}, "lanes"), sim.data, 1
         )

@@ -256,7 +256,7 @@ def test_law_09_what_cannot_be_is_refused():
         ({"friction": -1}, "expected friction to be from 0 to inf, got -1"),
         ({"restitution": 1.5}, "from 0 to 1"),
         ({"softness": 1e-3}, "two steps at least"),
-        ({"objects": "tree"}, "no object 'tree'"),
+        ({"objects": "tree"}, "got 'tree'"),
     ):
         with pytest.raises(ConfigError, match=words):
             sim.add(ContactResponse(**settings))

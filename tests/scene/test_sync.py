@@ -30,7 +30,7 @@ DERIVED = ("xpos", "xquat", "xmat", "geom_xpos", "geom_xmat", "cam_xpos", "cam_x
 
 @pytest.fixture(scope="module")
 def sim():
-    """Three worlds of two drones at random poses, and a tower with parts that is moved by hand."""
+    """Three worlds of two drones at random poses, and a tower with children that is moved through mjx_data."""
     sim = Sim(n_worlds=3, n_drones=2)
     tower = sim.spec.worldbody.add_frame().attach_body(mujoco.MjSpec.from_string(TOWER).body("tower"), "", "")
     tower.mocap = True
@@ -81,10 +81,12 @@ def test_every_transform_is_that_of_c_mujoco(sim, synced, world):
 
 @pytest.mark.parametrize("world", range(3))
 def test_a_world_to_be_drawn_is_that_of_c_mujoco(sim, world):
-    """The sync of one world for a picture gives the same, and the lights besides, without MJX."""
+    """The sync of one world for an image gives the same poses, and the lights, without MJX."""
     expected = reference(sim, world)
     data = mujoco.MjData(sim.mj_model)
-    sync_one_world(sim.data, sim.mjx_data, world, sim.mj_model, data)
+    mjx_data = sim.mjx_data
+    poses = (mjx_data.mocap_pos[world], mjx_data.mocap_quat[world], mjx_data.qpos[world])
+    sync_one_world(sim.data, world, poses, sim.mj_model, data)
     for name in (*DERIVED, "light_xpos", "light_xdir"):
         np.testing.assert_allclose(getattr(data, name), getattr(expected, name), atol=1e-6, err_msg=name)
 

@@ -13,6 +13,7 @@ import pytest
 from crazysim import ConfigError
 from crazysim.__main__ import main
 from crazysim.envs import AutoReset, DroneEnv, make
+from crazysim.envs.state import bare
 from crazysim.errors import UnknownNameError
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import run as runs
@@ -149,6 +150,50 @@ def test_evaluation_uses_tolerance_and_hold_of_the_task():
     assert found["crashed"] < 1
     easy = make("hover", 16, seconds=2.0, reach=1e-3, tolerance=2.0)
     assert evaluate(easy, idle)["success"] == 1
+    # A crash is no success, however small the error was.
+    crashed = evaluate(make("hover", 16, seconds=2.0, tolerance=1e3), lambda obs: -jnp.ones((16, 1, 4)))
+    assert crashed["crashed"] == 1
+    assert crashed["success"] == 0
+
+
+def test_advantages_are_sums_of_discounted_errors(rng):
+    """Generalised advantage: sum of (gamma lambda)^k delta_(t+k) up to the end of the episode, in NumPy."""
+    config = ppo.Config(discount=0.9, gae_lambda=0.7)
+    reward, value = rng.normal(size=(2, 6, 3, 1)).astype(np.float32)
+    last = rng.normal(size=(3, 1)).astype(np.float32)
+    over = np.zeros((6, 3, 1), bool)
+    over[2, 0], over[5, 1] = True, True
+    sample = ppo.Sample(*(jnp.zeros(0),) * 3, value, reward, over)
+    advantages, returns = jax.jit(ppo._advantages, static_argnums=2)(sample, last, config)
+    after = np.concatenate([value[1:], last[None]])
+    delta = reward + 0.9 * after * ~over - value
+    expected = np.zeros_like(delta)
+    for t, world in np.ndindex(6, 3):
+        for k in range(t, 6):
+            expected[t, world] += (0.9 * 0.7) ** (k - t) * delta[k, world]
+            if over[k, world]:
+                break
+    np.testing.assert_allclose(advantages, expected, atol=1e-5)
+    np.testing.assert_allclose(returns, expected + value, atol=1e-5)
+
+
+def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
+    """The reward of a truncated step contains the discounted value of the final observation; no other step does."""
+    env = AutoReset(make("hover", 4, seconds=0.06, engine="lanes"))  # three steps an episode
+    config = ppo.Config(n_steps=4, discount=0.5, hidden=(8,))
+    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
+    _, samples, _, _ = jax.jit(ppo._collect, static_argnums=(1, 2))(learner, env, config, jax.random.key(1))
+    state, step = learner.env, jax.jit(env.step)
+    n_truncated = 0
+    for k in range(4):
+        state = step(state, samples.action[k])
+        value = ppo._value(learner.value, learner.stats, state.info["final_obs"])
+        truncated = np.asarray(state.truncated & ~state.terminated)[:, None]
+        n_truncated += truncated.sum()
+        np.testing.assert_allclose(samples.reward[k], state.reward + 0.5 * truncated * value, atol=1e-5)
+        assert np.abs(value).min() > 1e-3
+        state = bare(state)
+    assert n_truncated == 4
 
 
 def test_ppo_finds_the_action_that_pays():

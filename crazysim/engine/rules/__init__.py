@@ -1,4 +1,4 @@
-"""Rules that lower the primitives of JAX to scalar operations; importing the package registers them (``lower``)."""
+"""Meaning of each JAX primitive on scalars; importing this package fills the table of rules in ``lower``."""
 
 from crazysim.engine.rules import control_flow, elementwise, indexing, linalg, movement, random, reductions
 

@@ -40,7 +40,7 @@ def _high_level(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]
 
 
 def _with_derivative(ctx: Lowering, eqn: Any, args: list[Elements], called: ClosedJaxpr) -> list[Elements]:
-    """Lower a call with a derivative of its own, which is lowered when it is needed."""
+    """Lower a call with a custom derivative, which is lowered only when a derivative is requested."""
     body = ctx.inner()
     block = body.finish(body.lower(called, [_inputs(body, x) for x in args]))
 
@@ -113,7 +113,7 @@ def _scan(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
         return _results(ctx, "loop", eqn, scalars(*carry), (block,), (("length", length),))
     if length > MAX_UNROLL:
         raise UnsupportedError(
-            f"primitive 'scan' with operands for each of {length} iterations; unrolled are at most {MAX_UNROLL}"
+            f"primitive 'scan' with operands for each of {length} iterations; at most {MAX_UNROLL} are unrolled"
         )
     stacked: list[list[Elements]] = []
     for i in range(length)[::-1] if p["reverse"] else range(length):

@@ -169,7 +169,7 @@ def _leading_zeros(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elemen
 def _reduce_precision(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Round the mantissa to nearest even; what the exponent cannot hold becomes infinite, or a zero with its sign."""
     dtype, exponent, mantissa = eqn.outvars[0].aval.dtype, eqn.params["exponent_bits"], eqn.params["mantissa_bits"]
-    if dtype.name not in ops.DTYPES:
+    if dtype not in ops.DTYPES:
         raise UnsupportedError(f"numbers of type {dtype.name}")
     info, bits = np.finfo(dtype), _Bits(ctx, dtype)
     x = bits.of(args[0])

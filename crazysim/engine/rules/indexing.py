@@ -137,7 +137,7 @@ def _gather_filled(eqn: Any, x: Elements, indices: np.ndarray) -> Elements:
 
 
 def _fill_value(dtype: Any) -> Any:
-    """Return the default of JAX for places outside: NaN, the least signed or the largest unsigned integer, True."""
+    """Return the fill value of JAX: NaN, the smallest signed or the largest unsigned integer, True."""
     kind = np.dtype(dtype).kind
     if kind == "f":
         return np.nan

@@ -1,4 +1,4 @@
-"""Rules for linear algebra on small matrices, unrolled."""
+"""Rules for small linear algebra, unrolled."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LARGEST_SYSTEM = 6
 
 def _check_size(eqn: Any, n: int) -> None:
     if n > LARGEST_SYSTEM:
-        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; unrolled are at most {LARGEST_SYSTEM}")
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; at most {LARGEST_SYSTEM} is supported")
 
 
 def _matrices(x: Elements) -> list[Elements]:

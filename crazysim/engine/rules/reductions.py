@@ -1,4 +1,4 @@
-"""Rules for reductions, cumulative reductions, sorts and products of arrays, unrolled."""
+"""Rules for reductions, unrolled: sums, scans, sorts and products of arrays."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _sorted(
     columns = [np.moveaxis(x, axis, 0).copy() for x in args]
     n = len(columns[0])
     if n > MAX_UNROLL:
-        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of {n} elements; unrolled are at most {MAX_UNROLL}")
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of {n} elements; at most {MAX_UNROLL} are unrolled")
     for turn in range(n):
         for i in range(turn % 2, n - 1, 2):
             first = [c[i, ...].copy() for c in columns]

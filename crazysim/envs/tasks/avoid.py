@@ -174,7 +174,7 @@ class Avoid(Task):
     def seen(self, data: SimData) -> Array:
         """Return the ways to the nearest points of the nearest obstacles, m. (n_drones, n_seen, 3)"""
         dtype, handles = data.states.pos.dtype, crossing_of(data).handles
-        places = slice(handles[0].places[0], handles[-1].places[-1] + 1)
+        places = slice(handles[0].rows[0], handles[-1].rows[-1] + 1)
         n_poles, n_boxes = self.n_poles, self.n_boxes
         # Middle and half size of each solid, in the object's frame; a pole's radius is subtracted from the distance.
         middle = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[0, 0, 0]] * n_boxes)

@@ -73,15 +73,15 @@ def race_of(data: SimData) -> RaceRecord:
 
 def gates_of(data: SimData) -> tuple[Array, Array]:
     """Return positions, m (..., n_gates, 3), and attitudes, xyzw (..., n_gates, 4), of the gates."""
-    places = race_of(data).gates.places
-    some = slice(places[0], places[-1] + 1)
+    rows = race_of(data).gates.rows
+    some = slice(rows[0], rows[-1] + 1)
     return data.objects.pos[..., some, :], data.objects.quat[..., some, :]  # type: ignore[union-attr]
 
 
 def obstacles_of(data: SimData) -> Array:
     """Return the upper ends of the obstacles, m. (..., n_obstacles, 3)"""
-    places = race_of(data).obstacles.places
-    pos = data.objects.pos[..., places[0] : places[-1] + 1, :]  # type: ignore[union-attr]
+    rows = race_of(data).obstacles.rows
+    pos = data.objects.pos[..., rows[0] : rows[-1] + 1, :]  # type: ignore[union-attr]
     return pos + np.array([0.0, 0.0, POLE_HEIGHT], pos.dtype)
 
 

@@ -1,1 +1,1 @@
-"""What drones measure, where Crazyflow has it; ``sim.depth`` and ``sim.scene.depth_fn`` are its home."""
+"""Sensors, under the paths of Crazyflow."""

@@ -1,4 +1,4 @@
-"""Depth pictures as Crazyflow has them: distances along the ray, -1 where it meets nothing."""
+"""Depth images as Crazyflow has them: distances along the ray, -1 where it meets nothing."""
 
 from __future__ import annotations
 
@@ -12,24 +12,26 @@ from crazysim.sim.sim import Sim
 def render_depth(
     sim: Sim, camera: int | str = 0, resolution: tuple[int, int] = (100, 100), include_drone: bool = False
 ) -> Array:
-    """Return how far it is from one camera of every world along each pixel's ray, m. (n_worlds, height, width)
+    """Return the depth image of one camera in every world, m. (n_worlds, height, width)
 
-    ``sim.depth`` sees through the cameras of all drones at once, and hides each drone from its own camera only.
+    ``sim.depth`` returns the images of all drones' cameras at once, and hides each drone from its own camera only.
 
     Args:
-        sim: The simulation.
-        camera: Id or name; 0 is ``track_cam:0``. Its field of view is its own.
+        sim: Simulation.
+        camera: Id or name; 0 is ``track_cam:0``.
         resolution: Width and height, pixels.
-        include_drone: Whether drones are seen, the camera's own too.
+        include_drone: True to show drones, including the one that carries the camera.
 
     Raises:
-        ValueError: If the camera does not exist or is several, or the resolution cannot be.
+        ValueError: If the camera does not exist, the name means several cameras, or the resolution is invalid.
     """
     try:
         width, height = resolution
     except (TypeError, ValueError):
-        raise ConfigError(f"resolution is {resolution!r}; needed are a width and a height, pixels") from None
+        raise ConfigError(f"expected a resolution of width and height, pixels, got {resolution!r}") from None
     depth = sim.depth(camera, width, height, drones=include_drone, hide_own=False, along="ray")
     if depth.shape[1] > 1:
-        raise ConfigError(f"{camera!r} are {depth.shape[1]} cameras; name one, such as '{camera}:0', or use sim.depth")
+        raise ConfigError(
+            f"expected one camera, got {depth.shape[1]} for {camera!r}. Use one such as '{camera}:0', or sim.depth."
+        )
     return jnp.where(jnp.isfinite(depth[:, 0]), depth[:, 0], -1.0)

@@ -1,0 +1,103 @@
+"""Parameters of an airframe as a dict, under the names of Crazyflow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from crazysim.drones import Airframe, load_airframe
+from crazysim.dynamics import first_principles, fitted
+from crazysim.dynamics.core import GRAVITY, Dynamics, require_support
+from crazysim.errors import ConfigError, UnknownNameError
+
+Drone = str | Path | Mapping[str, Any] | Airframe
+"""Name of a built-in airframe, path of a TOML file, dict, or airframe."""
+
+
+def load_params(dynamics: Dynamics | str, drone: Drone, xp: ModuleType | None = None, device: Any = None) -> dict:
+    """Return the parameters of a drone for a dynamics model, in SI units; thrusts are per rotor.
+
+    Args:
+        dynamics: Dynamics model.
+        drone: Airframe, or anything that ``load_airframe`` accepts.
+        xp: Array module of the values, such as ``jax.numpy``; None for NumPy.
+        device: Device of the values; None for the module's default.
+
+    Raises:
+        UnknownNameError: If the model or the drone does not exist.
+        ConfigError: If the drone has no parameters for the model.
+    """
+    if dynamics not in tuple(Dynamics):
+        raise UnknownNameError(f"expected one of {', '.join(Dynamics)} as dynamics, got {dynamics!r}")
+    model, airframe = Dynamics(dynamics), load_airframe(drone)
+    require_support(airframe, model)
+    params: dict[str, Any] = {
+        "gravity_vec": GRAVITY,
+        "mass": airframe.value("rigid_body.mass", ()),
+        "J": airframe.inertia,
+        "J_inv": np.linalg.inv(airframe.inertia),
+        "thrust_min": airframe.value("rotors.thrust_min", ()),
+        "thrust_max": airframe.value("rotors.thrust_max", ()),
+    }
+    if model == Dynamics.first_principles:
+        params |= {
+            "L": airframe.arm,
+            "prop_inertia": airframe.value("rotors.inertia"),
+            "rpm2thrust": airframe.value("rotors.thrust_curve"),
+            "rpm2torque": airframe.value("rotors.torque_curve"),
+            "rotor_dyn_coef": airframe.value("rotors.lag"),
+            "mixing_matrix": airframe.mixing_matrix,
+            "drag_matrix": _as_matrix(airframe.value("drag.coefficients")),
+        }
+    else:
+        fit = {key: airframe.value(f"fitted.{model.value}.{key}") for key in airframe.table(f"fitted.{model.value}")}
+        if "drag_coefficients" in fit:
+            fit["drag_matrix"] = _as_matrix(fit.pop("drag_coefficients"))
+        params |= fit
+    return as_arrays(params, xp, device)
+
+
+def load_fn_params(fn: Callable[..., Any], drone: Drone, xp: ModuleType | None = None, device: Any = None) -> dict:
+    """Return the parameters that ``first_principles.dynamics`` uses, as ``load_params`` has them.
+
+    Args:
+        fn: ``first_principles.dynamics``.
+        drone: Airframe, or anything that ``load_airframe`` accepts.
+        xp: Array module of the values; None for NumPy.
+        device: Device of the values; None for the module's default.
+
+    Raises:
+        ConfigError: If ``fn`` is another function.
+    """
+    if fn is not first_principles.dynamics:
+        hint = ", which is shared by all fitted models" if fn is fitted.dynamics else ""
+        raise ConfigError(f"expected first_principles.dynamics, got {fn!r}{hint}. Use load_params(dynamics, drone).")
+    params = load_params(Dynamics.first_principles, drone, xp, device)
+    return {name: value for name, value in params.items() if name not in ("thrust_min", "thrust_max")}
+
+
+def rotor_vel_limits(dynamics: Dynamics | str, drone: Drone) -> tuple[float, float]:
+    """Return the limits of ``states.rotor_vel``: rpm, or collective thrust in N in a fitted model."""
+    params = load_params(dynamics, drone)
+    thrusts = np.array([params["thrust_min"], params["thrust_max"]])
+    if dynamics != Dynamics.first_principles:
+        low, high = load_airframe(drone).n_rotors * thrusts
+    else:
+        k0, k1, k2 = np.atleast_2d(params["rpm2thrust"])[0]
+        low, high = (-k1 + np.sqrt(k1**2 - 4 * k2 * (k0 - thrusts))) / (2 * k2)
+    return float(low), float(high)
+
+
+def as_arrays(params: dict[str, Any], xp: ModuleType | None, device: Any) -> dict[str, Any]:
+    """Return a dict, or a dict of dicts, with its values as arrays of a module."""
+    make = (np if xp is None else xp).asarray
+    options = {} if device is None else {"device": device}
+    return {k: as_arrays(v, xp, device) if isinstance(v, dict) else make(v, **options) for k, v in params.items()}
+
+
+def _as_matrix(drag: np.ndarray) -> np.ndarray:
+    return np.diag(drag) if drag.ndim == 1 else drag

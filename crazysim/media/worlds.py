@@ -1,0 +1,39 @@
+"""Selection of worlds for images and recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.sim.sim import Sim
+
+
+def world_indices(sim: Sim, worlds: Sequence[int] | None) -> NDArray:
+    """Return indices of worlds, checked. (n,)
+
+    Args:
+        sim: Simulation.
+        worlds: Indices; None for all worlds.
+
+    Raises:
+        ConfigError: If there are none, or one does not exist.
+    """
+    indices = list(range(sim.n_worlds) if worlds is None else worlds)
+    if not indices:
+        raise ConfigError("expected at least one world, got none")
+    for world in indices:
+        require_world(sim, world)
+    return np.array(indices)
+
+
+def require_world(sim: Sim, world: int) -> None:
+    """Check that a world exists.
+
+    Raises:
+        ConfigError: If it does not.
+    """
+    if world not in range(sim.n_worlds):
+        raise ConfigError(f"expected a world from 0 to {sim.n_worlds - 1}, got {world!r}")

@@ -1,0 +1,120 @@
+"""The scene of every world on the device, as MJX holds it: allocated when first read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+from jax import Array
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from numpy.typing import NDArray
+
+from crazysim.core.data import SimData
+from crazysim.core.sharding import place_scene, put
+from crazysim.errors import ConfigError
+from crazysim.scene import build, contacts, mjx
+from crazysim.scene.sync import sync_sim2mjx
+
+
+class MjxScene:
+    """``mjx.Model`` and ``mjx.Data`` of one compiled scene."""
+
+    def __init__(self, mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device, mesh: Mesh | None):
+        """Take the compiled scene; nothing is allocated yet.
+
+        Args:
+            mj_model: Compiled scene.
+            n_worlds: Number of worlds.
+            device: Device of all arrays.
+            mesh: Devices over which the worlds are spread instead; None for one device.
+        """
+        self._mj_model, self._n_worlds, self._device, self._mesh = mj_model, n_worlds, device, mesh
+        self._model: mjx.Model | None = None
+        self._data: mjx.Data | None = None
+        self._rest: tuple[NDArray, ...] | None = None
+
+    @property
+    def model(self) -> mjx.Model:
+        """Model on the device, shared by all worlds.
+
+        Raises:
+            ConfigError: If MJX does not support the scene.
+        """
+        model = self._model
+        if model is None:
+            model = build.put_model(self._mj_model, self._device)
+            if self._mesh is not None:
+                model = jax.device_put(model, NamedSharding(self._mesh, PartitionSpec()))
+            self._model = model
+        return model
+
+    @property
+    def data(self) -> mjx.Data:
+        """State of the scene in every world; assigned poses are checked. (n_worlds, ...)"""
+        if self._data is None:
+            self._data = self._place(build.make_data(self._mj_model, self._n_worlds, self._device))
+        return self._data
+
+    @data.setter
+    def data(self, data: mjx.Data) -> None:
+        self._data = self._place(build.check_poses(data, self._mj_model, self._n_worlds))
+
+    @property
+    def is_allocated(self) -> bool:
+        """True once ``data`` has been read or assigned."""
+        return self._data is not None
+
+    def sync(self, data: SimData) -> SimData:
+        """Bring all worlds up to date, and return the data with ``core.mjx_synced`` set."""
+        data, self._data = sync_sim2mjx(data, self.data, self.model)
+        return data
+
+    def poses(self, worlds: Any = slice(None)) -> tuple[Any, Any, Any]:
+        """Return poses of some worlds at the last sync, or as the model has them while nothing is allocated.
+
+        Args:
+            worlds: Index, indices or slice.
+
+        Returns:
+            Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), and joint positions (n, n_qpos).
+        """
+        if self._data is not None:
+            return self._data.mocap_pos[worlds], self._data.mocap_quat[worlds], self._data.qpos[worlds]
+        if self._rest is None:
+            rest = mujoco.MjData(self._mj_model)
+            each = (rest.mocap_pos, rest.mocap_quat, self._mj_model.qpos0)
+            self._rest = tuple(np.array(x) for x in each)
+        pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[worlds] for x in self._rest)
+        return pos, quat, qpos
+
+    @property
+    def is_supported(self) -> bool:
+        """True if MJX supports the scene; others can be drawn, but have no ``contacts``."""
+        try:
+            return self.model is not None
+        except ConfigError:
+            return False
+
+    def contacts(self, body: str | None) -> Array:
+        """Return True for every contact slot, of one body or of all, that touched at the last sync.
+
+        Returns:
+            (n_worlds, n_slots), bool
+
+        Raises:
+            UnknownNameError: If the scene has no such body.
+        """
+        if body is None:
+            return contacts.contact_flags(self.data)
+        return contacts.body_contact_flags(self.data, self._mj_model, body)
+
+    def shard(self, mesh: Mesh) -> None:
+        """Spread the worlds over devices."""
+        self._mesh, self._model = mesh, None
+        if self._data is not None:
+            self._data = self._place(self._data)
+
+    def _place(self, data: mjx.Data) -> mjx.Data:
+        return put(data, self._device) if self._mesh is None else place_scene(data, self._mesh)

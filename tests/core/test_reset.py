@@ -1,0 +1,181 @@
+"""Full and masked resets: which leaves return to the default data, and which stay."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import hover_command, hover_rotor_state, to_all, with_states
+
+from crazysim import PyTree, Sim, leaf
+from crazysim.core.pipeline import insert_fn_before
+from crazysim.errors import ConfigError
+from crazysim.pytree import scopes
+from crazysim.utils import CORE_NDIM_KEY
+
+N_WORLDS, N_DRONES = 3, 2
+MASK = np.array([False, True, False])
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Counter:
+    """A record as code for Crazyflow declares it: by metadata, without the base class of this project."""
+
+    count: jax.Array = dataclasses.field(metadata={CORE_NDIM_KEY: 0})
+    """Steps. (n_worlds, 1)"""
+    table: jax.Array = dataclasses.field(metadata={CORE_NDIM_KEY: 1})
+    """Shared values. (3,)"""
+    history: dict = dataclasses.field(metadata={CORE_NDIM_KEY: 2})
+    """Arrays of each world. (n_worlds, 2, 2)"""
+    note: jax.Array
+    """An array without a declaration. (n_worlds,)"""
+
+    @staticmethod
+    def create():
+        """Return a counter at zero."""
+        zeros = jnp.zeros((N_WORLDS, 2, 2))
+        return Counter(jnp.zeros((N_WORLDS, 1)), jnp.zeros(3), {"one": zeros}, jnp.zeros(N_WORLDS))
+
+
+class Own(PyTree):
+    """A record of this project, next to the other kind."""
+
+    count: jax.Array = leaf("world")
+    """Steps. (n_worlds, 1)"""
+
+
+def count(data):
+    """Add one to every plugin."""
+    return data.replace(plugins=jax.tree.map(lambda x: x + 1, data.plugins))
+
+
+@pytest.fixture(scope="module")
+def counting():
+    """A simulation whose plugins, one of each kind, count steps."""
+    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES)
+    plugins = {"foreign": Counter.create(), "own": Own(jnp.zeros((N_WORLDS, 1))), "bare": jnp.zeros(2)}
+    sim.data = sim.data.replace(plugins=plugins | {"nested": (Counter.create(), jnp.zeros(()))})
+    sim.build_default_data()
+    insert_fn_before(sim.step_pipeline, "increment_steps", count)
+    sim.build_step_fn()
+    return sim
+
+
+def test_a_full_reset_restores_every_plugin(counting):
+    counting.step(5)
+    assert all(np.all(np.asarray(x) >= 5) for x in jax.tree.leaves(counting.data.plugins))
+    counting.reset()
+    assert jax.tree.leaves(counting.data.plugins)
+    for x in jax.tree.leaves(counting.data.plugins):
+        np.testing.assert_array_equal(x, 0)
+
+
+def test_a_masked_reset_restores_the_declared_leaves_of_its_worlds(counting):
+    """Crazyflow's metadata declare an axis over worlds as ``leaf`` does; undeclared and shared arrays stay."""
+    counting.reset()
+    counting.step(5)
+    counting.reset(MASK)
+    plugins = counting.data.plugins
+    expected = np.where(MASK, 0, 5)
+    for record in (plugins["foreign"], plugins["nested"][0]):
+        np.testing.assert_array_equal(record.count[:, 0], expected)
+        np.testing.assert_array_equal(record.history["one"][:, 1, 1], expected)
+        np.testing.assert_array_equal(record.table, 5)
+        np.testing.assert_array_equal(record.note, 5)
+    np.testing.assert_array_equal(plugins["own"].count[:, 0], expected)
+    np.testing.assert_array_equal(plugins["bare"], 5)
+
+
+def test_a_declared_axis_that_is_not_over_worlds_is_refused(counting):
+    data = counting.data
+    wrong = dataclasses.replace(Counter.create(), count=jnp.zeros((N_WORLDS + 1, 1)))
+    counting.data = data.replace(plugins=data.plugins | {"foreign": wrong})
+    with pytest.raises(ConfigError, match=r"data.plugins\['foreign'\].count .* got shape \(4, 1\)"):
+        counting.step()
+    counting.data = data
+
+
+def test_metadata_on_a_field_that_holds_a_record_are_refused(counting):
+    nested = dataclasses.replace(Counter.create(), count=Counter.create())
+    with pytest.raises(ConfigError, match=r"\['foreign'\].count, whose metadata have 'core_ndim', got a Counter"):
+        scopes(counting.data.replace(plugins={"foreign": nested}))
+
+
+def test_an_action_queue_flies_the_same_way_after_a_full_reset():
+    """A queue in a bare array delays commands: flights from two resets are equal to the last bit."""
+    sim = Sim(control="rotor_vel")
+    hover = to_all(sim.data, hover_command(sim.data))
+    sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(sim.data))
+    queue = jnp.broadcast_to(hover, (10, *hover.shape))
+    sim.data = sim.data.replace(plugins={"queue": queue})
+    sim.build_default_data()
+
+    def delayed(data):
+        queue = jnp.concatenate([data.plugins["queue"][1:], data.controls.rotor_vel[None]])
+        late = data.controls.replace(rotor_vel=data.plugins["queue"][0])
+        return data.replace(controls=late, plugins={"queue": queue})
+
+    insert_fn_before(sim.step_pipeline, "clip_rotor_vel_cmd", delayed)
+    sim.build_step_fn()
+
+    def fly():
+        sim.reset()
+        for _ in range(60):
+            sim.rotor_vel_control(1.2 * np.asarray(hover))
+            sim.step()
+        return np.asarray(sim.data.states.pos)
+
+    first = fly()
+    assert first[0, 0, 2] > 1.005
+    np.testing.assert_array_equal(fly(), first)
+
+
+def test_a_full_reset_restores_shared_parameters_and_a_masked_one_leaves_them():
+    sim = Sim(n_worlds=N_WORLDS, control="attitude")
+    key = jax.random.key_data(sim.data.core.rng_key)
+    params, attitude = sim.data.params, sim.data.controls.attitude
+    heavy = params.replace(mass=2 * params.mass, gravity_vec=0 * params.gravity_vec)
+    stiff = attitude.replace(params=attitude.params.replace(kR=3 * attitude.params.kR))
+    changed = sim.data.replace(params=heavy, controls=sim.data.controls.replace(attitude=stiff))
+    sim.data = changed
+    sim.seed(7)
+    sim.reset(MASK)
+    np.testing.assert_array_equal(sim.data.params.mass, heavy.mass)
+    np.testing.assert_array_equal(sim.data.controls.attitude.params.kR, stiff.params.kR)
+    sim.reset()
+    np.testing.assert_array_equal(sim.data.params.mass, params.mass)
+    np.testing.assert_array_equal(sim.data.params.gravity_vec, params.gravity_vec)
+    np.testing.assert_array_equal(sim.data.controls.attitude.params.kR, attitude.params.kR)
+    assert not np.array_equal(jax.random.key_data(sim.data.core.rng_key), key), "the seed stays"
+
+
+def test_a_parameter_of_each_drone_returns_to_the_shared_default_and_stays_of_each_drone():
+    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES)
+    mass = sim.data.params.mass
+    each = jnp.broadcast_to(2 * mass, (N_WORLDS, N_DRONES, 1))
+    sim.data = sim.data.replace(params=sim.data.params.replace(mass=each))
+    sim.reset(MASK)
+    np.testing.assert_allclose(sim.data.params.mass[:, 0, 0], np.where(MASK, 1, 2) * mass)
+    sim.reset()
+    np.testing.assert_array_equal(sim.data.params.mass, np.broadcast_to(mass, each.shape))
+
+
+def test_a_plugin_that_the_default_data_lack_stays():
+    sim = Sim()
+    sim.data = sim.data.replace(plugins={"late": jnp.ones(2)})
+    sim.reset()
+    np.testing.assert_array_equal(sim.data.plugins["late"], 1)
+
+
+def test_the_default_data_outlive_a_flight_that_began_from_them():
+    """Law 11: what a full reset returns is not the default's own buffers, which a rollout may give away."""
+    sim = Sim(control="rotor_vel")
+    sim.data = sim.data.replace(plugins={"bare": jnp.ones(2)})
+    sim.build_default_data()
+    sim.reset()
+    sim.rollout(lambda params, data: params, sim.data.controls.rotor_vel, 2)
+    assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(sim.default_data.plugins))
+    sim.reset()
+    assert float(sim.data.plugins["bare"].sum()) == 2

@@ -1,0 +1,52 @@
+"""The window's mouse: callbacks, without a screen."""
+
+import types
+
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim.scene.window import Window
+
+BUTTONS = {"left": 0, "right": 1, "middle": 2}
+
+
+@pytest.fixture
+def window():
+    """A window on a screen of 100 x 100 pixels that is none, with one button pressed at will."""
+    window = object.__new__(Window)
+    window._model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    window._camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(window._model, window._camera)
+    window._size, window._cursor, window.pressed = (100, 100), (0.0, 0.0), None
+    window._glfw = types.SimpleNamespace(
+        PRESS=1,
+        **{f"MOUSE_BUTTON_{name.upper()}": number for name, number in BUTTONS.items()},
+        get_mouse_button=lambda _, button: int(button == BUTTONS.get(window.pressed, -1)),
+    )
+    return window
+
+
+def view(window):
+    camera = window._camera
+    return np.array([camera.azimuth, camera.elevation, camera.distance, *camera.lookat])
+
+
+@pytest.mark.parametrize("button, changed", [(None, []), ("left", [0, 1]), ("right", [3, 4, 5]), ("middle", [2])])
+def test_dragging_turns_moves_or_zooms_the_view(window, button, changed):
+    """Left turns (azimuth, elevation), right moves (lookat), the middle button zooms (distance); no button, nothing."""
+    window._camera.azimuth = 30  # so that a move to the side has a part along x and one along y
+    window._on_move(None, 50, 50)
+    before = view(window)
+    window.pressed = button
+    window._on_move(None, 60, 45)
+    np.testing.assert_array_equal(np.flatnonzero(view(window) != before), changed)
+
+
+def test_scrolling_zooms(window):
+    before = view(window)
+    window._on_scroll(None, 0, 1)
+    assert view(window)[2] > before[2], "scrolling up goes away, as in MuJoCo's own viewer"
+    window._on_scroll(None, 0, -2)
+    assert view(window)[2] < before[2]
+    np.testing.assert_array_equal(np.delete(view(window), 2), np.delete(before, 2))

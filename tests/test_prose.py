@@ -1,0 +1,179 @@
+"""Prose of the package and of the pages follows the rules of CONTRIBUTING.md ("Style"), as far as they can be checked.
+
+The sources are parsed and tokenized, not imported.
+"""
+
+import ast
+import io
+import itertools
+import re
+import tokenize
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted((ROOT / "crazysim").rglob("*.py"))
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+
+QUESTION_WORDS = ("What", "Whether", "How", "Where", "Which", "Who", "Why")
+"""Never the first word of a docstring, or of the description of an argument or a result."""
+
+BANNED = {
+    r"told|untold": "passed, given, reported",
+    r"tells?": "gives, reports, prints",
+    r"heed(s|ed|ing)?": "uses, follows",
+    r"(un)?laid|unlay": "packed, unpacked",
+    r"(taken?|takes|taking|took|kept|keeps?|as it wants it,) apart": "flattened, separated, distinguished",
+    r"knows": "has, holds, uses",
+    r"sees": "receives, reads",
+    r"wants": "needs, requires",
+    r"asks?": "requests, queries",
+    r"asked": "requested, queried",
+    r"believes?": "uses, assumes",
+    r"nobody": "no caller, unused",
+    r"anew": "again",
+    r"riddles?": "ambiguous",
+    r"says so": "a reference to the place",
+    r"so and so": "the thing itself",
+    r"(is|are) no (more )?[A-Z][A-Z_=]+": "expected X, got Y",
+    r"written out": "unrolled, inlined, supported",
+    r"whole-?step|WholeStep": "fused environment step",
+    r"goes on": "continues",
+    r"go on": "continue",
+    r"as it wants it": "the form that is required",
+    r"no matter what": "always",
+}
+"""Regular expressions of words that are not used, each with replacements."""
+
+REMEDY = re.compile(
+    r"\b(expected|must|needs?|needed|use|pass|install|call|set|choose|add|remove|give|see|try|make|reduce|raise|increase"
+    r"|define|declare|move|write|omit|replace|update|delete|known|available|one of|at least|at most|run|allowed|only"
+    r"|did you mean|there are|it has|takes?|check|name|nearest|start|describe|repeat|first|are \{\}|reads)\b|>=|<=",
+    re.IGNORECASE,
+)
+"""Words of which a message to the user contains at least one: those of a requirement, an alternative or a remedy."""
+USER_ERRORS = {"ConfigError", "UnknownNameError", "ValueError", "TypeError", "RenderError", "ImportError"}
+
+FIELD_LINE = re.compile(r"^\s*\*{0,2}\w+( \([^)]*\))?: (\w+)", re.MULTILINE)
+
+
+def docstrings(tree):
+    """Yield line, kind and text of the docstrings of modules, classes, functions and attributes."""
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+            text = ast.get_docstring(node)
+            if text:
+                yield node.body[0].lineno, type(node).__name__, text
+        body = getattr(node, "body", None)
+        if not isinstance(body, list):
+            continue
+        for before, after in itertools.pairwise(body):
+            is_text = isinstance(after, ast.Expr) and isinstance(getattr(after.value, "value", None), str)
+            if is_text and isinstance(before, (ast.Assign, ast.AnnAssign)):
+                annotation = getattr(before, "annotation", None)
+                kind = "flag" if isinstance(annotation, ast.Name) and annotation.id == "bool" else "field"
+                yield after.lineno, kind, after.value.value.strip()
+
+
+def descriptions(text):
+    """Yield the first word of every description in the sections of a docstring."""
+    for section in re.findall(r"^\s*(?:Args|Attributes|Raises):\n((?:\s+.*\n?)+)", text, re.MULTILINE):
+        yield from (match[2] for match in FIELD_LINE.finditer(section))
+    yield from re.findall(r"^\s*(?:Returns|Yields):\n\s+(\w+)", text, re.MULTILINE)
+
+
+def prose(source):
+    """Yield line and text of every comment and string of a source."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type in (tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)):
+            yield token.start[0], token.string
+
+
+def banned(text):
+    """Yield position, word and replacements of every banned word of a text."""
+    for pattern, better in BANNED.items():
+        for match in re.finditer(rf"\b({pattern})\b", text):
+            yield match.start(), match[0], better
+
+
+def literal(node):
+    """Return the literal parts of a message, or None where it is not a literal."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        return "".join(part.value if isinstance(part, ast.Constant) else "{}" for part in node.values)
+    return None
+
+
+def violations(source):
+    """Return every violation of a source as (line, complaint)."""
+    tree = ast.parse(source)
+    found = []
+    for line, kind, text in docstrings(tree):
+        if text.split()[0] in QUESTION_WORDS:
+            found.append((line, f"a {kind} docstring begins with {text.split()[0]!r}"))
+        if kind == "flag" and not text.startswith("True "):
+            found.append((line, f"the docstring of a flag begins with {text.split()[0]!r}, not with 'True where'"))
+        found += [
+            (line, f"a description begins with {word!r}") for word in descriptions(text) if word in QUESTION_WORDS
+        ]
+    for line, text in prose(source):
+        for start, word, better in banned(text):
+            found.append((line + text[:start].count("\n"), f"{word!r}: write {better}"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assert):
+            found.append((node.lineno, "assert: raise an error that names the remedy"))
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args:
+            name = node.exc.func.id if isinstance(node.exc.func, ast.Name) else ""
+            message = literal(node.exc.args[0])
+            if name in USER_ERRORS and message is not None and not REMEDY.search(message):
+                found.append((node.lineno, f"message without a remedy: {message!r}"))
+    return sorted(found)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_prose_of_the_package(path):
+    found = violations(path.read_text())
+    assert not found, "\n".join(f"{path.relative_to(ROOT)}:{line}: {complaint}" for line, complaint in found)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_words_of_the_pages(path):
+    text = re.sub(r"`[^`]*`|```.*?```", lambda match: "\n" * match[0].count("\n"), path.read_text(), flags=re.DOTALL)
+    found = [(text[:start].count("\n") + 1, word, better) for start, word, better in banned(text)]
+    assert not found, "\n".join(f"{path.relative_to(ROOT)}:{line}: {word!r}: write {b}" for line, word, b in found)
+
+
+BAD = '''
+class Record:
+    done: bool
+    """Whether it is over."""
+    obs: int
+    """What a policy is told."""
+
+def f(x):
+    """Return y.
+
+    Args:
+        x: How far it is.
+    """
+    assert x  # it knows nothing
+    raise ValueError(f"{x!r} is bad")
+'''
+
+
+def test_the_check_finds_each_kind():
+    complaints = [complaint for _, complaint in violations(BAD)]
+    for expected in (
+        "a flag docstring begins with 'Whether'",
+        "a field docstring begins with 'What'",
+        "not with 'True where'",
+        "a description begins with 'How'",
+        "'told': write",
+        "'knows': write",
+        "assert:",
+        "message without a remedy",
+    ):
+        assert any(expected in complaint for complaint in complaints), expected
+    assert not violations('"""Module."""\n\n\ndef f(x):\n    """Return x."""\n    return x\n')
