@@ -166,12 +166,19 @@ def _call(program: Program, compiled: Compiled, leaves: list[Any], count: Array)
     inputs = [_as_numbers(leaves[i]) for i in source.inputs]
     like = {i: program.leaves[i] for i in source.outputs}
     shapes = {i: (program.rows[i], n_lanes) if i in program.rows else (n_worlds, *x.shape[1:]) for i, x in like.items()}
-    outputs = [jax.ShapeDtypeStruct(shapes[i], x.dtype) for i, x in like.items()]
+    outputs = [
+        jax.ShapeDtypeStruct((*shapes[i], 2) if jaxcompat.is_key(x) else shapes[i], x.number) for i, x in like.items()
+    ]
+
+    def as_keys(written: list[Array]) -> list[Array]:
+        pairs = zip(written, like.values(), strict=True)
+        return [jax.random.wrap_key_data(x) if jaxcompat.is_key(leaf) else x for x, leaf in pairs]
+
     if program.check is None:
-        return launch(n_lanes, count.reshape(1), inputs, outputs), jnp.zeros((n_worlds, 1), bool)
+        return as_keys(launch(n_lanes, count.reshape(1), inputs, outputs)), jnp.zeros((n_worlds, 1), bool)
     flags = jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)
     *written, flagged = launch(n_lanes, count.reshape(1), inputs, [*outputs, flags])
-    return written, flagged if n_drones == 1 else jnp.any(flagged, axis=1, keepdims=True)
+    return as_keys(written), flagged if n_drones == 1 else jnp.any(flagged, axis=1, keepdims=True)
 
 
 def _as_numbers(x: Any) -> Array:

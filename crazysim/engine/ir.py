@@ -228,7 +228,12 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
         if op.name == "barrier":
             builder.barrier()
         elif len(op.results) == 1 and not op.blocks:
-            values[op.results[0]] = builder.add(op.name, args, op.results[0].dtype, op.params)
+            (old,) = op.results
+            # What was simplified when it was built can be simplified further only if a value has become a constant.
+            if any([isinstance(x, np.generic) for x in args]):
+                values[old] = builder.add(op.name, args, old.dtype, op.params)
+            else:
+                (values[old],) = builder.add_many(op.name, args, (old.dtype,), op.params)
         else:
             blocks = tuple([_inlined(builder, inner, values) for inner in op.blocks])
             results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, blocks)

@@ -123,7 +123,7 @@ def _require(program: Program) -> None:
         require(segment.block)
         for i in {*segment.read, *segment.written}:
             leaf = program.leaves[i]
-            if leaf.number.name not in TYPES:
+            if leaf.number not in TYPES:
                 why = f"kernels have no numbers of type {leaf.number}, which {leaf.name} has"
                 raise UnsupportedError(why, stage=", ".join(segment.stages))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.listing import PACKED
 from crazysim.engine.program import Leaf, Program, Segment, Slot
 
@@ -36,10 +37,10 @@ def as_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Progr
 
     Args:
         program: The program.
-        select: From the leaves that are written to those that become rows.
+        select: From the leaves that are written to those that become rows; random keys stay as they are.
     """
-    chosen = sorted(select(program.written))
     leaves = list(program.leaves)
+    chosen = [i for i in sorted(select(program.written)) if not is_key(leaves[i])]
     # The only drone of a world is all that the world has.
     kinds = {i: ("drone" if program.n_drones == 1 else leaves[i].scope, leaves[i].dtype) for i in chosen}
     places: dict[int, tuple[int, int, int]] = {}

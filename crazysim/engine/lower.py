@@ -87,8 +87,9 @@ class Lowering:
         Raises:
             UnsupportedError: If the operation is not defined for elements of these types.
         """
-        shape = np.broadcast_shapes(*(x.shape for x in args))
-        rows = [np.broadcast_to(x, shape).reshape(-1) for x in args]
+        shapes = {x.shape for x in args}
+        shape = args[0].shape if len(shapes) == 1 else np.broadcast_shapes(*shapes)
+        rows = [(x if x.shape == shape else np.broadcast_to(x, shape)).reshape(-1) for x in args]
         if not rows[-1].size:
             return np.empty(shape, object)
         first = [row[0] for row in rows]
@@ -155,7 +156,7 @@ def inputs(builder: Builder, aval: Any, zeros: frozenset[int] = frozenset()) -> 
     size = int(np.prod(aval.shape, dtype=int))
     if is_key(aval):
         return as_elements([(builder.input(np.uint32), builder.input(np.uint32)) for _ in range(size)], aval.shape)
-    if aval.dtype.name not in ops.DTYPES:
+    if aval.dtype not in ops.DTYPES:
         raise UnsupportedError(f"numbers of type {aval.dtype.name}")
     zero = known_zero(aval.dtype)
     items = [zero if k in zeros and zero is not None else builder.input(aval.dtype) for k in range(size)]

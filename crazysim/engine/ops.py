@@ -19,7 +19,7 @@ import numpy as np
 
 from crazysim.engine.errors import UnsupportedError
 
-DTYPES = frozenset("bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split())
+DTYPES = frozenset(map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split()))
 """Types of numbers. In half precision XLA keeps more digits where it fuses, so that no two engines could agree."""
 
 
@@ -73,7 +73,7 @@ EXPENSIVE = 2
 
 def unsupported(name: str, dtypes: Sequence[np.dtype], result: Any = bool) -> UnsupportedError | None:
     """Return the error of an operation that is not defined for operands and a result of these types, or None."""
-    other = next((x.name for x in (*dtypes, np.dtype(result)) if x.name not in DTYPES), None)
+    other = next((x.name for x in (*dtypes, np.dtype(result)) if x not in DTYPES), None)
     if other is not None:
         return UnsupportedError(f"numbers of type {other}")
     if TABLE[name].accepts(dtypes):
@@ -157,8 +157,18 @@ def bitcast(x: Any, dtype: Any) -> Any:
     return np.asarray(x).view(dtype)
 
 
+def _power(a: Any, b: Any) -> Any:
+    """Raise to a power; for an exponent of 0.5 NumPy takes the root, which differs at -inf and -0."""
+    root = (b == 0.5) & ((a == 0) | np.isneginf(a))
+    return np.where(root, np.abs(a), np.power(a, b))
+
+
 def _integer_pow(x: Any, y: int) -> Any:
     return x**y if y >= 0 else 1 / x**-y
+
+
+def _log_gamma(x: Any) -> Any:
+    return np.where(np.isinf(x), np.abs(x), _special("gammaln")(x))
 
 
 def _special(name: str) -> Callable[..., Any]:
@@ -263,11 +273,11 @@ def _rows() -> list[Row]:
         unary("asinh", np.arcsinh, 16, "asinh"),
         unary("acosh", np.arccosh, 16, "acosh"),
         unary("atanh", np.arctanh, 16, "atanh"),
-        binary("pow", np.power, "f", 16, casadi="power"),
+        binary("pow", _power, "f", 16, casadi="power"),
         unary("erf", _special("erf"), 16, "erf"),
         unary("erfc", _special("erfc"), 16, lambda ca, x: 1 - ca.erf(x)),
         unary("erf_inv", _special("erfinv"), 16, _casadi_erf_inv),
-        unary("lgamma", _special("gammaln"), 32),
+        unary("lgamma", _log_gamma, 32),
         unary("digamma", _digamma, 32),
     ]
     comparisons = [

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import os
 from collections.abc import Callable, Iterable
+from typing import Any
 
 from crazysim.engine import dump, ops
 from crazysim.engine.ir import (
@@ -21,6 +22,7 @@ from crazysim.engine.ir import (
     substitute,
 )
 from crazysim.engine.program import Program, Segment, Slot, UnfusedStage
+from crazysim.engine.simplify import constant_key, fold
 from crazysim.engine.verify import verify
 
 Pass = Callable[[Program], Program]
@@ -30,7 +32,7 @@ VERIFY = "CRAZYSIM_VERIFY"
 
 
 def apply(program: Program, passes: Iterable[Pass]) -> Program:
-    """Return a program after passes; each result is verified and dumped if requested by environment variables."""
+    """Return a program after some passes, verified and dumped after each where the environment variables say so."""
     _inspect(program, "lowered")
     for one in passes:
         program = one(program)
@@ -54,7 +56,8 @@ def fuse(program: Program) -> Program:
     kinds = itertools.groupby(program.segments, lambda s: (s.scope, s.phase) if isinstance(s, Segment) else id(s))
     for _, some in kinds:
         run = list(some)
-        segments += [_joined(run)] if isinstance(run[0], Segment) else run
+        joined = [s for s in run if isinstance(s, Segment)]
+        segments += [_joined(joined)] if joined else run
     return dataclasses.replace(program, segments=tuple(segments))
 
 
@@ -126,7 +129,7 @@ def _hoisted(segment: Segment, changing: set[Slot]) -> Segment:
 
 def _with_inverses(block: Block, fixed: set[Value]) -> Iterable[Operation]:
     """Yield the operations of a block, divisions by fixed numbers as products. ``fixed`` grows as they are taken."""
-    inverses: dict[Element, Element] = {}
+    inverses: dict[Any, Element] = {}
     for op in block.operations:
         if op.name != "div" or op.dtype.kind != "f":
             yield op
@@ -135,9 +138,10 @@ def _with_inverses(block: Block, fixed: set[Value]) -> Iterable[Operation]:
         if (not is_constant(b) and b not in fixed) or is_constant(a) or a in fixed:
             yield op
             continue
-        if b not in inverses:
-            one = constant(1, op.dtype)
-            inverses[b] = one / b if is_constant(b) else Value(op.dtype)
-            if not is_constant(b):
-                yield Operation("div", (one, b), (inverses[b],), stage=op.stage)
-        yield Operation("mul", (a, inverses[b]), op.results, stage=op.stage)
+        one, key = constant(1, op.dtype), constant_key(b) if is_constant(b) else b
+        if key not in inverses and is_constant(b):
+            inverses[key] = fold("div", (one, b), op.dtype, ())
+        elif key not in inverses:
+            inverses[key] = Value(op.dtype)
+            yield Operation("div", (one, b), (inverses[key],), stage=op.stage)
+        yield Operation("mul", (a, inverses[key]), op.results, stage=op.stage)

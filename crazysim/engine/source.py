@@ -15,7 +15,8 @@ from crazysim.engine import ops
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import Block, Element, Operation, Value, is_constant
 
-TYPES = {"float32": "f32", "float64": "f64", "int32": "i32", "uint32": "u32", "bool": "b1"}
+TYPES = {np.dtype(name): short for name, short in
+         {"float32": "f32", "float64": "f64", "int32": "i32", "uint32": "u32", "bool": "b1"}.items()}  # fmt: skip
 """Types of numbers, and what they are called in the source."""
 
 
@@ -27,7 +28,7 @@ def require(block: Block) -> None:
     """
     for op in block.walk():
         row = ops.TABLE[op.name]
-        other = next((x.dtype.name for x in (*op.args, *op.results) if x.dtype.name not in TYPES), None)
+        other = next((x.dtype.name for x in (*op.args, *op.results) if x.dtype not in TYPES), None)
         if other is not None:
             raise UnsupportedError(f"kernels have no numbers of type {other}", op.name, op.stage)
         if not row.source and not row.structured:
@@ -137,9 +138,9 @@ class Writer:
         name = self._carry(op, args, depth)
         carry = [f"{name}_{k}" for k in range(len(args))]
         self.line("for (;;) {", depth)
-        (goes_on,) = self.block(test, carry, depth + 1)
-        self.line(f"if (!any({goes_on})) break;", depth + 1)
-        self._assign(name, self.block(body, carry, depth + 1), goes_on, depth + 1)
+        (continues,) = self.block(test, carry, depth + 1)
+        self.line(f"if (!any({continues})) break;", depth + 1)
+        self._assign(name, self.block(body, carry, depth + 1), continues, depth + 1)
         self.line("}", depth)
 
     def _carry(self, op: Operation, start: Sequence[str], depth: int) -> str:
@@ -193,10 +194,10 @@ def type_name(dtype: Any) -> str:
     Raises:
         UnsupportedError: If it has no name there.
     """
-    name = np.dtype(dtype).name
-    if name not in TYPES:
-        raise UnsupportedError(f"numbers of type {name} have no source")
-    return TYPES[name]
+    dtype = np.dtype(dtype)
+    if dtype not in TYPES:
+        raise UnsupportedError(f"kernels have no numbers of type {dtype.name}")
+    return TYPES[dtype]
 
 
 def literal(x: np.generic) -> str:

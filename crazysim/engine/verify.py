@@ -111,7 +111,7 @@ def _verify_types(op: Operation) -> None:
     _require(op.name in ops.TABLE, f"operation {op.name!r} is not in the table")
     row, dtypes, results = ops.TABLE[op.name], [x.dtype for x in op.args], [x.dtype for x in op.results]
     text = f"operation {op.name!r} of {', '.join(map(str, dtypes))} to {', '.join(map(str, results))}"
-    _require(all(x.name in ops.DTYPES for x in (*dtypes, *results)), f"{text}: a type that the engine does not have")
+    _require(all(x in ops.DTYPES for x in (*dtypes, *results)), f"{text}: a type that the engine does not have")
     match op.name:
         case "when":
             (block,) = op.blocks

@@ -7,8 +7,8 @@ import pytest
 from cases import shared_sim
 from jax.extend.random import threefry2x32_p
 
-from crazysim.core.stage import stage
-from crazysim.engine import interpret, lanes
+from crazysim.core.stage import as_stages, stage
+from crazysim.engine import fused, interpret, lanes, native
 from crazysim.engine.build import build_program
 from crazysim.engine.lower import lower_function
 from crazysim.engine.program import Segment
@@ -46,7 +46,7 @@ def test_an_observer_gets_every_operation_with_its_results():
 def step():
     """Return the program of a built-in step, and leaves with what it reads as one array behind them."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
-    program = build_program(list(sim.step_fn.stages), sim.data, watched=lambda data: jax.tree.leaves(data.states))
+    program = build_program(as_stages(sim.step_pipeline), sim.data, watched=lambda data: jax.tree.leaves(data.states))
     leaves = jax.tree.leaves(sim.data)
     packed = jnp.concatenate([leaves[i].ravel() for i in program.packed])
     return program, [*leaves, packed]
@@ -93,7 +93,11 @@ def draw(data):
     return data.replace(plugins=data.plugins | {"own": new})
 
 
-@pytest.mark.parametrize("steps", [lanes.steps, interpret.steps])
+def _kernel(program, leaves, n_steps):
+    return jax.jit(lambda leaves: fused.build(program, "cpu")(leaves, n_steps))(leaves)
+
+
+@pytest.mark.parametrize("steps", [lanes.steps, interpret.steps, *([_kernel] if native.compiler() else [])])
 def test_a_stage_may_write_random_keys(steps):
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
     own = Own(jax.random.split(jax.random.key(5), (3, 2)), jnp.zeros((3, 2)))
@@ -103,5 +107,6 @@ def test_a_stage_may_write_random_keys(steps):
     written, _ = steps(program, jax.tree.leaves(data), 2)
     expected = draw(draw(data)).plugins["own"]
     found = dict(zip((program.leaves[i].name.split(".")[-1] for i in program.written), written, strict=True))
+    assert found["key"].dtype == expected.key.dtype
     np.testing.assert_array_equal(found["drawn"], expected.drawn)
     np.testing.assert_array_equal(jax.random.key_data(found["key"]), jax.random.key_data(expected.key))

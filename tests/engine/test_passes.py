@@ -165,6 +165,23 @@ def test_only_what_never_changes_is_hoisted():
     )
 
 
+def test_the_inverse_of_a_number_is_computed_once():
+    """Of zeros there are two, with inverses of their own."""
+
+    def body(b, x, shared):
+        quotients = [b.add("div", (x, y), np.float32) for y in (shared, np.float32(0.0), np.float32(-0.0))]
+        again = b.add("div", (quotients[0], shared), np.float32)
+        return [again, quotients[1], quotients[2]]
+
+    program = Program(LEAVES, 1, (segment("a", [X, SHARED], [X, Y, Z], body),))
+    (after,) = verify(passes.hoist(program)).segments
+    assert [x.name for x in after.hoisted.operations] == ["div"]
+    assert [x.name for x in after.block.operations] == ["mul"] * 4
+    numbers = {X: np.full(N_WORLDS, 3.0, np.float32), SHARED: np.float32(2.0)}
+    found = run(passes.hoist(program), numbers, 1)
+    assert [found[slot][0] for slot in (X, Y, Z)] == [0.75, np.inf, -np.inf]
+
+
 def test_what_is_cheap_is_computed_again_instead_of_kept():
     program = Program(LEAVES, 1, (segment("a", [X, SHARED], [X], lambda b, x, s: op("mul")(b, x, *op("neg")(b, s))),))
     assert passes.hoist(program).segments == program.segments

@@ -39,7 +39,7 @@ def _convert(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("select_n")
 def _select_n(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """One of two cases by a bool; of more by a number, each against the next."""
+    """Select one of two cases by a bool, or one of several by an integer."""
     which, *cases = args
     dtype, kind = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
     if np.dtype(kind).kind == "b":
@@ -54,6 +54,8 @@ def _select_n(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 @rule("bitcast_convert_type")
 def _bitcast(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     before, after = eqn.invars[0].aval.dtype, eqn.params["new_dtype"]
+    if before == after:
+        return args
     if before.itemsize != np.dtype(after).itemsize:
         raise UnsupportedError(f"primitive 'bitcast_convert_type' from {before} to {after}, of another size")
     return [ctx.elementwise("bitcast_convert_type", args, after)]
@@ -86,7 +88,7 @@ def _add_any(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("lt_to", "le_to", "eq_to")
 def _total_order(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Comparisons in which NaN is the largest number, and equal to itself."""
+    """Compare in an order in which NaN is the largest number, and equal to itself."""
     name = eqn.primitive.name.removesuffix("_to")
     if eqn.invars[0].aval.dtype.kind != "f":
         return [ctx.elementwise(name, args, bool)]
@@ -102,6 +104,13 @@ def _total_order(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements
 @rule("optimization_barrier")
 def _barrier(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     ctx.builder.barrier()
+    return args
+
+
+@rule("device_put")
+def _device_put(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    if any(device is not None for device in eqn.params["devices"]):
+        raise UnsupportedError("primitive 'device_put' to a device that is named")
     return args
 
 
@@ -160,7 +169,7 @@ def _leading_zeros(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elemen
 def _reduce_precision(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Round the mantissa to nearest even; what the exponent cannot hold becomes infinite, or a zero with its sign."""
     dtype, exponent, mantissa = eqn.outvars[0].aval.dtype, eqn.params["exponent_bits"], eqn.params["mantissa_bits"]
-    if dtype.name not in ops.DTYPES:
+    if dtype not in ops.DTYPES:
         raise UnsupportedError(f"numbers of type {dtype.name}")
     info, bits = np.finfo(dtype), _Bits(ctx, dtype)
     x = bits.of(args[0])

@@ -1,15 +1,16 @@
-"""Rules for indexing: a known index moves elements, one that is known at run time selects among all."""
+"""Rules for indexing: a known index moves elements, a computed one selects among all places that it may mean."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from jax.lax import GatherScatterMode
 
 from crazysim.engine.ir import Element, constant, is_constant
+from crazysim.engine.jaxcompat import ClosedJaxpr
 from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
 from crazysim.engine.rules.movement import move_many, run_now
 
@@ -23,7 +24,7 @@ def _dynamic_slice(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elemen
 
 
 def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> Elements:
-    """Return ``size`` elements along an axis from a start that is kept inside."""
+    """Return ``size`` elements along an axis from a start that is clamped to the array."""
     last = x.shape[axis] - size
     pieces = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
     if is_constant(start) or last == 0:
@@ -43,7 +44,7 @@ def _dynamic_update_slice(ctx: Lowering, eqn: Any, args: list[Elements]) -> list
     ranges = []
     for start, size, length in zip(starts, update.shape, x.shape, strict=True):
         last = length - size
-        ranges.append([int(np.clip(start, 0, last))] if is_constant(start) or not last else list(range(last + 1)))
+        ranges.append([last and int(np.clip(start, 0, last))] if not last or is_constant(start) else range(last + 1))
     _check_range(int(np.prod([len(options) for options in ranges])))
     out = x
     for corner in itertools.product(*ranges):
@@ -56,7 +57,7 @@ def _dynamic_update_slice(ctx: Lowering, eqn: Any, args: list[Elements]) -> list
 
 
 def _at(ctx: Lowering, index: Element, k: int, last: int) -> Elements:
-    """Return whether an index, kept inside 0 to ``last``, is ``k``."""
+    """Return True where an index, clamped to 0 to ``last``, is ``k``."""
     op = "le" if k == 0 else "ge" if k == last else "eq"
     return as_elements([ctx.scalar(op, index, constant(k, index.dtype), dtype=bool)], ())
 
@@ -77,7 +78,7 @@ def _select(ctx: Lowering, condition: Elements, yes: Elements, no: Elements) -> 
 def _check_range(n: int) -> None:
     if n > MAX_UNROLL:
         raise UnsupportedError(
-            f"an index that is known at run time only, into {n} places; selected from are up to {MAX_UNROLL}"
+            f"an index that is computed at run time, into {n} places; selected from are at most {MAX_UNROLL}"
         )
 
 
@@ -126,7 +127,7 @@ def _gather(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 
 def _gather_filled(eqn: Any, x: Elements, indices: np.ndarray) -> Elements:
-    """Gather at known places, some of which may lie outside: those are filled."""
+    """Gather at known places; those outside the array are filled."""
     numbers = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     (places,) = run_now(eqn, [numbers, indices], fill_value=-1)
     fill = eqn.params["fill_value"]
@@ -138,9 +139,9 @@ def _gather_filled(eqn: Any, x: Elements, indices: np.ndarray) -> Elements:
 def _fill_value(dtype: Any) -> Any:
     """Return the fill value of JAX: NaN, the smallest signed or the largest unsigned integer, True."""
     kind = np.dtype(dtype).kind
-    return (
-        np.nan if kind == "f" else np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max if kind == "u" else True
-    )
+    if kind == "f":
+        return np.nan
+    return np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max if kind == "u" else True
 
 
 def _inside(ctx: Lowering, row: Elements, limits: list[int]) -> Elements:
@@ -154,53 +155,75 @@ def _inside(ctx: Lowering, row: Elements, limits: list[int]) -> Elements:
 
 @rule("scatter", *(f"scatter{mark}{op}" for mark in "-_" for op in ("add", "sub", "mul", "min", "max")))
 def _scatter(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """``x.at[i].set(u)`` and its kin, one row of indices after the other."""
+    """Write windows of ``updates`` into the operand, one row of ``indices`` after the other.
+
+    A window whose place is computed at run time is compared with every place it may have. A window that is partly
+    outside is dropped as a whole, or moved inside in mode ``clip``, as XLA does.
+    """
     x, indices, updates = args
-    dims, mode = eqn.params["dimension_numbers"], eqn.params["mode"]
-    combine = {"add": "add", "sub": "sub", "mul": "mul", "min": "min", "max": "max"}.get(eqn.primitive.name[8:])
-    window = [axis for axis in range(updates.ndim) if axis in dims.update_window_dims]
-    sizes = [updates.shape[axis] for axis in window]
-    operand_axes = [a for a in range(x.ndim) if a not in (*dims.inserted_window_dims, *dims.operand_batching_dims)]
-    if dims.operand_batching_dims:
-        raise UnsupportedError(f"primitive {eqn.primitive.name!r} with batch axes")
-    size_of = dict.fromkeys(range(x.ndim), 1) | dict(zip(operand_axes, sizes, strict=True))
-    limits = [x.shape[axis] - size_of[axis] for axis in dims.scatter_dims_to_operand_dims]
-    rows = indices.reshape(-1, indices.shape[-1])
-    order = [axis for axis in range(updates.ndim) if axis not in window] + window
-    blocks = updates.transpose(order).reshape(len(rows), *sizes)
+    dims, clip = eqn.params["dimension_numbers"], eqn.params["mode"] == GatherScatterMode.CLIP
+    window_axes = dims.update_window_dims
+    row_axes = [axis for axis in range(updates.ndim) if axis not in window_axes]
+    collapsed = {*dims.inserted_window_dims, *dims.operand_batching_dims}
+    sizes = iter(updates.shape[axis] for axis in window_axes)
+    window = [1 if axis in collapsed else next(sizes) for axis in range(x.ndim)]
+    starts_of = dims.scatter_dims_to_operand_dims
+    limits = [x.shape[axis] - window[axis] for axis in starts_of]
+    blocks = updates.transpose(*row_axes, *window_axes)
     out = x.copy()
-    for row, block in zip(rows, blocks, strict=True):
-        unknown = [not is_constant(i) for i in row]
-        ranges = [range(m + 1) if u else [int(i)] for i, m, u in zip(row, limits, unknown, strict=True)]
-        _check_range(int(np.prod([len(options) for options in ranges])))
-        for corner in itertools.product(*ranges):
-            start = dict.fromkeys(range(x.ndim), 0) | dict(zip(dims.scatter_dims_to_operand_dims, corner, strict=True))
-            if mode == GatherScatterMode.CLIP:
-                start |= {a: int(np.clip(start[a], 0, m))
-                          for a, m in zip(dims.scatter_dims_to_operand_dims, limits, strict=True)}  # fmt: skip
-            elif any(not 0 <= k <= m for k, m in zip(corner, limits, strict=True)):
-                continue  # dropped
-            place = tuple(slice(start[a], start[a] + size_of[a]) for a in range(x.ndim))
+    for row in np.ndindex(indices.shape[:-1]):
+        start, block = indices[row], blocks[(*row, ...)]
+        options = [_options(i, limit, clip) for i, limit in zip(start, limits, strict=True)]
+        _check_range(int(np.prod([len(places) for places in options])))
+        corner = [0] * x.ndim
+        for axis, batch_axis in zip(dims.operand_batching_dims, dims.scatter_indices_batching_dims, strict=True):
+            corner[axis] = row[batch_axis]
+        for places in itertools.product(*options):
+            for axis, k in zip(starts_of, places, strict=True):
+                corner[axis] = k
+            here = _all(
+                ctx,
+                (
+                    _at(ctx, i, k, limit)
+                    if clip
+                    else as_elements([ctx.scalar("eq", i, constant(k, i.dtype), dtype=bool)], ())
+                    for i, k, limit in zip(start, places, limits, strict=True)
+                    if not is_constant(i) and not (clip and limit == 0)
+                ),
+            )
+            place = tuple(slice(k, k + size) for k, size in zip(corner, window, strict=True))
             old = out[place]
-            new = block.reshape(old.shape)
-            if combine is not None:
-                new = ctx.elementwise(combine, [old, new], eqn.outvars[0].aval.dtype)
-            clip = mode == GatherScatterMode.CLIP
-            tests = []
-            for i, k, m, u in zip(row, corner, limits, unknown, strict=True):
-                if u:
-                    equal = as_elements([ctx.scalar("eq", i, constant(k, i.dtype), dtype=bool)], ())
-                    tests.append(_at(ctx, i, k, m) if clip else equal)
-            here = _all(ctx, tests)
+            new = _combined(ctx, eqn, old, block.reshape(old.shape))
             out[place] = new if here is None else _select(ctx, here, new, old)
     return [out]
 
 
+def _options(index: Element, limit: int, clip: bool) -> Sequence[int]:
+    """Return the places that a window may have along an axis; none if it is known to be outside."""
+    if not is_constant(index):
+        return range(limit + 1)
+    if clip:
+        return [int(np.clip(int(index), 0, limit))]
+    return [int(index)] if 0 <= index <= limit else []
+
+
+def _combined(ctx: Lowering, eqn: Any, old: Elements, new: Elements) -> Elements:
+    """Return what a scatter writes where ``old`` was: ``new``, their sum and the like, or a function of ``old``."""
+    combination = eqn.params["update_jaxpr"]
+    if combination is None:
+        return new
+    called = ClosedJaxpr(combination, eqn.params["update_consts"])
+    pairs = zip(old.reshape(-1), new.reshape(-1), strict=True)
+    return as_elements(
+        [ctx.lower(called, [as_elements([a], ()), as_elements([b], ())])[0][()] for a, b in pairs], old.shape
+    )
+
+
 def known(x: Elements) -> bool:
-    """Return whether all elements are constants."""
+    """Return True where all elements are constants."""
     return all(map(is_constant, x.reshape(-1)))
 
 
 def values(x: Elements) -> np.ndarray:
     """Return known elements as numbers."""
-    return np.array([int(item) for item in x.reshape(-1)], np.int32).reshape(x.shape)
+    return np.array(x.reshape(-1).tolist(), x.reshape(-1)[0].dtype if x.size else np.int32).reshape(x.shape)

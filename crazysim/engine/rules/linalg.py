@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from crazysim.engine.ir import constant
 from crazysim.engine.lower import Elements, Lowering, UnsupportedError, as_elements, rule
 
 LARGEST_SYSTEM = 6
-"""Largest matrix that is factorised; beyond it the written-out arithmetic is longer than a drone's step."""
+"""Largest matrix that is factorised; beyond it the unrolled arithmetic is longer than the rest of a step."""
 
 
 def _check_size(eqn: Any, n: int) -> None:
@@ -24,18 +25,23 @@ def _matrices(x: Elements) -> list[Elements]:
 
 @rule("cholesky")
 def _cholesky(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Return the lower factor; all of it is NaN if the matrix is not positive definite, as in LAPACK."""
     n, dtype = args[0].shape[-1], eqn.outvars[0].aval.dtype
     _check_size(eqn, n)
     zero = constant(0, dtype)
     out = []
     for a in _matrices(args[0]):
-        low = np.full((n, n), zero, object)
+        low, fails = np.full((n, n), zero, object), constant(False, bool)
         for j in range(n):
             for i in range(j, n):
                 rest = a[i, j]
                 for k in range(j):
                     rest = ctx.scalar("sub", rest, ctx.scalar("mul", low[i, k], low[j, k]))
                 low[i, j] = ctx.builder.add("sqrt", (rest,), dtype) if i == j else ctx.scalar("div", rest, low[j, j])
+                if i == j:
+                    fails = ctx.scalar("or", fails, ctx.scalar("le", rest, zero, dtype=bool))
+        for j, i in itertools.combinations_with_replacement(range(n), 2):
+            low[i, j] = ctx.scalar("select_n", fails, low[i, j], constant(np.nan, dtype))
         out.append(low)
     return [as_elements([x for low in out for x in low.reshape(-1)], args[0].shape)]
 
@@ -69,11 +75,12 @@ def _substitute(ctx: Lowering, a: Elements, b: Elements, lower: bool, unit: bool
 
 @rule("lu")
 def _lu(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Gauss with the largest pivot of each column, rows exchanged by selection."""
+    """Eliminate with the largest pivot of each column; rows are exchanged by selection."""
     n, m = args[0].shape[-2:]
     if n != m:
         raise UnsupportedError("primitive 'lu' of a matrix that is not square")
     _check_size(eqn, n)
+    zero = constant(0, eqn.outvars[0].aval.dtype)
     factors, all_pivots, permutations = [], [], []
     for a in _matrices(args[0]):
         a = a.copy()
@@ -91,8 +98,10 @@ def _lu(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
                 here = ctx.scalar("eq", pivot, constant(i, np.int32), dtype=bool)
                 for x in (*a.T, rows):  # every column, and the list of rows
                     x[i], x[j] = ctx.scalar("select_n", here, x[i], x[j]), ctx.scalar("select_n", here, x[j], x[i])
+            is_zero = ctx.scalar("eq", a[j, j], zero, dtype=bool)  # then the column is zero, and stays
+            divisor = ctx.scalar("select_n", is_zero, a[j, j], constant(1, a[j, j].dtype))
             for i in range(j + 1, n):
-                a[i, j] = ctx.scalar("div", a[i, j], a[j, j])
+                a[i, j] = ctx.scalar("div", a[i, j], divisor)
                 for k in range(j + 1, n):
                     a[i, k] = ctx.scalar("sub", a[i, k], ctx.scalar("mul", a[i, j], a[j, k]))
         factors.append(a)

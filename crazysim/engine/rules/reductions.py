@@ -32,21 +32,36 @@ def _reduce(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     ]
 
 
+@rule("reduce")
+def _reduce_by(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Reduce by a function of accumulated and new operands, beginning with initial values."""
+    axes, n = eqn.params["dimensions"], len(args) // 2
+    arrays = [np.moveaxis(x, axes, range(len(axes))) for x in args[:n]]
+    rest = arrays[0].shape[len(axes) :]
+    rows = [x.reshape(-1, *rest) for x in arrays]
+    results = [np.empty(rest, object) for _ in arrays]
+    for place in np.ndindex(rest):
+        reduced = args[n:]
+        for k in range(len(rows[0])):
+            reduced = ctx.lower(eqn.params["jaxpr"], [*reduced, *(x[(k, *place, ...)] for x in rows)])
+        for result, value in zip(results, reduced, strict=True):
+            result[place] = value[()]
+    return results
+
+
 @rule("cumsum", "cumprod", "cummax", "cummin")
 def _cumulate(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     op = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}[eqn.primitive.name]
     x = np.moveaxis(args[0], eqn.params["axis"], 0).copy()
     order = range(len(x))[::-1] if eqn.params["reverse"] else range(len(x))
     for last, i in itertools.pairwise(order):
-        x[i] = ctx.elementwise(op, [np.asarray(x[last], object), np.asarray(x[i], object)], eqn.outvars[0].aval.dtype)[
-            ()
-        ]
+        x[i, ...] = ctx.elementwise(op, [x[last, ...], x[i, ...]], eqn.outvars[0].aval.dtype)
     return [np.moveaxis(x, 0, eqn.params["axis"])]
 
 
 @rule("argmax", "argmin")
 def _argmax(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """The first of the best, or the first NaN, as XLA has it."""
+    """Return the index of the first extreme element, or of the first NaN, as XLA does."""
     (axis,), index = eqn.params["axes"], eqn.params["index_dtype"]
     better = "gt" if eqn.primitive.name == "argmax" else "lt"
     rows = [np.asarray(row, object) for row in np.moveaxis(args[0], axis, 0)]
@@ -64,41 +79,81 @@ def _argmax(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("sort")
 def _sort(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Odd-even transposition: neighbours change places, which keeps the order of equals. NaN goes last."""
-    axis, n_keys = eqn.params["dimension"], eqn.params["num_keys"]
-    dtypes = [v.aval.dtype for v in eqn.invars]
+    return _sorted(ctx, eqn, args, eqn.params["dimension"], eqn.params["num_keys"])
+
+
+@rule("top_k")
+def _top_k(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Return the largest in descending order, of equal ones the first.
+
+    XLA orders floats by their bits: -NaN, -inf, ..., -0, 0, ..., inf, NaN.
+    """
+    (x,), k, axis, dtype = args, eqn.params["k"], eqn.params["axis"], eqn.invars[0].aval.dtype
+    numbers = np.arange(x.shape[axis]).reshape([-1 if i == axis else 1 for i in range(x.ndim)])
+    places = constants(np.broadcast_to(numbers, x.shape), np.int32)
+    key = x
+    if dtype.kind == "f":  # the bits are in order but for negative numbers, of which the larger have the larger bits
+        whole = np.dtype(f"i{dtype.itemsize}")
+        key = ctx.elementwise("bitcast_convert_type", [x], whole)
+        turned = ctx.elementwise("xor", [key, constants(np.iinfo(whole).max, whole)], whole)
+        negative = ctx.elementwise("lt", [key, constants(0, whole)], bool)
+        key = ctx.elementwise("select_n", [negative, key, turned], whole)
+    columns = _sorted(ctx, eqn, [key, x, places], axis, 1, descending=True)
+    return [np.take(y, range(k), axis) for y in columns[1:]]
+
+
+def _sorted(
+    ctx: Lowering, eqn: Any, args: list[Elements], axis: int, n_keys: int, descending: bool = False
+) -> list[Elements]:
+    """Sort by odd-even transposition: it only exchanges neighbours, so it is stable. NaN goes last.
+
+    Args:
+        ctx: Takes the operations.
+        eqn: The operation, for messages.
+        args: Keys, then what is sorted with them.
+        axis: Axis to sort along.
+        n_keys: How many of the operands are keys.
+        descending: True for the largest first, which the keys must then be numbers without NaN for.
+    """
     columns = [np.moveaxis(x, axis, 0).copy() for x in args]
     n = len(columns[0])
     if n > MAX_UNROLL:
-        raise UnsupportedError(f"primitive 'sort' of {n} elements; at most {MAX_UNROLL} are unrolled")
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of {n} elements; at most {MAX_UNROLL} are unrolled")
     for turn in range(n):
         for i in range(turn % 2, n - 1, 2):
-            first = [np.asarray(c[i], object) for c in columns]
-            second = [np.asarray(c[i + 1], object) for c in columns]
-            swap, tied = constants(False, bool), constants(True, bool)
-            for a, b, dtype in zip(first[:n_keys], second[:n_keys], dtypes, strict=False):
-                above = ctx.elementwise("lt", [b, a], bool)
-                equal = ctx.elementwise("eq", [a, b], bool)
-                if dtype.kind == "f":
-                    a_nan, b_nan = ctx.elementwise("ne", [a, a], bool), ctx.elementwise("ne", [b, b], bool)
-                    above = ctx.elementwise(
-                        "or",
-                        [above, ctx.elementwise("and", [a_nan, ctx.elementwise("not", [b_nan], bool)], bool)],
-                        bool,
-                    )
-                    equal = ctx.elementwise("or", [equal, ctx.elementwise("and", [a_nan, b_nan], bool)], bool)
-                swap = ctx.elementwise("or", [swap, ctx.elementwise("and", [tied, above], bool)], bool)
-                tied = ctx.elementwise("and", [tied, equal], bool)
-            for c, a, b, dtype in zip(columns, first, second, dtypes, strict=True):
-                c[i] = ctx.elementwise("select_n", [swap, a, b], dtype)[()]
-                c[i + 1] = ctx.elementwise("select_n", [swap, b, a], dtype)[()]
+            first = [c[i, ...].copy() for c in columns]
+            second = [c[i + 1, ...].copy() for c in columns]
+            low, high = (first, second) if descending else (second, first)
+            swap = _precedes(ctx, low[:n_keys], high[:n_keys]) if first[0].size else constants(False, bool)
+            for c, a, b in zip(columns, first, second, strict=True):
+                if a.size:
+                    dtype = a.reshape(-1)[0].dtype
+                    c[i, ...] = ctx.elementwise("select_n", [swap, a, b], dtype)
+                    c[i + 1, ...] = ctx.elementwise("select_n", [swap, b, a], dtype)
     return [np.moveaxis(c, 0, axis) for c in columns]
+
+
+def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Elements]) -> Elements:
+    """Return where the first of two sets of keys precedes the second in ascending order, in which NaN is last."""
+    before, tied = constants(False, bool), constants(True, bool)
+    for a, b in zip(first, second, strict=True):
+        less, equal = ctx.elementwise("lt", [a, b], bool), ctx.elementwise("eq", [a, b], bool)
+        if a.reshape(-1)[0].dtype.kind == "f":
+            a_nan, b_nan = ctx.elementwise("ne", [a, a], bool), ctx.elementwise("ne", [b, b], bool)
+            only_b = ctx.elementwise("and", [b_nan, ctx.elementwise("not", [a_nan], bool)], bool)
+            less = ctx.elementwise("or", [less, only_b], bool)
+            equal = ctx.elementwise("or", [equal, ctx.elementwise("and", [a_nan, b_nan], bool)], bool)
+        before = ctx.elementwise("or", [before, ctx.elementwise("and", [tied, less], bool)], bool)
+        tied = ctx.elementwise("and", [tied, equal], bool)
+    return before
 
 
 @rule("dot_general")
 def _dot(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     (lhs_axes, rhs_axes), (lhs_batch, rhs_batch) = eqn.params["dimension_numbers"]
     dtype, (a, b) = eqn.outvars[0].aval.dtype, args
+    if any(v.aval.dtype.kind == "f" for v in eqn.invars) and dtype.kind != "f":
+        raise UnsupportedError(f"primitive 'dot_general' of floating-point numbers with a result of type {dtype}")
 
     def arranged(x: Elements, batch: Sequence[int], summed: Sequence[int]) -> tuple[Elements, tuple[int, ...]]:
         free = [i for i in range(x.ndim) if i not in (*batch, *summed)]

@@ -47,8 +47,8 @@ template <> struct is_lanes<i32v> { static const bool value = true; typedef i32 
 template <> struct is_lanes<u32v> { static const bool value = true; typedef u32 one; };
 template <> struct is_lanes<b1v> { static const bool value = true; typedef b1 one; };
 template <class... T> struct any_lanes { static const bool value = (is_lanes<T>::value || ...); };
-FN f32v lift(f32 x) { return f32v{} + x; }
-FN f64v lift(f64 x) { return f64v{} + x; }
+FN f32v lift(f32 x) { return x - f32v{}; }  // a sum would lose the sign of -0.0
+FN f64v lift(f64 x) { return x - f64v{}; }
 FN i32v lift(i32 x) { return i32v{} + x; }
 FN u32v lift(u32 x) { return u32v{} + x; }
 FN b1v lift(b1 x) { return {i32v{} - i32(x)}; }

@@ -1,0 +1,367 @@
+"""Differential fuzzer of the engines: random programs must give on every engine what they give on ``plain``.
+
+    python tests/engine/fuzz.py --programs 20000 --seed 1
+
+Programs (``programs``) are drawn at random, each becomes a stage of one drone or of one world, and many stages make a
+step, so that compilers are called once for all of them. Every value of every program is written to a record and
+compared, on inputs that hold zeros of both signs, ties, huge and tiny numbers, infinities and NaN.
+
+Integers, bools and moved numbers must be equal; what rounding explains is in ``rounding``. As a difference grows in
+the lines that follow, a value is compared with what JAX makes of the operands that the engine itself found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import dataclasses
+import functools
+import os
+import re
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+if __name__ == "__main__":  # the environment must be set before JAX is imported
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    import compiling
+
+    os.environ.update(compiling.environment(os.environ))
+    os.environ["XLA_FLAGS"] += " --xla_disable_hlo_passes=algsimp"  # it takes NaN times False for zero
+    os.environ["CXXFLAGS"] = f"{os.environ.get('CXXFLAGS', '')} -O0"
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from programs import Program, draw, evaluate, kept
+from rounding import close, explained, keeps_sign_of_zero
+
+from crazysim import Sim
+from crazysim.core.stage import Stage, as_stages, stage
+from crazysim.engine import Step, native
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.lower_stages import lower_stages
+from crazysim.engine.source import require
+from crazysim.pytree import PyTree, leaf
+
+N_WORLDS, N_DRONES = 36, 2
+COMPARED = tuple(e for e in ("lanes", "interpret", "fused") if e != "fused" or native.compiler())
+
+
+class Given(PyTree):
+    """Inputs of the programs, by the letter of their type and their shape."""
+
+    numbers: dict = leaf("drone", 0)
+    """Scalars. ()"""
+    vectors: dict = leaf("drone", 1)
+    """Vectors. (n,)"""
+    matrices: dict = leaf("drone", 2)
+    """Matrices. (n, m)"""
+
+
+class Results(PyTree):
+    """Values of the programs, those of floating point and the others."""
+
+    drone: dict = leaf("drone", 1)
+    """Of stages of one drone. (n,)"""
+    world: dict = leaf("world", 1)
+    """Of stages of one world. (n,)"""
+
+
+SHAPES = {"f": [(), (3,), (4,), (2, 3), (3, 3)], "i": [(), (3,), (2, 3)], "u": [(), (3,)], "b": [(), (3,)]}
+DTYPES = {"f": np.float32, "i": np.int32, "u": np.uint32, "b": np.bool_}
+SPECIAL = np.float32(
+    [0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 2.0, np.nan, np.inf, -np.inf, 1e-3, 1e30, -1e30, 1e-30, 8e37, 89.0, -104.0,
+     8388609.0, -2147483648.0, 4294967296.0, 1.5, -2.5, 1.1754944e-38, 1e5, 0.99999994]
+)  # fmt: skip
+
+
+def given(rng: np.random.Generator) -> Given:
+    """Return inputs: ordinary numbers in a third of the worlds, ties in the next, special numbers in the last."""
+    fields: list[dict[str, Any]] = [{}, {}, {}]
+    for letter, shapes in SHAPES.items():
+        for shape in shapes:
+            size = (N_WORLDS, N_DRONES, *shape)
+            if letter == "f":
+                options = [rng.uniform(-3, 3, size), rng.integers(-4, 5, size) / 2, rng.choice(SPECIAL, size)]
+            elif letter == "b":
+                options = [rng.integers(0, 2, size)] * 3
+            else:
+                low, extremes = (
+                    (0, [0, 1, 31, 32, 2**32 - 1, 2**31]) if letter == "u" else (-3, [-(2**31), 2**31 - 1, -1, 0, 33])
+                )
+                options = [rng.integers(low, 9, size), rng.integers(low, 3, size), rng.choice(np.array(extremes), size)]
+            third = np.arange(N_WORLDS) * 3 // N_WORLDS
+            x = np.choose(third.reshape(-1, *([1] * (len(size) - 1))), options)
+            fields[len(shape)][letter + "".join(map(str, shape))] = jnp.asarray(x.astype(DTYPES[letter]))
+    return Given(*fields)
+
+
+def flat(g: Given) -> dict[str, Any]:
+    """Return inputs by name."""
+    return {**g.numbers, **g.vectors, **g.matrices}
+
+
+def inputs_of(scope: str) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return shapes and types that a program sees: those of one drone, or of one world."""
+    lead = () if scope == "drone" else (N_DRONES,)
+    return {
+        letter + "".join(map(str, s)): jax.ShapeDtypeStruct((*lead, *s), DTYPES[letter])
+        for letter, shapes in SHAPES.items()
+        for s in shapes
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A program as a stage."""
+
+    program: Program
+    scope: str
+
+    @property
+    def avals(self) -> list[jax.ShapeDtypeStruct]:
+        """Shapes and types of all values."""
+        return jax.eval_shape(self.program.values, inputs_of(self.scope))
+
+    def stage(self, name: str) -> Stage:
+        """Return a stage that writes all values of the program under a name."""
+
+        def write(data: Any) -> Any:
+            results = data.plugins["results"]
+            floats, others = packed(self.program.values(flat(data.plugins["given"])), len(self.program.inputs))
+            new = getattr(results, self.scope) | {f"{name}f": floats, f"{name}o": others}
+            return data.replace(plugins=data.plugins | {"results": results.replace(**{self.scope: new})})
+
+        return Stage(write, self.scope, name=name)
+
+    def blank(self, name: str) -> dict[str, Any]:
+        """Return the slots that the stage writes to, of all worlds."""
+        floats, others = jax.eval_shape(
+            lambda g: packed(self.program.values(g), len(self.program.inputs)), inputs_of(self.scope)
+        )
+        batch = (N_WORLDS, N_DRONES if self.scope == "drone" else 1)
+        return {
+            f"{name}f": jnp.zeros((*batch, *floats.shape), np.float32),
+            f"{name}o": jnp.zeros((*batch, *others.shape), np.int32),
+        }
+
+    def unpacked(self, floats: np.ndarray, others: np.ndarray) -> list[np.ndarray]:
+        """Return the values of the lines from slots, of all worlds."""
+        values, at = [], [0, 0]
+        for aval in self.avals[len(self.program.inputs) :]:
+            k = 0 if jnp.issubdtype(aval.dtype, jnp.floating) else 1
+            part = (floats, others)[k][..., at[k] : at[k] + aval.size]
+            at[k] += aval.size
+            part = part.view(np.uint32) if aval.dtype == np.uint32 else part
+            values.append(part.reshape(-1, *aval.shape).astype(aval.dtype))
+        return values
+
+
+def packed(values: Sequence[Any], n_inputs: int) -> tuple[Any, Any]:
+    """Return the values behind the inputs as one vector of floats and one of integers."""
+    floats, others = [jnp.zeros(0, np.float32)], [jnp.zeros(0, np.int32)]
+    for x in values[n_inputs:]:
+        x = jnp.ravel(x)
+        if jnp.issubdtype(x.dtype, jnp.floating):
+            floats.append(x.astype(np.float32))
+        else:
+            others.append(lax.bitcast_convert_type(x, np.int32) if x.dtype == np.uint32 else x.astype(np.int32))
+    return jnp.concatenate(floats), jnp.concatenate(others)
+
+
+@stage("drone")
+def turned(data: Any) -> Any:
+    """Turn the vectors round, so that they are not the same at every step; engines hoist what is."""
+    given = data.plugins["given"]
+    vectors = {name: x[::-1] for name, x in given.vectors.items()}
+    return data.replace(plugins=data.plugins | {"given": given.replace(vectors=vectors)})
+
+
+@dataclasses.dataclass
+class Find:
+    """A program that an engine gets wrong."""
+
+    case: Case
+    engine: str
+    what: str
+
+    def __str__(self) -> str:
+        """Return the program and what is wrong with it."""
+        return f"--- {self.engine}, one {self.case.scope}: {self.what}\n{self.case.program}"
+
+
+class Fuzzer:
+    """Runs programs on all engines and counts."""
+
+    def __init__(self, seed: int, engines: Sequence[str] = COMPARED):
+        """Draw the inputs of all programs.
+
+        Args:
+            seed: Seed of inputs and programs.
+            engines: Engines that are compared with ``plain``.
+        """
+        self.engines = tuple(engines)
+        self.rng = np.random.default_rng(seed)
+        sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="rotor_vel")
+        self.given = given(self.rng)
+        self.data = sim.data
+        self.counts: collections.Counter[str] = collections.Counter()
+        self.refused: collections.Counter[str] = collections.Counter()
+
+    def draw(self, n: int) -> list[Case]:
+        """Return random programs."""
+        cases = []
+        for _ in range(n):
+            scope = "drone" if self.rng.random() < 0.8 else "world"
+            cases.append(Case(draw(self.rng, inputs_of(scope), int(self.rng.integers(1, 5))), scope))
+        return cases
+
+    def check(self, cases: Sequence[Case]) -> Iterator[Find]:
+        """Run programs on all engines, and yield what is wrong."""
+        self.counts["programs"] += len(cases)
+        yield from self._check(list(cases))
+
+    def _check(self, cases: list[Case]) -> Iterator[Find]:
+        if not cases:
+            return
+        data, stages = self._step_of(cases)
+        try:
+            program = lower_stages(as_stages(stages), data)
+        except Exception as error:
+            if len(cases) == 1:
+                yield Find(cases[0], "lowering", f"{type(error).__name__}: {error}")
+            else:
+                yield from self._check(cases[: len(cases) // 2])
+                yield from self._check(cases[len(cases) // 2 :])
+            return
+        refused = {unfused.name: unfused.error.reason for unfused in program.unfused_stages}
+        if refused:
+            self.counts["refused"] += len(refused)
+            self.refused.update(refused.values())
+            yield from self._check([case for k, case in enumerate(cases) if f"p{k}" not in refused])
+            return
+        if "fused" in self.engines:
+            try:
+                for segment in program.fused_segments:
+                    require(segment.block)
+            except UnsupportedError as error:
+                (no_source,) = [case for k, case in enumerate(cases) if f"p{k}" == error.stage]
+                self.counts["without source"] += 1
+                self.refused[error.reason] += 1
+                yield from self._check([case for case in cases if case is not no_source])
+                yield from self._compare([no_source], tuple(e for e in self.engines if e != "fused"))
+                return
+        yield from self._compare(cases, self.engines)
+
+    def _step_of(self, cases: Sequence[Case]) -> tuple[Any, dict[str, Stage]]:
+        stages = {f"p{k}": case.stage(f"p{k}") for k, case in enumerate(cases)} | {"turned": turned}
+        slots: dict[str, dict[str, Any]] = {"drone": {}, "world": {}}
+        for k, case in enumerate(cases):
+            slots[case.scope] |= case.blank(f"p{k}")
+        plugins = {"given": self.given, "results": Results(**slots)}
+        return self.data.replace(plugins=plugins), stages
+
+    def run(self, cases: Sequence[Case], engine: str) -> list[list[np.ndarray]]:
+        """Return the values of programs on an engine."""
+        data, stages = self._step_of(cases)
+        results = Step(stages, engine)(data).plugins["results"]
+        slots = {k: np.asarray(x) for k, x in {**results.drone, **results.world}.items()}
+        return [case.unpacked(slots[f"p{k}f"], slots[f"p{k}o"]) for k, case in enumerate(cases)]
+
+    def _compare(self, cases: Sequence[Case], engines: Sequence[str]) -> Iterator[Find]:
+        found: dict[str, list[list[np.ndarray]]] = {}
+        for engine in ("plain", *engines):
+            try:
+                start = time.perf_counter()
+                found[engine] = self.run(cases, engine)
+                self.counts[f"ms {engine}"] += int(1e3 * (time.perf_counter() - start))
+            except Exception as error:
+                if len(cases) == 1 and engine == "plain":
+                    self.counts["refused by JAX"] += 1
+                elif len(cases) == 1:
+                    yield Find(cases[0], engine, f"{type(error).__name__}: {str(error)[:2000]}")
+                else:
+                    half = len(cases) // 2
+                    yield from self._compare(cases[:half], engines)
+                    yield from self._compare(cases[half:], engines)
+                return
+        for k, case in enumerate(cases):
+            for engine in engines:
+                self.counts[f"compared on {engine}"] += 1
+                find = self._first_difference(case, engine, found["plain"][k], found[engine][k])
+                if find is None:
+                    continue
+                yield find
+                break
+
+    def _first_difference(self, case: Case, engine: str, plain: list[Any], other: list[Any]) -> Find | None:
+        """Return the first value that differs for no good reason."""
+        n = len(case.program.inputs)
+        inputs = [self._lanes(case.scope, name) for name in case.program.inputs]
+        for j, (a, b) in enumerate(zip(plain, other, strict=True)):
+            line = functools.partial(_of_values, case.program.lines[j])
+            signed = keeps_sign_of_zero(line, case.avals[: n + j])
+            bad = ~close(a, b, signed)
+            lanes = np.flatnonzero(bad.reshape(len(a), -1).any(1))
+            # A compiler may compute an operand once more and round it differently, so the inputs are tried as well.
+            whole = functools.partial(_of_inputs, case.program, n + j)
+            for fn, operands in ((line, [*inputs, *other[:j]]), (whole, inputs)):
+                if len(lanes):
+                    self.counts["examined for rounding"] += 1
+                    lanes = lanes[~explained(fn, [x[lanes] for x in operands], b[lanes], signed)]
+            if len(lanes):
+                values = {f"v{k}": x[lanes[0]] for k, x in enumerate([*inputs, *other[:j]])}
+                text = case.program.lines[j]
+                shown = ", ".join(f"{name}={_text(x)}" for name, x in values.items() if re.search(rf"\b{name}\b", text))
+                what = f"{text} with {shown}: plain {_text(a[lanes[0]])}, {engine} {_text(b[lanes[0]])}"
+                return Find(Case(kept(case.program, n + j), case.scope), engine, f"{what} ({len(lanes)} lanes)")
+        return None
+
+    def _lanes(self, scope: str, name: str) -> np.ndarray:
+        x = np.asarray(flat(self.given)[name])
+        return x.reshape(-1, *x.shape[2:]) if scope == "drone" else x
+
+
+def _of_values(line: str, *values: Any) -> Any:
+    return evaluate(line, values)
+
+
+def _of_inputs(program: Program, k: int, *inputs: Any) -> Any:
+    return program.values(dict(zip(program.inputs, inputs, strict=True)))[k]
+
+
+def _text(x: Any) -> str:
+    x = np.asarray(x)
+    return np.array2string(x.astype(np.float32) if x.dtype.kind == "V" else x, separator=",", precision=9).replace(
+        "\n", ""
+    )
+
+
+def main() -> None:
+    """Run the fuzzer from the command line."""
+    parser = argparse.ArgumentParser(description="Compare the engines on random programs.")
+    parser.add_argument("--programs", type=int, default=1000, help="number of programs")
+    parser.add_argument("--seed", type=int, default=0, help="seed of programs and inputs")
+    parser.add_argument("--batch", type=int, default=40, help="programs that are compiled together")
+    args = parser.parse_args()
+    fuzzer, start, n_finds = Fuzzer(args.seed), time.perf_counter(), 0
+    for done in range(0, args.programs, args.batch):
+        for find in fuzzer.check(fuzzer.draw(min(args.batch, args.programs - done))):
+            n_finds += 1
+            print(find, flush=True)
+        print(
+            f"# {fuzzer.counts['programs']} programs, {n_finds} finds, {time.perf_counter() - start:.0f} s", flush=True
+        )
+        jax.clear_caches()
+    for why, n in fuzzer.refused.most_common():
+        print(f"# refused {n}: {why}")
+    print(f"# {args.programs} programs, seed {args.seed}, {n_finds} finds; {dict(fuzzer.counts)}")
+    sys.exit(bool(n_finds))
+
+
+if __name__ == "__main__":
+    main()
