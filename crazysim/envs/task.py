@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 from jax import Array
 
 from crazysim.core.data import SimData
+from crazysim.core.plugin import FunctionPlugin, Placement
 from crazysim.envs.state import Obs
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
@@ -58,6 +59,16 @@ class Task:
 
     def install(self, sim: Sim) -> None:
         """Put into a simulation what the task needs: objects, a record, stages. Call it once, before ``DroneEnv``."""
+
+    def add_record(self, sim: Sim, record: PyTree, placements: Sequence[Placement] = ()) -> None:
+        """Add the task's record, for all worlds, and stages that update it; for use in ``install``.
+
+        Args:
+            sim: The simulation.
+            record: The record, for ``data.plugins["task"]``.
+            placements: Stages with their places in the step, such as ``Placement(stage, before="increment_steps")``.
+        """
+        sim.add(FunctionPlugin(NAME, record, placements))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return the data at the start of an episode, goals included.

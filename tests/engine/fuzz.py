@@ -6,11 +6,8 @@ Programs (``programs``) are drawn at random, each becomes a stage of one drone o
 step, so that compilers are called once for all of them. Every value of every program is written to a record and
 compared, on inputs that hold zeros of both signs, ties, huge and tiny numbers, infinities and NaN.
 
-Integers, truth values and moved numbers must be equal. Numbers that were rounded may differ by a few units in the last
-place: XLA and the host's library approximate functions differently, and compilers contract a product and a sum. Such a
-difference grows in the lines that follow, so a value that differs is computed once more by JAX from the operands that
-the engine itself found, with these disturbed by a few units in the last place: the value must lie among the results,
-to within rounding of the largest intermediate. What remains is a find.
+Integers, bools and moved numbers must be equal; what rounding explains is in ``rounding``. As a difference grows in
+the lines that follow, a value is compared with what JAX makes of the operands that the engine itself found.
 """
 
 from __future__ import annotations
@@ -18,13 +15,14 @@ from __future__ import annotations
 import argparse
 import collections
 import dataclasses
+import functools
 import os
+import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 if __name__ == "__main__":  # the environment must be set before JAX is imported
     sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -39,22 +37,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from programs import Program, draw, evaluate, kept
+from rounding import close, explained, keeps_sign_of_zero
 
 from crazysim import Sim
-from crazysim.core.stage import Stage, stage
-from crazysim.engine import Step, interpret, native
-from crazysim.engine.step import ENGINES
-from crazysim.errors import ConfigError
+from crazysim.core.stage import Stage, as_stages, stage
+from crazysim.engine import Step, native
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.lower_stages import lower_stages
+from crazysim.engine.source import require
 from crazysim.pytree import PyTree, leaf
 
 N_WORLDS, N_DRONES = 36, 2
-EPS = float(np.finfo(np.float32).eps)
-TINY = float(np.finfo(np.float32).tiny)
-UNITS = 16
-"""Units in the last place by which functions of two libraries may differ."""
-SAMPLES = 24
-"""Disturbed operands for each value that is looked at again."""
-
 COMPARED = tuple(e for e in ("lanes", "interpret", "fused") if e != "fused" or native.compiler())
 
 
@@ -82,7 +75,7 @@ SHAPES = {"f": [(), (3,), (4,), (2, 3), (3, 3)], "i": [(), (3,), (2, 3)], "u": [
 DTYPES = {"f": np.float32, "i": np.int32, "u": np.uint32, "b": np.bool_}
 SPECIAL = np.float32(
     [0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 2.0, np.nan, np.inf, -np.inf, 1e-3, 1e30, -1e30, 1e-30, 8e37, 89.0, -104.0,
-     8388609.0, -2147483648.0, 4294967296.0, 1.5, -2.5, TINY, 1e5, 0.99999994]
+     8388609.0, -2147483648.0, 4294967296.0, 1.5, -2.5, 1.1754944e-38, 1e5, 0.99999994]
 )  # fmt: skip
 
 
@@ -143,7 +136,7 @@ class Case:
             new = getattr(results, self.scope) | {f"{name}f": floats, f"{name}o": others}
             return data.replace(plugins=data.plugins | {"results": results.replace(**{self.scope: new})})
 
-        return _named(stage(self.scope)(write), name)
+        return Stage(write, self.scope, name=name)
 
     def blank(self, name: str) -> dict[str, Any]:
         """Return the slots that the stage writes to, of all worlds."""
@@ -166,12 +159,6 @@ class Case:
             part = part.view(np.uint32) if aval.dtype == np.uint32 else part
             values.append(part.reshape(-1, *aval.shape).astype(aval.dtype))
         return values
-
-
-def _named(stage: Stage, name: str) -> Stage:
-    """Return a stage under a name."""
-    stage.__name__ = name
-    return stage
 
 
 def packed(values: Sequence[Any], n_inputs: int) -> tuple[Any, Any]:
@@ -210,8 +197,14 @@ class Find:
 class Fuzzer:
     """Runs programs on all engines and counts."""
 
-    def __init__(self, seed: int):
-        """Draw the inputs of all programs."""
+    def __init__(self, seed: int, engines: Sequence[str] = COMPARED):
+        """Draw the inputs of all programs.
+
+        Args:
+            seed: Seed of inputs and programs.
+            engines: Engines that are compared with ``plain``.
+        """
+        self.engines = tuple(engines)
         self.rng = np.random.default_rng(seed)
         sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="rotor_vel")
         self.given = given(self.rng)
@@ -236,12 +229,11 @@ class Fuzzer:
         if not cases:
             return
         data, stages = self._step_of(cases)
-        steps = {"lanes": Step(stages, "lanes")}
         try:
-            program = steps["lanes"].plan(data).program
+            program = lower_stages(as_stages(stages), data)
         except Exception as error:
             if len(cases) == 1:
-                yield Find(cases[0], "planning", f"{type(error).__name__}: {error}")
+                yield Find(cases[0], "lowering", f"{type(error).__name__}: {error}")
             else:
                 yield from self._check(cases[: len(cases) // 2])
                 yield from self._check(cases[len(cases) // 2 :])
@@ -252,31 +244,18 @@ class Fuzzer:
             self.refused.update(refused.values())
             yield from self._check([case for k, case in enumerate(cases) if f"p{k}" not in refused])
             return
-        no_source = []
-        if "fused" in COMPARED:
-            steps["fused"] = Step(stages, "fused")
-            no_source = self._without_source(cases, steps["fused"], data)
-        if not no_source:
-            yield from self._compare(cases, COMPARED, steps)
-            return
-        self.counts["without source"] += len(no_source)
-        yield from self._check([case for case in cases if case not in no_source])
-        yield from self._compare(no_source, tuple(e for e in COMPARED if e != "fused"))
-
-    def _without_source(self, cases: Sequence[Case], step: Step, data: Any) -> list[Case]:
-        """Return the programs that no kernel can be written of."""
-        try:
-            step.plan(data)
-            return []
-        except ConfigError as error:
-            if len(cases) == 1:
-                self.refused[str(error).partition("(stage")[0]] += 1
-                return list(cases)
-        found = []
-        for case in cases:
-            data, stages = self._step_of([case])
-            found += self._without_source([case], Step(stages, "fused"), data)
-        return found
+        if "fused" in self.engines:
+            try:
+                for segment in program.fused_segments:
+                    require(segment.block)
+            except UnsupportedError as error:
+                (no_source,) = [case for k, case in enumerate(cases) if f"p{k}" == error.stage]
+                self.counts["without source"] += 1
+                self.refused[error.reason] += 1
+                yield from self._check([case for case in cases if case is not no_source])
+                yield from self._compare([no_source], tuple(e for e in self.engines if e != "fused"))
+                return
+        yield from self._compare(cases, self.engines)
 
     def _step_of(self, cases: Sequence[Case]) -> tuple[Any, dict[str, Stage]]:
         stages = {f"p{k}": case.stage(f"p{k}") for k, case in enumerate(cases)} | {"turned": turned}
@@ -286,25 +265,19 @@ class Fuzzer:
         plugins = {"given": self.given, "results": Results(**slots)}
         return self.data.replace(plugins=plugins), stages
 
-    def run(self, cases: Sequence[Case], engine: str, step: Step | None = None) -> list[list[np.ndarray]]:
+    def run(self, cases: Sequence[Case], engine: str) -> list[list[np.ndarray]]:
         """Return the values of programs on an engine."""
         data, stages = self._step_of(cases)
-        if engine == "interpret" and engine not in ENGINES:
-            with mock.patch("crazysim.engine.step.lanes", interpret):
-                results = Step(stages, "lanes")(data).plugins["results"]
-        else:
-            results = (step or Step(stages, engine))(data).plugins["results"]
+        results = Step(stages, engine)(data).plugins["results"]
         slots = {k: np.asarray(x) for k, x in {**results.drone, **results.world}.items()}
         return [case.unpacked(slots[f"p{k}f"], slots[f"p{k}o"]) for k, case in enumerate(cases)]
 
-    def _compare(
-        self, cases: Sequence[Case], engines: Sequence[str], steps: dict[str, Step] | None = None
-    ) -> Iterator[Find]:
+    def _compare(self, cases: Sequence[Case], engines: Sequence[str]) -> Iterator[Find]:
         found: dict[str, list[list[np.ndarray]]] = {}
         for engine in ("plain", *engines):
             try:
                 start = time.perf_counter()
-                found[engine] = self.run(cases, engine, (steps or {}).get(engine))
+                found[engine] = self.run(cases, engine)
                 self.counts[f"ms {engine}"] += int(1e3 * (time.perf_counter() - start))
             except Exception as error:
                 if len(cases) == 1 and engine == "plain":
@@ -330,38 +303,22 @@ class Fuzzer:
         n = len(case.program.inputs)
         inputs = [self._lanes(case.scope, name) for name in case.program.inputs]
         for j, (a, b) in enumerate(zip(plain, other, strict=True)):
-            signed = _keeps_sign_of_zero(case.program.lines[j], case.avals[: n + j])
-            bad = ~_close(a, b, signed)
+            line = functools.partial(_of_values, case.program.lines[j])
+            signed = keeps_sign_of_zero(line, case.avals[: n + j])
+            bad = ~close(a, b, signed)
             lanes = np.flatnonzero(bad.reshape(len(a), -1).any(1))
-            if not len(lanes):
-                continue
-            self.counts["looked at again"] += 1
-            values = [*inputs, *other[:j]]
-            line = case.program.lines[j]
-            lanes = lanes[~_explained(lambda *v: evaluate(line, v), [x[lanes] for x in values], b[lanes], signed)]  # noqa: B023
-            if not len(lanes):
-                continue
-            # A compiler may compute an operand once more, and round it otherwise there.
-            names = case.program.inputs
-            lanes = lanes[
-                ~_explained(
-                    lambda *v: case.program.values(dict(zip(names, v)))[n + j],
-                    [x[lanes] for x in inputs],
-                    b[lanes],
-                    signed,
-                )
-            ]  # noqa: B023, B905
-            if not len(lanes):
-                continue
-            lane = lanes[0]
-            smaller = kept(case.program, n + j)
-            shown = ", ".join(
-                f"v{m}={_text(v[lane])}"
-                for m, v in enumerate([*inputs, *other[:j]])
-                if f"v{m}" in case.program.lines[j]
-            )
-            what = f"{case.program.lines[j]} with {shown}: plain {_text(a[lane])}, {engine} {_text(b[lane])} ({len(lanes)} lanes)"
-            return Find(Case(smaller, case.scope), engine, what)
+            # A compiler may compute an operand once more and round it differently, so the inputs are tried as well.
+            whole = functools.partial(_of_inputs, case.program, n + j)
+            for fn, operands in ((line, [*inputs, *other[:j]]), (whole, inputs)):
+                if len(lanes):
+                    self.counts["examined for rounding"] += 1
+                    lanes = lanes[~explained(fn, [x[lanes] for x in operands], b[lanes], signed)]
+            if len(lanes):
+                values = {f"v{k}": x[lanes[0]] for k, x in enumerate([*inputs, *other[:j]])}
+                text = case.program.lines[j]
+                shown = ", ".join(f"{name}={_text(x)}" for name, x in values.items() if re.search(rf"\b{name}\b", text))
+                what = f"{text} with {shown}: plain {_text(a[lanes[0]])}, {engine} {_text(b[lanes[0]])}"
+                return Find(Case(kept(case.program, n + j), case.scope), engine, f"{what} ({len(lanes)} lanes)")
         return None
 
     def _lanes(self, scope: str, name: str) -> np.ndarray:
@@ -369,36 +326,12 @@ class Fuzzer:
         return x.reshape(-1, *x.shape[2:]) if scope == "drone" else x
 
 
-MOVES_ONLY = frozenset(
-    "neg abs sign select_n copy convert_element_type bitcast_convert_type reshape squeeze broadcast_in_dim transpose "
-    "rev slice concatenate gather scatter pad dynamic_slice dynamic_update_slice jit pjit stop_gradient iota lt ge gt "
-    "le eq ne and or not clamp split stack unstack tile sqrt ceil floor round".split()
-)
-"""Primitives that keep the sign of zero on every engine. XLA does not in sums and products, nor do libraries of
-functions."""
+def _of_values(line: str, *values: Any) -> Any:
+    return evaluate(line, values)
 
 
-def _keeps_sign_of_zero(line: str, avals: Sequence[Any]) -> bool:
-    return all(name in MOVES_ONLY for name in _primitives(_written_out(lambda *v: evaluate(line, v), avals).jaxpr))
-
-
-def _primitives(jaxpr: Any) -> Iterator[str]:
-    for eqn in jaxpr.eqns:
-        yield eqn.primitive.name
-        for x in jax.tree.leaves(
-            list(eqn.params.values()), is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")
-        ):
-            if hasattr(x, "eqns") or hasattr(x, "jaxpr"):
-                yield from _primitives(getattr(x, "jaxpr", x))
-
-
-def _written_out(fn: Any, args: Sequence[Any]) -> Any:
-    """Return the jaxpr of a function, with the functions that it calls written out if JAX can do that."""
-    try:
-        with jax.disable_jit():
-            return jax.make_jaxpr(fn)(*args)
-    except Exception:  # without jit, JAX sees concrete values and refuses some conversions of them
-        return jax.make_jaxpr(fn)(*args)
+def _of_inputs(program: Program, k: int, *inputs: Any) -> Any:
+    return program.values(dict(zip(program.inputs, inputs, strict=True)))[k]
 
 
 def _text(x: Any) -> str:
@@ -406,78 +339,6 @@ def _text(x: Any) -> str:
     return np.array2string(x.astype(np.float32) if x.dtype.kind == "V" else x, separator=",", precision=9).replace(
         "\n", ""
     )
-
-
-def _close(a: np.ndarray, b: np.ndarray, signed: bool) -> np.ndarray:
-    """Return where values are equal, or numbers to a few units in the last place, the sign of zero if asked for."""
-    if not jnp.issubdtype(a.dtype, jnp.floating):
-        return a == b
-    eps = max(EPS, float(jnp.finfo(a.dtype).eps))
-    a, b = a.astype(np.float64), b.astype(np.float64)
-    with np.errstate(all="ignore"):
-        near = np.abs(a - b) <= UNITS * eps * np.maximum(np.abs(a), np.abs(b))
-        near |= (np.abs(a) <= TINY) & (np.abs(b) <= TINY)  # below is zero to XLA, whose threads flush
-    zeros = np.full(a.shape, True) if not signed else (a != 0) | (b != 0) | (np.signbit(a) == np.signbit(b))
-    return ((a == b) & zeros) | (np.isnan(a) & np.isnan(b)) | (near & zeros & np.isfinite(a) & np.isfinite(b))
-
-
-def _explained(fn: Any, values: list[np.ndarray], found: np.ndarray, signed: bool) -> np.ndarray:
-    """Return for which lanes a value is what a function gives for its operands, within rounding.
-
-    The function is computed primitive by primitive, many times, and every result of arithmetic disturbed by a few units in
-    the last place.
-    """
-    results = np.asarray(_disturbed(fn, values, len(found)))
-    if not jnp.issubdtype(results.dtype, jnp.floating):
-        ok = (results == found).any(0)
-        return ok.reshape(len(ok), -1).all(1)
-    r, f = results.astype(np.float64), found.astype(np.float64)
-    eps = max(EPS, float(jnp.finfo(results.dtype).eps))
-    with np.errstate(all="ignore"):
-        low, high = np.min(np.where(np.isnan(r), np.inf, r), 0), np.max(np.where(np.isnan(r), -np.inf, r), 0)
-        slack = UNITS * eps * np.maximum(np.abs(low), np.abs(high)) + (high - low) + TINY
-        slack = np.where(np.isfinite(slack), slack, 0)
-        within = (f >= low - slack) & (f <= high + slack)
-        if signed:
-            within &= ~((f == 0) & (r == 0).all(0) & (np.signbit(f) != np.signbit(r[0])))
-        ok = within | (np.isnan(f) & np.isnan(r).any(0)) | (f == r).any(0) & ((f != 0) | within)
-    return ok.reshape(len(ok), -1).all(1)
-
-
-EXACT = MOVES_ONLY | {"max", "min", "sort", "while", "scan", "cond", "reduce_max", "reduce_min", "clamp", "random_bits"}
-"""Primitives whose results are not disturbed: they do not round, or consist of others."""
-
-
-def _disturbed(fn: Any, values: list[np.ndarray], n_lanes: int) -> Any:
-    """Return a function's value with disturbed arithmetic. (SAMPLES, n_lanes, ...)"""
-    rng = np.random.default_rng(0)
-    samples = [jnp.broadcast_to(x, (SAMPLES, *x.shape)) for x in values]
-    each = jax.vmap(fn, axis_size=n_lanes)
-    jaxpr = _written_out(jax.vmap(each, axis_size=SAMPLES), samples)
-    strength = np.linspace(0, 4, SAMPLES)  # the first is not disturbed
-
-    def noisy(x: Any) -> Any:
-        if jax.dtypes.issubdtype(x.dtype, jax.dtypes.extended) or not jnp.issubdtype(x.dtype, jnp.floating):
-            return x
-        if x.shape[:2] != (SAMPLES, n_lanes):
-            return x
-        noise = rng.uniform(-1, 1, x.shape) * strength.reshape(-1, *[1] * (x.ndim - 1)) * float(jnp.finfo(x.dtype).eps)
-        disturbed = (x.astype(np.float32) * (1 + noise.astype(np.float32))).astype(x.dtype)
-        return jnp.where(jnp.isfinite(disturbed), disturbed, x)
-
-    env: dict[Any, Any] = dict(zip(jaxpr.jaxpr.constvars, jaxpr.consts, strict=True))
-    env.update(zip(jaxpr.jaxpr.invars, map(noisy, samples), strict=True))
-    for eqn in jaxpr.jaxpr.eqns:
-        outs = _apply(eqn, [v.val if hasattr(v, "val") else env[v] for v in eqn.invars])
-        exact = eqn.primitive.name in EXACT
-        env.update(zip(eqn.outvars, outs if exact else map(noisy, outs), strict=True))
-    (out,) = jaxpr.jaxpr.outvars
-    return out.val if hasattr(out, "val") else env[out]
-
-
-def _apply(eqn: Any, args: list[Any]) -> list[Any]:
-    out = eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(eqn.params))
-    return list(out) if eqn.primitive.multiple_results else [out]
 
 
 def main() -> None:

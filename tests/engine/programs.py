@@ -284,7 +284,8 @@ def numbers_that_are_known(d: Draw) -> str:
     integers = "0 1 -1 3 -7 127 128 255 256 2147483647 -2147483648 65536".split()
     return d.choice([
         f"lax.full((3,), np.float32({d.choice(floats)}))", f"lax.full((), np.int32({d.choice(integers)}))",
-        f"lax.full((3,), np.uint32(np.int64({d.choice(integers)}) & 0xffffffff))", f"lax.full((), {d.choice(['True', 'False'])})",
+        f"lax.full((3,), np.uint32(np.int64({d.choice(integers)}) & 0xffffffff))",
+        f"lax.full((), {d.choice(['True', 'False'])})",
         f"np.float32([{d.choice(floats)}, {d.choice(floats)}, {d.choice(floats)}]) + 0 * jnp.arange(3)",
         f"jnp.asarray(np.float32([{d.choice(floats)}, {d.choice(floats)}, {d.choice(floats)}]))",
         f"jnp.asarray(np.int32([{d.choice(integers)}, {d.choice(integers)}, {d.choice(integers)}]))",
@@ -306,10 +307,11 @@ def reductions(d: Draw) -> str:
         f"jnp.{d.choice(_names(REDUCTIONS))}({x}, axis={axis})", f"jnp.{d.choice(_names(REDUCTIONS))}({x}, {axis})",
         f"jnp.{d.choice(_names(REDUCTIONS))}({x})",
         f"lax.{d.choice(['cumsum', 'cumprod', 'cummax', 'cummin', 'cumlogsumexp'])}({x}, {axis % n}, reverse={back})",
-        f"lax.{d.choice(['reduce_max', 'reduce_min', 'reduce_sum', 'reduce_prod', 'reduce_and', 'reduce_or', 'reduce_xor'])}({x}, ({axis % n},))",
+        f"lax.reduce_{d.choice(['max', 'min', 'sum', 'prod', 'and', 'or', 'xor'])}({x}, ({axis % n},))",
         f"lax.{d.choice(['argmax', 'argmin'])}({x}, {axis % n}, {d.choice(['np.int32', 'np.uint32', 'np.int8'])})",
         f"lax.reduce({x}, {x}.dtype.type({d.int(0, 2)}), lax.{d.choice(['add', 'mul', 'max', 'min'])}, ({axis % n},))",
-        f"lax.reduce(({x}, {x}), ({x}.dtype.type(1), {x}.dtype.type(0)), lambda a, b: (lax.max(a[0], b[0]), lax.add(a[1], b[1])), ({axis % n},))[{d.int(0, 1)}]",
+        f"lax.reduce(({x}, {x}), ({x}.dtype.type(1), {x}.dtype.type(0)), "
+        f"lambda a, b: (lax.max(a[0], b[0]), lax.add(a[1], b[1])), ({axis % n},))[{d.int(0, 1)}]",
         f"jnp.linalg.norm({x}, axis={axis})", f"jax.nn.softmax({x}, {axis})", f"jax.nn.logsumexp({x}, {axis})",
         f"jax.nn.log_softmax({x}, {axis})", f"jnp.quantile({x}, 0.3, axis={axis})", f"jnp.cumsum({x}, {axis})",
         f"jax.nn.standardize({x}, {axis})", f"jnp.ptp({x}, {axis})", f"jnp.average({x}, {axis})",
@@ -388,9 +390,11 @@ def gathers(d: Draw) -> str:
     inside = f"jnp.clip({i}, 0, {length - 1})"
     where = [d.int(-length - 1, length) for _ in range(d.int(1, 3))]
     return d.choice([
-        f"{x}[{i}]", f"{x}[{inside}]", f"{x}[{i}, ...]", f"{x}[..., {j}]", f"{x}[{i}, {j}]", f"{x}[{inside}, {d.int(0, 1)}]",
+        f"{x}[{i}]", f"{x}[{inside}]", f"{x}[{i}, ...]", f"{x}[..., {j}]", f"{x}[{i}, {j}]",
+        f"{x}[{inside}, {d.int(0, 1)}]",
         f"{x}.at[{i}].get(mode={mode if mode != 'promise_in_bounds' else 'clip'!r}, fill_value={d.int(0, 3)})",
-        f"{x}.at[{inside}].get(mode={mode!r}, unique_indices=True)", f"jnp.take({x}, {i}, {axis}, mode={mode if mode in ('clip', 'fill', 'wrap') else 'clip'!r})",
+        f"{x}.at[{inside}].get(mode={mode!r}, unique_indices=True)",
+        f"jnp.take({x}, {i}, {axis}, mode={mode if mode in ('clip', 'fill', 'wrap') else 'clip'!r})",
         f"jnp.take({x}, np.array({where}), {axis})", f"{x}[np.array({where})]", f"{x}[:, {i}]", f"{x}[{i}, :, None]",
         f"jnp.take({x}, np.array({where}), {axis}, mode='fill')", f"{x}.at[np.array({where})].get(mode={mode!r})",
         f"jnp.take_along_axis({x}, {d.value('i', 1)}, {axis}, mode={d.choice(['clip', 'fill'])!r})",
@@ -412,7 +416,8 @@ def scatters(d: Draw) -> str:
     length, n = max(d.shape[0], 1), len(d.shape)
     i, j = d.value("iu", 0, 1), d.value("iu", 0, 1)
     where = [d.int(-length - 1, length) for _ in range(d.int(1, 3))]
-    places = [f"{i}", f"np.array({where})", f"{d.int(-length, length - 1)}", f"{d.int(0, 1)}:", f"{i}, {j}", f"..., {j}",
+    places = [f"{i}", f"np.array({where})", f"{d.int(-length, length - 1)}", f"{d.int(0, 1)}:", f"{i}, {j}",
+              f"..., {j}",
               f"jnp.clip({i}, 0, {length - 1})", "::2", f":, {i}", f"np.array({where}), ...", f"{i}, :",
               f"np.array({where}), {j}", "...", f"{d.int(-2, 0)}, {d.int(0, 1)}"]  # fmt: skip
     place = d.choice(places)
@@ -452,7 +457,8 @@ def _windowed_scatter(d: Draw, x: str) -> str:
     numbers += "scatter_dims_to_operand_dims=(0,))"
     inside = f"jnp.clip({rows}, 0, 1)" if mode == "promise_in_bounds" else rows
     return (
-        f"lax.scatter{kind}(jnp.ravel({x}), {inside}[:, None], jnp.ones(({rows}.shape[0], 2), {x}.dtype) * 2, {numbers}, "
+        f"lax.scatter{kind}(jnp.ravel({x}), {inside}[:, None], jnp.ones(({rows}.shape[0], 2), {x}.dtype) * 2, "
+        f"{numbers}, "
         f"mode={mode!r})"
     )
 
@@ -468,15 +474,16 @@ def control_flow(d: Draw) -> str:
     two = d.choice(["c + y, c * y", "y, c", "jnp.maximum(c, y), c", "c, (y, c - y)[0]", "c * 0.5 + y, None"])
     back = d.choice(["True", "False"])
     inner = d.choice(["jnp.sin(t) * t", "t * t", "jnp.sum(t)", "jax.nn.relu(t)", "jnp.linalg.norm(t)", "jnp.tanh(t)"])
-    limit = d.int(1, 9)
+    limit, count = d.int(1, 9), d.value("i", 0, 0)
     return d.choice([
         f"lax.cond({test}, lambda t: t * 2, lambda t: t + t, {x})", f"lax.cond({test}, jnp.sin, jnp.cos, {x})",
         f"lax.cond({x}.sum() > 0, lambda: {x}, lambda: -{x})",
         f"lax.switch({index}, [lambda t: t, lambda t: -t, lambda t: t * t], {x})",
         f"lax.fori_loop(0, {d.int(0, 4)}, lambda k, c: (lambda c: {body})(c).astype(c.dtype), {x})",
-        f"lax.fori_loop({d.int(-1, 1)}, jnp.clip({d.value('i', 0, 0)}, 0, 6), lambda k, c: (({body}).astype(c.dtype)), {x})",
-        f"lax.while_loop(lambda c: (c[1] < {limit}) & (c[0].sum() < 9), lambda c: (c[0] + c[0], c[1] + 1), ({x}, 0))[0]",
-        f"lax.while_loop(lambda c: c < {limit}, lambda c: c + 1 + jnp.sign(c) ** 2, jnp.clip({d.value('i', 0, 0)}, -5, 5))",
+        f"lax.fori_loop({d.int(-1, 1)}, jnp.clip({count}, 0, 6), lambda k, c: (({body}).astype(c.dtype)), {x})",
+        f"lax.while_loop(lambda c: (c[1] < {limit}) & (c[0].sum() < 9), "
+        f"lambda c: (c[0] + c[0], c[1] + 1), ({x}, 0))[0]",
+        f"lax.while_loop(lambda c: c < {limit}, lambda c: c + 1 + jnp.sign(c) ** 2, jnp.clip({count}, -5, 5))",
         f"lax.scan(lambda c, y: ({two}), {x}[0], {x}, reverse={back})[0]",
         f"lax.scan(lambda c, y: ({two}), {x}[0], {x}, reverse={back})[1]",
         f"lax.scan(lambda c, _: (c * 0.5 + 1, c), {x}, None, length={d.int(1, 4)})[{d.int(0, 1)}]",
@@ -484,7 +491,8 @@ def control_flow(d: Draw) -> str:
         f"lax.map(lambda t: {inner}, {x})", f"jax.jit(lambda t: {inner})({x})", f"jax.vmap(lambda t: {inner})({x})",
         f"jax.checkpoint(lambda t: {inner})({x})", f"jax.grad(lambda t: jnp.sum({inner}))({x})",
         f"jax.jacfwd(lambda t: {inner})({x})", f"jax.jvp(lambda t: {inner}, ({x},), ({x},))[1]",
-        f"jax.value_and_grad(lambda t: jnp.sum(jnp.sin(t)))({x})[1]", f"jax.lax.platform_dependent({x}, cpu=jnp.sin, default=jnp.cos)",
+        f"jax.value_and_grad(lambda t: jnp.sum(jnp.sin(t)))({x})[1]",
+        f"jax.lax.platform_dependent({x}, cpu=jnp.sin, default=jnp.cos)",
         f"jax.hessian(lambda t: jnp.sum(t ** 3))({x})", f"jax.device_put({x})", f"lax.optimization_barrier({x})",
         f"jnp.vectorize(lambda a, b: a * b + 1)({x}, {d.like()})", f"jnp.apply_along_axis(jnp.sum, 0, {x})",
         f"lax.fori_loop(0, {length}, lambda k, c: c.at[k].set(c[k] * 2 + k), {x})",
@@ -501,7 +509,8 @@ def random_numbers(d: Draw) -> str:
         f"jax.random.bits({key}, (3,))", f"jax.random.uniform({key}, (3,))", f"jax.random.key_data({key})",
         f"jax.random.randint({key}, (2,), -5, 5)", f"jax.random.bernoulli({key}, 0.4, (3,))",
         f"jax.random.uniform(jax.random.split({key}, 3)[{d.int(0, 2)}])", f"jax.random.permutation({key}, 4)",
-        f"jax.random.choice({key}, 4, (2,))", f"jax.random.bits({key}, (2,), np.uint8)", f"jax.random.normal({key}, (2,))",
+        f"jax.random.choice({key}, 4, (2,))", f"jax.random.bits({key}, (2,), np.uint8)",
+        f"jax.random.normal({key}, (2,))",
         f"jax.vmap(lambda k: jax.random.bits(k))(jax.random.split({key}, 3))", f"jax.random.exponential({key}, (2,))",
         f"lax.scan(lambda c, k: (c + 1, jax.random.bits(k)), 0, jax.random.split({key}, 2))[1]",
         f"jax.random.key_data(lax.scan(lambda k, _: tuple(jax.random.split(k)), {key}, None, length=2)[1])",

@@ -1,4 +1,4 @@
-"""Rules for calls, which are followed, for branches, which become selections, and for loops, which stay loops."""
+"""Rules for calls, which are inlined, for branches, which become selections, and for loops, which stay loops."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _custom_jvp(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]
 
 @rule("call_hi_primitive")
 def _high_level(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """A primitive that is written in terms of others, from JAX 0.12 on."""
+    """Expand a primitive that is defined by others, which JAX has from 0.12 on."""
     avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
     return _with_derivative(ctx, eqn, args, jax.make_jaxpr(expanded(eqn))(*avals))
 
@@ -46,7 +46,7 @@ def _with_derivative(ctx: Lowering, eqn: Any, args: list[Elements], called: Clos
 
     @functools.cache
     def slope() -> Block:
-        """Return the program from operands and their changes to the changes of the results."""
+        """Return the block from operands and their tangents to the tangents of the results."""
         single = as_function(eqn)
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
         traced = jax.make_jaxpr(lambda x, dx: jax.jvp(single, x, dx)[1])(avals, avals)
@@ -68,7 +68,7 @@ def _linear_solve(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Element
 
 @rule("cond")
 def _cond(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Both branches are computed, and one is taken: lanes differ in which."""
+    """Compute all branches and select one: lanes differ in which."""
     which, *operands = args
     branches = [closed(b) for b in eqn.params["branches"]]
     index = which[()]
@@ -87,7 +87,7 @@ def _cond(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("platform_index")
 def _platform_index(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """The default branch: a program is lowered once for all platforms."""
+    """Take the default branch: a program is lowered once for all platforms."""
     platforms = list(eqn.params["platforms"])
     own = sorted({name for names in platforms for name in names or ()} & {"cpu", "gpu", "cuda", "rocm"})
     if own or None not in platforms:
@@ -101,7 +101,7 @@ def _platform_index(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Eleme
 def _scan(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     p, length = eqn.params, eqn.params["length"]
     body = closed(p["jaxpr"])
-    # Versions of JAX name the groups differently; what is stacked over turns has one axis more outside.
+    # Versions of JAX name the groups differently; operands per iteration have one axis more than in the body.
     n_carry = sum(o.aval.ndim == v.aval.ndim for o, v in zip(eqn.outvars, body.jaxpr.outvars, strict=True))
     n_stacked = sum(o.aval.ndim > v.aval.ndim for o, v in zip(eqn.invars, body.jaxpr.invars, strict=True))
     n_consts = len(eqn.invars) - n_carry - n_stacked
@@ -113,7 +113,7 @@ def _scan(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
         return _results(ctx, "loop", eqn, scalars(*carry), (block,), (("length", length),))
     if length > MAX_UNROLL:
         raise UnsupportedError(
-            f"primitive 'scan' with inputs or outputs for each of {length} turns; at most {MAX_UNROLL} are unrolled"
+            f"primitive 'scan' with operands for each of {length} iterations; at most {MAX_UNROLL} are unrolled"
         )
     stacked: list[list[Elements]] = []
     for i in range(length)[::-1] if p["reverse"] else range(length):
@@ -122,6 +122,8 @@ def _scan(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
         stacked.append(outs[n_carry:])
     if p["reverse"]:
         stacked.reverse()
+    if not length:
+        return [*carry, *(np.empty(v.aval.shape, object) for v in eqn.outvars[n_carry:])]
     ys = [np.stack([turn[k] for turn in stacked]) for k in range(len(body.jaxpr.outvars) - n_carry)]
     return [*carry, *ys]
 

@@ -39,7 +39,7 @@ def _convert(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("select_n")
 def _select_n(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """One of two cases by a bool; of more by a number, each against the next."""
+    """Select one of two cases by a bool, or one of several by an integer."""
     which, *cases = args
     dtype, kind = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
     if np.dtype(kind).kind == "b":
@@ -88,7 +88,7 @@ def _add_any(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("lt_to", "le_to", "eq_to")
 def _total_order(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Comparisons in which NaN is the largest number, and equal to itself."""
+    """Compare in an order in which NaN is the largest number, and equal to itself."""
     name = eqn.primitive.name.removesuffix("_to")
     if eqn.invars[0].aval.dtype.kind != "f":
         return [ctx.elementwise(name, args, bool)]

@@ -1,4 +1,4 @@
-"""Rules for indexing: a known index moves elements, one that is known at run time selects among all."""
+"""Rules for indexing: a known index moves elements, a computed one selects among all places that it may mean."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from jax.extend import core
 from jax.lax import GatherScatterMode
 
 from crazysim.engine.ir import Element, constant, is_constant
+from crazysim.engine.jaxcompat import ClosedJaxpr
 from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
 from crazysim.engine.rules.movement import move_many, run_now
 
@@ -24,7 +24,7 @@ def _dynamic_slice(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elemen
 
 
 def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> Elements:
-    """Return ``size`` elements along an axis from a start that is kept inside."""
+    """Return ``size`` elements along an axis from a start that is clamped to the array."""
     last = x.shape[axis] - size
     pieces = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
     if is_constant(start) or last == 0:
@@ -57,7 +57,7 @@ def _dynamic_update_slice(ctx: Lowering, eqn: Any, args: list[Elements]) -> list
 
 
 def _at(ctx: Lowering, index: Element, k: int, last: int) -> Elements:
-    """Return whether an index, kept inside 0 to ``last``, is ``k``."""
+    """Return True where an index, clamped to 0 to ``last``, is ``k``."""
     op = "le" if k == 0 else "ge" if k == last else "eq"
     return as_elements([ctx.scalar(op, index, constant(k, index.dtype), dtype=bool)], ())
 
@@ -78,7 +78,7 @@ def _select(ctx: Lowering, condition: Elements, yes: Elements, no: Elements) -> 
 def _check_range(n: int) -> None:
     if n > MAX_UNROLL:
         raise UnsupportedError(
-            f"an index that is known at run time only, into {n} places; selected from are up to {MAX_UNROLL}"
+            f"an index that is computed at run time, into {n} places; selected from are at most {MAX_UNROLL}"
         )
 
 
@@ -127,7 +127,7 @@ def _gather(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 
 def _gather_filled(eqn: Any, x: Elements, indices: np.ndarray) -> Elements:
-    """Gather at known places, some of which may lie outside: those are filled."""
+    """Gather at known places; those outside the array are filled."""
     numbers = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     (places,) = run_now(eqn, [numbers, indices], fill_value=-1)
     fill = eqn.params["fill_value"]
@@ -212,7 +212,7 @@ def _combined(ctx: Lowering, eqn: Any, old: Elements, new: Elements) -> Elements
     combination = eqn.params["update_jaxpr"]
     if combination is None:
         return new
-    called = core.ClosedJaxpr(combination, eqn.params["update_consts"])
+    called = ClosedJaxpr(combination, eqn.params["update_consts"])
     pairs = zip(old.reshape(-1), new.reshape(-1), strict=True)
     return as_elements(
         [ctx.lower(called, [as_elements([a], ()), as_elements([b], ())])[0][()] for a, b in pairs], old.shape
@@ -220,7 +220,7 @@ def _combined(ctx: Lowering, eqn: Any, old: Elements, new: Elements) -> Elements
 
 
 def known(x: Elements) -> bool:
-    """Return whether all elements are constants."""
+    """Return True where all elements are constants."""
     return all(map(is_constant, x.reshape(-1)))
 
 

@@ -11,7 +11,7 @@ from crazysim.engine.ir import constant
 from crazysim.engine.lower import Elements, Lowering, UnsupportedError, as_elements, rule
 
 LARGEST_SYSTEM = 6
-"""Largest matrix that is factorised; beyond it the written-out arithmetic is longer than a drone's step."""
+"""Largest matrix that is factorised; beyond it the unrolled arithmetic is longer than the rest of a step."""
 
 
 def _check_size(eqn: Any, n: int) -> None:
@@ -25,7 +25,7 @@ def _matrices(x: Elements) -> list[Elements]:
 
 @rule("cholesky")
 def _cholesky(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """The lower factor; all of it is NaN if the matrix is not positive definite."""
+    """Return the lower factor; all of it is NaN if the matrix is not positive definite, as in LAPACK."""
     n, dtype = args[0].shape[-1], eqn.outvars[0].aval.dtype
     _check_size(eqn, n)
     zero = constant(0, dtype)
@@ -39,8 +39,7 @@ def _cholesky(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
                     rest = ctx.scalar("sub", rest, ctx.scalar("mul", low[i, k], low[j, k]))
                 low[i, j] = ctx.builder.add("sqrt", (rest,), dtype) if i == j else ctx.scalar("div", rest, low[j, j])
                 if i == j:
-                    positive = ctx.scalar("gt", rest, zero, dtype=bool)
-                    fails = ctx.scalar("or", fails, ctx.scalar("not", positive))
+                    fails = ctx.scalar("or", fails, ctx.scalar("le", rest, zero, dtype=bool))
         for j, i in itertools.combinations_with_replacement(range(n), 2):
             low[i, j] = ctx.scalar("select_n", fails, low[i, j], constant(np.nan, dtype))
         out.append(low)
@@ -76,7 +75,7 @@ def _substitute(ctx: Lowering, a: Elements, b: Elements, lower: bool, unit: bool
 
 @rule("lu")
 def _lu(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Gauss with the largest pivot of each column, rows exchanged by selection."""
+    """Eliminate with the largest pivot of each column; rows are exchanged by selection."""
     n, m = args[0].shape[-2:]
     if n != m:
         raise UnsupportedError("primitive 'lu' of a matrix that is not square")

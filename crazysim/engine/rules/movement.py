@@ -1,4 +1,4 @@
-"""The rule for what moves elements and computes nothing: run on their numbers."""
+"""Rules for primitives that only move elements: they are run once, on the indices of the elements."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _move(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 
 def move(eqn: Any, args: list[Elements]) -> Elements:
-    """Return what a primitive that only moves elements makes of them."""
+    """Return the result of a primitive that only moves elements."""
     p, x = eqn.params, args[0]
     match eqn.primitive.name:
         case "reshape" if p.get("dimensions") is None:
@@ -48,12 +48,12 @@ def move(eqn: Any, args: list[Elements]) -> Elements:
 
 
 def move_many(eqn: Any, args: list[Elements], fixed: Sequence[Any] = ()) -> list[Elements]:
-    """Return what a primitive that only moves elements makes of them, by running it on their numbers.
+    """Return the results of a primitive that only moves elements, by running it on their indices.
 
     Args:
         eqn: The operation.
         args: The arrays that are moved.
-        fixed: Operands behind them that say where to: indices that are known.
+        fixed: Known indices, the operands behind them.
     """
     numbers, elements = [], []
     for x in args:

@@ -34,7 +34,7 @@ def _reduce(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("reduce")
 def _reduce_by(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """A reduction by a function of two sets of operands, from initial values on."""
+    """Reduce by a function of accumulated and new operands, beginning with initial values."""
     axes, n = eqn.params["dimensions"], len(args) // 2
     arrays = [np.moveaxis(x, axes, range(len(axes))) for x in args[:n]]
     rest = arrays[0].shape[len(axes) :]
@@ -55,15 +55,13 @@ def _cumulate(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     x = np.moveaxis(args[0], eqn.params["axis"], 0).copy()
     order = range(len(x))[::-1] if eqn.params["reverse"] else range(len(x))
     for last, i in itertools.pairwise(order):
-        x[i] = ctx.elementwise(op, [np.asarray(x[last], object), np.asarray(x[i], object)], eqn.outvars[0].aval.dtype)[
-            ()
-        ]
+        x[i, ...] = ctx.elementwise(op, [x[last, ...], x[i, ...]], eqn.outvars[0].aval.dtype)
     return [np.moveaxis(x, 0, eqn.params["axis"])]
 
 
 @rule("argmax", "argmin")
 def _argmax(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """The first of the best, or the first NaN, as XLA has it."""
+    """Return the index of the first extreme element, or of the first NaN, as XLA does."""
     (axis,), index = eqn.params["axes"], eqn.params["index_dtype"]
     better = "gt" if eqn.primitive.name == "argmax" else "lt"
     rows = [np.asarray(row, object) for row in np.moveaxis(args[0], axis, 0)]
@@ -86,7 +84,10 @@ def _sort(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 
 @rule("top_k")
 def _top_k(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """The largest in falling order, of equals the first. The order of floats is total, from -NaN over -0 to NaN."""
+    """Return the largest in descending order, of equal ones the first.
+
+    XLA orders floats by their bits: -NaN, -inf, ..., -0, 0, ..., inf, NaN.
+    """
     (x,), k, axis, dtype = args, eqn.params["k"], eqn.params["axis"], eqn.invars[0].aval.dtype
     numbers = np.arange(x.shape[axis]).reshape([-1 if i == axis else 1 for i in range(x.ndim)])
     places = constants(np.broadcast_to(numbers, x.shape), np.int32)
@@ -104,7 +105,16 @@ def _top_k(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
 def _sorted(
     ctx: Lowering, eqn: Any, args: list[Elements], axis: int, n_keys: int, descending: bool = False
 ) -> list[Elements]:
-    """Sort by odd-even transposition: neighbours change places, which keeps the order of equals. NaN is largest."""
+    """Sort by odd-even transposition: it only exchanges neighbours, so it is stable. NaN goes last.
+
+    Args:
+        ctx: Takes the operations.
+        eqn: The operation, for messages.
+        args: Keys, then what is sorted with them.
+        axis: Axis to sort along.
+        n_keys: How many of the operands are keys.
+        descending: True for the largest first, which the keys must then be numbers without NaN for.
+    """
     columns = [np.moveaxis(x, axis, 0).copy() for x in args]
     n = len(columns[0])
     if n > MAX_UNROLL:
@@ -124,7 +134,7 @@ def _sorted(
 
 
 def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Elements]) -> Elements:
-    """Return where the first of two sets of keys comes before the second in rising order, with NaN behind all."""
+    """Return where the first of two sets of keys precedes the second in ascending order, in which NaN is last."""
     before, tied = constants(False, bool), constants(True, bool)
     for a, b in zip(first, second, strict=True):
         less, equal = ctx.elementwise("lt", [a, b], bool), ctx.elementwise("eq", [a, b], bool)

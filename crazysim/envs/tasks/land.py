@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
-from crazysim.core.plugin import FunctionPlugin, Placement
+from crazysim.core.plugin import Placement
 from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
@@ -127,7 +127,7 @@ class Land(Task):
         placements = [Placement(touch, before="increment_steps")]
         if self.speed > 0:
             placements.insert(0, Placement(move, before="increment_steps", name=f"{NAME}_pads"))
-        sim.add(FunctionPlugin(NAME, record, placements))
+        self.add_record(sim, record, placements)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight about a metre above their pads."""

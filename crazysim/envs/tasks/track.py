@@ -12,7 +12,6 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import FunctionPlugin
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
@@ -64,7 +63,7 @@ class TrackTrajectory(Task):
 
     def install(self, sim: Sim) -> None:
         """Give every drone its time on the trajectory."""
-        sim.add(FunctionPlugin(NAME, Phase(jnp.zeros_like(sim.data.states.pos[..., :1]))))
+        self.add_record(sim, Phase(jnp.zeros_like(sim.data.states.pos[..., :1])))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones near the trajectory, moving along it."""

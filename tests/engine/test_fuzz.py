@@ -1,0 +1,109 @@
+"""The fuzzer, and the programs that it found engines to be wrong on."""
+
+import numpy as np
+import pytest
+from fuzz import Case, Fuzzer
+from programs import Program
+
+from crazysim.engine.lower import RULES, constants
+
+FOUND = {
+    # Both rows of an exchange in a sort were views of one array: medians of matrices were wrong.
+    "sort along an axis of a matrix": (("f23",), "jnp.sort(v0, 0, descending=True)"),
+    "median along an axis of a matrix": (("f33",), "jnp.median(v0, -2)"),
+    "sort with a second operand": (("f33", "i"), "lax.sort((v0, v0 * v1), 0, False, num_keys=2)[1]"),
+    "sort by bools": (("b3", "i3"), "lax.sort_key_val(v0, v1)[1]"),
+    "order of NaN in top_k": (("f33",), "jnp.partition(v0, 1, 1)"),
+    "top_k of equals": (("i23",), "lax.top_k(v0, 2)[1]"),
+    "rows without elements": (("f33",), "jnp.gradient(v0[:2], axis=0)"),
+    "power with an integer exponent": (("f23", "i23"), "lax.pow(v0, v1)"),
+    "sign of zeros and of unsigned numbers": (("f33", "u3"), "lax.sign(v0) * lax.sign(v1).astype(np.float32)"),
+    "sign of a zero that is known": ((), "lax.full((3,), np.float32(-0.0))"),
+    "bits as the same type": (("f3",), "lax.bitcast_convert_type(v0, np.float32)"),
+    "a quotient of zeros": (("f23", "b"), "v0.at[0:].divide(v1)"),
+    "a product with a zero that is known": (("f4",), "v0 * np.float32([0.0, 1.0, -0.0, 2.0])"),
+    "the root as a power": (("f3",), "jnp.float_power(v0, 0.5)"),
+    "a matrix that is not positive definite": (
+        ("f33",),
+        "jnp.linalg.cholesky(jnp.round(jnp.clip(jnp.nan_to_num(v0), -3, 3)))",
+    ),
+    "a singular matrix": ((), "jax.scipy.linalg.lu(lax.full((3, 3), np.float32(1.0)))[2]"),
+    "a function of two reductions": (
+        ("i23",), "lax.reduce((v0, v0), (0, 1), lambda a, b: (a[0] + b[0], lax.max(a[1], b[1])), (1,))[1]"
+    ),
+    "a scan over keys": (
+        ("i",),
+        "lax.scan(lambda c, k: (c, jax.random.bits(k)), 0, jax.random.split(jax.random.key(v0), 2))[1]",
+    ),
+    "a scan over nothing": (("f3",), "lax.scan(lambda c, y: (c + y, c), v0[0], v0[:0])[1].sum() + v0"),
+    "NaN as an integer": ((), "lax.full((3,), np.float32(np.nan)).astype(np.int32)"),
+    "too large for an integer": ((), "lax.full((3,), np.float32(3e9)).astype(np.uint32)"),
+    "device_put": (("f3",), "jax.device_put(v0) + 1"),
+}  # fmt: skip
+"""Inputs and a line, by what was wrong."""
+
+REFUSED = {
+    "platform_index": (("f3",), "lax.platform_dependent(v0, cpu=jnp.sin, default=jnp.cos)"),
+    "dot_general": (("f33",), "lax.dot(v0, v0, preferred_element_type=np.int32)"),
+    "svd": (("f33",), "jnp.linalg.svd(jnp.nan_to_num(v0))[1]"),
+    "float16": (("f3",), "v0.astype(np.float16)"),
+}
+"""Inputs and a line, by what the reason names."""
+
+
+@pytest.fixture(scope="module")
+def fuzzer():
+    return Fuzzer(0)
+
+
+def cases(programs, scope="drone"):
+    return [Case(Program(inputs, (line,)), scope) for inputs, line in programs.values()]
+
+
+@pytest.mark.parametrize("scope", ["drone", "world"])
+def test_programs_that_were_wrong_give_what_they_give_plain(scope):
+    fuzzer = Fuzzer(1)
+    chosen = FOUND if scope == "drone" else {name: FOUND[name] for name in ("sort by bools", "top_k of equals")}
+    finds = list(fuzzer.check(cases(chosen, scope)))
+    assert not finds, "\n".join(map(str, finds))
+    assert not fuzzer.counts["refused"], fuzzer.refused
+    assert fuzzer.counts["compared on lanes"] == len(chosen)
+
+
+def test_refused_programs_are_refused_when_the_step_is_planned(fuzzer):
+    for name, program in REFUSED.items():
+        fuzzer.refused.clear()
+        assert not list(fuzzer.check(cases({name: program})))
+        (why,) = fuzzer.refused
+        assert name in why
+
+
+def test_random_programs_give_what_they_give_plain(fuzzer):
+    """A small run; ``python tests/engine/fuzz.py --programs 20000`` is a large one."""
+    finds = list(fuzzer.check(fuzzer.draw(16)))
+    assert not finds, "\n".join(map(str, finds))
+    assert fuzzer.counts["compared on lanes"] > 8
+
+
+def minimum(ctx, eqn, args):
+    return [ctx.elementwise("min", args, args[0].reshape(-1)[0].dtype)]
+
+
+def zero_less(ctx, eqn, args):
+    """Return 0 - x, which has another sign where x is zero."""
+    return [ctx.elementwise("sub", [constants(0, np.float32), args[0]], np.float32)]
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "line"),
+    [
+        ("rev", lambda ctx, eqn, args: args, "jnp.flip(v0)"),
+        ("max", minimum, "jnp.maximum(v0, 1.0)"),
+        ("neg", zero_less, "-v0"),
+    ],
+)
+def test_a_wrong_rule_is_found(monkeypatch, name, wrong, line):
+    monkeypatch.setitem(RULES, name, wrong)
+    (find,) = Fuzzer(2, engines=("interpret",)).check([Case(Program(("f33",), (line,)), "drone")])
+    assert find.engine == "interpret"
+    assert line in str(find)
