@@ -250,7 +250,7 @@ def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):
     assert main(["export", folder]) == 2
     assert "--onnx FILE, --c FILE" in capsys.readouterr().err
     assert main(["train", "list"]) == 0
-    assert "reaching a random point and hovering" in capsys.readouterr().out
+    assert "Reach a random point and hover there" in capsys.readouterr().out
     assert main(["train", "hover", "--set", "secnds=1", "--out", str(tmp_path / "x")]) == 2
     assert "did you mean seconds?" in capsys.readouterr().err
 
