@@ -262,6 +262,7 @@ def test_a_film_shows_the_drone_and_its_goal(whole, tmp_path):
     env = small_config().make_env(2)
     path = tmp_path / "film.gif"
     assert film(env, whole.policy, path, worlds=1) == 11
+    env.sim.close()  # a renderer that is collected on a thread of a later training cannot be freed there
     images = frames(path)
     green = (images[0][..., 1] - images[0][..., 0] > 40) & (images[0][..., 1] - images[0][..., 2] > 20)
     assert TARGET_COLOR[1] > TARGET_COLOR[0]

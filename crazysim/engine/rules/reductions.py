@@ -108,12 +108,12 @@ def _sorted(
     """Sort by odd-even transposition: it only exchanges neighbours, so it is stable. NaN goes last.
 
     Args:
-        ctx: Takes the operations.
-        eqn: The operation, for messages.
-        args: Keys, then what is sorted with them.
+        ctx: Lowering that takes the operations.
+        eqn: Equation, for messages.
+        args: Keys, then the other operands, which are permuted with them.
         axis: Axis to sort along.
-        n_keys: How many of the operands are keys.
-        descending: True for the largest first, which the keys must then be numbers without NaN for.
+        n_keys: Number of operands that are keys.
+        descending: True to sort the largest first; the keys must then contain no NaN.
     """
     columns = [np.moveaxis(x, axis, 0).copy() for x in args]
     n = len(columns[0])
