@@ -38,6 +38,9 @@ FOUND = {
     "a scan over nothing": (("f3",), "lax.scan(lambda c, y: (c + y, c), v0[0], v0[:0])[1].sum() + v0"),
     "NaN as an integer": ((), "lax.full((3,), np.float32(np.nan)).astype(np.int32)"),
     "too large for an integer": ((), "lax.full((3,), np.float32(3e9)).astype(np.uint32)"),
+    "a product of bools": (("b3",), "jnp.outer(v0, v0) @ v0 | (v0 @ v0)"),
+    "angles of any size": (("f33",), "jnp.sin(v0) + jnp.cos(v0 * 1e7)"),
+    "lgamma of infinity": (("f3",), "lax.lgamma(v0)"),
     "device_put": (("f3",), "jax.device_put(v0) + 1"),
 }  # fmt: skip
 """Inputs and a line, by what was wrong."""

@@ -165,15 +165,15 @@ def _dot(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     batch = tuple(a.shape[i] for i in lhs_batch)
     a, a_sizes = arranged(a, lhs_batch, lhs_axes)
     b, b_sizes = arranged(b, rhs_batch, rhs_axes)
+    times, plus = ("and", "or") if dtype.kind == "b" else ("mul", "add")
     out = []
     for n in range(a.shape[0]):
         for row in a[n]:
             for column in b[n]:
                 terms = [
-                    ctx.scalar("mul", *(_cast(ctx, x, dtype) for x in pair)) for pair in zip(row, column, strict=True)
+                    ctx.scalar(times, *(_cast(ctx, x, dtype) for x in pair)) for pair in zip(row, column, strict=True)
                 ]
-                zero = constant(0, dtype)
-                out.append(functools.reduce(lambda s, t: ctx.scalar("add", s, t), terms, zero))
+                out.append(functools.reduce(lambda s, t: ctx.scalar(plus, s, t), terms, constant(0, dtype)))
     return [as_elements(out, (*batch, *a_sizes, *b_sizes))]
 
 

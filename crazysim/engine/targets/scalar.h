@@ -51,6 +51,11 @@ FN void sin_cos(f32 x, f32& s, f32& c) {
     quarter = i32(n);
     r = fmaf(n, -7.54978995489188216e-8f, fmaf(n, -4.837512969970703125e-4f, fmaf(n, -1.5703125f, x)));
   } else {
+#ifndef __CUDACC_RTC__  // the library is exact for any angle; on GPUs its registers would cost every kernel
+    s = f32(sin(f64(x)));
+    c = f32(cos(f64(x)));
+    return;
+#endif
     const f64 n = rint(f64(x) * 0.63661977236758134308);
     quarter = i32(n - 4.0 * floor(0.25 * n));
     const f64 far = fma(n, -6.1232339957367658860e-17, fma(n, -1.5707963267948965580, f64(x)));
