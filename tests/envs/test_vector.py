@@ -153,7 +153,7 @@ def test_an_action_of_the_device_that_is_not_finite_ends_its_world(next_step):
         ({"seed": 1.5}, ConfigError, "expected one integer as seed of all worlds"),
         ({"options": {"colour": 1}}, ConfigError, "expected no option of reset but reset_mask, got colour"),
         ({"options": {"reset_mask": [True]}}, ValueError, r"shape \(1,\)"),
-        ({"options": {"reset_mask": np.ones(3)}}, ValueError, "needed are .* bool"),
+        ({"options": {"reset_mask": np.ones(3)}}, ValueError, r"expected a mask of shape \(3,\) and bool"),
         (
             {"seed": 1, "options": {"reset_mask": np.ones(3, bool)}},
             ConfigError,
