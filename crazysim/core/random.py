@@ -1,7 +1,6 @@
 """Random numbers that depend on the seed, the world, the drone, the episode, the step and the stage's name.
 
-They do not depend on how many worlds there are, on how worlds are spread over devices, or on which other worlds are
-reset along.
+They are independent of the number of worlds, of the devices that worlds are spread over, and of other worlds' resets.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from crazysim.core.data import SimData, as_key
 
 
 def seed_sim(data: SimData, seed: int | Array) -> SimData:
-    """Return the data with another seed, or key, for all random numbers drawn from now on."""
+    """Return the data with another seed, or key, for all later random numbers."""
     return data.replace(core=data.core.replace(rng_key=as_key(seed)))
 
 
@@ -25,7 +24,7 @@ def world_key(data: SimData, name: str) -> Array:
 
     Args:
         data: The data of one drone or world; seed, world, episode and step are taken from it.
-        name: The stage that draws; another name, other numbers.
+        name: Name of the stage that draws; different names give independent numbers.
 
     Returns:
         Typed key. ()
@@ -41,11 +40,11 @@ def drone_key(data: SimData, name: str) -> Array:
 
 
 def world_keys(data: SimData, name: str) -> Array:
-    """Return a random key for every world; the same that ``world_key`` gives one of them.
+    """Return a random key for every world; the same as that of ``world_key`` for each of them.
 
     Args:
         data: The simulation; seed, episodes and steps are taken from it.
-        name: The stage that draws; another name, other numbers.
+        name: Name of the stage that draws; different names give independent numbers.
 
     Returns:
         Typed keys. (n_worlds,)
@@ -54,11 +53,11 @@ def world_keys(data: SimData, name: str) -> Array:
 
 
 def drone_keys(data: SimData, name: str) -> Array:
-    """Return a random key for every drone of every world; the same that ``drone_key`` gives one of them.
+    """Return a random key for every drone of every world; the same as that of ``drone_key`` for each of them.
 
     Args:
         data: The simulation; seed, episodes and steps are taken from it.
-        name: The stage that draws; another name, other numbers.
+        name: Name of the stage that draws; different names give independent numbers.
 
     Returns:
         Typed keys; draw with ``jax.vmap(jax.vmap(draw))(keys)``. (n_worlds, n_drones)

@@ -1,4 +1,4 @@
-"""A stage that says what it sees: one drone, or one world. Undeclared, a stage sees the whole batch."""
+"""Stages with a declared scope, one drone or one world. A stage without one receives the full batch."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ StageScope = Literal["drone", "world", "batch"]
 
 
 class Stage:
-    """A function ``SimData -> SimData`` with the scope that it was written for.
+    """A function ``SimData -> SimData`` with the scope that it is written for.
 
-    Called with the data of a simulation it does to every drone, or to every world, what its function does to one.
+    Called with the data of a simulation, it applies its function to every drone, or to every world.
     """
 
     def __init__(
@@ -29,7 +29,7 @@ class Stage:
         batched: bool = False,
         name: str | None = None,
     ):
-        """Declare a stage; see ``stage``. ``batched`` promises that the functions take any leading axes as well."""
+        """Declare a stage; see ``stage``. ``batched`` declares that the functions also take any leading axes."""
         self.fn, self.when, self.batched = fn, when, batched
         self.scope: StageScope = scope
         self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
@@ -42,7 +42,7 @@ class Stage:
         return _over_worlds(self, data)
 
     def one(self, data: Any) -> Any:
-        """Return the data after the stage, for the one drone or world that the data is of."""
+        """Return the data of one drone or world after the stage."""
         after = self.fn(data)
         mask = None if self.when is None else self.when(data)
         if mask is None:
@@ -60,7 +60,7 @@ class Stage:
 def stage(
     scope: Literal["drone", "world"], when: Callable[..., Array | None] | None = None
 ) -> Callable[[Callable[..., Any]], Stage]:
-    """Declare what a stage sees, so that an engine can fuse it with its neighbours.
+    """Declare the scope of a stage, so that an engine can fuse it with its neighbours.
 
     ``@stage("drone")``: the data of one drone. Leaves of drones and worlds come without batch axes: ``pos`` is (3,),
     ``steps`` (). The stage writes leaves of drones.
@@ -70,21 +70,21 @@ def stage(
 
     Args:
         scope: ``"drone"`` or ``"world"``.
-        when: Tells from the same data whether the stage acts at this step, as a bool (); None for always. An engine
-            spends nothing on a stage at steps where it acts nowhere.
+        when: Function of the same data that returns True, a bool (), at steps in which the stage acts; None for
+            always. Engines skip the stage at steps in which it acts nowhere.
 
     Raises:
         ConfigError: If the scope is neither.
     """
     if scope not in ("drone", "world"):
         raise ConfigError(
-            f"a stage is of one 'drone' or one 'world', not {scope!r}; undeclared, it sees the whole batch"
+            f"expected scope 'drone' or 'world', got {scope!r}. Use no declaration for a stage of the full batch."
         )
     return lambda fn: Stage(fn, scope, when)
 
 
 def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
-    """Return the functions of a pipeline as stages under the pipeline's names, undeclared ones of the whole batch."""
+    """Return the functions of a pipeline as stages under the pipeline's names; undeclared ones get the full batch."""
     return [
         Stage(fn.fn, fn.scope, fn.when, fn.batched, name) if isinstance(fn, Stage) else Stage(fn, "batch", name=name)
         for name, fn in pipeline.items()
@@ -92,7 +92,7 @@ def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
 
 
 class Axes:
-    """Which batch axes every leaf of a simulation's data has, and what it is called."""
+    """Batch axes and name of every leaf of a simulation's data."""
 
     def __init__(self, data: Any):
         """Read them off the data of all worlds."""

@@ -256,7 +256,7 @@ WRONG_CALLS = [
         "'integration' already exists",
         "name=",
     ),
-    (lambda sim: append_fn(sim.step_pipeline, None), "not None", "a function"),
+    (lambda sim: append_fn(sim.step_pipeline, None), "got None", "a function"),
 ]
 
 
