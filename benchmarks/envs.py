@@ -17,8 +17,7 @@ import jax.numpy as jnp
 from measure import digits, engine_of, medians, report
 
 import crazysim.envs as envs
-from crazysim.envs.env import flatten
-from crazysim.envs.rollout import bare
+from crazysim.envs.state import bare, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.train.networks import Policy, init_mlp
 

@@ -129,7 +129,7 @@ def _train(options: argparse.Namespace) -> None:
 
     if options.task == "list":
         for name, entry in TASKS.items():
-            print(f"{name:12} {(entry.maker.__doc__ or '').splitlines()[0].removeprefix('Return the task of ')}")
+            print(f"{name:12} {(entry.task.__doc__ or '').splitlines()[0]}")
         return
     from crazysim.train.run import CHECKPOINT, TrainConfig, train
     from crazysim.train.show import film, plot_curve, read_curve

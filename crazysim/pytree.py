@@ -13,7 +13,7 @@ from jax import Array
 
 from crazysim.errors import ConfigError
 
-Scope = Literal["drone", "world", "shared", "opaque", "parameter"]
+Scope = Literal["drone", "world", "rows", "shared", "opaque", "parameter"]
 
 T = TypeVar("T")
 
@@ -23,8 +23,9 @@ def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None) 
 
     Args:
         scope: Which batch axes the array carries. ``drone``: (n_worlds, n_drones, *core). ``world``:
-            (n_worlds, 1, *core). ``shared``: core. ``parameter``: shared or drone, told apart by its
-            number of dimensions. ``opaque``: untouched by resets and by sharding.
+            (n_worlds, 1, *core). ``rows``: (n_worlds, ...), with any further axes. ``shared``: core.
+            ``parameter``: shared or drone, told apart by its number of dimensions. ``opaque``: untouched by
+            resets and by sharding.
         core_ndim: Number of dimensions of the core shape.
         core: The core shape, where it can be no other. It keeps one mass for each of three worlds from passing
             for one along each of three axes.

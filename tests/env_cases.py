@@ -18,13 +18,18 @@ quick = functools.partial(jax.jit, compiler_options=compiling.options(emitters=T
 
 
 class Compiled(Wrapper):
-    """An environment whose functions are compiled once, for tests that call them from Python."""
+    """An environment whose functions are compiled once, for tests that call them from Python and compare bit for bit.
+
+    It is declared to need all worlds, so that nothing around it is fused.
+    """
+
+    batched = True
 
     def __init__(self, env):
         super().__init__(env)
         self.traces = collections.Counter()
-        """How often Python ran each of the functions."""
-        for name in ("reset", "restart", "step"):
+        """Number of times that Python ran each of the functions."""
+        for name in ("reset", "restart", "step", "begin"):
             setattr(self, name, quick(self._counted(name, getattr(env, name))))
 
     def _counted(self, name, fn):
@@ -42,7 +47,7 @@ def compiled(name="hover", n_worlds=4):
 
 
 def random_action(state, seed=0):
-    """Return actions beyond both ends of what is heeded, on the host. (n_worlds, n_drones, k)"""
+    """Return actions, some of them beyond the limits, on the host. (n_worlds, n_drones, k)"""
     return np.random.default_rng(seed).uniform(-1.2, 1.2, state.action.shape).astype(np.float32)
 
 
@@ -71,7 +76,7 @@ def obs_of(state, mask):
     return jax.tree.map(lambda x: x[mask], state.obs)
 
 
-def entries(makers_once=False):
-    """Return the names of all tasks, or one for each function that makes them, each with a worker of its own."""
-    names = {TASKS[name].maker: name for name in reversed(TASKS)}.values() if makers_once else TASKS
+def entries(classes_once=False):
+    """Return the names of all tasks, or one for each class of tasks, each with a worker of its own."""
+    names = {TASKS[name].task: name for name in reversed(TASKS)}.values() if classes_once else TASKS
     return [pytest.param(name, marks=pytest.mark.xdist_group(f"env {name}")) for name in names]

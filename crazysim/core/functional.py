@@ -27,8 +27,7 @@ def state_control(data: SimData, controls: Any, check_finite: bool = False) -> S
     Raises:
         ValueError: Wrong shape, type or command level, or a NaN or infinite command.
     """
-    controls = check_command(data, Control.state, controls, check_finite)
-    return data.replace(controls=data.controls.replace(state=data.controls.state.replace(staged_cmd=controls)))
+    return stage_command(data, check_command(data, Control.state, controls, check_finite))
 
 
 def attitude_control(data: SimData, controls: Any, check_finite: bool = False) -> SimData:
@@ -36,9 +35,7 @@ def attitude_control(data: SimData, controls: Any, check_finite: bool = False) -
 
     Arguments and errors as in ``state_control``.
     """
-    controls = check_command(data, Control.attitude, controls, check_finite)
-    ctrl = data.controls.attitude.replace(staged_cmd=controls)
-    return data.replace(controls=data.controls.replace(attitude=ctrl))
+    return stage_command(data, check_command(data, Control.attitude, controls, check_finite))
 
 
 def body_rate_control(data: SimData, controls: Any, check_finite: bool = False) -> SimData:
@@ -46,9 +43,7 @@ def body_rate_control(data: SimData, controls: Any, check_finite: bool = False) 
 
     Arguments and errors as in ``state_control``.
     """
-    controls = check_command(data, Control.body_rate, controls, check_finite)
-    ctrl = data.controls.body_rate.replace(staged_cmd=controls)
-    return data.replace(controls=data.controls.replace(body_rate=ctrl))
+    return stage_command(data, check_command(data, Control.body_rate, controls, check_finite))
 
 
 def force_torque_control(data: SimData, controls: Any, check_finite: bool = False) -> SimData:
@@ -56,9 +51,7 @@ def force_torque_control(data: SimData, controls: Any, check_finite: bool = Fals
 
     Arguments and errors as in ``state_control``.
     """
-    controls = check_command(data, Control.force_torque, controls, check_finite)
-    ctrl = data.controls.force_torque.replace(staged_cmd=controls)
-    return data.replace(controls=data.controls.replace(force_torque=ctrl))
+    return stage_command(data, check_command(data, Control.force_torque, controls, check_finite))
 
 
 def rotor_vel_control(data: SimData, controls: Any, check_finite: bool = False) -> SimData:
@@ -66,8 +59,24 @@ def rotor_vel_control(data: SimData, controls: Any, check_finite: bool = False) 
 
     Arguments and errors as in ``state_control``.
     """
-    controls = check_command(data, Control.rotor_vel, controls, check_finite)
-    return data.replace(controls=data.controls.replace(rotor_vel=controls))
+    return stage_command(data, check_command(data, Control.rotor_vel, controls, check_finite))
+
+
+def stage_command(data: SimData, command: Array) -> SimData:
+    """Return the data with a command at its command level, which is not checked.
+
+    For data of one drone, one world or all worlds alike. Rotor speeds take effect at the next step, other commands at
+    the next tick of their controller.
+
+    Args:
+        data: The simulation.
+        command: Command in the units of ``data.controls.mode``. (..., k)
+    """
+    controls, mode = data.controls, data.controls.mode
+    if mode == Control.rotor_vel:
+        return data.replace(controls=controls.replace(rotor_vel=command))
+    level = getattr(controls, mode.value).replace(staged_cmd=command)
+    return data.replace(controls=controls.replace(**{mode.value: level}))
 
 
 def time(data: SimData) -> Array:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.errors import ConfigError
-from crazysim.pytree import scopes
+from crazysim.pytree import PyTree, scopes
 
 StageScope = Literal["drone", "world", "batch"]
 
@@ -148,22 +148,81 @@ def with_leaves(leaves: Sequence[Any], numbers: Sequence[int], values: Sequence[
     return out
 
 
+def over_worlds(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of one world as a function of all worlds.
+
+    In records the batch axes are the declared ones: the function receives leaves of drones as (n_drones, ...), leaves
+    of worlds and rows without batch axes, and shared or opaque leaves as they are, which it must return unchanged. An
+    array outside of a record has worlds as its first axis.
+
+    Raises:
+        ConfigError: When the function is called, if it changes a leaf that all worlds share.
+    """
+
+    def of_all(*args: Any) -> Any:
+        leaves, treedef = jax.tree.flatten(args)
+        kinds = _kinds(args)
+        rows = [x[:, 0] if kind == "world" else x for kind, x in zip(kinds, leaves, strict=True)]
+        returned: dict[str, Any] = {}
+
+        def one(values: list[Any]) -> list[Any]:
+            result = fn(*treedef.unflatten(values))
+            paths, returned["treedef"] = jax.tree_util.tree_flatten_with_path(result)
+            returned["kinds"] = after = _kinds(result)
+            numbers = {(id(x), kind in BATCHED): i for i, (x, kind) in enumerate(zip(values, kinds, strict=True))}
+            unchanged = [numbers.get((id(x), kind in BATCHED)) for (_, x), kind in zip(paths, after, strict=True)]
+            returned["unchanged"] = unchanged
+            for (path, _), kind, number in zip(paths, after, unchanged, strict=True):
+                if kind not in BATCHED and number is None:
+                    name = jax.tree_util.keystr(path).lstrip(".")
+                    raise ConfigError(
+                        f"{getattr(fn, '__name__', fn)!r} is written for one world and changes {name}, which all "
+                        f"worlds share. Give every drone or world a leaf of its own first."
+                    )
+            return [x for (_, x), number in zip(paths, unchanged, strict=True) if number is None]
+
+        changed = iter(jax.vmap(one, ([0 if kind in BATCHED else None for kind in kinds],))(rows))
+        out = []
+        for kind, number in zip(returned["kinds"], returned["unchanged"], strict=True):
+            if number is not None and kinds[number] == kind:
+                out.append(leaves[number])
+            else:
+                x = next(changed) if number is None else rows[number]
+                out.append(x[:, None] if kind == "world" else x)
+        return returned["treedef"].unflatten(out)
+
+    return of_all
+
+
+BATCHED = ("drone", "world", "rows")
+"""Scopes of leaves that have an axis of worlds."""
+
+
+def _kinds(tree: Any) -> list[str]:
+    """Return the scope of every leaf: as its record declares it, and ``rows`` outside of records."""
+
+    def is_record(x: Any) -> bool:
+        return isinstance(x, PyTree)
+
+    return jax.tree.leaves(jax.tree.map(lambda x: scopes(x) if is_record(x) else "rows", tree, is_leaf=is_record))
+
+
 def _over_worlds(stage: Stage, data: Any) -> Any:
-    """Return the data after ``stage.one`` in every world, and for every drone if that is what it is for."""
-    leaves, axes = jax.tree.leaves(data), Axes(data)
-    written: list[int] = []
+    """Return the data after ``stage.one`` in every world, and for every drone if the stage is of one drone."""
+    axes = Axes(data)
 
-    def one(values: list[Any]) -> list[Any]:
-        after = stage.one(axes.treedef.unflatten(values))
-        written[:] = axes.written(values, after, stage)
-        new = jax.tree.leaves(after)
-        return [new[i] for i in written]
+    def of_world(world: Any) -> Any:
+        leaves = jax.tree.leaves(world)
+        written: list[int] = []
 
-    over_drones = [0 if s == "drone" else None for s in axes.scopes]
-    over_worlds = [0 if s in ("drone", "world") else None for s in axes.scopes]
-    each = jax.vmap(one, (over_drones,)) if stage.scope == "drone" else one
-    out = jax.vmap(each, (over_worlds,))(
-        [x[:, 0] if s == "world" else x for s, x in zip(axes.scopes, leaves, strict=True)]
-    )
-    new = [x[:, None] if axes.scopes[i] == "world" else x for i, x in zip(written, out, strict=True)]
-    return axes.treedef.unflatten(with_leaves(leaves, written, new))
+        def one(values: list[Any]) -> list[Any]:
+            after = stage.one(axes.treedef.unflatten(values))
+            written[:] = axes.written(values, after, stage)
+            new = jax.tree.leaves(after)
+            return [new[i] for i in written]
+
+        over_drones = [0 if s == "drone" else None for s in axes.scopes]
+        out = jax.vmap(one, (over_drones,))(leaves) if stage.scope == "drone" else one(leaves)
+        return axes.treedef.unflatten(with_leaves(leaves, written, out))
+
+    return over_worlds(of_world)(data)

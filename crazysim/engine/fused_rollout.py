@@ -14,10 +14,10 @@ from crazysim.engine import fused, kernel
 from crazysim.engine.build import build_program
 
 
-class Whole:
-    """``whole(leaves) -> leaves``, pure, as ``Step`` is, for data of one structure and a number of steps that is known.
+class FusedRollout:
+    """``rollout(leaves) -> leaves``, pure, as ``Step`` is, for data of one structure and a fixed number of steps.
 
-    What it writes before it reads is not read: there may be anything in its place.
+    A leaf that is written before it is read is not read: its value may be anything.
     """
 
     def __init__(
@@ -30,9 +30,9 @@ class Whole:
         n_steps: int,
         platform: str,
         scratch: Collection[int] = (),
-        lay: Callable[[list[int]], list[int]] | None = None,
+        rows: Callable[[list[int]], list[int]] | None = None,
     ):
-        """Read the stages.
+        """Lower the stages.
 
         Args:
             first: Stages that run once, before the steps.
@@ -40,36 +40,36 @@ class Whole:
             last: Stages that run once, after the steps.
             data: Data of the structure, or its shapes and types.
             zeros: Elements of shared leaves that are known to be zero, by leaf.
-            n_steps: How many steps.
-            platform: Where it runs, ``"cpu"`` or ``"gpu"``.
-            scratch: Leaves that are only there for one stage to tell another.
-            lay: Picks, from the leaves that are written, those that ``advance`` is given as rows.
+            n_steps: Number of steps.
+            platform: Platform it runs on, ``"cpu"`` or ``"gpu"``.
+            scratch: Leaves that only pass values from one stage to another.
+            rows: Selects, from the leaves that are written, those that ``run_packed`` takes as rows.
 
         Raises:
-            UnsupportedError: If something of it cannot be written out.
+            UnsupportedError: If a stage cannot be lowered.
         """
-        self.program = program = build_program(stages, data, zeros, None, first, last, scratch, lay)
+        self.program = program = build_program(stages, data, zeros, None, first, last, scratch, rows)
         if program.unfused_stages:
             raise program.unfused_stages[0].error
         self._n_leaves = len(jax.tree.leaves(data))
         self._rows = {i: list(leaf.rows_of) for i, leaf in enumerate(program.leaves) if leaf.rows_of}
         self.read = [i for i in kernel.needed(program) if i < self._n_leaves]
-        """Leaves that are read as they are, not as rows and not with the shared numbers."""
+        """Leaves that are read as arrays of their own, neither as rows nor with the shared numbers."""
         self._n_steps = n_steps
         self._run = fused.build(program, platform)
 
     def __call__(self, leaves: Sequence[Any]) -> list[Any]:
-        """Return the leaves after it all."""
+        """Return the leaves after all stages."""
         written, _ = self._run([*leaves, *self.shared(leaves)], self._n_steps)
         return with_leaves(leaves, self.program.written, written)
 
     def shared(self, leaves: Sequence[Any]) -> list[Array]:
-        """Return the shared numbers of some leaves one behind the other, if there are any."""
+        """Return the shared numbers of the leaves as one array, if there are any."""
         packed = self.program.packed
         return [jnp.concatenate([leaves[i].ravel() for i in packed])] if packed else []
 
-    def rows(self, leaves: Sequence[Any]) -> list[Array]:
-        """Return leaves as rows of one number of all drones each, an array for each type. (n_rows, n_lanes) each"""
+    def pack(self, leaves: Sequence[Any]) -> list[Array]:
+        """Return leaves as rows, each one number of all drones; one array for each type. (n_rows, n_lanes) each"""
         n_drones = self.program.n_drones
 
         def row(x: Any) -> Array:
@@ -78,8 +78,8 @@ class Whole:
 
         return [jnp.concatenate([row(leaves[i]) for i in some]) for some in self._rows.values()]
 
-    def unlaid(self, rows: Sequence[Array]) -> dict[int, Array]:
-        """Return the leaves that rows are of, by number."""
+    def unpack(self, rows: Sequence[Array]) -> dict[int, Array]:
+        """Return packed leaves, by number."""
         program, out = self.program, {}
         for array, some in zip(rows, self._rows.values(), strict=True):
             first = 0
@@ -91,15 +91,15 @@ class Whole:
                 first += size
         return out
 
-    def advance(
+    def run_packed(
         self, rows: Sequence[Array], shared: Sequence[Array], read: dict[int, Any]
     ) -> tuple[list[Array], dict[int, Array]]:
-        """Return the rows after it all, and the other leaves that are written.
+        """Return the rows after all stages, and the other leaves that are written.
 
         Args:
-            rows: From ``rows``.
+            rows: From ``pack``.
             shared: From ``shared``.
-            read: What is to be read as it is, by leaf.
+            read: Leaves that are read as arrays of their own.
         """
         leaves = [read.get(i) for i in range(self._n_leaves)]
         written, _ = self._run([*leaves, *shared, *rows], self._n_steps)

@@ -1,16 +1,19 @@
-"""Environments: tasks for many worlds, as pure functions, and as Gymnasium's vector environments.
+"""Environments: tasks in many worlds, as pure functions, and as vector environments of Gymnasium.
 
 Importing this module registers every task with Gymnasium, as ``crazysim/Hover-v0`` and so on.
 """
 
 from typing import TYPE_CHECKING
 
+from crazysim.envs import terms
 from crazysim.envs.actions import Actions, actions_of
-from crazysim.envs.env import DroneEnv, Env, EnvState, Task
-from crazysim.envs.random import uniform
+from crazysim.envs.env import DroneEnv, Env
+from crazysim.envs.random import draw, uniform
 from crazysim.envs.registry import TASKS, make
 from crazysim.envs.rollout import rollout
 from crazysim.envs.spawn import flying
+from crazysim.envs.state import EnvState, flatten
+from crazysim.envs.task import Task
 from crazysim.envs.tasks.core import state_of
 from crazysim.envs.vector import DroneVectorEnv, register
 from crazysim.envs.wrappers import (
@@ -23,6 +26,8 @@ from crazysim.envs.wrappers import (
     ObservationNoise,
     Observe,
     Randomize,
+    RewardTerms,
+    Wrapper,
 )
 from crazysim.lazy import lazy
 
@@ -51,13 +56,18 @@ __all__ = [
     "ObservationNoise",
     "Observe",
     "Randomize",
+    "RewardTerms",
     "Task",
+    "Wrapper",
     "actions_of",
+    "draw",
+    "flatten",
     "flying",
     "make",
     "make_parallel",
     "rollout",
     "state_of",
+    "terms",
     "uniform",
 ]
 

@@ -1,4 +1,4 @@
-"""What an action means: an affine map from [-1, 1] to commands with units, for each command level."""
+"""Meaning of actions: an affine map from [-1, 1] to commands with units, for each command level."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from crazysim.pytree import scopes
 from crazysim.rotation import safe_clip
 
 TILT = np.pi / 4
-"""Largest roll and pitch that an action commands, rad."""
+"""Largest roll and pitch of an action, rad."""
 YAW = np.pi / 2
-"""Largest yaw that an action commands, rad."""
+"""Largest yaw of an action, rad."""
 RATES = (10.0, 10.0, 4.0)
-"""Largest body rates that an action commands, rad/s."""
+"""Largest body rates of an action, rad/s."""
 REACH = (2.0, 2.0, 1.0)
-"""Farthest position setpoint from 1 m above the origin, m."""
+"""Largest distance of a position setpoint from 1 m above the origin, m."""
 
 
 class Actions:
@@ -35,29 +35,30 @@ class Actions:
     | --- | --- | --- |
     | ``attitude`` | roll, pitch; yaw; collective thrust | -45, 0, 45 deg; -90, 0, 90 deg; see below |
     | ``body_rate`` | rates about x, y; z; collective thrust | -10, 0, 10 rad/s; -4, 0, 4 rad/s; see below |
-    | ``force_torque`` | collective thrust; body torque | see below; a quarter of what the rotors can do either way |
-    | ``rotor_vel`` | speed of each rotor | twice hover less the largest, hover, the largest, rpm |
+    | ``force_torque`` | collective thrust; body torque | see below; a quarter of the rotors' limit either way |
+    | ``rotor_vel`` | speed of each rotor | twice hover minus the maximum, hover, the maximum, rpm |
     | ``state`` | position setpoint | 2 m to either side, 1 m down and up, of 1 m above the origin |
 
-    Collective thrust goes from twice hover less the most (motors off below zero), over hover, to the most of all
-    rotors, N.
+    Collective thrust ranges from twice hover minus the maximum (motors off below zero), over hover, to the maximum of
+    all rotors, N.
     """
 
     def __init__(self, centre: np.ndarray, scale: np.ndarray, control: Control):
         """Take the map, in the units of the command level. (k,) each
 
         Raises:
-            ConfigError: If the two have not the same shape (k,).
+            ConfigError: If the two do not have the same shape (k,).
         """
         self.centre, self.scale, self.control = np.asarray(centre, float), np.asarray(scale, float), control
         if self.centre.shape != self.scale.shape or self.centre.ndim != 1:
             raise ConfigError(
-                f"centre and scale of actions have shapes {self.centre.shape} and {self.scale.shape}; needed is (k,)"
+                f"expected centre and scale of actions of one shape (k,), got {self.centre.shape} and "
+                f"{self.scale.shape}"
             )
 
     @property
     def size(self) -> int:
-        """Numbers in an action."""
+        """Size of an action."""
         return len(self.centre)
 
     def command(self, action: Array) -> Array:
@@ -71,7 +72,7 @@ class Actions:
         return jnp.concatenate([command, rest], axis=-1)
 
     def __str__(self) -> str:
-        """Return the level and what an action of -1 and 1 commands."""
+        """Return the command level, and the commands at -1 and 1."""
         what = COMMAND_FIELDS[self.control]
         return f"{self.control.value} ({what}): {self.centre - self.scale} to {self.centre + self.scale}"
 
@@ -80,8 +81,8 @@ def actions_of(airframe: Airframe, params: SimParams, control: Control, tilt: fl
     """Return the usual map of a command level; see ``Actions``.
 
     Args:
-        airframe: What the rotors can do.
-        params: Parameters, which say what makes a drone hover; where each drone has its own, the first counts.
+        airframe: Airframe, for the limits of the rotors.
+        params: Parameters, for the hover command; where each drone has its own, those of the first are used.
         control: Command level.
         tilt: Largest roll and pitch of the attitude level, rad.
     """
@@ -101,13 +102,15 @@ def actions_of(airframe: Airframe, params: SimParams, control: Control, tilt: fl
         most = each / 2 * arms * np.abs(airframe.mixing_matrix).sum(axis=-1)
         return Actions(np.array([hover, 0, 0, 0]), np.array([span, *most / 4]), control)
     if isinstance(params, fitted.Params):
-        raise ConfigError("fitted models take no rotor commands; use dynamics='first_principles'")
+        raise ConfigError(
+            "expected dynamics='first_principles' for rotor commands, got a fitted model, which has no rotors"
+        )
     centre = np.asarray(first_principles.hover_rotor_vel(params))
     return Actions(centre, np.broadcast_to(np.asarray(params.rotor_vel_max), centre.shape) - centre, control)
 
 
 def hover_thrust(params: SimParams) -> Array:
-    """Return the collective thrust command under which a drone hovers, N. (..., 1)"""
+    """Return the collective thrust command at which a drone hovers, N. (..., 1)"""
     gravity = params.gravity_vec
     weight = params.mass * jnp.sqrt(jnp.sum(gravity * gravity, axis=-1, keepdims=True))
     return (weight - params.acc_coef) / params.cmd_f_coef if isinstance(params, fitted.Params) else weight

@@ -1,15 +1,12 @@
-"""A step of an environment as one kernel: what an action means, the physics, the task, and episodes that begin anew.
+"""An environment step as one kernel: action, physics, observation and the start of new episodes.
 
-Task and wrappers are functions of all worlds. Where each world is treated like every other and sees none of them, they
-can be written out for one, as stages of the engine: those before the first step of physics, and those after the last.
+The phases of a step (``crazysim.envs.phases``) are functions of one world. Here they become stages of the engine:
+``act`` runs before the first physics step, ``observe`` after the last, and ``begin`` where an episode is over.
 """
 
 from __future__ import annotations
 
-import copy
-import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,19 +14,28 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, Stage
-from crazysim.core.stages import finite
-from crazysim.engine.fused_rollout import Whole
-from crazysim.engine.independence import require_apart
-from crazysim.engine.lower import UnsupportedError
-from crazysim.envs.env import DroneEnv, Env, EnvState
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.fused_rollout import FusedRollout
+from crazysim.envs.phases import act, begin, observe
+from crazysim.envs.state import EnvState
 from crazysim.pytree import PyTree, leaf, scopes
 
+if TYPE_CHECKING:
+    from crazysim.envs.env import Env
+    from crazysim.envs.wrappers.autoreset import ResetPolicy
+
 NAME = "environment"
-"""Where the rest of an environment's state is, in ``data.plugins``, while the kernel runs."""
+"""Key in ``data.plugins`` of the rest of an environment's state while the kernel runs."""
+ACTION, OVER = "action of this step", "over"
+"""Names of arrays that no state has."""
+OUTPUTS = (".obs", ".reward", ".terminated", ".truncated", ".info")
+"""Prefixes of the names of what a step returns, and of which it reads the ends of episodes only."""
+ENDS = (".terminated", ".truncated")
+"""Names of outputs that the next step reads."""
 
 
 class Rest(PyTree):
-    """What an environment's state has beside the simulation: its arrays by name, each in rows of one drone or world."""
+    """State of an environment besides the simulation's data, by name, as rows of one drone or one world each."""
 
     of_drones: dict[str, Array] = leaf("drone", 1)
     """(n_worlds, n_drones, k) each"""
@@ -37,269 +43,188 @@ class Rest(PyTree):
     """(n_worlds, 1, k) each"""
 
 
-@dataclasses.dataclass(frozen=True)
-class Renewal:
-    """How new episodes begin."""
+class PackedState(NamedTuple):
+    """A state as few arrays: each array of a compiled call costs more than the arithmetic on it."""
 
-    over: Callable[[EnvState, EnvState], Array]
-    """``over(before, after)``: where, from the states before and after a step. (n_worlds,)"""
-    prepare: Callable[[EnvState], EnvState]
-    """``prepare(after)``: the state as it is where none begins."""
-    begin: Callable[[EnvState, Array], EnvState]
-    """``begin(prepared, mask)``: the state with new episodes in the worlds of a mask."""
+    rows: list[Array]
+    """Numbers that a step writes. (n_rows, n_lanes) each"""
+    shared: list[Array]
+    """Numbers that all drones share. (n,)"""
+    constants: dict[int, Array]
+    """Other arrays that a step reads, by leaf."""
 
 
-class WholeStep:
-    """``step(state, action) -> state`` of an environment in one kernel, for states of one structure."""
+class FusedEnvStep:
+    """``step(state, action) -> state`` of an environment as one kernel, for states of one structure."""
 
-    def __init__(self, env: Env, renewal: Renewal | None, state: EnvState, action: Any, laid: bool = False):
-        """Write it out.
+    def __init__(self, env: Env, policy: ResetPolicy | None, state: EnvState, action: Any, packed: bool = False):
+        """Trace and lower the step.
 
         Args:
             env: The environment, without automatic resets.
-            renewal: How new episodes begin; None if they do not.
-            state: State of the structure that is stepped, or its shapes and types.
-            action: Action, or its shape and type.
-            laid: Whether it is for ``advance``, which hands few arrays to and fro, rather than to be called.
+            policy: Rule of automatic resets; None for no resets.
+            state: A state of the structure that is stepped, or its shapes and types.
+            action: An action, or its shape and type.
+            packed: True for ``step_packed``, False for calls.
 
         Raises:
-            UnsupportedError: If something of it cannot be written out for one world.
+            UnsupportedError: If the engine cannot lower it.
         """
-        self._env, self._renewal = env, renewal
-        base = base_of(env)
+        self._env, self._policy, base = env, policy, env.base
+        for wrapper in env.wrappers:
+            if wrapper.batched:
+                raise UnsupportedError(f"wrapper {wrapper.name!r} is declared to need all worlds at once")
         self._n_drones = base.sim.n_drones
-        if base.sim.mesh is not None:
-            raise UnsupportedError("its worlds are spread over devices")
         state, action = jax.eval_shape(lambda *x: x, state, action)
-        after = jax.eval_shape(self._plainly, state, action)
-        self._given, self._told = _Layout(state), _Layout(after)
-        self._action = action
-        rest = self._given.shapes | self._told.shapes | {ACTION: action}
-        rest |= {OVER: jax.ShapeDtypeStruct((base.sim.n_worlds,), bool)} if renewal else {}
-        self._rest = rest
-        example = jax.eval_shape(lambda state, action: self._joined(state, action, base.sim.n_worlds), state, action)
-        axes = Axes(example)
-        self._axes = axes
-        self._require_apart(example, state)
-        places = _places(state.data, example)
-        # A parameter that has become one per drone since is zero for none of them for certain.
+        one, one_action = _of_one_world(state), jax.ShapeDtypeStruct(action.shape[1:], action.dtype)
+        self._before, self._after = _Layout(one), _Layout(jax.eval_shape(self._outline, one, one_action))
+        self._shapes = self._before.shapes | self._after.shapes | {ACTION: one_action}
+        self._shapes |= {OVER: jax.ShapeDtypeStruct((), bool)} if policy else {}
+        joined = jax.eval_shape(self._joined, state, action)
+        axes = Axes(joined)
+        places = _places(state.data, joined)
+        # A parameter that has become one per drone since is not certain to be zero for all of them.
         zeros = {places[i]: some for i, some in base.zeros if axes.scopes[places[i]] == "shared"}
-        last = [self._stage(self._observed, "observe and reward")]
-        if renewal is not None:
-            last.append(self._stage(self._begun, "new episodes", lambda one: one.plugins[NAME].of_worlds[OVER][0]))
+        first, last = [Stage(self._act, "world", name="actions")], [Stage(self._observe, "world", name="observations")]
+        if policy is not None:
+            last.append(Stage(self._begin, "world", lambda one: one.plugins[NAME].of_worlds[OVER][0], name="resets"))
         scratch = [i for i, name in enumerate(axes.names) if name.endswith(f"[{OVER!r}]")]
-        first = [self._stage(self._acted, "actions")]
-        self._numbers = _numbers(example)
-        told = {self._numbers[name] for name in self._told.shapes if name.startswith(TOLD)}
-        lay = (lambda written: [i for i in written if i not in told]) if laid else None
-        settings = (base.n_substeps, base.sim.device.platform, scratch, lay)
-        self._run = Whole(first, base.stages, last, example, zeros, *settings)
-        again = {name for name in self._told.shapes if self._numbers[name] in told & set(self._run.read)} - set(ENDS)
-        if laid and again:
+        self._leaf = _leaves_of_rest(joined)
+        outputs = {self._leaf[name] for name in self._after.shapes if name.startswith(OUTPUTS)}
+        rows = (lambda written: [i for i in written if i not in outputs]) if packed else None
+        settings = (base.n_substeps, base.sim.device.platform, scratch, rows)
+        self._run = FusedRollout(first, base.stages, last, joined, zeros, *settings)
+        again = {name for name in self._after.shapes if self._leaf[name] in outputs & set(self._run.read)} - set(ENDS)
+        if packed and again:
             raise UnsupportedError(f"a step reads {', '.join(sorted(again))} of the step before")
 
     def __call__(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one step later. (n_worlds, n_drones, k)"""
-        joined = self._joined(state, action, state.terminated.shape[0])
-        leaves, treedef = jax.tree.flatten(joined)
-        return self._stepped(self._run(leaves), treedef, self._told)
+        leaves, treedef = jax.tree.flatten(self._joined(state, action))
+        return self._separated(treedef.unflatten(self._run(leaves)), self._after)
 
-    # With few arrays ----------------------------------------------------------------------------------------------
+    # Packed states ------------------------------------------------------------------------------------------------
 
-    def lay(self, state: EnvState) -> Laid:
-        """Return a state as ``advance`` wants it."""
-        action = jnp.zeros(self._action.shape, self._action.dtype)
-        leaves = jax.tree.leaves(self._joined(state, action, state.terminated.shape[0]))
-        own = {self._numbers[name] for name in (*ENDS, ACTION)}
+    def pack(self, state: EnvState) -> PackedState:
+        """Return a state as the argument of ``step_packed``."""
+        action = jnp.zeros((state.terminated.shape[0], *self._shapes[ACTION].shape), self._shapes[ACTION].dtype)
+        leaves = jax.tree.leaves(self._joined(state, action))
+        own = {self._leaf[name] for name in (*ENDS, ACTION)}
         constants = {i: leaves[i] for i in self._run.read if i not in own}
-        return Laid(self._run.rows(leaves), self._run.shared(leaves), constants)
+        return PackedState(self._run.pack(leaves), self._run.shared(leaves), constants)
 
-    def advance(self, laid: Laid, ends: tuple[Array, Array], action: Array) -> tuple[Laid, EnvState]:
-        """Return what ``lay`` does of the state one step later, and that state without its data and what it remembers.
+    def step_packed(
+        self, packed: PackedState, ends: tuple[Array, Array], action: Array
+    ) -> tuple[PackedState, EnvState]:
+        """Return the packed state one step later, and that state without its data and memory.
 
         Args:
-            laid: The state before.
+            packed: The state before.
             ends: Its ``terminated`` and ``truncated``. (n_worlds,) each
-            action: What all drones do. (n_worlds, n_drones, k)
+            action: Action of every drone. (n_worlds, n_drones, k)
         """
-        given = self._rows(dict(zip(ENDS, ends, strict=True)) | {ACTION: action})
-        read = laid.constants | {self._numbers[k]: x for k, x in (given.of_drones | given.of_worlds).items()}
+        n_worlds = ends[0].shape[0]
+        given = self._rest(dict(zip(ENDS, ends, strict=True)) | {ACTION: action}, (n_worlds,))
+        read = packed.constants | {self._leaf[k]: x for k, x in (given.of_drones | given.of_worlds).items()}
         read = {i: x for i, x in read.items() if i in self._run.read}
-        rows, found = self._run.advance(laid.rows, laid.shared, read)
-        told = {name: found.get(self._numbers[name]) for name in self._told.shapes}
+        rows, found = self._run.run_packed(packed.rows, packed.shared, read)
+        outputs = {name: found.get(self._leaf[name]) for name in self._after.shapes}
         arrays = {
-            k: None if x is None else x.reshape(x.shape[0], *self._told.shapes[k].shape[1:]) for k, x in told.items()
+            name: None if x is None else x.reshape(n_worlds, *self._shapes[name].shape) for name, x in outputs.items()
         }
-        return laid._replace(rows=rows), self._told.state(arrays, None)
+        return packed._replace(rows=rows), self._after.state(arrays, None)
 
-    def unlay(self, laid: Laid, state: EnvState) -> EnvState:
-        """Return the state after some calls of ``advance``, bare of what they tell.
+    def unpack(self, packed: PackedState, state: EnvState) -> EnvState:
+        """Return a packed state as a state, without the outputs of its last step.
 
         Args:
-            laid: What the last of them returned.
-            state: What was given to ``lay``.
+            packed: Result of ``step_packed``.
+            state: The state that ``pack`` was called with.
         """
-        joined = self._joined(state, state.action, state.terminated.shape[0])
-        leaves, treedef = jax.tree.flatten(joined)
-        for i, x in self._run.unlaid(laid.rows).items():
+        leaves, treedef = jax.tree.flatten(self._joined(state, state.action))
+        for i, x in self._run.unpack(packed.rows).items():
             leaves[i] = x
-        return self._stepped(leaves, treedef, self._given)
+        return self._separated(treedef.unflatten(leaves), self._before)
 
-    def _stepped(self, leaves: list[Any], treedef: Any, layout: _Layout) -> EnvState:
-        after = self._state(treedef.unflatten(leaves), layout)
-        return after.replace(data=_shown(after.data, False))
+    # Stages of one world ------------------------------------------------------------------------------------------
 
-    # For any number of worlds -------------------------------------------------------------------------------------
+    def _act(self, joined: SimData) -> SimData:
+        state, action = act(self._env, self._state(joined, self._before), self._get(joined, ACTION))
+        return self._with(joined, state, self._before, {ACTION: action})
 
-    def _acted(self, joined: SimData) -> SimData:
-        """Have the data know what the action means."""
-        state, action = self._state(joined, self._given), self._of(joined, ACTION, self._action)
-        seen: list[SimData] = []
+    def _observe(self, joined: SimData) -> SimData:
+        before = self._state(joined, self._before)
+        core = before.data.core
+        data = before.data.replace(core=core.replace(nonfinite=core.nonfinite | ~_finite(before.data)))
+        after = observe(self._env, before.replace(data=data), self._get(joined, ACTION))
+        over = {}
+        if self._policy is not None:
+            over = {OVER: self._policy.is_over(before.done, after)}
+            after = self._policy.end(after)
+        return self._with(joined, after, self._after, over)
 
-        def fly(data: SimData) -> SimData:
-            seen.append(data)
-            return data
+    def _begin(self, joined: SimData) -> SimData:
+        ended = self._state(joined, self._after)
+        new = begin(self._env, ended, self._env.base.default_of_world(ended.data))
+        return self._with(joined, ended if self._policy is None else self._policy.begin(ended, new), self._after)
 
-        _flown(self._env, fly).step(state, action)
-        if len(seen) != 1:
-            raise UnsupportedError(f"a wrapper steps its environment {len(seen)} times in a step")
-        return self._changed(joined, seen[0], {})
+    def _outline(self, state: EnvState, action: Array) -> EnvState:
+        """Return a state of the structure that a step returns."""
+        state = observe(self._env, *act(self._env, state, action))
+        return state if self._policy is None else self._policy.end(state)
 
-    def _observed(self, joined: SimData, before: SimData | None = None) -> SimData:
-        """Have the rest know what there is to tell after the physics."""
-        state, action = self._state(joined, self._given), self._of(joined, ACTION, self._action)
-        now = _without_rest(joined)
-        now = now.replace(core=now.core.replace(nonfinite=now.core.nonfinite | ~finite(now)))
-        after = _flown(self._env, lambda _: now).step(state.replace(data=now if before is None else before), action)
-        told = {}
-        if self._renewal is not None:
-            told = {OVER: self._renewal.over(state, after)}
-            after = self._renewal.prepare(after)
-        return self._changed(joined, after.data, self._told.arrays(after) | told)
+    # Between a state and the data that the engine runs on -----------------------------------------------------------
 
-    def _begun(self, joined: SimData) -> SimData:
-        """Begin new episodes in all worlds."""
-        after = self._state(joined, self._told)
-        if self._renewal is not None:
-            after = self._renewal.begin(after, jnp.ones(after.terminated.shape, bool))
-        return self._changed(joined, after.data, self._told.arrays(after))
+    def _joined(self, state: EnvState, action: Array) -> SimData:
+        """Return the data of all worlds with the rest of the state as a plugin's record."""
+        n_worlds = state.terminated.shape[0]
+        arrays = {k: jnp.zeros((n_worlds, *x.shape), x.dtype) for k, x in self._shapes.items()}
+        arrays |= self._before.arrays(state) | {ACTION: action}
+        return state.data.replace(plugins=state.data.plugins | {NAME: self._rest(arrays, (n_worlds,))})
 
-    def _plainly(self, state: EnvState, action: Array) -> EnvState:
-        after = _flown(self._env, lambda data: data).step(state, action)
-        return after if self._renewal is None else self._renewal.prepare(after)
+    def _separated(self, joined: SimData, layout: _Layout) -> EnvState:
+        """Return the state of all worlds from the joined data."""
+        state = self._state(joined, layout, joined.states.pos.shape[:1])
+        core = state.data.core.replace(mjx_synced=jnp.asarray(False))
+        return state.replace(data=state.data.replace(core=core))
 
-    # Between a state and one record of data -----------------------------------------------------------------------
-
-    def _joined(self, state: EnvState, action: Array, n_worlds: int) -> SimData:
-        """Return the data with all else as one of its records."""
-        arrays = self._given.arrays(state) | {ACTION: action}
-        zeros = {k: jnp.zeros((n_worlds, *x.shape[1:]), x.dtype) for k, x in self._rest.items() if k not in arrays}
-        rest = self._rows(arrays | zeros)
-        return state.data.replace(plugins=state.data.plugins | {NAME: rest})
-
-    def _rows(self, arrays: dict[str, Array]) -> Rest:
+    def _rest(self, arrays: dict[str, Any], worlds: tuple[int, ...]) -> Rest:
+        """Return arrays of all worlds, or of one, as rows; an axis as long as there are drones is taken for theirs."""
         of_drones, of_worlds = {}, {}
         for name, x in arrays.items():
-            if _is_of_drones(self._rest[name], self._n_drones):
-                of_drones[name] = x.reshape(x.shape[0], self._n_drones, -1)
+            if self._shapes[name].shape[:1] == (self._n_drones,):
+                of_drones[name] = x.reshape(*worlds, self._n_drones, -1)
             else:
-                of_worlds[name] = x.reshape(x.shape[0], 1, -1)
+                of_worlds[name] = x.reshape(*worlds, *(1 for _ in worlds), -1)
         return Rest(of_drones, of_worlds)
 
-    def _of(self, joined: SimData, name: str, like: Any) -> Array:
+    def _get(self, joined: SimData, name: str, worlds: tuple[int, ...] = ()) -> Array:
         rest = joined.plugins[NAME]
         x = rest.of_drones[name] if name in rest.of_drones else rest.of_worlds[name]
-        return x.reshape(x.shape[0], *like.shape[1:])
+        return x.reshape(*worlds, *self._shapes[name].shape)
 
-    def _state(self, joined: SimData, layout: _Layout) -> EnvState:
-        arrays = {name: self._of(joined, name, like) for name, like in layout.shapes.items()}
-        return layout.state(arrays, _without_rest(joined))
+    def _state(self, joined: SimData, layout: _Layout, worlds: tuple[int, ...] = ()) -> EnvState:
+        data = joined.replace(plugins={k: x for k, x in joined.plugins.items() if k != NAME})
+        return layout.state({name: self._get(joined, name, worlds) for name in layout.shapes}, data)
 
-    def _changed(self, joined: SimData, data: SimData, arrays: dict[str, Array]) -> SimData:
-        rest, new = joined.plugins[NAME], self._rows({k: x.astype(self._rest[k].dtype) for k, x in arrays.items()})
-        rest = Rest(rest.of_drones | new.of_drones, rest.of_worlds | new.of_worlds)
-        # Whether the scene shows the data is the shell's to know.
-        data = _shown(data, joined.core.mjx_synced)
-        return data.replace(plugins=data.plugins | {NAME: rest})
-
-    # For one world ------------------------------------------------------------------------------------------------
-
-    def _stage(
-        self, fn: Callable[[SimData], SimData], name: str, when: Callable[[SimData], Array] | None = None
-    ) -> Stage:
-        """Return a function of all worlds as a stage of one."""
-        axes = {"drone": 1, "world": 2}
-
-        def of_one(one: SimData) -> SimData:
-            leaves, treedef = jax.tree.flatten(one)
-            scopes = self._axes.scopes
-            many = [x[(None,) * axes.get(s, 0)] if s in axes else x for s, x in zip(scopes, leaves, strict=True)]
-            after = jax.tree.leaves(fn(_of_worlds(treedef.unflatten(many), 1)))
-            return treedef.unflatten(
-                [x[(0,) * axes[s]] if s in axes else x for s, x in zip(scopes, after, strict=True)]
-            )
-
-        return Stage(of_one, "world", when, name=name)
-
-    def _require_apart(self, example: SimData, state: EnvState) -> None:
-        """Check that each world can be written out for itself.
-
-        Raises:
-            UnsupportedError: If not.
-        """
-        leaves, treedef = jax.tree.flatten(example)
-        batched = [s in ("drone", "world") for s in self._axes.scopes]
-        two = [_two(x) if b else x for x, b in zip(leaves, batched, strict=True)]
-        sources = ["worlds" if b else "shared" for b in batched]
-        of_data = [s in ("drone", "world") for s in jax.tree.leaves(scopes(state.data))]
-        old = [_two(x) if b else x for x, b in zip(jax.tree.leaves(state.data), of_data, strict=True)]
-        past = ["the data from before the step" if b else "shared" for b in of_data]
-
-        def apart(fn: Callable[..., SimData]) -> Callable[[list[Any]], list[Any]]:
-            def flat(values: list[Any]) -> list[Any]:
-                records = [treedef.unflatten(values[: len(two)])]
-                if len(values) > len(two):
-                    records.append(jax.tree.unflatten(jax.tree.structure(state.data), values[len(two) :]))
-                after = jax.tree.leaves(fn(*(_of_worlds(x, 2) for x in records)))
-                return [x for x, b in zip(after, batched, strict=True) if b]
-
-            return flat
-
-        require_apart(apart(self._acted), two, sources, "what an action means, or task.mark,")
-        require_apart(apart(self._observed), [*two, *old], [*sources, *past], "the task or a wrapper")
-        if self._renewal is not None:
-            require_apart(apart(self._begun), two, sources, "the beginning of an episode")
-
-
-class Laid(NamedTuple):
-    """A state as few arrays."""
-
-    rows: list[Array]
-    """What a step writes. (n_rows, n_lanes) each"""
-    shared: list[Array]
-    """What all drones share. (n,)"""
-    constants: dict[int, Array]
-    """What else a step reads, by number."""
-
-
-ACTION, OVER = "action of this step", "over"
-"""Names of what no state has."""
-TOLD = (".obs", ".reward", ".terminated", ".truncated", ".info")
-"""Names of what a step tells."""
-ENDS = (".terminated", ".truncated")
-"""What is told and read by the next step."""
+    def _with(
+        self, joined: SimData, state: EnvState, layout: _Layout, further: dict[str, Array] | None = None
+    ) -> SimData:
+        """Return the joined data of one world with a state in place of its own."""
+        arrays = layout.arrays(state) | (further or {})
+        arrays = {name: jnp.asarray(x, self._shapes[name].dtype) for name, x in arrays.items()}
+        old, new = joined.plugins[NAME], self._rest(arrays, ())
+        rest = Rest(old.of_drones | new.of_drones, old.of_worlds | new.of_worlds)
+        return state.data.replace(plugins=state.data.plugins | {NAME: rest})
 
 
 class _Layout:
-    """Arrays of a state beside its data, by name."""
+    """Arrays of a state besides its data, by name, with their shapes and types in one world."""
 
     def __init__(self, state: EnvState):
         paths, self._treedef = jax.tree_util.tree_flatten_with_path(state.replace(data=None))
         self._names = [jax.tree_util.keystr(path) for path, _ in paths]
         self.shapes = dict(zip(self._names, (x for _, x in paths), strict=True))
-        for name, x in self.shapes.items():
-            if x.shape[:1] != state.terminated.shape:
-                raise UnsupportedError(f"the state's {name} has shape {x.shape}, which is not of worlds")
 
     def arrays(self, state: EnvState) -> dict[str, Any]:
         return dict(zip(self._names, self._treedef.flatten_up_to(state.replace(data=None)), strict=True))
@@ -308,53 +233,30 @@ class _Layout:
         return self._treedef.unflatten([arrays[name] for name in self._names]).replace(data=data)
 
 
-def base_of(env: Env) -> DroneEnv:
-    """Return the environment that all wrappers are around."""
-    while not isinstance(env, DroneEnv):
-        env = env.env  # type: ignore[attr-defined]
-    return env
+def _of_one_world(state: EnvState) -> EnvState:
+    """Return shapes and types of a state in one world."""
+    taken = {"drone": 1, "world": 2, "rows": 1}
+    return jax.tree.map(
+        lambda kind, x: jax.ShapeDtypeStruct(x.shape[taken.get(kind, 0) :], x.dtype), scopes(state), state
+    )
 
 
-def _flown(env: Env, fly: Callable[[SimData], SimData]) -> Env:
-    """Return an environment that does something else in place of its physics."""
-    new = copy.copy(env)
-    if isinstance(new, DroneEnv):
-        new.fly = fly  # type: ignore[method-assign]
-    else:
-        new.env = _flown(new.env, fly)  # type: ignore[attr-defined]
-    return new
+def _finite(data: SimData) -> Array:
+    """Return true if all states and commands of a world are finite. ()"""
+    watched = (data.states, data.controls)
+    pairs = zip(jax.tree.leaves(scopes(watched)), jax.tree.leaves(watched), strict=True)
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for scope, x in pairs if scope == "drone"]))
 
 
-def _two(x: Any) -> jax.ShapeDtypeStruct:
-    """Return shape and type of the same of two worlds."""
-    return jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype)
-
-
-def _is_of_drones(x: Any, n_drones: int) -> bool:
-    return len(x.shape) > 1 and x.shape[1] == n_drones
-
-
-def _of_worlds(data: SimData, n_worlds: int) -> SimData:
-    return data.replace(core=data.core.replace(n_worlds=n_worlds))
-
-
-def _shown(data: SimData, shown: Any) -> SimData:
-    return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(shown)))
-
-
-def _without_rest(joined: SimData) -> SimData:
-    return joined.replace(plugins={k: x for k, x in joined.plugins.items() if k != NAME})
-
-
-def _numbers(joined: SimData) -> dict[str, int]:
-    """Return the numbers of the leaves that are no data, by name."""
+def _leaves_of_rest(joined: SimData) -> dict[str, int]:
+    """Return the numbers of the leaves that are not data, by name."""
     leaves, treedef = jax.tree.flatten(joined)
     rest = treedef.unflatten(range(len(leaves))).plugins[NAME]
     return rest.of_drones | rest.of_worlds
 
 
 def _places(data: SimData, joined: SimData) -> list[int]:
-    """Return where the leaves of the data are among those of the joined data."""
+    """Return the numbers that the leaves of the data have among those of the joined data."""
     leaves, treedef = jax.tree.flatten(data)
     numbered = treedef.unflatten(range(len(leaves)))
     rest = jax.tree.map(lambda _: -1, joined.plugins[NAME])

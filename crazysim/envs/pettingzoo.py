@@ -1,4 +1,4 @@
-"""One world of several drones as a parallel environment of PettingZoo's, each drone an agent."""
+"""One world of several drones as a parallel environment of PettingZoo, where each drone is an agent."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.envs.env import Env, EnvState, flatten
+from crazysim.envs.env import Env
 from crazysim.envs.registry import make
-from crazysim.envs.rendering import RENDER_MODES, Drawing
+from crazysim.envs.rendering import RENDER_MODES, Renderer
+from crazysim.envs.state import EnvState, flatten
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, UnknownNameError
 
@@ -35,21 +36,23 @@ class DroneParallelEnv(ParallelEnv):
 
         Args:
             env: An environment of one world, without automatic resets.
-            render_mode: What ``render`` does: ``"rgb_array"`` returns a picture, ``"human"`` draws into a window.
-            render_size: Width and height of a picture, pixels.
+            render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws into a window.
+            render_size: Width and height of an image, pixels.
 
         Raises:
-            ConfigError: If it has several worlds, or begins episodes by itself, or there is no such mode.
+            ConfigError: If it has several worlds, or resets automatically, or there is no such mode.
         """
         if env.sim.n_worlds != 1:
             raise ConfigError(
-                f"PettingZoo knows one world, and this environment has {env.sim.n_worlds}: make it with n_worlds=1, or "
-                f"use crazysim.envs.DroneVectorEnv"
+                f"expected an environment of one world, got {env.sim.n_worlds} worlds. Make it with n_worlds=1, or use "
+                f"crazysim.envs.DroneVectorEnv."
             )
         if isinstance(env, AutoReset):
-            raise ConfigError("PettingZoo's users reset by themselves: give the environment without AutoReset")
+            raise ConfigError(
+                "expected an environment without AutoReset, got one with it. Call reset() after an episode."
+            )
         self.env, self.sim, self.render_mode = env, env.sim, render_mode
-        self._drawing = Drawing(env.sim, render_mode, size=render_size)
+        self._renderer = Renderer(env.sim, render_mode, size=render_size)
         self.metadata = {
             "name": f"crazysim/{env.task.name}",
             "render_modes": list(RENDER_MODES),
@@ -72,21 +75,21 @@ class DroneParallelEnv(ParallelEnv):
         self.state_space = _box((size,), np.inf, action.dtype)
 
     def observation_space(self, agent: str) -> gymnasium.Space:
-        """Return what an agent observes, the same object at every call."""
+        """Return the observation space of an agent, the same object at every call."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> gymnasium.Space:
-        """Return what an agent may do, the same object at every call."""
+        """Return the action space of an agent, the same object at every call."""
         return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode.
+        """Start an episode.
 
         Args:
-            seed: Of all that is random; None to go on from what was drawn before, at first from the system.
-            options: PettingZoo's; there are none here, and what is given is not looked at.
+            seed: Seed of all random numbers; None to continue those before, which first come from the system.
+            options: Options of PettingZoo; there are none here, and they are ignored.
         """
         del options
         if seed is not None:
@@ -104,12 +107,12 @@ class DroneParallelEnv(ParallelEnv):
             Observations, rewards, terminations, truncations and infos, by agent.
 
         Raises:
-            ConfigError: If no episode is going on, an action is missing or not finite.
+            ConfigError: If no episode is running, or an action is missing or not finite.
             UnknownNameError: If there is no such agent.
             ValueError: If an action has another shape.
         """
         if self.now is None or not self.agents:
-            raise ConfigError("no episode is going on: call reset() first")
+            raise ConfigError("expected a running episode, got none. Call reset() first.")
         self.now, out = self._step(self.now, self._together(actions))
         obs, reward, terminated, truncated, info = jax.device_get(out)
         if self.render_mode == "human":
@@ -124,7 +127,7 @@ class DroneParallelEnv(ParallelEnv):
         )
 
     def state(self) -> np.ndarray:
-        """Return what all drones observe in one vector: the first drone's observations by name, then the next one's.
+        """Return the observations of all drones as one vector: those of the first drone by name, then the next one's.
 
         Raises:
             ConfigError: If there was no reset.
@@ -134,14 +137,14 @@ class DroneParallelEnv(ParallelEnv):
         return np.array(flatten(self.now.obs)).ravel()
 
     def render(self) -> np.ndarray | None:
-        """Draw the world: a picture (height, width, 3), or into a window.
+        """Render the world: return an image (height, width, 3), or draw into a window.
 
         Raises:
-            ConfigError: If nothing was said of drawing when the environment was made, or it was not reset.
-            RenderError: If this machine cannot draw.
+            ConfigError: If the environment was made without ``render_mode``, or was not reset.
+            RenderError: If this machine cannot render.
         """
-        pictures = self._drawing(self.now)
-        return pictures[0] if pictures else None
+        images = self._renderer(self.now)
+        return images[0] if images else None
 
     def close(self) -> None:
         """Close the window."""
@@ -155,21 +158,21 @@ class DroneParallelEnv(ParallelEnv):
         """Return the actions of all agents as one array, checked. (n_drones, k)"""
         if unknown := set(actions) - set(self.agents):
             raise UnknownNameError(
-                f"there is no agent {', '.join(sorted(unknown))}; there are {', '.join(self.agents)}"
+                f"expected actions of {', '.join(self.agents)}, got one of {', '.join(sorted(unknown))}"
             )
         if missing := [agent for agent in self.agents if agent not in actions]:
-            raise ConfigError(f"there is no action for {', '.join(missing)}; every drone needs one")
+            raise ConfigError(f"expected an action of every drone, got none of {', '.join(missing)}")
         shape = self.action_spaces[self.agents[0]].shape
         rows = [np.asarray(actions[agent], np.float32) for agent in self.agents]
         for agent, row in zip(self.agents, rows, strict=True):
             if row.shape != shape:
-                raise ValueError(f"the action of {agent} has shape {row.shape}; needed is {shape}")
+                raise ValueError(f"expected an action of {agent} of shape {shape}, got {row.shape}")
             if not np.isfinite(row).all():
-                raise ConfigError(f"the action of {agent} is NaN or infinite")
+                raise ConfigError(f"expected a finite action of {agent}, got NaN or infinity")
         return np.stack(rows)
 
     def _of_agents(self, tree: Any) -> dict[str, Any]:
-        """Return for each agent what is its own, (1, n_drones, ...), and what the world has as a whole, (1,)."""
+        """Return the entries of each agent, of arrays (1, n_drones, ...), with those of the whole world, (1,)."""
 
         def own(x: Any, i: int) -> Any:
             # A copy: what comes from JAX cannot be written to.
@@ -183,8 +186,8 @@ def make_parallel(task: str, render_mode: str | None = None, **options: Any) -> 
 
     Args:
         task: One of ``crazysim.envs.TASKS``.
-        render_mode: What ``render`` does.
-        options: As for ``crazysim.envs.make``; ``n_drones`` above all.
+        render_mode: Mode of ``render``.
+        options: Options of ``crazysim.envs.make``, such as ``n_drones``.
     """
     return DroneParallelEnv(make(task, 1, **options), render_mode)
 

@@ -1,6 +1,6 @@
-"""Random numbers of episodes: as repeatable as those of ``crazysim.core.random``, at a twentieth of the arithmetic.
+"""Random numbers of episodes: as repeatable as those of ``crazysim.core.random``, with a twentieth of the arithmetic.
 
-A million worlds that draw twenty numbers each, in every step, for the few of them that begin anew, must cost less than
+A million worlds draw twenty numbers each in every step, for the few episodes that start, and that must cost less than
 the physics. JAX's generator is a cipher of twenty rounds; here two rounds of an integer hash with avalanche (Wellons
 2018, "Prospecting for hash functions", with the later constants 21f0aaad, d35a2d97) mix seed, world and episode.
 """
@@ -18,52 +18,82 @@ from jax import Array
 from crazysim.core.data import SimData
 
 STRIDE = np.uint32(0x9E3779B9)
-"""2^32 over the golden ratio: multiples of it are spread evenly."""
+"""2^32 divided by the golden ratio: its multiples are spread evenly."""
 
 
-def episode_keys(data: SimData, name: str) -> Array:
-    """Return a random key for every world, another in each of its episodes.
+def episode_key(data: SimData, name: str) -> Array:
+    """Return the random key of a world's episode.
 
     Args:
-        data: The simulation; seed, worlds and episodes are taken from it.
-        name: What draws; another name, other numbers.
+        data: The data of one world; seed, world and episode are taken from it.
+        name: Name of the stream; another name gives other numbers.
 
     Returns:
-        Typed keys, for ``uniform`` or ``jax.random``. (n_worlds,)
+        Typed key, for ``draw``, ``uniform`` or ``jax.random``. ()
     """
     core = data.core
     seed = jax.random.key_data(core.rng_key).astype(jnp.uint32)
-    world, episode = (x[:, 0].astype(jnp.uint32) for x in (core.world_id, core.episode))
+    world, episode = core.world_id.astype(jnp.uint32), core.episode.astype(jnp.uint32)
     first = _mix(seed[0] ^ np.uint32(zlib.crc32(name.encode())))
     second = _mix(seed[1] + first)
     own = _mix(_mix(first + world * STRIDE) ^ (second + episode * STRIDE))
     return jax.random.wrap_key_data(jnp.stack([own, _mix(own ^ second)], axis=-1), impl="threefry2x32")
 
 
-def uniform(keys: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
-    """Return random numbers for every world, evenly from a range, in steps of 2^-24 of it.
+def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
+    """Return uniformly distributed random numbers, in steps of 2^-24 of their range.
 
-    Other than with ``jax.random`` the first numbers of a longer draw are those of a shorter one with the same keys.
+    Unlike with ``jax.random``, a longer draw with the same key begins with the numbers of a shorter one.
 
     Args:
-        keys: One random key per world. (n_worlds,)
-        shape: Shape of one world's numbers.
+        key: Random key. ()
+        shape: Shape of the numbers.
         low: Lower ends; anything that broadcasts to the shape.
         high: Upper ends.
 
     Returns:
-        (n_worlds, *shape)
+        (*shape)
     """
-    words = jax.random.key_data(keys).astype(jnp.uint32).reshape(-1, 2, *(1 for _ in shape))
+    words = jax.random.key_data(key).astype(jnp.uint32)
     count = np.arange(int(np.prod(shape)), dtype=np.uint32).reshape(shape)
     with np.errstate(over="ignore"):
-        bits = _mix(_mix(words[:, 0] + count * STRIDE) ^ words[:, 1])
+        bits = _mix(_mix(words[0] + count * STRIDE) ^ words[1])
     x = (bits >> 8).astype(jnp.zeros(()).dtype) * 2.0**-24
     return low + x * (jnp.asarray(high, x.dtype) - jnp.asarray(low, x.dtype))
 
 
+def draw(key: Array, *batch: int, **sizes: int | tuple[int, ...]) -> dict[str, Array]:
+    """Return random numbers in [0, 1) by name: one draw, divided among the names in their order.
+
+    ``draw(key, n_drones, start=3, yaw=1)`` gives ``start`` (n_drones, 3) and ``yaw`` (n_drones, 1). A name added at the
+    end leaves the others' numbers as they are only without a batch shape.
+
+    Args:
+        key: Random key. ()
+        batch: Leading axes, usually the number of drones; none for numbers of the world.
+        sizes: Size of the last axis by name, or the shape of several last axes.
+
+    Returns:
+        (*batch, size) each
+    """
+    shapes = {name: (size,) if isinstance(size, int) else tuple(size) for name, size in sizes.items()}
+    lengths = [int(np.prod(shape)) for shape in shapes.values()]
+    parts = jnp.split(uniform(key, *batch, sum(lengths)), np.cumsum(lengths)[:-1], axis=-1)
+    return {name: x.reshape(*batch, *shape) for (name, shape), x in zip(shapes.items(), parts, strict=True)}
+
+
+def between(x: Array, low: Any, high: Any) -> Array:
+    """Return numbers in [0, 1) scaled to a range. (...)"""
+    return low + x * (jnp.asarray(high, x.dtype) - jnp.asarray(low, x.dtype))
+
+
+def within(x: Array, most: Any) -> Array:
+    """Return numbers in [0, 1) scaled to the range from ``-most`` to ``most``. (...)"""
+    return between(x, -jnp.asarray(most, x.dtype), most)
+
+
 def _mix(x: Array) -> Array:
-    """Return a number of 32 bits, each bit of which depends on each of those that came."""
+    """Return a mixed 32-bit number, every bit of which depends on every bit of the input."""
     x = (x ^ (x >> 16)) * np.uint32(0x21F0AAAD)
     x = (x ^ (x >> 15)) * np.uint32(0xD35A2D97)
     return x ^ (x >> 15)

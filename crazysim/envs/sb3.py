@@ -1,4 +1,4 @@
-"""Environments for Stable-Baselines3: its ``VecEnv`` over all worlds at once, NumPy in and out."""
+"""Environments for Stable-Baselines3: a ``VecEnv`` of all worlds, with NumPy arrays."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.envs.env import Env, EnvState, Obs, flatten, from_host
-from crazysim.envs.rendering import Drawing
+from crazysim.envs.env import Env
+from crazysim.envs.rendering import Renderer
+from crazysim.envs.state import EnvState, Obs, flatten, from_host
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
 from crazysim.errors import ConfigError
 
@@ -24,12 +25,12 @@ except ImportError as error:
 
 
 class DroneVecEnv(VecEnv):
-    """Stable-Baselines3's vector environment over a functional one: an environment of its is a world of ours.
+    """Vector environment of Stable-Baselines3 over a functional environment; each world is one of its environments.
 
-    A new episode begins within the step that ends one. The infos of worlds whose episode ended have, as those of
-    ``Monitor`` and of ``DummyVecEnv``: ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` with ``r``, ``l``
-    and ``t``, and also ``error`` and ``nonfinite``; the infos of others are empty. With several drones the reward is
-    their mean, and observations and actions are those of all, drone after drone.
+    A new episode starts within the step that ends one. The infos of worlds whose episode ended have the entries of
+    ``Monitor`` and ``DummyVecEnv``, ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` with ``r``, ``l``
+    and ``t``, and also ``error`` and ``nonfinite``; other infos are empty. With several drones the reward is their
+    mean, and observations and actions are those of all, drone after drone.
     """
 
     def __init__(
@@ -44,22 +45,22 @@ class DroneVecEnv(VecEnv):
 
         Args:
             env: The environment.
-            dict_obs: Whether observations are named, for ``MultiInputPolicy``; else they are one vector, by name one
-                behind the other, for ``MlpPolicy``.
-            render_mode: What ``render`` does: ``"rgb_array"`` returns a picture, ``"human"`` draws the first of the
-                worlds into a window.
-            render_worlds: Which worlds are drawn.
-            render_size: Width and height of a picture, pixels.
+            dict_obs: True for named observations, for ``MultiInputPolicy``; False for one vector, concatenated by name,
+                for ``MlpPolicy``.
+            render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws the first of the worlds
+                into a window.
+            render_worlds: Worlds to render.
+            render_size: Width and height of an image, pixels.
 
         Raises:
-            ConfigError: If there is no such mode, or the environment begins episodes by itself.
+            ConfigError: If there is no such mode, or the environment resets automatically.
         """
         if isinstance(env, AutoReset):
             raise ConfigError(
-                "give the environment without AutoReset: new episodes begin as Stable-Baselines3 wants it"
+                "expected an environment without AutoReset, which DroneVecEnv adds itself, got one with it"
             )
         self.env, self.sim, self.dict_obs = AutoReset(EpisodeStatistics(env)), env.sim, dict_obs
-        self._drawing = Drawing(env.sim, render_mode, render_worlds, render_size)
+        self._renderer = Renderer(env.sim, render_mode, render_worlds, render_size)
         self._begin, self._advance = jax.jit(self._first), jax.jit(self._next)
         self._generator, _ = gymnasium.utils.seeding.np_random()
         self._actions: np.ndarray | None = None
@@ -77,7 +78,7 @@ class DroneVecEnv(VecEnv):
         )
 
     def reset(self) -> Any:
-        """Begin new episodes in all worlds, with the seed that ``seed`` was given last, if it was not used yet."""
+        """Start new episodes in all worlds, with the last seed passed to ``seed`` if it is unused."""
         seed = self._seeds[0]
         number = seed if seed is not None else int(self._generator.integers(2**31))
         if seed is not None:
@@ -97,7 +98,7 @@ class DroneVecEnv(VecEnv):
             ValueError: If they have another shape.
         """
         if self.state is None:
-            raise ConfigError("the environment must be reset before its first step: call reset()")
+            raise ConfigError("expected a reset before the first step, got none. Call reset().")
         self._actions = from_host(actions, (self.num_envs, *(self.action_space.shape or ())))
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
@@ -107,33 +108,33 @@ class DroneVecEnv(VecEnv):
             ConfigError: If no actions were given.
         """
         if self._actions is None:
-            raise ConfigError("there are no actions to wait for: call step(actions)")
+            raise ConfigError("expected actions before step_wait(), got none. Call step(actions).")
         self.state, out = self._advance(self.state, self._actions)
         self._actions = None
-        obs, final, reward, done, told = jax.device_get(out)
+        obs, final, reward, done, results = jax.device_get(out)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for world in np.flatnonzero(done):
             last = {name: x[world] for name, x in final.items()}
             infos[world] = {
                 "terminal_observation": self._out(last),
-                "TimeLimit.truncated": bool(told["out_of_time"][world]),
+                "TimeLimit.truncated": bool(results["out_of_time"][world]),
                 "episode": {
-                    "r": float(told["return"][world]),
-                    "l": int(told["length"][world]),
+                    "r": float(results["return"][world]),
+                    "l": int(results["length"][world]),
                     "t": round(time.time() - self._since, 6),
                 },
-                "error": float(told["error"][world]),
-                "nonfinite": bool(told["nonfinite"][world]),
+                "error": float(results["error"][world]),
+                "nonfinite": bool(results["nonfinite"][world]),
             }
         return self._out(obs), np.array(reward), np.array(done), infos
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the functional environment, which all worlds share, for each of some worlds.
+        """Return an attribute of the functional environment, which all worlds share, once per world.
 
         Raises:
-            AttributeError: If it has none of that name.
+            AttributeError: If there is none of that name.
         """
-        value = self._drawing.mode if attr_name == "render_mode" else getattr(self.env, attr_name)
+        value = self._renderer.mode if attr_name == "render_mode" else getattr(self.env, attr_name)
         return [value] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -143,31 +144,33 @@ class DroneVecEnv(VecEnv):
             ConfigError: In any case.
         """
         del value, indices
-        raise ConfigError(f"{attr_name!r} cannot be set: all worlds are one compiled program; make another environment")
+        raise ConfigError(f"cannot set {attr_name!r}: all worlds are one compiled program. Make another environment.")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Draw, which is the only thing that a world can be asked to do by itself.
+        """Render, the only method of a single world.
 
         Raises:
-            ConfigError: If something else is asked for.
+            ConfigError: If another method is called.
         """
         del indices
         if method_name != "render" or args or kwargs:
-            raise ConfigError(f"there is no {method_name!r} of a single world: all worlds are one compiled program")
+            raise ConfigError(
+                f"expected method 'render' without arguments, got {method_name!r}: all worlds are one compiled program"
+            )
         return list(self.get_images())
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """Return whether infos have what a wrapper of Stable-Baselines3's would put there: only for ``Monitor``."""
+        """Return true for ``Monitor``, whose infos are there; false for other wrappers of Stable-Baselines3."""
         return [wrapper_class.__name__ == "Monitor"] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Return a picture, (height, width, 3), of each world that is to be drawn, or draw the first into a window.
+        """Return an image (height, width, 3) of each world to render, or draw the first into a window.
 
         Raises:
-            ConfigError: If nothing was said of drawing when the environment was made, or it was not reset.
-            RenderError: If this machine cannot draw.
+            ConfigError: If the environment was made without ``render_mode``, or was not reset.
+            RenderError: If this machine cannot render.
         """
-        return self._drawing(self.state)
+        return self._renderer(self.state)
 
     def close(self) -> None:
         """Close the window."""
@@ -180,22 +183,22 @@ class DroneVecEnv(VecEnv):
     def _next(self, state: EnvState, actions: Array) -> tuple[EnvState, Any]:
         state = self.env.step(state, actions.reshape(state.action.shape))
         info = state.info
-        told = {
+        results = {
             "out_of_time": state.truncated & ~state.terminated,
             "return": info["episode_return"].mean(axis=1),
             "length": info["episode_length"],
             "error": info["error"].mean(axis=1),
             "nonfinite": info["nonfinite"],
         }
-        out = (self._seen(state.obs), self._seen(info["final_obs"]), state.reward.mean(axis=1), state.done, told)
+        out = (self._seen(state.obs), self._seen(info["final_obs"]), state.reward.mean(axis=1), state.done, results)
         return state, out
 
     def _seen(self, obs: Obs) -> Obs:
-        """Return observations as one vector called ``all``, or, where they are named, those of all drones by name."""
+        """Return observations as one vector ``all``, or, if named, those of all drones by name."""
         if not self.dict_obs:
             obs = {"all": flatten(obs)}
         return {name: x.reshape(x.shape[0], -1).astype(jnp.float32) for name, x in obs.items()}
 
     def _out(self, obs: dict[str, Any]) -> Any:
-        """Return observations as arrays that may be written to: what comes from JAX may not, and Torch minds."""
+        """Return observations as writable arrays, as Torch requires; those of JAX are read-only."""
         return {name: np.array(x) for name, x in obs.items()} if self.dict_obs else np.array(obs["all"])

@@ -1,4 +1,4 @@
-"""Where episodes begin: drones that are flying already."""
+"""Starts of episodes: drones that are already flying."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def flying(
     """Return the data with drones in the air, their rotors turning as in hover.
 
     Args:
-        data: The simulation.
-        pos: Positions, world frame, m. (n_worlds, n_drones, 3)
-        quat: Attitudes, xyzw; None for level. (n_worlds, n_drones, 4)
-        vel: Velocities, world frame, m/s; broadcasts to (n_worlds, n_drones, 3).
-        ang_vel: Angular velocities, body frame, rad/s; likewise.
+        data: One world, or all of them.
+        pos: Positions, world frame, m. (..., n_drones, 3)
+        quat: Attitudes, xyzw; None for level. (..., n_drones, 4)
+        vel: Velocities, world frame, m/s; broadcasts to the shape of the positions.
+        ang_vel: Angular velocities, body frame, rad/s; broadcasts likewise.
     """
     s, controls = data.states, data.controls
     level = jnp.array([0.0, 0.0, 0.0, 1.0], s.quat.dtype)
@@ -32,7 +32,7 @@ def flying(
         ang_vel=ang_vel,
         rotor_vel=jnp.broadcast_to(hover_rotors(data.params), s.rotor_vel.shape),
     )
-    # The controllers' derivative terms would else see a jump of the angular velocity at their first tick.
+    # Otherwise the controllers' derivative terms would see a jump of the angular velocity at their first tick.
     for level_name in ("attitude", "body_rate"):
         ctrl = getattr(controls, level_name)
         if ctrl is not None and ctrl.prev_ang_vel is not None:
@@ -41,7 +41,11 @@ def flying(
 
 
 def any_attitude(x: Array) -> Array:
-    """Return attitudes spread evenly over all rotations from three numbers in [0, 1] (Shoemake 1992). (..., 4)"""
+    """Return attitudes distributed uniformly over all rotations, xyzw (Shoemake 1992). (..., 4)
+
+    Args:
+        x: Random numbers in [0, 1). (..., 3)
+    """
     a, b, c = x[..., 0], 2 * jnp.pi * x[..., 1], 2 * jnp.pi * x[..., 2]
     low, high = jnp.sqrt(1 - a), jnp.sqrt(a)
     return jnp.stack([low * jnp.sin(b), low * jnp.cos(b), high * jnp.sin(c), high * jnp.cos(c)], axis=-1)

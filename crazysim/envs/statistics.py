@@ -1,33 +1,33 @@
-"""Statistics of what has been observed, to normalise with."""
+"""Running mean and variance of observations."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.pytree import PyTree
+from crazysim.pytree import PyTree, leaf
 
 CLIP, EPSILON = 10.0, 1e-6
-"""Largest normalised observation, and what is added to a variance before the root is taken."""
+"""Largest magnitude of a normalised observation, and the addend that keeps the root of a variance above zero."""
 
 
 class RunningStats(PyTree):
-    """Mean and variance of what has been seen (Chan, Golub, LeVeque 1979)."""
+    """Mean and variance of all observations so far (Chan, Golub, LeVeque 1979)."""
 
-    mean: Array
-    """(k,)"""
-    var: Array
-    """(k,)"""
-    count: Array
-    """How many were seen. ()"""
+    mean: Array = leaf("shared", 1)
+    """Mean. (k,)"""
+    var: Array = leaf("shared", 1)
+    """Variance. (k,)"""
+    count: Array = leaf("shared", 0)
+    """Number of observations. ()"""
 
     @staticmethod
     def create(size: int) -> RunningStats:
-        """Return the statistics of nothing: mean zero, variance one."""
+        """Return the statistics before any observation: mean zero, variance one."""
         return RunningStats(jnp.zeros(size), jnp.ones(size), jnp.full((), 1e-4, jnp.result_type(float)))
 
     def update(self, x: Array) -> RunningStats:
-        """Return the statistics with a batch more. (..., k)"""
+        """Return the statistics with one more batch. (..., k)"""
         x = x.reshape(-1, x.shape[-1])
         n, mean, var = x.shape[0], x.mean(axis=0), x.var(axis=0)
         total = self.count + n
@@ -36,5 +36,5 @@ class RunningStats(PyTree):
         return RunningStats(self.mean + delta * n / total, spread / total, total)
 
     def normalize(self, x: Array) -> Array:
-        """Return numbers of mean zero and variance one, at most ten. (..., k)"""
+        """Return observations with mean zero and variance one, clipped to [-10, 10]. (..., k)"""
         return jnp.clip((x - self.mean) / jnp.sqrt(self.var + EPSILON), -CLIP, CLIP)

@@ -1,4 +1,4 @@
-"""Steps of an environment one call at a time, with as few arrays as can be: each costs more than what is done to it."""
+"""Environment steps one call at a time, with few arrays: each costs more than the arithmetic on it."""
 
 from __future__ import annotations
 
@@ -11,28 +11,27 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.stage import with_leaves
-from crazysim.envs.env import EnvState
-from crazysim.envs.fused_step import Laid, WholeStep
-from crazysim.envs.rollout import bare
-from crazysim.envs.wrappers import AutoReset
+from crazysim.envs.fused_step import FusedEnvStep, PackedState
+from crazysim.envs.state import EnvState, bare
+from crazysim.envs.wrappers.autoreset import AutoReset
 from crazysim.errors import ConfigError
 
-Tell = Callable[[EnvState], Any]
-"""What of a state after a step is handed out: a tree of arrays. Of its data and memory nothing is there."""
+Output = Callable[[EnvState], Any]
+"""State after a step, without data and memory, to the tree of arrays that a call returns."""
 
 
-class Advance:
-    """A state, and its compiled step: as rows in one kernel where that can be, else leaf by leaf."""
+class EnvStepper:
+    """A state and its compiled step: packed in one kernel where that is possible, else leaf by leaf."""
 
-    def __init__(self, env: AutoReset, tell: Tell):
-        """Take the environment, and what is handed out after a step."""
-        self._env, self._tell = env, tell
+    def __init__(self, env: AutoReset, output: Output):
+        """Take the environment, and the function that selects what a step returns."""
+        self._env, self._output = env, output
         self._structure: Any = None
-        self._steps: _Rows | _Leaves | None = None
+        self._steps: _PackedSteps | _LeafSteps | None = None
 
     @property
     def state(self) -> EnvState | None:
-        """The state, bare of observations, reward and info; None before there is one."""
+        """The state without observations, reward and info; None before there is one."""
         return None if self._steps is None else self._steps.state()
 
     @state.setter
@@ -41,8 +40,9 @@ class Advance:
         leaves, treedef = jax.tree.flatten(state)
         structure = (treedef, [(x.shape, x.dtype) for x in leaves])
         if self._steps is None or structure != self._structure:
-            whole = self._env.whole(state, state.action, laid=True)
-            self._steps = _Leaves(self._env, self._tell) if isinstance(whole, str) else _Rows(whole, self._tell)
+            fused = self._env.fused_step(state, state.action, packed=True)
+            is_fused = isinstance(fused, FusedEnvStep)
+            self._steps = _PackedSteps(fused, self._output) if is_fused else _LeafSteps(self._env, self._output)
             self._structure = structure
         self._steps.hold(state)
 
@@ -52,60 +52,56 @@ class Advance:
         return None if self._steps is None else self._steps.compiled
 
     def __call__(self, actions: Array | np.ndarray) -> tuple[Any, Array, Array]:
-        """Return what is handed out after a step, and where an episode is over and where its time is. (n_worlds,)
+        """Advance the state by one step, and return the output, ``terminated`` and ``truncated``. (n_worlds,) each
 
         Args:
-            actions: What all drones do, for each world in any shape. (n_worlds, ...)
+            actions: Actions of all drones, for each world in any shape. (n_worlds, ...)
 
         Raises:
             ConfigError: If there is no state.
         """
         if self._steps is None:
-            raise ConfigError("there is no state to step on from")
+            raise ConfigError("expected a state before the first step, got none. Assign stepper.state.")
         return self._steps.step(actions)
 
 
-class _Rows:
-    """Steps of one kernel."""
+class _PackedSteps:
+    """Steps of one kernel on a packed state."""
 
-    def __init__(self, whole: WholeStep, tell: Tell):
-        self._whole = whole
+    def __init__(self, fused: FusedEnvStep, output: Output):
         self._rows: list[Array]
-        self._laid: Laid
+        self._rest: PackedState
         self._start: EnvState
         self._ends: tuple[Array, Array]
 
-        def advance(rows: list[Array], laid: Laid, ends: tuple[Array, Array], actions: Any) -> Any:
-            laid, told = whole.advance(laid._replace(rows=rows), ends, jnp.asarray(actions))
-            return laid.rows, tell(told), (told.terminated, told.truncated)
+        def step(rows: list[Array], rest: PackedState, ends: tuple[Array, Array], actions: Any) -> Any:
+            packed, state = fused.step_packed(rest._replace(rows=rows), ends, jnp.asarray(actions))
+            return packed.rows, output(state), (state.terminated, state.truncated)
 
-        self.compiled = jax.jit(advance, donate_argnums=0)  # nobody else has the rows
-        self._lay, self._unlay = jax.jit(whole.lay), jax.jit(whole.unlay)
+        self.compiled = jax.jit(step, donate_argnums=0)  # no caller has the rows
+        self._pack, self._unpack = jax.jit(fused.pack), jax.jit(fused.unpack)
 
     def hold(self, state: EnvState) -> None:
-        laid = self._lay(state)
-        self._rows, self._laid = laid.rows, laid._replace(rows=[])
+        packed = self._pack(state)
+        self._rows, self._rest = packed.rows, packed._replace(rows=[])
         self._start, self._ends = state, (state.terminated, state.truncated)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array]:
-        self._rows, told, self._ends = self.compiled(self._rows, self._laid, self._ends, actions)
+        self._rows, output, self._ends = self.compiled(self._rows, self._rest, self._ends, actions)
         terminated, truncated = self._ends
-        return told, terminated, truncated
+        return output, terminated, truncated
 
     def state(self) -> EnvState:
         terminated, truncated = self._ends
-        state = self._unlay(self._laid._replace(rows=self._rows), self._start)
+        state = self._unpack(self._rest._replace(rows=self._rows), self._start)
         return state.replace(terminated=terminated, truncated=truncated)
 
 
-class _Leaves:
-    """Steps of a function of the state that return what of it they write, and copy nothing.
+class _LeafSteps:
+    """Steps of a function that returns the leaves it writes: a compiled call copies what it returns unchanged."""
 
-    What a compiled call returns as it came is copied.
-    """
-
-    def __init__(self, env: AutoReset, tell: Tell):
-        self._env, self._tell = env, tell
+    def __init__(self, env: AutoReset, output: Output):
+        self._env, self._output = env, output
         self._leaves: list[Any] = []
         self.compiled: Any = None
 
@@ -119,13 +115,13 @@ class _Leaves:
         n = len(self._written)
         self._leaves = with_leaves(self._leaves, self._written, values[:n])
         state = self.state()
-        return self._told.unflatten(values[n:]), state.terminated, state.truncated
+        return self._output_tree.unflatten(values[n:]), state.terminated, state.truncated
 
     def state(self) -> EnvState:
         return self._treedef.unflatten(self._leaves)
 
     def _prepare(self, actions: Any) -> Any:
-        """Find out what is written, and return what is to be compiled."""
+        """Return the function to compile, after finding out which leaves it writes."""
         treedef = self._treedef
 
         def flat(leaves: list[Any], actions: Any) -> list[Any]:
@@ -133,8 +129,8 @@ class _Leaves:
             state = self._env.step(before, jnp.asarray(actions).reshape(before.action.shape))
             after, same = jax.tree.flatten(bare(state).replace(obs={}))
             if same != treedef:
-                raise ConfigError(f"a step changed the structure of the state: {treedef} became {same}")
-            values, self._told = jax.tree.flatten(self._tell(state))
+                raise ConfigError(f"expected a step to keep the structure of the state, {treedef}, got {same}")
+            values, self._output_tree = jax.tree.flatten(self._output(state))
             return [*after, *values]
 
         jaxpr = jax.make_jaxpr(flat)(self._leaves, actions).jaxpr

@@ -1,10 +1,9 @@
-"""Race courses: where gates, obstacles and starts are, as given or drawn at random."""
+"""Race courses: poses of gates, obstacles and starts, given or drawn at random."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,10 +30,10 @@ Points = Sequence[Sequence[float]]
 
 @dataclass(frozen=True)
 class Track:
-    """A course. Its usual numbers are those of lsy_drone_racing's levels 0 to 2; the start is in the air here."""
+    """A course. The default is that of lsy_drone_racing's levels 0 to 2, with the start in the air."""
 
     gates_pos: Points = ((0.5, 0.25, 0.7), (1.05, 0.75, 1.2), (-1.0, -0.25, 0.7), (0.0, -0.75, 1.2))
-    """Middle of each gate's opening, in the order they are to be passed, m. (n_gates, 3)"""
+    """Middle of each gate's opening, in the order of the race, m. (n_gates, 3)"""
     gates_rpy: Points = ((0, 0, -0.78), (0, 0, 2.35), (0, 0, 3.14), (0, 0, 0))
     """Roll, pitch and yaw of each gate, rad; it is passed along its x axis. (n_gates, 3)"""
     obstacles_pos: Points = ((0.0, 0.75, 1.55), (1.0, 0.25, 1.55), (-1.5, -0.25, 1.55), (-0.5, -0.75, 1.55))
@@ -63,10 +62,6 @@ class Track:
         n_x, n_y = np.floor(room / CELL + 1e-6).astype(int)
         return int(n_x), int(n_y)
 
-    def settings(self) -> dict[str, Any]:
-        """Return the numbers as nested lists, as they are written into checkpoints."""
-        return {name: np.asarray(value, float).tolist() for name, value in asdict(self).items()}
-
 
 def checked(track: Track, n_drones: int, jitter: float, random: bool) -> Track:
     """Return a track that can be flown from its starts.
@@ -75,7 +70,7 @@ def checked(track: Track, n_drones: int, jitter: float, random: bool) -> Track:
         track: The track.
         n_drones: Drones in a world.
         jitter: Farthest that drones, gates and obstacles together are moved from their places in the plane, m.
-        random: Whether gates and obstacles are placed at random.
+        random: True if gates and obstacles are placed at random.
 
     Raises:
         ConfigError: If a shape or number cannot be, a start is too near to a gate, to an obstacle or to the arena's
@@ -145,11 +140,11 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
 
     Args:
         track: Heights, numbers and limits.
-        x: Random numbers from 0 to 1. (n_worlds, n_random)
+        x: Random numbers in [0, 1). (..., n_random)
 
     Returns:
-        Start (n_worlds, 3), positions of gates (n_worlds, n_gates, 3), their attitudes, xyzw (n_worlds, n_gates, 4),
-        positions of obstacles (n_worlds, n_obstacles, 3).
+        Start, m (..., 3), positions of gates, m (..., n_gates, 3), their attitudes, xyzw (..., n_gates, 4), positions
+        of obstacles, m (..., n_obstacles, 3).
     """
     n, (n_x, n_y) = track.n_gates, track.grid
     cells, corners, within, turns = jnp.split(x, np.cumsum([n_x * n_y, (n_x + 1) * (n_y + 1), 2 * n]), axis=-1)
@@ -159,11 +154,11 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
 
     cell = ranks(cells, n + 1)
     flat = jnp.asarray(first) + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
-    shift = IN_CELL * (2 * within.reshape(-1, n, 2) - 1)
-    gates = flat[:, 1:] + shift
-    start = jnp.concatenate([flat[:, 0], jnp.full_like(flat[:, 0, :1], START_HEIGHT)], axis=-1)
+    shift = IN_CELL * (2 * within.reshape(*x.shape[:-1], n, 2) - 1)
+    gates = flat[..., 1:, :] + shift
+    start = jnp.concatenate([flat[..., 0, :], jnp.full_like(flat[..., 0, :1], START_HEIGHT)], axis=-1)
 
-    way = gates - jnp.concatenate([flat[:, :1], gates[:, :-1]], axis=1)
+    way = gates - jnp.concatenate([flat[..., :1, :], gates[..., :-1, :]], axis=-2)
     yaw = jnp.arctan2(way[..., 1], way[..., 0]) + TURN * (2 * turns - 1)
     quat = rotation.from_rpy(jnp.stack([0 * yaw, 0 * yaw, yaw], axis=-1))
 
@@ -173,11 +168,11 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def ranks(x: Array, n: int) -> Array:
-    """Return how many of some numbers are smaller than each of the first ``n``: as good as a draw without replacement.
+    """Return the rank of each of the first ``n`` numbers among all: a draw without replacement.
 
     Args:
         x: Random numbers, at least ``n``. (..., m)
-        n: How many are wanted.
+        n: Number of ranks to return.
 
     Returns:
         Different whole numbers from 0 to m - 1. (..., n)

@@ -1,4 +1,4 @@
-"""Trajectories to be tracked: position, velocity and acceleration at any time."""
+"""Reference trajectories: position and velocity at any time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def figure_eight(period: float = 5.0, width: float = 2.0, depth: float = 1.0, he
     """Return a lying figure eight, ``(width/2 sin wt, depth/2 sin 2wt, height)``, a Lissajous curve.
 
     Args:
-        period: Time for all of it, s.
+        period: Period, s.
         width: Size along x, m.
         depth: Size along y, m.
         height: Height, m.
@@ -36,10 +36,10 @@ def figure_eight(period: float = 5.0, width: float = 2.0, depth: float = 1.0, he
 
 
 def polynomial(coefficients: Any, durations: Any) -> Trajectory:
-    """Return a piecewise polynomial, which begins anew when it is through.
+    """Return a piecewise polynomial, which is repeated after its end.
 
     Args:
-        coefficients: Of each piece and axis, constant term first, in the time since the piece began, s.
+        coefficients: Coefficients of each piece and axis, constant term first, of the time since its start, s.
             (n_pieces, 3, degree + 1)
         durations: Length of each piece, s. (n_pieces,)
 
@@ -49,8 +49,8 @@ def polynomial(coefficients: Any, durations: Any) -> Trajectory:
     c, lengths = np.asarray(coefficients, float), np.asarray(durations, float)
     if c.ndim != 3 or c.shape[1] != 3 or lengths.shape != c.shape[:1] or not np.all(lengths > 0):
         raise ConfigError(
-            f"coefficients have shape {c.shape} and durations {lengths.shape}; needed are (n_pieces, 3, degree + 1) "
-            f"and (n_pieces,), durations above zero"
+            f"expected coefficients (n_pieces, 3, degree + 1) and positive durations (n_pieces,), got shapes {c.shape} "
+            f"and {lengths.shape}"
         )
     begins = np.concatenate([[0.0], np.cumsum(lengths)])
     rates = c[..., 1:] * np.arange(1, c.shape[-1])

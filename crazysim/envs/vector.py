@@ -1,4 +1,4 @@
-"""Environments as Gymnasium's vector environments: one compiled call a step, arrays that stay on the device."""
+"""Environments as vector environments of Gymnasium: one compiled call per step, arrays that stay on the device."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
 from crazysim.core.settings import as_mask, member
-from crazysim.envs.env import DroneEnv, Env, EnvState, from_host
+from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.registry import TASKS, make
-from crazysim.envs.rendering import RENDER_MODES, Drawing
-from crazysim.envs.stepper import Advance
+from crazysim.envs.rendering import RENDER_MODES, Renderer
+from crazysim.envs.state import EnvState, from_host
+from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError
 
 
 class DroneVectorEnv(gymnasium.vector.VectorEnv):
-    """A vector environment of Gymnasium's over a functional one.
+    """Vector environment of Gymnasium over a functional environment.
 
-    Observations are named, (num_envs, k) for a single drone a world and (num_envs, n_drones, k) else, actions likewise;
-    with several drones the reward is their mean. All are JAX arrays on the simulation's device: Gymnasium's wrappers
-    ``JaxToNumpy`` and ``JaxToTorch`` make others of them.
+    Observations are named, (num_envs, k) with one drone per world and (num_envs, n_drones, k) with several, and actions
+    likewise; with several drones the reward is their mean. All are JAX arrays on the simulation's device, which
+    Gymnasium's wrappers ``JaxToNumpy`` and ``JaxToTorch`` convert.
     """
 
     def __init__(
@@ -41,21 +42,23 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             env: The environment.
-            autoreset_mode: When new episodes begin.
-            render_mode: What ``render`` does: ``"rgb_array"`` returns pictures, ``"human"`` draws the first world into
-                a window.
-            render_worlds: Which worlds are drawn.
-            render_size: Width and height of a picture, pixels.
+            autoreset_mode: Mode of automatic resets.
+            render_mode: Mode of ``render``: ``"rgb_array"`` returns images, ``"human"`` draws the first world into a
+                window.
+            render_worlds: Worlds to render.
+            render_size: Width and height of an image, pixels.
 
         Raises:
-            ConfigError: If there is no such mode, or the environment begins episodes by itself.
+            ConfigError: If there is no such mode, or the environment resets automatically.
         """
         if isinstance(env, AutoReset):
-            raise ConfigError("give the environment without AutoReset, and say autoreset_mode= here")
+            raise ConfigError(
+                "expected an environment without AutoReset, got one with it. Use autoreset_mode= instead."
+            )
         mode = member(GymnasiumMode, "autoreset_mode", autoreset_mode)
         self.env = AutoReset(env, AutoresetMode(mode.value))
         self.sim, self.render_mode = env.sim, render_mode
-        self._drawing = Drawing(env.sim, render_mode, render_worlds, render_size)
+        self._renderer = Renderer(env.sim, render_mode, render_worlds, render_size)
         self.metadata = {
             "autoreset_mode": mode,
             "render_modes": list(RENDER_MODES),
@@ -65,8 +68,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self._single = env.sim.n_drones == 1
         self._begin = jax.jit(self.env.reset)
         self._again = jax.jit(self.env.restart)
-        self._advance = Advance(self.env, self._tell)
-        self._told: Any = None
+        self._stepper = EnvStepper(self.env, self._output)
+        self._outputs: Any = None
         shapes = jax.eval_shape(self.env.reset, jax.random.key(0))
         self._of_drone = {k for k, v in shapes.info.items() if k != "final_obs" and v.ndim > 1}
         self.single_observation_space = gymnasium.spaces.Dict(
@@ -77,40 +80,40 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin new episodes in all worlds, or in those of ``options["reset_mask"]``, (num_envs,) of type bool.
+        """Start new episodes in all worlds, or in those of ``options["reset_mask"]``, (num_envs,) of type bool.
 
-        Without a seed the random numbers go on from those before; the first ones come from the system.
+        Without a seed the random numbers continue those before; the first ones come from the system.
 
         Raises:
-            ConfigError: If the seed is no integer, or an option does not exist.
+            ConfigError: If the seed is not an integer, or an option does not exist.
         """
         options = dict(options or {})
         mask = as_mask(options.pop("reset_mask", None), self.num_envs)
         if options:
-            raise ConfigError(f"reset has no option {', '.join(options)}; it has reset_mask")
+            raise ConfigError(f"expected no option of reset but reset_mask, got {', '.join(options)}")
         if seed is not None and not isinstance(seed, (int, np.integer)):
             raise ConfigError(
-                f"the seed is {seed!r}; one integer seeds all worlds, each of which draws its own numbers"
+                f"expected one integer as seed of all worlds, each of which draws its own numbers, got {seed!r}"
             )
         super().reset(seed=None if seed is None else int(seed))
         before = self.state if mask is not None else None
         if before is not None:
             if seed is not None:
-                raise ConfigError("a seed is one for all worlds; reset them all with it, or leave it out with a mask")
+                raise ConfigError("expected a seed or a reset_mask, got both. A seed is that of all worlds.")
             state = self._again(before, mask)
         else:
             number = seed if seed is not None else int(self.np_random.integers(2**31))
             state = self._begin(jax.random.key(int(number)))
-        self._advance.state, self._told = state, self._tell(state)
-        return self._told[0], self._told[2]
+        self._stepper.state, self._outputs = state, self._output(state)
+        return self._outputs[0], self._outputs[2]
 
     @property
     def state(self) -> EnvState | None:
-        """The functional environment's state, each drone with the reward of its world; None before the first reset."""
-        state = self._advance.state
+        """State of the functional environment, each drone with the reward of its world; None before the first reset."""
+        state = self._stepper.state
         if state is None:
             return None
-        obs, reward, info = self._told
+        obs, reward, info = self._outputs
         n = (self.num_envs, self.sim.n_drones)
         info = {k: v for k, v in info.items() if not k.endswith("final_obs")}
         info = {k: v.reshape(*n, *v.shape[1:]) if self._single and k in self._of_drone else v for k, v in info.items()}
@@ -125,28 +128,28 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             ConfigError: If the environment was not reset, or actions of the host are not finite.
-            ValueError: If they have another shape.
+            ValueError: If the actions have another shape.
         """
-        if self._told is None:
-            raise ConfigError("the environment must be reset before its first step: call reset()")
+        if self._outputs is None:
+            raise ConfigError("expected a reset before the first step, got none. Call reset().")
         needed = self.action_space.shape or ()
         if not isinstance(actions, jax.Array):
             actions = from_host(actions, needed)
         elif actions.shape != needed:
-            raise ValueError(f"actions have shape {actions.shape}; needed is {needed}")
-        self._told, terminated, truncated = self._advance(actions)
-        obs, reward, info = self._told
+            raise ValueError(f"expected actions of shape {needed}, got {actions.shape}")
+        self._outputs, terminated, truncated = self._stepper(actions)
+        obs, reward, info = self._outputs
         if self.render_mode == "human":
             self.render()
         return obs, reward, terminated, truncated, info
 
-    def _tell(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
-        """Return observations, rewards and infos as Gymnasium has them."""
+    def _output(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
+        """Return observations, rewards and infos in Gymnasium's form."""
         reward = state.reward[:, 0] if self._single else jnp.mean(state.reward, axis=1)
         return self._of_drones(state.obs), reward, self._info(state)
 
     def _of_drones(self, tree: Any) -> Any:
-        """Return arrays of drones without the drones' axis where there is one drone."""
+        """Return arrays of drones, without the axis of drones if there is one drone."""
         return jax.tree.map(lambda x: x[:, 0], tree) if self._single else tree
 
     def _info(self, state: EnvState) -> dict[str, Any]:
@@ -160,14 +163,14 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return gymnasium.spaces.Box(-limit, limit, shape, x.dtype)
 
     def render(self) -> tuple[Any, ...] | None:
-        """Draw the chosen worlds as they are: a picture (height, width, 3) of each, or a window.
+        """Render the chosen worlds: return an image (height, width, 3) of each, or draw into a window.
 
         Raises:
-            ConfigError: If nothing was said of drawing when the environment was made, or it was not reset.
-            RenderError: If this machine cannot draw.
+            ConfigError: If the environment was made without ``render_mode``, or was not reset.
+            RenderError: If this machine cannot render.
         """
-        pictures = self._drawing(self.state)
-        return tuple(pictures) if self.render_mode == "rgb_array" else None
+        images = self._renderer(self.state)
+        return tuple(images) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window."""
@@ -183,15 +186,15 @@ def make_vector(
     max_episode_steps: int | None = None,
     **options: Any,
 ) -> DroneVectorEnv:
-    """Return a vector environment of a task; what ``gymnasium.make_vec`` calls.
+    """Return a vector environment of a task, for ``gymnasium.make_vec``.
 
     Args:
         task: One of ``crazysim.envs.TASKS``.
         num_envs: Number of worlds.
-        autoreset_mode: When new episodes begin.
-        render_mode: What ``render`` does.
-        max_episode_steps: Length of an episode in steps; None for the task's.
-        options: As for ``crazysim.envs.make``.
+        autoreset_mode: Mode of automatic resets.
+        render_mode: Mode of ``render``.
+        max_episode_steps: Length of an episode, steps; None for that of the task.
+        options: Options of ``crazysim.envs.make``.
     """
     if max_episode_steps is not None:
         options["seconds"] = max_episode_steps / options.get("freq", 50)
@@ -200,7 +203,7 @@ def make_vector(
 
 
 def register() -> None:
-    """Have Gymnasium know every task by its id."""
+    """Register every task with Gymnasium under its id."""
     for name, entry in TASKS.items():
         if entry.id not in gymnasium.registry:
             gymnasium.register(entry.id, vector_entry_point=f"{__name__}:make_vector", kwargs={"task": name})

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from crazysim.envs.env import Env, EnvState, flatten
+from crazysim.envs.env import Env
+from crazysim.envs.state import EnvState, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 from crazysim.train.networks import QUICK, Layers, Policy, init_mlp

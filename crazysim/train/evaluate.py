@@ -45,8 +45,9 @@ def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
         state = env.step(state, policy(state.obs))
         total = total + jnp.where(over[:, None], 0.0, state.reward)
         error = jnp.where(over[:, None], error, state.info["error"])
-        if env.task.succeeded is not None:
-            done = done | (env.task.succeeded(state.data) & ~over[:, None])
+        succeeded = env.succeeded(state)
+        if succeeded is not None:
+            done = done | (succeeded & ~over[:, None])
         over = over | state.terminated
         return (state, over, total, error, done), (error, over)
 
@@ -54,7 +55,8 @@ def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
     done = jnp.zeros(state.reward.shape, bool)
     carry = (state, jnp.zeros_like(state.terminated), jnp.zeros_like(state.reward), state.info["error"], done)
     (_, _, total, _, done), (error, over) = jax.lax.scan(step, carry, length=env.max_steps)
-    return {"error": error, "over": over, "reward": total, "succeeded": done}
+    flown = {"error": error, "over": over, "reward": total}
+    return flown if env.succeeded(state) is None else flown | {"succeeded": done}
 
 
 def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None) -> dict[str, float]:
@@ -78,7 +80,7 @@ def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None)
     last = max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
     over = flown["over"][-1]
     settled = jnp.all(flown["error"][-last:] < env.task.tolerance, axis=0) & ~over[:, None]
-    if env.task.succeeded is not None:
+    if "succeeded" in flown:
         last, settled = 1, flown["succeeded"]
     crashed = over & ~jnp.all(settled, axis=-1)
     error = jnp.where(crashed[None, :, None], jnp.nan, flown["error"][-last:])

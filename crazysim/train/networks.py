@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.envs.env import flatten
+from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 

@@ -85,9 +85,11 @@ def film(
     skip = max(rate // 25, 1)
 
     def draw_target(sim: Sim, world: int) -> None:
-        if env.task.target is not None:
-            draw_points(sim, np.asarray(env.task.target(sim.data)[world]), TARGET_COLOR, 0.04)
+        target = targets(state)
+        if target is not None:
+            draw_points(sim, np.asarray(target[world]), TARGET_COLOR, 0.04)
 
+    targets = jax.jit(env.target)
     step = jax.jit(lambda state: env.step(state, policy(state.obs)))
     state = jax.jit(env.reset)(jax.random.key(seed))
     view = View(
@@ -97,7 +99,7 @@ def film(
         trail=1.5,
         text="{time:.1f} s",
         draw=draw_target,
-        cam_config=env.task.camera,
+        cam_config=env.task.camera(sim.n_drones),
     )
     n_frames = env.max_steps // skip + 1
     with Film(path, view, fps=rate / skip, progress=progress, total=n_frames) as recording:

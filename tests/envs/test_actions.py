@@ -111,7 +111,7 @@ def test_an_action_says_what_it_is():
 
 
 def test_a_map_of_two_lengths_is_refused():
-    with pytest.raises(ConfigError, match=r"\(3,\) and \(4,\); needed is \(k,\)"):
+    with pytest.raises(ConfigError, match=r"of one shape \(k,\), got \(3,\) and \(4,\)"):
         Actions(np.zeros(3), np.ones(4), Control.attitude)
 
 

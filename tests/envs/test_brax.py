@@ -9,7 +9,7 @@ from env_cases import kind, quick
 from crazysim import ConfigError
 from crazysim.envs import AutoReset, make
 from crazysim.envs.brax import BraxEnv
-from crazysim.envs.env import flatten
+from crazysim.envs.state import flatten
 
 pytestmark = pytest.mark.xdist_group("brax")
 N_WORLDS, N_STEPS = 3, 5
@@ -70,7 +70,9 @@ def test_keys_of_any_kind_are_the_same_seed(env, reset):
     for rng in (jax.random.PRNGKey(3), keys, jax.random.key_data(keys)):
         np.testing.assert_array_equal(reset(rng).obs, state.obs)
     assert len(np.unique(state.obs[:, 6])) == N_WORLDS
-    with pytest.raises(ValueError, match=r"shape \(4,\); needed is one key, or one for each of the 3 worlds"):
+    with pytest.raises(
+        ValueError, match=r"expected one key, or one for each of the 3 worlds, got keys of shape \(4,\)"
+    ):
         env.reset(jax.random.split(jax.random.key(0), 4))
     with pytest.raises(ValueError, match=r"key data of shape \(4, 2\)"):
         env.reset(jax.random.split(jax.random.PRNGKey(0), 4))
@@ -120,5 +122,7 @@ def test_wrong_input_is_told(functional, env, reset):
     with pytest.raises(ConfigError, match="without AutoReset"):
         BraxEnv(AutoReset(functional))
     state = reset(jax.random.key(0))
-    with pytest.raises(ValueError, match=r"shape \(8,\); needed is \(3, 8\) = \(n_worlds, action_size\)"):
+    with pytest.raises(
+        ValueError, match=r"expected an action of shape \(3, 8\) = \(n_worlds, action_size\), got \(8,\)"
+    ):
         env.step(state, jnp.zeros(8))

@@ -1,6 +1,5 @@
 """What every task promises, by the name it is registered under: a new one is tested as soon as it is there."""
 
-import dataclasses
 import functools
 
 import gymnasium
@@ -13,8 +12,11 @@ from env_cases import compiled, entries, kind, obs_of, of_worlds, one_step_to_go
 from gymnasium.vector.utils import batch_space
 
 from crazysim.dynamics import first_principles
+from crazysim.engine import interpret
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
+from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.spawn import flying
+from crazysim.envs.tasks.hover import Hover
 
 N_WORLDS, N_STEPS = 4, 10_000
 ENDS = np.array([True, False, True, False])
@@ -72,7 +74,7 @@ def test_shapes_and_types_are_those_of_the_spaces(env, begun):
         assert state.info["error"].shape == state.reward.shape
         assert {x.shape[:2] for x in state.info.values()} <= {(N_WORLDS,), (N_WORLDS, env.sim.n_drones)}
     space = spaces.single_action_space
-    assert space.shape == (env.actions.size,) if single else (env.sim.n_drones, env.actions.size)
+    assert space.shape == ((env.actions.size,) if single else (env.sim.n_drones, env.actions.size))
     np.testing.assert_array_equal([space.low, space.high], [-np.ones(space.shape), np.ones(space.shape)])
 
 
@@ -96,7 +98,7 @@ def test_repeated_steps_are_traced_once(env, begun):
         state = env.restart(state, jnp.asarray(ENDS))
         assert kind(state) == kind(begun)
         state = env.restart(state, np.array(ENDS))
-    assert env.traces == {"reset": 1, "restart": 1, "step": 1}
+    assert {name: env.traces[name] for name in ("reset", "restart", "step")} == {"reset": 1, "restart": 1, "step": 1}
 
 
 def test_the_same_seed_gives_the_same_numbers(env, begun):
@@ -165,6 +167,23 @@ def test_episodes_end_in_time_and_are_counted(env, flown):
         assert not info["episode_length"][~done[:, world], world].any()
         sums = np.add.reduceat(reward[: ends[-1] + 1, world], np.concatenate([[0], ends[:-1] + 1]), axis=0)
         np.testing.assert_allclose(info["episode_return"][ends, world], sums, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", entries(classes_once=True), indirect=True)
+def test_one_program_is_the_whole_step(env, begun):
+    """Actions, physics, task and new episodes, lowered for one world and interpreted, equal the unfused step."""
+    auto = AutoReset(env, "SameStep")
+    fused = FusedEnvStep(env.env, auto.policy, begun, begun.action)
+    program = fused._run.program
+    fused._run._run = lambda leaves, n_steps: interpret.steps(program, leaves, n_steps)
+    before, action = one_step_to_go(env, begun, ENDS), random_action(begun)
+    found, expected = fused(before, jnp.asarray(action)), auto.step(before, action)
+    assert kind(found)[0] == kind(expected)[0]
+    pairs = zip(jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(expected), strict=True)
+    for (path, x), y in pairs:
+        assert (x.shape, x.dtype) == (y.shape, y.dtype), path
+        if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+            np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4, err_msg=jax.tree_util.keystr(path))
 
 
 def test_next_step_begins_with_the_step_after_the_last(env, begun):
@@ -237,7 +256,7 @@ def test_a_world_that_is_lost_ends_alone(env, begun):
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((after.obs, after.reward, after.info["error"])))
 
 
-@pytest.mark.parametrize("name", entries(makers_once=True), indirect=True)
+@pytest.mark.parametrize("name", entries(classes_once=True), indirect=True)
 def test_the_gradient_of_the_reward_is_finite(name, begun, flown):
     """Law 7, for actions and states, at the beginning of an episode and where random flight leads.
 
@@ -258,15 +277,17 @@ def test_the_gradient_of_the_reward_is_finite(name, begun, flown):
         assert any(g.any() for g in jax.tree.leaves(grads))
 
 
+class AtRest(Hover):
+    """Hover from rest."""
+
+    def spawn(self, data, key):
+        return flying(super().spawn(data, key), jnp.array([0.0, 0.0, 1.0]))
+
+
 @functools.cache
 def at_rest(control):
-    """Return the hover task for a drone that begins level and at rest, 1 m above the origin, and its goal there."""
-    like = make("hover", 1, control=control)
-
-    def spawn(data, keys):
-        return flying(like.task.spawn(data, keys), jnp.array([0.0, 0.0, 1.0]))
-
-    return DroneEnv(like.sim, dataclasses.replace(like.task, spawn=spawn))
+    """Return the hover task for a drone that starts level and at rest, 1 m above the origin, and its goal there."""
+    return DroneEnv(make("hover", 1, control=control).sim, AtRest())
 
 
 @pytest.mark.parametrize("control", LEVELS)

@@ -1,6 +1,4 @@
-"""A step of an environment as one kernel gives what the same step gives as it is written, or says why there is none."""
-
-import dataclasses
+"""An environment step as one kernel gives what the same step gives unfused, or says why it is not fused."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +6,9 @@ import numpy as np
 import pytest
 
 import crazysim.envs as envs
+from crazysim.core.stage import over_worlds
 from crazysim.engine import fused
+from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import AutoReset, Wrapper
 
 pytestmark = pytest.mark.skipif(fused.missing("cpu") is not None, reason="there is no C++ compiler")
@@ -16,10 +16,10 @@ N = 6
 
 
 class AsWritten(AutoReset):
-    """The same without a kernel for the whole."""
+    """The same without a kernel for the whole step."""
 
-    def whole(self, *_, **__):
-        return "it was not asked for"
+    def fused_step(self, *_, **__):
+        return "it was not requested"
 
 
 def both(env, mode="SameStep"):
@@ -36,21 +36,39 @@ def close(found, expected, tolerance=2e-5):
             np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance, err_msg=name)
 
 
-def lopsided(data, keys):
+def lopsided(data, key):
     """Draw products of inertia, which are zero where all drones share them."""
-    x = jax.vmap(lambda key: jax.random.uniform(key, (1, 1, 1), minval=2e-6, maxval=4e-6))(keys)
+    x = jax.random.uniform(key, (1, 1, 1), minval=2e-6, maxval=4e-6)
     off = jnp.array([[0.0, 1, 1], [1, 0, 1], [1, 1, 0]])
     inertia = data.params.J + x * off
     return data.replace(params=data.params.replace(J=inertia, J_inv=jnp.linalg.inv(inertia)))
 
 
+class Bound(Wrapper):
+    """Halves rewards by a method that it holds as an attribute."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.halve = self._halve
+
+    def _halve(self, state):
+        return state.replace(reward=state.reward / 2)
+
+    def after_step(self, state):
+        return self.halve(state)
+
+
 CASES = {
-    "hover, same step": (lambda: envs.EpisodeStatistics(envs.make("hover", N, seconds=0.3)), "SameStep"),
+    "hover, same step": (
+        lambda: Bound(envs.EpisodeStatistics(envs.ObservationNoise(envs.make("hover", N, seconds=0.3), {"pos": 0.1}))),
+        "SameStep",
+    ),
     "hover, next step": (
-        lambda: envs.FrameStack(envs.Randomize(envs.make("hover", N, seconds=0.3), lopsided, ("J", "J_inv")), 2),
+        lambda: envs.FrameStack(
+            envs.ActionDelay(envs.Randomize(envs.make("hover", N, seconds=0.3), lopsided, ("J", "J_inv")), 1), 2
+        ),
         "NextStep",
     ),
-    "race": (lambda: envs.ActionDelay(envs.make("race", N, practice=True), 1), "SameStep"),
     "swarm": (lambda: envs.make("swarm", N, n_drones=3, seconds=0.3), "Disabled"),
 }
 
@@ -89,60 +107,117 @@ def test_a_rollout_in_rows_is_a_loop_of_steps(hover):
         keep = lambda s: (s.reward, s.done, s.info["error"], s.data.states.pos)  # noqa: E731
         return envs.rollout(env, start, act, jax.random.key(1), 20, keep)
 
-    close(jax.jit(lambda: fly(one))(), jax.jit(lambda: fly(written))())
-
     def total(env):
-        return lambda gain: fly(env, gain)[1][0].sum()
+        def rewarded(gain):
+            end, kept = fly(env, gain)
+            return kept[0].sum(), (end, kept)
 
-    slopes = [jax.jit(jax.grad(total(env)))(1.0) for env in (one, written)]
-    np.testing.assert_allclose(*slopes, rtol=1e-3)
-    gains = jnp.array([0.0, 1.0])
-    np.testing.assert_allclose(jax.jit(jax.vmap(total(one)))(gains)[1], jax.jit(total(written))(1.0), rtol=1e-5)
+        return rewarded
 
-
-def changed(env, **functions):
-    new = envs.DroneEnv(env.sim, dataclasses.replace(env.task, **functions))
-    return AutoReset(new)
-
-
-class Remembers(Wrapper):
-    """Pays for what was flown."""
-
-    def step(self, state, action):
-        before = state.data.states.pos
-        state = self.env.step(state, action)
-        return state.replace(reward=jnp.sum(state.data.states.pos - before, axis=-1))
+    # One compilation for each of values, values in a batch, and slopes; without a kernel, one for all.
+    (_, expected), expected_slope = jax.jit(jax.value_and_grad(total(written), has_aux=True))(1.0)
+    close(jax.jit(lambda: fly(one))(), expected)
+    totals, _ = jax.jit(jax.vmap(total(one)))(jnp.array([0.0, 1.0]))
+    np.testing.assert_allclose(totals[1], expected[1][0].sum(), rtol=1e-5)
+    slope = jax.jit(jax.grad(lambda gain: total(one)(gain)[0]))(1.0)
+    np.testing.assert_allclose(slope, expected_slope, rtol=1e-3)
 
 
-class Twice(Wrapper):
-    """Takes two steps for one."""
+class Fourier(Hover):
+    """Rewards by an operation that the engine does not have."""
 
-    def step(self, state, action):
-        return self.env.step(self.env.step(state, action), action)
+    def rewards(self, data, *_):
+        return {"spectrum": jnp.fft.fft(data.states.pos).real[..., 0]}
+
+
+class Ranked(Hover):
+    """Rewards a drone's height over the mean of all worlds."""
+
+    batched = True
+
+    def spawn(self, data, key):
+        return over_worlds(super().spawn)(data, key)
+
+    def terminated(self, data):
+        return over_worlds(super().terminated)(data)
+
+    def rewards(self, data, *_):
+        height = data.states.pos[..., 2]
+        return {"height": height - height.mean()}
+
+
+def with_reset_stage(env):
+    sim = envs.make("hover", N).sim
+    sim.reset_pipeline["own"] = lambda data, default, mask: data
+    return AutoReset(envs.DroneEnv(sim, env.task))
+
+
+def with_other_defaults(env):
+    sim = envs.make("hover", N).sim
+    pos = sim.data.states.pos.at[0, 0, 0].set(1.0)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    sim.build_default_data()
+    return AutoReset(envs.DroneEnv(sim, env.task))
 
 
 REFUSED = {
-    "looks from one world into another": lambda env: changed(
-        env, reward=lambda data, action, last: data.states.pos[..., 2] - data.states.pos[..., 2].mean()
-    ),
-    "does not do the same in every world": lambda env: changed(
-        env, reward=lambda data, action, last: data.states.pos[..., 2] + jnp.arange(len(data.states.pos))[:, None]
-    ),
-    "the data from before the step": lambda env: AutoReset(Remembers(env)),
-    "steps its environment 2 times": lambda env: AutoReset(Twice(env)),
-    "is not of worlds": lambda env: AutoReset(envs.Normalize(env)),
-    "primitive": lambda env: changed(env, reward=lambda data, action, last: jnp.fft.fft(data.states.pos).real[..., 0]),
+    "task 'hover' is declared to need all worlds at once": lambda env: AutoReset(envs.DroneEnv(env.sim, Ranked())),
+    "wrapper 'Normalize' is declared to need all worlds at once": lambda env: AutoReset(envs.Normalize(env)),
+    "primitive": lambda env: AutoReset(envs.DroneEnv(env.sim, Fourier())),
     "the engine is 'lanes'": lambda env: AutoReset(envs.make("hover", N, engine="lanes")),
+    "'own' of the reset pipeline takes all worlds at once": with_reset_stage,
+    "episodes begin from different data in different worlds": with_other_defaults,
 }
 
 
 @pytest.mark.parametrize("why", REFUSED)
-def test_what_cannot_be_written_out_is_told_and_runs_as_it_is_written(hover, why):
+def test_a_step_that_is_not_one_kernel_says_why_in_one_line(hover, why):
     env = REFUSED[why](hover)
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    line = env.explain(state)
+    assert line.startswith("a step is not one kernel: ")
+    assert "\n" not in line
+    assert why in line
+
+
+def test_a_task_of_all_worlds_is_rewarded_across_them(hover):
+    env = REFUSED["task 'hover' is declared to need all worlds at once"](hover)
     state = jax.jit(env.reset)(jax.random.key(0))
-    told = env.explain(state)
-    assert told.startswith("a step is not one kernel: ")
-    assert why in told
-    if why == "looks from one world into another":
-        after = jax.jit(env.step)(state, state.action)
-        np.testing.assert_allclose(np.mean(after.reward), 0, atol=1e-6)
+    after = jax.jit(env.step)(state, state.action)
+    height = after.data.states.pos[..., 2]
+    np.testing.assert_allclose(after.reward, height - height.mean(), atol=1e-6)
+    np.testing.assert_allclose(np.mean(after.reward), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("make", [with_reset_stage, with_other_defaults])
+def test_episodes_begin_as_the_simulation_resets(hover, make):
+    """What takes all worlds at once still takes part in every reset."""
+    env = make(hover)
+    if make is with_reset_stage:
+        lift = lambda data, default, mask: data.replace(  # noqa: E731
+            controls=data.controls.replace(rotor_vel=data.controls.rotor_vel + 7.0)
+        )
+        env.sim.reset_pipeline["own"] = lift
+        env = AutoReset(envs.DroneEnv(env.sim, env.task))
+    state = jax.jit(env.reset)(jax.random.key(0))
+    if make is with_reset_stage:
+        np.testing.assert_array_equal(state.data.controls.rotor_vel, 7.0)
+    else:
+        fresh = env.base.default_of(state.data).states.pos
+        np.testing.assert_array_equal(fresh[:, 0, 0], [1.0, *np.zeros(N - 1)])
+
+
+class Buggy(Hover):
+    """Adds what cannot be added."""
+
+    def rewards(self, data, *_):
+        return {"bug": data.states.pos[..., 2] + None}
+
+
+def test_a_bug_in_a_task_is_not_taken_for_a_step_that_cannot_be_fused(hover):
+    env = AutoReset(envs.DroneEnv(hover.sim, Buggy()))
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    with pytest.raises(TypeError, match="NoneType"):
+        env.explain(state)
+    with pytest.raises(TypeError, match="NoneType"):
+        jax.eval_shape(env.step, state, state.action)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim, rotation
+from crazysim.core.stage import over_worlds
 from crazysim.envs import DroneEnv, make
-from crazysim.envs.tasks.avoid import CELL, HEIGHT, IN_CELL, avoid
+from crazysim.envs.tasks.avoid import CELL, HEIGHT, IN_CELL, Avoid
 
 N_WORLDS = 2048
 
@@ -16,7 +17,9 @@ N_WORLDS = 2048
 def begun():
     """Return the environment, two drones in every world, the state where episodes begin, and the step."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=2, control="attitude")
-    env = DroneEnv(sim, avoid(sim))
+    task = Avoid()
+    task.install(sim)
+    env = DroneEnv(sim, task)
     return env, jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
 
 
@@ -63,7 +66,7 @@ def test_what_is_seen_are_the_nearest_points_of_the_nearest_obstacles(begun):
     inside = put(state, rng.uniform([-1.6, -2, 0.2], [1.6, 2, 1.8], (N_WORLDS, 2, 3))).data
     env.sim.data = inside
     gaps = np.sort(np.asarray(env.sim.contact_report().object_distance), axis=-1)[..., :4]
-    ways = np.asarray(jax.jit(env.task.observe)(inside)["obstacles_near"]).reshape(N_WORLDS, 2, 4, 3)
+    ways = np.asarray(jax.jit(over_worlds(env.task.observe))(inside)["obstacles_near"]).reshape(N_WORLDS, 2, 4, 3)
     # A report measures from the ball around the drone, 2 cm above its centre, which the ways begin at.
     far = np.linalg.norm(ways, axis=-1) - 0.086
     outside = gaps > 0.05
@@ -98,7 +101,7 @@ def test_hits_disable_and_arriving_is_a_success(begun):
     expected[2:9, 0] = True
     expected[7, 1] = True
     np.testing.assert_array_equal(after.info["disabled"], expected)
-    arrived = np.asarray(env.task.succeeded(after.data))
+    arrived = np.asarray(env.succeeded(after))
     np.testing.assert_array_equal(np.argwhere(arrived), [[0, 0], [0, 1], [1, 0]])
     np.testing.assert_array_equal(np.flatnonzero(after.terminated), [0, 7])
     reward = np.asarray(after.reward)
@@ -119,6 +122,6 @@ def test_time_ends_an_episode(begun):
 
 
 @pytest.mark.parametrize("options", [{"n_poles": -1}, {"n_poles": 0, "n_boxes": 0}, {"n_seen": 0}, {"n_boxes": 1.5}])
-def test_what_cannot_be_a_field_is_told(options):
+def test_what_cannot_be_a_field_is_refused(options):
     with pytest.raises(ConfigError, match="whole numbers"):
         make("avoid", 1, **options)

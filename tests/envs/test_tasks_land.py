@@ -1,16 +1,14 @@
 """Landing: pads that move, what counts as landed, and what as crashed."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim, rotation
-from crazysim.core.random import world_keys
+from crazysim.core.stage import over_worlds
 from crazysim.envs import DroneEnv, make
-from crazysim.envs.tasks.land import land
+from crazysim.envs.tasks.land import Land, pad_of
 from crazysim.train.evaluate import evaluate
 
 N_SPAWNS, SPEED = 2048, 0.5
@@ -36,7 +34,9 @@ CASES = {
 def environment(n_worlds, n_drones=1, **options):
     """Return an environment."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
-    return DroneEnv(sim, land(sim, **options))
+    task = Land(**options)
+    task.install(sim)
+    return DroneEnv(sim, task)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def still():
 
 def test_landed_is_who_touches_the_pad_softly_upright_and_within_it(still):
     env, world, _, after, _ = still
-    landed = np.asarray(env.task.succeeded(after.data))[:, 0]
+    landed = np.asarray(env.succeeded(after))[:, 0]
     assert {name for name, k in world.items() if landed[k]} == {"soft", "edge"}
 
 
@@ -80,8 +80,7 @@ def test_landing_pays_and_crashing_costs_once(still):
 def moving():
     """Return the environment of pads that move, two drones a world, and a beginning."""
     env = environment(N_SPAWNS, 2, speed=SPEED)
-    data = env.sim.default_data
-    return env, jax.jit(env.task.spawn)(data, world_keys(data, "spawn"))
+    return env, jax.jit(env.reset)(jax.random.key(5)).data
 
 
 def test_starts_are_clear_of_contact_and_pads_on_their_circles(moving):
@@ -107,20 +106,22 @@ def test_a_moving_pad_moves_in_the_data_at_its_speed(moving):
     np.testing.assert_allclose(np.linalg.norm(after.objects.vel, axis=-1), SPEED, rtol=1e-4)
     along = (after.objects.pos - data.objects.pos) * 500 / steps
     np.testing.assert_allclose(along, after.objects.vel, atol=0.01)
-    seen = env.task.observe(after)["difference_to_pad"] + after.states.pos
+    seen = over_worlds(env.task.observe)(after)["difference_to_pad"] + after.states.pos
     np.testing.assert_allclose(seen, after.objects.pos[:, 0], atol=1e-5)
 
 
 def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes():
     env = environment(2, speed=SPEED, seconds=3.0)
-    spawn = env.task.spawn
 
-    def above(data, keys):
-        """Begin over the pad, with its velocity; the second world upside down."""
-        data = spawn(data, keys)
-        pos = data.objects.pos + jnp.array([0.0, 0.0, 0.35])
-        quat = jnp.array([[[0.0, 0, 0, 1]], [[1.0, 0, 0, 0]]])
-        return data.replace(states=data.states.replace(pos=pos[:, 0], vel=data.objects.vel[:, 0], quat=quat))
+    class Above(Land):
+        """Start over the pad, with its velocity; the second world upside down."""
+
+        def spawn(self, data, key):
+            data = super().spawn(data, key)
+            pos, vel = pad_of(data, data.core.steps)
+            quat = jnp.array([[[0.0, 0, 0, 1]], [[1.0, 0, 0, 0]]])[data.core.world_id]
+            states = data.states.replace(pos=pos + jnp.array([0.0, 0.0, 0.35]), vel=vel, quat=quat)
+            return data.replace(states=states)
 
     def follow(obs):
         """Hold the pad's velocity and sink with 0.3 m/s."""
@@ -129,7 +130,7 @@ def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes
         roll, pitch = -ahead[..., 1:2] / 9.81, ahead[..., :1] / 9.81
         return jnp.concatenate([roll / (jnp.pi / 4), pitch / (jnp.pi / 4), 0 * roll, down], axis=-1)
 
-    env.task = dataclasses.replace(env.task, spawn=above)
+    env = DroneEnv(env.sim, Above(speed=SPEED, seconds=3.0))
     judged = evaluate(env, jax.tree_util.Partial(follow))
     assert judged["success"] == judged["crashed"] == 0.5
     assert judged["error"] < 0.27
@@ -137,8 +138,12 @@ def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"speed": -1}, "speed is -1"), ({"radius": 2.0}, "radius is 2"), ({"speed": "x"}, "speed")],
+    [
+        ({"speed": -1}, "expected speed from 0.0 to 10.0 m/s, got -1"),
+        ({"radius": 2.0}, "expected radius from 0.05 to 0.5 m, got 2.0"),
+        ({"speed": "x"}, "got 'x'"),
+    ],
 )
-def test_what_cannot_be_landed_on_is_told(options, message):
+def test_what_cannot_be_landed_on_is_refused(options, message):
     with pytest.raises(ConfigError, match=message):
         make("land", 1, **options)

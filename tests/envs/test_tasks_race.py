@@ -1,7 +1,5 @@
 """The race: its rules, its levels, what is seen of the course, and its courses."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +7,10 @@ import pytest
 
 from crazysim import ConfigError, Sim, rotation
 from crazysim.core.random import world_keys
-from crazysim.envs import AutoReset, DroneEnv, make
+from crazysim.core.stage import over_worlds
+from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks import race as task
+from crazysim.envs.tasks import race_rules as rules
 from crazysim.envs.tracks import Track, ranks
 from crazysim.train.evaluate import evaluate
 
@@ -37,7 +37,9 @@ CASES = {
 def environment(n_worlds, n_drones=1, **options):
     """Return an environment."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
-    return DroneEnv(sim, task.race(sim, **options))
+    race = task.Race(**options)
+    race.install(sim)
+    return DroneEnv(sim, race)
 
 
 def put(state, pos, vel=0.0, **changes):
@@ -88,7 +90,7 @@ def test_contacts_and_the_edge_of_the_arena_disable_and_end(raced):
 
 def test_the_last_gate_ends_the_race_as_a_success(raced):
     env, world, _, after, _ = raced
-    assert {name for name, k in world.items() if env.task.succeeded(after.data)[k, 0]} == {"last"}
+    assert {name for name, k in world.items() if env.succeeded(after)[k, 0]} == {"last"}
     assert after.info["error"][world["last"], 0] == 0
     assert after.info["gates_passed"][world["last"], 0] == 4
 
@@ -100,7 +102,8 @@ def test_rewards_count_way_gates_and_crashes_once(raced):
     np.testing.assert_allclose(reward[world["not there yet"]], 2 * moved, atol=0.01)
     assert reward[world["forwards"]] > 1.9
     assert reward[world["obstacle"]] < -1.9
-    sparse = np.asarray(task.sparse(after.data, None, None))[:, 0]
+    terms = over_worlds(lambda data: rules.sparse(data, None, None))(after.data)
+    sparse = np.asarray(terms["gates"] + terms["disabled"])[:, 0]
     assert sparse[world["forwards"]] == 1
     assert sparse[world["obstacle"]] == -1
     assert sparse[world["not there yet"]] == sparse[world["backwards"]] == 0
@@ -159,9 +162,7 @@ def drawn():
     out = {}
     for level, n_worlds, n_drones in ((0, 64, 1), (1, 64, 2), (2, 2048, 1), (3, 2048, 2)):
         env = environment(n_worlds, n_drones, level=level)
-        data = env.sim.default_data
-        spawned = jax.jit(env.task.spawn)(data, world_keys(data, "spawn"))
-        out[level] = env, spawned
+        out[level] = env, jax.jit(env.reset)(jax.random.key(5)).data
     return out
 
 
@@ -228,7 +229,7 @@ def test_random_courses_leave_room_between_gates_and_poles(drawn):
 def test_poses_are_nominal_until_the_drone_was_near(drawn):
     env, data = drawn[2]
     gate = np.asarray(data.objects.pos[:, :, 0])
-    observe = jax.jit(env.task.observe)
+    observe = jax.jit(over_worlds(env.task.observe))
     said, far = np.asarray(TRACK.gates_pos[0]), np.array([-2.0, 1.0, 1.0])
 
     def at(data, pos):
@@ -248,15 +249,16 @@ def test_poses_are_nominal_until_the_drone_was_near(drawn):
     assert visited.all()
     observed, _ = seen(at(data, gate + [0.6, 0.4, 0.0]))
     np.testing.assert_allclose(observed, np.broadcast_to(said, observed.shape), atol=1e-6)
-    observed, visited = seen(at(jax.jit(env.task.mark)(near), far))
+    observed, visited = seen(at(jax.jit(over_worlds(env.task.before_step))(near), far))
     np.testing.assert_allclose(observed, gate, atol=1e-6)
     assert visited.all()
 
 
 def test_the_same_key_gives_the_same_course_in_any_world(drawn):
-    env, data, spawn = *drawn[1], jax.jit(drawn[1][0].task.spawn)
-    keys = world_keys(env.sim.default_data, "spawn")
-    again, other = spawn(env.sim.default_data, keys), spawn(env.sim.default_data, jnp.roll(keys, 1))
+    env, _ = drawn[1]
+    spawn = jax.jit(over_worlds(env.task.spawn))
+    default, keys = env.default_of(env.sim.default_data), world_keys(env.sim.default_data, "spawn")
+    data, again, other = spawn(default, keys), spawn(default, keys), spawn(default, jnp.roll(keys, 1))
     for name in ("pos", "quat"):
         np.testing.assert_array_equal(getattr(again.states, name), getattr(data.states, name))
         np.testing.assert_array_equal(getattr(other.states, name)[1:], getattr(data.states, name)[:-1])
@@ -265,32 +267,32 @@ def test_the_same_key_gives_the_same_course_in_any_world(drawn):
 
 
 def test_way_leads_around_a_gate_from_behind_and_back_from_beside_it():
-    ahead = task.way(
+    ahead = rules.way(
         jnp.array([[-1.0, 0.0, 0.0], [-4.0, 3.0, 0.0], [-3.0, 4.0, 0.0], [0.5, 0.0, 0.0], [0.3, 0.9, 0.0]])
     )
     around = 2 * 0.45 - 0.15  # from beside the frame, where both ways are the same
     expected = [1.0, 5.0, 5.0 + 0.85, np.hypot(0.5, 0.45) + around, np.hypot(0.3, 0.45) + around]
     np.testing.assert_allclose(ahead, expected, rtol=1e-6)
     beside = np.array([[1e-7, 0.45, 0.0], [-1e-7, 0.45, 0.0]])
-    np.testing.assert_allclose(task.way(jnp.asarray(beside)), around, rtol=1e-6)
-    slope = jax.grad(lambda pos: task.way(pos))(jnp.array([-0.01, 0.38, 0.1]))
+    np.testing.assert_allclose(rules.way(jnp.asarray(beside)), around, rtol=1e-6)
+    slope = jax.grad(lambda pos: rules.way(pos))(jnp.array([-0.01, 0.38, 0.1]))
     assert slope[0] > 0.9, "beside the frame the way is shorter farther back"
 
 
 def test_practice_begins_behind_gates():
     env = make("race", 400, practice=True)
     data = jax.jit(env.reset)(jax.random.key(0)).data
-    passed = np.asarray(task.race_of(data).passed)[:, 0]
+    passed = np.asarray(rules.race_of(data).passed)[:, 0]
     assert np.bincount(passed, minlength=4).min() > 60, "each gate as often as the others"
-    pos, quat = task.gates_of(data)
+    pos, quat = rules.gates_of(data)
     for k in (1, 2, 3):
         here = passed == k
         inside = rotation.rotate_inverse(quat[here, 0, k - 1], data.states.pos[here, 0] - pos[here, 0, k - 1])
         assert np.all((inside[:, 0] > 0.14) & (inside[:, 0] < 0.31)), "behind it, and clear of it"
         np.testing.assert_allclose(inside[:, 1:], 0, atol=1e-5)
-    still = jax.jit(lambda state: AutoReset(env, "Disabled").step(state, state.action))(env.reset(jax.random.key(0)))
-    assert not np.any(still.info["disabled"])
-    with pytest.raises(ConfigError, match="practice is for a single drone"):
+    env.sim.data = data
+    assert not np.any(env.sim.contact_report().any)
+    with pytest.raises(ConfigError, match="expected a single drone for practice, got 2"):
         make("multi_race", practice=True)
 
 
@@ -306,17 +308,19 @@ def test_a_given_track_is_flown_and_judged():
         gates_pos=[(-1, 0, 1), (0.0, 0, 1)], gates_rpy=[(0, 0, 0)] * 2, obstacles_pos=[(1, 1, 1.5)], start=(-2, 0, 1)
     )
     env = environment(3, track=track, seconds=1.2)
-    spawn = env.task.spawn
 
-    def thrown(data, keys):
-        data = spawn(data, keys)
-        vel = jnp.array([3.0, 0.0, 0.0])[None, None] * jnp.array([1.0, 1.0, -1.0])[:, None, None]
-        pos = jnp.broadcast_to(jnp.array([-1.5, 0.0, 1.0]), vel.shape)
-        record = data.plugins["task"].replace(last_pos=pos)
-        states = data.states.replace(pos=pos, vel=vel, quat=jnp.zeros_like(data.states.quat).at[..., 3].set(1.0))
-        return data.replace(states=states, plugins=data.plugins | {"task": record})
+    class Thrown(task.Race):
+        """Start in flight towards the gates; the third world away from them."""
 
-    env.task = dataclasses.replace(env.task, spawn=thrown)
+        def spawn(self, data, key):
+            data = super().spawn(data, key)
+            vel = jnp.array([[3.0, 0.0, 0.0]]) * jnp.array([1.0, 1.0, -1.0])[data.core.world_id]
+            pos = jnp.array([[-1.5, 0.0, 1.0]])
+            record = data.plugins["task"].replace(last_pos=pos)
+            states = data.states.replace(pos=pos, vel=vel, quat=jnp.array([[0.0, 0.0, 0.0, 1.0]]))
+            return data.replace(states=states, plugins=data.plugins | {"task": record})
+
+    env = DroneEnv(env.sim, Thrown(track=track, seconds=1.2))
     judged = evaluate(env, jax.tree_util.Partial(lambda obs: jnp.zeros((3, 1, 4))))
     np.testing.assert_allclose(judged["success"], 2 / 3, rtol=1e-6)
     np.testing.assert_allclose(judged["crashed"], 1 / 3, rtol=1e-6)
@@ -326,7 +330,7 @@ def test_a_given_track_is_flown_and_judged():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"level": 4}, "level is 4"),
+        ({"level": 4}, "expected level 0, 1, 2 or 3, got 4"),
         ({"track": Track(gates_rpy=[(0, 0, 0)])}, "gates_rpy has shape"),
         ({"track": Track(start=(0.3, 0.25, 0.7))}, "gate 0 of the track is"),
         ({"track": Track(obstacles_pos=[(-1.5, 0.7, 1.5)])}, "obstacle 0 of the track is"),
@@ -336,6 +340,6 @@ def test_a_given_track_is_flown_and_judged():
         ({"n_drones": 9, "level": 3}, "room for 8"),
     ],
 )
-def test_what_cannot_be_raced_is_told(options, message):
+def test_what_cannot_be_raced_is_refused(options, message):
     with pytest.raises(ConfigError, match=message):
         make("race", 1, **options)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
-from crazysim.core.random import world_keys
+from crazysim.core.stage import over_worlds
 from crazysim.envs import DroneEnv, make
-from crazysim.envs.tasks.swarm import separation, swarm
+from crazysim.envs.tasks.swarm import Swarm, separation
 
 N_WORLDS, N_DRONES = 2048, 4
 
@@ -17,7 +17,9 @@ N_WORLDS, N_DRONES = 2048, 4
 def begun():
     """Return the environment, the state where episodes begin, and the step."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="attitude")
-    env = DroneEnv(sim, swarm(sim))
+    task = Swarm()
+    task.install(sim)
+    env = DroneEnv(sim, task)
     return env, jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
 
 
@@ -98,29 +100,30 @@ def test_separation_is_kept_at_every_physics_step(begun):
 def test_a_formation_is_what_drones_are_sent_to():
     formation = [(0, 0, 1), (0.5, 0, 1), (0, 0.5, 1), (0, 0, 2)]
     sim = Sim(n_worlds=64, n_drones=N_DRONES, control="attitude")
-    env = DroneEnv(sim, swarm(sim, formation, strict=False))
-    data = jax.jit(env.task.spawn)(sim.default_data, world_keys(sim.default_data, "spawn"))
+    task = Swarm(formation=formation, strict=False)
+    task.install(sim)
+    data = jax.jit(DroneEnv(sim, task).reset)(jax.random.key(0)).data
     np.testing.assert_allclose(data.plugins["task"].goal, np.broadcast_to(formation, (64, 4, 3)))
     close = data.states.pos.at[:, 1].set(data.states.pos[:, 0] + 0.1)
     near = data.replace(states=data.states.replace(pos=close))
     near = near.replace(plugins={"task": near.plugins["task"].replace(closest=jnp.zeros((64, 4)))})
-    assert not np.any(env.task.terminated(near))
-    zeros, reward = jnp.zeros((64, 4, 4)), jax.jit(env.task.reward)
-    calm, crowded = reward(data, zeros, zeros), reward(near, zeros, zeros)
-    assert np.all(np.asarray(crowded - calm)[:, 0] < -2)
+    assert not np.any(over_worlds(task.terminated)(near))
+    zeros, rewards = jnp.zeros((64, 4, 4)), jax.jit(over_worlds(task.rewards))
+    calm, crowded = rewards(data, zeros, zeros), rewards(near, zeros, zeros)
+    assert np.all(np.asarray(crowded["crowding"] - calm["crowding"])[:, 0] < -2)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"n_drones": 1}, "two drones at least"),
-        ({"formation": [(0, 0, 1)]}, "shape"),
+        ({"n_drones": 1}, "at least two drones in a swarm, got 1"),
+        ({"formation": [(0, 0, 1)]}, r"got shape \(1, 3\)"),
         ({"formation": [(0, 0, 1), (1, 0, 1), (0, 1, 1), (0, 0, 1.5)]}, r"places \[0, 3\]"),
-        ({"formation": [(0, 0, 0.1), (1, 0, 1), (0, 1, 1), (2, 0, 1.5)]}, "0.2 m over the floor"),
-        ({"formation": "abc"}, "needed is an array"),
-        ({"n_seen": 0}, "n_seen"),
+        ({"formation": [(0, 0, 0.1), (1, 0, 1), (0, 1, 1), (2, 0, 1.5)]}, "at least 0.2 m over the floor, got 0.1 m"),
+        ({"formation": "abc"}, "got 'abc'"),
+        ({"n_seen": 0}, "n_seen of at least 1, got 0"),
     ],
 )
-def test_what_cannot_be_a_swarm_is_told(options, message):
+def test_what_cannot_be_a_swarm_is_refused(options, message):
     with pytest.raises(ConfigError, match=message):
         make("swarm", 1, **options)

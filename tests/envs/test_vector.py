@@ -109,23 +109,23 @@ def test_one_dispatch_a_step_and_arrays_stay_where_they_are(next_step):
     with jax.transfer_guard("disallow"):
         obs, reward, terminated, truncated, info = next_step.step(action)
     assert all(isinstance(x, jax.Array) for x in jax.tree.leaves((obs, reward, terminated, truncated, info)))
-    traces = next_step._advance.compiled._cache_size()
+    traces = next_step._stepper.compiled._cache_size()
     for given in (zeros(next_step), zeros(next_step).astype(np.float64), zeros(next_step).tolist()):
         next_step.step(given)
     # NumPy comes in by another door than JAX, and is traced once
-    assert next_step._advance.compiled._cache_size() <= traces + 1
+    assert next_step._stepper.compiled._cache_size() <= traces + 1
 
 
 @pytest.mark.parametrize(
     ("action", "error", "message"),
     [
-        (np.zeros((3, 5)), ValueError, r"shape \(3, 5\); needed is \(3, 4\)"),
-        (jnp.zeros((2, 4)), ValueError, r"shape \(2, 4\); needed is \(3, 4\)"),
-        (np.zeros(4), ValueError, r"shape \(4,\); needed is \(3, 4\)"),
+        (np.zeros((3, 5)), ValueError, r"expected actions of shape \(3, 4\), got \(3, 5\)"),
+        (jnp.zeros((2, 4)), ValueError, r"expected actions of shape \(3, 4\), got \(2, 4\)"),
+        (np.zeros(4), ValueError, r"expected actions of shape \(3, 4\), got \(4,\)"),
         (
             np.array([[0.0] * 4, [np.nan] * 4, [0, 0, 0, np.inf]]),
             ConfigError,
-            r"NaN or infinite in world\(s\) \[1, 2\]",
+            r"expected finite actions, got NaN or infinity in world\(s\) \[1, 2\]",
         ),
     ],
 )
@@ -149,12 +149,16 @@ def test_an_action_of_the_device_that_is_not_finite_ends_its_world(next_step):
 @pytest.mark.parametrize(
     ("kwargs", "error", "message"),
     [
-        ({"seed": [1, 2, 3]}, ConfigError, "one integer seeds all worlds"),
-        ({"seed": 1.5}, ConfigError, "one integer seeds all worlds"),
-        ({"options": {"colour": 1}}, ConfigError, "no option colour; it has reset_mask"),
+        ({"seed": [1, 2, 3]}, ConfigError, "expected one integer as seed of all worlds"),
+        ({"seed": 1.5}, ConfigError, "expected one integer as seed of all worlds"),
+        ({"options": {"colour": 1}}, ConfigError, "expected no option of reset but reset_mask, got colour"),
         ({"options": {"reset_mask": [True]}}, ValueError, r"shape \(1,\)"),
         ({"options": {"reset_mask": np.ones(3)}}, ValueError, "needed are .* bool"),
-        ({"seed": 1, "options": {"reset_mask": np.ones(3, bool)}}, ConfigError, "a seed is one for all worlds"),
+        (
+            {"seed": 1, "options": {"reset_mask": np.ones(3, bool)}},
+            ConfigError,
+            "expected a seed or a reset_mask, got both",
+        ),
     ],
 )
 def test_wrong_resets(next_step, kwargs, error, message):
@@ -166,11 +170,11 @@ def test_wrong_resets(next_step, kwargs, error, message):
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"render_mode": "ascii"}, "render_mode is 'ascii'; it must be None or one of rgb_array, human"),
+        ({"render_mode": "ascii"}, "expected render_mode None, rgb_array or human, got 'ascii'"),
         ({"autoreset_mode": "sometimes"}, "autoreset_mode is 'sometimes'; it must be one of 'NextStep'"),
         ({"color": "red"}, "task 'hover' has no option 'color'"),
         ({"n_world": 2}, "did you mean n_worlds"),
-        ({"freq": 300}, "the environment's freq of 300 Hz does not divide the simulation's 500 Hz"),
+        ({"freq": 300}, "expected an environment freq that divides the simulation's 500 Hz, got 300 Hz"),
     ],
 )
 def test_wrong_settings(kwargs, message):
@@ -189,7 +193,7 @@ def test_what_comes_before_a_reset_is_refused():
         env.step(np.zeros((1, 4)))
     with pytest.raises(ConfigError, match="render_mode='rgb_array'"):
         env.render()
-    with pytest.raises(ConfigError, match="without AutoReset, and say autoreset_mode="):
+    with pytest.raises(ConfigError, match=r"got one with it. Use autoreset_mode= instead"):
         DroneVectorEnv(AutoReset(env.env.env))
 
 
@@ -240,5 +244,5 @@ def test_several_drones_have_an_axis_and_share_their_mean_reward():
     _, reward, terminated, _, info = env.step(env.action_space.sample())
     assert (reward.shape, terminated.shape, info["error"].shape) == ((2,), (2,), (2, 3))
     np.testing.assert_allclose(reward, env.state.reward.mean(axis=1), rtol=1e-6)
-    with pytest.raises(ValueError, match=r"needed is \(2, 3, 4\)"):
+    with pytest.raises(ValueError, match=r"expected actions of shape \(2, 3, 4\)"):
         env.step(np.zeros((2, 4)))

@@ -60,7 +60,7 @@ def check_contract():
         assert np.abs(last - before[world][POS]).max() < 0.02, "it is the last of the old episode"
         assert np.abs(last - obs[world][POS]).max() > 0.1, "what is returned is of the new one"
     assert not env.step(np.zeros((3, 4)))[2].any()
-    assert "(2, 4); needed is (3, 4)" in raises(ValueError, env.step, np.zeros((2, 4)))
+    assert "of shape (3, 4), got (2, 4)" in raises(ValueError, env.step, np.zeros((2, 4)))
     assert "world(s) [0, 1, 2]" in raises(ConfigError, env.step, np.full((3, 4), np.nan))
     assert env.get_attr("max_steps") == [N_STEPS] * 3
     assert env.get_attr("max_steps", 1) == [N_STEPS]

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import FunctionPlugin, Placement, Simulation
 from crazysim.core.stage import stage
-from crazysim.envs.env import Task
-from crazysim.envs.random import uniform
+from crazysim.envs import terms
+from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.core import NAME, check_collisions, nearest, others_near, state_of
+from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.core import install_rules, nearest, others_near, state_of, with_record
 from crazysim.envs.tracks import ranks
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, static
+from crazysim.scene.objects import Handle
+from crazysim.sim.sim import Sim
 
 CELL, IN_CELL = 0.8, 0.15
-"""Width of the cells that obstacles stand in, one at most in each, and most of each component of the distance from a
-cell's middle, m: a drone fits between a pole and whatever is next to it."""
+"""Width of the cells that hold at most one obstacle each, and largest component of the distance of an obstacle from the
+middle of its cell, m: a drone fits between a pole and whatever is next to it."""
 LENGTH = 4
-"""Cells from the starts to the goals."""
+"""Number of cells from the starts to the goals."""
 GAP = 0.6
 """Distance of starts and goals from the field, m."""
 POLE_RADIUS, BOX = 0.05, 0.3
@@ -30,122 +36,150 @@ POLE_RADIUS, BOX = 0.05, 0.3
 HEIGHT = 2.0
 """Height of poles and ceiling, m."""
 JITTER = 0.15
-"""Most of each component of the distance of starts and goals from their places, m."""
+"""Largest component of the distance of starts and goals from their places, m."""
 SPACING = 0.6
-"""Distance of starts, and of goals, of several drones, m."""
+"""Distance between the starts, and between the goals, of several drones, m."""
 
 
-class Flight(PyTree):
-    """Where each drone is to go, and how that ended."""
+class Crossing(PyTree):
+    """Goal of each drone, and the outcome of its flight."""
 
     goal: Array = leaf("drone", 1)
-    """Where it is to go, m. (n_worlds, n_drones, 3)"""
+    """Goal, m. (n_worlds, n_drones, 3)"""
     reached: Array = leaf("drone", 0)
-    """Whether it was there. (n_worlds, n_drones)"""
+    """True where the drone has reached its goal. (n_worlds, n_drones)"""
     disabled: Array = leaf("drone", 0)
-    """Whether it has touched something, or left the arena. (n_worlds, n_drones)"""
+    """True where it has touched something, or left the arena. (n_worlds, n_drones)"""
     out_before: Array = leaf("drone", 0)
-    """Whether it had arrived or was disabled before this environment step. (n_worlds, n_drones)"""
+    """True where it had arrived or was disabled before this environment step. (n_worlds, n_drones)"""
     to_go_before: Array = leaf("drone", 0)
     """Distance from the goal before this environment step, m. (n_worlds, n_drones)"""
+    handles: tuple[Handle, ...] = static()
+    """Handles of the poles, then of the boxes."""
 
     @property
     def out(self) -> Array:
-        """Whether it has arrived or is disabled. (n_worlds, n_drones)"""
+        """True where the drone has arrived or is disabled. (n_worlds, n_drones)"""
         return self.reached | self.disabled
 
 
-def avoid(
-    sim: Simulation,
-    n_poles: int = 8,
-    n_boxes: int = 4,
-    n_seen: int = 4,
-    seconds: float = 8.0,
-    tolerance: float = 0.2,
-) -> Task:
-    """Return the task of flying some 4.5 m through a field of obstacles that stand elsewhere in every episode.
+class Field(NamedTuple):
+    """Size of the field, for a number of drones."""
+
+    width: int
+    """Number of cells across."""
+    size: np.ndarray
+    """Length and width, m. (2,)"""
+    half: np.ndarray
+    """Half the size of the arena, m. (2,)"""
+    goals: np.ndarray
+    """Places of the goals; the starts are opposite, m. (n_drones, 3)"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Avoid(Task):
+    """Fly some 4.5 m through a field of obstacles, which stand elsewhere in every episode.
 
     Poles reach from the floor to the ceiling; boxes hang in the air. A drone is disabled when it touches one, the floor
     or another drone, or leaves the arena; contacts are checked at every physics step. An episode ends when every drone
-    is disabled or was at its goal.
-
-    Args:
-        sim: The simulation, which is given the obstacles.
-        n_poles: Number of poles.
-        n_boxes: Number of boxes.
-        n_seen: How many of the nearest obstacles a policy sees.
-        seconds: Length of an episode, s.
-        tolerance: Distance at which a goal counts as reached, m.
-
-    Raises:
-        ConfigError: If a number cannot be.
+    is disabled or has reached its goal.
     """
-    counts = {"n_poles": n_poles, "n_boxes": n_boxes, "n_seen": n_seen}
-    if not all(type(n) is int and n >= 0 for n in counts.values()) or n_poles + n_boxes == 0 or n_seen == 0:
-        raise ConfigError(f"{counts}; needed are whole numbers, one obstacle at least, and one seen")
-    n, n_drones = n_poles + n_boxes, sim.n_drones
-    # At least a third of the cells stays free, and the field is as wide as its drones beside each other.
-    width = max(4, -(-3 * n // (2 * LENGTH)), -(-int(10 * SPACING * n_drones) // int(10 * CELL)))
-    field = CELL * np.array([LENGTH, width])
-    half = np.array([field[0] / 2 + GAP + JITTER + 0.5, field[1] / 2 + 0.5])
-    row = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
-    ends = np.stack([np.full(n_drones, field[0] / 2 + GAP + JITTER), row, np.full(n_drones, HEIGHT / 2)], axis=-1)
-    handles = []
-    if n_poles:
-        handles.append(sim.scene.add("pole", count=n_poles, pos=(0, 0, 0), radius=POLE_RADIUS, height=HEIGHT))
-    if n_boxes:
-        handles.append(sim.scene.add("box", count=n_boxes, pos=(0, 0, HEIGHT / 2), size=(BOX, BOX, BOX)))
-    places = slice(handles[0].places[0], handles[-1].places[-1] + 1)
-    # Middle and half size of what is solid, in an object's frame; a pole's radius is taken off the distance.
-    middle = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[0, 0, 0]] * n_boxes)
-    size = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[BOX / 2] * 3] * n_boxes)
-    thick = np.array([POLE_RADIUS] * n_poles + [0.0] * n_boxes)
-    contacts = sim.scene.contact_fn(handles, drones=False)
-    zero, no = jnp.zeros_like(sim.data.states.pos), jnp.zeros((sim.n_worlds, n_drones), bool)
-    record = Flight(zero, no, no, no, zero[..., 0])
 
-    @stage("drone")
-    def advance(data: SimData) -> SimData:
-        """Disable a drone that touches something or leaves the arena; else tell whether it is at its goal."""
-        own, pos = record_of(data), data.states.pos
-        left = jnp.any(jnp.abs(pos[:2]) > half.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
-        disabled = own.disabled | (~own.reached & (left | contacts(data).any))
-        apart = pos - own.goal
-        reached = own.reached | (~disabled & (rotation.dot(apart, apart)[0] < tolerance**2))
-        new = own.replace(disabled=disabled, reached=reached)
-        return data.replace(plugins=data.plugins | {NAME: new})
+    name = "avoid"
+    Record = Crossing
 
-    sim.add(FunctionPlugin(NAME, record, [Placement(advance, before="increment_steps")]))
-    check_collisions(sim)
-    n_cells = LENGTH * width
+    n_poles: int = 8
+    """Number of poles."""
+    n_boxes: int = 4
+    """Number of boxes."""
+    n_seen: int = 4
+    """Number of nearest obstacles that a drone observes."""
+    seconds: float = 8.0
+    """Length of an episode, s."""
+    tolerance: float = 0.2
+    """Distance at which a goal counts as reached, m."""
 
-    def spawn(data: SimData, keys: Array) -> SimData:
-        x = uniform(keys, n_cells + 4 * n + 12 * n_drones)
-        cells, stands, flies = jnp.split(x, [n_cells, n_cells + 4 * n], axis=-1)
-        cell = ranks(cells, n)
-        stands = 2 * stands.reshape(-1, n, 4) - 1
-        corner = jnp.asarray((CELL - field) / 2, x.dtype)
-        flat = corner + CELL * jnp.stack([cell % LENGTH, cell // LENGTH], axis=-1) + IN_CELL * stands[..., :2]
-        hangs = (np.arange(n) >= n_poles) * jnp.asarray(HEIGHT / 2 + (HEIGHT / 2 - BOX) * stands[..., 2])
-        angle = jnp.pi * stands[..., 3:] / 2
-        pos = jnp.concatenate([flat, hangs[..., None]], axis=-1)
+    def __post_init__(self) -> None:
+        """Check the settings.
+
+        Raises:
+            ConfigError: If a number is not a whole number, or zero where it may not be.
+        """
+        counts = {"n_poles": self.n_poles, "n_boxes": self.n_boxes, "n_seen": self.n_seen}
+        whole = all(type(n) is int and n >= 0 for n in counts.values())
+        if not whole or self.n_poles + self.n_boxes == 0 or self.n_seen == 0:
+            raise ConfigError(f"expected whole numbers, at least one obstacle, and one observed, got {counts}")
+
+    def field(self, n_drones: int) -> Field:
+        """Return the size of the field: a third of the cells stay free, and all drones fit beside each other."""
+        n = self.n_poles + self.n_boxes
+        width = max(4, -(-3 * n // (2 * LENGTH)), -(-int(10 * SPACING * n_drones) // int(10 * CELL)))
+        size = CELL * np.array([LENGTH, width])
+        half = np.array([size[0] / 2 + GAP + JITTER + 0.5, size[1] / 2 + 0.5])
+        row = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
+        goals = np.stack([np.full(n_drones, size[0] / 2 + GAP + JITTER), row, np.full(n_drones, HEIGHT / 2)], axis=-1)
+        return Field(width, size, half, goals)
+
+    def install(self, sim: Sim) -> None:
+        """Add the obstacles and the check of contacts."""
+        handles = []
+        if self.n_poles:
+            handles.append(sim.scene.add("pole", count=self.n_poles, pos=(0, 0, 0), radius=POLE_RADIUS, height=HEIGHT))
+        if self.n_boxes:
+            handles.append(sim.scene.add("box", count=self.n_boxes, pos=(0, 0, HEIGHT / 2), size=(BOX, BOX, BOX)))
+        contacts = sim.scene.contact_fn(handles, drones=False)
+        zero, no = jnp.zeros_like(sim.data.states.pos), jnp.zeros((sim.n_worlds, sim.n_drones), bool)
+        half = self.field(sim.n_drones).half
+
+        @stage("drone")
+        def check(data: SimData) -> SimData:
+            """Disable a drone that touches something or leaves the arena, and note one that reaches its goal."""
+            own, pos = crossing_of(data), data.states.pos
+            left = jnp.any(jnp.abs(pos[:2]) > half.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
+            disabled = own.disabled | (~own.reached & (left | contacts(data).any))
+            offset = pos - own.goal
+            reached = own.reached | (~disabled & (rotation.dot(offset, offset)[0] < self.tolerance**2))
+            return with_record(data, own.replace(disabled=disabled, reached=reached))
+
+        record = Crossing(zero, no, no, no, zero[..., 0], tuple(handles))
+        install_rules(sim, record, check, collisions=True)
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return drones in flight before the field, and obstacles in cells of their own."""
+        n, n_drones, dtype = self.n_poles + self.n_boxes, data.core.n_drones, data.states.pos.dtype
+        field = self.field(n_drones)
+        x = draw(key, cells=LENGTH * field.width, obstacles=(n, 4), drones=(n_drones, 12))
+        cell, stands = ranks(x["cells"], n), 2 * x["obstacles"] - 1
+        corner = jnp.asarray((CELL - field.size) / 2, dtype)
+        flat = corner + CELL * jnp.stack([cell % LENGTH, cell // LENGTH], axis=-1) + IN_CELL * stands[:, :2]
+        hangs = (np.arange(n) >= self.n_poles) * jnp.asarray(HEIGHT / 2 + (HEIGHT / 2 - BOX) * stands[:, 2])
+        angle = jnp.pi * stands[:, 3:] / 2
+        pos = jnp.concatenate([flat, hangs[:, None]], axis=-1)
         quat = jnp.concatenate([0 * angle, 0 * angle, jnp.sin(angle), jnp.cos(angle)], axis=-1)
-        first = 0
-        for handle in handles:
+        first, own = 0, crossing_of(data)
+        for handle in own.handles:
             some = slice(first, first + len(handle))
-            data, first = handle.set_pose(data, pos[:, some], quat[:, some]), some.stop
-        off, aim, rpy, vel = jnp.split(2 * flies.reshape(-1, n_drones, 12) - 1, 4, axis=-1)
-        at = ends.astype(x.dtype)
-        data = flying(data, at * np.array([-1, 1, 1], x.dtype) + JITTER * off, rotation.from_rpy(0.1 * rpy), 0.1 * vel)
-        new = record_of(data).replace(goal=at + JITTER * aim)
-        return data.replace(plugins=data.plugins | {NAME: new})
+            data, first = handle.set_pose(data, pos[some], quat[some]), some.stop
+        offset, aim, rpy, vel = jnp.split(2 * x["drones"] - 1, 4, axis=-1)
+        goals = field.goals.astype(dtype)
+        start = goals * np.array([-1, 1, 1], dtype) + JITTER * offset
+        data = flying(data, start, rotation.from_rpy(0.1 * rpy), 0.1 * vel)
+        return with_record(data, own.replace(goal=goals + JITTER * aim))
 
-    def to_go(data: SimData) -> Array:
-        return rotation.safe_norm(record_of(data).goal - data.states.pos)[..., 0]
+    def before_step(self, data: SimData) -> SimData:
+        """Note the distance from the goal, and which drones are out."""
+        own = crossing_of(data)
+        return with_record(data, own.replace(out_before=own.out, to_go_before=self.error(data)))
 
-    def seen(data: SimData) -> Array:
-        """Return the ways to the nearest points of the nearest obstacles, m. (n_worlds, n_drones, n_seen, 3)"""
-        dtype = data.states.pos.dtype
+    def seen(self, data: SimData) -> Array:
+        """Return the ways to the nearest points of the nearest obstacles, m. (n_drones, n_seen, 3)"""
+        dtype, handles = data.states.pos.dtype, crossing_of(data).handles
+        places = slice(handles[0].places[0], handles[-1].places[-1] + 1)
+        n_poles, n_boxes = self.n_poles, self.n_boxes
+        # Middle and half size of each solid, in the object's frame; a pole's radius is subtracted from the distance.
+        middle = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[0, 0, 0]] * n_boxes)
+        size = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[BOX / 2] * 3] * n_boxes)
+        thick = np.array([POLE_RADIUS] * n_poles + [0.0] * n_boxes)
         pos, quat = (x[..., places, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
         inside = rotation.rotate_inverse(quat, data.states.pos[..., None, :] - pos) - middle.astype(dtype)
         reach = jnp.asarray(size, dtype)
@@ -153,54 +187,60 @@ def avoid(
         far = rotation.safe_norm(ways)
         gap = far - thick[:, None].astype(dtype)
         ways = rotation.rotate(quat, ways) * (gap / jnp.where(far > 1e-3, far, 1))
-        return nearest(gap[..., 0], ways, min(n_seen, n))
+        return nearest(gap[..., 0], ways, min(self.n_seen, n_poles + n_boxes))
 
-    def observe(data: SimData) -> dict[str, Array]:
-        ways = seen(data)
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state, and the ways to its goal, to the nearest obstacles and to other drones, m."""
+        n_drones = data.core.n_drones
         obs = state_of(data) | {
-            "difference_to_goal": record_of(data).goal - data.states.pos,
-            "obstacles_near": ways.reshape(*ways.shape[:2], -1),
+            "difference_to_goal": crossing_of(data).goal - data.states.pos,
+            "obstacles_near": self.seen(data).reshape(n_drones, -1),
         }
         if n_drones > 1:
-            others, _ = others_near(data, 2, ~record_of(data).out)
-            obs["drones_near"] = others.reshape(*others.shape[:2], -1)
+            others, _ = others_near(data, 2, ~crossing_of(data).out)
+            obs["drones_near"] = others.reshape(n_drones, -1)
         return obs
 
-    def mark(data: SimData) -> SimData:
-        own = record_of(data)
-        new = own.replace(out_before=own.out, to_go_before=to_go(data))
-        return data.replace(plugins=data.plugins | {NAME: new})
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return progress and the outcome, and costs of flying close to obstacles, turning and changing actions."""
+        own = crossing_of(data)
+        gap = rotation.safe_norm(self.seen(data)[..., 0, :])[..., 0]
+        paid = {
+            "progress": 2.0 * (own.to_go_before - self.error(data)),
+            "closeness": -0.05 * jnp.exp(-10 * gap),
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "reached": 10.0 * own.reached,
+            "disabled": -10.0 * own.disabled,
+        }
+        return terms.only_where(~own.out_before, paid)
 
-    def reward(data: SimData, action: Array, last_action: Array) -> Array:
-        """Twice the way gained, m; less for being near an obstacle, turning, jerky actions; 10 at the goal, -10 hit."""
-        own = record_of(data)
-        gap = rotation.safe_norm(seen(data)[..., 0, :])[..., 0]
-        spin = jnp.sum(jnp.square(data.states.ang_vel), axis=-1)
-        jerk = jnp.sum(jnp.square(action - last_action), axis=-1)
-        paid = 2.0 * (own.to_go_before - to_go(data)) - 0.05 * jnp.exp(-10 * gap) - 0.002 * spin - 0.02 * jerk
-        return jnp.where(own.out_before, 0, paid + 10.0 * own.reached - 10.0 * own.disabled)
+    def terminated(self, data: SimData) -> Array:
+        """Return true where every drone is disabled or has arrived."""
+        return jnp.all(crossing_of(data).out)
 
-    def info(data: SimData) -> dict[str, Array]:
-        return {"reached": record_of(data).reached, "disabled": record_of(data).disabled}
+    def error(self, data: SimData) -> Array:
+        """Return the distance from the goal, m."""
+        return rotation.safe_norm(crossing_of(data).goal - data.states.pos)[..., 0]
 
-    return Task(
-        "avoid",
-        spawn,
-        observe,
-        reward,
-        terminated=lambda data: jnp.all(record_of(data).out, axis=-1),
-        error=to_go,
-        info=info,
-        target=lambda data: record_of(data).goal,
-        camera={"lookat": (0, 0, 0.5), "distance": 6.5, "elevation": -45},
-        mark=mark,
-        succeeded=lambda data: record_of(data).reached,
-        seconds=seconds,
-        tolerance=tolerance,
-        settings=counts | {"seconds": seconds, "tolerance": tolerance},
-    )
+    def info(self, data: SimData) -> dict[str, Array]:
+        """Return which drones have arrived and are disabled."""
+        return {"reached": crossing_of(data).reached, "disabled": crossing_of(data).disabled}
+
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        """Return the camera of images and films."""
+        del n_drones
+        return {"lookat": (0, 0, 0.5), "distance": 6.5, "elevation": -45}
+
+    def target(self, data: SimData) -> Array:
+        """Return the goal, m."""
+        return crossing_of(data).goal
+
+    def succeeded(self, data: SimData) -> Array:
+        """Return which drones have arrived."""
+        return crossing_of(data).reached
 
 
-def record_of(data: SimData) -> Flight:
+def crossing_of(data: SimData) -> Crossing:
     """Return the task's record."""
     return data.plugins[NAME]

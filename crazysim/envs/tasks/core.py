@@ -1,4 +1,4 @@
-"""What tasks have in common: a goal that is part of the data, the usual observations, and the edge of the arena."""
+"""Parts that tasks share: goals, the usual observations, limits of the arena, contacts between drones."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from jax.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.pipeline import insert_fn_before
-from crazysim.core.plugin import FunctionPlugin, Simulation
-from crazysim.core.stage import stage
+from crazysim.core.plugin import FunctionPlugin, Placement
+from crazysim.core.stage import Stage, stage
+from crazysim.envs.task import NAME
 from crazysim.pytree import PyTree, leaf
+from crazysim.sim.sim import Sim
 
-NAME = "task"
-"""Name of a task's record in ``data.plugins``."""
 FLOOR = 0.02
-"""Height of the centre below which a drone has crashed, m."""
+"""Height of the centre of mass below which a drone has crashed, m."""
 
 
 class Goal(PyTree):
-    """Where a drone is to be."""
+    """Goal of every drone."""
 
     pos: Array = leaf("drone", 1)
     """Position, world frame, m. (n_worlds, n_drones, 3)"""
@@ -29,7 +28,7 @@ class Goal(PyTree):
     """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
 
 
-def install_goal(sim: Simulation) -> None:
+def install_goal(sim: Sim) -> None:
     """Give every drone a goal, ``data.plugins["task"]``, at the origin and at rest."""
     sim.add(FunctionPlugin(NAME, Goal(jnp.zeros_like(sim.data.states.pos), jnp.zeros_like(sim.data.states.pos))))
 
@@ -40,45 +39,54 @@ def goal_of(data: SimData) -> Goal:
 
 
 def with_goal(data: SimData, pos: ArrayLike, vel: ArrayLike = 0.0) -> SimData:
-    """Return the data with other goals, (n_worlds, n_drones, 3) each."""
+    """Return the data with other goals: positions, m, and velocities, m/s. (..., n_drones, 3) each"""
     pos = jnp.broadcast_to(pos, data.states.pos.shape)
-    return data.replace(plugins=data.plugins | {NAME: Goal(pos, jnp.broadcast_to(vel, pos.shape))})
+    return with_record(data, Goal(pos, jnp.broadcast_to(vel, pos.shape)))
+
+
+def with_record(data: SimData, record: PyTree) -> SimData:
+    """Return the data with another record of the task."""
+    return data.replace(plugins=data.plugins | {NAME: record})
 
 
 def state_of(data: SimData) -> dict[str, Array]:
-    """Return position, m, attitude as the nine entries of its matrix, velocity, m/s, body rates, rad/s."""
+    """Return the usual observations: ``pos`` m, ``rot`` (rotation matrix), ``vel`` m/s and ``ang_vel`` rad/s.
+
+    Returns:
+        (..., n_drones, k) each
+    """
     s = data.states
-    turned = rotation.matrix(s.quat)
+    matrix = rotation.matrix(s.quat)
     return {
         "pos": s.pos,
-        "rot": turned.reshape(*turned.shape[:-2], 9),
+        "rot": matrix.reshape(*matrix.shape[:-2], 9),
         "vel": s.vel,
         "ang_vel": s.ang_vel,
     }
 
 
-def away(data: SimData) -> Array:
-    """Return the distance from the goal, m. (n_worlds, n_drones)"""
+def distance_to_goal(data: SimData) -> Array:
+    """Return the distance from the goal, m. (..., n_drones)"""
     return rotation.safe_norm(goal_of(data).pos - data.states.pos)[..., 0]
 
 
 def on_floor(data: SimData) -> Array:
-    """Return which drones are on the floor, or below. (n_worlds, n_drones)"""
+    """Return true where a drone is on the floor or below. (..., n_drones)"""
     return data.states.pos[..., 2] < FLOOR
 
 
 def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
-    """Return which drones are on the floor, too high, or too far from the z axis. (n_worlds, n_drones)"""
+    """Return true where a drone is on the floor, too high, or too far from the z axis. (..., n_drones)"""
     pos = data.states.pos
     return on_floor(data) | (pos[..., 2] > height) | jnp.any(jnp.abs(pos[..., :2]) > half_width, axis=-1)
 
 
 def pick(x: Array, number: Array) -> Array:
-    """Return the entry of each drone's own number: a choice among all, which costs less than looking one up.
+    """Return one of several entries: a selection among all, which costs less than an index.
 
     Args:
         x: Entries. (..., n, k)
-        number: Which of the n. (...)
+        number: Index of the entry. (...)
 
     Returns:
         (..., k)
@@ -88,12 +96,12 @@ def pick(x: Array, number: Array) -> Array:
 
 
 def nearest(distance: Array, x: Array, n: int) -> Array:
-    """Return the entries of the least distances, nearest first.
+    """Return the entries with the smallest distances, nearest first.
 
     Args:
         distance: Distances, m. (..., m)
-        x: What is to be sorted by them. (..., m, k)
-        n: How many are wanted, at most m.
+        x: Entries. (..., m, k)
+        n: Number of entries to return, at most m.
 
     Returns:
         (..., n, k)
@@ -106,46 +114,58 @@ def nearest(distance: Array, x: Array, n: int) -> Array:
     return jnp.stack(out, axis=-2)
 
 
-def check_collisions(sim: Simulation) -> None:
-    """Have drones that touch each other disabled at every step, in the task's record, before its own stage.
+def install_rules(sim: Sim, record: PyTree, rules: Stage, collisions: bool = False) -> None:
+    """Add a task's record, and a stage that updates it at the end of every physics step.
 
-    Of drones that the record has as ``out`` nothing is noticed: they are neither disabled nor do they disable others.
-    The record needs leaves ``disabled`` and ``out``, (n_worlds, n_drones) each.
+    Args:
+        sim: The simulation.
+        record: Record of all worlds, for ``data.plugins["task"]``.
+        rules: The stage.
+        collisions: True to disable drones that touch each other, before the stage.
     """
-    if sim.n_drones == 1:
-        return
+    placements = [Placement(rules, before="increment_steps")]
+    if collisions and sim.n_drones > 1:
+        placements.insert(0, Placement(collision_stage(sim), before="increment_steps", name=f"{NAME}_collisions"))
+    sim.add(FunctionPlugin(NAME, record, placements))
+
+
+def collision_stage(sim: Sim) -> Stage:
+    """Return a stage that disables drones that touch each other, in the task's record.
+
+    Drones whose ``out`` is true in the record neither touch nor are touched. The record needs leaves ``disabled`` and
+    ``out``, (n_worlds, n_drones) each.
+    """
     contacts = sim.scene.contact_fn((), floor=False)
 
     @stage("world")
     def collide(data: SimData) -> SimData:
         record, s = data.plugins[NAME], data.states
         out = record.out
-        # Only for the question: each that is out is so far away that it touches nothing, and no other that is out.
+        # Only for this query: drones that are out are moved far apart from each other and from all others.
         far = 1000.0 * (1 + np.arange(len(out)))[:, None] * np.array([0.0, 0.0, 1.0])
         elsewhere = jnp.where(out[:, None], far.astype(s.pos.dtype), s.pos)
         hit = contacts(data.replace(states=s.replace(pos=elsewhere))).any & ~out
-        new = record.replace(disabled=record.disabled | hit)
-        return data.replace(plugins=data.plugins | {NAME: new})
+        return with_record(data, record.replace(disabled=record.disabled | hit))
 
-    insert_fn_before(sim.step_pipeline, NAME, collide, f"{NAME}_collisions")
-    sim.build_step_fn()
+    return collide
 
 
 def others_near(data: SimData, n: int, counts: Array | None = None) -> tuple[Array, Array]:
-    """Return where the nearest other drones are relative to each, m, and their relative velocities, m/s.
+    """Return positions, m, and velocities, m/s, of the nearest other drones of a world relative to each drone.
 
     Args:
-        data: The simulation.
-        n: How many are wanted; less where there are fewer.
-        counts: Which drones are to be seen; None for all. What is not there is zero. (n_worlds, n_drones)
+        data: The data of one world.
+        n: Number of others to return; fewer if there are fewer.
+        counts: True where a drone can be seen; None for all. Others are zero. (n_drones,)
 
     Returns:
-        (n_worlds, n_drones, n, 3) each
+        (n_drones, n, 3) each
     """
     s = data.states
-    n_drones = s.pos.shape[1]
-    seen = ~np.eye(n_drones, dtype=bool) if counts is None else counts[:, None] & ~np.eye(n_drones, dtype=bool)
-    apart, passing = (jnp.where(seen[..., None], x[:, None] - x[:, :, None], 0) for x in (s.pos, s.vel))
-    far = jnp.where(seen, jnp.sum(apart * apart, axis=-1), jnp.inf)
-    found = nearest(far, jnp.concatenate([apart, passing], axis=-1), min(n, n_drones - 1))
+    n_drones = s.pos.shape[0]
+    others = ~np.eye(n_drones, dtype=bool)
+    seen = others if counts is None else counts[None] & others
+    relative, passing = (jnp.where(seen[..., None], x[None] - x[:, None], 0) for x in (s.pos, s.vel))
+    far = jnp.where(seen, jnp.sum(relative * relative, axis=-1), jnp.inf)
+    found = nearest(far, jnp.concatenate([relative, passing], axis=-1), min(n, n_drones - 1))
     return found[..., :3], found[..., 3:]

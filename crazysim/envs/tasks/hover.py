@@ -2,59 +2,86 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation
-from crazysim.envs.env import Task
-from crazysim.envs.random import uniform
+from crazysim.envs import terms
+from crazysim.envs.random import draw, within
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.core import away, goal_of, install_goal, out_of_bounds, state_of, with_goal
+from crazysim.envs.task import Task
+from crazysim.envs.tasks.core import Goal, distance_to_goal, goal_of, install_goal, out_of_bounds, state_of, with_goal
+from crazysim.sim.sim import Sim
 
 HALF_WIDTH, HEIGHT = 3.0, 3.0
-"""Edge of the arena, m."""
+"""Limits of the arena, m."""
+MIDDLE = np.array([0.0, 0.0, 1.2])
+"""Middle of the box that starts and goals are drawn from, m."""
 
 
-def hover(sim: Simulation, reach: float = 1.0, seconds: float = 5.0, tolerance: float = 0.05) -> Task:
-    """Return the task of reaching a random point and hovering there.
+@dataclass(frozen=True, kw_only=True)
+class Hover(Task):
+    """Reach a random point and hover there.
 
-    A drone begins in flight, slightly tilted and moving, in a box around (0, 0, 1.2); so does its goal. An episode
-    ends on the floor, and 3 m from the axis or above it.
-
-    Args:
-        sim: The simulation, which is given goals.
-        reach: Half the width of the box that starts and goals are drawn from, m; its half height is 0.7 of that.
-        seconds: Length of an episode, s.
-        tolerance: Distance below which the goal counts as reached, m.
+    A drone starts in flight, slightly tilted and moving, in a box around (0, 0, 1.2); so does its goal. An episode ends
+    on the floor, and 3 m from the axis or above it.
     """
-    install_goal(sim)
-    box = np.array([reach, reach, 0.7 * reach])
-    middle = np.array([0.0, 0.0, 1.2])
-    spread = np.concatenate([box, box, [0.2, 0.2, 0.2], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
 
-    def spawn(data: SimData, keys: Array) -> SimData:
-        x = uniform(keys, data.core.n_drones, len(spread), low=-spread, high=spread)
-        start, goal, rpy, vel, ang_vel = jnp.split(x, 5, axis=-1)
-        return with_goal(flying(data, middle + start, rotation.from_rpy(rpy), vel, ang_vel), middle + goal)
+    name = "hover"
+    Record = Goal
 
-    def observe(data: SimData) -> dict[str, Array]:
+    reach: float = 1.0
+    """Half the width of the box of starts and goals, m; its half height is 0.7 of that."""
+    seconds: float = 5.0
+    """Length of an episode, s."""
+    tolerance: float = 0.05
+    """Distance below which the goal counts as reached, m."""
+
+    def install(self, sim: Sim) -> None:
+        """Give every drone a goal."""
+        install_goal(sim)
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return drones in flight, and their goals."""
+        x = draw(key, data.core.n_drones, start=3, goal=3, rpy=3, vel=3, ang_vel=3)
+        box = np.array([self.reach, self.reach, 0.7 * self.reach])
+        quat = rotation.from_rpy(within(x["rpy"], 0.2))
+        vel, ang_vel = within(x["vel"], 0.5), within(x["ang_vel"], 0.5)
+        data = flying(data, MIDDLE + within(x["start"], box), quat, vel, ang_vel)
+        return with_goal(data, MIDDLE + within(x["goal"], box))
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state and the way to its goal, m."""
         return state_of(data) | {"difference_to_goal": goal_of(data).pos - data.states.pos}
 
-    def terminated(data: SimData) -> Array:
-        return jnp.any(out_of_bounds(data, HALF_WIDTH, HEIGHT), axis=-1)
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return proximity to the goal, and costs of turning, of changing actions and of a crash."""
+        return {
+            "proximity": terms.proximity(self.error(data)),
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "crash": -10.0 * out_of_bounds(data, HALF_WIDTH, HEIGHT),
+        }
 
-    def reward(data: SimData, action: Array, last_action: Array) -> Array:
-        """Up to 1.5 near the goal, less what is spent on turning and on jerky actions; -10 for a crash."""
-        d = away(data)
-        spin = jnp.sum(jnp.square(data.states.ang_vel), axis=-1)
-        jerk = jnp.sum(jnp.square(action - last_action), axis=-1)
-        near = jnp.exp(-2 * d) + 0.5 * jnp.exp(-20 * d)
-        return near - 0.002 * spin - 0.02 * jerk - 10.0 * out_of_bounds(data, HALF_WIDTH, HEIGHT)
+    def terminated(self, data: SimData) -> Array:
+        """Return true where a drone has left the arena."""
+        return jnp.any(out_of_bounds(data, HALF_WIDTH, HEIGHT))
 
-    settings = {"reach": reach, "seconds": seconds, "tolerance": tolerance}
-    return Task("hover", spawn, observe, reward, terminated, away, seconds=seconds, tolerance=tolerance,
-                settings=settings, target=lambda data: goal_of(data).pos,
-                camera={"lookat": (0, 0, 1.2), "distance": 4.5, "elevation": -20})  # fmt: skip
+    def error(self, data: SimData) -> Array:
+        """Return the distance from the goal, m."""
+        return distance_to_goal(data)
+
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        """Return the camera of images and films."""
+        del n_drones
+        return {"lookat": (0, 0, 1.2), "distance": 4.5, "elevation": -20}
+
+    def target(self, data: SimData) -> Array:
+        """Return the goal, m."""
+        return goal_of(data).pos

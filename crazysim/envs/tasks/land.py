@@ -1,6 +1,10 @@
-"""Land on a pad, which stands or moves."""
+"""Land on a pad, which stands still or moves."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,185 +12,221 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
-from crazysim.core.pipeline import insert_fn_before
-from crazysim.core.plugin import FunctionPlugin, Placement, Simulation
+from crazysim.core.plugin import FunctionPlugin, Placement
 from crazysim.core.stage import stage
-from crazysim.envs.env import Task
-from crazysim.envs.random import uniform
+from crazysim.envs import terms
+from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.core import NAME, pick, state_of
+from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.core import pick, state_of, with_record
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, static
+from crazysim.scene.objects import Handle
+from crazysim.sim.sim import Sim
 
 RADIUS, HEIGHT = 0.25, 0.2
-"""Radius of a pad, and height of its upper side, m."""
+"""Default radius of a pad, and height of its upper side, m."""
 SPACING = 3.0
-"""Distance of the pads of several drones, m; each has its own, and is told of no other."""
+"""Distance between the pads of several drones, m; a drone observes its own pad only."""
 HALF_WIDTH, CEILING = 1.4, 2.5
-"""Farthest from the middle of the pad's way along x and y, and highest, that a drone may be, m."""
+"""Largest distance from the middle of the pad's path along x and y, and largest height, of a drone, m."""
 CIRCLE = (0.3, 0.7)
-"""Least and largest radius of the circle that a moving pad goes round, m."""
+"""Smallest and largest radius of a moving pad's circle, m."""
 SOFT = 0.5
 """Largest speed relative to the pad at touch-down, m/s."""
 UPRIGHT = np.cos(np.pi / 9)
-"""Least vertical part of the body z axis at touch-down: 20 degrees of tilt."""
+"""Smallest vertical component of the body z axis at touch-down: 20 degrees of tilt."""
 
 
 class Landing(PyTree):
-    """Where each drone's pad goes, and how its landing ended."""
+    """Path of each drone's pad, and the outcome of its landing."""
 
     circle: Array = leaf("drone", 1)
-    """Radius of the circle that the pad goes round, m; zero for one that stands. (n_worlds, n_drones, 1)"""
+    """Radius of the circle that the pad moves on, m; zero for one that stands still. (n_worlds, n_drones, 1)"""
     rate: Array = leaf("drone", 1)
-    """Its angular velocity on the circle, rad/s. (n_worlds, n_drones, 1)"""
+    """Angular velocity of the pad on the circle, rad/s. (n_worlds, n_drones, 1)"""
     phase: Array = leaf("drone", 1)
-    """Its angle at the episode's beginning, rad. (n_worlds, n_drones, 1)"""
+    """Angle of the pad on the circle at the start of the episode, rad. (n_worlds, n_drones, 1)"""
     landed: Array = leaf("drone", 0)
-    """Whether the drone has touched down softly. (n_worlds, n_drones)"""
+    """True where the drone has touched down softly. (n_worlds, n_drones)"""
     crashed: Array = leaf("drone", 0)
-    """Whether it has hit something otherwise, or left its part of the arena. (n_worlds, n_drones)"""
+    """True where it has touched anything otherwise, or left its part of the arena. (n_worlds, n_drones)"""
     out_before: Array = leaf("drone", 0)
-    """Whether it had landed or crashed before this environment step. (n_worlds, n_drones)"""
+    """True where it had landed or crashed before this environment step. (n_worlds, n_drones)"""
     to_go_before: Array = leaf("drone", 0)
     """Distance from the pad before this environment step, m. (n_worlds, n_drones)"""
+    pads: Handle = static()
+    """Handle of the pads, one per drone."""
 
     @property
     def out(self) -> Array:
-        """Whether the drone has landed or crashed. (n_worlds, n_drones)"""
+        """True where the drone has landed or crashed. (n_worlds, n_drones)"""
         return self.landed | self.crashed
 
 
-def land(sim: Simulation, speed: float = 0.0, radius: float = RADIUS, seconds: float = 6.0) -> Task:
-    """Return the task of landing on a pad, 0.2 m above the floor.
+@dataclass(frozen=True, kw_only=True)
+class Land(Task):
+    """Land on a pad, 0.2 m above the floor.
 
-    Landed is who touches the pad from above, within its radius, with at most 0.5 m/s relative to it and a tilt of at
-    most 20 degrees; contact is checked at every physics step. Any other touch is a crash, and so is leaving the 2.8 m
-    around the middle of the pad's way. An episode ends when every drone has landed or crashed.
-
-    Args:
-        sim: The simulation, which is given a pad per drone.
-        speed: Speed with which a pad goes round a circle of 0.3 to 0.7 m, either way, m/s; zero for pads that stand.
-        radius: Radius of a pad, m.
-        seconds: Length of an episode, s.
-
-    Raises:
-        ConfigError: If speed or radius cannot be.
+    A drone has landed when it touches the pad from above, within its radius, with at most 0.5 m/s relative to it and a
+    tilt of at most 20 degrees; contact is checked at every physics step. Any other contact is a crash, as is leaving
+    the 2.8 m around the middle of the pad's path. An episode ends when every drone has landed or crashed.
     """
-    for name, value, low, high in (("speed", speed, 0.0, 10.0), ("radius", radius, 0.05, 0.5)):
-        if not isinstance(value, (int, float)) or not low <= value <= high:
-            raise ConfigError(f"{name} is {value!r}; a pad has from {low} to {high} (m/s, and m)")
-    n_drones = sim.n_drones
-    middle = np.concatenate([SPACING * grid_2d(n_drones), np.full((n_drones, 1), HEIGHT)], axis=-1)
-    pads = sim.scene.add("landing_pad", "pad", count=n_drones, pos=middle, radius=radius)
-    contacts = sim.scene.contact_fn([pads], drones=False)
-    zero, no = jnp.zeros_like(sim.data.states.pos[..., :1]), jnp.zeros((sim.n_worlds, n_drones), bool)
-    record = Landing(zero, zero, zero, no, no, no, zero[..., 0])
 
-    def around(data: SimData) -> Array:
-        """Return the middle of the way of each drone's pad; a stage of one drone finds its own by its number, m."""
-        return pick(jnp.asarray(middle, data.states.pos.dtype), data.core.drone_id)
+    name = "land"
+    Record = Landing
 
-    def pad(data: SimData, steps: Array) -> tuple[Array, Array]:
-        """Return position, m, and velocity, m/s, of each drone's pad after some steps. (..., 3) each"""
-        own = data.plugins[NAME]
-        angle = own.phase + own.rate * (steps / data.core.freq)
-        out = jnp.concatenate([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
-        along = jnp.concatenate([-jnp.sin(angle), jnp.cos(angle), 0 * angle], axis=-1)
-        return around(data) + own.circle * out, own.circle * own.rate * along
+    speed: float = 0.0
+    """Speed of a pad on a circle of 0.3 to 0.7 m radius, in either direction, m/s; zero for pads that stand still."""
+    radius: float = RADIUS
+    """Radius of a pad, m."""
+    seconds: float = 6.0
+    """Length of an episode, s."""
 
-    def now(data: SimData) -> tuple[Array, Array]:
-        return pad(data, data.core.steps[..., None])
+    def __post_init__(self) -> None:
+        """Check the settings.
 
-    @stage("world")
-    def move(data: SimData) -> SimData:
-        """Have the pads where they are at the end of this step."""
-        pos, vel = pad(data, data.core.steps + 1)
-        return pads.set_pose(data, pos, vel=vel)
+        Raises:
+            ConfigError: If speed or radius is out of range.
+        """
+        for name, low, high, unit in (("speed", 0.0, 10.0, "m/s"), ("radius", 0.05, 0.5, "m")):
+            value = getattr(self, name)
+            if not isinstance(value, (int, float)) or not low <= value <= high:
+                raise ConfigError(f"expected {name} from {low} to {high} {unit}, got {value!r}")
 
-    @stage("drone")
-    def touch(data: SimData) -> SimData:
-        """Tell at the first touch whether it is a landing."""
-        own, s, report = data.plugins[NAME], data.states, contacts(data)
-        pos, vel = pad(data, data.core.steps + 1)
-        if report.objects is None or report.floor is None:
-            raise TypeError("report.objects, report.floor: None, where the kind has one")
-        mine = np.arange(n_drones) == data.core.drone_id
-        on_pad, elsewhere = jnp.any(report.objects & mine), jnp.any(report.objects & ~mine) | report.floor
-        apart, past = s.pos - pos, s.vel - vel
-        above = (apart[2] > 0) & (apart[0] * apart[0] + apart[1] * apart[1] < radius**2)
-        soft = (rotation.dot(past, past)[0] <= SOFT**2) & (rotation.z_axis(s.quat)[2] >= UPRIGHT)
-        good = on_pad & above & soft & ~elsewhere
-        bad = (on_pad & ~good) | elsewhere | beyond(data)
-        new = own.replace(landed=own.landed | (good & ~own.crashed), crashed=own.crashed | (bad & ~own.landed))
-        return data.replace(plugins=data.plugins | {NAME: new})
+    def install(self, sim: Sim) -> None:
+        """Add the pads, their motion and the check of contacts."""
+        pads = sim.scene.add("landing_pad", "pad", count=sim.n_drones, pos=middles(sim.n_drones), radius=self.radius)
+        contacts = sim.scene.contact_fn([pads], drones=False)
+        zero, no = jnp.zeros_like(sim.data.states.pos[..., :1]), jnp.zeros((sim.n_worlds, sim.n_drones), bool)
 
-    def beyond(data: SimData) -> Array:
-        pos = data.states.pos
-        return jnp.any(jnp.abs(pos - around(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)
+        @stage("drone")
+        def touch(data: SimData) -> SimData:
+            """Decide at the first contact whether it is a landing."""
+            own, s, report = landing_of(data), data.states, contacts(data)
+            pos, vel = pad_of(data, data.core.steps + 1)
+            if report.objects is None or report.floor is None:
+                raise TypeError("expected contacts with pads and floor, got None")
+            mine = np.arange(data.core.n_drones) == data.core.drone_id
+            on_pad, elsewhere = jnp.any(report.objects & mine), jnp.any(report.objects & ~mine) | report.floor
+            offset, drift = s.pos - pos, s.vel - vel
+            above = (offset[2] > 0) & (offset[0] * offset[0] + offset[1] * offset[1] < self.radius**2)
+            soft = (rotation.dot(drift, drift)[0] <= SOFT**2) & (rotation.z_axis(s.quat)[2] >= UPRIGHT)
+            good = on_pad & above & soft & ~elsewhere
+            bad = (on_pad & ~good) | elsewhere | beyond(data)
+            new = own.replace(landed=own.landed | (good & ~own.crashed), crashed=own.crashed | (bad & ~own.landed))
+            return with_record(data, new)
 
-    sim.add(FunctionPlugin(NAME, record, [Placement(touch, before="increment_steps")]))
-    if speed > 0:
-        insert_fn_before(sim.step_pipeline, NAME, move, f"{NAME}_pads")
-        sim.build_step_fn()
+        @stage("world")
+        def move(data: SimData) -> SimData:
+            """Move the pads to their places at the end of this step."""
+            pos, vel = pad_of(data, data.core.steps + 1)
+            return pads.set_pose(data, pos, vel=vel)
 
-    def spawn(data: SimData, keys: Array) -> SimData:
-        x = uniform(keys, n_drones, 12)
-        off, rpy, vel = jnp.split(2 * x[..., :9] - 1, 3, axis=-1)
-        at = middle.astype(x.dtype) + off * np.array([1.0, 1.0, 0.4], x.dtype) + np.array([0, 0, 1.0], x.dtype)
+        record = Landing(zero, zero, zero, no, no, no, zero[..., 0], pads)
+        placements = [Placement(touch, before="increment_steps")]
+        if self.speed > 0:
+            placements.insert(0, Placement(move, before="increment_steps", name=f"{NAME}_pads"))
+        sim.add(FunctionPlugin(NAME, record, placements))
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return drones in flight about a metre above their pads."""
+        n_drones = data.core.n_drones
+        x = draw(key, n_drones, start=3, rpy=3, vel=3, circle=1, direction=1, phase=1)
+        dtype = data.states.pos.dtype
+        start, rpy, vel = (2 * x[name] - 1 for name in ("start", "rpy", "vel"))
+        at = middles(n_drones).astype(dtype) + start * np.array([1.0, 1.0, 0.4], dtype) + np.array([0, 0, 1.0], dtype)
         data = flying(data, at, rotation.from_rpy(0.2 * rpy), 0.3 * vel)
-        circle = CIRCLE[0] + (CIRCLE[1] - CIRCLE[0]) * x[..., 9:10]
-        rate = jnp.where(x[..., 10:11] < 0.5, -speed, speed) / circle
-        moves = float(speed > 0)
-        new = record_of(data).replace(circle=moves * circle, rate=moves * rate, phase=2 * jnp.pi * x[..., 11:12])
-        data = data.replace(plugins=data.plugins | {NAME: new})
-        pos, along = now(data)
-        return pads.set_pose(data, pos, vel=along) if speed > 0 else data
+        circle = CIRCLE[0] + (CIRCLE[1] - CIRCLE[0]) * x["circle"]
+        rate = jnp.where(x["direction"] < 0.5, -self.speed, self.speed) / circle
+        moves = float(self.speed > 0)
+        new = landing_of(data).replace(circle=moves * circle, rate=moves * rate, phase=2 * jnp.pi * x["phase"])
+        data = with_record(data, new)
+        pos, along = pad_of(data, data.core.steps)
+        return new.pads.set_pose(data, pos, vel=along) if self.speed > 0 else data
 
-    def to_pad(data: SimData) -> Array:
-        return rotation.safe_norm(now(data)[0] - data.states.pos)[..., 0]
+    def before_step(self, data: SimData) -> SimData:
+        """Note the distance from the pad, and which drones are out."""
+        own = landing_of(data)
+        return with_record(data, own.replace(out_before=own.out, to_go_before=self.error(data)))
 
-    def observe(data: SimData) -> dict[str, Array]:
-        pos, vel = now(data)
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state, and the way to its pad, m, and the pad's relative velocity, m/s."""
+        pos, vel = pad_of(data, data.core.steps)
         return state_of(data) | {
             "difference_to_pad": pos - data.states.pos,
             "difference_to_pad_vel": vel - data.states.vel,
         }
 
-    def mark(data: SimData) -> SimData:
-        own = record_of(data)
-        new = own.replace(out_before=own.out, to_go_before=to_pad(data))
-        return data.replace(plugins=data.plugins | {NAME: new})
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return progress and the outcome, and costs of speed near the pad, of turning and of changing actions."""
+        own, d = landing_of(data), self.error(data)
+        drift = rotation.safe_norm(pad_of(data, data.core.steps)[1] - data.states.vel)[..., 0]
+        paid = {
+            "progress": 2.0 * (own.to_go_before - d),
+            "speed": -0.1 * drift * jnp.exp(-4 * d),
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "landed": 10.0 * own.landed,
+            "crashed": -10.0 * own.crashed,
+        }
+        return terms.only_where(~own.out_before, paid)
 
-    def reward(data: SimData, action: Array, last_action: Array) -> Array:
-        """Twice the way gained, m; less for speed near the pad, turning, jerky actions; 10 landed, -10 crashed."""
-        own, d = record_of(data), to_pad(data)
-        past = rotation.safe_norm(now(data)[1] - data.states.vel)[..., 0]
-        spin = jnp.sum(jnp.square(data.states.ang_vel), axis=-1)
-        jerk = jnp.sum(jnp.square(action - last_action), axis=-1)
-        paid = 2.0 * (own.to_go_before - d) - 0.1 * past * jnp.exp(-4 * d) - 0.002 * spin - 0.02 * jerk
-        paid = paid + 10.0 * own.landed - 10.0 * own.crashed
-        return jnp.where(own.out_before, 0, paid)
+    def terminated(self, data: SimData) -> Array:
+        """Return true where every drone has landed or crashed."""
+        return jnp.all(landing_of(data).out)
 
-    def info(data: SimData) -> dict[str, Array]:
-        return {"landed": record_of(data).landed, "crashed": record_of(data).crashed}
+    def error(self, data: SimData) -> Array:
+        """Return the distance from the pad, m."""
+        return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
 
-    return Task(
-        "land",
-        spawn,
-        observe,
-        reward,
-        terminated=lambda data: jnp.all(record_of(data).out, axis=-1),
-        error=to_pad,
-        info=info,
-        target=lambda data: now(data)[0],
-        camera={"lookat": (0, 0, 0.6), "distance": 3.5, "elevation": -20},
-        mark=mark,
-        succeeded=lambda data: record_of(data).landed,
-        seconds=seconds,
-        settings={"speed": speed, "radius": radius, "seconds": seconds},
-    )
+    def info(self, data: SimData) -> dict[str, Array]:
+        """Return which drones have landed and crashed."""
+        return {"landed": landing_of(data).landed, "crashed": landing_of(data).crashed}
+
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        """Return the camera of images and films."""
+        del n_drones
+        return {"lookat": (0, 0, 0.6), "distance": 3.5, "elevation": -20}
+
+    def target(self, data: SimData) -> Array:
+        """Return the middle of the pad, m."""
+        return pad_of(data, data.core.steps)[0]
+
+    def succeeded(self, data: SimData) -> Array:
+        """Return which drones have landed."""
+        return landing_of(data).landed
 
 
-def record_of(data: SimData) -> Landing:
+def landing_of(data: SimData) -> Landing:
     """Return the task's record."""
     return data.plugins[NAME]
+
+
+def middles(n_drones: int) -> np.ndarray:
+    """Return the middle of each pad's path, m. (n_drones, 3)"""
+    return np.concatenate([SPACING * grid_2d(n_drones), np.full((n_drones, 1), HEIGHT)], axis=-1)
+
+
+def middle_of(data: SimData) -> Array:
+    """Return the middle of the path of each drone's pad, of one drone or one world, m. (..., 3)"""
+    return pick(jnp.asarray(middles(data.core.n_drones), data.states.pos.dtype), data.core.drone_id)
+
+
+def pad_of(data: SimData, steps: Array) -> tuple[Array, Array]:
+    """Return position, m, and velocity, m/s, of each drone's pad after some steps, of one drone or one world.
+
+    Returns:
+        (..., 3) each
+    """
+    own = landing_of(data)
+    angle = own.phase + own.rate * (steps / data.core.freq)
+    out = jnp.concatenate([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
+    along = jnp.concatenate([-jnp.sin(angle), jnp.cos(angle), 0 * angle], axis=-1)
+    return middle_of(data) + own.circle * out, own.circle * own.rate * along
+
+
+def beyond(data: SimData) -> Array:
+    """Return true where a drone has left its part of the arena. (...)"""
+    pos = data.states.pos
+    return jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)

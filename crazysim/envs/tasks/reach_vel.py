@@ -2,61 +2,71 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation
-from crazysim.envs.env import Task
-from crazysim.envs.random import uniform
+from crazysim.envs import terms
+from crazysim.envs.random import draw, within
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.core import goal_of, install_goal, on_floor, state_of, with_goal
+from crazysim.envs.task import Task
+from crazysim.envs.tasks.core import Goal, goal_of, install_goal, on_floor, state_of, with_goal
+from crazysim.sim.sim import Sim
 
 HEIGHT = 5.0
-"""Where episodes begin, m; high enough to sink for as long as they last at most speeds."""
+"""Height of the start, m; enough to sink for a whole episode at most speeds."""
 
 
-def reach_vel(sim: Simulation, speed: float = 1.0, seconds: float = 4.0, tolerance: float = 0.1) -> Task:
-    """Return the task of reaching a random velocity and keeping it. Its error is a difference of velocities, m/s.
+@dataclass(frozen=True, kw_only=True)
+class ReachVel(Task):
+    """Reach a random velocity and keep it. The task error is a difference of velocities, m/s.
 
-    A drone begins in flight, 5 m high, slightly tilted and moving. An episode ends on the floor.
-
-    Args:
-        sim: The simulation, which is given goals.
-        speed: Most of each component of the velocity, m/s; the vertical one is a quarter of it at most.
-        seconds: Length of an episode, s.
-        tolerance: Difference below which the velocity counts as reached, m/s.
+    A drone starts in flight, 5 m high, slightly tilted and moving. An episode ends on the floor.
     """
-    install_goal(sim)
-    spread = np.array([1.0, 1.0, 0.0, 0.2, 0.2, 0.2, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, speed, speed, speed / 4])
 
-    def spawn(data: SimData, keys: Array) -> SimData:
-        x = uniform(keys, data.core.n_drones, len(spread), low=-spread, high=spread)
-        offset, rpy, vel, ang_vel, goal = jnp.split(x, 5, axis=-1)
-        start = offset + np.array([0.0, 0.0, HEIGHT])
-        return with_goal(flying(data, start, rotation.from_rpy(rpy), vel, ang_vel), start, goal)
+    name = "reach_vel"
+    Record = Goal
 
-    def missing(data: SimData) -> Array:
-        return goal_of(data).vel - data.states.vel
+    speed: float = 1.0
+    """Largest component of the velocity, m/s; the vertical one is at most a quarter of it."""
+    seconds: float = 4.0
+    """Length of an episode, s."""
+    tolerance: float = 0.1
+    """Difference below which the velocity counts as reached, m/s."""
 
-    def observe(data: SimData) -> dict[str, Array]:
-        return state_of(data) | {"difference_to_target_vel": missing(data)}
+    def install(self, sim: Sim) -> None:
+        """Give every drone a goal."""
+        install_goal(sim)
 
-    def error(data: SimData) -> Array:
-        return rotation.safe_norm(missing(data))[..., 0]
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return drones in flight, and the velocities they should reach."""
+        x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, ang_vel=3, goal=3)
+        start = within(x["start"], np.array([1.0, 1.0, 0.0])) + np.array([0.0, 0.0, HEIGHT])
+        quat = rotation.from_rpy(within(x["rpy"], 0.2))
+        data = flying(data, start, quat, within(x["vel"], 0.5), within(x["ang_vel"], 0.5))
+        return with_goal(data, start, within(x["goal"], self.speed * np.array([1.0, 1.0, 0.25])))
 
-    def terminated(data: SimData) -> Array:
-        return jnp.any(on_floor(data), axis=-1)
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state and the missing velocity, m/s."""
+        return state_of(data) | {"difference_to_target_vel": goal_of(data).vel - data.states.vel}
 
-    def reward(data: SimData, action: Array, last_action: Array) -> Array:
-        """Up to 1.5 near the velocity, less what is spent on turning and on jerky actions; -10 for a crash."""
-        d = error(data)
-        spin = jnp.sum(jnp.square(data.states.ang_vel), axis=-1)
-        jerk = jnp.sum(jnp.square(action - last_action), axis=-1)
-        return jnp.exp(-d) + 0.5 * jnp.exp(-10 * d) - 0.002 * spin - 0.02 * jerk - 10.0 * on_floor(data)
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return proximity to the velocity, and costs of turning, of changing actions and of a crash."""
+        return {
+            "proximity": terms.proximity(self.error(data), coarse=1.0, fine=10.0),
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "crash": -10.0 * on_floor(data),
+        }
 
-    settings = {"speed": speed, "seconds": seconds, "tolerance": tolerance}
-    return Task("reach_vel", spawn, observe, reward, terminated, error, seconds=seconds, tolerance=tolerance,
-                settings=settings)  # fmt: skip
+    def terminated(self, data: SimData) -> Array:
+        """Return true where a drone is on the floor."""
+        return jnp.any(on_floor(data))
+
+    def error(self, data: SimData) -> Array:
+        """Return the difference from the velocity, m/s."""
+        return rotation.safe_norm(goal_of(data).vel - data.states.vel)[..., 0]

@@ -2,58 +2,84 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation
-from crazysim.envs.env import Task
-from crazysim.envs.random import uniform
+from crazysim.envs import terms
+from crazysim.envs.random import draw
 from crazysim.envs.spawn import any_attitude, flying
-from crazysim.envs.tasks.core import away, goal_of, install_goal, out_of_bounds, state_of, with_goal
+from crazysim.envs.task import Task
+from crazysim.envs.tasks.core import Goal, distance_to_goal, goal_of, install_goal, out_of_bounds, state_of, with_goal
+from crazysim.sim.sim import Sim
 
 HALF_WIDTH, HEIGHT = 8.0, 8.0
-"""Edge of the arena, m."""
+"""Limits of the arena, m."""
+GOAL = np.array([0.0, 0.0, 3.0])
+"""Goal of every drone, m."""
 
 
-def recover(
-    sim: Simulation, speed: float = 2.0, spin: float = 6.0, seconds: float = 5.0, tolerance: float = 0.1
-) -> Task:
-    """Return the task of catching a thrown drone: any attitude, speed and spin, to hover at (0, 0, 3).
+@dataclass(frozen=True, kw_only=True)
+class Recover(Task):
+    """Catch a thrown drone, with any attitude, speed and spin, and hover at (0, 0, 3)."""
 
-    Args:
-        sim: The simulation, which is given goals.
-        speed: Most of each component of the velocity it is thrown with, m/s.
-        spin: Most of each body rate, rad/s.
-        seconds: Length of an episode, s.
-        tolerance: Distance below which the goal counts as reached, m.
-    """
-    install_goal(sim)
-    goal = jnp.array([0.0, 0.0, 3.0])
+    name = "recover"
+    Record = Goal
 
-    def spawn(data: SimData, keys: Array) -> SimData:
-        x = uniform(keys, data.core.n_drones, 12)
-        pos = goal + 2 * x[..., :3] - 1
-        vel, ang_vel = speed * (2 * x[..., 3:6] - 1), spin * (2 * x[..., 6:9] - 1)
-        return with_goal(flying(data, pos, any_attitude(x[..., 9:]), vel, ang_vel), goal)
+    speed: float = 2.0
+    """Largest component of the velocity at the start, m/s."""
+    spin: float = 6.0
+    """Largest body rate at the start, rad/s."""
+    seconds: float = 5.0
+    """Length of an episode, s."""
+    tolerance: float = 0.1
+    """Distance below which the goal counts as reached, m."""
 
-    def observe(data: SimData) -> dict[str, Array]:
+    def install(self, sim: Sim) -> None:
+        """Give every drone a goal."""
+        install_goal(sim)
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return drones just thrown, and their goals."""
+        x = draw(key, data.core.n_drones, start=3, vel=3, ang_vel=3, attitude=3)
+        goal = GOAL.astype(data.states.pos.dtype)
+        pos = goal + 2 * x["start"] - 1
+        vel, ang_vel = self.speed * (2 * x["vel"] - 1), self.spin * (2 * x["ang_vel"] - 1)
+        return with_goal(flying(data, pos, any_attitude(x["attitude"]), vel, ang_vel), goal)
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state and the way to its goal, m."""
         return state_of(data) | {"difference_to_goal": goal_of(data).pos - data.states.pos}
 
-    def terminated(data: SimData) -> Array:
-        return jnp.any(out_of_bounds(data, HALF_WIDTH, HEIGHT), axis=-1)
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return proximity to the goal and uprightness, and costs of turning, of changing actions and of a crash."""
+        return {
+            "proximity": terms.proximity(self.error(data), coarse=1.0, fine=10.0),
+            "upright": 0.5 * rotation.z_axis(data.states.quat)[..., 2],
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "crash": -20.0 * out_of_bounds(data, HALF_WIDTH, HEIGHT),
+        }
 
-    def reward(data: SimData, action: Array, last_action: Array) -> Array:
-        """Up to 2 near the goal and upright, less what is spent on turning and jerky actions; -20 for a crash."""
-        d = away(data)
-        spins = jnp.sum(jnp.square(data.states.ang_vel), axis=-1)
-        jerk = jnp.sum(jnp.square(action - last_action), axis=-1)
-        upright = rotation.z_axis(data.states.quat)[..., 2]
-        near = jnp.exp(-d) + 0.5 * jnp.exp(-10 * d) + 0.5 * upright
-        return near - 0.002 * spins - 0.02 * jerk - 20.0 * out_of_bounds(data, HALF_WIDTH, HEIGHT)
+    def terminated(self, data: SimData) -> Array:
+        """Return true where a drone has left the arena."""
+        return jnp.any(out_of_bounds(data, HALF_WIDTH, HEIGHT))
 
-    settings = {"speed": speed, "spin": spin, "seconds": seconds, "tolerance": tolerance}
-    return Task("recover", spawn, observe, reward, terminated, away, seconds=seconds, tolerance=tolerance,
-                settings=settings, target=lambda data: goal_of(data).pos,
-                camera={"lookat": (0, 0, 2.5), "distance": 9.0, "elevation": -15})  # fmt: skip
+    def error(self, data: SimData) -> Array:
+        """Return the distance from the goal, m."""
+        return distance_to_goal(data)
+
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        """Return the camera of images and films."""
+        del n_drones
+        return {"lookat": (0, 0, 2.5), "distance": 9.0, "elevation": -15}
+
+    def target(self, data: SimData) -> Array:
+        """Return the goal, m."""
+        return goal_of(data).pos

@@ -1,8 +1,10 @@
-"""Change places, or form a formation, without flying into each other or into each other's downwash."""
+"""Change places, or form a formation, at a distance from each other and out of each other's downwash."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,175 +12,202 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import FunctionPlugin, Placement, Simulation
 from crazysim.core.stage import stage
-from crazysim.envs.env import Task
-from crazysim.envs.random import uniform
+from crazysim.envs import terms
+from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.core import NAME, on_floor, others_near, state_of
+from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.core import install_rules, on_floor, others_near, state_of, with_record
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
+from crazysim.sim.sim import Sim
 
 SEPARATION = (0.24, 0.24, 0.6)
 """Half axes of the ellipsoid around a drone that no other's centre may enter, m: twice the radii of 0.12 m across and
 0.3 m along the thrust with which Preiss, Hoenig, Ayanian and Sukhatme (Downwash-aware trajectory planning for large
 quadrotor teams, 2017) describe a Crazyflie."""
 SPACING = 0.9
-"""Least distance of neighbours on the circle that a swarm begins on, m."""
+"""Smallest distance of neighbours on the circle of the starts, m."""
 HEIGHT = 1.2
 """Height of the circle, m."""
 ROOM = 1.5
 """Distance of the arena's limits from the circle and the formation, m."""
 JITTER = 0.1
-"""Most of each component of a start's distance from its place on the circle, m."""
+"""Largest component of the distance of a start from its place on the circle, m."""
 
 
-class Swarm(PyTree):
-    """Where each drone is to be, and how near others have come to it."""
+class SwarmRecord(PyTree):
+    """Goal of each drone, and how close others have come to it."""
 
     goal: Array = leaf("drone", 1)
-    """Its slot, m. (n_worlds, n_drones, 3)"""
+    """Position that the drone should take, m. (n_worlds, n_drones, 3)"""
     closest: Array = leaf("drone", 0)
-    """Least separation from another drone so far, 1 at the edge of the ellipsoid. (n_worlds, n_drones)"""
+    """Smallest separation from another drone so far; 1 at the edge of the ellipsoid. (n_worlds, n_drones)"""
 
 
-def swarm(
-    sim: Simulation,
-    formation: Sequence[Sequence[float]] | None = None,
-    n_seen: int = 3,
-    strict: bool = True,
-    seconds: float = 8.0,
-    tolerance: float = 0.1,
-) -> Task:
-    """Return the task of changing places on a circle, or of forming a formation, at a distance from each other.
+@dataclass(frozen=True, kw_only=True)
+class Swarm(Task):
+    """Change places on a circle, or form a formation, at a distance from each other.
 
-    A swarm begins on a circle that is turned at random. Without a formation each drone is to take the place of another,
-    the same number of places on for all. No drone may come into the ellipsoid around another, 0.24 m wide and 0.6 m
-    high each way, below which it would also fly in its downwash; that is checked at every physics step. An episode ends
-    when one does, if ``strict``, on the floor, and 1.5 m outside of circle and formation.
-
-    Args:
-        sim: The simulation, of two drones a world at least; it is given their goals.
-        formation: Where the drones are to be, in their order, m; None to change places. (n_drones, 3)
-        n_seen: How many of the nearest others a drone sees.
-        strict: Whether an episode ends when two come too near; they pay for it in any case.
-        seconds: Length of an episode, s.
-        tolerance: Distance below which a drone counts as in its slot, m.
-
-    Raises:
-        ConfigError: If there is one drone only, or the formation cannot be.
+    The drones start on a circle that is turned at random. Without a formation each one should take the place of
+    another, the same number of places on for all. No drone may enter the ellipsoid around another, with half axes of
+    0.24 m across and 0.6 m in height, below which it would also fly in its downwash; that is checked at every physics
+    step. An episode ends when one does, if ``strict``, on the floor, and 1.5 m outside of circle and formation.
     """
-    n = sim.n_drones
-    if n < 2:
-        raise ConfigError("a swarm has two drones at least: make the simulation with n_drones=2 or more")
-    if type(n_seen) is not int or n_seen < 1:
-        raise ConfigError(f"n_seen is {n_seen!r}; a drone sees 1 of the others at least")
-    slots = None if formation is None else as_formation(formation, n)
-    radius = max(SPACING, SPACING / (2 * np.sin(np.pi / n)))
-    far = np.array([radius, radius, HEIGHT]) if slots is None else np.maximum(radius, np.abs(slots).max(axis=0))
-    limit = far + ROOM
-    zero = jnp.zeros_like(sim.data.states.pos)
-    record = Swarm(zero, jnp.full(zero.shape[:2], jnp.inf, zero.dtype))
 
-    @stage("world")
-    def keep(data: SimData) -> SimData:
-        """Note how near others have come."""
-        own = record_of(data)
-        new = own.replace(closest=jnp.minimum(own.closest, separation(data.states.pos)))
-        return data.replace(plugins=data.plugins | {NAME: new})
+    name = "swarm"
+    Record = SwarmRecord
 
-    sim.add(FunctionPlugin(NAME, record, [Placement(keep, before="increment_steps")]))
+    formation: Sequence[Sequence[float]] | None = None
+    """Goals of the drones, in their order, m; None to change places. (n_drones, 3)"""
+    n_seen: int = 3
+    """Number of nearest other drones that a drone observes."""
+    strict: bool = True
+    """True to end an episode when two drones come too close; they are penalised in any case."""
+    seconds: float = 8.0
+    """Length of an episode, s."""
+    tolerance: float = 0.1
+    """Distance below which a drone counts as in its place, m."""
 
-    def spawn(data: SimData, keys: Array) -> SimData:
-        x = uniform(keys, 2 + 9 * n)
-        off, rpy, vel = jnp.split(2 * x[:, 2:].reshape(-1, n, 9) - 1, 3, axis=-1)
-        begin = 2 * jnp.pi * (x[:, :1] + np.arange(n, dtype=x.dtype) / n)
-        # Everyone moves on by 1 to n - 1 places.
-        places = 1 + jnp.floor((n - 1) * x[:, 1:2])
+    def __post_init__(self) -> None:
+        """Check the settings.
+
+        Raises:
+            ConfigError: If a drone is to observe none of the others.
+        """
+        if type(self.n_seen) is not int or self.n_seen < 1:
+            raise ConfigError(f"expected n_seen of at least 1, got {self.n_seen!r}")
+
+    def install(self, sim: Sim) -> None:
+        """Give every drone a goal, and check separation at every physics step.
+
+        Raises:
+            ConfigError: If there is only one drone, or the formation does not fit.
+        """
+        if sim.n_drones < 2:
+            raise ConfigError(f"expected at least two drones in a swarm, got {sim.n_drones}. Use n_drones=2 or more.")
+        if self.formation is not None:
+            as_formation(self.formation, sim.n_drones)
+        zero = jnp.zeros_like(sim.data.states.pos)
+
+        @stage("world")
+        def keep_closest(data: SimData) -> SimData:
+            """Note how close others have come."""
+            own = swarm_of(data)
+            return with_record(data, own.replace(closest=jnp.minimum(own.closest, separation(data.states.pos))))
+
+        record = SwarmRecord(zero, jnp.full(zero.shape[:2], jnp.inf, zero.dtype))
+        install_rules(sim, record, keep_closest)
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return drones in flight on the circle, and their goals."""
+        n, dtype = data.core.n_drones, data.states.pos.dtype
+        x = draw(key, turn=1, places=1, drones=(n, 9))
+        offset, rpy, vel = jnp.split(2 * x["drones"] - 1, 3, axis=-1)
+        begin = 2 * jnp.pi * (x["turn"] + np.arange(n, dtype=dtype) / n)
+        # All move on by 1 to n - 1 places.
+        places = 1 + jnp.floor((n - 1) * x["places"])
         end = begin + 2 * jnp.pi * places / n
-        goal = on_circle(end, radius) if slots is None else jnp.asarray(slots, x.dtype)
-        data = flying(data, on_circle(begin, radius) + JITTER * off, rotation.from_rpy(0.1 * rpy), 0.1 * vel)
-        new = Swarm(jnp.broadcast_to(goal, data.states.pos.shape), separation(data.states.pos))
-        return data.replace(plugins=data.plugins | {NAME: new})
+        goal = on_circle(end, n) if self.formation is None else jnp.asarray(np.asarray(self.formation, float), dtype)
+        data = flying(data, on_circle(begin, n) + JITTER * offset, rotation.from_rpy(0.1 * rpy), 0.1 * vel)
+        return with_record(data, SwarmRecord(goal, separation(data.states.pos)))
 
-    def away(data: SimData) -> Array:
-        return rotation.safe_norm(record_of(data).goal - data.states.pos)[..., 0]
-
-    def observe(data: SimData) -> dict[str, Array]:
-        near, passing = (x.reshape(*x.shape[:2], -1) for x in others_near(data, n_seen))
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state, the way to its goal, and the nearest other drones, m and m/s."""
+        near, passing = (x.reshape(x.shape[0], -1) for x in others_near(data, self.n_seen))
         return state_of(data) | {
-            "difference_to_goal": record_of(data).goal - data.states.pos,
+            "difference_to_goal": swarm_of(data).goal - data.states.pos,
             "drones_near": near,
             "drones_near_vel": passing,
         }
 
-    def lost(data: SimData) -> Array:
-        beyond = jnp.any(jnp.abs(data.states.pos) > limit.astype(data.states.pos.dtype), axis=-1)
-        return on_floor(data) | beyond | (strict & (record_of(data).closest < 1))
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return proximity to the goal, and costs of crowding, turning, changing actions and ending the episode."""
+        gap = separation(data.states.pos)
+        return {
+            "proximity": terms.proximity(self.error(data)),
+            "crowding": -(jnp.maximum(1.5 - gap, 0) + 2.0 * (gap < 1)),
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "lost": -10.0 * self.lost(data),
+        }
 
-    def reward(data: SimData, action: Array, last_action: Array) -> Array:
-        """Up to 1.5 in the slot, less near others, for turning and for jerky actions; -10 where the episode ends."""
-        d, apart = away(data), separation(data.states.pos)
-        spin = jnp.sum(jnp.square(data.states.ang_vel), axis=-1)
-        jerk = jnp.sum(jnp.square(action - last_action), axis=-1)
-        near = jnp.exp(-2 * d) + 0.5 * jnp.exp(-20 * d)
-        crowded = jnp.maximum(1.5 - apart, 0) + 2.0 * (apart < 1)
-        return near - crowded - 0.002 * spin - 0.02 * jerk - 10.0 * lost(data)
+    def lost(self, data: SimData) -> Array:
+        """Return true where a drone is on the floor, outside of the arena, or too close to another. (n_drones,)"""
+        pos = data.states.pos
+        beyond = jnp.any(jnp.abs(pos) > self.limits(data.core.n_drones).astype(pos.dtype), axis=-1)
+        return on_floor(data) | beyond | (self.strict & (swarm_of(data).closest < 1))
 
-    return Task(
-        "swarm",
-        spawn,
-        observe,
-        reward,
-        terminated=lambda data: jnp.any(lost(data), axis=-1),
-        error=away,
-        info=lambda data: {"separation": record_of(data).closest},
-        target=lambda data: record_of(data).goal,
-        camera={"lookat": (0, 0, 1.0), "distance": 4.0 + 2 * radius, "elevation": -35},
-        seconds=seconds,
-        tolerance=tolerance,
-        settings={
-            "formation": None if slots is None else slots.tolist(),
-            "n_seen": n_seen,
-            "strict": strict,
-            "seconds": seconds,
-            "tolerance": tolerance,
-        },
-    )
+    def limits(self, n_drones: int) -> np.ndarray:
+        """Return the limits of the arena, m. (3,)"""
+        radius = circle_radius(n_drones)
+        if self.formation is None:
+            return np.array([radius, radius, HEIGHT]) + ROOM
+        return np.maximum(radius, np.abs(np.asarray(self.formation, float)).max(axis=0)) + ROOM
+
+    def terminated(self, data: SimData) -> Array:
+        """Return true where a drone is lost."""
+        return jnp.any(self.lost(data))
+
+    def error(self, data: SimData) -> Array:
+        """Return the distance from the goal, m."""
+        return rotation.safe_norm(swarm_of(data).goal - data.states.pos)[..., 0]
+
+    def info(self, data: SimData) -> dict[str, Array]:
+        """Return the smallest separation so far."""
+        return {"separation": swarm_of(data).closest}
+
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        """Return a camera that shows the whole circle."""
+        return {"lookat": (0, 0, 1.0), "distance": 4.0 + 2 * circle_radius(n_drones), "elevation": -35}
+
+    def target(self, data: SimData) -> Array:
+        """Return the goal, m."""
+        return swarm_of(data).goal
+
+
+def swarm_of(data: SimData) -> SwarmRecord:
+    """Return the task's record."""
+    return data.plugins[NAME]
 
 
 def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndarray:
     """Return a formation as an array, checked. (n_drones, 3)
 
     Raises:
-        ConfigError: If it has another shape, is too low, or two of its places are too near to each other.
+        ConfigError: If it has another shape, is too low, or two of its places are too close to each other.
     """
     try:
         slots = np.asarray(formation, float)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"the formation cannot be {formation!r}; needed is an array ({n_drones}, 3)") from error
+        raise ConfigError(f"expected a formation of shape ({n_drones}, 3), got {formation!r}") from error
     if slots.shape != (n_drones, 3) or not np.all(np.isfinite(slots)):
-        raise ConfigError(f"the formation has shape {slots.shape}; needed are finite numbers ({n_drones}, 3), m")
+        raise ConfigError(f"expected a formation of finite numbers ({n_drones}, 3), m, got shape {slots.shape}")
     if slots[:, 2].min() < 0.2:
-        raise ConfigError(f"the formation reaches down to {slots[:, 2].min()} m; needed are 0.2 m over the floor")
+        raise ConfigError(f"expected a formation at least 0.2 m over the floor, got {slots[:, 2].min()} m")
     apart = np.asarray(separation(jnp.asarray(slots)))
     if apart.min() < 1.2:
         pair = sorted(np.argsort(apart)[:2].tolist())
         raise ConfigError(
-            f"places {pair} of the formation are too near to each other: {apart.min():.2f} of the least separation, "
-            f"which is {SEPARATION[0]} m beside and {SEPARATION[2]} m above each other; needed is 1.2 of it"
+            f"expected places of the formation at 1.2 times the smallest separation, which is {SEPARATION[0]} m beside "
+            f"and {SEPARATION[2]} m above each other, got {apart.min():.2f} between places {pair}"
         )
     return slots
 
 
-def on_circle(angle: Array, radius: float) -> Array:
-    """Return points of the circle that a swarm begins on, m. (..., 3)"""
-    height = jnp.full_like(angle, HEIGHT)
+def circle_radius(n_drones: int) -> float:
+    """Return the radius of the circle of the starts, m."""
+    return max(SPACING, SPACING / (2 * np.sin(np.pi / n_drones)))
+
+
+def on_circle(angle: Array, n_drones: int) -> Array:
+    """Return points of the circle of the starts, m. (..., 3)"""
+    radius, height = circle_radius(n_drones), jnp.full_like(angle, HEIGHT)
     return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), height], axis=-1)
 
 
 def separation(pos: Array) -> Array:
-    """Return how far the nearest other drone is, in half axes of the ellipsoid: below 1 it is too near.
+    """Return the distance to the nearest other drone in half axes of the ellipsoid; below 1 it is too close.
 
     Args:
         pos: Positions of a world's drones, m. (..., n_drones, 3)
@@ -190,8 +219,3 @@ def separation(pos: Array) -> Array:
     square = jnp.sum(apart * apart, axis=-1)
     other = ~np.eye(pos.shape[-2], dtype=bool)
     return rotation.safe_sqrt(jnp.min(jnp.where(other, square, jnp.inf), axis=-1))
-
-
-def record_of(data: SimData) -> Swarm:
-    """Return the task's record."""
-    return data.plugins[NAME]

@@ -2,101 +2,121 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import FunctionPlugin, Simulation
-from crazysim.envs.env import Task
-from crazysim.envs.random import uniform
+from crazysim.core.plugin import FunctionPlugin
+from crazysim.envs import terms
+from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.core import NAME, on_floor, state_of
+from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.core import on_floor, state_of, with_record
 from crazysim.envs.trajectories import Trajectory, figure_eight
 from crazysim.pytree import PyTree, leaf
+from crazysim.sim.sim import Sim
 
 TOO_FAR = 1.5
 """Distance from the trajectory at which an episode ends, m."""
 LATEST = 20.0
-"""Latest time of the trajectory at which an episode begins, s."""
+"""Latest time on the trajectory at which an episode starts, s."""
 
 
 class Phase(PyTree):
-    """Where on the trajectory an episode begins."""
+    """Start of an episode on the trajectory."""
 
     since: Array = leaf("drone", 1)
-    """Time of the trajectory at the episode's beginning, s. (n_worlds, n_drones, 1)"""
+    """Time on the trajectory at the start of the episode, s. (n_worlds, n_drones, 1)"""
 
 
-def track(
-    sim: Simulation,
-    trajectory: Trajectory | None = None,
-    n_samples: int = 5,
-    spacing: float = 0.1,
-    seconds: float = 10.0,
-    tolerance: float = 0.05,
-    spread: float = 0.2,
-) -> Task:
-    """Return the task of following a trajectory, a figure eight of 2 m by 1 m in 5 s if nothing else is asked for.
+@dataclass(frozen=True, kw_only=True)
+class TrackTrajectory(Task):
+    """Follow a trajectory.
 
-    A drone begins near a random point of the trajectory, and sees where the next samples of it are. An episode ends on
-    the floor, and 1.5 m away from where the drone should be.
-
-    Args:
-        sim: The simulation, which is given the time at which each drone begins.
-        trajectory: Time to position and velocity; ``crazysim.envs.trajectories`` has some.
-        n_samples: How many points of the time to come a policy sees.
-        spacing: Time from one to the next, s.
-        seconds: Length of an episode, s.
-        tolerance: Distance below which the drone counts as on the trajectory, m.
-        spread: Most of each component of the distance at the beginning, m.
+    A drone starts near a random point of the trajectory, and observes the next samples of it. An episode ends on the
+    floor, and 1.5 m away from where the drone should be.
     """
-    sim.add(FunctionPlugin(NAME, Phase(jnp.zeros_like(sim.data.states.pos[..., :1]))))
-    where = figure_eight() if trajectory is None else trajectory
-    ahead = spacing * (1 + np.arange(n_samples))
-    jitter = np.array([spread] * 3 + [0.2] * 3 + [0.2] * 3)
 
-    def spawn(data: SimData, keys: Array) -> SimData:
-        x = uniform(keys, data.core.n_drones, 10)
-        offset, rpy, vel = jnp.split((2 * x[..., :9] - 1) * jitter.astype(x.dtype), 3, axis=-1)
-        begin = LATEST * x[..., 9:]
-        pos, along = where(begin[..., 0])
-        data = flying(data, pos + offset, rotation.from_rpy(rpy), along + vel)
-        return data.replace(plugins=data.plugins | {NAME: Phase(begin)})
+    name = "track"
+    Record = Phase
 
-    def time(data: SimData) -> Array:
+    trajectory: Trajectory = field(default_factory=figure_eight)
+    """Time to position and velocity; by default a figure eight of 2 m by 1 m in 5 s. See
+    ``crazysim.envs.trajectories``."""
+    n_samples: int = 5
+    """Number of samples of the time ahead that a policy observes."""
+    spacing: float = 0.1
+    """Time between samples, s."""
+    spread: float = 0.2
+    """Largest component of the distance from the trajectory at the start, m."""
+    seconds: float = 10.0
+    """Length of an episode, s."""
+    tolerance: float = 0.05
+    """Distance below which the drone counts as on the trajectory, m."""
+    hold: float = 5.0
+    """Time at the end of an episode during which it must stay there, s."""
+
+    def install(self, sim: Sim) -> None:
+        """Give every drone its time on the trajectory."""
+        sim.add(FunctionPlugin(NAME, Phase(jnp.zeros_like(sim.data.states.pos[..., :1]))))
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return drones near the trajectory, moving along it."""
+        x = draw(key, data.core.n_drones, offset=3, rpy=3, vel=3, begin=1)
+        dtype = data.states.pos.dtype
+        offset = (2 * x["offset"] - 1) * np.asarray(self.spread, dtype)
+        rpy, vel = ((2 * x[name] - 1) * np.asarray(0.2, dtype) for name in ("rpy", "vel"))
+        begin = LATEST * x["begin"]
+        pos, along = self.trajectory(begin[..., 0])
+        return with_record(flying(data, pos + offset, rotation.from_rpy(rpy), along + vel), Phase(begin))
+
+    def time(self, data: SimData) -> Array:
+        """Return the time on the trajectory, s. (n_drones,)"""
         return data.plugins[NAME].since[..., 0] + data.core.steps / data.core.freq
 
-    def to_go(data: SimData) -> Array:
-        return where(time(data))[0] - data.states.pos
-
-    def observe(data: SimData) -> dict[str, Array]:
-        t = time(data)
-        points = where(t[..., None] + ahead.astype(t.dtype))[0] - data.states.pos[..., None, :]
-        pos, vel = where(t)
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state, the differences from the trajectory, and the ways to its next samples, m."""
+        t, s = self.time(data), data.states
+        ahead = (self.spacing * (1 + np.arange(self.n_samples))).astype(t.dtype)
+        points = self.trajectory(t[..., None] + ahead)[0] - s.pos[..., None, :]
+        pos, vel = self.trajectory(t)
         return state_of(data) | {
-            "difference_to_goal": pos - data.states.pos,
-            "difference_to_target_vel": vel - data.states.vel,
+            "difference_to_goal": pos - s.pos,
+            "difference_to_target_vel": vel - s.vel,
             "local_samples": points.reshape(*points.shape[:-2], -1),
         }
 
-    def error(data: SimData) -> Array:
-        return rotation.safe_norm(to_go(data))[..., 0]
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return proximity to the trajectory, and costs of changing actions and of losing it."""
+        return {
+            "proximity": terms.proximity(self.error(data), coarse=3.0),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "lost": -10.0 * self.lost(data),
+        }
 
-    def lost(data: SimData) -> Array:
-        return on_floor(data) | (error(data) > TOO_FAR)
+    def lost(self, data: SimData) -> Array:
+        """Return true where a drone is on the floor or too far from the trajectory. (n_drones,)"""
+        return on_floor(data) | (self.error(data) > TOO_FAR)
 
-    def terminated(data: SimData) -> Array:
-        return jnp.any(lost(data), axis=-1)
+    def terminated(self, data: SimData) -> Array:
+        """Return true where a drone is lost."""
+        return jnp.any(self.lost(data))
 
-    def reward(data: SimData, action: Array, last_action: Array) -> Array:
-        """Up to 1.5 on the trajectory, less what is spent on jerky actions; -10 where it is lost."""
-        d = error(data)
-        jerk = jnp.sum(jnp.square(action - last_action), axis=-1)
-        return jnp.exp(-3 * d) + 0.5 * jnp.exp(-20 * d) - 0.02 * jerk - 10.0 * lost(data)
+    def error(self, data: SimData) -> Array:
+        """Return the distance from the trajectory, m."""
+        return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
 
-    settings = {"n_samples": n_samples, "spacing": spacing, "seconds": seconds, "tolerance": tolerance}
-    return Task("track", spawn, observe, reward, terminated, error, seconds=seconds, tolerance=tolerance, hold=5.0,
-                settings=settings, target=lambda data: where(time(data))[0],
-                camera={"lookat": (0, 0, 0.9), "distance": 3.5, "elevation": -30})  # fmt: skip
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        """Return the camera of images and films."""
+        del n_drones
+        return {"lookat": (0, 0, 0.9), "distance": 3.5, "elevation": -30}
+
+    def target(self, data: SimData) -> Array:
+        """Return the point of the trajectory, m."""
+        return self.trajectory(self.time(data))[0]

@@ -1,0 +1,45 @@
+"""Default data of a simulation with what is alike in all worlds and drones stored once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from crazysim.core.data import SimData
+from crazysim.pytree import scopes
+
+
+def compact(data: SimData) -> SimData:
+    """Return the data with one world and drone in place of all where they are alike, as arrays of the host."""
+
+    def one(scope: str, x: Any) -> Any:
+        if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return x
+        x = np.asarray(x)
+        for axis in range({"drone": 2, "world": 1}.get(scope, 0)):
+            first = x.take([0], axis)
+            if np.array_equal(x, np.broadcast_to(first, x.shape)):
+                x = first
+        return x
+
+    return jax.tree.map(one, scopes(data), data)
+
+
+def spread(data: SimData, n_worlds: int, n_drones: int) -> SimData:
+    """Return compacted data with all worlds and drones."""
+    shapes = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1)}
+
+    def all_of(scope: str, x: Any) -> Any:
+        shape = shapes.get(scope, ())
+        return jnp.broadcast_to(x, (*shape, *x.shape[len(shape) :])) if shape else x
+
+    return jax.tree.map(all_of, scopes(data), data)
+
+
+def with_own(default: SimData, data: SimData) -> SimData:
+    """Return the default data with the seed, numbers and flags of the data."""
+    own = {name: getattr(data.core, name) for name in ("rng_key", "world_id", "drone_id", "n_worlds")}
+    return default.replace(core=default.core.replace(**own))

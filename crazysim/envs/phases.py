@@ -1,0 +1,133 @@
+"""Phases of an environment step: act, (physics), observe, and begin, which starts an episode.
+
+Each is written for one world. ``Env`` runs them for all worlds with ``apply=all_worlds``; ``FusedEnvStep`` runs the
+same functions as stages of the engine. Tasks and wrappers are called here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.functional import stage_command
+from crazysim.core.stage import over_worlds
+from crazysim.envs.random import episode_key
+from crazysim.envs.state import EnvState
+from crazysim.envs.task import Task, total
+
+if TYPE_CHECKING:
+    from crazysim.envs.env import Env
+
+Apply = Callable[[Callable[..., Any], bool], Callable[..., Any]]
+"""``apply(fn, batched)``: the function as a phase calls it; ``batched`` for functions that take all worlds anyway."""
+
+
+def one_world(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
+    """Return the function unchanged: the phase runs in one world."""
+    del batched
+    return fn
+
+
+def all_worlds(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
+    """Return a function of all worlds."""
+    return fn if batched else over_worlds(fn)
+
+
+def act(env: Env, state: EnvState, action: Array, apply: Apply = one_world) -> tuple[EnvState, Array]:
+    """Return the state with the action's command staged, and the action as the wrappers pass it on.
+
+    Args:
+        env: The environment with its wrappers.
+        state: The state before the step.
+        action: Action. (n_drones, k)
+        apply: Caller of functions of one world.
+    """
+    for wrapper in reversed(env.wrappers):
+        state, action = apply(wrapper.before_step, wrapper.batched)(state, action)
+    data = apply(env.task.before_step, env.task.batched)(state.data)
+    return state.replace(data=stage_command(data, env.actions.command(action))), action
+
+
+def observe(env: Env, state: EnvState, action: Array, apply: Apply = one_world) -> EnvState:
+    """Return the state after the physics: observations, reward and the end of the episode.
+
+    Args:
+        env: The environment with its wrappers.
+        state: Result of ``act``, with the data after the physics.
+        action: The action that ``act`` returned. (n_drones, k)
+        apply: Caller of functions of one world.
+    """
+    task, last_step = env.task, env.max_steps * env.n_substeps
+
+    def evaluate(data: SimData, action: Array, last_action: Array) -> Any:
+        reward = jnp.asarray(total(task.rewards(data, action, last_action)), action.dtype)
+        return task.observe(data), reward, task.terminated(data), _step_info(task, data)
+
+    def conclude(state: EnvState, action: Array, results: Any) -> EnvState:
+        obs, reward, terminated, info = results
+        nonfinite = state.data.core.nonfinite
+        return state.replace(
+            obs=jax.tree.map(lambda x: jnp.where(nonfinite, jnp.zeros((), x.dtype), x), obs),
+            reward=jnp.where(nonfinite, jnp.zeros((), reward.dtype), reward),
+            terminated=terminated | nonfinite,
+            truncated=state.data.core.steps >= last_step,
+            action=action,
+            info=state.info | {"nonfinite": nonfinite} | info,
+        )
+
+    results = apply(evaluate, task.batched)(state.data, action, state.action)
+    state = apply(conclude, False)(state, action, results)
+    for wrapper in env.wrappers:
+        state = apply(wrapper.after_step, wrapper.batched)(state)
+    return state
+
+
+def begin(env: Env, state: EnvState, default: SimData, apply: Apply = one_world) -> EnvState:
+    """Return the state at the start of an episode; of the state before, only data, info and memory are read.
+
+    Args:
+        env: The environment with its wrappers.
+        state: The state before.
+        default: Data that the world is reset to.
+        apply: Caller of functions of one world.
+    """
+    task, base = env.task, env.base
+    shape = (base.sim.n_drones, env.actions.size)
+    before = apply(base.reset_data, base.batched_reset)(state.data, default)
+    key = apply(lambda data: episode_key(data, f"spawn {task.name}"), False)(before)
+    data = apply(task.spawn, task.batched)(before, key)
+    for wrapper in env.wrappers:
+        data = apply(wrapper.after_spawn, wrapper.batched)(data)
+    data = jax.tree.map(_like, before, data)
+
+    def start(state: EnvState, obs: Any, info: Any) -> EnvState:
+        dtype = state.data.states.pos.dtype
+        over = jnp.zeros((), bool)
+        return state.replace(
+            obs=obs,
+            reward=jnp.zeros(shape[:1], dtype),
+            terminated=over,
+            truncated=over,
+            action=jnp.zeros(shape, dtype),
+            info=state.info | {"nonfinite": state.data.core.nonfinite} | info,
+        )
+
+    seen = apply(lambda data: (task.observe(data), _step_info(task, data)), task.batched)(data)
+    state = apply(start, False)(state.replace(data=data), *seen)
+    for wrapper in env.wrappers:
+        state = apply(wrapper.after_reset, wrapper.batched)(state)
+    return state
+
+
+def _step_info(task: Task, data: SimData) -> dict[str, Array]:
+    return {"error": task.error(data)} | task.info(data)
+
+
+def _like(old: Any, new: Any) -> Any:
+    """Return an array in shape and type of the old one: of another type, the next step would be compiled again."""
+    return new if new is old else jnp.broadcast_to(jnp.asarray(new, old.dtype), old.shape)

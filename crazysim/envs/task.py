@@ -1,0 +1,123 @@
+"""Base class of tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.envs.state import Obs
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree
+from crazysim.sim.sim import Sim
+
+NAME = "task"
+"""Name of a task's record in ``data.plugins``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A task: a frozen record of settings whose methods are pure functions of one world.
+
+    Subclasses are frozen dataclasses. They define ``name``, ``spawn``, ``observe``, ``rewards``, ``terminated`` and
+    ``error``, and whatever else they need. Leaves of drones are (n_drones, ...), those of worlds have no batch axes.
+    What must be remembered from step to step is a record in ``data.plugins["task"]``, which ``install`` puts there.
+    """
+
+    name: ClassVar[str] = ""
+    """Name in messages and files; also the name of its random stream."""
+    Record: ClassVar[type[PyTree] | None] = None
+    """Type of the record in ``data.plugins["task"]``; None if there is none."""
+    batched: ClassVar[bool] = False
+    """True for a task that needs all worlds at once. Its methods then receive the data of all worlds with their batch
+    axes, and one key per world, and its steps are not fused."""
+
+    seconds: float = 5.0
+    """Length of an episode, s."""
+    tolerance: float = 0.05
+    """Error below which the task counts as done, in the unit of ``error``."""
+    hold: float = 1.0
+    """Time at the end of an episode during which the error must stay below the tolerance, s."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Refuse the record of functions that ``Task`` was in version 0.1.
+
+        Raises:
+            ConfigError: If the base class itself is called.
+        """
+        del args, kwargs
+        if cls is Task:
+            raise ConfigError(
+                "expected a subclass of Task, got Task itself, which took functions of all worlds up to version 0.1. "
+                "Write a frozen dataclass with methods for one world: docs/guides/tasks.md"
+            )
+        return super().__new__(cls)
+
+    def install(self, sim: Sim) -> None:
+        """Put into a simulation what the task needs: objects, a record, stages. Call it once, before ``DroneEnv``."""
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return the data at the start of an episode, goals included.
+
+        Args:
+            data: The world after its reset.
+            key: Random key of the episode, for ``crazysim.envs.random`` or ``jax.random``. ()
+        """
+        raise NotImplementedError(f"{type(self).__name__}.spawn")
+
+    def before_step(self, data: SimData) -> SimData:
+        """Return the data before an environment step; for rewards of differences, note here what they start from."""
+        return data
+
+    def observe(self, data: SimData) -> Obs:
+        """Return the observations of every drone. (n_drones, k) each"""
+        raise NotImplementedError(f"{type(self).__name__}.observe")
+
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return the terms of the reward of an environment step, by name; the reward is their sum. (n_drones,) each
+
+        Args:
+            data: The world after the step.
+            action: Action of this step, in [-1, 1]. (n_drones, k)
+            last_action: Action of the step before; zero at the start of an episode. (n_drones, k)
+        """
+        raise NotImplementedError(f"{type(self).__name__}.rewards")
+
+    def terminated(self, data: SimData) -> Array:
+        """Return true where the episode ended by success or failure. ()"""
+        raise NotImplementedError(f"{type(self).__name__}.terminated")
+
+    def error(self, data: SimData) -> Array:
+        """Return the task error of every drone, m unless the task says otherwise. (n_drones,)"""
+        raise NotImplementedError(f"{type(self).__name__}.error")
+
+    def info(self, data: SimData) -> dict[str, Array]:
+        """Return further quantities for ``state.info``, by name. () or (n_drones, ...) each"""
+        del data
+        return {}
+
+    def target(self, data: SimData) -> Array | None:
+        """Return the place where each drone should be, for images, m; None to draw none. (n_drones, 3)"""
+        del data
+        return None
+
+    def camera(self, n_drones: int) -> Mapping[str, Any] | None:
+        """Return the camera of images and films: lookat, distance, azimuth, elevation; None for the usual one."""
+        del n_drones
+        return None
+
+    def succeeded(self, data: SimData) -> Array | None:
+        """Return true where a drone has succeeded; None if success is an error that stays small. (n_drones,)"""
+        del data
+        return None
+
+
+def total(terms: Mapping[str, Array]) -> Array:
+    """Return the sum of the terms of a reward, in their order. (...)"""
+    first, *others = terms.values()
+    for term in others:
+        first = first + term
+    return first

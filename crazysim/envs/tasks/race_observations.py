@@ -1,0 +1,78 @@
+"""Observations of the race: the course as far as a drone has come near it. All functions are of one world."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.envs.tasks.core import nearest, others_near, pick
+from crazysim.envs.tasks.race_rules import OPENING, gates_of, obstacles_of, race_of
+
+CORNERS = OPENING / 2 * np.array([[0, 1, 1], [0, 1, -1], [0, -1, -1], [0, -1, 1]])
+"""Corners of the opening in the gate's frame, m. (4, 3)"""
+
+
+def visited(data: SimData, sensor_range: float) -> tuple[Array, Array]:
+    """Return true for gates and obstacles that each drone is or has been near. (n_drones, n) each"""
+    record = race_of(data)
+
+    def near(pos: Array) -> Array:
+        flat = (pos - data.states.pos[..., None, :])[..., :2]
+        return jnp.sum(flat * flat, axis=-1) < sensor_range**2
+
+    return record.gates_visited | near(gates_of(data)[0]), record.obstacles_visited | near(obstacles_of(data))
+
+
+def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
+    """Return the observations of lsy_drone_racing, each as one row, and more of them for small networks.
+
+    Those are ``rot`` (9), ``vel_body`` (3), ``gate_corners`` of the next two gates in the drone's frame (24),
+    ``obstacles_near``, ways to the axes of the next two poles (6), and with several drones ``drones_near``, the
+    nearest two of those still in the race (6); all from observed poses, in the drone's frame, m.
+    """
+    record, s, n_drones = race_of(data), data.states, data.core.n_drones
+    gates_pos, gates_quat, poles = (
+        jnp.broadcast_to(x, (n_drones, *x.shape)) for x in (*gates_of(data), obstacles_of(data))
+    )
+    seen_gates, seen_obstacles = visited(data, sensor_range)
+    n_gates, n_obstacles = seen_gates.shape[-1], seen_obstacles.shape[-1]
+    nominal_pos, nominal_quat = record.nominal_pos, record.nominal_quat
+    if nominal_pos is not None and nominal_quat is not None:
+        gates_pos = jnp.where(seen_gates[..., None], gates_pos, nominal_pos[:n_gates])
+        gates_quat = jnp.where(seen_gates[..., None], gates_quat, nominal_quat)
+        poles = jnp.where(seen_obstacles[..., None], poles, nominal_pos[n_gates:])
+    matrix = rotation.matrix(s.quat)
+
+    def in_body(world: Array) -> Array:
+        return rotation.matvec(jnp.swapaxes(matrix, -1, -2)[..., None, :, :], world)
+
+    corners = []
+    for k in (0, 1):
+        number = jnp.minimum(record.passed + k, n_gates - 1)
+        pos, quat = pick(gates_pos, number)[..., None, :], pick(gates_quat, number)[..., None, :]
+        around = pos + rotation.rotate(quat, jnp.asarray(CORNERS, pos.dtype))
+        corners.append(in_body(around - s.pos[..., None, :]))
+    to_poles = (poles - s.pos[..., None, :]) * np.array([1, 1, 0], s.pos.dtype)
+    far = jnp.sum(to_poles * to_poles, axis=-1)
+    obs = {
+        "pos": s.pos,
+        "quat": s.quat,
+        "vel": s.vel,
+        "ang_vel": s.ang_vel,
+        "target_gate": jnp.where(record.finished, -1, record.passed)[..., None],
+        "gates_pos": gates_pos,
+        "gates_quat": gates_quat,
+        "gates_visited": seen_gates,
+        "obstacles_pos": poles,
+        "obstacles_visited": seen_obstacles,
+        "rot": matrix,
+        "vel_body": in_body(s.vel[..., None, :]),
+        "gate_corners": jnp.concatenate(corners, axis=-2),
+        "obstacles_near": in_body(nearest(far, to_poles, min(2, n_obstacles))),
+    }
+    if n_drones > 1:
+        obs["drones_near"] = in_body(others_near(data, 2, ~record.out)[0])
+    return {name: x.reshape(n_drones, -1).astype(s.pos.dtype) for name, x in obs.items()}

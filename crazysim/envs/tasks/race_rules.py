@@ -1,0 +1,160 @@
+"""Rules of the race: gates and obstacles of a course, progress of each drone, and rewards for it.
+
+All functions are of one world, or, without the axis of drones, of one drone.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.envs import terms
+from crazysim.envs.task import NAME
+from crazysim.envs.tasks.core import pick
+from crazysim.pytree import PyTree, leaf, static
+from crazysim.scene.objects import Handle
+
+OPENING = 0.45
+"""Width and height of a gate's opening, m."""
+POLE_HEIGHT = 1.7
+"""Height of an obstacle, m; the part that is too long for its place is below the floor."""
+AROUND = 0.45
+"""Distance from the middle of a gate at which a way around it passes, m."""
+FUNNEL = 0.15
+"""Distance from the axis of a gate, m, that is no detour at the gate itself; it grows by a metre for each before it."""
+
+
+class RaceRecord(PyTree):
+    """Progress of each drone, and what it has observed of the course."""
+
+    passed: Array = leaf("drone", 0)
+    """Number of gates passed, which is the index of the next. (n_worlds, n_drones)"""
+    disabled: Array = leaf("drone", 0)
+    """True where the drone has touched something, or left the arena. (n_worlds, n_drones)"""
+    last_pos: Array = leaf("drone", 1)
+    """Position one physics step ago, m. (n_worlds, n_drones, 3)"""
+    gates_visited: Array = leaf("drone", 1)
+    """True for gates that it was near before this environment step. (n_worlds, n_drones, n_gates)"""
+    obstacles_visited: Array = leaf("drone", 1)
+    """True for obstacles that it was near before this environment step. (n_worlds, n_drones, n_obstacles)"""
+    passed_before: Array = leaf("drone", 0)
+    """Number of gates passed before this environment step. (n_worlds, n_drones)"""
+    out_before: Array = leaf("drone", 0)
+    """True where it was finished or disabled before this environment step. (n_worlds, n_drones)"""
+    to_go_before: Array = leaf("drone", 0)
+    """Way to go before this environment step, m. (n_worlds, n_drones)"""
+    nominal_pos: Array | None = leaf("world", 2)
+    """Nominal positions of gates, then of obstacles, m; None if they stand there. (n_worlds, 1, n, 3)"""
+    nominal_quat: Array | None = leaf("world", 2)
+    """Nominal attitudes of gates, xyzw; None if they have those. (n_worlds, 1, n_gates, 4)"""
+    gates: Handle = static()
+    """Handle of the gates, in their order."""
+    obstacles: Handle = static()
+    """Handle of the obstacles."""
+
+    @property
+    def finished(self) -> Array:
+        """True where a drone has passed all gates. (n_worlds, n_drones)"""
+        return self.passed >= self.gates_visited.shape[-1]
+
+    @property
+    def out(self) -> Array:
+        """True where a drone is finished or disabled. (n_worlds, n_drones)"""
+        return self.finished | self.disabled
+
+
+def race_of(data: SimData) -> RaceRecord:
+    """Return the race's record."""
+    return data.plugins[NAME]
+
+
+def gates_of(data: SimData) -> tuple[Array, Array]:
+    """Return positions, m (..., n_gates, 3), and attitudes, xyzw (..., n_gates, 4), of the gates."""
+    places = race_of(data).gates.places
+    some = slice(places[0], places[-1] + 1)
+    return data.objects.pos[..., some, :], data.objects.quat[..., some, :]  # type: ignore[union-attr]
+
+
+def obstacles_of(data: SimData) -> Array:
+    """Return the upper ends of the obstacles, m. (..., n_obstacles, 3)"""
+    places = race_of(data).obstacles.places
+    pos = data.objects.pos[..., places[0] : places[-1] + 1, :]  # type: ignore[union-attr]
+    return pos + np.array([0.0, 0.0, POLE_HEIGHT], pos.dtype)
+
+
+def next_gate(data: SimData) -> tuple[Array, Array]:
+    """Return position and attitude of each drone's next gate, the last one where it has finished. (..., 3), (..., 4)"""
+    pos, quat = gates_of(data)
+    number = jnp.minimum(race_of(data).passed, pos.shape[-2] - 1)
+    return pick(pos, number), pick(quat, number)
+
+
+def passes(data: SimData) -> Array:
+    """Return true where the last physics step led forwards through the opening of the next gate. (...)"""
+    record = race_of(data)
+    pos, quat = next_gate(data)
+    before, now = (rotation.rotate_inverse(quat, x - pos) for x in (record.last_pos, data.states.pos))
+    crossed = (before[..., 0] < 0) & (now[..., 0] >= 0)
+    share = before[..., :1] / jnp.where(crossed[..., None], before[..., :1] - now[..., :1], 1)
+    there = before + share * (now - before)
+    return crossed & jnp.all(jnp.abs(there[..., 1:]) < OPENING / 2, axis=-1) & ~record.finished
+
+
+def to_next_gate(data: SimData) -> Array:
+    """Return the distance to the middle of the next gate, m; zero where all are passed. (n_drones,)"""
+    pos, _ = next_gate(data)
+    return jnp.where(race_of(data).finished, 0, rotation.safe_norm(data.states.pos - pos)[..., 0])
+
+
+def to_go(data: SimData) -> Array:
+    """Return the way to the end of the course through the middle of every gate, m. (n_drones,)"""
+    record = race_of(data)
+    pos, quat = gates_of(data)
+    legs = way(rotation.rotate_inverse(quat[..., 1:, :], pos[..., :-1, :] - pos[..., 1:, :]))
+    left = jnp.arange(1, pos.shape[-2]) > record.passed[..., None]
+    next_pos, next_quat = next_gate(data)
+    first = way(rotation.rotate_inverse(next_quat, data.states.pos - next_pos))
+    return jnp.where(record.finished, 0, first + jnp.sum(jnp.where(left, legs, 0), axis=-1))
+
+
+def way(pos: Array) -> Array:
+    """Return the way to the middle of a gate, from beside it by a detour, and from behind it around its frame, m.
+
+    By the distance in a straight line the best place would be one beside the frame, where the frame is in the way.
+
+    Args:
+        pos: Position in the gate's frame, m. (..., 3)
+
+    Returns:
+        (...)
+    """
+    beside = AROUND * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1]], pos.dtype)
+    around = rotation.safe_norm(pos[..., None, :] - beside)[..., 0]
+    off = rotation.safe_norm(pos[..., 1:])[..., 0]
+    detour = jnp.maximum(off - (FUNNEL - pos[..., 0]), 0)
+    behind = 2 * AROUND - FUNNEL + jnp.min(around, axis=-1)
+    return jnp.where(pos[..., 0] > 0, behind, rotation.safe_norm(pos)[..., 0] + detour)
+
+
+def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+    """Return rewards for progress, m, and gates, and costs of turning, changing actions and being disabled."""
+    record = race_of(data)
+    paid = {
+        "progress": 2.0 * (record.to_go_before - to_go(data)),
+        "gates": 2.0 * (record.passed - record.passed_before),
+        "spin": -0.001 * terms.spin(data),
+        "action_rate": -0.01 * terms.action_rate(action, last_action),
+        "disabled": -2.0 * record.disabled,
+    }
+    return terms.only_where(~record.out_before, paid)
+
+
+def sparse(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+    """Return 1 for each gate passed and -1 when the drone is disabled."""
+    del action, last_action
+    record, dtype = race_of(data), data.states.pos.dtype
+    gates, disabled = (record.passed - record.passed_before).astype(dtype), record.disabled.astype(dtype)
+    return terms.only_where(~record.out_before, {"gates": gates, "disabled": -disabled})

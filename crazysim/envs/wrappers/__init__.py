@@ -1,0 +1,23 @@
+"""Wrappers: environments around environments, written for one world."""
+
+from crazysim.envs.wrappers.action import ActionDelay
+from crazysim.envs.wrappers.autoreset import AutoReset, AutoresetMode, ResetPolicy
+from crazysim.envs.wrappers.base import Wrapper
+from crazysim.envs.wrappers.observation import FrameStack, Normalize, ObservationNoise, Observe
+from crazysim.envs.wrappers.randomize import Randomize
+from crazysim.envs.wrappers.rewards import EpisodeStatistics, RewardTerms
+
+__all__ = [
+    "ActionDelay",
+    "AutoReset",
+    "AutoresetMode",
+    "EpisodeStatistics",
+    "FrameStack",
+    "Normalize",
+    "ObservationNoise",
+    "Observe",
+    "Randomize",
+    "ResetPolicy",
+    "RewardTerms",
+    "Wrapper",
+]

@@ -1,0 +1,29 @@
+"""Wrappers that change actions."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.core.settings import positive
+from crazysim.envs.env import Env
+from crazysim.envs.state import EnvState
+from crazysim.envs.wrappers.base import Wrapper
+
+
+class ActionDelay(Wrapper):
+    """Delay actions by some environment steps; until the first one arrives, the action is zero, which hovers."""
+
+    def __init__(self, env: Env, n: int):
+        """Take the environment and the delay, environment steps."""
+        super().__init__(env)
+        self.n = positive("n", n)
+
+    def after_reset(self, state: EnvState) -> EnvState:
+        """Return the state with a queue of zeros. (n, n_drones, k)"""
+        return self.remember(state, jnp.zeros((self.n, *state.action.shape), state.action.dtype))
+
+    def before_step(self, state: EnvState, action: Array) -> tuple[EnvState, Array]:
+        """Return the state with the action queued, and the action that arrives. (n_drones, k)"""
+        queue = self.recall(state)
+        return self.remember(state, jnp.concatenate([queue[1:], action[None]])), queue[0]

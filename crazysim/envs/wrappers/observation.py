@@ -1,0 +1,138 @@
+"""Wrappers that change observations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.random import world_key
+from crazysim.core.settings import positive
+from crazysim.envs.env import Env
+from crazysim.envs.state import EnvState, Obs
+from crazysim.envs.statistics import RunningStats
+from crazysim.envs.wrappers.base import Wrapper
+from crazysim.errors import ConfigError
+
+
+class Observe(Wrapper):
+    """Change observations by ``fn(obs, data) -> obs``, a pure function of one world.
+
+    ``Observe(env, lambda obs, data: {"vector": flatten(obs)})`` concatenates all of them.
+    """
+
+    def __init__(self, env: Env, fn: Callable[[Obs, SimData], Obs]):
+        """Take the environment and the function."""
+        super().__init__(env)
+        self.fn = fn
+
+    def after_reset(self, state: EnvState) -> EnvState:
+        """Return the state with changed observations."""
+        return state.replace(obs=self.fn(state.obs, state.data))
+
+    def after_step(self, state: EnvState) -> EnvState:
+        """Return the state with changed observations."""
+        return state.replace(obs=self.fn(state.obs, state.data))
+
+
+class ObservationNoise(Wrapper):
+    """Add normal noise to observations, independent in every step; the same seed and world give the same noise."""
+
+    def __init__(self, env: Env, std: dict[str, float]):
+        """Take the environment, and the standard deviations by name of the observation, in its unit.
+
+        Raises:
+            ConfigError: If there is no observation of that name, when the environment is first reset.
+        """
+        super().__init__(env)
+        self.std = dict(std)
+
+    def after_reset(self, state: EnvState) -> EnvState:
+        """Return the state with noisy observations."""
+        return state.replace(obs=self._noisy(state.obs, state.data))
+
+    def after_step(self, state: EnvState) -> EnvState:
+        """Return the state with noisy observations."""
+        return state.replace(obs=self._noisy(state.obs, state.data))
+
+    def _noisy(self, obs: Obs, data: SimData) -> Obs:
+        if missing := set(self.std) - set(obs):
+            raise ConfigError(f"expected names of observations, {', '.join(obs)}, got {', '.join(sorted(missing))}")
+        key = world_key(data, "observation noise")
+        keys = jax.vmap(lambda drone: jax.random.fold_in(key, drone))(data.core.drone_id)
+        noisy = dict(obs)
+        for i, (name, std) in enumerate(sorted(self.std.items())):
+            noisy[name] = obs[name] + std * jax.vmap(lambda key, i=i, x=obs[name]: _normal(key, i, x))(keys)
+        return noisy
+
+
+def _normal(key: Array, number: int, like: Array) -> Array:
+    return jax.random.normal(jax.random.fold_in(key, number), like.shape[1:], like.dtype)
+
+
+class Normalize(Wrapper):
+    """Normalise observations to mean zero and variance one over all worlds and drones so far, clipped to [-10, 10].
+
+    ``state.memory["Normalize"]`` holds the statistics, by name of the observation. To fly a policy as it was trained,
+    pass them: ``Normalize(env, stats)`` leaves them unchanged.
+    """
+
+    batched = True
+
+    def __init__(self, env: Env, stats: dict[str, RunningStats] | None = None):
+        """Take the environment, and fixed statistics; None to update them in every step."""
+        super().__init__(env)
+        self.stats = stats
+
+    def after_reset(self, state: EnvState) -> EnvState:
+        """Return the state with normalised observations; only those of the first reset enter the statistics.
+
+        Raises:
+            ConfigError: If the fixed statistics are of other observations.
+        """
+        if self.name in state.memory:
+            return self._normalized(state, self.recall(state))
+        stats = self.stats or {name: RunningStats.create(x.shape[-1]) for name, x in state.obs.items()}
+        if missing := set(state.obs) ^ set(stats):
+            raise ConfigError(
+                f"expected statistics of the observations {', '.join(sorted(state.obs))}, got those of "
+                f"{', '.join(sorted(stats))}: {', '.join(sorted(missing))} is in one of them only"
+            )
+        return self._updated(state, stats)
+
+    def after_step(self, state: EnvState) -> EnvState:
+        """Return the state with normalised observations, after they have entered the statistics."""
+        return self._updated(state, self.recall(state))
+
+    def _updated(self, state: EnvState, stats: dict[str, RunningStats]) -> EnvState:
+        if self.stats is None:
+            stats = {name: stats[name].update(x) for name, x in state.obs.items()}
+        return self._normalized(state, stats)
+
+    def _normalized(self, state: EnvState, stats: dict[str, RunningStats]) -> EnvState:
+        return self.remember(state, stats, obs={name: stats[name].normalize(x) for name, x in state.obs.items()})
+
+
+class FrameStack(Wrapper):
+    """Observe the last few observations, the oldest first, concatenated along the last axis."""
+
+    def __init__(self, env: Env, n: int):
+        """Take the environment and the number of observations."""
+        super().__init__(env)
+        self.n = positive("n", n)
+
+    def after_reset(self, state: EnvState) -> EnvState:
+        """Return the state with the first observation repeated."""
+        return self._stacked(state, jax.tree.map(lambda x: jnp.repeat(x[..., None, :], self.n, axis=-2), state.obs))
+
+    def after_step(self, state: EnvState) -> EnvState:
+        """Return the state with the new observation in place of the oldest."""
+        old = self.recall(state)
+        frames = jax.tree.map(lambda x, y: jnp.concatenate([y[..., 1:, :], x[..., None, :]], axis=-2), state.obs, old)
+        return self._stacked(state, frames)
+
+    def _stacked(self, state: EnvState, frames: Obs) -> EnvState:
+        return self.remember(state, frames, obs=jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1), frames))

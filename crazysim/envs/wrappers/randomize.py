@@ -1,0 +1,64 @@
+"""Wrapper that randomises the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.stage import Axes
+from crazysim.envs.env import Env
+from crazysim.envs.random import episode_key
+from crazysim.envs.wrappers.base import Wrapper
+from crazysim.errors import ConfigError
+from crazysim.pytree import scopes
+
+
+class Randomize(Wrapper):
+    """Begin every episode with other data: masses, motors, or whatever a function changes.
+
+    ``fn(data, key) -> data`` receives one world and its key of the episode. Parameters that it changes are one per
+    drone; name them in ``params``.
+    """
+
+    def __init__(self, env: Env, fn: Callable[[SimData, Array], SimData], params: tuple[str, ...] = ()):
+        """Take the environment, the function, and the names of the parameters that it changes.
+
+        Raises:
+            ConfigError: If the dynamics have no such parameter.
+        """
+        super().__init__(env)
+        known = vars(env.sim.data.params)
+        if missing := [name for name in params if known.get(name) is None]:
+            raise ConfigError(
+                f"expected parameters of {env.sim.dynamics.value}, {', '.join(known)}, got {', '.join(missing)}"
+            )
+        self.fn, self.params = fn, tuple(params)
+
+    def prepare(self, data: SimData) -> SimData:
+        """Return the data of all worlds with the named parameters repeated for every drone."""
+        shape = data.states.pos.shape[:2]
+        shared = [name for name in self.params if getattr(scopes(data.params), name) == "shared"]
+        values = {name: getattr(data.params, name) for name in shared}
+        repeated = {name: jnp.broadcast_to(x, (*shape, *x.shape)) for name, x in values.items()}
+        return data.replace(params=data.params.replace(**repeated))
+
+    def after_spawn(self, data: SimData) -> SimData:
+        """Return the data of an episode after the function.
+
+        Raises:
+            ConfigError: If the function changes what all worlds share.
+        """
+        drawn = self.fn(data, episode_key(data, "randomize"))
+        axes = Axes(data)
+        leaves = zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(drawn), strict=True)
+        shared = [name for name, scope, x, new in leaves if scope in ("shared", "opaque") and new is not x]
+        if shared:
+            raise ConfigError(
+                f"{', '.join(shared)} cannot be randomised: all worlds share it. Name parameters that should be one "
+                f"per drone in params=, as in Randomize(env, fn, params=('mass',))."
+            )
+        return drawn

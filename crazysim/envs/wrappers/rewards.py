@@ -1,0 +1,60 @@
+"""Wrappers that record rewards."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.envs.env import Env
+from crazysim.envs.state import EnvState
+from crazysim.envs.wrappers.base import Wrapper
+
+
+class EpisodeStatistics(Wrapper):
+    """Record return and length of episodes that end: ``info["episode_return"]``, ``info["episode_length"]``.
+
+    Both are zero in worlds whose episode continues.
+    """
+
+    def after_reset(self, state: EnvState) -> EnvState:
+        """Return the state with sums of zero."""
+        return self._recorded(state, {"return": jnp.zeros_like(state.reward), "length": jnp.zeros((), jnp.int32)})
+
+    def after_step(self, state: EnvState) -> EnvState:
+        """Return the state with the step added, and the sums in its info where the episode ended."""
+        before = self.recall(state)
+        return self._recorded(state, {"return": before["return"] + state.reward, "length": before["length"] + 1})
+
+    def _recorded(self, state: EnvState, sums: dict[str, Array]) -> EnvState:
+        def where(over: Array, x: Array) -> Array:
+            return jnp.where(over, x, jnp.zeros((), x.dtype))
+
+        ended: Any = jax.tree.map(lambda x: where(state.done, x), sums)
+        left = jax.tree.map(lambda x: where(~state.done, x), sums)
+        info = {"episode_return": ended["return"], "episode_length": ended["length"]}
+        return self.remember(state, left, info=state.info | info)
+
+
+class RewardTerms(Wrapper):
+    """Record the terms of the reward by name: ``info["reward near"]`` and so on. (n_drones,) each"""
+
+    def __init__(self, env: Env):
+        """Take the environment."""
+        super().__init__(env)
+        self.batched = env.task.batched
+
+    def after_reset(self, state: EnvState) -> EnvState:
+        """Return the state with terms of zero."""
+        shapes = jax.eval_shape(self.task.rewards, state.data, state.action, state.action)
+        terms = {f"reward {name}": jnp.zeros(x.shape, state.reward.dtype) for name, x in shapes.items()}
+        return self.remember(state, state.action, info=state.info | terms)
+
+    def after_step(self, state: EnvState) -> EnvState:
+        """Return the state with the terms of the step; zero in worlds that are not finite."""
+        terms = self.task.rewards(state.data, state.action, self.recall(state))
+        lost, dtype = state.data.core.nonfinite, state.reward.dtype
+        info = {f"reward {k}": jnp.where(lost, jnp.zeros((), dtype), jnp.asarray(x, dtype)) for k, x in terms.items()}
+        return self.remember(state, state.action, info=state.info | info)

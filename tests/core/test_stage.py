@@ -1,0 +1,78 @@
+"""Functions of one world as functions of all worlds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.core.stage import over_worlds
+from crazysim.pytree import PyTree, leaf
+
+
+class Numbers(PyTree):
+    """A record with leaves of every scope."""
+
+    own: jax.Array = leaf("drone", 1)
+    ours: jax.Array = leaf("world", 1)
+    row: jax.Array = leaf("rows")
+    all: jax.Array = leaf("shared", 1)
+    opaque: jax.Array = leaf("opaque")
+
+
+def numbers(n_worlds, n_drones):
+    rng = np.random.default_rng(0)
+    shapes = ((n_worlds, n_drones, 2), (n_worlds, 1, 2), (n_worlds, 5), (2,), (n_worlds,))
+    return Numbers(*(jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes))
+
+
+@pytest.mark.parametrize(("n_worlds", "n_drones"), [(1, 1), (2, 2), (2, 3), (3, 2)])
+def test_every_world_is_treated_as_the_function_says(n_worlds, n_drones):
+    """Law 2: axes are the declared ones, also where worlds and drones are equally many."""
+    record, factor = numbers(n_worlds, n_drones), jnp.arange(1.0, n_worlds + 1)
+
+    def fn(one, factor):
+        assert [x.shape for x in jax.tree.leaves(one)] == [(n_drones, 2), (2,), (5,), (2,), (n_worlds,)]
+        assert factor.shape == ()
+        new = one.replace(own=factor * one.own + one.ours, ours=one.ours + one.all, row=one.row[::-1])
+        return new, {"sum": one.own.sum(), "opaque": one.opaque}["sum"], one.ours
+
+    after, total, ours = over_worlds(fn)(record, factor)
+    np.testing.assert_allclose(after.own, factor[:, None, None] * record.own + record.ours, rtol=1e-6)
+    np.testing.assert_allclose(after.ours, record.ours + record.all, rtol=1e-6)
+    np.testing.assert_array_equal(after.row, record.row[:, ::-1])
+    np.testing.assert_allclose(total, record.own.sum(axis=(1, 2)), rtol=1e-5)
+    np.testing.assert_array_equal(ours, record.ours[:, 0])
+    assert after.all is record.all
+    assert after.opaque is record.opaque
+
+
+def test_a_leaf_that_is_not_written_is_returned_as_it_came():
+    record = numbers(2, 3)
+    after = over_worlds(lambda one: one.replace(own=one.own + 1))(record)
+    assert all(getattr(after, name) is getattr(record, name) for name in ("ours", "row", "all", "opaque"))
+
+
+def test_a_shared_leaf_may_be_returned_for_every_world():
+    np.testing.assert_array_equal(over_worlds(lambda one: one.all)(numbers(3, 1)).shape, (3, 2))
+
+
+@pytest.mark.parametrize("name", ["all", "opaque"])
+def test_what_all_worlds_share_cannot_be_changed(name):
+    def greedy(one):
+        return one.replace(**{name: getattr(one, name) + 1})
+
+    with pytest.raises(ConfigError, match=f"'greedy' is written for one world and changes {name}, which all worlds"):
+        over_worlds(greedy)(numbers(2, 2))
+
+
+def test_a_world_of_a_simulation_has_no_batch_axes():
+    data = Sim(n_worlds=2, n_drones=2).data
+
+    def fn(one):
+        assert one.states.pos.shape == (2, 3)
+        assert one.core.steps.shape == ()
+        assert one.params.mass.shape == data.params.mass.shape
+        return one.replace(core=one.core.replace(steps=one.core.steps + one.core.world_id))
+
+    np.testing.assert_array_equal(over_worlds(fn)(data).core.steps, [[0], [1]])

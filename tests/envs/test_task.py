@@ -1,0 +1,93 @@
+"""Tasks as frozen records, their installation, and their random draws."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.core.stage import over_worlds
+from crazysim.envs import DroneEnv, Task, draw, uniform
+from crazysim.envs.random import between, episode_key, within
+from crazysim.envs.task import total
+from crazysim.envs.tasks.hover import Hover
+from crazysim.envs.tasks.land import Land
+
+
+def test_making_a_task_changes_no_simulation_and_installing_it_does():
+    sim = Sim(n_worlds=2, control="attitude")
+    data, stages = sim.data, list(sim.step_pipeline)
+    task = Land()
+    assert sim.data is data
+    assert list(sim.step_pipeline) == stages
+    task.install(sim)
+    assert isinstance(sim.data.plugins["task"], Land.Record)
+    assert list(sim.step_pipeline) == [*stages[:-1], "task", stages[-1]]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        task.speed = 1.0
+    assert task == Land()
+    assert task != Land(speed=0.5)
+
+
+@pytest.mark.parametrize("installed", [None, Hover()])
+def test_an_environment_needs_the_task_installed(installed):
+    sim = Sim(control="attitude")
+    if installed is not None:
+        installed.install(sim)
+    with pytest.raises(ConfigError, match=r"expected a simulation in which task 'land' is installed.*install\(sim\)"):
+        DroneEnv(sim, Land())
+
+
+def test_records_of_functions_are_refused():
+    """They were tasks in version 0.1."""
+    with pytest.raises(ConfigError, match="expected a subclass of Task, got Task itself"):
+        Task("climb", lambda data, keys: data, observe=None, reward=None, terminated=None, error=None)
+    with pytest.raises(ConfigError, match="expected a Task, got 'hover'"):
+        DroneEnv(Sim(control="attitude"), "hover")
+
+
+def test_the_total_of_terms_is_their_sum_in_order():
+    terms = {"a": jnp.float32(1e8), "b": jnp.float32(-1e8), "c": jnp.float32(1.0)}
+    assert total(terms) == 1.0
+    assert total({"a": terms["a"], "c": terms["c"], "b": terms["b"]}) == 0.0
+
+
+def test_named_draws_are_parts_of_one_draw():
+    key = jax.random.wrap_key_data(jnp.array([1, 2], jnp.uint32))
+    x = draw(key, 3, start=2, yaw=1, pose=(2, 2))
+    assert {name: v.shape for name, v in x.items()} == {"start": (3, 2), "yaw": (3, 1), "pose": (3, 2, 2)}
+    row = uniform(key, 3, 7)
+    np.testing.assert_array_equal(x["start"], row[:, :2])
+    np.testing.assert_array_equal(x["yaw"], row[:, 2:3])
+    np.testing.assert_array_equal(x["pose"], row[:, 3:].reshape(3, 2, 2))
+    world = draw(key, turn=1, places=(2, 3))
+    np.testing.assert_array_equal(world["turn"], draw(key, turn=1, places=(2, 3), more=4)["turn"])
+    np.testing.assert_array_equal(world["places"], draw(key, turn=1, places=(2, 3), more=4)["places"])
+
+
+def test_draws_are_uniform_and_scaled():
+    key = jax.random.wrap_key_data(jnp.array([3, 4], jnp.uint32))
+    x = np.asarray(uniform(key, 20_000))
+    assert 0 <= x.min() < 1e-3 < 0.999 < x.max() < 1
+    np.testing.assert_allclose(np.histogram(x, 10, (0, 1))[0], 2000, atol=200)
+    np.testing.assert_allclose(between(x, 2.0, 4.0), 2 + 2 * x, rtol=1e-6)
+    np.testing.assert_allclose(within(x, 0.5), x - 0.5, atol=1e-6)
+    np.testing.assert_allclose(uniform(key, 5, low=-1.0, high=3.0), 4 * x[:5] - 1, rtol=1e-5, atol=1e-6)
+
+
+def test_keys_depend_on_seed_world_episode_and_name_only():
+    """Law 10."""
+    four, two = (Sim(n_worlds=n, rng_key=7).data for n in (4, 2))
+
+    def words(data, name="spawn"):
+        return np.asarray(jax.random.key_data(over_worlds(lambda one: episode_key(one, name))(data)))
+
+    first = words(four)
+    np.testing.assert_array_equal(words(two), first[:2])
+    others = [words(four, "another"), words(Sim(n_worlds=4, rng_key=8).data)]
+    later = four.replace(core=four.core.replace(episode=four.core.episode + 1))
+    assert len(np.unique(np.concatenate([first, words(later), *others]), axis=0)) == 16
+    ticked = four.replace(core=four.core.replace(steps=four.core.steps + 5))
+    np.testing.assert_array_equal(words(ticked), first)
