@@ -1,7 +1,7 @@
-"""Named stages in order: how the step and the reset of a simulation are put together and changed.
+"""Pipelines: the named stages of a step or a reset in order, and functions that edit them.
 
-A pipeline is an ordered dict from names to functions. Every function here changes it in place; afterwards the
-simulation's ``build_step_fn`` or ``build_reset_fn`` makes the change take effect.
+A pipeline is an ordered dict from names to functions. The functions here change it in place; the change takes effect
+with the simulation's next ``build_step_fn`` or ``build_reset_fn``.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ Pipeline = dict[str, Callable[..., Any]]
 
 
 def append_fn(pipeline: Pipeline, fn: Callable[..., Any], name: str | None = None) -> None:
-    """Add a stage at the end; without a name it is called as the function is.
+    """Add a stage at the end, under the function's name if none is given.
 
     Raises:
-        ValueError: If the name exists already, or there is none.
+        ValueError: If the name exists already, or the function has none.
     """
     _insert(pipeline, len(pipeline), fn, name)
 
 
 def prepend_fn(pipeline: Pipeline, fn: Callable[..., Any], name: str | None = None) -> None:
-    """Add a stage at the beginning; without a name it is called as the function is.
+    """Add a stage at the beginning, under the function's name if none is given.
 
     Raises:
-        ValueError: If the name exists already, or there is none.
+        ValueError: If the name exists already, or the function has none.
     """
     _insert(pipeline, 0, fn, name)
 
@@ -36,7 +36,7 @@ def insert_fn_before(pipeline: Pipeline, anchor: str, fn: Callable[..., Any], na
     """Add a stage right before the stage ``anchor``.
 
     Raises:
-        ValueError: If there is no such stage, the name exists already, or there is none.
+        ValueError: If there is no such stage, or the name exists already.
     """
     _insert(pipeline, _index(pipeline, anchor), fn, name)
 
@@ -45,13 +45,13 @@ def insert_fn_after(pipeline: Pipeline, anchor: str, fn: Callable[..., Any], nam
     """Add a stage right after the stage ``anchor``.
 
     Raises:
-        ValueError: If there is no such stage, the name exists already, or there is none.
+        ValueError: If there is no such stage, or the name exists already.
     """
     _insert(pipeline, _index(pipeline, anchor) + 1, fn, name)
 
 
 def replace_fn(pipeline: Pipeline, fn: Callable[..., Any], name: str) -> None:
-    """Exchange the function of the stage ``name``.
+    """Replace the function of the stage ``name``.
 
     Raises:
         ValueError: If there is no such stage.
@@ -61,7 +61,7 @@ def replace_fn(pipeline: Pipeline, fn: Callable[..., Any], name: str) -> None:
 
 
 def remove_fn(pipeline: Pipeline, name: str) -> None:
-    """Take the stage ``name`` out.
+    """Remove the stage ``name``.
 
     Raises:
         ValueError: If there is no such stage.
@@ -72,18 +72,18 @@ def remove_fn(pipeline: Pipeline, name: str) -> None:
 
 def _index(pipeline: Pipeline, name: str) -> int:
     if name not in pipeline:
-        raise UnknownNameError(f"No stage named {name!r} in the pipeline; use one of its stages: {', '.join(pipeline)}")
+        raise UnknownNameError(f"No stage named {name!r} exists in the pipeline. Use one of {', '.join(pipeline)}.")
     return list(pipeline).index(name)
 
 
 def _insert(pipeline: Pipeline, index: int, fn: Callable[..., Any], name: str | None) -> None:
     if not callable(fn):
-        raise ValueError(f"expected a stage as a function, got {fn!r}")
+        raise ValueError(f"expected a function as a stage, got {fn!r}. Use a function from SimData to SimData.")
     name = name if name is not None else getattr(fn, "__name__", None)
     if name is None or name == "<lambda>":
-        raise ValueError(f"{fn!r} has no name of its own and needs an explicit name; pass name=")
+        raise ValueError(f"expected a named function, got {fn!r}, which needs an explicit name. Use name=...")
     if name in pipeline:
-        raise UnknownNameError(f"a stage named {name!r} already exists; pass another name=, or use replace_fn")
+        raise UnknownNameError(f"a stage named {name!r} already exists. Use another name=, or replace_fn.")
     items = list(pipeline.items())
     items.insert(index, (name, fn))
     pipeline.clear()

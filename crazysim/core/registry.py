@@ -71,7 +71,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         """Add a plugin; see ``Sim.add``."""
         if not isinstance(plugin, Plugin):
             raise ConfigError(f"expected a plugin, got {plugin!r}. Use sim.add(Wind(...)), or a Plugin of your own.")
-        plugin = plugin if name is None else dataclasses.replace(plugin, name=name)
+        plugin = plugin if name is None else dataclasses.replace(plugin, name=name)  # type: ignore[type-var]
         name, kind = plugin.name, type(plugin).__name__
         if not isinstance(name, str) or not name:
             raise ConfigError(f"expected a non-empty string as name of a {kind}, got {name!r}")

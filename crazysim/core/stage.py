@@ -16,9 +16,9 @@ StageScope = Literal["drone", "world", "batch"]
 
 
 class Stage:
-    """A function ``SimData -> SimData`` with the scope that it was written for.
+    """A function ``SimData -> SimData`` with the scope that it is written for.
 
-    Called with the data of a simulation it does to every drone, or to every world, what its function does to one.
+    Called with the data of a simulation, it applies its function to every drone, or to every world.
     """
 
     def __init__(
@@ -29,7 +29,7 @@ class Stage:
         batched: bool = False,
         name: str | None = None,
     ):
-        """Declare a stage; see ``stage``. ``batched`` promises that the functions take any leading axes as well."""
+        """Declare a stage; see ``stage``. ``batched`` declares that the functions also take any leading axes."""
         self.fn, self.when, self.batched = fn, when, batched
         self.scope: StageScope = scope
         self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
@@ -42,7 +42,7 @@ class Stage:
         return _over_worlds(self, data)
 
     def one(self, data: Any) -> Any:
-        """Return the data after the stage, for the one drone or world that the data is of."""
+        """Return the data of one drone or world after the stage."""
         after = self.fn(data)
         mask = None if self.when is None else self.when(data)
         if mask is None:
@@ -86,7 +86,7 @@ def stage(
 
 
 def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
-    """Return the functions of a pipeline as stages under the pipeline's names, undeclared ones of the whole batch."""
+    """Return the functions of a pipeline as stages under the pipeline's names; undeclared ones get the full batch."""
     return [
         Stage(fn.fn, fn.scope, fn.when, fn.batched, name) if isinstance(fn, Stage) else Stage(fn, "batch", name=name)
         for name, fn in pipeline.items()

@@ -71,26 +71,26 @@ def test_replace_keeps_the_place_and_exchanges_the_function(pipeline):
         (
             lambda p: insert_fn_before(p, "zeroth", third),
             UnknownNameError,
-            "No stage named 'zeroth' in the pipeline; use one of its stages: first, second",
+            "No stage named 'zeroth' exists in the pipeline. Use one of first, second",
         ),
         (
             lambda p: insert_fn_after(p, "zeroth", third),
             UnknownNameError,
-            "No stage named 'zeroth' in the pipeline; use one of its stages: first, second",
+            "No stage named 'zeroth' exists in the pipeline. Use one of first, second",
         ),
         (
             lambda p: replace_fn(p, third, "third"),
             UnknownNameError,
-            "No stage named 'third' in the pipeline; use one of its stages: first, second",
+            "No stage named 'third' exists in the pipeline. Use one of first, second",
         ),
         (
             lambda p: remove_fn(p, "third"),
             UnknownNameError,
-            "No stage named 'third' in the pipeline; use one of its stages: first, second",
+            "No stage named 'third' exists in the pipeline. Use one of first, second",
         ),
-        (lambda p: append_fn(p, partial(third)), ValueError, "needs an explicit name; pass name="),
-        (lambda p: append_fn(p, lambda x: x), ValueError, "needs an explicit name; pass name="),
-        (lambda p: append_fn(p, 3), ValueError, "expected a stage as a function, got 3"),
+        (lambda p: append_fn(p, partial(third)), ValueError, "needs an explicit name. Use name="),
+        (lambda p: append_fn(p, lambda x: x), ValueError, "needs an explicit name. Use name="),
+        (lambda p: append_fn(p, 3), ValueError, "expected a function as a stage, got 3"),
     ],
 )
 def test_changes_that_cannot_be_leave_the_pipeline_as_it_was(pipeline, change, error, fragment):
