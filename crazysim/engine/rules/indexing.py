@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from jax.extend import core
 from jax.lax import GatherScatterMode
 
+from crazysim.engine import jaxcompat
 from crazysim.engine.ir import Element, constant, is_constant
 from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
 from crazysim.engine.rules.movement import move_many, run_now
@@ -212,7 +212,7 @@ def _combined(ctx: Lowering, eqn: Any, old: Elements, new: Elements) -> Elements
     combination = eqn.params["update_jaxpr"]
     if combination is None:
         return new
-    called = core.ClosedJaxpr(combination, eqn.params["update_consts"])
+    called = jaxcompat.ClosedJaxpr(combination, eqn.params["update_consts"])
     pairs = zip(old.reshape(-1), new.reshape(-1), strict=True)
     return as_elements(
         [ctx.lower(called, [as_elements([a], ()), as_elements([b], ())])[0][()] for a, b in pairs], old.shape
