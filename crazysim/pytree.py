@@ -13,9 +13,9 @@ from jax import Array
 
 from crazysim.errors import ConfigError
 
-Scope = Literal["drone", "world", "rows", "shared", "opaque", "parameter"]
+Scope = Literal["drone", "world", "batched", "shared", "opaque", "parameter"]
 
-PER_WORLD = ("drone", "world", "batched")
+PER_WORLD = ("drone", "world", "rows", "batched")
 """Scopes of leaves that have a first axis over worlds, as ``scopes`` returns them."""
 CORE_NDIM_KEY = "core_ndim"
 """Key under which the metadata of a field give the number of dimensions without batch axes; Crazyflow's key too."""
@@ -28,8 +28,8 @@ def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None) 
 
     Args:
         scope: Batch axes of the array. ``drone``: (n_worlds, n_drones, *core). ``world``: (n_worlds, 1, *core).
-            ``rows``: (n_worlds, ...), with any further axes. ``shared``: core. ``parameter``: shared or drone, by its
-            number of dimensions. ``opaque``: undeclared; masked resets and sharding do not change it.
+            ``batched``: (n_worlds, ...), with any further axes. ``shared``: core. ``parameter``: shared or drone, by
+            its number of dimensions. ``opaque``: undeclared; masked resets and sharding do not change it.
         core_ndim: Number of dimensions of the core shape.
         core: The core shape, if it is fixed. It keeps one mass for each of three worlds from passing for one along
             each of three axes.

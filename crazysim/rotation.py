@@ -1,6 +1,6 @@
 """Rotations as unit quaternions, xyzw, body to world, with finite gradients everywhere.
 
-Small products are written out element by element: matrix products of this size are slow on every device, and sums of
+Small products are unrolled: matrix products of this size are slow on every device, and sums of
 products fuse.
 """
 
@@ -40,7 +40,7 @@ def add_cross(offset: Array, a: Array, b: Array) -> Array:
 
 
 def matvec(matrix: Array, vector: Array, offset: Array | None = None) -> Array:
-    """Return ``matrix @ vector + offset`` for small arrays, written out.
+    """Return ``matrix @ vector + offset`` for small arrays, unrolled.
 
     Args:
         matrix: (..., m, n)

@@ -98,10 +98,13 @@ def banned(text):
 
 
 def literal(node):
-    """Return the literal parts of a message, or None where it is not a literal."""
+    """Return the literal parts of a message; None if it is not a literal, or a function contributes to it."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):
+        calls = (part.value for part in node.values if isinstance(getattr(part, "value", None), ast.Call))
+        if any(isinstance(call.func, ast.Name) and call.func.id.startswith("_") for call in calls):
+            return None
         return "".join(part.value if isinstance(part, ast.Constant) else "{}" for part in node.values)
     return None
 

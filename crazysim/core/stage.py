@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, scopes
+from crazysim.pytree import PER_WORLD, PyTree, scopes
 
 StageScope = Literal["drone", "world", "batch"]
 
@@ -150,12 +150,16 @@ def with_leaves(leaves: Sequence[Any], numbers: Sequence[int], values: Sequence[
     return out
 
 
-def over_worlds(fn: Callable[..., Any]) -> Callable[..., Any]:
+def over_worlds(fn: Callable[..., Any], split: Sequence[str] = PER_WORLD) -> Callable[..., Any]:
     """Return a function of one world as a function of all worlds.
 
     In records the batch axes are the declared ones: the function receives leaves of drones as (n_drones, ...), leaves
-    of worlds and rows without batch axes, and shared or opaque leaves as they are, which it must return unchanged. An
+    of worlds and batched leaves without batch axes, and all others as they are, which it must return unchanged. An
     array outside of a record has worlds as its first axis.
+
+    Args:
+        fn: The function of one world: from any trees of arrays to one.
+        split: Scopes of the leaves that are divided among worlds.
 
     Raises:
         ConfigError: When the function is called, if it changes a leaf that all worlds share.
@@ -171,11 +175,16 @@ def over_worlds(fn: Callable[..., Any]) -> Callable[..., Any]:
             result = fn(*treedef.unflatten(values))
             paths, returned["treedef"] = jax.tree_util.tree_flatten_with_path(result)
             returned["kinds"] = after = _kinds(result)
-            numbers = {(id(x), kind in BATCHED): i for i, (x, kind) in enumerate(zip(values, kinds, strict=True))}
-            unchanged = [numbers.get((id(x), kind in BATCHED)) for (_, x), kind in zip(paths, after, strict=True)]
+            numbers = {id(x): i for i, x in enumerate(values)}
+            unchanged = [numbers.get(id(x)) for _, x in paths]
+            for k, number in enumerate(unchanged):
+                if number is not None and kinds[number] not in split and after[k] in split:
+                    unchanged[k] = None  # shared, and now an array of every world
+                elif number is not None and after[k] not in split:
+                    after[k] = kinds[number]  # without its axis of worlds the scope of a foreign record is not known
             returned["unchanged"] = unchanged
             for (path, _), kind, number in zip(paths, after, unchanged, strict=True):
-                if kind not in BATCHED and number is None:
+                if kind not in split and number is None:
                     name = jax.tree_util.keystr(path).lstrip(".")
                     raise ConfigError(
                         f"{getattr(fn, '__name__', fn)!r} is written for one world and changes {name}, which all "
@@ -183,7 +192,7 @@ def over_worlds(fn: Callable[..., Any]) -> Callable[..., Any]:
                     )
             return [x for (_, x), number in zip(paths, unchanged, strict=True) if number is None]
 
-        changed = iter(jax.vmap(one, ([0 if kind in BATCHED else None for kind in kinds],))(rows))
+        changed = iter(jax.vmap(one, ([0 if kind in split else None for kind in kinds],))(rows))
         out = []
         for kind, number in zip(returned["kinds"], returned["unchanged"], strict=True):
             if number is not None and kinds[number] == kind:
@@ -196,17 +205,13 @@ def over_worlds(fn: Callable[..., Any]) -> Callable[..., Any]:
     return of_all
 
 
-BATCHED = ("drone", "world", "rows")
-"""Scopes of leaves that have an axis of worlds."""
-
-
 def _kinds(tree: Any) -> list[str]:
-    """Return the scope of every leaf: as its record declares it, and ``rows`` outside of records."""
+    """Return the scope of every leaf: as its record declares it, and ``batched`` outside of records."""
 
     def is_record(x: Any) -> bool:
         return isinstance(x, PyTree)
 
-    return jax.tree.leaves(jax.tree.map(lambda x: scopes(x) if is_record(x) else "rows", tree, is_leaf=is_record))
+    return jax.tree.leaves(jax.tree.map(lambda x: scopes(x) if is_record(x) else "batched", tree, is_leaf=is_record))
 
 
 def _over_worlds(stage: Stage, data: Any) -> Any:
@@ -227,4 +232,4 @@ def _over_worlds(stage: Stage, data: Any) -> Any:
         out = jax.vmap(one, (over_drones,))(leaves) if stage.scope == "drone" else one(leaves)
         return axes.treedef.unflatten(with_leaves(leaves, written, out))
 
-    return over_worlds(of_world)(data)
+    return over_worlds(of_world, ("drone", "world"))(data)

@@ -181,7 +181,7 @@ def _read(source: str | Path) -> tuple[str, dict[str, Any]]:
     try:
         return path.stem, tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}") from error
+        raise ConfigError(f"{path} is not valid TOML: {error}; see {GUIDE} for the format") from error
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -29,7 +29,7 @@ Steps = Callable[[Program, list[Any], int], tuple[list[Any], Any]]
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """First difference between two engines."""
+    """A difference between two engines."""
 
     stage: str
     """First stage after which the engines differ."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from crazysim.engine.ir import Block, Element, Operation, Value
 
 if TYPE_CHECKING:
-    from crazysim.engine.program import Program, Segment, Slot
+    from crazysim.engine.program import Program, Segment, Slot, UnfusedStage
 
 INDENT = "  "
 PACKED = "packed"
@@ -22,12 +22,13 @@ def of_program(program: Program) -> str:
     lines = []
     for segment in program.segments:
         lines.append("")
-        if hasattr(segment, "jaxpr"):
-            lines.append(f"{segment.phase} stage {segment.name} of all worlds, unfused: {segment.error.reason}")
-            lines += [f"{INDENT}reads {program.leaves[i].name}" for i in segment.used]
-            lines += [f"{INDENT}writes {program.leaves[i].name}" for i in segment.written]
+        if segment in program.unfused_stages:
+            stage = cast("UnfusedStage", segment)
+            lines.append(f"{stage.phase} stage {stage.name} of all worlds, unfused: {stage.error.reason}")
+            lines += [f"{INDENT}reads {program.leaves[i].name}" for i in stage.used]
+            lines += [f"{INDENT}writes {program.leaves[i].name}" for i in stage.written]
         else:
-            lines += _of_segment(program, segment, _Names())
+            lines += _of_segment(program, cast("Segment", segment), _Names())
     if program.check is not None:
         lines += ["", *_of_segment(program, program.check, _Names())]
     return "\n".join(lines[1:]) + "\n"

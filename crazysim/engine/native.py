@@ -22,6 +22,7 @@ from jax import Array
 from crazysim.engine import dump, jaxcompat, kernel_cache
 from crazysim.engine.errors import KernelError
 from crazysim.engine.kernel import Kernel
+from crazysim.errors import ConfigError
 from crazysim.version import __version__
 
 FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-shared",
@@ -162,7 +163,11 @@ def _compile(words: Sequence[str], key: str, source: str, place: Path) -> Path:
 
 def _run(words: Sequence[str], source: str) -> subprocess.CompletedProcess[str]:
     """Run the compiler in a process group of its own, which a timeout ends with all its children."""
-    limit = float(os.environ.get("CRAZYSIM_COMPILE_TIMEOUT", TIMEOUT))
+    given = os.environ.get("CRAZYSIM_COMPILE_TIMEOUT", TIMEOUT)
+    try:
+        limit = float(given)
+    except ValueError:
+        raise ConfigError(f"expected seconds in CRAZYSIM_COMPILE_TIMEOUT, got {given!r}; set a number") from None
     pipe = subprocess.PIPE
     try:
         process = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, text=True, start_new_session=True)

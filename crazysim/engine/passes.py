@@ -32,7 +32,7 @@ VERIFY = "CRAZYSIM_VERIFY"
 
 
 def apply(program: Program, passes: Iterable[Pass]) -> Program:
-    """Return a program after passes; each result is verified and dumped if requested by environment variables."""
+    """Return a program after some passes, verified and dumped after each where the environment variables say so."""
     _inspect(program, "lowered")
     for one in passes:
         program = one(program)
@@ -56,7 +56,8 @@ def fuse(program: Program) -> Program:
     kinds = itertools.groupby(program.segments, lambda s: (s.scope, s.phase) if isinstance(s, Segment) else id(s))
     for _, some in kinds:
         run = list(some)
-        segments += [_joined(run)] if isinstance(run[0], Segment) else run
+        joined = [s for s in run if isinstance(s, Segment)]
+        segments += [_joined(joined)] if joined else run
     return dataclasses.replace(program, segments=tuple(segments))
 
 

@@ -138,9 +138,9 @@ class Writer:
         name = self._carry(op, args, depth)
         carry = [f"{name}_{k}" for k in range(len(args))]
         self.line("for (;;) {", depth)
-        (goes_on,) = self.block(test, carry, depth + 1)
-        self.line(f"if (!any({goes_on})) break;", depth + 1)
-        self._assign(name, self.block(body, carry, depth + 1), goes_on, depth + 1)
+        (continues,) = self.block(test, carry, depth + 1)
+        self.line(f"if (!any({continues})) break;", depth + 1)
+        self._assign(name, self.block(body, carry, depth + 1), continues, depth + 1)
         self.line("}", depth)
 
     def _carry(self, op: Operation, start: Sequence[str], depth: int) -> str:

@@ -117,6 +117,8 @@ class _Interpreter:
             case "sqrt" if self.in_custom_jvp:
                 return [self._guarded_sqrt(args[0])]
         form = ops.TABLE[op.name].casadi
+        if form is None:
+            raise UnsupportedError(f"operation {op.name!r} has no form in CasADi", stage=op.stage)
         named = isinstance(form, str)
         out = getattr(self.casadi, form)(*args) if named else form(self.casadi, *args, **dict(op.params))
         if op.name == "div" and op.dtype.kind in "iu":

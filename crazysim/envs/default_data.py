@@ -1,4 +1,4 @@
-"""Default data of a simulation with what is alike in all worlds and drones stored once."""
+"""Resets to the default data, in which what is alike in all worlds and drones is stored once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim.core.data import SimData
-from crazysim.pytree import scopes
+from crazysim.pytree import map_batched, scopes
 
 
 def compact(data: SimData) -> SimData:
@@ -43,3 +43,10 @@ def with_own(default: SimData, data: SimData) -> SimData:
     """Return the default data with the seed, numbers and flags of the data."""
     own = {name: getattr(data.core, name) for name in ("rng_key", "world_id", "drone_id", "n_worlds")}
     return default.replace(core=default.core.replace(**own))
+
+
+def reset_world(data: SimData, default: SimData) -> SimData:
+    """Return the data of one world reset to its default; what worlds share stays. See ``core.stages.reset``."""
+    plugins = {name: default.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
+    new = map_batched(lambda x, value: jnp.broadcast_to(value, x.shape), data, default.replace(plugins=plugins))
+    return new.replace(core=new.core.replace(episode=data.core.episode + 1))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
@@ -17,12 +18,12 @@ from crazysim.core.stage import Stage
 from crazysim.core.stages import reset
 from crazysim.engine import fused
 from crazysim.envs.actions import Actions, actions_of
-from crazysim.envs.default_data import compact, spread, with_own
+from crazysim.envs.default_data import compact, reset_world, spread, with_own
 from crazysim.envs.phases import act, all_worlds, begin, observe
 from crazysim.envs.state import EnvState, validate_action
 from crazysim.envs.task import NAME, Task
 from crazysim.errors import ConfigError
-from crazysim.pytree import scopes, select_worlds
+from crazysim.pytree import PER_WORLD, scopes, select_worlds
 from crazysim.sim.sim import Sim
 
 if TYPE_CHECKING:
@@ -177,10 +178,12 @@ class DroneEnv(Env):
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
         self._step = sim.build_step_fn()
-        self.batched_reset = list(sim.reset_pipeline.values()) != [reset]
-        """True if the reset pipeline has functions of all worlds."""
+        self._foreign = "batched" in jax.tree.leaves(scopes(sim.default_data))
+        self.batched_reset = self._foreign or list(sim.reset_pipeline.values()) != [reset]
+        """True if the reset pipeline has functions of all worlds, or a record of another library is reset."""
+        reset_all, worlds = sim.build_reset_fn().__wrapped__, np.ones(sim.n_worlds, bool)
         self.reset_data: Callable[[SimData, SimData], SimData] = (
-            sim.build_reset_fn().__wrapped__ if self.batched_reset else reset
+            (lambda data, default: reset_all(data, default, worlds)) if self.batched_reset else reset_world
         )
         """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``batched_reset``."""
         self.zeros = self._step.zeros(sim.data)
@@ -236,6 +239,11 @@ class DroneEnv(Env):
         return self._step.stages
 
     @property
+    def strict(self) -> bool:
+        """True to raise an error where a step runs unfused for another reason than a documented limit."""
+        return self._step.strict
+
+    @property
     def unfused(self) -> str | None:
         """Reason why its steps cannot be one kernel, as far as it is known without tracing; None if there is none."""
         if self._step.engine not in ("auto", "fused"):
@@ -246,6 +254,8 @@ class DroneEnv(Env):
             return "the worlds are sharded over several devices"
         if self.task.batched:
             return f"task {self.task.name!r} is declared to need all worlds at once"
+        if self._foreign:
+            return "a record in data.plugins is of another library, and is not divided among worlds"
         if self.batched_reset:
             own = ", ".join(repr(name) for name in self.sim.reset_pipeline if name != "reset")
             return f"{own} of the reset pipeline takes all worlds at once"
@@ -285,5 +295,5 @@ def select_states(mask: Array, new: EnvState, old: EnvState) -> EnvState:
     old = old.replace(reward=new.reward if old.reward is None else old.reward, info=new.info | old.info)
     kinds = jax.tree.leaves(scopes(new))
     pairs = zip(kinds, jax.tree.leaves(new), jax.tree.leaves(old), strict=True)
-    leaves = [select_worlds(mask, x, y) if kind in ("drone", "world", "rows") else x for kind, x, y in pairs]
+    leaves = [select_worlds(mask, x, y) if kind in PER_WORLD else x for kind, x, y in pairs]
     return jax.tree.structure(new).unflatten(leaves)

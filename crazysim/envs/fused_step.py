@@ -14,7 +14,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, Stage
-from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.errors import LimitError
 from crazysim.engine.fused_rollout import FusedRollout
 from crazysim.envs.phases import act, begin, observe
 from crazysim.envs.state import EnvState
@@ -73,7 +73,7 @@ class FusedEnvStep:
         self._env, self._policy, base = env, policy, env.base
         for wrapper in env.wrappers:
             if wrapper.batched:
-                raise UnsupportedError(f"wrapper {wrapper.name!r} is declared to need all worlds at once")
+                raise LimitError(f"wrapper {wrapper.name!r} is declared to need all worlds at once")
         self._n_drones = base.sim.n_drones
         state, action = jax.eval_shape(lambda *x: x, state, action)
         one, one_action = _of_one_world(state), jax.ShapeDtypeStruct(action.shape[1:], action.dtype)
@@ -96,7 +96,7 @@ class FusedEnvStep:
         self._run = FusedRollout(first, base.stages, last, joined, zeros, *settings)
         again = {name for name in self._after.shapes if self._leaf[name] in outputs & set(self._run.read)} - set(ENDS)
         if packed and again:
-            raise UnsupportedError(f"a step reads {', '.join(sorted(again))} of the step before")
+            raise LimitError(f"a step reads {', '.join(sorted(again))} of the step before")
 
     def __call__(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one step later. (n_worlds, n_drones, k)"""
@@ -235,7 +235,7 @@ class _Layout:
 
 def _of_one_world(state: EnvState) -> EnvState:
     """Return shapes and types of a state in one world."""
-    taken = {"drone": 1, "world": 2, "rows": 1}
+    taken = {"drone": 1, "world": 2, "batched": 1}
     return jax.tree.map(
         lambda kind, x: jax.ShapeDtypeStruct(x.shape[taken.get(kind, 0) :], x.dtype), scopes(state), state
     )

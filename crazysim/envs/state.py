@@ -25,19 +25,19 @@ class EnvState(PyTree):
 
     data: SimData
     """The simulation."""
-    obs: Obs = leaf("rows")
+    obs: Obs = leaf("batched")
     """Observations passed to the policy. (n_worlds, n_drones, k) each"""
-    reward: Array = leaf("rows")
+    reward: Array = leaf("batched")
     """Reward of the step that led here. (n_worlds, n_drones)"""
-    terminated: Array = leaf("rows")
+    terminated: Array = leaf("batched")
     """True where the episode ended by success or failure. (n_worlds,)"""
-    truncated: Array = leaf("rows")
+    truncated: Array = leaf("batched")
     """True where the episode reached its time limit. (n_worlds,)"""
-    action: Array = leaf("rows")
+    action: Array = leaf("batched")
     """Action of the step that led here; zero at the start of an episode. (n_worlds, n_drones, k)"""
-    info: dict[str, Any] = leaf("rows")
+    info: dict[str, Any] = leaf("batched")
     """Further quantities by name. (n_worlds,) or (n_worlds, n_drones, ...) each"""
-    memory: dict[str, Any] = leaf("rows")
+    memory: dict[str, Any] = leaf("batched")
     """State of the wrappers, by name of the wrapper. (n_worlds, ...) each, but for declared shared leaves"""
 
     @property

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 from crazysim.core import functional as F
 
 if TYPE_CHECKING:
-    from crazysim.core.data import SimData
     from crazysim.engine import Stepper
 
 
@@ -17,8 +16,6 @@ class Commands:
     Arguments and errors of all methods are those of ``crazysim.core.functional.state_control``.
     """
 
-    data: SimData
-    """Everything that changes."""
     _stepper: Stepper
 
     def state_control(self, controls: Any, check_finite: bool = False) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from crazysim.deprecation import warn_renamed
 from crazysim.scene import mjx
+from crazysim.scene.build import use_boxes
 from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
 from crazysim.scene.overlays import Overlays
@@ -19,7 +20,6 @@ from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Scene
 
 if TYPE_CHECKING:
-    from crazysim.core.data import SimData
     from crazysim.core.registry import PluginRegistry
     from crazysim.engine import Stepper
 
@@ -52,8 +52,8 @@ class SceneShell:
 
     n_worlds: int
     """Number of worlds."""
-    data: SimData
-    """Everything that changes."""
+    n_drones: int
+    """Number of drones in each world."""
     plugins: PluginRegistry
     """Plugins, which draw overlays."""
     _scene: Scene
@@ -209,3 +209,12 @@ class SceneShell:
     def close(self) -> None:
         """Close the window and free the renderers."""
         self._scene.close()
+
+
+def use_box_collision(sim: SceneShell, enable: bool = True) -> None:
+    """Let drones touch with boxes instead of spheres, or with spheres again; compiles the scene again.
+
+    Boxes follow the drone's outline more closely and cost more to check.
+    """
+    use_boxes(sim.spec, sim.n_drones, enable)
+    sim.build_mjx()

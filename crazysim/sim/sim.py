@@ -28,14 +28,13 @@ from crazysim.engine import Step, Stepper, build_reset, explain
 from crazysim.engine.plain import ResetFn
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
-from crazysim.scene.build import use_boxes
 from crazysim.scene.queries import SceneQueries
 from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim.commands import Commands
 from crazysim.sim.configuration import Configuration
 from crazysim.sim.plugins import PluginMethods
-from crazysim.sim.scene_shell import SceneShell
+from crazysim.sim.scene_shell import SceneShell, use_box_collision
 
 __all__ = [
     "Sim",
@@ -121,7 +120,7 @@ class Sim(Commands, PluginMethods, SceneShell):
         self._stepper = Stepper(self.device, mesh, engine, strict)
         self._queries = self._new_queries()
         self._seed = as_key(rng_key)
-        self.plugins = PluginRegistry(self)
+        self.plugins = PluginRegistry(self)  # type: ignore[arg-type]  # properties serve as attributes
         self.build_data()
         self.build_default_data()
 
@@ -304,12 +303,3 @@ class Sim(Commands, PluginMethods, SceneShell):
         """Make the reset pipeline as it is now take effect; return ``reset(data, default_data, mask=None)``, pure."""
         self.reset_fn = build_reset(self.reset_pipeline)
         return self.reset_fn
-
-
-def use_box_collision(sim: Sim, enable: bool = True) -> None:
-    """Let drones touch with boxes instead of spheres, or with spheres again; compiles the scene again.
-
-    Boxes follow the drone's outline more closely and cost more to check.
-    """
-    use_boxes(sim.spec, sim.n_drones, enable)
-    sim.build_mjx()

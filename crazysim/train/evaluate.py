@@ -75,8 +75,8 @@ def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None)
         of their drones had succeeded; ``error``: mean error of the other worlds over the last ``task.hold`` seconds,
         m (at the end of the episode for tasks with ``task.succeeded``); ``reward``: mean return of an episode.
     """
-    policy = policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
-    flown = fly(env, policy, jax.random.key(HELD_OUT) if key is None else key)
+    compiled: Any = policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
+    flown = fly(env, compiled, jax.random.key(HELD_OUT) if key is None else key)
     last = max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
     over = flown["over"][-1]
     settled = jnp.all(flown["error"][-last:] < env.task.tolerance, axis=0) & ~over[:, None]

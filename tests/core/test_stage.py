@@ -15,7 +15,7 @@ class Numbers(PyTree):
 
     own: jax.Array = leaf("drone", 1)
     ours: jax.Array = leaf("world", 1)
-    row: jax.Array = leaf("rows")
+    row: jax.Array = leaf("batched")
     all: jax.Array = leaf("shared", 1)
     opaque: jax.Array = leaf("opaque")
 

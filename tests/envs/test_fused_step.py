@@ -1,5 +1,7 @@
 """An environment step as one kernel gives what the same step gives unfused, or says why it is not fused."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,8 +10,11 @@ import pytest
 import crazysim.envs as envs
 from crazysim.core.stage import over_worlds
 from crazysim.engine import fused
+from crazysim.engine.errors import UnsupportedError
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import AutoReset, Wrapper
+from crazysim.errors import EngineWarning
+from crazysim.pytree import CORE_NDIM_KEY
 
 pytestmark = pytest.mark.skipif(fused.missing("cpu") is not None, reason="there is no C++ compiler")
 N = 6
@@ -160,10 +165,26 @@ def with_other_defaults(env):
     return AutoReset(envs.DroneEnv(sim, env.task))
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Counts:
+    """A record of another library, which declares its axes as Crazyflow does."""
+
+    count: jax.Array = dataclasses.field(metadata={CORE_NDIM_KEY: 0})
+
+
+def with_foreign_record(env):
+    sim = envs.make("hover", N).sim
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {"counts": Counts(jnp.zeros(N))})
+    sim.build_default_data()
+    return AutoReset(envs.DroneEnv(sim, env.task))
+
+
 REFUSED = {
+    "a record in data.plugins is of another library": with_foreign_record,
     "task 'hover' is declared to need all worlds at once": lambda env: AutoReset(envs.DroneEnv(env.sim, Ranked())),
     "wrapper 'Normalize' is declared to need all worlds at once": lambda env: AutoReset(envs.Normalize(env)),
-    "primitive": lambda env: AutoReset(envs.DroneEnv(env.sim, Fourier())),
+    "a stage of one world is unrolled for at most 8 drones": lambda _: AutoReset(envs.make("swarm", 2, n_drones=9)),
     "the engine is 'lanes'": lambda env: AutoReset(envs.make("hover", N, engine="lanes")),
     "'own' of the reset pipeline takes all worlds at once": with_reset_stage,
     "episodes begin from different data in different worlds": with_other_defaults,
@@ -178,6 +199,20 @@ def test_a_step_that_is_not_one_kernel_says_why_in_one_line(hover, why):
     assert line.startswith("a step is not one kernel: ")
     assert "\n" not in line
     assert why in line
+
+
+def test_a_step_that_the_engine_cannot_lower_warns_once_or_raises(hover):
+    env = AutoReset(envs.DroneEnv(hover.sim, Fourier()))
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    with pytest.warns(
+        EngineWarning, match=r"environment steps run unfused: primitive .*complex64 \(stage 'observations'"
+    ):
+        line = env.explain(state)
+    assert line.startswith("a step is not one kernel: primitive ")
+    assert env.explain(state) == line  # without another warning, which would be an error here
+    strict = AutoReset(envs.DroneEnv(envs.make("hover", N, strict=True).sim, Fourier()))
+    with pytest.raises(UnsupportedError, match="complex64"):
+        strict.explain(state)
 
 
 def test_a_task_of_all_worlds_is_rewarded_across_them(hover):
@@ -205,6 +240,15 @@ def test_episodes_begin_as_the_simulation_resets(hover, make):
     else:
         fresh = env.base.default_of(state.data).states.pos
         np.testing.assert_array_equal(fresh[:, 0, 0], [1.0, *np.zeros(N - 1)])
+
+
+def test_records_of_other_libraries_are_reset_with_their_world(hover):
+    env = with_foreign_record(hover)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    data = state.data.replace(plugins=state.data.plugins | {"counts": Counts(jnp.ones(N))})
+    mask = np.arange(N) == 1
+    after = jax.jit(env.restart)(state.replace(data=data), mask)
+    np.testing.assert_array_equal(after.data.plugins["counts"].count, ~mask)
 
 
 class Buggy(Hover):

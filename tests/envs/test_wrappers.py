@@ -82,6 +82,13 @@ class Recorder(Wrapper):
         return state
 
 
+def test_shared_parameters_stay_when_episodes_begin(env):
+    state = env.reset(jax.random.key(0))
+    heavier_all = state.data.params.replace(mass=state.data.params.mass * 2)
+    after = env.restart(state.replace(data=state.data.replace(params=heavier_all)), jnp.asarray(FIRST))
+    assert trees_equal(after.data.params, heavier_all)
+
+
 def test_hooks_are_called_in_their_order_with_one_world():
     calls = []
     env = Recorder(Recorder(make("hover", 3, n_drones=2), "inner", calls), "outer", calls)

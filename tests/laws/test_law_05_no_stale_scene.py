@@ -325,6 +325,56 @@ def test_nothing_of_the_scene_is_held_per_world_before_it_is_asked_for():
     assert foreign_bytes() > 1000 * n_worlds
 
 
+def test_data_has_what_was_added_before_the_scene_is_compiled(monkeypatch, syncs):
+    """Reading data, stepping, commands and resets compile no MuJoCo model; a question does, once for all edits.
+
+    The data has the objects and mocap ids that the model will have, between hand-made bodies too.
+    """
+    compiled = []
+    sim = Sim(n_worlds=2, n_drones=2)
+
+    def count(spec, real=place.build.compile_spec):
+        compiled.append(1)
+        return real(spec)
+
+    monkeypatch.setattr(place.build, "compile_spec", count)
+    assert sim.data.objects is None
+    first = sim.scene.add("gate", count=2, pos=(0, 3, 1))
+    sim.spec.worldbody.add_body(name="by_hand", mocap=True, pos=[0, 0, 9]).add_geom(size=[0.1, 0, 0])
+    sim.step()
+    second = sim.scene.add("box", pos=(0.0, 0.0, UP), size=(4.0, 4.0, 0.2))
+    objects, default = sim.data.objects, sim.default_data.objects
+    assert objects.names == default.names == ("gate:0", "gate:1", "box:0")
+    sim.data = second.set_pose(sim.data, pos=(0.0, 0.0, 2 * UP))
+    sim.attitude_control(np.zeros((2, 2, 4)))
+    sim.step(2)
+    sim.seed(1)
+    moved = at_height(sim.data, UP, 2 * UP)
+    sim.reset(np.array([True, False]))
+    assert sim.data.objects.pos.shape == (2, 1, 3, 3)
+    np.testing.assert_allclose(second.pose(sim.data)[0][:, 0, 2], [UP, 2 * UP])
+    sim.data = moved
+    assert not compiled
+    touching = drone_touches(sim)
+    assert len(compiled) == 1
+    assert touching == [False, True], "the box is where the data has it"
+    ids = [sim.mj_model.body(name).mocapid.item() for name in objects.names]
+    np.testing.assert_array_equal(sim.data.objects.mocap_ids, ids)
+    np.testing.assert_array_equal(objects.mocap_ids, ids)
+    np.testing.assert_array_equal(sim.data.core.drone_mocap_ids, [0, 1])
+    assert len(syncs) == 1
+    assert first.pose(sim.data)[0].shape == (2, 2, 3)
+    assert len(compiled) == 1
+
+
+def test_a_spec_that_lost_a_drone_is_refused_by_name():
+    sim = Sim(n_drones=2)
+    sim.spec.delete(sim.spec.body("drone:1"))
+    sim.scene.add("box")
+    with pytest.raises(ValueError, match="has lost 'drone:1'"):
+        _ = sim.data
+
+
 def test_drawing_one_world_of_several_holds_none_of_the_others(opengl, syncs):
     """A picture needs one world's poses: no MJX, no scene state, no sync of all worlds."""
     sim = Sim(n_worlds=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -12,11 +13,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.settings import member
-from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.envs.env import Env, select_states
 from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.state import EnvState, validate_action
 from crazysim.envs.wrappers.base import Wrapper
+from crazysim.errors import EngineWarning
 
 
 class AutoresetMode(StrEnum):
@@ -102,12 +104,15 @@ class AutoReset(Wrapper):
         return f"a step is not one kernel: {fused}" if isinstance(fused, str) else "a step is one kernel"
 
     def fused_step(self, state: EnvState, action: Any, packed: bool = False) -> FusedEnvStep | str:
-        """Return the step as one kernel, or the reason why there is none.
+        """Return the step as one kernel, or the reason why there is none; warn if that is not a documented limit.
 
         Args:
             state: A state of the structure that is stepped.
             action: An action, or its shape and type.
             packed: True for a step of packed states; see ``FusedEnvStep``.
+
+        Raises:
+            UnsupportedError: If the simulation is strict, and the engine cannot lower or compile the step.
         """
         if (why := self.base.unfused) is not None:
             return why
@@ -116,6 +121,11 @@ class AutoReset(Wrapper):
         if key not in self._fused:
             try:
                 self._fused[key] = FusedEnvStep(self.env, self.policy, state, action, packed)
-            except UnsupportedError as error:
+            except LimitError as error:
                 self._fused[key] = str(error)
+            except UnsupportedError as error:
+                if self.base.strict:
+                    raise
+                self._fused[key] = str(error).partition("\n")[0]
+                warnings.warn(f"environment steps run unfused: {error}", EngineWarning, stacklevel=2)
         return self._fused[key]

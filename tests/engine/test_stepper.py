@@ -1,0 +1,94 @@
+"""Data between calls of the compiled step: flattened while it advances, a record when it is read."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import shared_sim, trees_equal
+
+from crazysim.engine import Stepper
+from crazysim.engine.flat import PackCache, ZerosCache
+
+
+@pytest.fixture
+def sim():
+    return shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
+
+
+@pytest.fixture
+def stepper(sim):
+    stepper = Stepper(sim.device, None, "auto", strict=True)
+    stepper.build(sim.step_pipeline)
+    stepper.assign(sim.default_data)
+    return stepper
+
+
+def test_a_record_is_put_together_once_when_it_is_read(stepper):
+    assert stepper.data is stepper.data
+    before = stepper.data
+    stepper.advance(2)
+    assert stepper.data is not before
+    assert stepper.data is stepper.data
+    assert trees_equal(stepper.data, stepper.step(before, jnp.int32(2)))
+    np.testing.assert_array_equal(before.core.steps, 0)
+
+
+def test_steps_in_a_row_flatten_once(stepper, monkeypatch):
+    flattened = []
+    monkeypatch.setattr(
+        stepper.step, "flatten", lambda data, real=stepper.step.flatten: flattened.append(1) or real(data)
+    )
+    for n in (1, 2, 1):
+        stepper.advance(n)
+    assert len(flattened) == 1
+    assert stepper.data.core.steps[0, 0] == 4
+    stepper.advance(1)  # reading takes nothing away
+    assert len(flattened) == 1
+    stepper.data = stepper.data
+    stepper.advance(1)
+    assert len(flattened) == 2
+
+
+def test_a_new_step_takes_over_the_data(stepper, sim):
+    stepper.advance(3)
+    step = stepper.build(sim.step_pipeline)
+    assert stepper.step is step
+    stepper.advance(1)
+    assert stepper.data.core.steps[0, 0] == 4
+    assert step._cache_size() == 1
+
+
+def test_data_from_outside_is_placed_and_counts_as_unsynced(stepper):
+    far = jax.devices("cpu")[1]
+    states = stepper.data.states.replace(pos=jax.device_put(np.ones((3, 2, 3), np.float32), far))
+    stepper.assign(stepper.data.replace(states=states, core=stepper.data.core.replace(mjx_synced=np.True_)))
+    assert stepper.data.states.pos.devices() == {stepper.device}
+    assert not stepper.data.core.mjx_synced
+    flag = stepper.data.core.mjx_synced
+    stepper.assign(stepper.data.replace(states=states))
+    assert stepper.data.core.mjx_synced is flag  # known to be false: nothing is transferred
+
+
+def test_packed_parameters_are_made_again_only_for_other_arrays():
+    pack, a, b = PackCache(), jnp.ones(2), jnp.zeros((2, 2))
+    first = pack([a, b])
+    np.testing.assert_array_equal(first, [1, 1, 0, 0, 0, 0])
+    assert pack([a, b]) is first
+    assert pack([a, b + 0]) is not first
+    traced = jax.jit(lambda x: pack([x, b]))(a)
+    np.testing.assert_array_equal(traced, first)
+
+
+def test_zeros_are_looked_for_in_shared_floats_alone(sim):
+    zeros, data = ZerosCache(), sim.data
+    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(data)]
+    found = {names[i]: some for i, some in zeros(data, jax.tree.leaves(data))}
+    assert found[".params.J"] == {1, 2, 3, 5, 6, 7}
+    assert not any("states" in name or "core" in name for name in found)
+    J = data.params.J.at[0, 1].set(1e-6)
+    changed = data.replace(params=data.params.replace(J=J))
+    found = {names[i]: some for i, some in zeros(changed, jax.tree.leaves(changed))}
+    assert found[".params.J"] == {2, 3, 5, 6, 7}
+    seen = []
+    jax.jit(lambda d: seen.append(zeros(d, jax.tree.leaves(d))) or d.states.pos)(changed)
+    assert seen == [()]
