@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
@@ -41,7 +41,7 @@ def locate(x: jax.Array) -> Location:
     if len(devices) == 1 or not isinstance(x.sharding, NamedSharding):
         return Location(platform, devices)
     spec = x.sharding.spec
-    return Location(platform, devices, x.sharding.mesh, spec[0] if len(spec) else None)
+    return Location(platform, devices, cast(Mesh, x.sharding.mesh), spec[0] if len(spec) else None)
 
 
 def put(tree: Any, device: jax.Device) -> Any:

@@ -29,9 +29,9 @@ class Params(PyTree):
     mass: Array = leaf("parameter", 1, (1,))
     """Mass, kg. (1,)"""
     L: Array = leaf("parameter", 1)
-    """Arm that scales the first two rows of the mixing matrix, for all rotors or each, m. (1,) or (n_rotors,)"""
+    """Arm that scales the first two rows of the mixing matrix, m; (n_rotors,) if rotors differ. (1,)"""
     prop_inertia: Array = leaf("parameter", 1)
-    """Inertia of a propeller and motor about its axis, for all rotors or each, kg m^2. (1,) or (n_rotors,)"""
+    """Inertia of a propeller and motor about its axis, kg m^2; (n_rotors,) if rotors differ. (1,)"""
     gravity_vec: Array = leaf("parameter", 1)
     """Gravitational acceleration, world frame, m/s^2. (3,)"""
     J: Array = leaf("parameter", 2)
@@ -39,15 +39,15 @@ class Params(PyTree):
     J_inv: Array = leaf("parameter", 2)
     """Inverse of the inertia, body frame, 1/(kg m^2). (3, 3)"""
     rpm2thrust: Array = leaf("parameter", 2)
-    """Thrust curve, for all rotors or each, N, N/rpm, N/rpm^2. (1 or n_rotors, 3)"""
+    """Thrust curve, N, N/rpm, N/rpm^2; (n_rotors, 3) if rotors differ. (1, 3)"""
     rpm2torque: Array = leaf("parameter", 2)
-    """Drag torque curve, for all rotors or each, N m, N m/rpm, N m/rpm^2. (1 or n_rotors, 3)"""
+    """Drag torque curve, N m, N m/rpm, N m/rpm^2; (n_rotors, 3) if rotors differ. (1, 3)"""
     mixing_matrix: Array = leaf("parameter", 2)
     """Mixing matrix, rotor thrusts to torque: positions over L, and signs of the drag torque, 1. (3, n_rotors)"""
     drag_matrix: Array = leaf("parameter", 2)
     """Linear drag coefficients, body frame, N s/m. (3, 3)"""
     rotor_dyn_coef: Array = leaf("parameter", 2)
-    """Rotor lag on spin-up and spin-down, for all rotors or each, 1/s, 1/(s rpm). (1 or n_rotors, 4)"""
+    """Rotor lag on spin-up and spin-down, 1/s, 1/(s rpm); (n_rotors, 4) if rotors differ. (1, 4)"""
     rotor_vel_min: Array = leaf("parameter", 1)
     """Minimum speed of a rotor that is on, for all rotors or each, rpm. (1,) or (n_rotors,)"""
     rotor_vel_max: Array = leaf("parameter", 1)

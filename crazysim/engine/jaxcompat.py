@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -22,6 +23,7 @@ from jax.extend.random import threefry2x32_p, threefry_prng_impl
 from crazysim.engine.errors import UnsupportedError
 
 __all__ = [
+    "DIGAMMA_AT_ZERO",
     "ClosedJaxpr",
     "Equation",
     "Jaxpr",
@@ -209,6 +211,10 @@ def register_host_target(name: str, function: Any) -> None:
 def compute_capability(device: Any) -> int:
     """Return the compute capability of an NVIDIA GPU as a number: 90 for 9.0."""
     return int(str(device.compute_capability).replace(".", ""))
+
+
+DIGAMMA_AT_ZERO = -math.inf if jax.__version_info__ >= (0, 11) else math.nan
+"""Value of ``jax.lax.digamma`` at zero: a pole, which JAX gives a sign from 0.11 on."""
 
 
 def versions() -> str:

@@ -7,6 +7,7 @@ same time: each file appears complete, by renaming.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import hashlib
@@ -45,11 +46,9 @@ def folder() -> Path:
 @functools.cache
 def temporary() -> Path:
     """Return a folder that is removed when this process ends."""
-    _KEPT.append(made := tempfile.TemporaryDirectory(prefix="crazysim-"))
-    return Path(made.name)
-
-
-_KEPT: list[tempfile.TemporaryDirectory[str]] = []
+    folder = tempfile.TemporaryDirectory(prefix="crazysim-")
+    atexit.register(folder.cleanup)
+    return Path(folder.name)
 
 
 def find(place: Path, key: str) -> Iterator[Path]:

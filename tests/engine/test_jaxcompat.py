@@ -243,3 +243,7 @@ def test_only_one_module_goes_beyond_the_public_interface():
         if path.name != "jaxcompat.py" and word in path.read_text()
     }
     assert found == {"engine/step.py: _cache_size"}  # a method of ours by that name, for the tests of law 6
+
+
+def test_digamma_at_zero_is_that_of_this_version():
+    np.testing.assert_array_equal(jax.lax.digamma(np.float32(0)), np.float32(jaxcompat.DIGAMMA_AT_ZERO))

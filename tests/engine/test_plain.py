@@ -8,7 +8,6 @@ from cases import as_numbers, send, shared_sim, trees_equal, with_states
 
 from crazysim import ConfigError
 from crazysim.engine import Step, build_reset
-from crazysim.pytree import scopes
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +144,7 @@ def test_every_step_and_reset_tells_the_scene_that_it_is_stale(sim, data, step):
         assert not after.core.mjx_synced
 
 
-def test_a_full_reset_brings_back_all_that_belongs_to_a_world_and_nothing_else(sim, data, step):
+def test_a_full_reset_restores_everything_but_counters_and_seed(sim, data, step):
     reset = build_reset(sim.reset_pipeline)
     shared = data.replace(params=data.params.replace(mass=jnp.array([0.05])))
     flown, default = step(shared, jnp.int32(5)), sim.default_data
@@ -154,13 +153,12 @@ def test_a_full_reset_brings_back_all_that_belongs_to_a_world_and_nothing_else(s
     leaves = {jax.tree_util.keystr(path): k for k, (path, _) in enumerate(jax.tree_util.tree_leaves_with_path(after))}
     changed = 0
     for name, k in leaves.items():
-        scope, new, was, start = (jax.tree.leaves(x)[k] for x in (scopes(after), after, flown, default))
+        new, was, start = (jax.tree.leaves(x)[k] for x in (after, flown, default))
         if name.rsplit(".", 1)[-1] in kept:
             continue
-        of_world = scope in ("drone", "world")
-        np.testing.assert_array_equal(as_numbers(new), as_numbers(start if of_world else was), err_msg=name)
-        changed += of_world and not np.array_equal(as_numbers(was), as_numbers(start))
-    assert changed >= 8  # what a flight changes: states, commands, counts, integrals
-    np.testing.assert_array_equal(after.params.mass, np.float32([0.05]))
+        np.testing.assert_array_equal(as_numbers(new), as_numbers(start), err_msg=name)
+        changed += not np.array_equal(as_numbers(was), as_numbers(start))
+    assert changed >= 9  # what a flight changes: states, commands, counts, integrals; and the mass
+    np.testing.assert_array_equal(after.params.mass, default.params.mass)
     np.testing.assert_array_equal(after.core.episode, np.ones((3, 1)))
     np.testing.assert_array_equal(after.core.steps, np.zeros((3, 1)))

@@ -422,7 +422,7 @@ def test_law_09_rollouts_refuse_what_cannot_be(settings, words):
 
 def test_law_09_a_policy_of_another_shape_is_told():
     sim = shared_sim(n_worlds=2, n_drones=1, control="attitude")
-    with pytest.raises(ValueError, match=r"attitude command has shape \(2, 1, 3\); this simulation needs \(2, 1, 4\)"):
+    with pytest.raises(ValueError, match=r"attitude command has shape \(2, 1, 3\); expected \(2, 1, 4\)"):
         sim.rollout(lambda params, data: data.states.pos, None, 3)
 
 

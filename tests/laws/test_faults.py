@@ -25,6 +25,7 @@ from cases import (
 
 from crazysim import ConfigError, PyTree, Sim, leaf
 from crazysim.core.stages import FLOOR
+from crazysim.pytree import PER_WORLD, scopes
 
 
 @functools.cache
@@ -269,19 +270,28 @@ def named_leaves(data):
     return {jax.tree_util.keystr(k): as_numbers(v) for k, v in jax.tree_util.tree_leaves_with_path(data)}
 
 
-def test_fault_16_masked_and_full_reset_are_one(dirty):
+def test_fault_16_a_full_reset_is_that_of_all_worlds_and_of_what_they_share(dirty):
     default, used, reset = dirty
     full, masked = reset(used, default), reset(used, default, jnp.ones(3, bool))
     assert jax.tree.structure(full) == jax.tree.structure(masked)
-    masked, full = named_leaves(masked), named_leaves(full)
+    per_world = dict(zip(named_leaves(full), (s in PER_WORLD for s in jax.tree.leaves(scopes(full))), strict=True))
+    masked, full, start, before = (named_leaves(x) for x in (masked, full, default, used))
     assert len(full) > 40
+    shared = 0
     for name, value in full.items():
-        np.testing.assert_array_equal(masked[name], value, err_msg=name)
+        if per_world[name]:
+            np.testing.assert_array_equal(masked[name], value, err_msg=name)
+        elif name not in (".core.rng_key", ".core.mjx_synced"):
+            np.testing.assert_array_equal(value, start[name], err_msg=name)
+            np.testing.assert_array_equal(masked[name], before[name], err_msg=name)
+            shared += not np.array_equal(before[name], start[name])
+    assert shared >= 2, "gravity and an undeclared array were changed"
     one_by_one = used
     for world in range(3):
         one_by_one = reset(one_by_one, default, jnp.arange(3) == world)
     for name, value in named_leaves(one_by_one).items():
-        np.testing.assert_array_equal(full[name], value, err_msg=name)
+        if per_world[name]:
+            np.testing.assert_array_equal(full[name], value, err_msg=name)
 
 
 def test_fault_16_a_reset_touches_its_worlds_and_what_belongs_to_them_only(dirty):

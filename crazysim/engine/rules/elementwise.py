@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from jax.lax import RoundingMethod
 
-from crazysim.engine import ops
+from crazysim.engine import jaxcompat, ops
 from crazysim.engine.lower import Elements, Lowering, UnsupportedError, constants, rule
 
-OWN_RULE = frozenset("convert_element_type bitcast_convert_type select_n integer_pow pow round_even round_away".split())
+OWN_RULE = frozenset(
+    "convert_element_type bitcast_convert_type select_n integer_pow pow round_even round_away digamma".split()
+)
 """Operations that no primitive maps to one to one."""
 
 
@@ -24,6 +26,15 @@ def _pow(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     """Raise to a power; JAX converts one that is an integer."""
     dtype = eqn.outvars[0].aval.dtype
     return [ctx.elementwise("pow", [args[0], ctx.elementwise("convert_element_type", [args[1]], dtype)], dtype)]
+
+
+@rule("digamma")
+def _digamma(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
+    """Return the digamma function, whose value at zero depends on the version of JAX."""
+    dtype = eqn.outvars[0].aval.dtype
+    at_zero = ctx.elementwise("eq", [args[0], constants(0, dtype)], bool)
+    regular = ctx.elementwise("digamma", args, dtype)
+    return [ctx.elementwise("select_n", [at_zero, regular, constants(jaxcompat.DIGAMMA_AT_ZERO, dtype)], dtype)]
 
 
 @rule("round")
