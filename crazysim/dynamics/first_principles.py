@@ -49,9 +49,9 @@ class Params(PyTree):
     rotor_dyn_coef: Array = leaf("parameter", 2)
     """Rotor lag on spin-up and spin-down, 1/s, 1/(s rpm); (n_rotors, 4) if rotors differ. (1, 4)"""
     rotor_vel_min: Array = leaf("parameter", 1)
-    """Minimum speed of a rotor that is on, for all rotors or each, rpm. (1,) or (n_rotors,)"""
+    """Minimum speed of a rotor that is on, rpm; (n_rotors,) if rotors differ. (1,)"""
     rotor_vel_max: Array = leaf("parameter", 1)
-    """Maximum rotor speed, for all rotors or each, rpm. (1,) or (n_rotors,)"""
+    """Maximum rotor speed, rpm; (n_rotors,) if rotors differ. (1,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> Params:
