@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,7 +25,7 @@ def _reduce(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     op, dtype, axes = COMBINE[eqn.primitive.name], eqn.outvars[0].aval.dtype, eqn.params["axes"]
     x = np.moveaxis(args[0], axes, range(len(axes)))
     rest = x.shape[len(axes) :]
-    rows = list(x.reshape(-1, *rest))
+    rows = list(x.reshape(math.prod(x.shape[: len(axes)]), *rest))
     if not rows:
         return [constants(run_now(eqn, [np.zeros(args[0].shape, dtype)])[0], dtype)]
     return [
@@ -38,7 +39,7 @@ def _reduce_by(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     axes, n = eqn.params["dimensions"], len(args) // 2
     arrays = [np.moveaxis(x, axes, range(len(axes))) for x in args[:n]]
     rest = arrays[0].shape[len(axes) :]
-    rows = [x.reshape(-1, *rest) for x in arrays]
+    rows = [x.reshape(math.prod(x.shape[: len(axes)]), *rest) for x in arrays]
     results = [np.empty(rest, object) for _ in arrays]
     for place in np.ndindex(rest):
         reduced = args[n:]
