@@ -6,7 +6,7 @@ PINS ?=
 RUN = $(VENV)/bin/python
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 
-.PHONY: demo test check docs format benchmark clean
+.PHONY: demo test test-fast check docs format benchmark clean
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -19,6 +19,16 @@ demo: $(VENV)/installed
 
 test: $(VENV)/installed
 	$(RUN) -m pytest -n 2 --dist loadgroup $(TESTS)
+
+# Physics, control, geometry, data, and the engine on its interpreter: what compiles little.
+FAST = tests/control tests/dynamics tests/drones tests/geometry tests/core/test_data.py tests/core/test_pipeline.py \
+  tests/core/test_random.py tests/core/test_functional.py $(addprefix tests/engine/test_,ir.py simplify.py passes.py \
+  interpret.py rules.py symbolic.py plan.py jaxcompat.py) tests/envs/test_task.py tests/envs/test_actions.py \
+  tests/laws/test_law_03_functional_core.py tests/laws/test_law_09_wrong_input.py tests/test_pytree.py \
+  tests/test_rotation.py tests/test_prose.py tests/test_package.py
+
+test-fast: $(VENV)/installed
+	$(RUN) -m pytest -n 2 --dist loadgroup $(FAST)
 
 check: $(VENV)/installed
 	$(VENV)/bin/ruff format --check .
