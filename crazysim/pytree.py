@@ -15,7 +15,7 @@ from crazysim.errors import ConfigError
 
 Scope = Literal["drone", "world", "batched", "shared", "opaque", "parameter"]
 
-PER_WORLD = ("drone", "world", "rows", "batched")
+PER_WORLD = ("drone", "world", "batched")
 """Scopes of leaves that have a first axis over worlds, as ``scopes`` returns them."""
 CORE_NDIM_KEY = "core_ndim"
 """Key under which the metadata of a field give the number of dimensions without batch axes; Crazyflow's key too."""
