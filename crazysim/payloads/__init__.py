@@ -1,0 +1,6 @@
+"""Loads that hang from drones: on rods and cables, on hooks, and below several drones."""
+
+from crazysim.payloads.core import LoadData, direction, load_pos, load_vel
+from crazysim.payloads.slung import SlungLoad
+
+__all__ = ["LoadData", "SlungLoad", "direction", "load_pos", "load_vel"]
