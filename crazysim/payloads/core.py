@@ -33,14 +33,14 @@ class LoadData(Exposed):
     """Mass of the load, kg; zero for none. (1,)"""
     length: Array = leaf("parameter", 1, (1,))
     """Length of rod or cable, m. (1,)"""
-    attach: Array = leaf("parameter", 1, (3,))
-    """Attachment on the drone, from its centre of mass, body frame, m. (3,)"""
-    damping: Array = leaf("parameter", 1, (1,))
-    """Viscous torque of the joint over the angular velocity, N m s. (1,)"""
-    restitution: Array = leaf("parameter", 1, (1,))
-    """Ratio of radial speeds after and before a cable becomes taut, 1. (1,)"""
-    drag: Array = leaf("parameter", 1, (1,))
-    """Linear drag coefficient of the load, N s/m. (1,)"""
+    attach: Array | None = leaf("parameter", 1, (3,))
+    """Attachment on the drone, from its centre of mass, body frame, m; None for the centre of mass. (3,)"""
+    damping: Array | None = leaf("parameter", 1, (1,))
+    """Viscous torque of the joint over the angular velocity, N m s; None for none. (1,)"""
+    restitution: Array | None = leaf("parameter", 1, (1,))
+    """Ratio of radial speeds after and before a cable becomes taut, 1; None for no bounce. (1,)"""
+    drag: Array | None = leaf("parameter", 1, (1,))
+    """Linear drag coefficient of the load, N s/m; None for none. (1,)"""
     friction: Array = leaf("parameter", 1, (1,))
     """Coulomb's coefficient between load and floor, 1. (1,)"""
     clearance: Array = leaf("parameter", 1, (1,))
@@ -53,43 +53,42 @@ def air_and_gravity(data: SimData, load: LoadData, vel: Array) -> Array:
     Drag is implicit in time, so that it cannot reverse a motion, and a load without mass moves with the air.
     """
     gravity = data.params.gravity_vec
-    if load.air_vel is None:
+    if load.air_vel is None or load.drag is None:
         return gravity
     air = wind_at(data) + load.air_vel
     return gravity + load.drag / (load.mass + load.drag / data.core.freq + TINY) * (air - vel)
 
 
-def on_floor(load: LoadData, freq: int) -> LoadData:
-    """Return a load that does not fall through the floor, and that friction brakes there."""
+def on_floor(load: LoadData) -> LoadData:
+    """Return a load that does not fall through the floor; friction brakes it there, along x and y separately."""
     height, climb = load.pos[..., 2:], load.vel[..., 2:]
-    lands = (height < load.clearance) | ((height == load.clearance) & (climb <= 0))
-    impulse = jnp.where(lands, jnp.maximum(-climb, 0.0), 0.0)
+    lands = height <= load.clearance
+    brake = jnp.where(lands, load.friction * jnp.maximum(-climb, 0.0), 0.0)
     level = load.vel[..., :2]
-    speed = rotation.safe_norm(level)
-    kept = jnp.maximum(speed - load.friction * impulse, 0.0) / jnp.where(speed > 0, speed, 1.0)
-    # A mean push of more than its weight is a landing; its impulse may stop all sliding.
-    vel = jnp.concatenate([jnp.where(lands, kept, 1.0) * level, jnp.where(lands, jnp.maximum(climb, 0.0), climb)], -1)
+    level = level - jnp.maximum(jnp.minimum(level, brake), -brake)
+    vel = jnp.concatenate([level, jnp.where(lands, jnp.maximum(climb, 0.0), climb)], -1)
     pos = jnp.concatenate([load.pos[..., :2], jnp.maximum(height, load.clearance)], -1)
     return load.replace(pos=pos, vel=vel)
 
 
-def hanging(s: SimState, attach: Array, length: Array, clearance: Array, is_cable: bool) -> tuple[Array, Array]:
+def hanging(s: SimState, attach: Array | None, length: Array, clearance: Array, is_cable: bool) -> tuple[Array, Array]:
     """Return position and velocity of a load that hangs at rest below its drone, or rests on the floor.
 
     Args:
         s: State of the drones. Leaves (..., k)
-        attach: Attachment, body frame, m. (..., 3)
+        attach: Attachment, body frame, m; None for the centre of mass. (..., 3)
         length: Length of the link, m. (..., 1)
         clearance: Height of the load above the floor where it rests, m. (..., 1)
         is_cable: True for a cable, which is slack where the load rests; a rod then lies behind the drone.
     """
     rot = rotation.matrix(s.quat)
-    top = s.pos + rotation.matvec(rot, attach)
+    arm = jnp.zeros(3, s.pos.dtype) if attach is None else attach
+    top = s.pos + rotation.matvec(rot, arm)
     drop = jnp.clip(top[..., 2:] - clearance, -length, length)
     back = jnp.zeros_like(drop) if is_cable else rotation.safe_sqrt(length * length - drop * drop)
     heading = rotation.yaw(s.quat)[..., None]
     offset = jnp.concatenate([-back * jnp.cos(heading), -back * jnp.sin(heading), -drop], axis=-1)
-    vel = s.vel + rotation.matvec(rot, rotation.cross(s.ang_vel, jnp.broadcast_to(attach, s.ang_vel.shape)))
+    vel = s.vel + rotation.matvec(rot, rotation.cross(s.ang_vel, jnp.broadcast_to(arm, s.ang_vel.shape)))
     return top + offset, vel
 
 

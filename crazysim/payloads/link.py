@@ -5,8 +5,8 @@ vector q from the attachment p to the mass, the tension T per mass (the *specifi
 
     t (1 + m_tip q.A q) = q.(a_tip - a_p) + |w|^2 / L + impulses
 
-where a_tip and a_p are the accelerations of mass and attachment without the link, w is the velocity of the mass relative
-to the attachment, and ``A`` maps a force at the attachment to its acceleration. Nothing divides by m_tip: at zero the
+where a_tip and a_p are the accelerations of mass and attachment without the link, w is the velocity of the mass across
+the link, relative to the attachment, and ``A`` maps a force at the attachment to its acceleration. Nothing divides by m_tip: at zero the
 body is free, and the mass still swings.
 
 A hinge about the body's y axis keeps the mass in the body's x-z plane. That is a second constraint along the body's y
@@ -18,7 +18,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from crazysim import rotation
 from crazysim.core.data import SimState, SimStateDeriv
@@ -26,10 +26,14 @@ from crazysim.rotation import cross, dot, matvec
 
 TINY = 1e-12
 """Summand of denominators that vanish where both mass and damping are zero, kg."""
+CLOSE = 1e-20
+"""Summand of the squared distance, m^2, by which the direction of a link without length is zero."""
 SLOW = 0.1
 """Speed below which a cable that becomes taut does not bounce, m/s."""
 PULL = 0.1
 """Fraction of an error in length that one step of a scheme of higher order removes."""
+SLACK = 1e9
+"""Acceleration that no tension of a slack cable outweighs, m/s^2."""
 BAND = 1e-4
 """Relative slack up to which a cable counts as taut in schemes of higher order: 0.04 mm of 0.4 m."""
 
@@ -37,18 +41,18 @@ BAND = 1e-4
 class Link(NamedTuple):
     """Parameters of a link."""
 
-    attach: Array
-    """Attachment on the body, from its centre of mass, body frame, m. (3,)"""
+    attach: Array | None
+    """Attachment on the body, from its centre of mass, body frame, m; None for the centre of mass. (3,)"""
     length: Array
     """Length, m. (1,)"""
     mass: Array
     """Mass at the tip, kg. (1,)"""
-    damping: Array
-    """Viscous torque of the joint over the angular velocity, N m s. (1,)"""
-    restitution: Array
-    """Ratio of radial speeds after and before a cable becomes taut, 1. (1,)"""
-    holds: Array | bool = True
-    """True where the link is connected. ()"""
+    damping: Array | None = None
+    """Viscous torque of the joint over the angular velocity, N m s; None for none. (1,)"""
+    restitution: Array | None = None
+    """Ratio of radial speeds after and before a cable becomes taut, 1; None for no bounce. (1,)"""
+    holds: Array | None = None
+    """True where the link is connected; None for always. ()"""
     is_cable: bool = False
     """True for a cable, which can be slack; False for a rod."""
     is_hinge: bool = False
@@ -60,27 +64,28 @@ class Relative(NamedTuple):
 
     rot: Array
     """Attitude of the body. (3, 3)"""
-    arm: Array
-    """Attachment from the centre of mass, m. (3,)"""
+    arm: Array | None
+    """Attachment from the centre of mass, m; None for zero. (3,)"""
     offset: Array
     """Tip from the attachment, m. (3,)"""
     distance: Array
     """Length of the offset, m. (1,)"""
     direction: Array
-    """Unit vector along the offset; down where the offset is zero. (3,)"""
+    """Unit vector along the offset; zero where the offset is. (3,)"""
     vel: Array
     """Velocity of the tip relative to the attachment, m/s. (3,)"""
 
 
-def relative(s: SimState, pos: Array, vel: Array, attach: Array) -> Relative:
+def relative(s: SimState, pos: Array, vel: Array, attach: Array | None) -> Relative:
     """Return the geometry of the link from a body to a tip."""
-    rot = rotation.matrix(s.quat)
-    arm = matvec(rot, attach)
-    offset = pos - s.pos - arm
-    distance = rotation.safe_norm(offset)
-    is_zero = distance == 0
-    direction = jnp.where(is_zero, jnp.asarray([0.0, 0.0, -1.0], pos.dtype), offset / jnp.where(is_zero, 1.0, distance))
-    return Relative(rot, arm, offset, distance, direction, vel - s.vel - matvec(rot, cross(s.ang_vel, attach)))
+    rot, arm = rotation.matrix(s.quat), None
+    offset, rel_vel = pos - s.pos, vel - s.vel
+    if attach is not None:
+        arm = matvec(rot, attach)
+        offset, rel_vel = offset - arm, rel_vel - matvec(rot, cross(s.ang_vel, attach))
+    square = dot(offset, offset)
+    inverse = lax.rsqrt(square + CLOSE)
+    return Relative(rot, arm, offset, square * inverse, offset * inverse, rel_vel)
 
 
 class Linked(NamedTuple):
@@ -92,8 +97,30 @@ class Linked(NamedTuple):
     """Rate of the tip's position, m/s. (3,)"""
     acc: Array
     """Acceleration of the tip, m/s^2. (3,)"""
-    tension: Array
-    """Tension of the link, N; negative where a rod pushes. (1,)"""
+
+
+class Pull(NamedTuple):
+    """A unit force on the tip along a direction, and the same backwards on the body."""
+
+    direction: Array
+    """Direction, world frame. (3,)"""
+    lever: Array | None
+    """Torque on the body, body frame, m; None for none. (3,)"""
+    turn: Array | None
+    """Angular acceleration of the body, body frame, 1/(kg m). (3,)"""
+
+    @staticmethod
+    def create(direction: Array, rot: Array, J_inv: Array, point: Array | None) -> Pull:
+        """Return the pull at a point of the body, from its centre of mass, body frame, m; None for there."""
+        if point is None:
+            return Pull(direction, None, None)
+        lever = cross(point, to_body(rot, direction))
+        return Pull(direction, lever, matvec(J_inv, lever))
+
+    def response(self, other: Pull, mass: Array) -> Array:
+        """Return the acceleration of the body at this pull, along it, under the other. (1,)"""
+        along = dot(self.direction, other.direction) / mass
+        return along if self.lever is None or other.turn is None else along + dot(self.lever, other.turn)
 
 
 def couple(
@@ -105,8 +132,8 @@ def couple(
     Schemes of order 1 get the mean over a step. Then the impulse that ends all relative motion along the link is part
     of the tension: of a rod in every step, of a cable where it would be longer than ``length`` at the end of the step.
     The change of the constraint's direction counts half: the other half follows as an impulse in the next step, which
-    makes the swing time-reversible (the kicks of RATTLE, Andersen 1983, at both ends of the step). The tip moves with
-    its new velocity, relative to the attachment. Errors in length are removed from positions only.
+    makes the swing time-reversible (the two kicks of RATTLE, Andersen 1983). The tip moves with its new velocity,
+    relative to the attachment. Errors in length are removed from positions only.
 
     Args:
         s: State of the body. Leaves (k,)
@@ -120,105 +147,135 @@ def couple(
         dt: Duration of the step, s; None for the derivative at an instant.
         freq: Steps per second, Hz.
     """
-    r = relative(s, pos, vel, link.attach)
-    q, w, h = r.direction, r.vel, 1 / freq
-    m = jnp.where(link.holds, link.mass, 0.0) if link.holds is not True else link.mass
-    share = 1.0 if dt is None else 0.5
+    r, m = relative(s, pos, vel, link.attach), link.mass
+    out = dot(r.direction, r.vel)
+    attach_acc = acceleration_at(s, deriv, r.rot, link.attach, 1.0 if dt is None else 0.5)
+    damped = None if link.damping is None else _damping(s, r, link, freq)
+    rel_acc = free_acc - attach_acc if damped is None else free_acc + damped - attach_acc
 
-    # Joint damping, implicit in time, so that it cannot reverse a motion.
+    first = Pull.create(r.direction, r.rot, J_inv, link.attach)
+    # Of equal directions: their product is 1 but for rounding.
+    share = m / mass if first.lever is None or first.turn is None else m / mass + m * dot(first.lever, first.turn)
+    rhs = dot(r.direction, rel_acc) + (1.0 if dt is None else 0.5) / link.length * (dot(r.vel, r.vel) - out * out)
+    rhs = rhs + _radial(r, out, rhs, link, dt, freq)
+    pulls = [first]
+    if link.is_hinge:
+        second, rhs_2 = _hinge(s, deriv, r, rel_acc, J_inv, link, dt, freq)
+        cross_share = dot(first.direction, second.direction) + m * first.response(second, mass)
+        share_2 = m * second.response(second, mass)
+        inverse = 1 / ((1 + share) * (1 + share_2) - cross_share * cross_share)
+        tension = ((1 + share_2) * rhs - cross_share * rhs_2) * inverse
+        aside = ((1 + share) * rhs_2 - cross_share * rhs) * inverse
+        tensions, pulls = [tension, aside], [first, second]
+    else:
+        tension = rhs * (1 / (1 + share))
+        tensions = [jnp.maximum(tension, 0.0) if link.is_cable else tension]
+    if link.holds is not None:
+        tensions = [jnp.where(link.holds, t, 0.0) for t in tensions]
+
+    parts = [t * p.direction for t, p in zip(tensions, pulls, strict=True)]
+    pull = sum(parts[1:], parts[0])
+    torques = [t * p.turn for t, p in zip(tensions, pulls, strict=True) if p.turn is not None]
+    if damped is not None:
+        damped = damped if link.holds is None else jnp.where(link.holds, damped, 0.0)
+        pull = pull - damped
+        arm = r.offset if r.arm is None else r.arm + r.offset
+        torques.append(matvec(J_inv, -to_body(r.rot, cross(arm, damped))))
+    acc, tip_acc = m / mass * pull, free_acc - pull
+    turned = deriv
+    if torques:
+        ang_acc = m * sum(torques[1:], torques[0])
+        turned = deriv.replace(ang_acc=deriv.ang_acc + ang_acc)
+        turned = turned if dt is None else turned.replace(ang_vel=deriv.ang_vel + dt * ang_acc)
+    after = turned.replace(acc=deriv.acc + acc)
+    after = after if dt is None else after.replace(vel=deriv.vel + dt * acc)
+    rate = _tip_rate(s, deriv, r, link, vel, tip_acc, attach_acc, dt, freq)
+    return Linked(after, rate, tip_acc)
+
+
+def to_body(rot: Array, vector: Array) -> Array:
+    """Return a world vector in the frame of a body. (3,)"""
+    return matvec(jnp.swapaxes(rot, -1, -2), vector)
+
+
+def acceleration_at(s: SimState, deriv: SimStateDeriv, rot: Array, point: Array | None, share: float) -> Array:
+    """Return the acceleration of a point of the body, with a share of its centripetal part, m/s^2. (3,)"""
+    if point is None:
+        return deriv.acc
+    centripetal = share * cross(s.ang_vel, cross(s.ang_vel, point))
+    return matvec(rot, centripetal + cross(deriv.ang_acc, point), deriv.acc)
+
+
+def _swing(s: SimState, r: Relative) -> tuple[Array, Array]:
+    """Return the body's angular velocity, world frame, and the velocity of the tip relative to the turning body."""
     ang_vel = matvec(r.rot, s.ang_vel)
-    turning = cross(ang_vel, r.offset)
-    swing = w - turning
-    stiff = link.damping / (link.length * link.length)
-    damped = -stiff / (link.mass + h * stiff + TINY) * (swing - dot(q, swing) * q)
-    tip = free_acc + damped
+    return ang_vel, r.vel - cross(ang_vel, r.offset)
 
-    def body_arm(point: Array, direction: Array) -> tuple[Array, Array]:
-        """Return the angular acceleration of the body per force along a direction, and the moment arm."""
-        lever = cross(point, direction)
-        return matvec(J_inv, lever), lever
 
-    attach_acc = deriv.acc + matvec(r.rot, cross(deriv.ang_acc, link.attach))
-    centripetal = matvec(r.rot, cross(s.ang_vel, cross(s.ang_vel, link.attach)))
-    along_b = rotation.matvec(jnp.swapaxes(r.rot, -1, -2), q)
-    turn_1, lever_1 = body_arm(link.attach, along_b)
-    rel_acc = tip - attach_acc
-    m_11 = 1 + m * (1 / mass + dot(turn_1, lever_1))
-    out = dot(q, w)
-    rhs = dot(q, rel_acc) + share * ((dot(w, w) - out * out) / link.length - dot(q, centripetal))
+def _damping(s: SimState, r: Relative, link: Link, freq: int) -> Array:
+    """Return the acceleration of the tip by the damped joint; implicit in time, so that it cannot reverse a motion."""
+    swing = _swing(s, r)[1]
+    stiff = link.damping / (link.length * link.length)  # type: ignore[operator]
+    return -stiff / (link.mass + stiff / freq + TINY) * (swing - dot(r.direction, swing) * r.direction)
 
-    if link.is_hinge:
-        y = r.rot[..., :, 1]
-        tip_b = link.attach + rotation.matvec(jnp.swapaxes(r.rot, -1, -2), r.offset)
-        y_b = jnp.asarray([0.0, 1.0, 0.0], q.dtype)
-        turn_2, lever_2 = body_arm(tip_b, y_b)
-        m_22 = 1 + m * (1 / mass + dot(turn_2, lever_2))
-        m_12 = dot(q, y) + m * (dot(q, y) / mass + dot(turn_1, lever_2))
-        spin = cross(ang_vel, turning) - 2 * cross(ang_vel, w) - centripetal
-        rhs_2 = dot(y, rel_acc - cross(matvec(r.rot, deriv.ang_acc), r.offset)) + share * dot(y, spin)
-        aside = dot(y, swing)
-        rhs_2 = rhs_2 + (aside / dt if dt is not None else 2 * PULL * freq * aside)
-    if dt is not None:
-        wanted = jnp.zeros_like(out)
-        if link.is_cable:
-            gap = jnp.maximum(link.length - r.distance, 0.0) / dt
-            bounces = (link.restitution > 0) & (out > SLOW)
-            stretched = jnp.maximum(r.distance - link.length, 0.0)
-            fallen = 2 * stretched * jnp.maximum(dot(q, rel_acc), 0.0)
-            back = link.restitution * rotation.safe_sqrt(out * out - fallen)
-            wanted = jnp.where(bounces, -back, gap)
-            # The bounce begins where the cable would be taut at the end of the step.
-            reaches = out + dt * dot(q, rel_acc) > gap
-            wanted = jnp.where(bounces & ~reaches, gap, wanted)
-        rhs = rhs + (out - wanted) / dt
-    elif link.is_cable:
-        rhs = jnp.where(r.distance > (1 - BAND) * link.length, rhs + 2 * PULL * freq * out, 0.0)
-    else:
-        rhs = rhs + 2 * PULL * freq * out
-    if link.is_hinge:
-        det = m_11 * m_22 - m_12 * m_12
-        t_1, t_2 = (m_22 * rhs - m_12 * rhs_2) / det, (m_11 * rhs_2 - m_12 * rhs) / det
-    else:
-        t_1 = rhs / m_11
-    if link.is_cable:
-        t_1 = jnp.maximum(t_1, 0.0)
 
-    pull = t_1 * q
-    force = m * (pull - damped)
-    torque = m * t_1 * lever_1
-    lever_d = matvec(jnp.swapaxes(r.rot, -1, -2), cross(r.arm + r.offset, damped))
-    torque = torque - m * lever_d
-    if link.is_hinge:
-        pull = pull + t_2 * y
-        force = force + m * t_2 * y
-        torque = torque + m * t_2 * lever_2
-    acc, ang_acc = force / mass, matvec(J_inv, torque)
-    held = pull - damped if link.holds is True else jnp.where(link.holds, pull - damped, 0.0)
-    tip_acc = free_acc - held
-
-    stretch = r.distance - link.length
-    if link.is_cable:
-        stretch = jnp.where(stretch > -BAND * link.length, stretch, 0.0) if dt is None else jnp.maximum(stretch, 0.0)
-    error = stretch * q
-    if link.is_hinge:
-        error = error + dot(y, r.offset) * y
+def _radial(r: Relative, out: Array, free: Array, link: Link, dt: float | None, freq: int) -> Array:
+    """Return the summand of the tension, before it is shared, that ends relative motion along the link."""
     if dt is None:
-        rate = vel - PULL * freq * error
-        new = deriv.replace(acc=deriv.acc + acc, ang_acc=deriv.ang_acc + ang_acc)
-    else:
-        # ``deriv.vel`` moves the body; the tip moves with its new velocity relative to that.
-        moved = deriv.vel - s.vel + matvec(r.rot, cross(deriv.ang_vel - s.ang_vel, link.attach))
-        rate = vel + dt * (tip_acc - attach_acc) + moved - error / dt
-        new = deriv.replace(
-            acc=deriv.acc + acc,
-            ang_acc=deriv.ang_acc + ang_acc,
-            vel=deriv.vel + dt * acc,
-            ang_vel=deriv.ang_vel + dt * ang_acc,
-        )
-    if link.holds is not True:
-        loose = vel if dt is None else vel + dt * free_acc
-        rate = jnp.where(link.holds, rate, loose)
-    return Linked(new, rate, tip_acc, m * t_1)
+        if not link.is_cable:
+            return 2 * PULL * freq * out
+        return jnp.where(r.distance > (1 - BAND) * link.length, 2 * PULL * freq * out, -SLACK)
+    if not link.is_cable:
+        return freq * out
+    gap = freq * jnp.maximum(link.length - r.distance, 0.0)
+    if link.restitution is None:
+        return freq * (out - gap)
+    # It bounces in the step at whose end it would be taut, with the speed that it had when it became taut.
+    late = jnp.maximum(r.distance - link.length, 0.0)
+    back = link.restitution * rotation.safe_sqrt(out * out - 2 * late * jnp.maximum(free, 0.0))
+    bounces = (link.restitution > 0) & (out > SLOW) & (out + dt * free > gap)
+    return freq * (out - jnp.where(bounces, -back, gap))
+
+
+def _hinge(
+    s: SimState, deriv: SimStateDeriv, r: Relative, rel_acc: Array, J_inv: Array, link: Link, dt: float | None,
+    freq: int,
+) -> tuple[Pull, Array]:  # fmt: skip
+    """Return the pull that keeps the tip in the body's x-z plane, and the relative acceleration that it prevents."""
+    y = r.rot[..., 1]
+    ang_vel, swing = _swing(s, r)
+    offset = to_body(r.rot, r.offset)
+    pull = Pull.create(y, r.rot, J_inv, offset if link.attach is None else offset + link.attach)
+    turning = matvec(r.rot, cross(deriv.ang_acc, offset))
+    coriolis = cross(ang_vel, cross(ang_vel, r.offset) - 2 * r.vel)
+    aside = dot(y, swing)
+    end = freq * aside if dt is not None else 2 * PULL * freq * aside
+    return pull, dot(y, rel_acc - turning + (1.0 if dt is None else 0.5) * coriolis) + end
+
+
+def _tip_rate(
+    s: SimState, deriv: SimStateDeriv, r: Relative, link: Link, vel: Array, tip_acc: Array, attach_acc: Array,
+    dt: float | None, freq: int,
+) -> Array:  # fmt: skip
+    """Return the rate of the tip's position, which removes errors in length, m/s. (3,)"""
+    stretch = r.distance - link.length
+    if link.is_cable and dt is not None:
+        stretch = jnp.maximum(stretch, 0.0)
+    elif link.is_cable:
+        stretch = jnp.where(stretch > -BAND * link.length, stretch, 0.0)
+    error = stretch * r.direction
+    if link.is_hinge:
+        error = error + dot(r.rot[..., 1], r.offset) * r.rot[..., 1]
+    if dt is None:
+        away = PULL * freq * error
+        return vel - (away if link.holds is None else jnp.where(link.holds, away, 0.0))
+    # ``deriv.vel`` moves the body; the tip moves with its new velocity relative to that.
+    away = dt * attach_acc + freq * error
+    if deriv.vel is not s.vel:
+        away = away - (deriv.vel - s.vel)
+        if link.attach is not None:
+            away = away - matvec(r.rot, cross(deriv.ang_vel - s.ang_vel, link.attach))
+    return vel + dt * tip_acc - (away if link.holds is None else jnp.where(link.holds, away, 0.0))
 
 
 def end_relative_motion(
@@ -238,14 +295,15 @@ def end_relative_motion(
         vel: Velocity of the tip, world frame, m/s. (3,)
     """
     r = relative(s, pos, vel, link.attach)
-    q, out = r.direction, dot(r.direction, r.vel)
-    lever = cross(link.attach, matvec(jnp.swapaxes(r.rot, -1, -2), q))
-    turn = matvec(J_inv, lever)
-    share = 1 / (1 + link.mass * (1 / mass + dot(turn, lever)))
-    change = out
+    out = dot(r.direction, r.vel)
+    pull = Pull.create(r.direction, r.rot, J_inv, link.attach)
+    change = out / (1 + link.mass * pull.response(pull, mass))
     if link.is_cable:
+        back = 1.0 if link.restitution is None else 1 + link.restitution
         taut = (r.distance > (1 - BAND) * link.length) & (out > 0)
-        change = jnp.where(taut, jnp.where(out > SLOW, 1 + link.restitution, 1.0) * out, 0.0)
-    change = jnp.where(link.holds, change * share, 0.0)
-    body = s.replace(vel=s.vel + link.mass / mass * change * q, ang_vel=s.ang_vel + link.mass * change * turn)
-    return body, vel - change * q
+        change = jnp.where(taut, jnp.where(out > SLOW, back, 1.0) * change, 0.0)
+    change = change if link.holds is None else jnp.where(link.holds, change, 0.0)
+    s = s.replace(vel=s.vel + link.mass / mass * change * pull.direction)
+    if pull.turn is not None:
+        s = s.replace(ang_vel=s.ang_vel + link.mass * change * pull.turn)
+    return s, vel - change * pull.direction

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
@@ -48,8 +49,8 @@ class SlungLoad(Plugin):
     """Viscous torque of the joint over its angular velocity, N m s. () or (n_worlds, n_drones)"""
     restitution: Any = parameter(default=0.0)
     """Ratio of the radial speeds after and before a cable becomes taut, 0 to 1. () or (n_worlds, n_drones)"""
-    drag: Any = parameter(default=None)
-    """Linear drag coefficient of the load, N s/m, through which wind and downwash act on it; None for no drag.
+    drag: Any = parameter(default=0.0)
+    """Linear drag coefficient of the load, N s/m, through which wind and downwash act on it.
     () or (n_worlds, n_drones)"""
     friction: Any = parameter(default=0.6)
     """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
@@ -85,7 +86,7 @@ class SlungLoad(Plugin):
 
     def stop_at_floor(self, data: SimData) -> SimData:
         """Stop the load at the floor; of one drone."""
-        return self.write(data, on_floor(self.read(data), data.core.freq))
+        return self.write(data, on_floor(self.read(data)))
 
     def become_taut(self, data: SimData) -> SimData:
         """Apply the impulse of a cable that is taut while the load moves outwards; of one drone."""
@@ -127,9 +128,7 @@ class SlungLoad(Plugin):
         return place_loads(data, self.name, load, load.pos, load.attached, CABLE_SEGMENTS if self.cable else 1)
 
     def _link(self, load: LoadData) -> Link:
-        return Link(
-            load.attach, load.length, load.mass, load.damping, load.restitution, load.attached, is_cable=self.cable
-        )
+        return Link(load.attach, load.length, load.mass, load.damping, load.restitution, load.attached, self.cable)
 
 
 def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float) -> LoadData:
@@ -138,8 +137,13 @@ def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float) 
     def check(name: str, core: tuple[int, ...] = (1,), **limits: Any) -> Array:
         return check_parameter(sim, name, getattr(plugin, name), core, **limits)
 
-    length, attach = check("length", positive=True), check("attach", (3,))
-    rest = check_parameter(sim, "size", clearance, low=0.0)
+    def optional(name: str, core: tuple[int, ...] = (1,), **limits: Any) -> Array | None:
+        """Return a setting, or None where it is zero everywhere: what is not there is not computed."""
+        value = check(name, core, **limits)
+        return value if np.any(np.asarray(value)) else None
+
+    length, attach = check("length", positive=True), optional("attach", (3,))
+    rest, drag = check_parameter(sim, "size", clearance, low=0.0), optional("drag", low=0.0)
     if plugin.in_scene:
         add_to_scene(
             sim, plugin.name, plugin.size, plugin.rgba, float(jnp.max(length)), sim.n_drones,
@@ -150,14 +154,14 @@ def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float) 
     return LoadData(
         pos=pos,
         vel=vel + jnp.zeros_like(states.vel),
-        air_vel=None if plugin.drag is None else zeros(sim, 3),
+        air_vel=None if drag is None else zeros(sim, 3),
         attached=jnp.ones(states.pos.shape[:2], bool),
         mass=check("mass", low=0.0),
         length=length,
         attach=attach,
-        damping=check("damping", low=0.0),
-        restitution=check("restitution", low=0.0, high=1.0) if is_cable else check_parameter(sim, "restitution", 0.0),
-        drag=check_parameter(sim, "drag", 0.0 if plugin.drag is None else plugin.drag, low=0.0),
+        damping=optional("damping", low=0.0),
+        restitution=optional("restitution", low=0.0, high=1.0) if is_cable else None,
+        drag=drag,
         friction=check("friction", low=0.0),
         clearance=rest,
     )
@@ -177,7 +181,8 @@ def place_loads(data: SimData, name: str, load: LoadData, tip: Array, holds: Arr
     r = relative(data.states, tip, load.vel, load.attach)
     offset = jnp.where(holds[..., None], r.offset, -load.length * r.rot[..., 2])
     up = jnp.where(load.attached[..., None], -r.direction, jnp.asarray([0.0, 0.0, 1.0], tip.dtype))
-    links = pieces(data.states.pos + r.arm, offset, load.length, n_pieces)
+    top = data.states.pos if r.arm is None else data.states.pos + r.arm
+    links = pieces(top, offset, load.length, n_pieces)
     return placed(data.objects, {name: (load.pos, turned_z(up)), f"{name}_link": links})  # type: ignore[arg-type]
 
 
