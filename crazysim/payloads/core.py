@@ -59,16 +59,23 @@ def air_and_gravity(data: SimData, load: LoadData, vel: Array) -> Array:
     return gravity + load.drag / (load.mass + load.drag / data.core.freq + TINY) * (air - vel)
 
 
-def on_floor(load: LoadData) -> LoadData:
-    """Return a load that does not fall through the floor; friction brakes it there, along x and y separately."""
-    height, climb = load.pos[..., 2:], load.vel[..., 2:]
-    lands = height <= load.clearance
-    brake = jnp.where(lands, load.friction * jnp.maximum(-climb, 0.0), 0.0)
-    level = load.vel[..., :2]
+def on_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> tuple[Array, Array]:
+    """Return position and velocity of a body that does not fall through the floor.
+
+    Friction brakes it there, along x and y separately.
+
+    Args:
+        pos: Position, world frame, m. (..., 3)
+        vel: Velocity, world frame, m/s. (..., 3)
+        clearance: Height of the body above the floor where it rests, m. (..., 1)
+        friction: Coulomb's coefficient, 1. (..., 1)
+    """
+    height, climb, level = pos[..., 2:], vel[..., 2:], vel[..., :2]
+    lands = height <= clearance
+    brake = jnp.where(lands, friction * jnp.maximum(-climb, 0.0), 0.0)
     level = level - jnp.maximum(jnp.minimum(level, brake), -brake)
-    vel = jnp.concatenate([level, jnp.where(lands, jnp.maximum(climb, 0.0), climb)], -1)
-    pos = jnp.concatenate([load.pos[..., :2], jnp.maximum(height, load.clearance)], -1)
-    return load.replace(pos=pos, vel=vel)
+    vel = jnp.concatenate([level, jnp.where(lands, jnp.maximum(climb, 0.0), climb)], axis=-1)
+    return jnp.concatenate([pos[..., :2], jnp.maximum(height, clearance)], axis=-1), vel
 
 
 def hanging(s: SimState, attach: Array | None, length: Array, clearance: Array, is_cable: bool) -> tuple[Array, Array]:
@@ -120,7 +127,9 @@ def load_vel(data: SimData, name: str = "load") -> Array:
 # Scene ------------------------------------------------------------------------------------------------------
 
 
-def add_to_scene(sim: Simulation, name: str, size: Any, rgba: Any, length: float, n_links: int, n_pieces: int) -> None:
+def add_to_scene(
+    sim: Simulation, name: str, size: Any, rgba: Any, length: float, n_loads: int, n_pieces: int
+) -> None:
     """Add the loads and links of a plugin to the scene, if they are not there yet.
 
     Args:
@@ -129,13 +138,12 @@ def add_to_scene(sim: Simulation, name: str, size: Any, rgba: Any, length: float
         size: Radius of a ball, or full lengths of a box, m.
         rgba: Colour of the loads.
         length: Length of a link, m.
-        n_links: Number of links in a world.
+        n_loads: Number of loads in a world; there is a link for each drone.
         n_pieces: Straight pieces of each.
     """
     objects = sim.data.objects
     if objects is not None and f"{name}:0" in objects.names:
         return
-    n_loads = n_links if rgba is None or np.ndim(rgba) < 2 else len(rgba)
     rgba = (0.85, 0.55, 0.2, 1.0) if rgba is None else rgba
     if np.ndim(size) == 0:
         sim.scene.add("sphere", name, count=n_loads, radius=float(size), rgba=rgba)
@@ -143,7 +151,7 @@ def add_to_scene(sim: Simulation, name: str, size: Any, rgba: Any, length: float
         sim.scene.add("box", name, count=n_loads, size=tuple(map(float, size)), rgba=rgba)
     piece = f"""<mujoco><worldbody><geom type="capsule" size="{LINK_RADIUS} {length / n_pieces / 2}"
       contype="0" conaffinity="0" rgba="0.15 0.15 0.15 1"/></worldbody></mujoco>"""
-    sim.scene.add(piece, f"{name}_link", count=n_links * n_pieces)
+    sim.scene.add(piece, f"{name}_link", count=sim.n_drones * n_pieces)
 
 
 def placed(objects: Objects, rows: dict[str, tuple[Array, Array]]) -> Objects:

@@ -64,7 +64,7 @@ class SlungLoad(Plugin):
 
     def record(self, sim: Simulation) -> LoadData:
         """Return loads at rest below their drones."""
-        return load_record(self, sim, self.cable, _rest_height(self.size))
+        return load_record(self, sim, self.cable, rest_height(self.size))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage of the floor, and for cables in schemes of higher order that of becoming taut."""
@@ -86,7 +86,9 @@ class SlungLoad(Plugin):
 
     def stop_at_floor(self, data: SimData) -> SimData:
         """Stop the load at the floor; of one drone."""
-        return self.write(data, on_floor(self.read(data)))
+        load = self.read(data)
+        pos, vel = on_floor(load.pos, load.vel, load.clearance, load.friction)
+        return self.write(data, load.replace(pos=pos, vel=vel))
 
     def become_taut(self, data: SimData) -> SimData:
         """Apply the impulse of a cable that is taut while the load moves outwards; of one drone."""
@@ -167,7 +169,9 @@ def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float) 
     )
 
 
-def place_loads(data: SimData, name: str, load: LoadData, tip: Array, holds: Array, n_pieces: int) -> Objects:
+def place_loads(
+    data: SimData, name: str, load: LoadData, tip: Array, holds: Array, n_pieces: int, ring: float = 0.0
+) -> Objects:
     """Return the scene's objects with loads and links at their poses; of one world.
 
     Args:
@@ -177,16 +181,18 @@ def place_loads(data: SimData, name: str, load: LoadData, tip: Array, holds: Arr
         tip: Ends of the links, world frame, m. (n_drones, 3)
         holds: True where something is attached to the end; other links hang along the body's z axis. (n_drones,)
         n_pieces: Straight pieces of a link.
+        ring: Height of the point by which a load hangs above its middle, m.
     """
     r = relative(data.states, tip, load.vel, load.attach)
     offset = jnp.where(holds[..., None], r.offset, -load.length * r.rot[..., 2])
     up = jnp.where(load.attached[..., None], -r.direction, jnp.asarray([0.0, 0.0, 1.0], tip.dtype))
     top = data.states.pos if r.arm is None else data.states.pos + r.arm
     links = pieces(top, offset, load.length, n_pieces)
-    return placed(data.objects, {name: (load.pos, turned_z(up)), f"{name}_link": links})  # type: ignore[arg-type]
+    rows = {name: (load.pos - ring * up, turned_z(up)), f"{name}_link": links}
+    return placed(data.objects, rows)  # type: ignore[arg-type]
 
 
-def _rest_height(size: Any) -> float:
+def rest_height(size: Any) -> float:
     """Return the height of the middle of a ball or box above the floor on which it stands, m.
 
     Raises:
