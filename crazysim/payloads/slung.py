@@ -198,7 +198,7 @@ def rest_height(size: Any) -> float:
     Raises:
         ConfigError: If the size is neither a radius nor three lengths.
     """
-    shape = jnp.shape(size)
-    if shape not in ((), (3,)) or not bool(jnp.all(jnp.asarray(size) > 0)):
+    shape = np.shape(size)
+    if shape not in ((), (3,)) or not np.all(np.asarray(size) > 0):
         raise ConfigError(f"expected size as a positive radius, or as three positive lengths of a box, m, got {size!r}")
     return float(size) if shape == () else float(size[2]) / 2
