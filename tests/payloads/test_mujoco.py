@@ -92,7 +92,7 @@ def of_crazysim(dof, attach, damping, start, ang_vel, law, integrator):
 CASES = {
     # degrees of freedom, joint, damping, initial angles, initial body rates, forces
     "swing": (2, (0, 0, 0), 0.0, (0.6, 0.3), (0, 0, 0), constant),
-    "swing, hinge": (1, (0, 0, 0), 0.001, (0.6, 0.0), (0.02, 0, 0.3), constant),
+    "swing, hinge": (1, (0, 0, 0), 0.001, (0.8, 0.0), (0.3, 0, 0.5), feedback),
     "hover": (2, (0.01, 0, -0.02), 0.001, (0.3, 0.2), (0, 0, 0.5), feedback),
     "hover, hinge": (1, (0.01, 0, -0.02), 0.001, (0.3, 0.0), (0, 0, 0.5), feedback),
 }
@@ -109,5 +109,5 @@ def test_five_seconds_as_in_mujoco(case, x64):
     error = np.linalg.norm(got - want, axis=-1).max(axis=0)
     swings = np.ptp(want[:, 1] - want[:, 0], axis=0).max()
     print(f"{case}: drone {error[0]:.1e} m, tip {error[1]:.1e} m; the tip swings over {swings:.2f} m")
-    assert swings > 0.2
+    assert swings > 0.15
     assert error.max() < WITHIN[case]
