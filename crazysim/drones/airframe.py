@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -68,9 +68,7 @@ class Airframe:
         """
         paths = dict(_values(self.tables))
         if path not in paths:
-            table, _, key = path.rpartition(".")
-            remedy = f"Add {key} to its table [{table}]; {GUIDE} lists all keys." if path in KEYS else None
-            raise ConfigError(f"airframe {self.name!r} has no value {path!r}. {remedy or suggestion(path, paths)}")
+            raise ConfigError(f"airframe {self.name!r} has no value {path!r}. {_remedy(path, paths)}")
         value = paths[path]
         if shape is not None and value.shape != shape:
             raise ConfigError(f"airframe {self.name!r}: expected {path} of shape {shape}, got {value.shape}")
@@ -200,6 +198,12 @@ def _values(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield from _values(item, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", item
+
+
+def _remedy(path: str, paths: Iterable[str]) -> str:
+    """Return the advice for a value that an airframe lacks: to add it if it exists, else the path that was meant."""
+    table, _, key = path.rpartition(".")
+    return f"Add {key} to its table [{table}]; {GUIDE} lists all keys." if path in KEYS else suggestion(path, paths)
 
 
 def _check(airframe: Airframe) -> None:
