@@ -189,6 +189,7 @@ def test_law_06_an_edit_compiles_once_and_an_undone_one_not_at_all(sim):
     append_fn(sim.step_pipeline, stage("drone")(counted), "counted")
     sim.step()
     step, n = sim.step_fn, len(traces)
+    assert n > 0
     for _ in range(10):
         sim.step()
     assert sim.step_fn is step
