@@ -156,7 +156,8 @@ class Planner(NamedTuple):
         return f"with a mesh every stage must be declared, and {undeclared[0]!r} is not" if undeclared else ""
 
     def _plain(self, data: SimData, why: str) -> Plan:
-        run, written = plain.build(self.stages, data, by_component=not self.location.spread)
+        on_cpu = self.location.platform == "cpu"
+        run, written = plain.build(self.stages, data, by_component=not self.location.spread, barriers=on_cpu)
         everything = tuple(range(len(jax.tree.leaves(data))))
         # XLA spreads the arrays of ``plain`` over devices by itself.
         return self._wrap("plain", why, data, None, everything, tuple(written), run, len(everything))
