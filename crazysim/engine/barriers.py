@@ -96,11 +96,9 @@ def _node(eqn: Any) -> _Node:
     row = TABLE.get(name)
     size = max(sum(v.aval.size for v in eqn.outvars), 1)
     joins = name in ("concatenate", "stack") or name.startswith("reduce_")
-    by_element = name in MOVES or name in NESTED or row is not None and not row.structured
+    by_element = name in MOVES or name in NESTED or (row is not None and not row.structured)
     operands = [
-        (v, 1.0 if by_element and not joins else v.aval.size / size)
-        for v in eqn.invars
-        if not isinstance(v, Literal)
+        (v, 1.0 if by_element and not joins else v.aval.size / size) for v in eqn.invars if not isinstance(v, Literal)
     ]
     cost = 0.0
     if name in NESTED:
@@ -136,9 +134,7 @@ def _evaluations(nodes: Sequence[_Node], asked: Sequence[Any], chosen: set[Any])
     return count
 
 
-def _evaluate(
-    jaxpr: ClosedJaxpr, args: Sequence[Any], chosen: set[Any], barrier: Callable[[Any], Any]
-) -> list[Any]:
+def _evaluate(jaxpr: ClosedJaxpr, args: Sequence[Any], chosen: set[Any], barrier: Callable[[Any], Any]) -> list[Any]:
     """Return the values of a jaxpr, with a barrier behind the chosen variables."""
     inner = jaxpr.jaxpr
     values: dict[Any, Any] = dict(zip(inner.constvars, jaxpr.consts, strict=True))

@@ -66,7 +66,9 @@ def test_xla_computes_the_angles_of_a_rotation_once():
 
 @pytest.mark.parametrize("transform", [lambda f: f, jax.jit, jax.vmap])
 def test_values_stay(transform):
-    fn = lambda x: {"quat": quaternion(jnp.atleast_2d(x)), "unit": x / rotation.safe_norm(x), "same": x}
+    def fn(x):
+        return {"quat": quaternion(jnp.atleast_2d(x)), "unit": x / rotation.safe_norm(x), "same": x}
+
     like = X[0] if transform is jax.vmap else X
     once = compute_once(fn, like, 1)
     for new, old in zip(*(jax.tree.leaves(transform(f)(X)) for f in (once, fn)), strict=True):

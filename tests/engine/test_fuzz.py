@@ -105,6 +105,9 @@ def zero_less(ctx, eqn, args):
         ("rev", lambda ctx, eqn, args: args, "jnp.flip(v0)"),
         ("max", minimum, "jnp.maximum(v0, 1.0)"),
         ("neg", zero_less, "-v0"),
+        ("cumprod", lambda ctx, eqn, args: args, "lax.cumprod(v0, 1)"),
+        ("lgamma", lambda ctx, eqn, args: [ctx.elementwise("digamma", args, np.float32)], "lax.lgamma(v0)"),
+        ("rem", lambda ctx, eqn, args: [ctx.elementwise("div", args, np.float32)], "lax.rem(v0, v0 + 1)"),
     ],
 )
 def test_a_wrong_rule_is_found(monkeypatch, name, wrong, line):
