@@ -133,7 +133,7 @@ class Sim(Commands, PluginMethods, SceneShell):
 
     def _new_queries(self) -> SceneQueries:
         kernels = self.mesh is None and self.engine in ("auto", "fused")
-        return SceneQueries(self._scene, self.device.platform if kernels else None)
+        return SceneQueries(self._scene, self.device.platform if kernels else None, self.configuration.strict)
 
     @property
     def data(self) -> SimData:

@@ -165,10 +165,13 @@ def _disturbed(fn: Any, values: list[np.ndarray], n_lanes: int) -> Any:
             return x
         unit = (rng.uniform(-1, 1, x.shape) * strength.reshape(-1, *[1] * (x.ndim - 1))).astype(np.float32)
         wide = x.astype(np.float32)
-        disturbed = (wide * (1 + float(jnp.finfo(x.dtype).eps) * unit) + absolute * unit).astype(x.dtype)
-        exact = np.asarray(wide)
-        denormal = (exact != 0) & (np.abs(exact) < TINY)  # arithmetic may take them for zero
-        return jnp.where(jnp.isfinite(disturbed) & ~denormal, disturbed, x)
+        disturbed = wide * (1 + float(jnp.finfo(x.dtype).eps) * unit)
+        disturbed = (disturbed + absolute * unit if absolute else disturbed).astype(x.dtype)  # keeps the sign of zero
+        exact = np.asarray(wide)  # XLA may take denormal numbers for zero, here too
+        denormal = (exact != 0) & (np.abs(exact) < TINY)
+        flushed = np.arange(SAMPLES).reshape(-1, *[1] * (x.ndim - 1)) % 2 == 1
+        kept = jnp.where(denormal & flushed, jnp.zeros_like(x), x)
+        return jnp.where(jnp.isfinite(disturbed) & ~denormal, disturbed, kept)
 
     def any_alternative(eqn: Any, args: list[Any], out: Any) -> Any:
         found = alternatives(eqn, args, out) if is_sampled(out) else None

@@ -31,6 +31,7 @@ def is_explained(fn, values, found, dtype=np.float32):
         pytest.param(lambda x: jnp.sum(x), [[3e38, 3e38, -3e38]], 3e38, None, id="a sum that overflows"),
         pytest.param(lax.rem, [3.0, DENORMAL], NAN, 1.0, id="remainder by a denormal number taken for zero"),
         pytest.param(lax.rem, [3.0, DENORMAL], 0.0, 1.0, id="remainder by a denormal number"),
+        pytest.param(lax.pow, [0.0, DENORMAL], 1.0, 2.5, id="power with a denormal exponent taken for zero"),
         pytest.param(lax.rem, [3.0, 2.0], 1.0, NAN, id="remainder by an ordinary number"),
         pytest.param(lax.div, [0.0, DENORMAL], NAN, None, id="division by a denormal number taken for zero"),
         pytest.param(lax.div, [0.0, DENORMAL], 0.0, None, id="division by a denormal number"),
@@ -40,6 +41,12 @@ def test_what_rounding_explains(fn, values, found, wrong):
     """``wrong`` is what it must not explain; None where any number can come out."""
     assert is_explained(fn, values, found)
     assert wrong is None or not is_explained(fn, values, wrong)
+
+
+def test_the_sign_of_zero_is_kept_where_it_is_defined():
+    values, found = [np.float32([-0.0])], np.float32([0.0])
+    assert explained(jnp.rint, values, -found, signed=True)[0]
+    assert not explained(jnp.rint, values, found, signed=True)[0]
 
 
 def test_zero_by_zero_is_any_integer_that_compilers_make_of_it():
