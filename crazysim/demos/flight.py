@@ -196,7 +196,7 @@ def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
     left.plot(setpoint[:, 0], setpoint[:, 1], "--", color="0.6", label="setpoint")
     for i in range(tracks.shape[1]):
         left.plot(tracks[:, i, 0], tracks[:, i, 1], color=COLORS[i % 4], label=f"drone {i}")
-    for place in np.asarray(sim.data.objects.pos[0]):
+    for place in np.asarray(sim.data.objects.pos[0, 0]):
         left.add_patch(plt.Circle(place[:2], POLE_RADIUS, color="0.2"))
     left.set(title="Tracks in world 0, seen from above", xlabel="x, m", ylabel="y, m", aspect="equal")
     left.legend(loc="upper right", fontsize=8)
