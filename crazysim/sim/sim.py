@@ -132,7 +132,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
 
     def _new_queries(self) -> SceneQueries:
         kernels = self.mesh is None and self.engine in ("auto", "fused")
-        return SceneQueries(self._scene, self.device.platform if kernels else None)
+        return SceneQueries(self._scene, self.device.platform if kernels else None, self.configuration.strict)
 
     @property
     def data(self) -> SimData:
