@@ -97,6 +97,7 @@ def test_uploads_are_flown_and_nothing_is_compiled_again():
     other = line([0.2, 0, 1], [0.2, 2, 1.5], duration=3.0).then(hover([0.2, 2, 1.5]))
     for slot in (1, 2, 3):
         plugin.upload(sim, slot, other)
+        plugin.assign(sim, index=np.array([[0, slot]] * N_WORLDS))
         sim.step(5)
     assert sim.step_fn.plan(sim.data) is plan
     assert _compiled(sim) == size
@@ -127,6 +128,18 @@ def test_resets_restore_slots_starts_and_indices():
     after = sim.data.plugins["follow"]
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_drones_are_given_other_starts_and_rates():
+    sim = build()
+    plugin = sim.add(Follow([EIGHT, UP], start=START))
+    plugin.assign(sim, start=2.0, rate=RATE)
+    record = sim.data.plugins["follow"]
+    np.testing.assert_allclose(record.start[..., 0], np.full((3, 2), 2.0))
+    np.testing.assert_allclose(record.rate[..., 0], RATE)
+    np.testing.assert_array_equal(record.index[..., 0], [[0, 1]] * 3)
+    with pytest.raises(ConfigError, match="index"):
+        plugin.assign(sim, index=2)
 
 
 def test_settings_change_without_compiling():
