@@ -1,4 +1,4 @@
-"""Controllers: pure functions for one drone, with any leading axes, and the protocol that ``Sim(controller=...)`` uses."""
+"""Controllers: pure functions for one drone, with any leading axes, and the protocol of ``Sim(controller=...)``."""
 
 from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
 from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque

@@ -28,8 +28,8 @@ def find_controller(controller: Any) -> Controller | None:
         return None if controller == CASCADE else controller
     if not isinstance(controller, str):
         raise ConfigError(
-            f"expected a controller as a name or a Controller, got {controller!r}. Use controller='pid', or an instance "
-            f"of a subclass of crazysim.control.Controller."
+            f"expected a controller as a name or a Controller, got {controller!r}. Use controller='pid', or an "
+            f"instance of a subclass of crazysim.control.Controller."
         )
     if controller not in CONTROLLERS:
         names = ", ".join(repr(name) for name in (CASCADE, *CONTROLLERS))

@@ -100,8 +100,8 @@ class StateControlData(PyTree):
     params: StateParams | None
     """Gains and constants; None with another controller."""
     feedforward: Array | None = leaf("drone", 1)
-    """Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, yaw acceleration, rad/s^2, of the setpoint in force; None in Crazyflow's
-    cascade. (n_worlds, n_drones, 8)"""
+    """Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, and yaw acceleration, rad/s^2, of the setpoint in force; None in
+    Crazyflow's cascade. (n_worlds, n_drones, 8)"""
     staged_feedforward: Array | None = leaf("drone", 1)
     """The same of the staged setpoint; None in Crazyflow's cascade. (n_worlds, n_drones, 8)"""
 

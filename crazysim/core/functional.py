@@ -123,7 +123,9 @@ def check_command(data: SimData, control: Control, command: Any, check_finite: b
             f"this simulation takes {data.controls.mode.value!r} commands, not {control.value!r}. "
             f"Call {data.controls.mode.value}_control, or build it with Sim(control={control.value!r})."
         )
-    return _as_command(data, control.value, command_shape(data, control), COMMAND_FIELDS[control], command, check_finite)
+    return _as_command(
+        data, control.value, command_shape(data, control), COMMAND_FIELDS[control], command, check_finite
+    )
 
 
 def _as_command(

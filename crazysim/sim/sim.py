@@ -113,7 +113,18 @@ class Sim(Commands, PluginMethods, SceneShell):
             Control.force_torque: force_torque_freq,
         }
         self.configuration = c = Configuration.create(
-            n_worlds, n_drones, drone, dynamics, control, integrator, freq, rates, device, mesh, engine, strict,
+            n_worlds,
+            n_drones,
+            drone,
+            dynamics,
+            control,
+            integrator,
+            freq,
+            rates,
+            device,
+            mesh,
+            engine,
+            strict,
             controller,
         )
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
@@ -130,9 +141,7 @@ class Sim(Commands, PluginMethods, SceneShell):
         self.build_data()
         self.build_default_data()
 
-        self.step_pipeline: Pipeline = build_step_pipeline(
-            self.control, self.dynamics, self.integrator, c.controller
-        )
+        self.step_pipeline: Pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
         self.reset_pipeline: Pipeline = {"reset": reset}
         self.build_step_fn()
         self.build_reset_fn()
