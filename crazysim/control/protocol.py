@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar, dataclass_transform
+from typing import Any, ClassVar, dataclass_transform
 
 from jax import Array
 
@@ -11,9 +11,6 @@ from crazysim.control.core import Control
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree
-
-if TYPE_CHECKING:  # data belong to a layer above
-    from crazysim.core.data import SimData
 
 OUTPUTS = (Control.force_torque, Control.rotor_vel)
 """Levels of the commands that controllers return."""
@@ -47,7 +44,7 @@ class Controller:
             raise TypeError(f"controller {cls.__name__} has no field 'freq'; add one, such as freq: int = 500")
         missing = [key for key in ("name", "levels", "output") if not hasattr(cls, key)]
         if missing:
-            raise TypeError(f"controller {cls.__name__} lacks the class variables {missing}")
+            raise TypeError(f"controller {cls.__name__} has no class variables {missing}; add them")
         if cls.output not in OUTPUTS:
             raise TypeError(f"controller {cls.__name__}: expected output as one of {OUTPUTS}, got {cls.output!r}")
 
@@ -63,22 +60,22 @@ class Controller:
         """Return the memory of one drone at rest, in a record of leaves of scope ``drone``, or None."""
         return None
 
-    def outer(self, data: SimData, command: Setpoint, memory: Any, params: Any) -> Any:
+    def outer(self, data: Any, command: Setpoint, memory: Any, params: Any) -> Any:
         """Return the memory after a tick of the outer loop.
 
         Args:
-            data: Data of one drone.
+            data: ``SimData`` of one drone.
             command: The setpoint.
             memory: Memory of the drone.
             params: Parameters of the drone.
         """
         raise NotImplementedError(f"controller {self.name!r} has an outer_freq, and does not define outer")
 
-    def update(self, data: SimData, command: Setpoint | Array, memory: Any, params: Any) -> tuple[Array, Any]:
+    def update(self, data: Any, command: Setpoint | Array, memory: Any, params: Any) -> tuple[Array, Any]:
         """Return the command of the level ``output``, and the memory after a tick.
 
         Args:
-            data: Data of one drone, with the command in force in ``data.controls``.
+            data: ``SimData`` of one drone, with the command in force in ``data.controls``.
             command: Setpoint at the level ``state``; otherwise the command of the level ``data.controls.mode``. (4,)
             memory: Memory of the drone.
             params: Parameters of the drone.
