@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -66,7 +68,9 @@ def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams)
     """
     p = params
     pwm = thrust + matvec(p.torque_allocation, torque)
-    excess = jnp.max(pwm, axis=-1, keepdims=True) - p.pwm_max
+    # The gradient of jnp.max divides by the number of equal elements, which is zero where XLA rounds a copy otherwise.
+    highest = functools.reduce(jnp.maximum, [pwm[..., i : i + 1] for i in range(pwm.shape[-1])])
+    excess = highest - p.pwm_max
     pwm = pwm - jnp.where(excess > 0, excess, 0.0)
     return jnp.where(thrust <= 0, 0.0, jnp.where(pwm < 0, 0.0, pwm))
 

@@ -58,9 +58,9 @@ def motors():
 
 
 def test_saturation_lowers_all_motors_and_keeps_the_torque(motors):
-    """60000 +- 10000 PWM about x: the excess of 4465 leaves all four, so the difference stays 10000."""
-    pwm = distribute(jnp.array([60000.0]), jnp.array([10000.0, 0, 0]), params=motors)
-    np.testing.assert_allclose(pwm, [50000 + 535, 50000 + 535, 60535 + 5000, 60535 + 5000], atol=0.02)
+    """60000 +- 10000 PWM: the excess of 4465 leaves all four, so the difference stays 20000."""
+    pwm = distribute(jnp.array([60000.0]), jnp.array([20000.0, 0, 0]), params=motors)
+    np.testing.assert_allclose(pwm, [45535, 45535, 65535, 65535], atol=0.02)
 
 
 @given(vectors(3, 60000.0), st.floats(1.0, 65535.0))
