@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +76,8 @@ class Sim(Commands, PluginMethods, SceneShell):
         mesh: Mesh | None = None,
         engine: str = "auto",
         strict: bool = False,
-        controller: str | Controller = CASCADE,
+        controller: str | Controller | Sequence[str | Controller] = CASCADE,
+        switch: Any = None,
     ):
         """Build the scene's spec, the data and both pipelines; MuJoCo allocates nothing per world.
 
@@ -100,8 +101,10 @@ class Sim(Commands, PluginMethods, SceneShell):
                 can run the step pipeline here. ``explain`` says which that is.
             strict: True to raise an error where a slower engine would be taken with an ``EngineWarning``.
             controller: Controller that follows the commands: a name of ``crazysim.control.controllers.CONTROLLERS``, a
-                ``crazysim.control.Controller``, or ``"crazyflow"`` for the cascade of Crazyflow. The rates above
-                replace its own.
+                ``crazysim.control.Controller``, or ``"crazyflow"`` for the cascade of Crazyflow; or a list of several.
+                The rates above replace its own.
+            switch: Chooses among several controllers: a function ``(state, setpoint, time) -> index`` of one drone, or
+                indices, () or (n_worlds, n_drones).
 
         Raises:
             ValueError: If an argument is invalid, with what was expected.
@@ -126,6 +129,7 @@ class Sim(Commands, PluginMethods, SceneShell):
             engine,
             strict,
             controller,
+            switch,
         )
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
         self.dynamics, self.control, self.integrator = c.dynamics, c.control, c.integrator
