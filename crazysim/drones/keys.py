@@ -20,6 +20,7 @@ _RESPONSE: dict[str, Shapes] = {
     "rpy_rates_coef": _VECTOR,
     "cmd_rpy_coef": _VECTOR,
 }
+_PID: dict[str, Shapes] = {"kp": _VECTOR, "ki": _VECTOR, "kd": _VECTOR}
 
 TABLES: dict[str, dict[str, Shapes]] = {
     "rigid_body": {"mass": _NUMBER, "inertia": ((3,), (3, 3))},
@@ -55,6 +56,25 @@ TABLES: dict[str, dict[str, Shapes]] = {
         "kd_omega": _VECTOR,
         "int_err_max": _VECTOR,
     },
+    "mellinger": {
+        "mass": _NUMBER,
+        "mass_thrust": _NUMBER,
+        "kp": _VECTOR,
+        "kd": _VECTOR,
+        "ki": _VECTOR,
+        "integral_max": _VECTOR,
+        "kR": _VECTOR,
+        "kw": _VECTOR,
+        "ki_m": _VECTOR,
+        "kd_omega": _VECTOR,
+        "integral_m_max": _VECTOR,
+        "torque_max": _VECTOR,
+    },
+    "pid": {"tilt_max": ((2,),), "thrust_base": _NUMBER, "thrust_min": _NUMBER},
+    "pid.position": _PID | {"output_max": _VECTOR, "cutoff": _NUMBER},
+    "pid.velocity": _PID | {"output_max": _VECTOR, "cutoff": _NUMBER},
+    "pid.attitude": _PID | {"integral_max": _VECTOR},
+    "pid.rate": _PID | {"integral_max": _VECTOR},
     "shape": {
         "plate": _VECTOR,
         "battery": _VECTOR,

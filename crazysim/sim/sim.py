@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.sharding import Mesh
 
-from crazysim.control import Control
+from crazysim.control import Control, Controller
+from crazysim.control.controllers import CASCADE
 from crazysim.core import functional as F
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
@@ -74,6 +75,8 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         mesh: Mesh | None = None,
         engine: str = "auto",
         strict: bool = False,
+        controller: str | Controller | Sequence[str | Controller] = CASCADE,
+        switch: Any = None,
     ):
         """Build the scene's spec, the data and both pipelines; MuJoCo allocates nothing per world.
 
@@ -96,6 +99,11 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
             engine: Engine that executes steps, one of ``crazysim.engine.ENGINES``; ``"auto"`` takes the fastest that
                 can run the step pipeline here. ``explain`` says which that is.
             strict: True to raise an error where a slower engine would be taken with an ``EngineWarning``.
+            controller: Controller that follows the commands: a name of ``crazysim.control.controllers.CONTROLLERS``, a
+                ``crazysim.control.Controller``, or ``"crazyflow"`` for the cascade of Crazyflow; or a list of several.
+                The rates above replace its own.
+            switch: Chooses among several controllers: a function ``(state, setpoint, time) -> index`` of one drone, or
+                indices, () or (n_worlds, n_drones).
 
         Raises:
             ValueError: If an argument is invalid, with what was expected.
@@ -107,7 +115,20 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
             Control.force_torque: force_torque_freq,
         }
         self.configuration = c = Configuration.create(
-            n_worlds, n_drones, drone, dynamics, control, integrator, freq, rates, device, mesh, engine, strict
+            n_worlds,
+            n_drones,
+            drone,
+            dynamics,
+            control,
+            integrator,
+            freq,
+            rates,
+            device,
+            mesh,
+            engine,
+            strict,
+            controller,
+            switch,
         )
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
         self.dynamics, self.control, self.integrator = c.dynamics, c.control, c.integrator
@@ -123,7 +144,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self.build_data()
         self.build_default_data()
 
-        self.step_pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator)
+        self.step_pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
         self.reset_pipeline = {"reset": reset}
         self.build_step_fn()
         self.build_reset_fn()
@@ -194,6 +215,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
             dict(self.configuration.control_freqs),
             self._scene.drone_mocap_ids,
             self._seed,
+            self.configuration.controller,
         )
         self.data = data.replace(objects=self._scene.objects(None))
         self.plugins.build_records()
