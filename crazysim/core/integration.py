@@ -11,6 +11,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimStateDeriv
+from crazysim.core.influence import constrained, influenced, own_rates
 from crazysim.core.plugin import Plugin
 from crazysim.core.stage import Stage, over_drones
 
@@ -136,9 +137,9 @@ class Integration:
     def derivative(self, data: SimData) -> SimStateDeriv:
         """Return the derivative of the drones' states under all influences, and of the plugins' own states."""
         if self.couples_world:
-            influenced, deriv = data, over_drones(lambda one: self._free(one)[1])(data)
+            seen, deriv = data, over_drones(lambda one: self._free(one)[1])(data)
         else:
-            influenced, deriv = self._free(data)
+            seen, deriv = self._free(data)
         constraining = [plugin for plugin in self.plugins if plugin.constrains]
         if not constraining:
             return deriv
@@ -146,14 +147,14 @@ class Integration:
         if self.method is symplectic_euler:
             vel, ang_vel = deriv.vel + dt * deriv.acc, deriv.ang_vel + dt * deriv.ang_acc
             deriv = deriv.replace(vel=vel, ang_vel=ang_vel)
-        return constraining[0].constrain(influenced, deriv, dt)
+        return constrained(constraining[0], seen, deriv, dt)
 
     def _free(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
         """Return the data under all influences, and the derivative without constraints."""
         for plugin in self.plugins:
-            data = plugin.influence(data)
+            data = influenced(plugin, data)
         deriv = self.deriv_fn(data)
-        own = {plugin.name: rates for plugin in self.plugins if (rates := dict(plugin.derivative(data)))}
+        own = {plugin.name: rates for plugin in self.plugins if (rates := own_rates(plugin, data))}
         return data, deriv.replace(plugins=own) if own else deriv
 
     def stage(self) -> Stage:
