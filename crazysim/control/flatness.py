@@ -16,6 +16,9 @@ HORIZONTAL = 0.05
 Below 3 degrees the heading does not determine the attitude, and the rate that holds it grows without bound.
 """
 
+NO_THRUST = 1e-3
+"""Thrust over mass below which its direction counts as undefined, m/s^2: a ten-thousandth of hover."""
+
 
 class Attitude(NamedTuple):
     """Attitude with its first two derivatives."""
@@ -44,22 +47,22 @@ def attitude_of_thrust(
 
         w_z x.c = w_x z.c + yaw' y.l
 
-    A thrust of zero counts as one along z. Where thrust and heading are parallel, y is the horizontal ``l``, and the
+    A thrust below ``NO_THRUST`` counts as one along z that does not change. Where thrust and heading are parallel, y is the horizontal ``l``, and the
     rate about z is limited (``HORIZONTAL``).
 
     Args:
-        thrust: Thrust vector in any unit, such as the specific force, world frame, m/s^2. (..., 3)
-        thrust_rate: Its derivative, per s. (..., 3)
-        thrust_acc: Its second derivative, per s^2. (..., 3)
+        thrust: Thrust vector over the mass, world frame, m/s^2. (..., 3)
+        thrust_rate: Its derivative, m/s^3. (..., 3)
+        thrust_acc: Its second derivative, m/s^4. (..., 3)
         yaw: Heading, rad. (..., 1)
         yaw_rate: Its derivative, rad/s. (..., 1)
         yaw_acc: Its second derivative, rad/s^2. (..., 1)
     """
     cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
     ahead, left = jnp.concatenate([cos, sin, zero], axis=-1), jnp.concatenate([-sin, cos, zero], axis=-1)
-    size = rotation.safe_norm(thrust)
-    inverse = jnp.where(size == 0, 0.0, 1 / jnp.where(size == 0, 1.0, size))
-    z = rotation.safe_normalize(thrust, jnp.asarray([0.0, 0.0, 1.0], thrust.dtype))
+    falls = dot(thrust, thrust) < NO_THRUST**2
+    inverse = jnp.where(falls, 0.0, 1 / rotation.safe_norm(jnp.where(falls, 1.0, thrust)))
+    z = jnp.where(falls, jnp.asarray([0.0, 0.0, 1.0], thrust.dtype), thrust * inverse)
     across = cross(z, ahead)
     y = jnp.where(dot(across, across) < 1e-10, left, rotation.safe_normalize(across, left))
     x = rotation.safe_normalize(cross(y, z), ahead)  # exactly one unless thrust and heading are parallel

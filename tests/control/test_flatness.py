@@ -65,7 +65,9 @@ def test_level_and_turning_by_hand():
     np.testing.assert_allclose(now.ang_acc, [0.5, 0, 0.25], atol=1e-12)
 
 
-@pytest.mark.parametrize("thrust", [[0, 0, 0], [9.81, 0, 0], [-9.81, 0, 0], [0, 0, -9.81], [0, 9.81, 0], [1e-20, 0, 0]])
+@pytest.mark.parametrize(
+    "thrust", [[0, 0, 0], [9.81, 0, 0], [-9.81, 0, 0], [0, 0, -9.81], [0, 9.81, 0], [1e-20, 0, 0], [0, 1e-3, 0]]
+)
 def test_singular_directions_give_rotations_and_finite_gradients(thrust):
     thrust, other, one = np.array(thrust, float), np.array([1.0, 2.0, 3.0]), np.ones(1)
     now = attitude(thrust, other, other, np.zeros(1), one, one)
