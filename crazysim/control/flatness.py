@@ -42,7 +42,7 @@ def attitude_of_thrust(
     """Return the attitude whose z axis is along a thrust vector and whose x axis is closest to a heading.
 
     With the thrust ``f``, the heading ``c = (cos yaw, sin yaw, 0)`` and ``l = e_z x c``, the axes are ``z = f / |f|``,
-    ``y = z x c / |z x c|`` and ``x = y x z`` (Mellinger and Kumar 2011, eq. 4 to 6). The rates follow from two
+    ``y = z x c / |z x c|`` and ``x = y x z`` (Mellinger and Kumar 2011). The rates follow from two
     conditions, differentiated once and twice: ``z' = w_y x - w_x y``, and ``y . c = 0``:
 
         w_z x.c = w_x z.c + yaw' y.l
