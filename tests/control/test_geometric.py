@@ -203,7 +203,7 @@ def test_it_recovers_from_upside_down():
     sim = simulation("cf21B_500")
     start_at(sim, hover)
     s = sim.data.states
-    upside_down = np.broadcast_to([np.sqrt(1 - 0.01), 0.1, 0, 0], s.quat.shape)
+    upside_down = np.broadcast_to([np.sqrt(0.99), 0, 0, 0.1], s.quat.shape)
     high = np.broadcast_to([0, 0, 20.0], s.pos.shape)
     sim.data = sim.data.replace(states=s.replace(quat=upside_down.astype("f4"), pos=high.astype("f4")))
     states, _, _, _ = fly(sim, law("cf21B_500"), lambda t: hover(t) + np.array([0, 0, 19.0, 0]), 12.0)
