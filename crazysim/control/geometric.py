@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,15 +11,20 @@ from jax import Array
 from crazysim import rotation
 from crazysim.control.allocation import AllocationParams
 from crazysim.control.bandwidth import bandwidth
+from crazysim.control.core import Control
 from crazysim.control.flatness import Attitude, attitude_of_thrust
 from crazysim.control.priority import prioritized_wrench
+from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
+if TYPE_CHECKING:  # data belong to a layer above
+    from crazysim.core.data import SimData
+
 Gains = Literal["bandwidth", "airframe"]
-"""Rule for the gains: by bandwidth, or from the airframe's table ``[controller.geometric]``."""
+"""Rule for the gains: by bandwidth, or from the airframe's table ``[geometric]``."""
 
 
 class GeometricParams(PyTree):
@@ -52,7 +57,7 @@ class GeometricParams(PyTree):
             airframe: The airframe.
             freq: Rate of the controller, Hz.
             gains: ``"bandwidth"``: by the rule of ``crazysim.control.bandwidth``, times mass and inertia.
-                ``"airframe"``: the table ``[controller.geometric]`` of the airframe, in the lab's airframes the gains
+                ``"airframe"``: the table ``[geometric]`` of the airframe, in the lab's airframes the gains
                 of AIMotionLab.
 
         Raises:
@@ -60,7 +65,7 @@ class GeometricParams(PyTree):
         """
         mass, drag = airframe.value("rigid_body.mass", ()), airframe.value("drag.coefficients")
         if gains == "airframe":
-            table = {key: airframe.value(f"controller.geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
+            table = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
         else:
             rates, moments = bandwidth(airframe, freq), np.diag(airframe.inertia)
             table = {
@@ -173,3 +178,27 @@ def attitude_errors(matrix: Array, ang_vel: Array, desired: Attitude) -> tuple[A
     rate = matvec(to_body, matvec(desired.matrix, desired.ang_vel))
     acc = matvec(to_body, matvec(desired.matrix, desired.ang_acc))
     return rotation_error, ang_vel - rate, acc - cross(ang_vel, rate)
+
+
+class Geometric(Controller):
+    """Geometric tracking control (``geometric_control``) of setpoints."""
+
+    name: ClassVar[str] = "geometric"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state,)
+    output: ClassVar[Control] = Control.force_torque
+    freq: int = 500
+    """Rate, Hz."""
+    gains: Gains = "bandwidth"
+    """Rule for the gains, as for ``GeometricParams.create``."""
+    feedforward: bool = True
+    """False for the law of AIMotionLab-Virtual, without feed-forward."""
+
+    def params(self, airframe: Airframe) -> GeometricParams:
+        """Return gains and constants for an airframe."""
+        return GeometricParams.create(airframe, self.freq, self.gains)
+
+    def update(self, data: SimData, command: Any, memory: Any, params: GeometricParams) -> tuple[Array, Any]:
+        """Return the wrench."""
+        s = data.states
+        state = (s.pos, s.quat, s.vel, s.ang_vel)
+        return geometric_control(*state, command, params=params, feedforward=self.feedforward), memory

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.sharding import Mesh
 
-from crazysim.control import Control
+from crazysim.control import Control, Controller
+from crazysim.control.controllers import CASCADE
 from crazysim.core import functional as F
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
@@ -75,6 +76,7 @@ class Sim(Commands, PluginMethods, SceneShell):
         mesh: Mesh | None = None,
         engine: str = "auto",
         strict: bool = False,
+        controller: str | Controller = CASCADE,
     ):
         """Build the scene's spec, the data and both pipelines; MuJoCo allocates nothing per world.
 
@@ -97,6 +99,9 @@ class Sim(Commands, PluginMethods, SceneShell):
             engine: Engine that executes steps, one of ``crazysim.engine.ENGINES``; ``"auto"`` takes the fastest that
                 can run the step pipeline here. ``explain`` says which that is.
             strict: True to raise an error where a slower engine would be taken with an ``EngineWarning``.
+            controller: Controller that follows the commands: a name of ``crazysim.control.controllers.CONTROLLERS``, a
+                ``crazysim.control.Controller``, or ``"crazyflow"`` for the cascade of Crazyflow. The rates above
+                replace its own.
 
         Raises:
             ValueError: If an argument is invalid, with what was expected.
@@ -108,7 +113,19 @@ class Sim(Commands, PluginMethods, SceneShell):
             Control.force_torque: force_torque_freq,
         }
         self.configuration = c = Configuration.create(
-            n_worlds, n_drones, drone, dynamics, control, integrator, freq, rates, device, mesh, engine, strict
+            n_worlds,
+            n_drones,
+            drone,
+            dynamics,
+            control,
+            integrator,
+            freq,
+            rates,
+            device,
+            mesh,
+            engine,
+            strict,
+            controller,
         )
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
         self.dynamics, self.control, self.integrator = c.dynamics, c.control, c.integrator
@@ -124,7 +141,7 @@ class Sim(Commands, PluginMethods, SceneShell):
         self.build_data()
         self.build_default_data()
 
-        self.step_pipeline: Pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator)
+        self.step_pipeline: Pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
         self.reset_pipeline: Pipeline = {"reset": reset}
         self.build_step_fn()
         self.build_reset_fn()
@@ -195,6 +212,7 @@ class Sim(Commands, PluginMethods, SceneShell):
             dict(self.configuration.control_freqs),
             self._scene.drone_mocap_ids,
             self._seed,
+            self.configuration.controller,
         )
         self.data = data.replace(objects=self._scene.objects(None))
         self.plugins.build_records()
