@@ -11,6 +11,7 @@ from crazysim.errors import ConfigError, UnknownNameError
 CASCADE = "crazyflow"
 """Name of Crazyflow's cascade, which is made of stages of its own and follows every command level."""
 CONTROLLERS = {
+    "geometric": "crazysim.control.geometric:Geometric",
     "pid": "crazysim.control.pid:PID",
     "mellinger": "crazysim.control.mellinger:Mellinger",
 }
