@@ -53,12 +53,17 @@ def rotor_rate(airframe: Airframe) -> float:
     return float(np.min([lag[:, 0] + 2 * lag[:, 1] * hover, lag[:, 2] + 2 * lag[:, 3] * hover]))
 
 
-def bandwidth(airframe: Airframe, freq: int) -> Bandwidth:
+def bandwidth(airframe: Airframe, freq: int, rate: float | None = None) -> Bandwidth:
     """Return the rates of the loops of an airframe under a controller that runs at ``freq`` Hz.
+
+    Args:
+        airframe: The airframe.
+        freq: Rate of the controller, Hz.
+        rate: Rate of the lag of the rotors, 1/s; None for ``rotor_rate``.
 
     Raises:
         ConfigError: If the airframe has no rotor constants.
     """
-    rate = 1 / (1 / rotor_rate(airframe) + 1.5 / freq)
+    rate = 1 / (1 / (rotor_rate(airframe) if rate is None else rate) + 1.5 / freq)
     axes = rate * np.array([1.0, 1.0, YAW])
     return Bandwidth(POSITION * rate, ATTITUDE_STIFFNESS * axes**2, axes)

@@ -113,7 +113,8 @@ def on_host(gain: Any, *args: Any) -> np.ndarray:
         ConfigError: If the Riccati equation has no stabilising solution.
     """
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
-        return check_gain(np.asarray(jax.jit(gain)(*(np.asarray(x, np.float64) for x in args))))
+        args = jax.tree.map(lambda x: np.asarray(x, np.float64), args, is_leaf=lambda x: isinstance(x, list))
+        return check_gain(np.asarray(jax.jit(gain)(*args)))
 
 
 def hover_gain(mass: Array, J: Array, Q: Array, R: Array) -> Array:

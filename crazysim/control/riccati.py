@@ -70,7 +70,7 @@ def solve_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
     P = _doubled(eye + 2 * shift * V, 2 * shift * inverse @ G @ W, 2 * shift * W @ Q @ inverse)
     for _ in range(REFINEMENTS):
         closed = A - G @ P
-        P = _lyapunov(closed, Q + P @ G @ P)
+        P = solve_lyapunov(closed, Q + P @ G @ P)
     return P
 
 
@@ -90,7 +90,7 @@ def _doubled(A: Array, G: Array, H: Array) -> Array:
     return jnp.where(converged, H, jnp.nan)
 
 
-def _lyapunov(A: Array, Q: Array) -> Array:
+def solve_lyapunov(A: Array, Q: Array) -> Array:
     """Return X with ``A^T X + X A + Q = 0`` for a stable A, by Cayley transform and doubling."""
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
     shift = jnp.linalg.norm(A) / jnp.sqrt(A.shape[0])
