@@ -161,7 +161,7 @@ def gain_at(time: Array, gains: Array, dt: Array) -> Array:
     """Return the gain at a time, s, interpolated linearly between knots ``dt`` apart and held at the ends. (4, 12)"""
     last = gains.shape[-3] - 1
     place = rotation.safe_clip(time / dt, 0.0, float(last))
-    below = jnp.minimum(jnp.floor(place).astype(jnp.int32), last - 1)
+    gains, below = jnp.asarray(gains), jnp.minimum(jnp.floor(place).astype(jnp.int32), last - 1)
     share = place - below
     return (1 - share) * gains[below] + share * gains[below + 1]
 
