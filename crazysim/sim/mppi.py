@@ -163,8 +163,8 @@ class MPPI:
             "mppi_cost": Stage(self._cost_stage, "drone", self._control_tick),
         }
         self._step = Step(pipeline, c.engine, c.device.platform, device=c.device)
-        self._memory = self.init(sim.n_worlds, sim.n_drones)
-        self._zeros: Any = None
+        self._device = c.device
+        self._memory = jax.device_put(self.init(sim.n_worlds, sim.n_drones), c.device)
         self._jitted = jax.jit(self.plan)
 
     def init(self, n_worlds: int, n_drones: int) -> MPPIMemory:
@@ -174,7 +174,7 @@ class MPPI:
 
     def reset(self) -> None:
         """Forget the plans of ``command``."""
-        self._memory = self.init(*self._memory.plan.shape[:2])
+        self._memory = jax.device_put(self.init(*self._memory.plan.shape[:2]), self._device)
 
     def command(self, data: SimData, setpoint: Setpoint) -> Array:
         """Return the command of every drone, and keep the plan for the next call; one compiled call.
