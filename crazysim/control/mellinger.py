@@ -10,7 +10,13 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.core import Control
-from crazysim.control.power_distribution import PowerDistributionParams, distribute, pwm_of_thrust, rotor_vel_of_pwm
+from crazysim.control.power_distribution import (
+    PowerDistributionParams,
+    command_of_rotor_vel,
+    distribute,
+    pwm_of_thrust,
+    rotor_vel_of_pwm,
+)
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
@@ -172,22 +178,64 @@ class Mellinger(Controller):
         self, data: Any, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
     ) -> tuple[Array, MellingerMemory]:
         """Return the rotor speeds, rpm, and the memory. (n_rotors,)"""
-        s, p = data.states, params
-        axes = rotation.matrix(s.quat)
-        if isinstance(command, Setpoint):
-            force, integral = desired_force(s.pos, s.vel, command, memory.integral, self.freq, params=p)
-            memory = memory.replace(integral=integral)
-            axes_des, ang_vel_des = axes_of_force(force, command.yaw), data.controls.state.cmd[13:16]
-            thrust = p.mass_thrust * dot(force, axes[:, 2])
-        else:
-            axes_des, ang_vel_des = rotation.matrix(rotation.from_rpy(command[:3])), jnp.zeros_like(s.ang_vel)
-            thrust = pwm_of_thrust(command[3:], params=p.motors)
-        torque, memory = torque_of_rotation(axes, axes_des, s.ang_vel, ang_vel_des, memory, self.freq, params=p)
+        p = params
+        thrust, torque, memory, _ = self._command(data, command, memory, p)
         off = thrust <= 0
         memory = memory.replace(
             integral=jnp.where(off, 0.0, memory.integral), integral_m=jnp.where(off, 0.0, memory.integral_m)
         )
         return rotor_vel_of_pwm(distribute(thrust, torque, params=p.motors), params=p.motors), memory
+
+    def take_over(
+        self,
+        data: Any,
+        command: Setpoint | Array,
+        memory: MellingerMemory,
+        params: MellingerParams,
+        rotor_vel: Array,
+    ) -> MellingerMemory:
+        """Return a memory with integrals that continue the present force and torque as far as their limits allow."""
+        p, s = params, data.states
+        rates = _desired_rates(data, command)
+        zero = jnp.zeros_like(s.ang_vel)
+        rest = MellingerMemory(zero, zero, s.ang_vel, rates)
+        thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
+        _, _, _, force = self._command(data, command, rest, p)
+        wanted = thrust / p.mass_thrust * rotation.z_axis(s.quat)
+        integral = safe_clip(_over(wanted - force, p.ki), -p.integral_max, p.integral_max)
+        integral = integral if isinstance(command, Setpoint) else zero
+        rest = rest.replace(integral=integral)
+        _, out, _, _ = self._command(data, command, rest, p)
+        return rest.replace(integral_m=safe_clip(_over(torque - out, p.ki_m), -p.integral_m_max, p.integral_m_max))
+
+    def _command(
+        self, data: Any, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
+    ) -> tuple[Array, Array, MellingerMemory, Array]:
+        """Return thrust and torque, PWM, the memory, and the desired force, N, which is zero without a setpoint."""
+        s, p, force = data.states, params, jnp.zeros_like(data.states.pos)
+        axes = rotation.matrix(s.quat)
+        if isinstance(command, Setpoint):
+            force, integral = desired_force(s.pos, s.vel, command, memory.integral, self.freq, params=p)
+            memory = memory.replace(integral=integral)
+            axes_des, thrust = axes_of_force(force, command.yaw), p.mass_thrust * dot(force, axes[:, 2])
+        else:
+            axes_des = rotation.matrix(rotation.from_rpy(command[:3]))
+            thrust = pwm_of_thrust(command[3:], params=p.motors)
+        rates = _desired_rates(data, command)
+        torque, memory = torque_of_rotation(axes, axes_des, s.ang_vel, rates, memory, self.freq, params=p)
+        return thrust, torque, memory, force
+
+
+def _desired_rates(data: Any, command: Setpoint | Array) -> Array:
+    """Return the desired body rates, rad/s: those of a full-state setpoint, otherwise zero. (3,)"""
+    if isinstance(command, Setpoint):
+        return data.controls.state.cmd[13:16]
+    return jnp.zeros_like(data.states.ang_vel)
+
+
+def _over(x: Array, gain: Array) -> Array:
+    """Return ``x / gain``, and zero where the gain is zero. (...)"""
+    return jnp.where(gain == 0, 0.0, x / jnp.where(gain == 0, 1.0, gain))
 
 
 def axes_of_force(force: Array, yaw: Array) -> Array:

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.control.core import Control
-from crazysim.control.pid_loop import Loop, LoopMemory, pid_step
-from crazysim.control.power_distribution import PowerDistributionParams, distribute, pwm_of_thrust, rotor_vel_of_pwm
+from crazysim.control.pid_loop import Loop, LoopMemory, continued, pid_step
+from crazysim.control.power_distribution import (
+    PowerDistributionParams,
+    command_of_rotor_vel,
+    distribute,
+    pwm_of_thrust,
+    rotor_vel_of_pwm,
+)
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
@@ -222,6 +229,36 @@ class PID(Controller):
             attitude=attitude, rate=rate, rpy_des=rpy_des, thrust=thrust, started=jnp.ones_like(memory.started)
         )
         return rotor_vel, _reset_at_zero_thrust(after, rpy, data.states.pos)
+
+    def take_over(
+        self, data: Any, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rotor_vel: Array
+    ) -> PIDMemory:
+        """Return a memory with integrals that continue the present thrust, roll, pitch and torque.
+
+        At the level ``state`` the integrals of the velocity loop take up the difference of thrust, roll and pitch, and
+        those of the rate loop at every level the difference of torque.
+        """
+        s, p, rest = data.states, params, jax.tree.map(jnp.zeros_like, memory)
+        rpy, ang_vel = DEGREES * rotation.to_rpy(s.quat), DEGREES * s.ang_vel
+        thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
+        if isinstance(command, Setpoint):
+            heading = heading_of(s.quat)
+            position = rest.position.started_at(along_heading(heading, s.pos), rest.started)
+            vel_des, _ = velocity_of_position(s.pos, heading, command.pos, position, self.outer_freq, loop=p.position)
+            measured = along_heading(heading, s.vel)
+            velocity = rest.velocity.started_at(measured, rest.started)
+            out, _ = pid_step(vel_des - measured, measured, velocity, self.outer_freq, loop=p.velocity)
+            lift = (thrust - p.thrust_base) / THRUST_SCALE
+            wanted = jnp.stack([rpy[1], -rpy[0], lift[0]])
+            velocity = continued(velocity, out, wanted, loop=p.velocity)
+            rest = rest.replace(position=position, velocity=velocity)
+        rest = rest.replace(
+            attitude=rest.attitude.started_at(rpy, rest.started), rate=rest.rate.started_at(ang_vel, rest.started)
+        )
+        started = rest.replace(rpy_des=rpy, thrust=thrust, started=jnp.ones_like(rest.started))
+        _, _, ang_vel_des = self._desired_rates(data, command, started, p, rpy)
+        out, _ = torque_of_rates(ang_vel, ang_vel_des, started.rate, self.freq, loop=p.rate)
+        return started.replace(rate=continued(started.rate, out, torque, loop=p.rate))
 
     def _desired_rates(
         self, data: Any, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rpy: Array

@@ -140,6 +140,21 @@ def pid_step(
     return (out if loop.output_max is None else safe_clip(out, -loop.output_max, loop.output_max)), memory
 
 
+def continued(memory: LoopMemory, out: Array, wanted: Array, *, loop: Loop) -> LoopMemory:
+    """Return the memory with integrals that turn the outputs of a tick into wanted ones, within their limits.
+
+    Args:
+        memory: Memory of the loops.
+        out: Outputs with this memory. (3,)
+        wanted: Wanted outputs. (3,)
+        loop: Gains and limits.
+    """
+    if loop.ki is None:
+        return memory
+    missing = jnp.where(loop.ki == 0, 0.0, (wanted - out) / jnp.where(loop.ki == 0, 1.0, loop.ki))
+    return memory.replace(integral=safe_clip(memory.integral + missing, -loop.integral_max, loop.integral_max))
+
+
 def low_pass(cutoff: float, freq: float) -> list[float]:
     """Return the coefficients b0, a1, a2 of a Butterworth low-pass filter of second order.
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim.control.core import allocation_matrix
 from crazysim.drones import Airframe
-from crazysim.dynamics.rotor import rotor_vel_of_thrust
+from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import matvec, safe_clip
 
@@ -23,6 +26,8 @@ class PowerDistributionParams(PyTree):
     """Thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
     torque_allocation: Array = leaf("parameter", 2)
     """Torque commands to PWM of each rotor, with the firmware's factor 1/2 for roll and pitch, 1. (n_rotors, 3)"""
+    torque_of_pwm: Array = leaf("parameter", 2)
+    """Inverse of the allocation, PWM of each rotor to torque commands, 1. (3, n_rotors)"""
 
     @staticmethod
     def create(airframe: Airframe) -> PowerDistributionParams:
@@ -36,16 +41,17 @@ class PowerDistributionParams(PyTree):
             thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
             rpm2thrust=as_parameter(airframe.value("rotors.thrust_curve").reshape(-1, 3)),
             torque_allocation=as_parameter(torque_allocation(airframe)),
+            torque_of_pwm=as_parameter(np.linalg.pinv(torque_allocation(airframe))),
         )
 
 
-def torque_allocation(airframe: Airframe) -> Array:
+def torque_allocation(airframe: Airframe) -> np.ndarray:
     """Return the shares of roll, pitch and yaw commands in the PWM of each rotor. (n_rotors, 3)
 
     The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the least-norm
     allocation of a quadrotor in X. Other layouts get the same factors.
     """
-    return allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0]  # type: ignore[return-value]
+    return allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0]
 
 
 def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams) -> Array:
@@ -66,7 +72,9 @@ def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams)
     """
     p = params
     pwm = thrust + matvec(p.torque_allocation, torque)
-    excess = jnp.max(pwm, axis=-1, keepdims=True) - p.pwm_max
+    # The gradient of jnp.max divides by the number of equal elements, which is zero where XLA rounds a copy otherwise.
+    highest = functools.reduce(jnp.maximum, [pwm[..., i : i + 1] for i in range(pwm.shape[-1])])
+    excess = highest - p.pwm_max
     pwm = pwm - jnp.where(excess > 0, excess, 0.0)
     return jnp.where(thrust <= 0, 0.0, jnp.where(pwm < 0, 0.0, pwm))
 
@@ -90,3 +98,15 @@ def pwm_of_thrust(thrust: Array, *, params: PowerDistributionParams) -> Array:
     p = params
     n_rotors = p.torque_allocation.shape[-2]
     return thrust * (p.pwm_max / (n_rotors * p.thrust_max))
+
+
+def command_of_rotor_vel(rotor_vel: Array, *, params: PowerDistributionParams) -> tuple[Array, Array]:
+    """Return the thrust of each motor (..., 1) and the torque (..., 3) that lead to rotor speeds, PWM.
+
+    Args:
+        rotor_vel: Rotor speeds, rpm. (..., n_rotors)
+        params: Parameters, shared or with the leading axes of the rotor speeds.
+    """
+    p = params
+    pwm = jnp.where(rotor_vel > 0, curve(rotor_vel, p.rpm2thrust), 0.0) * (p.pwm_max / p.thrust_max)
+    return jnp.mean(pwm, axis=-1, keepdims=True), matvec(p.torque_of_pwm, pwm)

@@ -85,6 +85,25 @@ class Controller:
         """
         raise NotImplementedError(f"controller {self.name!r} does not define update")
 
+    def take_over(self, data: Any, command: Setpoint | Array, memory: Any, params: Any, rotor_vel: Array) -> Any:
+        """Return the memory with which the controller starts to command a drone in flight, in place of another one.
+
+        By default the memory of when it was last active. Override it to make the first command continue the last.
+
+        Args:
+            data: ``SimData`` of one drone.
+            command: Setpoint or command, as in ``update``.
+            memory: Memory of when the controller was last active.
+            params: Parameters of the drone.
+            rotor_vel: Rotor speeds that the other controller commanded last, rpm. (n_rotors,)
+        """
+        return memory
+
+    @property
+    def members(self) -> tuple[Controller, ...]:
+        """The controllers that take turns: this one."""
+        return (self,)
+
     @property
     def has_outer(self) -> bool:
         """True if the controller has an outer loop."""

@@ -405,11 +405,12 @@ def require_controller(dynamics: Dynamics, control: Control, controller: Control
     """
     if controller is None:
         return
-    if control not in controller.levels:
-        raise ConfigError(
-            f"expected a command level that controller {controller.name!r} follows, {' or '.join(controller.levels)}, "
-            f"got control={control.value!r}. Use another level, or controller='crazyflow', which follows all."
-        )
+    for member in controller.members:
+        if control not in member.levels:
+            raise ConfigError(
+                f"expected a command level that controller {member.name!r} follows, {' or '.join(member.levels)}, got "
+                f"control={control.value!r}. Use another level, or controller='crazyflow', which follows all."
+            )
     if dynamics != Dynamics.first_principles:
         raise ConfigError(
             f"expected dynamics with rotors for controller {controller.name!r}, got {dynamics.value!r}, which contains "

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.control import Control, Controller
+from crazysim.control.switch import Switch
 from crazysim.errors import ConfigError, UnknownNameError
 
 
@@ -144,6 +145,11 @@ def controller_at_rates(
     Raises:
         ConfigError: If a rate does not divide ``freq``.
     """
+    if isinstance(controller, Switch):
+        members = tuple(controller_at_rates(member, control, freq, given) for member in controller.controllers)
+        own = {rate for member in members for rate in (member.freq, member.outer_freq) if rate is not None}
+        common = max(own) if all(max(own) % rate == 0 for rate in own) else freq
+        return dataclasses.replace(controller, controllers=members, freq=common)
     rates = {"freq": given.get(control)}
     if control == Control.state and controller.has_outer:
         rates = {"outer_freq": given.get(control), "freq": given.get(Control.attitude)}

@@ -66,6 +66,7 @@ class Configuration:
         engine: str,
         strict: bool,
         controller: Any,
+        switch: Any = None,
     ) -> Configuration:
         """Return the configuration for the arguments of ``Sim``, as users pass them.
 
@@ -78,7 +79,7 @@ class Configuration:
         require_pair(dynamics, control)
         airframe = load_airframe(drone)
         require_support(airframe, dynamics)
-        freqs, controller = control_freqs(control, freq, dict(rates)), find_controller(controller)
+        freqs, controller = control_freqs(control, freq, dict(rates)), find_controller(controller, switch)
         if controller is not None:
             require_controller(dynamics, control, controller)
             controller = controller_at_rates(controller, control, freq, dict(rates))
