@@ -187,9 +187,7 @@ def state_error(
         yaw: Heading in whose frame position and velocity are given, rad; None for the world frame. (..., 1)
     """
     matrix = rotation.matrix(quat)
-    relative = [
-        [dot(reference.matrix[..., i], matrix[..., j])[..., 0] for j in range(3)] for i in range(3)
-    ]  # R_d^T R
+    relative = [[dot(reference.matrix[..., i], matrix[..., j])[..., 0] for j in range(3)] for i in range(3)]  # R_d^T R
     rotation_error = 0.5 * jnp.stack(
         [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]], axis=-1
     )
@@ -208,9 +206,7 @@ def into_heading(vector: Array, yaw: Array) -> Array:
     return jnp.concatenate([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
 
 
-def lqr_control(
-    pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: Setpoint, *, params: LQRParams
-) -> Array:
+def lqr_control(pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: Setpoint, *, params: LQRParams) -> Array:
     """Return the wrench of the LQR about hover, with the wrench of the setpoint's motion as feed-forward.
 
     ``u = u_ref - K e``. Errors of position and velocity are taken in the frame of the desired heading, so that one gain

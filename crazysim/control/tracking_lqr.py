@@ -69,9 +69,7 @@ class _Model(NamedTuple):
     drag_matrix: Array
 
 
-def error_derivative(
-    error: Array, wrench: Array, reference: Reference, ang_acc: Array, mass: Array, J: Array
-) -> Array:
+def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc: Array, mass: Array, J: Array) -> Array:
     """Return the derivative of the errors of a drone about a reference, under an error of its wrench.
 
     The errors are those of ``state_error`` to first order: position, velocity, a small rotation e_R with

@@ -307,6 +307,8 @@ def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
         torque = np.array([arm, arm, 0.1 * arm])
         rows = [[thrust[0], 0, 0, 0], [low, *-torque], [high, *torque], [spread, *(0.05 * torque)]]
     else:
-        limit, deviation = ((0.7, 0.7, np.pi), (0.15, 0.15, 0.1)) if level == Control.attitude else ((8, 8, 3), (2, 2, 1))
+        limit, deviation = (
+            ((0.7, 0.7, np.pi), (0.15, 0.15, 0.1)) if level == Control.attitude else ((8, 8, 3), (2, 2, 1))
+        )
         rows = [[0, 0, 0, weight], [*(-x for x in limit), low], [*limit, high], [*deviation, spread]]
     return tuple(np.asarray(row, floating()) for row in rows)  # type: ignore[return-value]
