@@ -55,14 +55,14 @@ class RolloutRecord(PyTree):
 def tracking_cost(states: SimState, setpoint: Setpoint, command: Array) -> Array:
     """Return the cost of a drone off its setpoint: squared errors in m, m/s, yaw, and body rates. ()
 
-    A metre counts as much as 2 m/s, 1 rad of yaw, or 5 rad/s; drones within 5 cm of the floor pay 10 more.
+    A metre counts as much as 2 m/s, 1 rad of yaw, or 10 rad/s; drones within 5 cm of the floor pay 10 more.
     """
     del command
     pos, vel = states.pos - setpoint.pos, states.vel - setpoint.vel
     yaw = rotation.yaw(states.quat) - setpoint.yaw[0]
     rates = jnp.sum(states.ang_vel * states.ang_vel)
     crash = jnp.where(states.pos[2] < 0.05, 10.0, 0.0)
-    return jnp.sum(pos * pos) + 0.25 * jnp.sum(vel * vel) + (1 - jnp.cos(yaw)) + 0.04 * rates + crash
+    return jnp.sum(pos * pos) + 0.25 * jnp.sum(vel * vel) + (1 - jnp.cos(yaw)) + 0.01 * rates + crash
 
 
 def setpoint_after(setpoint: Setpoint, t: Array) -> Setpoint:
@@ -171,6 +171,11 @@ class MPPI:
         """Return the memory before the first command: plans that hover."""
         shape = (n_worlds, n_drones, self.knots, len(self.hover))
         return MPPIMemory(jnp.asarray(np.broadcast_to(self.hover, shape), floating()), jnp.int32(0))
+
+    @property
+    def engine(self) -> str:
+        """Engine of the rollouts; empty before the first command."""
+        return ", ".join({plan.engine for plan in self._step._plans.values()})
 
     def reset(self) -> None:
         """Forget the plans of ``command``."""
