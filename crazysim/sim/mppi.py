@@ -313,7 +313,7 @@ def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
         rows = [[thrust[0], 0, 0, 0], [low, *-torque], [high, *torque], [spread, *(0.05 * torque)]]
     else:
         limit, deviation = (
-            ((0.7, 0.7, np.pi), (0.15, 0.15, 0.1)) if level == Control.attitude else ((8, 8, 3), (2, 2, 1))
+            ((0.7, 0.7, np.pi), (0.1, 0.1, 0.05)) if level == Control.attitude else ((8, 8, 3), (2, 2, 1))
         )
         rows = [[0, 0, 0, weight], [*(-x for x in limit), low], [*limit, high], [*deviation, spread]]
     return tuple(np.asarray(row, floating()) for row in rows)  # type: ignore[return-value]
