@@ -10,6 +10,7 @@ from test_pages import BLOCK, PAGES, ROOT
 
 MODULES = {
     "crazysim",
+    "crazysim.control.load_lqr",
     "crazysim.core",
     "crazysim.dynamics",
     "crazysim.envs",
