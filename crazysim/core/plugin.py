@@ -203,7 +203,7 @@ class Plugin:
         has at most one plugin that constrains.
 
         Args:
-            data: Data of one drone, or of one world where ``coupling`` says so; with all influences applied if of one
+            data: Data of one drone, or of one world if ``coupling`` is ``"world"``; with all influences applied if of one
                 drone.
             deriv: Derivative of the free drone or drones.
             dt: Duration of the step that the derivative is for, s, in schemes of order 1: impulses of the step are

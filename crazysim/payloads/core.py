@@ -1,4 +1,4 @@
-"""What loads share: forces of air and floor, placing in the scene, and reading the swing."""
+"""Parts common to all loads: forces of air and floor, poses in the scene, and the swing of the rod."""
 
 from __future__ import annotations
 
