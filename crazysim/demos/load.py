@@ -65,9 +65,8 @@ def run(
                 recorder = None
         if k % FPS == FPS - 1:
             error = np.linalg.norm(np.asarray(sim.data.plugins["load"].pos) - goal, axis=-1)
-            print(
-                f"{(k + 1) / FPS:4.0f} s   load {100 * error.mean():5.1f} cm from its goal, {100 * error.max():.1f} cm at most"
-            )
+            mean, most = 100 * error.mean(), 100 * error.max()
+            print(f"{(k + 1) / FPS:4.0f} s   load {mean:5.1f} cm from its goal, {most:.1f} cm at most")
     if recorder is not None:
         recorder.close()
         print(f"wrote {out / 'load.mp4'}")
