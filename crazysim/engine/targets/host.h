@@ -288,6 +288,10 @@ FN four<f32> lookup_four(const f32* p, i32 index, i32 k) {
 // Rows of four numbers are loaded whole and transposed, four at a time.
 typedef f32 f32x4 __attribute__((vector_size(16)));
 FN four<f32v> lookup_four(const f32* p, i32v index, i32 k) {
+  if (!any(ne_(index, index[0]))) {  // drones that move alike
+    const four<f32> r = lookup_four(p, index[0], k);
+    return {{lift(r.x[0]), lift(r.x[1]), lift(r.x[2]), lift(r.x[3])}};
+  }
   f32 columns[4][W];
   int i = 0;
 #if defined(__GNUC__) && !defined(__clang__)
