@@ -1,18 +1,28 @@
-"""Trajectories: records of piecewise polynomials, and their constructors."""
+"""Trajectories: a record of piecewise polynomials, its constructors and checks, and the plugin that follows them."""
 
 from crazysim.trajectories.approaches import Approach
+from crazysim.trajectories.follow import Follow, FollowData
 from crazysim.trajectories.limits import Limits, Report, Violation, check
+from crazysim.trajectories.shapes import circle, figure_eight, helix, hover, line, lissajous
 from crazysim.trajectories.splines import of_bezier, spline
 from crazysim.trajectories.trajectory import Trajectory
 from crazysim.trajectories.waypoints import minimum_jerk, minimum_snap
 
 __all__ = [
     "Approach",
+    "Follow",
+    "FollowData",
     "Limits",
     "Report",
     "Trajectory",
     "Violation",
     "check",
+    "circle",
+    "figure_eight",
+    "helix",
+    "hover",
+    "line",
+    "lissajous",
     "minimum_jerk",
     "minimum_snap",
     "of_bezier",

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from crazysim.drones import Airframe, load_airframe
@@ -64,7 +65,7 @@ class Limits:
             )
         if self.min_thrust is not None and self.min_thrust >= 1:
             raise ConfigError(
-                f"expected a smallest thrust of less than 1 weight, got {self.min_thrust}. A drone with more must climb."
+                f"expected a smallest thrust of less than 1 weight, got {self.min_thrust}. With more, it must climb."
             )
 
     def given(self) -> dict[str, float]:
@@ -168,7 +169,7 @@ def check(
     Thrust and body rate are those of a drone without drag that flies its trajectory exactly (differential flatness).
 
     Args:
-        trajectories: One trajectory, or one for each drone.
+        trajectories: One trajectory, or one for each drone: a sequence, or a record with one leading axis.
         limits: Limits.
         airframe: Airframe whose thrusts are limits where ``limits`` has none; None for no such limits.
         starts: Start of each drone, s. () or (n_drones,)
@@ -179,7 +180,7 @@ def check(
     Raises:
         ConfigError: If there is no trajectory, or the number of names or starts differs from that of the trajectories.
     """
-    several = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
+    several = _unstacked(trajectories) if isinstance(trajectories, Trajectory) else list(trajectories)
     fleet = Fleet.of(several, starts, duration)
     labels = tuple(names) if names is not None else tuple(f"drone {k}" for k in range(len(several)))
     if len(labels) != len(several):
@@ -203,3 +204,10 @@ def check(
             who = tuple(labels[k] for k in pair.drones)
             violations.append(Violation("separation", pair.drones, pair.time, pair.distance, separation, who))
     return Report(tuple(violations), closest, found, labels, fleet.duration)
+
+
+def _unstacked(trajectories: Trajectory) -> list[Trajectory]:
+    """Return the single trajectories of a record with at most one leading axis."""
+    if trajectories.ends.ndim == 1:
+        return [trajectories]
+    return [jax.tree.map(lambda x, k=k: x[k], trajectories) for k in range(len(trajectories.ends))]

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-
 import jax
 import numpy as np
-
 
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.trajectories.fleet import Fleet, Floats, Ints
