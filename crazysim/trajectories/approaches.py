@@ -55,7 +55,8 @@ def closest_approaches(fleet: Fleet, tolerance: float = 1e-3) -> list[Approach]:
     dt, motion = fleet.duration / n_cells, _Motion(fleet)
     pair, cell = np.repeat(np.arange(len(first)), n_cells), np.tile(np.arange(n_cells), len(first))
     while len(pair) and dt > SHORTEST:
-        table = motion.table(n_cells, dt)
+        worthwhile = n_cells * fleet.n_drones <= min(TABLE, len(pair))
+        table = motion.table(n_cells, dt) if worthwhile else None
         keep = np.zeros(len(pair), bool)
         for k in range(0, len(pair), BATCH):
             part = slice(k, k + BATCH)
@@ -85,10 +86,8 @@ class _Motion:
             jumps[order, piece + 1] = np.linalg.norm((after - before)[:, :3], axis=-1)
         self.jumps = np.cumsum(jumps, axis=1)
 
-    def table(self, n_cells: int, dt: float) -> tuple[Floats, ...] | None:
-        """Return the motion of every drone in every cell, (n_drones, n_cells, ...); None if that is too much."""
-        if n_cells * self.fleet.n_drones > TABLE:
-            return None
+    def table(self, n_cells: int, dt: float) -> tuple[Floats, ...]:
+        """Return the motion of every drone in every cell. (n_drones, n_cells, ...)"""
         return self.in_cells(np.arange(self.fleet.n_drones)[:, None], np.arange(n_cells), dt, None)
 
     def in_cells(self, drone: Ints, cell: Ints, dt: float, table: tuple[Floats, ...] | None) -> tuple[Floats, ...]:

@@ -9,9 +9,9 @@ from crazysim.trajectories import interpolation
 from crazysim.trajectories.interpolation import Floats
 
 N_SAMPLES = 65
-"""Number of times at which the deviation of each piece is looked at."""
+"""Number of times at which the deviation of each piece is sampled, and of those around each maximum."""
 MARGIN = 0.01
-"""Part of the radius that is kept free: it covers deviations between samples and the end of the iteration."""
+"""Part of the radius that is kept free, so that the iteration ends; half of it is left at the end."""
 N_ROUNDS = 100
 """Largest number of rounds; a few are typical."""
 
@@ -38,30 +38,57 @@ def fill_in_corridors(nodes: Floats, durations: Floats, radii: Floats) -> Floats
     scaled, lengths = nodes * powers, durations / unit
     filled = interpolation.fill(scaled, lengths)
     program = _Program(scaled, filled, lengths)
-    u = np.linspace(0.0, 1.0, N_SAMPLES)
-    weights = u[:, None] ** np.arange(2 * nodes.shape[1]) @ interpolation.hermite_basis(nodes.shape[1])
-    begin, along = nodes[:-1, 0], np.diff(nodes[:, 0], axis=0)
-    square = np.sum(along**2, axis=-1)
     inner, limit = radii * (1 - MARGIN), radii * (1 - MARGIN / 2)
     for _ in range(N_ROUNDS):
-        pos = np.einsum("uj,pj,pja->pua", weights, program.powers, interpolation.pairs(filled))
-        part = np.einsum("pua,pa->pu", pos - begin[:, None], along) / np.where(square > 0, square, 1.0)[:, None]
-        nearest = begin[:, None] + np.clip(part, 0.0, 1.0)[..., None] * along[:, None]
-        outside = pos - nearest
-        distance = np.linalg.norm(outside, axis=-1)
-        padded = np.pad(distance, ((0, 0), (1, 1)))
-        is_peak = (distance >= padded[:, :-2]) & (distance >= padded[:, 2:]) & (distance > limit[:, None])
-        piece, at = np.nonzero(is_peak)
-        if not len(piece):
+        paths = interpolation.unit_coefficients(filled, lengths)
+        piece, u = _maxima(paths, nodes[:, 0], radii)
+        outside, nearest, distance = _deviation(paths[piece], nodes[piece, 0], nodes[piece + 1, 0], u)
+        leaves = distance > limit[piece]
+        if not np.any(leaves):
             return filled / powers
-        normal = outside[piece, at] / distance[piece, at][:, None]
-        reach = np.sum(normal * nearest[piece, at], axis=-1) + inner[piece]
-        program.add(piece, weights[at], normal, reach)
+        piece, normal = piece[leaves], outside[leaves] / distance[leaves, None]
+        reach = np.sum(normal * nearest[leaves], axis=-1) + inner[piece]
+        program.add(piece, u[leaves], normal, reach)
         filled = program.solve()
     raise ConfigError(
         f"expected a curve inside its corridors after {N_ROUNDS} rounds, got one that leaves the corridor of piece "
         f"{piece[0]}. Make the corridor wider, or add a waypoint."
     )
+
+
+def _deviation(paths: Floats, begin: Floats, end: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the vectors from line segments to curves, their feet on the segments, and their lengths.
+
+    Args:
+        paths: Coefficients. (n, 3, degree + 1)
+        begin: First points of the segments, m. (n, 3)
+        end: Last points, m. (n, 3)
+        u: Time within each piece over its length. (n,) or (n, n_times)
+
+    Returns:
+        (n, 3) or (n, n_times, 3), twice, and the same without the last axis.
+    """
+    u, along = np.asarray(u), end - begin
+    shape = (len(u), *[1] * (u.ndim - 1), 3)
+    begin, along = begin.reshape(shape), along.reshape(shape)
+    pos = np.einsum("n...k,nak->n...a", u[..., None] ** np.arange(paths.shape[-1]), paths)
+    square = np.sum(along**2, axis=-1)
+    part = np.sum((pos - begin) * along, axis=-1) / np.where(square > 0, square, 1.0)
+    nearest = begin + np.clip(part, 0.0, 1.0)[..., None] * along
+    return pos - nearest, nearest, np.linalg.norm(pos - nearest, axis=-1)
+
+
+def _maxima(paths: Floats, waypoints: Floats, radii: Floats) -> tuple[np.ndarray, Floats]:
+    """Return pieces, and times within them, at which the deviation is largest and comes near the radius. (n,) each"""
+    samples = np.linspace(0.0, 1.0, N_SAMPLES)
+    u = np.broadcast_to(samples, (len(paths), N_SAMPLES))
+    distance = _deviation(paths, waypoints[:-1], waypoints[1:], u)[2]
+    padded = np.pad(distance, ((0, 0), (1, 1)))
+    is_peak = (distance >= padded[:, :-2]) & (distance >= padded[:, 2:]) & (distance > 0.5 * radii[:, None])
+    piece, at = np.nonzero(is_peak)
+    around = np.clip(samples[at][:, None] + (2 * samples - 1) / (N_SAMPLES - 1), 0.0, 1.0)
+    distance = _deviation(paths[piece], waypoints[piece], waypoints[piece + 1], around)[2]
+    return piece, around[np.arange(len(piece)), np.argmax(distance, axis=-1)] if len(piece) else np.zeros(0)
 
 
 class _Program:
@@ -80,9 +107,10 @@ class _Program:
         self.factors = [np.linalg.cholesky(matrix[np.ix_(f, f)]) for f in free]
         self.rows, self.slack = np.zeros((0, sum(map(np.sum, free)))), np.zeros(0)
 
-    def add(self, piece: np.ndarray, weights: Floats, normal: Floats, reach: Floats) -> None:
-        """Add half-spaces: ``normal . pos <= reach`` at one time within each piece. (n,), (n, 2k), (n, 3), (n,)"""
+    def add(self, piece: np.ndarray, u: Floats, normal: Floats, reach: Floats) -> None:
+        """Add half-spaces: ``normal . pos <= reach`` at one time ``u`` within each piece. (n,), (n,), (n, 3), (n,)"""
         n = len(piece)
+        weights = u[:, None] ** np.arange(2 * self.order) @ interpolation.hermite_basis(self.order)
         rows = np.zeros((n, self.is_free.shape[0], self.order, 3))
         values = ((weights * self.powers[piece])[..., None] * normal[:, None]).reshape(n, 2, self.order, 3)
         rows[np.arange(n), piece], rows[np.arange(n), piece + 1] = values[:, 0], values[:, 1]

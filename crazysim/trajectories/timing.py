@@ -17,8 +17,10 @@ MARGIN = 1e-4
 """Part of a limit that is left unused, for the rounding of trajectories in float32."""
 PRECISION = 1e-5
 """Relative precision of the factor of time."""
-N_DOUBLINGS = 40
-"""Largest number of times that the durations are doubled or halved."""
+STEP = 1.25
+"""Factor by which the durations are changed until the limits are met, then until they are not."""
+N_STEPS = 100
+"""Largest number of such steps: a factor of 5e9."""
 
 
 def trapezoids(distances: Floats, limits: Limits) -> Floats:
@@ -85,6 +87,9 @@ def violated(durations: Floats, coefficients: Floats, limits: Limits) -> list[st
 def shortest(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:
     """Return the durations, in the same ratios, at which a trajectory just meets its limits.
 
+    The search starts slow. A smallest thrust can be exceeded at one speed and met again at a higher one, where the
+    thrust turns faster than the drone falls; such speeds are not looked for.
+
     Args:
         solve: Function that returns the coefficients for durations.
         durations: First guess, s. (n_pieces,)
@@ -98,21 +103,21 @@ def shortest(solve: Callable[[Floats], Floats], durations: Floats, limits: Limit
         return violated(durations * factor, solve(durations * factor), limits)
 
     high = 1.0
-    for _ in range(N_DOUBLINGS):
+    for _ in range(N_STEPS):
         names = excess(high)
         if not names:
             break
-        high *= 2
+        high *= STEP
     else:
         raise ConfigError(
             f"expected waypoints that can be flown within the limits, got some that exceed {' and '.join(names)} "
             f"however slow the flight. Raise the limit, or change waypoints or fixed derivatives."
         )
-    low = high / 2
-    for _ in range(N_DOUBLINGS):
+    low = high / STEP
+    for _ in range(N_STEPS):
         if excess(low):
             break
-        low, high = low / 2, low
+        low, high = low / STEP, low
     else:
         raise ConfigError(
             f"expected limits that bound the speed of the flight, got {limits}. Set a limit of speed or acceleration, "
