@@ -19,8 +19,8 @@ PRECISION = 1e-5
 """Relative precision of the factor of time."""
 STEP = 1.25
 """Factor by which the durations are changed until the limits are met, then until they are not."""
-N_STEPS = 100
-"""Largest number of such steps: a factor of 5e9."""
+N_STEPS = 50
+"""Largest number of such steps: a factor of 70,000."""
 
 
 def trapezoids(distances: Floats, limits: Limits) -> Floats:

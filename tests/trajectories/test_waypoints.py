@@ -122,14 +122,20 @@ def test_planned_flights_pass_the_waypoints_at_rest_within_tight_limits(method, 
         np.testing.assert_allclose(at_ends, 0.0, atol=1e-3 * max(limits.acceleration, limits.speed))
 
 
-@pytest.mark.parametrize(
-    "name, value", [("body_rate", 1.0), ("yaw_rate", 0.5), ("min_thrust", 0.9), ("vertical_speed", 0.3)]
-)
+@pytest.mark.parametrize("name, value", [("body_rate", 1.0), ("yaw_rate", 0.5), ("vertical_speed", 0.3)])
 def test_each_limit_alone_sets_the_duration(name, value):
     limits = Limits(**{name: value})
     report = check(minimum_snap(WAYPOINTS, limits=limits, yaw=[0, 1, 2, 3, 4]), limits)
     assert report.ok
     np.testing.assert_allclose(report.peaks[name].value, value, rtol=1e-3)
+
+
+def test_a_smallest_thrust_bounds_how_fast_a_climb_ends():
+    limits = Limits(min_thrust=0.5)
+    report = check(minimum_snap([[0, 0, 1], [0, 0, 3]], limits=limits), limits)
+    assert report.ok
+    np.testing.assert_allclose(report.peaks["min_thrust"].value, 0.5, rtol=1e-3)
+    np.testing.assert_allclose(report.peaks["thrust"].value, 1.5, rtol=1e-3)  # the climb is symmetric
 
 
 def test_ratios_of_the_durations_are_those_of_least_snap():
@@ -226,15 +232,18 @@ def test_the_corridor_costs_no_more_than_the_optimum_of_scipy(x64):
     base = coefficients(np.zeros(6))
     parts = np.array([coefficients(e) - base for e in np.eye(6)])
 
-    def beside(c):
-        return np.concatenate([c[..., 0, 1, :] @ powers.T, c[..., 1, 0, :] @ powers.T - 1], axis=-1)
+    def room(x):
+        """Return the squared radius, of which 0.5% to 1% is kept free, less the squared distance to the segments."""
+        pos = np.einsum("uk,pak->pua", powers, base + np.tensordot(x, parts, 1))
+        begin, along = waypoints[:2, None, :2], np.diff(waypoints, axis=0)[:, None, :2]
+        nearest = begin + np.clip(np.sum((pos - begin) * along, axis=-1), 0, 1)[..., None] * along
+        return ((0.9925 * radius) ** 2 - np.sum((pos - nearest) ** 2, axis=-1)).ravel()
 
-    room = [{"type": "ineq", "fun": lambda x, s=s: radius - s * (beside(base) + x @ beside(parts))} for s in (1, -1)]
-    least = 1e4 * minimize(lambda x: cost(coefficients(x)) / 1e4, np.zeros(6), constraints=room, method="SLSQP").fun
+    bound = {"type": "ineq", "fun": room}
+    least = 1e4 * minimize(lambda x: cost(coefficients(x)) / 1e4, np.zeros(6), constraints=bound, method="SLSQP").fun
     free = cost(pieces(minimum_snap(waypoints, durations))[:, :2])
-    assert free < 0.75 * least  # the corridor matters
-    # The corridor also bounds the ends of the segments, and 1% of it is kept free.
-    assert 0.99 * least < cost(found[:, :2]) < 1.1 * least
+    assert free < 0.7 * least  # the corridor matters
+    np.testing.assert_allclose(cost(found[:, :2]), least, rtol=3e-3)
 
 
 def test_coincident_waypoints_are_fine_with_durations():
