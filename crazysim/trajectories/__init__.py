@@ -4,6 +4,7 @@ from crazysim.trajectories.approaches import Approach
 from crazysim.trajectories.follow import Follow, FollowData
 from crazysim.trajectories.limits import Limits, Report, Violation, check
 from crazysim.trajectories.shapes import circle, figure_eight, helix, hover, line, lissajous
+from crazysim.trajectories.smoothest import smoothest
 from crazysim.trajectories.splines import of_bezier, spline
 from crazysim.trajectories.trajectory import Trajectory
 from crazysim.trajectories.waypoints import minimum_jerk, minimum_snap
@@ -26,5 +27,6 @@ __all__ = [
     "minimum_jerk",
     "minimum_snap",
     "of_bezier",
+    "smoothest",
     "spline",
 ]
