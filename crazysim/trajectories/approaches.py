@@ -61,8 +61,8 @@ def closest_approaches(fleet: Fleet, tolerance: float = 1e-3) -> list[Approach]:
         for k in range(0, len(pair), BATCH):
             part = slice(k, k + BATCH)
             i, j = first[pair[part]], second[pair[part]]
-            sides = [motion.in_cells(drone, cell[part], dt, table) for drone in (i, j)]
-            lower = _lower_bounds(fleet, *sides, (i, j), pair[part], cell[part], dt, best, when)
+            one, other = (motion.in_cells(drone, cell[part], dt, table) for drone in (i, j))
+            lower = _lower_bounds(fleet, one, other, (i, j), pair[part], cell[part], dt, best, when)
             keep[part] = lower < best[pair[part]] - tolerance
         pair, cell = np.repeat(pair[keep], SPLIT), (cell[keep][:, None] * SPLIT + np.arange(SPLIT)).ravel()
         dt, n_cells = dt / SPLIT, n_cells * SPLIT

@@ -55,13 +55,13 @@ class Fleet:
         begins = np.broadcast_to(begins, (n_drones,))
         host = [jax.tree.map(np.asarray, trajectory) for trajectory in trajectories]
         ends = [begin + float(t.ends[-1]) for begin, t in zip(begins, host, strict=True)]
-        duration = max(ends) if duration is None else float(duration)
-        if not 0 < duration < np.inf:
+        end = max(ends) if duration is None else float(duration)
+        if not 0 < end < np.inf:
             raise ConfigError(f"expected a positive, finite duration, s, got {duration!r}")
         size = max(t.coefficients.shape[-1] for t in host)
-        parts = [_pieces(t, begin, duration, size) for t, begin in zip(host, begins, strict=True)]
+        parts = [_pieces(t, begin, end, size) for t, begin in zip(host, begins, strict=True)]
         drone = np.repeat(np.arange(n_drones), [len(part[0]) for part in parts])
-        return Fleet(duration, drone, *(np.concatenate(x) for x in zip(*parts, strict=True)))
+        return Fleet(end, drone, *(np.concatenate(x) for x in zip(*parts, strict=True)))
 
     @property
     def n_drones(self) -> int:
