@@ -60,6 +60,21 @@ def test_a_short_meeting_at_high_speed_is_found():
     np.testing.assert_allclose(approach.time, 1800.623, atol=1e-3)
 
 
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_dash_within_a_cell_is_found(smooth):
+    """A drone at rest dashes to another and back in 0.16 s, between the ends of a cell and off its middle."""
+
+    def dash(begin, end):
+        return spline([0.0, 0.08], [begin, end], 7) if smooth else straight(begin, end, 0.08)
+
+    home, away = np.array([0, 0, 1.0]), np.array([1, 0, 1.0])
+    one = straight(home, home, 0.82).then(dash(home, away)).then(dash(away, home)).then(straight(home, home, 3.02))
+    other = straight(away + [0.02, 0, 0], away + [0.02, 0, 0], 4.0)
+    (approach,) = closest_approaches(Fleet.of([one, other]))
+    np.testing.assert_allclose(approach.distance, 0.02, atol=1e-3)
+    np.testing.assert_allclose(approach.time, 0.9, atol=0.01)
+
+
 def test_starts_shift_the_meeting():
     flights = [straight([-5, 0, 1], [5, 0, 1], 10.0), straight([5, 0, 1], [-5, 0, 1], 10.0)]
     (together,) = closest_approaches(Fleet.of(flights))

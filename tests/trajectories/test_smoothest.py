@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from crazysim.trajectories import minimum_jerk, minimum_snap, smoothest
+from crazysim.trajectories import interpolation, minimum_jerk, minimum_snap, smoothest
 
 RNG = np.random.default_rng(3)
 WAYPOINTS, DURATIONS = RNG.uniform(-2, 2, (6, 3)), RNG.uniform(0.6, 2.0, 5)
@@ -15,8 +15,11 @@ METHODS = {4: minimum_snap, 3: minimum_jerk}
 
 @pytest.mark.parametrize("order", METHODS)
 def test_it_is_that_of_the_host(order, x64):
-    trajectory, _ = jax.jit(smoothest, static_argnums=2)(WAYPOINTS, DURATIONS, order)
+    trajectory, cost = jax.jit(smoothest, static_argnums=2)(WAYPOINTS, DURATIONS, order)
     expected = METHODS[order](WAYPOINTS, DURATIONS)
+    nodes = np.full((6, order, 3), np.nan)
+    nodes[:, 0], nodes[[0, -1], 1:] = WAYPOINTS, 0.0
+    np.testing.assert_allclose(cost, interpolation.cost(interpolation.fill(nodes, DURATIONS), DURATIONS), rtol=1e-9)
     np.testing.assert_allclose(trajectory.ends, expected.ends)
     np.testing.assert_allclose(trajectory.coefficients, expected.coefficients, atol=1e-9)
 
