@@ -16,7 +16,6 @@ from crazysim.control.controllers import CASCADE
 from crazysim.core import functional as F
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
-from crazysim.core.pipeline import Pipeline
 from crazysim.core.random import seed_sim
 from crazysim.core.registry import PluginRegistry
 from crazysim.core.settings import as_mask, positive
@@ -25,8 +24,7 @@ from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_
 from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameters import rotor_vel_limits
-from crazysim.engine import Step, Stepper, build_reset, explain
-from crazysim.engine.plain import ResetFn
+from crazysim.engine import Stepper, explain
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
 from crazysim.scene.queries import SceneQueries
@@ -34,6 +32,7 @@ from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim.commands import Commands
 from crazysim.sim.configuration import Configuration
+from crazysim.sim.pipelines import Pipelines
 from crazysim.sim.plugins import PluginMethods
 from crazysim.sim.scene_shell import SceneShell, use_box_collision
 
@@ -49,7 +48,7 @@ __all__ = [
 ]
 
 
-class Sim(Commands, PluginMethods, SceneShell):
+class Sim(Commands, Pipelines, PluginMethods, SceneShell):
     """Worlds of drones that advance together.
 
     ``data`` holds everything that changes, ``step_pipeline`` and ``reset_pipeline`` the stages that change it, ``spec``
@@ -145,8 +144,8 @@ class Sim(Commands, PluginMethods, SceneShell):
         self.build_data()
         self.build_default_data()
 
-        self.step_pipeline: Pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
-        self.reset_pipeline: Pipeline = {"reset": reset}
+        self.step_pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
+        self.reset_pipeline = {"reset": reset}
         self.build_step_fn()
         self.build_reset_fn()
 
@@ -154,7 +153,7 @@ class Sim(Commands, PluginMethods, SceneShell):
 
     def _new_queries(self) -> SceneQueries:
         kernels = self.mesh is None and self.engine in ("auto", "fused")
-        return SceneQueries(self._scene, self.device.platform if kernels else None)
+        return SceneQueries(self._scene, self.device.platform if kernels else None, self.configuration.strict)
 
     @property
     def data(self) -> SimData:
@@ -253,6 +252,7 @@ class Sim(Commands, PluginMethods, SceneShell):
         """Advance every world by a number of physics steps; any number uses the same compilation."""
         n_steps = positive("n_steps", n_steps)
         self._adopt_scene()
+        self._take_edits()
         self._stepper.advance(n_steps)
         self._scene.invalidate()
 
@@ -315,13 +315,3 @@ class Sim(Commands, PluginMethods, SceneShell):
         """Take data that a compiled call returned."""
         self._stepper.accept(data)
         self._scene.invalidate()
-
-    def build_step_fn(self) -> Step:
-        """Make the step pipeline as it is now take effect; return ``step(data, n_steps=1) -> data``, pure."""
-        self.step_fn = self._stepper.build(self.step_pipeline)
-        return self.step_fn
-
-    def build_reset_fn(self) -> ResetFn:
-        """Make the reset pipeline as it is now take effect; return ``reset(data, default_data, mask=None)``, pure."""
-        self.reset_fn = build_reset(self.reset_pipeline)
-        return self.reset_fn

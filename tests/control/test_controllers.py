@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Latency, Sim, make
-from crazysim.control import Control, Controller, Setpoint
-from crazysim.control.mellinger import Mellinger
-from crazysim.control.pid import PID
+from crazysim.control import PID, Control, Controller, Mellinger, Setpoint
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
 from crazysim.pytree import PyTree, as_parameter, leaf
