@@ -1,12 +1,12 @@
 """Optimisation barriers for ``plain``: a costly value that several others need is computed once.
 
-XLA's CPU backend fuses a value into everything that uses it and computes it anew there, angles and norms too. It also
+XLA's CPU backend fuses a value into everything that uses it and computes it again there, angles and norms too. It also
 reads a vector of three or four numbers from rows, which do not fill a vector unit. A barrier prevents the first, and a
 layout by component behind it the second. Barriers are placed from the equations of a function, so that a control law
 needs none: one after another where it saves most, as long as it saves more than ``WORTH``.
 
 The estimate assumes that everything element-wise is fused. For each element of a value, its work is the arithmetic that
-computes it from inputs and barriers. Its evaluations are the elements of it that its users ask for.
+computes it from inputs and barriers. Its evaluations are the elements of it that its users request.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def choose(jaxpr: ClosedJaxpr, least: int) -> set[Any]:
 
 
 class _Node(NamedTuple):
-    """An equation as the estimate sees it."""
+    """An equation as the estimate reads it."""
 
     results: list[Any]
     """Variables that it defines."""

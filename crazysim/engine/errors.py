@@ -57,13 +57,13 @@ class KernelError(UnsupportedError):
 
 
 def report_unsupported(problems: Sequence[str], strict: bool, reported: set[str], remedy: str) -> None:
-    """Warn, once, of what the engine does not support and a slower path computes, or raise it.
+    """Warn once that a slower path computes some operations, which the engine does not support, or raise it.
 
     Args:
-        problems: What is not supported, and why; nothing happens if there are none.
+        problems: Unsupported operations, each with the reason; nothing happens if there are none.
         strict: True to raise an error instead.
         reported: Warnings that were given before; the new one is added.
-        remedy: What to do about the error, as the beginning of a sentence that ends with ``use strict=False``.
+        remedy: Way out of the error, as the beginning of a sentence that ends with ``use strict=False``.
 
     Raises:
         ConfigError: With ``strict``.

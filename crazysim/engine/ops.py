@@ -225,7 +225,7 @@ where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)``
 ``while(*carry)`` runs its second block as long as its first is true. ``custom_jvp(*args, slope=)`` runs its block, and
 has a derivative of its own. ``threefry2x32`` is the cipher of JAX's random numbers.
 ``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=)`` the entry at the sum of an int32 and a
-constant; whoever makes one sees to it that there is such an entry.
+constant; whoever makes one ensures that there is such an entry.
 
 Costs are counted with what decides them: comparisons with selections, signs with what takes them. Functions cost what
 hardware that approximates them and a step that refines take, or the shortest polynomial that is exact to float32;
