@@ -4,6 +4,7 @@ from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
 from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque
 from crazysim.control.core import COMMAND_FIELDS, Control, command_size
 from crazysim.control.parameters import load_fn_params, load_params
+from crazysim.control.setpoint import Setpoint
 from crazysim.control.state import StateParams, state2attitude
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "AllocationParams",
     "AttitudeParams",
     "Control",
+    "Setpoint",
     "StateParams",
     "attitude2force_torque",
     "body_rate2force_torque",

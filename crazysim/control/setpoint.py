@@ -1,0 +1,69 @@
+"""Setpoints: the position, yaw and derivatives that a controller follows at one instant."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim import rotation
+from crazysim.pytree import PyTree, leaf
+
+
+class Setpoint(PyTree):
+    """Desired motion of one drone at one instant, with any leading axes: position, yaw and derivatives, world frame."""
+
+    pos: Array = leaf("drone", 1)
+    """Position, world frame, m. (..., 3)"""
+    vel: Array = leaf("drone", 1)
+    """Velocity, world frame, m/s. (..., 3)"""
+    acc: Array = leaf("drone", 1)
+    """Acceleration, world frame, m/s^2. (..., 3)"""
+    jerk: Array = leaf("drone", 1)
+    """Third derivative of the position, world frame, m/s^3. (..., 3)"""
+    snap: Array = leaf("drone", 1)
+    """Fourth derivative of the position, world frame, m/s^4. (..., 3)"""
+    yaw: Array = leaf("drone", 1)
+    """Yaw, rad. (..., 1)"""
+    yaw_rate: Array = leaf("drone", 1)
+    """Rate of the yaw, rad/s. (..., 1)"""
+    yaw_acc: Array = leaf("drone", 1)
+    """Second derivative of the yaw, rad/s^2. (..., 1)"""
+
+    def command(self) -> Array:
+        """Return the state command: position, velocity, acceleration, quaternion of the yaw, body rates. (..., 16)
+
+        The quaternion is xyzw, and the body rates are those of a level drone, (0, 0, yaw rate).
+        """
+        zeros = jnp.zeros_like(self.pos[..., :2])
+        quat = [zeros, jnp.sin(self.yaw / 2), jnp.cos(self.yaw / 2)]
+        return jnp.concatenate([self.pos, self.vel, self.acc, *quat, zeros, self.yaw_rate], axis=-1)
+
+    def feedforward(self) -> Array:
+        """Return what the state command lacks: jerk, snap, yaw rate, second derivative of the yaw. (..., 8)"""
+        return jnp.concatenate([self.jerk, self.snap, self.yaw_rate, self.yaw_acc], axis=-1)
+
+    @staticmethod
+    def of_command(cmd: Array, feedforward: Array | None = None) -> Setpoint:
+        """Return the setpoint of a state command.
+
+        Args:
+            cmd: Position, velocity, acceleration, quaternion of any length, of which only the yaw is used, and body
+                rates. (..., 16)
+            feedforward: Jerk, snap, yaw rate, second derivative of the yaw; None for the yaw rate in the command and
+                zeros. (..., 8)
+        """
+        if feedforward is None:
+            zeros = jnp.zeros_like(cmd[..., :6])
+            further = jnp.concatenate([zeros, cmd[..., 15:16], zeros[..., :1]], axis=-1)
+        else:
+            further = feedforward
+        return Setpoint(
+            pos=cmd[..., 0:3],
+            vel=cmd[..., 3:6],
+            acc=cmd[..., 6:9],
+            jerk=further[..., 0:3],
+            snap=further[..., 3:6],
+            yaw=rotation.yaw(cmd[..., 9:13])[..., None],
+            yaw_rate=further[..., 6:7],
+            yaw_acc=further[..., 7:8],
+        )

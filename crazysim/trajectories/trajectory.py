@@ -1,0 +1,209 @@
+"""Trajectories: position and yaw of one vehicle over time, as piecewise polynomials."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from crazysim.control.setpoint import Setpoint
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, floating, leaf
+
+N_DERIVATIVES = 4
+"""Highest derivative of a setpoint: snap."""
+
+
+class Trajectory(PyTree):
+    """Position and yaw of one vehicle as piecewise polynomials of time, with any leading axes for several.
+
+    Each piece is a polynomial of its own time scaled to ``u`` in [0, 1], which suits float32. Before its start a
+    trajectory is at rest at its first point; after its end it is at rest at its last point, or starts again.
+    """
+
+    ends: Array = leaf("shared", 1)
+    """End of each piece, s since the start of the trajectory, ascending. Padding repeats the last one. (n_pieces,)"""
+    coefficients: Array = leaf("shared", 3)
+    """Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, of the piece's time divided by its
+    length. (n_pieces, 4, degree + 1)"""
+    repeats: Array = leaf("shared", 0)
+    """True where the trajectory starts again after its end. ()"""
+
+    @staticmethod
+    def of_pieces(durations: Any, coefficients: Any, repeats: bool = False) -> Trajectory:
+        """Return the trajectory of polynomials of the time in seconds, worked out in float64 on the host.
+
+        Args:
+            durations: Length of each piece, s. (n_pieces,)
+            coefficients: Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, of the time
+                since its start, s. Without yaw, it is zero. (n_pieces, 4, degree + 1) or (n_pieces, 3, degree + 1)
+            repeats: True to start again after the end.
+
+        Raises:
+            ConfigError: If the shapes do not fit, a number is not finite, or a duration is not positive.
+        """
+        lengths, c = np.asarray(durations, float), np.asarray(coefficients, float)
+        if lengths.ndim != 1 or not lengths.size or c.ndim != 3 or c.shape[1] not in (3, 4) or len(c) != len(lengths):
+            raise ConfigError(
+                f"expected durations (n_pieces,) and coefficients (n_pieces, 4, degree + 1), or (n_pieces, 3, "
+                f"degree + 1) without yaw, got shapes {lengths.shape} and {c.shape}"
+            )
+        if not c.shape[2] or not np.all(np.isfinite(c)):
+            raise ConfigError(f"expected finite coefficients, at least one for each axis, got shape {c.shape}")
+        ends = np.cumsum(lengths).astype(floating())
+        steps = np.diff(ends, prepend=0.0)
+        if not np.all(np.isfinite(ends)) or not np.all(lengths > 0) or not np.all(steps > 0):
+            k = int(np.argmin(np.where(np.isfinite(steps), steps, -np.inf)))
+            raise ConfigError(
+                f"expected finite, positive durations that add up to ascending times in {np.dtype(floating()).name}, "
+                f"got {lengths[k]!r} s for piece {k}. Merge pieces that are too short."
+            )
+        if c.shape[1] == 3:
+            c = np.concatenate([c, np.zeros_like(c[:, :1])], axis=1)
+        c = c * lengths[:, None, None] ** np.arange(c.shape[2])
+        return Trajectory(ends, c.astype(floating()), np.bool_(repeats))  # type: ignore[arg-type]
+
+    @property
+    def n_pieces(self) -> int:
+        """Number of pieces, with padding."""
+        return self.ends.shape[-1]
+
+    @property
+    def degree(self) -> int:
+        """Largest degree of the polynomials."""
+        return self.coefficients.shape[-1] - 1
+
+    @property
+    def duration(self) -> Array:
+        """Time from the start to the end, s. (...)"""
+        return self.ends[..., -1]
+
+    def evaluate(self, t: Any) -> Setpoint:
+        """Return the setpoint of one trajectory at one time, with derivatives up to snap.
+
+        Where two pieces meet, the later one counts. Use ``jax.vmap`` for several trajectories or times.
+
+        Args:
+            t: Time since the start of the trajectory, s. ()
+        """
+        ends, end = jnp.asarray(self.ends), jnp.asarray(self.ends)[-1]
+        t = jnp.asarray(t, ends.dtype)
+        local = jnp.where(t < 0, 0.0, t)
+        local = jnp.where(self.repeats, lax.rem(local, end), jnp.where(t > end, end, local))
+        inside = (t >= 0) & (self.repeats | (t <= end))
+        piece = _piece(ends, local)
+        begin = jnp.where(piece > 0, ends[jnp.maximum(piece - 1, 0)], 0.0)
+        length = ends[piece] - begin
+        length = jnp.where(length > 0, length, 1.0)  # of padding
+        values = _derivatives(jnp.asarray(self.coefficients)[piece], (local - begin) / length, N_DERIVATIVES)
+        rate = jnp.where(inside, 1 / length, 0.0)
+        pos = values[0]
+        vel, acc, jerk, snap = (value * rate**k for k, value in enumerate(values[1:], start=1))
+        return Setpoint(
+            pos=pos[:3], vel=vel[:3], acc=acc[:3], jerk=jerk[:3], snap=snap[:3],
+            yaw=pos[3:], yaw_rate=vel[3:], yaw_acc=acc[3:],
+        )  # fmt: skip
+
+    @staticmethod
+    def stack(trajectories: Sequence[Trajectory]) -> Trajectory:
+        """Return several trajectories as one record with a new first axis, padded to common sizes.
+
+        Args:
+            trajectories: Single trajectories.
+
+        Raises:
+            ConfigError: If there is none.
+        """
+        if not trajectories:
+            raise ConfigError("expected at least one trajectory, got none")
+        n_pieces, degree = max(t.n_pieces for t in trajectories), max(t.degree for t in trajectories)
+        padded = [t.padded(n_pieces, degree) for t in trajectories]
+        xp = _module(padded)
+        return jax.tree.map(lambda *leaves: xp.stack(leaves), *padded)
+
+    def padded(self, n_pieces: int, degree: int) -> Trajectory:
+        """Return the same trajectory with at least this number of pieces and this degree, for one vehicle.
+
+        Further pieces have no length and stay at the last point.
+        """
+        xp = _module(self)
+        more, higher = max(0, n_pieces - self.n_pieces), max(0, degree - self.degree)
+        ends = xp.concatenate([self.ends, xp.broadcast_to(self.ends[-1:], (more,))])
+        coefficients = xp.pad(self.coefficients, ((0, 0), (0, 0), (0, higher)))
+        last = xp.sum(coefficients[-1:], axis=-1, keepdims=True)
+        rest = xp.pad(last, ((0, 0), (0, 0), (0, self.degree + higher)))
+        rest = xp.broadcast_to(rest, (more, *rest.shape[1:]))
+        return self.replace(ends=ends, coefficients=xp.concatenate([coefficients, rest]))
+
+    def then(self, other: Trajectory) -> Trajectory:
+        """Return this trajectory followed by another one, which starts at this one's end; for one vehicle.
+
+        A jump between the two remains. Move the other one with ``moved`` to avoid it.
+
+        Raises:
+            ConfigError: If one of them repeats.
+        """
+        if self.repeats or other.repeats:
+            raise ConfigError("expected trajectories that end, got one that repeats. Use replace(repeats=np.False_).")
+        degree = max(self.degree, other.degree)
+        first, second = self.padded(0, degree), other.padded(0, degree)
+        xp = _module([first, second])
+        return first.replace(
+            ends=xp.concatenate([first.ends, first.ends[-1] + second.ends]),
+            coefficients=xp.concatenate([first.coefficients, second.coefficients]),
+        )
+
+    def moved(self, offset: Any = (0.0, 0.0, 0.0), yaw: Any = 0.0) -> Trajectory:
+        """Return the trajectory turned around the z axis of the world, then moved, with any leading axes.
+
+        Args:
+            offset: Displacement, m. (3,)
+            yaw: Angle by which the curve and the yaw along it are turned, rad. ()
+        """
+        xp = _module([self, offset, yaw])
+        c, offset = self.coefficients, xp.asarray(offset, self.coefficients.dtype)
+        cos, sin = xp.cos(yaw).astype(c.dtype), xp.sin(yaw).astype(c.dtype)
+        x, y = cos * c[..., 0, :] - sin * c[..., 1, :], sin * c[..., 0, :] + cos * c[..., 1, :]
+        turned = xp.stack([x, y, c[..., 2, :], c[..., 3, :]], axis=-2)
+        constant = turned[..., :1] + xp.append(offset, xp.asarray(yaw, c.dtype))[:, None]
+        return self.replace(coefficients=xp.concatenate([constant, turned[..., 1:]], axis=-1))
+
+
+def _module(tree: Any) -> Any:
+    """Return ``jax.numpy`` if there is an array of JAX, else NumPy, which compiles nothing."""
+    return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(tree)) else np
+
+
+def _piece(ends: Array, t: Array) -> Array:
+    """Return the number of ends up to a time, at most that of the last piece, by bisection. ()"""
+    n = ends.shape[0]
+    low = jnp.zeros(jnp.shape(t), jnp.int32)
+    for k in reversed(range((n - 1).bit_length())):
+        middle = jnp.minimum(low + 2**k, n - 1)
+        low = jnp.where(ends[middle - 1] <= t, middle, low)
+    return low
+
+
+def _derivatives(coefficients: Array, u: Array, order: int) -> list[Array]:
+    """Return a polynomial and its derivatives up to an order, by Horner's scheme. (...) each
+
+    The scheme, repeated on its own partial results, gives ``p^(k)(u) / k!``.
+
+    Args:
+        coefficients: Constant term first. (..., degree + 1)
+        u: Argument. ()
+        order: Highest derivative.
+    """
+    columns = [coefficients[..., k] for k in reversed(range(coefficients.shape[-1]))]
+    taylor = columns[:1]
+    for column in columns[1:]:
+        raised = [taylor[0] * u + column]
+        raised += [taylor[k] * u + taylor[k - 1] for k in range(1, len(taylor))]
+        taylor = [*raised, taylor[-1]][: order + 1]
+    taylor += [jnp.zeros_like(columns[0])] * (order + 1 - len(taylor))
+    return [math.factorial(k) * value for k, value in enumerate(taylor)]

@@ -1,0 +1,173 @@
+"""The record of a trajectory, against polynomials of NumPy and SciPy in float64."""
+
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import PPoly
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories import Trajectory
+
+pytestmark = pytest.mark.usefixtures("x64")
+
+DERIVATIVES = ("pos", "vel", "acc", "jerk", "snap")
+YAW = ("yaw", "yaw_rate", "yaw_acc")
+evaluate = jax.jit(jax.vmap(Trajectory.evaluate, in_axes=(None, 0)))
+
+
+def random_pieces(n_pieces=5, degree=7, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0.2, 2.0, n_pieces), rng.normal(size=(n_pieces, 4, degree + 1))
+
+
+def oracle(durations, c, t, order):
+    """The derivative of all axes at times inside. (n, 4)"""
+    curves = PPoly(np.moveaxis(c[..., ::-1], -1, 0), np.concatenate([[0], np.cumsum(durations)]))
+    return curves.derivative(order)(t) if order else curves(t)
+
+
+def check_same(setpoint, durations, c, t, rtol=1e-10):
+    for order, name in enumerate(DERIVATIVES):
+        np.testing.assert_allclose(getattr(setpoint, name), oracle(durations, c, t, order)[:, :3], rtol, 1e-9, name)
+    for order, name in enumerate(YAW):
+        np.testing.assert_allclose(getattr(setpoint, name), oracle(durations, c, t, order)[:, 3:], rtol, 1e-9, name)
+
+
+@pytest.mark.parametrize("n_pieces", [1, 2, 3, 5, 8, 13])
+@pytest.mark.parametrize("degree", [0, 1, 3, 7, 9])
+def test_position_yaw_and_derivatives_are_those_of_the_polynomials(n_pieces, degree):
+    durations, c = random_pieces(n_pieces, degree)
+    t = np.linspace(0, durations.sum() * (1 - 1e-9), 41)
+    check_same(evaluate(Trajectory.of_pieces(durations, c), t), durations, c, t)
+
+
+def test_where_two_pieces_meet_the_later_one_counts():
+    trajectory = Trajectory.of_pieces([1, 2, 1], np.arange(3.0)[:, None, None] * np.ones((1, 4, 1)))
+    s = evaluate(trajectory, np.array([0, 1 - 1e-9, 1, 3 - 1e-9, 3, 4, 9]))
+    np.testing.assert_array_equal(s.pos[:, 0], [0, 0, 1, 1, 2, 2, 2])
+
+
+def test_before_the_start_and_after_the_end_it_is_at_rest():
+    durations, c = random_pieces()
+    trajectory, end = Trajectory.of_pieces(durations, c), durations.sum()
+    s = evaluate(trajectory, np.array([-1e9, -1e-9, end + 1e-9, 1e9]))
+    first, last = (oracle(durations, c, np.array([t]), 0)[0] for t in (0, end))
+    np.testing.assert_allclose(np.concatenate([s.pos, s.yaw], 1), [first, first, last, last], rtol=1e-9)
+    for name in ("vel", "acc", "jerk", "snap", "yaw_rate", "yaw_acc"):
+        np.testing.assert_array_equal(getattr(s, name), np.zeros_like(getattr(s, name)))
+
+
+def test_one_that_repeats_starts_again():
+    durations, c = random_pieces()
+    trajectory, end = Trajectory.of_pieces(durations, c, repeats=True), durations.sum()
+    t = np.linspace(0.001, 0.999, 17) * end
+    check_same(evaluate(trajectory, t + 3 * end), durations, c, t, rtol=1e-7)
+    before = evaluate(trajectory, np.array([-0.5]))
+    np.testing.assert_allclose(before.pos[0], c[0, :3, 0])
+    np.testing.assert_array_equal(before.vel, np.zeros((1, 3)))
+
+
+def test_stacked_ones_are_the_same_as_alone_within_and_beyond_their_ends():
+    pieces = [random_pieces(1, 7, 1), random_pieces(4, 3, 2), random_pieces(6, 5, 3)]
+    alone = [Trajectory.of_pieces(*p, repeats=k == 1) for k, p in enumerate(pieces)]
+    stacked = Trajectory.stack(alone)
+    assert stacked.coefficients.shape == (3, 6, 4, 8)
+    assert (stacked.n_pieces, stacked.degree, stacked.duration.shape) == (6, 7, (3,))
+    for k, (trajectory, (durations, _)) in enumerate(zip(alone, pieces, strict=True)):
+        end = durations.sum()
+        t = np.concatenate([np.linspace(-1, end + 2, 50), [end, np.nextafter(end, 0), np.nextafter(end, 9e9)]])
+        one, many = evaluate(trajectory, t), evaluate(jax.tree.map(lambda x, k=k: x[k], stacked), t)
+        inside = (t < end - 1e-9) | (t > end + 1e-9) | (k == 1)  # at the end itself padding is already at rest
+        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
+            np.testing.assert_allclose(x[inside], y[inside], atol=1e-9)
+        np.testing.assert_allclose(one.pos, many.pos, atol=1e-9)
+
+
+def test_one_after_the_other():
+    (d1, c1), (d2, c2) = random_pieces(2, 3, 1), random_pieces(3, 7, 2)
+    both = Trajectory.of_pieces(d1, c1).then(Trajectory.of_pieces(d2, c2))
+    t = np.linspace(0, d1.sum() + d2.sum() - 1e-9, 60)
+    c = np.concatenate([np.pad(c1, ((0, 0), (0, 0), (0, 4))), c2])
+    check_same(evaluate(both, t), np.concatenate([d1, d2]), c, t)
+    with pytest.raises(ConfigError, match="repeats"):
+        both.then(Trajectory.of_pieces(d1, c1, repeats=True))
+
+
+@pytest.mark.parametrize("traced", [False, True])
+def test_moving_turns_and_shifts_positions_and_turns_derivatives(traced):
+    durations, c = random_pieces()
+    trajectory, offset, yaw = Trajectory.of_pieces(durations, c), np.array([1.0, -2.0, 3.0]), 0.7
+    move = jax.jit(Trajectory.moved) if traced else Trajectory.moved
+    t = np.linspace(-0.3, durations.sum() + 0.3, 30)
+    before, after = evaluate(trajectory, t), evaluate(move(trajectory, offset, yaw), t)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    np.testing.assert_allclose(after.pos, before.pos @ turn.T + offset, atol=1e-9)
+    np.testing.assert_allclose(after.yaw, before.yaw + yaw, atol=1e-12)
+    for name in DERIVATIVES[1:]:
+        np.testing.assert_allclose(getattr(after, name), getattr(before, name) @ turn.T, atol=1e-9)
+    np.testing.assert_allclose(after.yaw_rate, before.yaw_rate, atol=1e-12)
+
+
+@given(t=st.floats(-5, 20), repeats=st.booleans())
+def test_each_derivative_is_the_gradient_of_the_one_before(t, repeats):
+    trajectory = Trajectory.of_pieces(*random_pieces(), repeats=repeats)
+    s = trajectory.evaluate(t)
+    slopes = jax.jacfwd(trajectory.evaluate)(jnp.asarray(t))
+    for low, high in [*pairwise(DERIVATIVES), *pairwise(YAW)]:
+        np.testing.assert_allclose(getattr(slopes, low), getattr(s, high), rtol=1e-9, atol=1e-9)
+
+
+def test_it_is_linear_in_its_coefficients_and_has_their_gradient():
+    durations, c = random_pieces()
+    trajectory = Trajectory.of_pieces(durations, c)
+    grad = jax.grad(lambda c: trajectory.replace(coefficients=c).evaluate(durations[0] + 0.1).pos[1])(
+        jnp.asarray(trajectory.coefficients)
+    )
+    expected = np.zeros_like(c)
+    expected[1, 1] = (0.1 / durations[1]) ** np.arange(8)
+    np.testing.assert_allclose(grad, expected, atol=1e-12)
+
+
+def test_float32_keeps_a_minute_of_long_pieces_to_a_hundredth_of_a_millimetre():
+    """Coefficients of seconds would reach 60^7 = 3e12 in size; those of the scaled time are positions."""
+    t_end, n = 60.0, 8
+    c = np.zeros((1, 4, n))
+    c[0, :3, :4] = np.array([0, 0, 3 / t_end**2, -2 / t_end**3]) * np.array([[5.0], [-4.0], [2.0]])
+    t = np.linspace(0, t_end, 500)
+    exact = oracle([t_end], c, t, 0)[:, :3]
+    with jax.enable_x64(False):
+        trajectory = Trajectory.of_pieces([t_end], c)
+        assert trajectory.coefficients.dtype == np.float32
+        s = jax.vmap(trajectory.evaluate)(t.astype(np.float32))
+        assert s.snap.dtype == np.float32
+        np.testing.assert_allclose(s.pos, exact, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "durations, shape, message",
+    [
+        ([1.0, 2.0], (3, 4, 8), "n_pieces"),
+        ([1.0], (1, 2, 8), "without yaw"),
+        ([], (0, 4, 8), "n_pieces"),
+        ([1.0, 0.0], (2, 4, 8), "positive durations"),
+        ([1.0, -1.0], (2, 4, 8), "positive durations"),
+        ([1.0, np.inf], (2, 4, 8), "positive durations"),
+        ([1e9, 1e-9], (2, 4, 8), "piece 1"),
+        ([1.0], (1, 4, 0), "at least one"),
+    ],
+)
+def test_wrong_pieces_are_refused(durations, shape, message):
+    with pytest.raises(ConfigError, match=message):
+        Trajectory.of_pieces(durations, np.zeros(shape))
+
+
+def test_coefficients_that_are_not_finite_are_refused():
+    with pytest.raises(ConfigError, match="finite"):
+        Trajectory.of_pieces([1.0], np.full((1, 4, 2), np.nan))
+    with pytest.raises(ConfigError, match="at least one trajectory"):
+        Trajectory.stack([])
