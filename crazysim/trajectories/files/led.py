@@ -18,8 +18,8 @@ TICK = 0.02
 """Unit of durations, s."""
 MAX_BYTES = 2**20
 """Longest program, bytes."""
-MAX_COMMANDS = 200_000
-"""Most commands that a program may run, which bounds its loops."""
+MAX_REPEATED = 200_000
+"""Most commands that the loops and jumps of a program may repeat."""
 MAX_LOOPS = 4
 """Deepest nesting of loops, that of libskybrush's ``CONFIG_MAX_LOOP_DEPTH``."""
 MAX_VARINT = 2**28 - 1
@@ -35,7 +35,9 @@ JUMP, TRIGGERED_JUMP, SET_PYRO, SET_PYRO_ALL = 0x12, 0x13, 0x14, 0x15
 BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
 
-def decode_lights(program: bytes | str, until: float = 3600.0, place: str = "a light program") -> Lights:
+def decode_lights(
+    program: bytes | str, until: float = 3600.0, place: str = "a light program", max_repeated: int = MAX_REPEATED
+) -> Lights:
     """Return the lights of a light program.
 
     A drone of the simulation has no remote control and no pyrotechnics: colours from channels are black, as libskybrush
@@ -45,6 +47,7 @@ def decode_lights(program: bytes | str, until: float = 3600.0, place: str = "a l
         program: Byte code, or its base64 form as in ``lights.json``.
         until: Time at which the program is stopped, s; endless loops end there.
         place: File and place in it, for messages.
+        max_repeated: Most commands that loops and jumps may repeat.
 
     Raises:
         ConfigError: If it is no program: an unknown command, a missing argument, a jump to nowhere, loops that are too
@@ -58,7 +61,7 @@ def decode_lights(program: bytes | str, until: float = 3600.0, place: str = "a l
     if len(program) > MAX_BYTES:
         raise ConfigError(f"expected at most {MAX_BYTES} bytes in {place}, got {len(program)}")
     machine = _Machine(program, place)
-    machine.run(round(until / TICK))
+    machine.run(round(until / TICK), len(program) + max_repeated)
     return machine.lights()
 
 
@@ -92,12 +95,12 @@ class _Machine:
             if byte < 0x80:
                 return value
 
-    def run(self, end: int) -> None:
+    def run(self, end: int, max_commands: int) -> None:
         """Run until the program ends, or a time, ticks."""
-        for _ in range(MAX_COMMANDS):
+        for _ in range(max_commands):
             if self.at >= len(self.code) or self.now > end or not self.command(self.byte()):
                 return
-        self.refuse(f"a program that runs at most {MAX_COMMANDS} commands in {end * TICK:g} s", "more")
+        self.refuse(f"a program that runs at most {max_commands} commands in {end * TICK:g} s", "more")
 
     def command(self, code: int) -> bool:
         """Run one command; return False at the end of the program."""

@@ -59,10 +59,10 @@ def unpack_poly4d(content: bytes, place: str = "a trajectory memory") -> Traject
     if not content or len(content) % size or len(content) // size > checks.MAX_POINTS:
         checks.refuse(f"1 to {checks.MAX_POINTS} pieces of {size} bytes", f"{len(content)} bytes", place)
     rows = np.frombuffer(content, "<f4").reshape(-1, POLY4D_FLOATS).astype(float)
-    return ofrows_of(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], place)
+    return of_rows(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], place)
 
 
-def ofrows_of(rows: NDArray, place: str) -> Trajectory:
+def of_rows(rows: NDArray, place: str) -> Trajectory:
     """Return the trajectory of rows of duration, s, and coefficients of x, y, z, m, and yaw, rad, per second.
 
     Args:

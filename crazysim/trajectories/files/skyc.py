@@ -17,7 +17,7 @@ import numpy as np
 from crazysim.errors import ConfigError
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.archive import Archive, write_archive
-from crazysim.trajectories.files.led import MAX_COMMANDS, decode_lights, encode_lights
+from crazysim.trajectories.files.led import MAX_REPEATED, decode_lights, encode_lights
 from crazysim.trajectories.files.lights import Lights
 from crazysim.trajectories.files.show import Cue, ParameterChange, Show
 from crazysim.trajectories.files.show_trajectory import format_trajectory, parse_trajectory
@@ -27,6 +27,8 @@ MAX_DRONES = 5000
 """Most drones of a show, that of Skybrush."""
 MAX_PIECES = 2_000_000
 """Most pieces of all trajectories, or all lights, padded to the longest."""
+MAX_LOOPED = 10_000_000
+"""Most commands that the loops of all light programs may repeat."""
 
 log = logging.getLogger(__name__)
 
@@ -63,12 +65,16 @@ def parse_show(content: bytes, place: str = "a show") -> Show:
     drones = checks.sequence(checks.record(swarm, swarm_at).get("drones"), MAX_DRONES, f"{swarm_at}, drones")
     if not drones:
         checks.refuse("at least one drone", "none", swarm_at)
-    found = [_drone(archive, drone, f"{swarm_at}, drone {i}", i) for i, drone in enumerate(drones)]
+    found = []
+    for i, drone in enumerate(drones):
+        found.append(_drone(archive, drone, f"{swarm_at}, drone {i}", i))
+        _bound(len(drones) * found[-1]["trajectory"].n_pieces, found[-1]["at"])
     trajectories = [drone["trajectory"] for drone in found]
-    _bound(len(found) * max(x.n_pieces for x in trajectories), f"{place}: trajectories")
     duration = max(float(x.duration) for x in trajectories)
-    lights = [_lights(archive, drone["lights"], drone["at"], duration) for drone in found]
-    _bound(len(found) * max(len(x.times) for x in lights), f"{place}: lights")
+    lights, decoded = [], {}
+    for drone in found:
+        lights.append(_lights(archive, drone, duration, MAX_LOOPED // len(found), decoded))
+        _bound(len(found) * len(lights[-1].times), f"{drone['at']}, lights")
     names = [drone["name"] for drone in found]
     if len(set(names)) < len(names):
         checks.refuse("different names of the drones", f"{checks.shown(sorted(names))}", swarm_at)
@@ -153,15 +159,20 @@ def _cues(archive: Archive, value: Any, place: str) -> tuple[Cue, ...]:
     return tuple(sorted(cues, key=lambda cue: cue.time))
 
 
-def _lights(archive: Archive, value: Any, place: str, until: float) -> Lights:
-    """Return the lights of one drone."""
-    if value is None:
+def _lights(
+    archive: Archive, drone: dict[str, Any], until: float, max_looped: int, decoded: dict[str, Lights]
+) -> Lights:
+    """Return the lights of one drone; those of equal programs are decoded once."""
+    if drone["lights"] is None:
         return Lights.constant()
-    value, place = archive.resolve(value, f"{place}, lights")
+    value, place = archive.resolve(drone["lights"], f"{drone['at']}, lights")
     value = checks.record(value, place)
     checks.version_one(value, place)
     if value.get("data") is not None:
-        return decode_lights(checks.text(value["data"], f"{place}, data", 2**22), until, place)
+        data = checks.text(value["data"], f"{place}, data", 2**22)
+        if data not in decoded:
+            decoded[data] = decode_lights(data, until, place, min(max_looped, MAX_REPEATED))
+        return decoded[data]
     if value.get("colors") is not None:
         return parse_colors(value["colors"], f"{place}, colors")
     return Lights.constant()
@@ -180,7 +191,7 @@ def parse_colors(value: Any, place: str) -> Lights:
     Raises:
         ConfigError: If an entry is invalid.
     """
-    entries = checks.sequence(value, MAX_COMMANDS, place)
+    entries = checks.sequence(value, MAX_REPEATED, place)
     times, colors, now = [], [], 0.0
     for i, entry in enumerate(entries):
         at = f"{place}, entry {i}"
