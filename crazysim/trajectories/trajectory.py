@@ -91,16 +91,29 @@ class Trajectory(PyTree):
         Args:
             t: Time since the start of the trajectory, s. ()
         """
-        ends, end = jnp.asarray(self.ends), jnp.asarray(self.ends)[-1]
+        return jax.tree.map(lambda x: jnp.asarray(x)[None], self).evaluate_one(0, t)
+
+    def evaluate_one(self, index: Any, t: Any) -> Setpoint:
+        """Return the setpoint of one of several trajectories at one time, with derivatives up to snap.
+
+        It reads the numbers that it needs and no others, so that many trajectories cost no more than one.
+
+        Args:
+            index: Which of the trajectories along the one leading axis; the nearest one if there is none of this
+                index. ()
+            t: Time since the start of the trajectory, s. ()
+        """
+        ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
+        end, repeats = _at(ends, index, ends.shape[1] - 1), _at(jnp.asarray(self.repeats), index)
         t = jnp.asarray(t, ends.dtype)
         local = jnp.where(t < 0, 0.0, t)
-        local = jnp.where(self.repeats, lax.rem(local, end), jnp.where(t > end, end, local))
-        inside = (t >= 0) & (self.repeats | (t <= end))
-        piece = _piece(ends, local)
-        begin = jnp.where(piece > 0, ends[jnp.maximum(piece - 1, 0)], 0.0)
-        length = ends[piece] - begin
+        local = jnp.where(repeats, lax.rem(local, end), jnp.where(t > end, end, local))
+        inside = (t >= 0) & (repeats | (t <= end))
+        piece = _piece(ends, index, local)
+        begin = jnp.where(piece > 0, _at(ends, index, jnp.maximum(piece - 1, 0)), 0.0)
+        length = _at(ends, index, piece) - begin
         length = jnp.where(length > 0, length, 1.0)  # of padding
-        values = _derivatives(jnp.asarray(self.coefficients)[piece], (local - begin) / length, N_DERIVATIVES)
+        values = _derivatives(_at(coefficients, index, piece), (local - begin) / length, N_DERIVATIVES)
         rate = jnp.where(inside, 1 / length, 0.0)
         pos = values[0]
         vel, acc, jerk, snap = (value * rate**k for k, value in enumerate(values[1:], start=1))
@@ -179,13 +192,18 @@ def _module(tree: Any) -> Any:
     return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(tree)) else np
 
 
-def _piece(ends: Array, t: Array) -> Array:
-    """Return the number of ends up to a time, at most that of the last piece, by bisection. ()"""
-    n = ends.shape[0]
+def _at(x: Array, *index: Any) -> Array:
+    """Return an entry of an array; an index that is too large or too small means the last or first one."""
+    return x.at[index].get(mode="clip")
+
+
+def _piece(ends: Array, index: Any, t: Array) -> Array:
+    """Return the number of ends of a trajectory up to a time, at most that of its last piece, by bisection. ()"""
+    n = ends.shape[1]
     low = jnp.zeros(jnp.shape(t), jnp.int32)
     for k in reversed(range((n - 1).bit_length())):
         middle = jnp.minimum(low + 2**k, n - 1)
-        low = jnp.where(ends[middle - 1] <= t, middle, low)
+        low = jnp.where(_at(ends, index, middle - 1) <= t, middle, low)
     return low
 
 

@@ -1,0 +1,220 @@
+"""Trajectories of standard shapes: figure eight, Lissajous, circle, helix, line, hover.
+
+Curves are fitted piecewise by polynomials of degree 7 that have the curve's position and first three derivatives at
+both ends of each piece, in float64. The remainder of Hermite's interpolation, ``p^(8)(s) t^4 (t - h)^4 / 8!`` in a piece
+of length h, is at most ``max |p^(8)| (h / 2)^8 / 8!``, which decides the number of pieces.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories.trajectory import Trajectory
+
+TOLERANCE = 5e-6
+"""Largest error of the position of a fitted curve, m; float32 adds its rounding, 6e-8 of a coordinate."""
+PERIOD = 5.0
+"""Period without another, s."""
+
+Curve = Callable[[np.ndarray, int], np.ndarray]
+"""Times, s (n,), and the order of a derivative to x, y, z, m, and yaw, rad, differentiated as often. (n, 4)"""
+
+
+def figure_eight(
+    width: float = 2.0,
+    depth: float = 1.0,
+    period: float | None = None,
+    speed: float | None = None,
+    height: float = 1.0,
+) -> Trajectory:
+    """Return a lying figure eight, ``(width/2 sin wt, depth/2 sin 2wt, height)``, that repeats.
+
+    Args:
+        width: Size along x, m.
+        depth: Size along y, m.
+        period: Period, s; None for 5 s, or for what the speed needs.
+        speed: Largest speed instead, m/s, which is reached in the middle.
+        height: Height, m.
+    """
+    return lissajous((width / 2, depth / 2, 0.0), (1, 2, 1), period=period, speed=speed, center=(0.0, 0.0, height))
+
+
+def lissajous(
+    amplitudes: Any = (1.0, 1.0, 0.2),
+    frequencies: Any = (1, 2, 3),
+    phases: Any = (0.0, 0.0, 0.0),
+    period: float | None = None,
+    speed: float | None = None,
+    center: Any = (0.0, 0.0, 1.0),
+) -> Trajectory:
+    """Return a Lissajous curve, ``center + amplitudes sin(frequencies wt + phases)``, that repeats.
+
+    Args:
+        amplitudes: Half of the size along each axis, m. (3,)
+        frequencies: Oscillations along each axis in one period, whole numbers. (3,)
+        phases: Phase of each oscillation, rad. (3,)
+        period: Period, s; None for 5 s, or for what the speed needs.
+        speed: Upper bound of the speed instead, m/s: that of a curve whose axes are fastest at the same time.
+        center: Centre, world frame, m. (3,)
+
+    Raises:
+        ConfigError: If a setting is invalid.
+    """
+    a, k, phi, c = (_vector(n, x) for n, x in zip(("amplitudes", "frequencies", "phases", "center"),
+                                                  (amplitudes, frequencies, phases, center), strict=True))  # fmt: skip
+    if np.any(k != np.round(k)):
+        raise ConfigError(f"expected frequencies as whole numbers, got {frequencies!r}")
+    w = 2 * np.pi / _period(period, speed, 2 * np.pi * float(np.linalg.norm(a * k)))
+
+    def curve(t: np.ndarray, order: int) -> np.ndarray:
+        pos = a * (k * w) ** order * np.sin(k * w * t[:, None] + phi + order * np.pi / 2)
+        return np.pad(pos + (c if order == 0 else 0.0), ((0, 0), (0, 1)))
+
+    return fitted(curve, 2 * np.pi / w, float(np.max(np.abs(a) * np.abs(k * w) ** 8)) * 3**0.5, repeats=True)
+
+
+def circle(
+    radius: float = 1.0,
+    period: float | None = None,
+    speed: float | None = None,
+    height: float = 1.0,
+    along: bool = False,
+) -> Trajectory:
+    """Return a level circle around the z axis, counterclockwise from ``(radius, 0, height)``, that repeats.
+
+    Args:
+        radius: Radius, m.
+        period: Period, s; None for 5 s, or for what the speed needs.
+        speed: Speed instead, m/s.
+        height: Height, m.
+        along: True to turn the drone's x axis along its motion; otherwise the yaw is zero.
+    """
+    return helix(radius, 0.0, 1.0, period, speed, height, along).replace(repeats=np.bool_(True))
+
+
+def helix(
+    radius: float = 1.0,
+    climb: float = 0.5,
+    turns: float = 3.0,
+    period: float | None = None,
+    speed: float | None = None,
+    height: float = 0.5,
+    along: bool = False,
+) -> Trajectory:
+    """Return a helix around the z axis, counterclockwise from ``(radius, 0, height)``.
+
+    Args:
+        radius: Radius, m.
+        climb: Height gained with each turn, m.
+        turns: Number of turns.
+        period: Time of one turn, s; None for 5 s, or for what the speed needs.
+        speed: Speed instead, m/s.
+        height: Height of the start, m.
+        along: True to turn the drone's x axis along its motion; otherwise the yaw is zero.
+
+    Raises:
+        ConfigError: If a setting is invalid.
+    """
+    _positive("turns", turns)
+    radius, climb, height = (_vector(n, x, ()) for n, x in (("radius", radius), ("climb", climb), ("height", height)))
+    w = 2 * np.pi / _period(period, speed, math.hypot(2 * np.pi * radius, climb))
+
+    def curve(t: np.ndarray, order: int) -> np.ndarray:
+        angle = w * t + order * np.pi / 2
+        line = (w * t if order == 0 else np.full_like(t, w)) if order < 2 else np.zeros_like(t)
+        z, yaw = climb / (2 * np.pi) * line + (height if order == 0 else 0.0), line * along
+        yaw = yaw + np.pi / 2 * (along and order == 0)
+        return np.stack([radius * w**order * np.cos(angle), radius * w**order * np.sin(angle), z, yaw], axis=-1)
+
+    return fitted(curve, 2 * np.pi / w * turns, abs(float(radius)) * w**8)
+
+
+def line(
+    start: Any, end: Any, duration: float | None = None, speed: float | None = None, yaw: float = 0.0
+) -> Trajectory:
+    """Return a straight line from rest to rest, with acceleration and jerk zero at both ends.
+
+    Args:
+        start: First point, world frame, m. (3,)
+        end: Last point, world frame, m. (3,)
+        duration: Time that it takes, s; None for 5 s, or for what the speed needs.
+        speed: Largest speed instead, m/s, which is reached in the middle.
+        yaw: Yaw, rad.
+
+    Raises:
+        ConfigError: If a setting is invalid.
+    """
+    a, b = _vector("start", start), _vector("end", end)
+    # u^4 (35 - 84 u + 70 u^2 - 20 u^3) goes from 0 to 1 with three derivatives of zero at both; its slope is at most
+    # 140 (1/2)^6 = 35/16.
+    time = _period(duration, speed, 35 / 16 * float(np.linalg.norm(b - a)), "duration")
+    c = np.zeros((1, 4, 8))
+    c[0, :3] = np.outer(b - a, [0, 0, 0, 0, 35, -84, 70, -20]) / time ** np.arange(8)
+    c[0, :, 0] = [*a, _vector("yaw", yaw, ())]
+    return Trajectory.of_pieces([time], c)
+
+
+def hover(pos: Any = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 1.0) -> Trajectory:
+    """Return a trajectory that stays at a point.
+
+    Args:
+        pos: The point, world frame, m. (3,)
+        yaw: Yaw, rad.
+        duration: Time until what comes next with ``then``, s.
+
+    Raises:
+        ConfigError: If a setting is invalid.
+    """
+    _positive("duration", duration)
+    return Trajectory.of_pieces([duration], np.append(_vector("pos", pos), _vector("yaw", yaw, ()))[None, :, None])
+
+
+def fitted(curve: Curve, duration: float, eighth: float, repeats: bool = False) -> Trajectory:
+    """Return a smooth curve as a trajectory of pieces of equal length, each within ``TOLERANCE``.
+
+    Args:
+        curve: The curve with its derivatives up to the third.
+        duration: Length of the curve, s.
+        eighth: Upper bound of its eighth derivative, m/s^8.
+        repeats: True to start again after the end.
+    """
+    longest = 2 * (TOLERANCE * math.factorial(8) / eighth) ** (1 / 8) if eighth > 0 else math.inf
+    n = max(1, math.ceil(duration / longest))
+    h = duration / n
+    knots = np.linspace(0.0, duration, n + 1)
+    # Derivatives by u = t / h over k!: the first four coefficients at the start, four conditions at the end.
+    at_knots = np.stack([curve(knots, k) * h**k / math.factorial(k) for k in range(4)], axis=-1)
+    binomials = np.array([[math.comb(j, k) for j in range(8)] for k in range(4)], float)
+    rest = at_knots[1:] - at_knots[:-1] @ binomials[:, :4].T
+    coefficients = np.concatenate([at_knots[:-1], np.linalg.solve(binomials[:, 4:], rest[..., None])[..., 0]], axis=-1)
+    return Trajectory.of_pieces(np.full(n, h), coefficients / h ** np.arange(8), repeats)
+
+
+def _period(period: float | None, speed: float | None, length: float, name: str = "period") -> float:
+    """Return the time of something that has this length, m, for the largest speed of a constant rate."""
+    if period is not None and speed is not None:
+        raise ConfigError(f"expected {name} or speed, got both: {period!r} s and {speed!r} m/s. Leave one out.")
+    if speed is None:
+        return _positive(name, PERIOD if period is None else period)
+    _positive("speed", speed)
+    if length == 0:
+        raise ConfigError(f"expected a curve of some size for a speed of {speed!r} m/s, got a point. Use {name}=.")
+    return length / speed
+
+
+def _positive(name: str, value: Any) -> float:
+    if not isinstance(value, (int, float, np.number)) or not np.isfinite(value) or value <= 0:
+        raise ConfigError(f"expected {name} as a positive number, got {value!r}")
+    return float(value)
+
+
+def _vector(name: str, value: Any, shape: tuple[int, ...] = (3,)) -> Any:
+    array = np.asarray(value)
+    if array.shape != shape or array.dtype.kind not in "iuf" or not np.all(np.isfinite(array)):
+        raise ConfigError(f"expected {name} as {'3 finite numbers' if shape else 'a finite number'}, got {value!r}")
+    return array.astype(float)
