@@ -36,7 +36,7 @@ def run(
 
     Args:
         block: The block.
-        inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share.
+        inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
         shape: Shape of the lanes.
         env: Values of the blocks around it.
         observe: Gets every operation with its results.
@@ -46,7 +46,8 @@ def run(
     """
     env = dict(env or {})
     given = [np.asarray(x, v.dtype) for x, v in zip(inputs, block.inputs, strict=True)]
-    env.update(zip(block.inputs, (np.broadcast_to(x, shape) for x in given), strict=True))
+    lanes_of = (x if v.size else np.broadcast_to(x, shape) for x, v in zip(given, block.inputs, strict=True))
+    env.update(zip(block.inputs, lanes_of, strict=True))
     with np.errstate(all="ignore"):
         for op in block.operations:
             results = _apply(op, [_get(env, x, shape) for x in op.args], shape, env)
@@ -79,6 +80,10 @@ def _apply(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: E
             return args
         case "custom_jvp":
             return run(op.blocks[0], args, shape, env)
+        case "table":
+            return [op.param("numbers").array]
+        case "lookup":
+            return [args[0][args[1] + op.param("offset")]]
         case "threefry2x32":
             return list(threefry2x32(*args))
     numpy, params = ops.TABLE[op.name].numpy, dict(op.params)

@@ -22,10 +22,30 @@ Element = Any
 
 @dataclasses.dataclass(frozen=True, eq=False, slots=True)
 class Value:
-    """One number that is computed at run time; equal only to itself."""
+    """One number that is computed at run time, or a table of numbers; equal only to itself."""
 
     dtype: np.dtype
     """Type of the number."""
+    size: int = 0
+    """Number of entries of a table, which only ``lookup`` reads; 0 for a single number."""
+
+
+class Numbers:
+    """Entries of a table that are known before the program runs; equal to those of the same type and bits."""
+
+    def __init__(self, array: np.ndarray):
+        """Hold a flat array."""
+        self.array = array
+        self._key = (array.dtype, array.tobytes())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Numbers) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __repr__(self) -> str:
+        return f"{self.array.dtype}[{self.array.size}]"
 
 
 class Operation(NamedTuple):
@@ -102,9 +122,9 @@ class Builder:
         self.operations: list[Operation] = []
         self._known: dict[Any, tuple[Value, ...]] = {}
 
-    def input(self, dtype: Any) -> Value:
-        """Add an input."""
-        value = Value(np.dtype(dtype))
+    def input(self, dtype: Any, size: int = 0) -> Value:
+        """Add an input, a table if a size is given."""
+        value = Value(np.dtype(dtype), size)
         self.inputs.append(value)
         return value
 
@@ -150,7 +170,8 @@ class Builder:
     def _new(self, name: str, args: tuple, dtypes: tuple, params: tuple, blocks: tuple) -> tuple[Value, ...]:
         if name not in ops.TABLE:
             raise KeyError(f"operation {name!r} is not in ops.TABLE")
-        results = tuple([Value(dtype) for dtype in dtypes])
+        size = dict(params)["numbers"].array.size if name == "table" else 0
+        results = tuple([Value(dtype, size) for dtype in dtypes])
         self.operations.append(Operation(name, args, results, params, blocks, self.stage))
         return results
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from importlib import resources
 
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.program import Phase, Program, Segment, Slot
+from crazysim.engine.program import TABLE, Phase, Program, Segment, Slot
 from crazysim.engine.source import TYPES, Writer, require, type_name
 
 UNBOUNDED = "1 /* blocks at least */"
@@ -80,7 +80,9 @@ def write(program: Program, target: str) -> Kernel:
     names = {slot: f"x{slot[0]}_{slot[1]}" for slot in slots}
     for slot in slots:
         kind, access = _type(program, slot[0]), _load(program, slot)
-        if slot not in loaded:
+        if slot[1] == TABLE:
+            names[slot] = f"p{slot[0]}"
+        elif slot not in loaded:
             writer.line(f"auto {names[slot]} = {kind}_lanes({kind}(0));", 1)
         elif slot in written:
             writer.line(f"auto {names[slot]} = {kind}_lanes({access});", 1)
@@ -107,7 +109,8 @@ def write(program: Program, target: str) -> Kernel:
     frame = {"cuda": _cuda, "host": _host}[target]
     widest = 8 if any(_type(program, i) == "f64" for i in (*inputs, *outputs)) else 4
     defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n"
-    text = defines + preamble(target) + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
+    tables = "".join(f"{line}\n" for line in writer.tables)
+    text = defines + preamble(target) + tables + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
     in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
     return Kernel(text, inputs, outputs, in_place, program.group)
 

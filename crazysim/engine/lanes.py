@@ -18,7 +18,7 @@ from jax import Array
 from crazysim.engine import jaxcompat, xla
 from crazysim.engine.ir import Block
 from crazysim.engine.jaxcompat import is_key
-from crazysim.engine.program import Phase, Program, Segment, Slot, UnfusedStage
+from crazysim.engine.program import TABLE, Phase, Program, Segment, Slot, UnfusedStage
 
 Execute = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
 """Runs a block: from the block, its inputs and the lanes' shape to its outputs."""
@@ -52,7 +52,9 @@ class Lanes:
         return (self.n_worlds * self.n_drones,)
 
     def get(self, slot: Slot) -> Any:
-        """Return a number of every drone, or the one number that all share."""
+        """Return a number of every drone, or the one number that all share, or a table."""
+        if slot[1] == TABLE:
+            return self.arrays[slot[0]].reshape(-1)
         if slot not in self.lanes:
             self._split(slot[0])
         return self.lanes[slot]
@@ -154,7 +156,7 @@ def _run_worlds(segment: Segment, lanes: Lanes) -> None:
             drone, k = divmod(k, leaves[leaf].size)
             return lanes.get((leaf, k)).reshape(shape)[:, drone]
         value = lanes.get(slot)
-        return value.reshape(shape)[:, 0] if jnp.ndim(value) else value
+        return value.reshape(shape)[:, 0] if jnp.ndim(value) and k != TABLE else value
 
     outs = lanes.execute(segment.block, [of_world(slot) for slot in segment.reads], shape[:1])
     new: dict[Slot, dict[int, Array]] = {}

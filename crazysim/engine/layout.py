@@ -13,10 +13,11 @@ from crazysim.engine.program import Leaf, Program, Segment, Slot
 def pack_shared(program: Program) -> Program:
     """Read the numbers that all drones share from one leaf, behind the others, in which they follow each other.
 
-    A call of a compiled step costs by the number of its arrays. A leaf that an unfused stage reads stays one.
+    A call of a compiled step costs by the number of its arrays. A leaf that an unfused stage reads, or that is
+    a table, stays one.
     """
     leaves = program.leaves
-    direct = {leaf for stage in program.unfused_stages for leaf in stage.used}
+    direct = {leaf for stage in program.unfused_stages for leaf in stage.used} | program.tables
     shared = [i for i in program.read if leaves[i].scope == "shared" and i not in direct and i not in program.written]
     shared = [i for i in shared if leaves[i].dtype == leaves[0].dtype]
     if not shared:

@@ -37,7 +37,7 @@ def of_program(program: Program) -> str:
 def of_block(block: Block) -> str:
     """Return a block as text."""
     names = _Names()
-    inputs = ", ".join(f"{names.new(x)}: {x.dtype}" for x in block.inputs)
+    inputs = ", ".join(f"{names.new(x)}: {_type(x)}" for x in block.inputs)
     lines = list(_of_operations(block, names, 1))
     outputs = ", ".join(names.of(x) for x in block.outputs)
     return "\n".join([f"block({inputs})", *lines, f"return {outputs}"]) + "\n"
@@ -56,6 +56,8 @@ def of_operation(program: Program, operation: Operation) -> str:
 def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
     """Return a place as the field and the element, such as ``states.pos[2]``; of a world, with the drone."""
     (i, k), leaf = slot, program.leaves[slot[0]]
+    if k < 0:  # all of it, a table
+        return f"{leaf.name}[:]"
     drone = ""
     if segment.scope == "world" and leaf.scope == "drone":
         number, k = divmod(k, leaf.size)
@@ -73,18 +75,22 @@ def _of_segment(program: Program, segment: Segment, names: _Names) -> Iterator[s
     if segment.hoisted.outputs:
         yield f"{INDENT}hoisted, once before the first step:"
         for x, slot in zip(segment.hoisted.inputs, segment.hoisted_reads, strict=True):
-            yield f"{INDENT * 2}{names.new(x)}: {x.dtype} = {slot_name(program, segment, slot)}"
+            yield f"{INDENT * 2}{names.new(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
         yield from _of_operations(segment.hoisted, names, 2)
         for x, y in zip(segment.block.inputs[len(segment.reads) :], segment.hoisted.outputs, strict=True):
             yield f"{INDENT * 2}{names.new(x)} = {names.of(y)}"
     for x, slot in zip(segment.block.inputs, segment.reads, strict=False):
-        yield f"{INDENT}{names.new(x)}: {x.dtype} = {slot_name(program, segment, slot)}"
+        yield f"{INDENT}{names.new(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
     yield from _of_operations(segment.block, names, 1)
     if segment is program.check:
         yield f"{INDENT}flagged = {names.of(segment.block.outputs[0])}"
         return
     for x, slot in zip(segment.block.outputs, segment.writes, strict=True):
         yield f"{INDENT}{slot_name(program, segment, slot)} = {names.of(x)}"
+
+
+def _type(x: Value) -> str:
+    return f"{x.dtype}[{x.size}]" if x.size else f"{x.dtype}"
 
 
 class _Names:
@@ -122,7 +128,7 @@ def _of_operations(block: Block, names: _Names, depth: int) -> Iterator[str]:
 
 def _line(op: Operation, names: _Names) -> str:
     params = [f"{k}={v}" for k, v in op.params if not callable(v)]
-    results = ", ".join(f"{names.new(x)}: {x.dtype}" for x in op.results)
+    results = ", ".join(f"{names.new(x)}: {_type(x)}" for x in op.results)
     return f"{results} = {op.name}({', '.join([*map(names.of, op.args), *params])})"
 
 

@@ -13,14 +13,14 @@ most primitives need no rule of their own:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from crazysim.engine import jaxcompat, ops
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.ir import Block, Builder, Element, constant
+from crazysim.engine.ir import Block, Builder, Element, Value, constant
 from crazysim.engine.jaxcompat import ClosedJaxpr, Literal, is_key
 from crazysim.engine.simplify import known_zero
 
@@ -44,12 +44,29 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
     return register
 
 
+class Entry(NamedTuple):
+    """Place of a number in a table: its index is the sum of a computed base and a constant."""
+
+    table: Value
+    """The table."""
+    base: Element
+    """Computed part of the index; the constant 0 if there is none."""
+    offset: int
+    """Constant part."""
+
+
 class Lowering:
     """Lowers jaxprs into a block of scalar operations."""
 
-    def __init__(self, builder: Builder | None = None):
-        """Add operations to a block, to a new one if none is given."""
+    def __init__(self, builder: Builder | None = None, entries: dict[Value, Entry] | None = None):
+        """Add operations to a block, to a new one if none is given.
+
+        Args:
+            builder: Builder of the block.
+            entries: Numbers that can also be looked up in tables, to which others are added.
+        """
         self.builder = Builder() if builder is None else builder
+        self.entries = {} if entries is None else entries
 
     def lower(self, jaxpr: ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
         """Return the results of a jaxpr for arrays of elements.
@@ -112,7 +129,13 @@ class Lowering:
 
     def inner(self) -> Lowering:
         """Return a lowering into a new block inside this one."""
-        return Lowering(Builder(self.builder))
+        return Lowering(Builder(self.builder), self.entries)
+
+    def lookup(self, table: Value, base: Element, offset: int) -> Element:
+        """Return a number of a table."""
+        found = self.builder.add("lookup", (table, base), table.dtype, (("offset", offset),))
+        self.entries[found] = Entry(table, base, offset)
+        return found
 
     def finish(self, outputs: Sequence[Elements]) -> Block:
         """Return the block, with these outputs."""

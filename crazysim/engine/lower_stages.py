@@ -6,13 +6,15 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Literal
 
 import jax
+import numpy as np
 
 import crazysim.engine.rules  # noqa: F401  (fills the table of rules)
 from crazysim.core.stage import Axes, Stage
 from crazysim.engine.errors import LimitError, UnsupportedError
-from crazysim.engine.ir import Builder, Element, constant, prune
-from crazysim.engine.lower import Elements, Lowering, as_elements, inputs, scalars
-from crazysim.engine.program import Leaf, Phase, Program, Segment, Slot, UnfusedStage
+from crazysim.engine.ir import Builder, Element, Value, constant, prune
+from crazysim.engine.jaxcompat import is_key
+from crazysim.engine.lower import Elements, Entry, Lowering, as_elements, inputs, scalars
+from crazysim.engine.program import TABLE, Leaf, Phase, Program, Segment, Slot, UnfusedStage
 from crazysim.engine.tracing import TracedStage
 
 MAX_UNROLLED_DRONES = 8
@@ -70,7 +72,8 @@ def _lower_stage(
         scope: Literal["drone", "world"] = "world" if stage.scope == "world" and of_drones else "drone"
         if scope == "world" and n_drones > MAX_UNROLLED_DRONES:
             raise LimitError(f"a stage of one world is unrolled for at most {MAX_UNROLLED_DRONES} drones")
-        return _segment(stage, scope, phase, traced, zeros)
+        shared = [i for i in traced.used if axes.scopes[i] == "shared" and not is_key(traced.avals[i])]
+        return _segment(stage, scope, phase, traced, zeros, shared)
     except UnsupportedError as error:
         traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)
         why = error.located(stage=stage.__name__)
@@ -78,10 +81,16 @@ def _lower_stage(
 
 
 def _segment(
-    stage: Stage, scope: Literal["drone", "world"], phase: Phase, traced: TracedStage, zeros: Zeros
+    stage: Stage,
+    scope: Literal["drone", "world"],
+    phase: Phase,
+    traced: TracedStage,
+    zeros: Zeros,
+    shared: Sequence[int],
 ) -> Segment:
     lowering = Lowering(Builder(stage=stage.__name__))
     before = {i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.used}
+    tables = {_table(lowering, before[i]): (i, TABLE) for i in shared if i in before and before[i].size > 1}
     args = [before[i] for i in traced.used]
     if traced.when is None:
         after = lowering.lower(traced.fn, args)
@@ -95,9 +104,18 @@ def _segment(
     for i, new in zip(traced.written, after, strict=True):
         old = scalars(before[i]) if i in before else [None] * len(scalars(new))
         writes.update({(i, k): b for k, (a, b) in enumerate(zip(old, scalars(new), strict=True)) if a is not b})
-    slots = {x: (i, k) for i, elements in before.items() for k, x in enumerate(scalars(elements))}
+    slots = {x: (i, k) for i, elements in before.items() for k, x in enumerate(scalars(elements))} | tables
     block = prune(lowering.builder.finish(tuple(writes.values())), keep_inputs=False)
     return Segment(scope, (stage.__name__,), phase, block, tuple([slots[x] for x in block.inputs]), tuple(writes))
+
+
+def _table(lowering: Lowering, elements: Elements) -> Value:
+    """Return a table of the numbers of a shared array, which can also be looked up there."""
+    items = elements.reshape(-1)
+    table = lowering.builder.input(items[0].dtype, len(items))
+    zero = constant(0, np.int32)
+    lowering.entries.update((x, Entry(table, zero, k)) for k, x in enumerate(items) if isinstance(x, Value))
+    return table
 
 
 def _guarded(

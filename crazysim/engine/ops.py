@@ -306,6 +306,8 @@ def _rows() -> list[Row]:
     ]  # fmt: skip
     structured = [
         Row(name="barrier", operands="", results="", cost=0, structured=True),
+        Row(name="table", operands="", results="*", cost=0, structured=True),
+        Row(name="lookup", operands="**", results="*", structured=True),
         Row(name="threefry2x32", operands="uuuu", results="uu", cost=60, structured=True),
         *(Row(name=name, operands="...", results="...", cost=0, structured=True)
           for name in ("when", "loop", "while", "custom_jvp")),
@@ -326,6 +328,8 @@ TABLE: Mapping[str, Row] = {row.name: row for row in _rows()}
 where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)`` runs its block that often;
 ``while(*carry)`` runs its second block as long as its first is true. ``custom_jvp(*args, slope=)`` runs its block, and
 has a derivative of its own. ``threefry2x32`` is the cipher of JAX's random numbers.
+``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=)`` the entry at the sum of an int32 and a
+constant; whoever makes one sees to it that there is such an entry.
 
 Costs are counted with what decides them: comparisons with selections, signs with what takes them. Functions cost what
 hardware that approximates them and a step that refines take, or the shortest polynomial that is exact to float32;

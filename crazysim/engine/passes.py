@@ -70,7 +70,7 @@ def _joined(segments: list[Segment]) -> Segment:
         values: dict[Value, Element] = {}
         for x, slot in zip(segment.block.inputs, segment.reads, strict=True):
             if slot not in now:
-                now[slot] = before[slot] = builder.input(x.dtype)
+                now[slot] = before[slot] = builder.input(x.dtype, x.size)
             values[x] = now[slot]
         now.update(zip(segment.writes, inline(builder, segment.block, values), strict=True))
         builder.barrier()

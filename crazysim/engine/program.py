@@ -25,6 +25,9 @@ Slot = tuple[int, int]
 Phase = Literal["first", "each", "last"]
 """When a segment runs: once before the first step, at each step, once after the last."""
 
+TABLE = -1
+"""Element of a slot that means the whole leaf, a table: only shared leaves are tables."""
+
 PHASES: tuple[Phase, ...] = ("first", "each", "last")
 
 
@@ -170,6 +173,12 @@ class Program:
         return sorted({i for s in self.segments for i in s.read})
 
     @functools.cached_property
+    def tables(self) -> set[int]:
+        """Leaves that are read as tables."""
+        segments = self.fused_segments
+        return {leaf for s in segments for leaf, k in (*s.reads, *s.hoisted_reads) if k == TABLE}
+
+    @functools.cached_property
     def rows(self) -> dict[int, int]:
         """Leaves that are rows, and how many rows they have."""
         return {i: leaf.shape[0] for i, leaf in enumerate(self.leaves) if leaf.rows_of}
@@ -185,7 +194,9 @@ class Program:
 
     def per_drone(self, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
         """Return the slots of a segment as those of one drone: in a segment of worlds they count all its drones."""
-        return list(slots) if segment.scope == "drone" else [(i, k % self.leaves[i].size) for i, k in slots]
+        if segment.scope == "drone":
+            return list(slots)
+        return [(i, k if k == TABLE else k % self.leaves[i].size) for i, k in slots]
 
     def changing(self) -> set[Slot]:
         """Return the numbers that a step may change."""
@@ -194,7 +205,7 @@ class Program:
             if isinstance(segment, Segment):
                 changing.update(self.per_drone(segment, segment.writes))
             else:
-                changing.update((leaf, k) for leaf in segment.written for k in range(self.leaves[leaf].size))
+                changing.update((leaf, k) for leaf in segment.written for k in range(TABLE, self.leaves[leaf].size))
         return changing
 
     def parts(self) -> Iterator[Program]:

@@ -47,6 +47,7 @@ class Writer:
         self.names: dict[Value, str] = {}
         self.pairs: dict[str, str] = {}
         self.tests: dict[Value, Operation] = {}
+        self.tables: list[str] = []
         self._count = 0
 
     def new(self, prefix: str = "v") -> str:
@@ -86,6 +87,11 @@ class Writer:
                 name = self._results(op)
                 self.line(f"auto {name}_0 = u32_lanes({args[2]}), {name}_1 = u32_lanes({args[3]});", depth)
                 self.line(f"threefry2x32({args[0]}, {args[1]}, {name}_0, {name}_1);", depth)
+            case "table":
+                self._table(op)
+            case "lookup":
+                name = self.names[op.results[0]] = self.new()
+                self.line(f"const auto {name} = lookup({args[0]}, {args[1]}, {op.param('offset')});", depth)
             case "sin" | "cos":
                 self._sin_cos(op, args[0], depth)
             case "custom_jvp":  # no derivative is taken of a kernel
@@ -106,6 +112,12 @@ class Writer:
         name = name or self.new()
         self.names.update((x, f"{name}_{k}") for k, x in enumerate(op.results))
         return name
+
+    def _table(self, op: Operation) -> None:
+        """Write a table of constants, in front of the kernel."""
+        name = self.names[op.results[0]] = self.new("t")
+        numbers = ", ".join(_entry(x) for x in op.param("numbers").array)
+        self.tables.append(f"TABLE {type_name(op.dtype)} {name}[] = {{{numbers}}};")
 
     def _sin_cos(self, op: Operation, x: str, depth: int) -> None:
         """Write sine and cosine at once: most of the work for one of the two is that for the other."""
@@ -198,6 +210,11 @@ def type_name(dtype: Any) -> str:
     if dtype not in TYPES:
         raise UnsupportedError(f"kernels have no numbers of type {dtype.name}")
     return TYPES[dtype]
+
+
+def _entry(x: np.generic) -> str:
+    """Return a finite constant without a call, for an initialiser."""
+    return f"{float(x).hex()}{'f' * (x.dtype == np.float32)}" if x.dtype.kind == "f" else f"{int(x)}"
 
 
 def literal(x: np.generic) -> str:

@@ -61,6 +61,8 @@ def _refusal(op: Operation) -> str | None:
             return RANDOM
         case "while":
             return "a loop that runs until a condition fails cannot be unrolled"
+        case "lookup":
+            return "it looks a number up in a table, at a place that is computed"
         case "loop" if op.param("length") > MAX_LOOP:
             return f"a loop of {op.param('length')} iterations is too long; at most {MAX_LOOP} are unrolled"
     row = ops.TABLE[op.name]

@@ -6,7 +6,7 @@ import numpy as np
 
 from crazysim.engine import ops
 from crazysim.engine.ir import Block, Element, Operation, Value
-from crazysim.engine.program import PHASES, Program, Segment, Slot
+from crazysim.engine.program import PHASES, TABLE, Program, Segment, Slot
 
 
 class VerificationError(AssertionError):
@@ -71,6 +71,10 @@ def _slots(
     _require(len(set(slots)) == len(slots), f"a place is there twice as {what}")
     for (i, k), x in zip(slots, elements, strict=True):
         leaf = program.leaves[i]
+        if k == TABLE:
+            is_table = what != "output" and leaf.scope == "shared" and x.size == leaf.size and x.dtype == leaf.number
+            _require(is_table, f"{what} is {leaf.name} as a table, which it is not")
+            continue
         n_drones = program.n_drones if segment.scope == "world" and leaf.scope == "drone" else 1
         _require(0 <= k < leaf.size * n_drones, f"{what} {k} of {leaf.name}, which has {leaf.size * n_drones} numbers")
         _require(x.dtype == leaf.number, f"{what} of type {x.dtype} for {leaf.name} of type {leaf.number}")
@@ -101,6 +105,7 @@ def _verify_block(block: Block, defined: set[Value]) -> None:
         define(op.results)
     for x in block.outputs:
         use(x, "an output")
+        _require(not isinstance(x, Value) or not x.size, "an output is a table")
 
 
 def _definitions(block: Block) -> list[Value]:
@@ -112,7 +117,16 @@ def _verify_types(op: Operation) -> None:
     row, dtypes, results = ops.TABLE[op.name], [x.dtype for x in op.args], [x.dtype for x in op.results]
     text = f"operation {op.name!r} of {', '.join(map(str, dtypes))} to {', '.join(map(str, results))}"
     _require(all(x in ops.DTYPES for x in (*dtypes, *results)), f"{text}: a type that the engine does not have")
+    tables = [x for x in op.args[op.name == "lookup" :] if isinstance(x, Value) and x.size]
+    _require(not tables, f"{text}: a table, which only 'lookup' reads")
     match op.name:
+        case "table":
+            numbers = op.param("numbers").array
+            _require((numbers.dtype, numbers.size) == (results[0], op.results[0].size), text)
+        case "lookup":
+            table, offset = op.args[0], op.param("offset")
+            _require(isinstance(table, Value) and 0 <= offset < table.size, f"{text}: no entry {offset}")
+            _require(dtypes[1] == np.dtype(np.int32) and results == [table.dtype], text)
         case "when":
             (block,) = op.blocks
             outs = [x.dtype for x in block.outputs]

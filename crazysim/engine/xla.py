@@ -22,7 +22,7 @@ def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: Env 
 
     Args:
         block: The block.
-        inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share.
+        inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
         shape: Shape of the lanes.
         env: Values of the blocks around it.
 
@@ -57,7 +57,7 @@ def _last_uses(block: Block) -> dict[Value, int]:
 def _separate(env: Env, block: Block, position: int, last_use: dict[Value, int]) -> None:
     """Compute once what is used beyond this point: XLA's CPU backend repeats shared arithmetic for every result."""
     results = [x for op in block.operations[:position] for x in op.results]
-    live = [x for x in results if last_use.get(x, -1) > position and np.ndim(env[x])]
+    live = [x for x in results if last_use.get(x, -1) > position and not x.size and np.ndim(env[x])]
     env.update(zip(live, lax.optimization_barrier([env[x] for x in live]), strict=True))
 
 
@@ -133,6 +133,15 @@ def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
     return call(*(jnp.asarray(x) for x in args))
 
 
+def _table(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    return [jnp.asarray(op.param("numbers").array)]
+
+
+def _lookup(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    table, index = args
+    return [jnp.asarray(table).at[index + op.param("offset")].get(mode="promise_in_bounds")]
+
+
 def _threefry(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     return jaxcompat.threefry2x32_p.bind(*_broadcast(args))
 
@@ -142,5 +151,7 @@ STRUCTURE: dict[str, Callable[..., Any]] = {
     "while": _while,
     "when": _when,
     "custom_jvp": _custom_jvp,
+    "table": _table,
+    "lookup": _lookup,
     "threefry2x32": _threefry,
 }

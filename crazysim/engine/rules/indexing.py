@@ -12,6 +12,7 @@ from jax.lax import GatherScatterMode
 from crazysim.engine.ir import Element, constant, is_constant
 from crazysim.engine.jaxcompat import ClosedJaxpr
 from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
+from crazysim.engine.rules import tables
 from crazysim.engine.rules.movement import move_many, run_now
 
 
@@ -26,10 +27,15 @@ def _dynamic_slice(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elemen
 def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> Elements:
     """Return ``size`` elements along an axis from a start that is clamped to the array."""
     last = x.shape[axis] - size
-    pieces = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
     if is_constant(start) or last == 0:
-        return pieces[int(np.clip(start, 0, last)) if last else 0]
+        k = int(np.clip(start, 0, last)) if last else 0
+        return np.take(x, range(k, k + size), axis)
+    table = tables.find(ctx, x, (axis,), last + 1)
+    if table is not None:
+        offsets = np.take(table.offsets, range(size), axis)
+        return table.look_up(offsets, [table.base_at([start], [last])] * offsets.size)
     _check_range(last + 1)
+    pieces = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
     taken = pieces[last]
     for k in range(last - 1, -1, -1):
         here = as_elements([ctx.scalar("le", start, constant(k, start.dtype), dtype=bool)], ())
@@ -92,7 +98,7 @@ def _gather(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
         return move_many(eqn, [x], [values(indices)])
     dims, mode, sizes = eqn.params["dimension_numbers"], eqn.params["mode"], eqn.params["slice_sizes"]
     limits = [x.shape[axis] - sizes[axis] for axis in dims.start_index_map]
-    _check_range(int(np.prod([limit + 1 for limit in limits])))
+    n_places = int(np.prod([limit + 1 for limit in limits]))
     rows = indices.reshape(-1, indices.shape[-1])
     out = eqn.outvars[0].aval
     # Which row of indices an element of the result belongs to: the axes of the result that are no offsets.
@@ -103,9 +109,37 @@ def _gather(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
         shape[axis] = size
     row_of = np.broadcast_to(np.arange(len(rows)).reshape(shape), out.shape).reshape(-1)
 
+    table = tables.find(ctx, x, dims.start_index_map, n_places)
+    if table is not None:
+        zeros = np.zeros(indices.shape, np.int32)
+        offsets = move_many(eqn, [table.offsets.astype(object)], [zeros])[0].reshape(-1)
+        bases = [table.base_at(row, limits) for row in rows]
+        result = list(table.look_up(offsets, [bases[k] for k in row_of]))
+    else:
+        result = _select_windows(ctx, eqn, x, indices.shape, rows, row_of, limits)
+    if mode == GatherScatterMode.FILL_OR_DROP:
+        inside = [_inside(ctx, row, limits) for row in rows]
+        fill = eqn.params["fill_value"]
+        fill = _fill_value(out.dtype) if fill is None else fill
+        result = [_select(ctx, inside[row_of[o]], as_elements([item], ()), constants(fill, out.dtype))[()]
+                  for o, item in enumerate(result)]  # fmt: skip
+    return [as_elements(result, out.shape)]
+
+
+def _select_windows(
+    ctx: Lowering,
+    eqn: Any,
+    x: Elements,
+    shape: tuple[int, ...],
+    rows: Elements,
+    row_of: np.ndarray,
+    limits: Sequence[int],
+) -> list[Element]:
+    """Return the elements of a gather, selected among all places that the indices may mean."""
+    _check_range(int(np.prod([limit + 1 for limit in limits])))
     result: list[Element] = []
     for corner in itertools.product(*(range(limit + 1) for limit in limits)):
-        static = np.broadcast_to(np.array(corner, np.int32), indices.shape)
+        static = np.broadcast_to(np.array(corner, np.int32), shape)
         here = move_many(eqn, [x], [static])[0].reshape(-1)
         if not result:
             result = list(here)
@@ -117,13 +151,7 @@ def _gather(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
             condition = hit[row_of[o]]
             if condition is not None and item is not result[o]:
                 result[o] = _select(ctx, condition, as_elements([item], ()), as_elements([result[o]], ()))[()]
-    if mode == GatherScatterMode.FILL_OR_DROP:
-        inside = [_inside(ctx, row, limits) for row in rows]
-        fill = eqn.params["fill_value"]
-        fill = _fill_value(out.dtype) if fill is None else fill
-        result = [_select(ctx, inside[row_of[o]], as_elements([item], ()), constants(fill, out.dtype))[()]
-                  for o, item in enumerate(result)]  # fmt: skip
-    return [as_elements(result, out.shape)]
+    return result
 
 
 def _gather_filled(eqn: Any, x: Elements, indices: np.ndarray) -> Elements:

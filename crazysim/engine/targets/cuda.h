@@ -29,3 +29,6 @@ FN b1 of_drone(b1 x, int d) { return of_drone(i32(x), d) != 0; }
 // A row of numbers, one for each lane.
 #define LOAD_ROW(p, k) p[size_t(k) * n_lanes + lane]
 #define STORE_ROW(p, k, value) if (active) p[size_t(k) * n_lanes + lane] = value;
+// Tables: constants, and the entry of one at index + k.
+#define TABLE static __device__ const
+template <class T> FN T lookup(const T* p, i32 index, i32 k) { return p[index + k]; }

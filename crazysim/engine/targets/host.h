@@ -266,6 +266,20 @@ FN void store_row(b1* p, int n, b1v x) { store_each(p, 1, 1, 0, n, -x.m); }
 #define LOAD_ROW(p, k) load_row(p + (k) * n_lanes + first, n_active)
 #define STORE_ROW(p, k, value) store_row(p + (k) * n_lanes + first, n_active, value);
 
+// Tables: constants, and the entry of one at index + k.
+#define TABLE static const
+template <class T> FN T lookup(const T* p, i32 index, i32 k) { return p[index + k]; }
+template <class T> FN typename vec<T>::type lookup(const T* p, i32v index, i32 k) {
+  typename vec<T>::type x;
+  for (int i = 0; i < W; ++i) x[i] = p[index[i] + k];
+  return x;
+}
+FN b1v lookup(const b1* p, i32v index, i32 k) {
+  i32v x;
+  for (int i = 0; i < W; ++i) x[i] = p[index[i] + k];
+  return {-x};
+}
+
 // Work that is worth it is shared between the cores, in whole blocks of lanes. Of the system's headers the small ones:
 // reading those of std::thread would take as long as reading all of this.
 static int64_t n_cores() {  // that this process may use
