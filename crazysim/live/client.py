@@ -144,5 +144,3 @@ class StreamClient(_Client):
     def start_show(self) -> None:
         """Start the trajectories of all drones that have received one."""
         self.send(b"00_CMDSTART_show_EOF")
-
-

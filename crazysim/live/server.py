@@ -60,8 +60,8 @@ class CommandServer(CommandQueue):
     """Server for the lab's protocol, in threads of its own.
 
     At ``drone_port`` a client takes the control of one drone with ``REQ_07``, answered by ``ACK_07`` or, if the drone
-    does not exist or another client has it, ``ACK_00``. Its commands ``CMDSTART_takeoff_0.5_EOF`` and so on are answered
-    by ``ACK``, or ``ERR`` if they are invalid. At ``stream_port`` messages name their drone,
+    does not exist or another client has it, ``ACK_00``. Its commands, ``CMDSTART_takeoff_0.5_EOF`` for example, are
+    answered by ``ACK``, or ``ERR`` if they are invalid. At ``stream_port`` messages name their drone,
     ``07_CMDSTART_takeoff_0.5_EOF``; shows and ``START`` are accepted too.
 
         with CommandServer() as server:
@@ -308,5 +308,3 @@ def _frames(peer: socket.socket, stopped: threading.Event, timeout: float) -> An
             deadline = None
         elif deadline is None:
             deadline = time.monotonic() + timeout
-
-

@@ -65,8 +65,9 @@ def _refined(squares: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:
 
 def tracking_rms(flight: ShowFlight) -> dict[str, float]:
     """Return the root mean square of every drone's distance from its planned position, m, by name."""
-    errors = np.linalg.norm(flight.pos.astype(float) - flight.planned, axis=-1)
-    return dict(zip(flight.show.names, np.sqrt(np.mean(errors**2, axis=0)).tolist(), strict=True))
+    errors = flight.pos - flight.planned
+    mean = np.einsum("tnk,tnk->n", errors, errors, dtype=float) / len(errors)
+    return dict(zip(flight.show.names, np.sqrt(mean).tolist(), strict=True))
 
 
 def collisions(flight: ShowFlight) -> list[dict[str, Any]]:

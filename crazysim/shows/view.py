@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.media import Film, Flight, View, flight_of
-from crazysim.media import web
+from crazysim.media import Film, Flight, View, flight_of, web
 from crazysim.media.recording import put
 from crazysim.shows.flight import ShowFlight
 from crazysim.shows.report import collisions

@@ -109,8 +109,8 @@ def test_commands_that_cannot_be_carried_out_change_nothing(sim, caplog):
     high = Trajectory.of_pieces([1.0], np.zeros((1, 4, 9)))
     many = Show(tuple("abcd"), Trajectory.stack([hover()] * 4), Lights.stack([Lights.constant()] * 4))
     big = Show(("a",), Trajectory.stack([long]), Lights.stack([Lights.constant()]))
-    wrong = [Upload(1, long), Upload(1, high), Upload(None, Trajectory.stack([hover()])), Start(1), Start(None), Land(4),
-             LoadShow(many), LoadShow(big)]  # fmt: skip
+    uploads = [Upload(1, long), Upload(1, high), Upload(None, Trajectory.stack([hover()]))]
+    wrong = [*uploads, Start(1), Start(None), Land(4), LoadShow(many), LoadShow(big)]
     assert fleet.apply(wrong) == 0
     assert caplog.text.count("refused: expected") == len(wrong)
     assert sim.data is before

@@ -250,6 +250,9 @@ def test_listener_stops_at_garbage_and_at_the_end(caplog):
 
 
 def test_client_reports_a_silent_server():
-    with lab_server() as (port, _), StreamClient(port=port, timeout=0.2) as stream:
-        with pytest.raises(ConfigError, match=r"within 0\.2 s"):
-            stream.command(1, "land")
+    with (
+        lab_server() as (port, _),
+        StreamClient(port=port, timeout=0.2) as stream,
+        pytest.raises(ConfigError, match=r"within 0\.2 s"),
+    ):
+        stream.command(1, "land")

@@ -3,8 +3,14 @@
 from crazysim.trajectories.files.csv import load_csv, save_csv, save_samples
 from crazysim.trajectories.files.led import decode_lights, encode_lights
 from crazysim.trajectories.files.lights import Lights
-from crazysim.trajectories.files.polynomials import load_memory, pack_compressed, pack_poly4d, save_memory
-from crazysim.trajectories.files.polynomials import unpack_compressed, unpack_poly4d
+from crazysim.trajectories.files.polynomials import (
+    load_memory,
+    pack_compressed,
+    pack_poly4d,
+    save_memory,
+    unpack_compressed,
+    unpack_poly4d,
+)
 from crazysim.trajectories.files.show import Cue, Show
 from crazysim.trajectories.files.skyc import load_show, save_show
 

@@ -54,7 +54,7 @@ def _table(lines: list[str], place: str) -> NDArray:
             if not rows and any(cell[:1].isalpha() for cell in cells):
                 continue  # the header
             checks.refuse("numbers", checks.shown(line), f"{place}, line {i}")
-        if len(row) not in (4, 5, 25, 33) or rows and len(row) != len(rows[0]):
+        if len(row) not in (4, 5, 25, 33) or (rows and len(row) != len(rows[0])):
             expected = f"{len(rows[0])} columns, as before" if rows else "4, 5, 25 or 33 columns"
             checks.refuse(expected, str(len(row)), f"{place}, line {i}")
         rows.append(row)

@@ -138,7 +138,7 @@ def _short(values: NDArray) -> bytes:
     rounded = np.round(values)
     if rounded.size and np.abs(rounded).max() > 32767:
         raise ConfigError(
-            "expected coordinates within 32.767 m and 3276.7 degrees of the origin, which 16 bits can hold, got others. "
+            "expected coordinates within 32.767 m and 3276.7 degrees of zero, which 16 bits can hold, got others. "
             "Move the trajectory, or save it uncompressed."
         )
     return rounded.astype("<i2").tobytes()

@@ -96,7 +96,9 @@ def _with_yaw(ends: Any, c: Any, yaw_control: Any, place: str) -> tuple[Any, Any
     setpoints = checks.sequence(value.get("setpoints"), checks.MAX_POINTS, place)
     if not setpoints:
         return ends, c
-    pairs = np.array([checks.numbers(x, [2], checks.MAX_COORDINATE, f"{place}, entry {i}") for i, x in enumerate(setpoints)])
+    pairs = np.array(
+        [checks.numbers(x, [2], checks.MAX_COORDINATE, f"{place}, entry {i}") for i, x in enumerate(setpoints)]
+    )
     times, yaw = pairs[:, 0], np.deg2rad(pairs[:, 1])
     checks.ascending(times, checks.MIN_LENGTH, place)
     ends, c = split(ends, c, times)

@@ -279,5 +279,7 @@ def _format_lights(lights: Lights) -> dict[str, Any]:
     if np.array_equal(begins, ends):
         kept = np.diff(times, append=np.inf) > 0
         colors = np.round(255 * begins[kept]).astype(int).tolist()
-        value["colors"] = [[float(str(t)), color] for t, color in zip(np.asarray(lights.times)[kept], colors, strict=True)]
+        value["colors"] = [
+            [float(str(t)), color] for t, color in zip(np.asarray(lights.times)[kept], colors, strict=True)
+        ]
     return value

@@ -1,4 +1,4 @@
-"""Shows as other programs write them, byte by byte: the structures of the public sample shows and of Skybrush Studio."""
+"""Shows as other programs write them: the structures of the public sample shows and of Skybrush Studio."""
 
 import base64
 import copy

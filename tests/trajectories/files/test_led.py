@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazysim.errors import ConfigError
-from crazysim.trajectories.files import Lights, decode_lights, encode_lights
-from crazysim.trajectories.files import led
+from crazysim.trajectories.files import Lights, decode_lights, encode_lights, led
 
 RED, GREEN, WHITE, BLACK = (1, 0, 0), (0, 1, 0), (1, 1, 1), (0, 0, 0)
 
@@ -111,7 +110,9 @@ def test_any_program_is_decoded_or_refused(program):
 
 
 pieces = st.lists(
-    st.tuples(st.integers(1, 400), st.tuples(*[st.integers(0, 255)] * 3), st.tuples(*[st.integers(0, 255)] * 3), st.booleans()),
+    st.tuples(
+        st.integers(1, 400), st.tuples(*[st.integers(0, 255)] * 3), st.tuples(*[st.integers(0, 255)] * 3), st.booleans()
+    ),
     min_size=1,
     max_size=8,
 )
@@ -130,7 +131,21 @@ def test_lights_survive_the_code(pieces):
 
 def test_code_is_short():
     white = Lights.of_pieces([0.0, 1.0, 2.0, 3.0], [(1, 1, 1), (0, 0, 0), (0.2,) * 3, (1, 0, 0)])
-    assert list(encode_lights(white)) == [led.SET_WHITE, 50, led.SET_BLACK, 50, led.SET_GRAY, 51, 50, 4, 255, 0, 0, 0, 0]
+    assert list(encode_lights(white)) == [
+        led.SET_WHITE,
+        50,
+        led.SET_BLACK,
+        50,
+        led.SET_GRAY,
+        51,
+        50,
+        4,
+        255,
+        0,
+        0,
+        0,
+        0,
+    ]
 
 
 def test_wrong_lights():

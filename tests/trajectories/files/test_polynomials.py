@@ -10,8 +10,17 @@ from scipy.interpolate import CubicHermiteSpline
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories import Trajectory
-from crazysim.trajectories.files import load_csv, load_memory, pack_compressed, pack_poly4d, save_csv, save_memory
-from crazysim.trajectories.files import save_samples, unpack_compressed, unpack_poly4d
+from crazysim.trajectories.files import (
+    load_csv,
+    load_memory,
+    pack_compressed,
+    pack_poly4d,
+    save_csv,
+    save_memory,
+    save_samples,
+    unpack_compressed,
+    unpack_poly4d,
+)
 from crazysim.trajectories.files.csv import POLYNOMIALS
 from crazysim.trajectories.files.pieces import pieces_of
 
