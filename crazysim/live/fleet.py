@@ -228,6 +228,7 @@ def _at(trajectory: Trajectory, t: float) -> NDArray:
 
 def _without_padding(trajectory: Trajectory) -> Trajectory:
     """Return one trajectory of a stacked record without the pieces that have no length."""
-    n = max(int(np.count_nonzero(np.diff(np.asarray(trajectory.ends), prepend=0.0) > 0)), 1)
+    ends = np.asarray(trajectory.ends, float)
+    n = max(int(np.searchsorted(ends, ends[-1])) + 1, 1)
     cut = jax.tree.map(np.asarray, trajectory)
     return cut.replace(ends=cut.ends[:n], coefficients=cut.coefficients[:n])

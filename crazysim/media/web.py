@@ -176,6 +176,7 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
     end = float(flight.time[-1])
     times = np.linspace(0, end, int(np.ceil(FPS * end)) + 1)  # viser does not interpolate
     shown: dict[Any, NDArray] = {}
+    lit: dict[str, tuple[int, int, int]] = {}
 
     def move(handle: Any, pos: NDArray, quat: NDArray | None = None) -> None:
         pose = np.concatenate([pos, [] if quat is None else np.roll(quat, 1)])
@@ -201,8 +202,8 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
         if lights is not None:
             colors = lights[min(int(np.searchsorted(flight.time, time)), len(lights) - 1)]
             for bulb, color in zip(bulbs, colors, strict=True):
-                if (rgb := _rgb(color)) != shown.get(bulb.name):
-                    shown[bulb.name] = bulb.color = rgb
+                if (rgb := _rgb(color)) != lit.get(bulb.name):
+                    lit[bulb.name] = bulb.color = rgb
     return recording
 
 

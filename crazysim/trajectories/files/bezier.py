@@ -52,9 +52,9 @@ def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
         (degree + 1, k)
     """
     n = coefficients.shape[1]
-    degree = n - 1 if degree is None else degree
-    padded = np.pad(coefficients, ((0, 0), (0, degree + 1 - n)))
-    return _to_bernstein(degree) @ padded.T
+    raised = n - 1 if degree is None else degree
+    padded = np.pad(coefficients, ((0, 0), (0, raised + 1 - n)))
+    return _to_bernstein(raised) @ padded.T
 
 
 def restricted(coefficients: NDArray, begin: float, end: float) -> NDArray:

@@ -53,9 +53,9 @@ class Show:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the show but its cues, as in ``show.json``; ``validation`` has maxAltitude, m, maxVelocityXY and
     maxVelocityZ, m/s, and minDistance, m."""
-    homes: NDArray | None = None
+    homes: NDArray = None  # type: ignore[assignment]  # replaced at construction
     """Home of each drone, m; None for the begins of the trajectories. (n_drones, 3)"""
-    landings: NDArray | None = None
+    landings: NDArray = None  # type: ignore[assignment]  # replaced at construction
     """Landing place of each drone, m; None for the ends of the trajectories. (n_drones, 3)"""
     parameters: tuple[tuple[ParameterChange, ...], ...] = ()
     """Changes of firmware parameters of each drone."""
