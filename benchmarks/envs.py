@@ -50,7 +50,7 @@ def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int) 
     def flying(policy: Policy) -> Any:
         return lambda state, key: policy(state.obs) + 0.1 * jax.random.normal(key, state.action.shape)
 
-    def flown(act: Any) -> Any:
+    def jitted(act: Any) -> Any:
         def run(carry: Any) -> Any:
             state, key = carry
             key, now = jax.random.split(key)
@@ -70,7 +70,7 @@ def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int) 
     for name, act in acts.items():
         carry = (bare(start), jax.device_put(jax.random.key(2), place))
         begin = time.perf_counter()
-        run = flown(act).lower(carry).compile()
+        run = jitted(act).lower(carry).compile()
         compile_s = time.perf_counter() - begin
         carry, _ = run(carry)
         last: list[Any] = [carry]

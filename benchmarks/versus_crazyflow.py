@@ -96,7 +96,7 @@ class Versus:
     def __init__(self, workers: dict[str, Worker], engines: list[str], device: str, repeats: int):
         """Store the two programs."""
         self.workers, self.engines, self.device, self.repeats = workers, engines, device, repeats
-        self.machine = workers["crazysim"].ask(do="machine", device=device)
+        self.machine = workers["crazysim"].request(do="machine", device=device)
 
     def compare(self, benchmark: str, **case: Any) -> None:
         """Print steps per second and compile time of each engine and of Crazyflow, and the ratio."""
@@ -129,7 +129,7 @@ class Versus:
             line: dict[str, Any] = {"benchmark": "versus_crazyflow/memory", "n_drones": n_drones}
             for name, worker in self.workers.items():
                 first, last = (
-                    worker.ask(do="memory", n_worlds=n, n_drones=n_drones, device=self.device)["bytes"]
+                    worker.request(do="memory", n_worlds=n, n_drones=n_drones, device=self.device)["bytes"]
                     for n in (few, many)
                 )
                 line[f"{name}_bytes_per_world"] = round((last - first) / (many - few))
@@ -156,13 +156,13 @@ class Versus:
     def _measure(self, task: str, contestants: dict[str, tuple[Worker, Any]]) -> dict[str, tuple[float, float]]:
         """Return the median time of a call and of its compilation, s, alternating between the programs."""
         first = {
-            name: worker.ask(do="build", task=task, name=name, device=self.device, case=case)["seconds"]
+            name: worker.request(do="build", task=task, name=name, device=self.device, case=case)["seconds"]
             for name, (worker, case) in contestants.items()
         }
         turns = {name: functools.partial(worker.time, name) for name, (worker, _) in contestants.items()}
         seconds = medians(turns, self.repeats)
         for name, (worker, _) in contestants.items():
-            worker.ask(do="end", name=name)
+            worker.request(do="end", name=name)
         return {name: (seconds[name], first[name] - seconds[name]) for name in contestants}
 
 
@@ -172,7 +172,7 @@ def first_steps(pythons: dict[str, str], device: str, repeats: int = 3) -> None:
     for _ in range(repeats):
         for name, python in pythons.items():
             worker = Worker(python, name)
-            times[name].append(worker.ask(do="first_step", device=device))
+            times[name].append(worker.request(do="first_step", device=device))
             worker.close()
     line: dict[str, Any] = {"benchmark": "versus_crazyflow/first_step", "n_worlds": 1}
     for name, runs in times.items():
@@ -192,7 +192,7 @@ class Worker:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
         self._in, self._out = self._process.stdin, self._process.stdout
 
-    def ask(self, **request: Any) -> dict[str, Any]:
+    def request(self, **request: Any) -> dict[str, Any]:
         """Return the answer to a request."""
         self._in.write(json.dumps(request) + "\n")
         self._in.flush()
@@ -203,7 +203,7 @@ class Worker:
 
     def time(self, name: str) -> float:
         """Return the seconds of a call of what was built under a name."""
-        return self.ask(do="time", name=name)["seconds"]
+        return self.request(do="time", name=name)["seconds"]
 
     def close(self) -> None:
         """End the process."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from crazysim.demos import DEMOS
 from crazysim.errors import RenderError
 
 
@@ -18,17 +20,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="crazysim", description="A drone simulator in which thousands of worlds advance in one call."
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command")
-    demo = commands.add_parser(
-        "demo",
-        help="fly figure eights around obstacles in many worlds; print figures, write a plot and a film",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    demo.add_argument("--worlds", type=int, default=1024, help="number of worlds")
-    demo.add_argument("--drones", type=int, default=4, help="drones in each world")
-    demo.add_argument("--seconds", type=float, default=10.0, help="duration of the flight, s")
-    demo.add_argument("--device", default="cpu", help="device: cpu, gpu")
-    demo.add_argument("--out", type=Path, default=Path("out"), help="folder for the plot and the film")
-    demo.add_argument("--no-film", action="store_true", help="write no film")
+    demo = commands.add_parser("demo", help="run a demonstration; print figures, write a plot and a film")
+    demo.add_argument("name", nargs="?", choices=DEMOS, default="flight", metavar="NAME", help=_listed(DEMOS))
+    demo.add_argument("--worlds", type=int, dest="n_worlds", help="number of worlds; by default the demonstration's")
+    demo.add_argument("--drones", type=int, dest="n_drones", help="drones in each world")
+    demo.add_argument("--seconds", type=float, help="duration, s")
+    demo.add_argument("--device", help="device: cpu, gpu")
+    demo.add_argument("--out", type=Path, help="folder of the files; by default out")
+    demo.add_argument("--no-film", dest="film", action="store_const", const=False, help="write no film")
     replay = commands.add_parser(
         "replay",
         help="play a recorded flight in a browser",
@@ -77,6 +76,11 @@ def _add_show(commands: Any) -> None:
     show.add_argument("--device", default="cpu", help="device: cpu, gpu")
 
 
+def _listed(names: Mapping[str, str]) -> str:
+    """Return names and what they are, for a help text."""
+    return "; ".join(f"{name}: {what}" for name, what in names.items())
+
+
 def _add_training(commands: Any) -> None:
     """Add the commands that train, evaluate, export and film policies."""
     with_defaults = {"formatter_class": argparse.ArgumentDefaultsHelpFormatter}
@@ -116,9 +120,9 @@ def _add_training(commands: Any) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    from crazysim.demo import run
-
-    run(options.worlds, options.drones, options.seconds, options.device, options.out, film=not options.no_film)
+    names = ("n_worlds", "n_drones", "seconds", "device", "out", "film")
+    settings = {name: x for name in names if (x := getattr(options, name)) is not None}
+    importlib.import_module(f"crazysim.demos.{options.name}").run(**settings)
 
 
 def _replay(options: argparse.Namespace) -> None:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from crazysim import demo
 from crazysim.__main__ import main
+from crazysim.demos import DEMOS, flight
 from crazysim.media import Flight
 
 
@@ -22,6 +22,16 @@ def test_as_a_module_in_a_process_of_its_own():
     assert "demo" in out.stdout
 
 
+def test_a_demo_has_a_name(capsys, monkeypatch):
+    ran = []
+    monkeypatch.setattr(flight, "run", lambda **settings: ran.append(settings))
+    assert main(["demo"]) == main(["demo", "flight", "--worlds", "8", "--no-film"]) == 0
+    assert ran == [{}, {"n_worlds": 8, "film": False}]
+    with pytest.raises(SystemExit):
+        main(["demo", "dance"])
+    assert all(name in capsys.readouterr().err for name in DEMOS)
+
+
 def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
     """A second of 8 worlds of 4 drones: figures are printed and both files are pictures of something."""
     assert main(["demo", "--worlds", "8", "--seconds", "1", "--out", str(tmp_path)]) == 0
@@ -31,9 +41,9 @@ def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
     error_cm = float(out.split("tracking error")[1].split("cm")[0])
     assert 0.1 < error_cm < 20  # the cascade lags some centimetres behind; a crashed drone would be metres off
     assert (tmp_path / "tracks.png").read_bytes().startswith(b"\x89PNG")
-    flight = Flight.load(tmp_path / "flight.npz")
-    assert flight.pos.shape == (25, 1, 4, 3)
-    assert np.ptp(flight.pos[:, 0, :, :2], axis=0).max(-1).min() > 0.4, "every drone is on its way"
+    flown = Flight.load(tmp_path / "flight.npz")
+    assert flown.pos.shape == (25, 1, 4, 3)
+    assert np.ptp(flown.pos[:, 0, :, :2], axis=0).max(-1).min() > 0.4, "every drone is on its way"
     film = tmp_path / "flight.mp4"
     decode = [get_ffmpeg_exe(), "-loglevel", "error", "-i", film, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)
@@ -44,9 +54,9 @@ def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
 
 def test_without_opengl_the_demo_says_so_and_does_the_rest(tmp_path, capsys, monkeypatch):
     def no_picture(*args, **kwargs):
-        raise demo.RenderError("no OpenGL context could be made")
+        raise flight.RenderError("no OpenGL context could be made")
 
-    monkeypatch.setattr(demo.Sim, "render", no_picture)
+    monkeypatch.setattr(flight.Sim, "render", no_picture)
     assert main(["demo", "--worlds", "8", "--seconds", "1", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert len([line for line in out.splitlines() if line.startswith("no film")]) == 1
@@ -67,10 +77,10 @@ def test_wrong_arguments_are_one_line(arguments, word, capsys):
 
 def test_the_poles_are_where_drones_can_hit_them():
     """Contacts are found in some worlds and not in all: the check would be worthless otherwise."""
-    sim = demo.build(64, 4, "cpu")
-    fly = demo.build_fly_frame(sim)
+    sim = flight.build(64, 4, "cpu")
+    fly = flight.build_fly_frame(sim)
     touched = np.zeros(64, bool)
     for _ in range(75):
         sim.data, _ = fly(sim.data)
-        touched |= np.asarray(sim.contacts().any(axis=1))
+        touched |= flight.touches(sim).any((1, 2))
     assert 0 < touched.sum() < 64

@@ -1,9 +1,10 @@
-"""Control cascade of the Crazyflie firmware: pure functions for one drone, with any leading axes."""
+"""Controllers: pure functions for one drone, with any leading axes, and the protocol of ``Sim(controller=...)``."""
 
 from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
 from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque
 from crazysim.control.core import COMMAND_FIELDS, Control, command_size
 from crazysim.control.parameters import load_fn_params, load_params
+from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.control.state import StateParams, state2attitude
 
@@ -12,6 +13,7 @@ __all__ = [
     "AllocationParams",
     "AttitudeParams",
     "Control",
+    "Controller",
     "Setpoint",
     "StateParams",
     "attitude2force_torque",

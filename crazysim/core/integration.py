@@ -11,6 +11,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimStateDeriv
+from crazysim.core.influence import influenced, own_rates
 from crazysim.core.plugin import Plugin
 from crazysim.core.stage import Stage
 
@@ -131,9 +132,9 @@ class Integration:
     def derivative(self, data: SimData) -> SimStateDeriv:
         """Return the derivative of the drones' states under all influences, and of the plugins' own states."""
         for plugin in self.plugins:
-            data = plugin.influence(data)
+            data = influenced(plugin, data)
         deriv = self.deriv_fn(data)
-        own = {plugin.name: rates for plugin in self.plugins if (rates := dict(plugin.derivative(data)))}
+        own = {plugin.name: rates for plugin in self.plugins if (rates := own_rates(plugin, data))}
         return deriv.replace(plugins=own) if own else deriv
 
     def stage(self) -> Stage:

@@ -1,7 +1,7 @@
 """Pipelines: the named stages of a step or a reset in order, and functions that edit them.
 
 A pipeline is an ordered dict from names to functions. The functions here change it in place; the change takes effect
-with the simulation's next ``build_step_fn`` or ``build_reset_fn``.
+at the simulation's next step or reset. Functions that ``build_step_fn`` or ``build_reset_fn`` returned do not change.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.pipeline import Pipeline
 from crazysim.drones import Airframe
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import PyTree
 
 
@@ -171,8 +171,10 @@ class Plugin:
     def influence(self, data: SimData) -> SimData:
         """Return the data of one drone as the dynamics are to use it: other forces, commands or parameters.
 
-        The integrator evaluates it for every time derivative, and discards the changes afterwards: external forces,
-        commands and parameters in ``sim.data`` stay as the user set them.
+        It may write ``states.force``, ``states.torque``, ``controls.rotor_vel`` (``controls.attitude.cmd`` in fitted
+        dynamics) and any field of ``params``; all other fields are returned as they are. The integrator evaluates it
+        for every time derivative, and discards the changes afterwards: external forces, commands and parameters in
+        ``sim.data`` stay as the user set them.
         """
         return data
 
@@ -180,7 +182,7 @@ class Plugin:
         """Return the time derivatives of fields of the record that are states of the plugin's own, per second.
 
         The integrator advances them together with the drone's states, in every scheme. ``data`` is of one drone, with
-        all influences applied.
+        all influences applied. A rate has the shape of its field, which is declared with ``leaf("drone", ...)``.
         """
         return {}
 
@@ -192,7 +194,17 @@ class Plugin:
         """Draw overlays into the next image of a world, on ``sim.scene``."""
 
     def read(self, data: SimData) -> Any:
-        """Return the plugin's record in some data."""
+        """Return the plugin's record in some data.
+
+        Raises:
+            UnknownNameError: If the data has none: the plugin was not added, or was removed.
+        """
+        if self.name not in data.plugins:
+            raise UnknownNameError(
+                f"expected data with a record of plugin {self.name!r}, got records of "
+                f"{', '.join(map(repr, data.plugins)) or 'none'}. The plugin was not added, was removed, or has no "
+                f"record. Use sim.add({type(self).__name__}(...)) first."
+            )
         return data.plugins[self.name]
 
     def write(self, data: SimData, record: PyTree) -> SimData:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -9,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.control import Control
+from crazysim.control import Control, Controller
+from crazysim.control.switch import Switch
 from crazysim.errors import ConfigError, UnknownNameError
 
 
@@ -124,6 +126,44 @@ def control_freqs(control: Control, freq: int, given: dict[Control, int | None])
                 f"every whole number of steps. Use the nearest rate below, {nearest} Hz."
             )
     return freqs
+
+
+def controller_at_rates(
+    controller: Controller, control: Control, freq: int, given: dict[Control, int | None]
+) -> Controller:
+    """Return a controller with the rates that it has in a simulation, each a divisor of ``freq``.
+
+    The requested rate of the command's level is that of the outer loop if there is one, and that of attitude then that
+    of ``update``. A rate that is the default of its class is lowered to the largest divisor.
+
+    Args:
+        controller: The controller.
+        control: Command level.
+        freq: Rate of physics steps, Hz.
+        given: Requested rates, Hz; None for those of the controller.
+
+    Raises:
+        ConfigError: If a rate does not divide ``freq``.
+    """
+    if isinstance(controller, Switch):
+        members = tuple(controller_at_rates(member, control, freq, given) for member in controller.controllers)
+        own = {rate for member in members for rate in (member.freq, member.outer_freq) if rate is not None}
+        common = max(own) if all(max(own) % rate == 0 for rate in own) else freq
+        return dataclasses.replace(controller, controllers=members, freq=common)
+    rates = {"freq": given.get(control)}
+    if control == Control.state and controller.has_outer:
+        rates = {"outer_freq": given.get(control), "freq": given.get(Control.attitude)}
+    defaults = {f.name: f.default for f in dataclasses.fields(controller)}  # type: ignore[arg-type]
+    for name, requested in rates.items():
+        rate = positive(f"{name} of controller {controller.name!r}", requested or getattr(controller, name))
+        nearest = _largest_divisor(freq, min(rate, freq))
+        if rate != nearest and (requested or rate != defaults[name]):
+            raise ConfigError(
+                f"expected {name} of controller {controller.name!r} to divide freq = {freq} Hz, got {rate} Hz. Use the "
+                f"nearest rate below, {nearest} Hz."
+            )
+        rates[name] = nearest
+    return dataclasses.replace(controller, **rates)  # type: ignore[type-var]
 
 
 def _largest_divisor(freq: int, limit: int) -> int:

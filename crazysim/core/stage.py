@@ -85,6 +85,12 @@ def stage(
     return lambda fn: Stage(fn, scope, when)
 
 
+def tick(data: Any, freq: int) -> Array | None:
+    """Return where a controller of a rate acts at this step, or None if it does always. (n_worlds, 1), or () for one"""
+    period = data.core.freq // freq
+    return None if period == 1 else data.core.steps % period == 0
+
+
 def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
     """Return the functions of a pipeline as stages under the pipeline's names; undeclared ones get the full batch."""
     return [

@@ -12,15 +12,17 @@ from jax import Array
 
 from crazysim.control import (
     Control,
+    Controller,
     attitude2force_torque,
     body_rate2force_torque,
     force_torque2rotor_vel,
     state2attitude,
 )
+from crazysim.core.controllers import controller_stages
 from crazysim.core.data import SimData, SimStateDeriv
 from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integrator
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.stage import Stage, StageScope
+from crazysim.core.stage import Stage, StageScope, tick
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.pytree import PER_WORLD, scopes, select_worlds
 
@@ -38,20 +40,13 @@ def _ticks(controller: str) -> Callable[[SimData], Array | None]:
     return lambda data: tick(data, getattr(data.controls, controller).freq)
 
 
-def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integrator) -> Pipeline:
-    """Return the stages of one physics step, in order."""
+def build_step_pipeline(
+    control: Control, dynamics: Dynamics, integrator: Integrator, controller: Controller | None = None
+) -> Pipeline:
+    """Return the stages of one physics step, in order; ``controller`` None is Crazyflow's cascade."""
     fitted_model = dynamics != Dynamics.first_principles
-    stages: Pipeline = {}
-    if control == Control.state:
-        stages["state_controller"] = state_controller
-    if control in (Control.state, Control.attitude):
-        if fitted_model:
-            stages["attitude_controller" if control == Control.state else "commit_attitude"] = commit_attitude
-        else:
-            stages["attitude_controller"] = attitude_controller
-    if control == Control.body_rate:
-        stages["body_rate_controller"] = body_rate_controller
-    if not fitted_model and control != Control.rotor_vel:
+    stages = cascade_stages(control, fitted_model) if controller is None else controller_stages(controller, control)
+    if not fitted_model and Control.rotor_vel not in (control, controller and controller.output):
         stages["force_torque_controller"] = force_torque_controller
     stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
     deriv_fn: DerivFn = first_principles_derivative
@@ -67,10 +62,19 @@ def build_step_pipeline(control: Control, dynamics: Dynamics, integrator: Integr
     return stages
 
 
-def tick(data: SimData, freq: int) -> Array | None:
-    """Return which worlds' controllers of a rate fire at this step, or None where all do always. (n_worlds, 1)"""
-    period = data.core.freq // freq
-    return None if period == 1 else data.core.steps % period == 0
+def cascade_stages(control: Control, fitted_model: bool) -> Pipeline:
+    """Return the stages of Crazyflow's cascade from a command level down to the wrench, in order."""
+    stages: Pipeline = {}
+    if control == Control.state:
+        stages["state_controller"] = state_controller
+    if control in (Control.state, Control.attitude):
+        if fitted_model:
+            stages["attitude_controller" if control == Control.state else "commit_attitude"] = commit_attitude
+        else:
+            stages["attitude_controller"] = attitude_controller
+    if control == Control.body_rate:
+        stages["body_rate_controller"] = body_rate_controller
+    return stages
 
 
 def _controls(data: SimData) -> Any:

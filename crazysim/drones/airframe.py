@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -13,29 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.drones.keys import GUIDE, KEYS, TOP_LEVEL, check_keys, suggestion
 from crazysim.errors import ConfigError, UnknownNameError
 
 FOLDER = Path(__file__).parent
-GUIDE = "docs/guides/airframes.md"
-
-_NUMBER: tuple[tuple[int, ...], ...] = ((),)
-SHAPE_KEYS: dict[str, tuple[tuple[int, ...], ...]] = {
-    "plate": ((3,),),
-    "battery": ((3,),),
-    "battery_height": _NUMBER,
-    "arm_radius": _NUMBER,
-    "motor_radius": _NUMBER,
-    "motor_height": _NUMBER,
-    "propeller_radius": _NUMBER,
-    "propeller_height": _NUMBER,
-    "led_radius": _NUMBER,
-    "led_heights": ((2,),),
-    "collision_sphere": ((4,),),
-    "collision_box": ((6,),),
-    "fpv_camera": ((3,),),
-    "track_camera": ((3,),),
-}
-"""Keys of the table ``[shape]`` and the shapes of their arrays; every key is optional."""
 
 
 class Drone(StrEnum):
@@ -56,7 +36,7 @@ class Airframe:
     """Constants of a drone type, as plain numbers in SI units (rotor speeds in rpm)."""
 
     name: str
-    """Name; the file's stem for an airframe that was loaded from a file."""
+    """Name: the key ``name``, or else the file's stem; ``custom`` for a dict without one."""
     tables: Mapping[str, Any]
     """All tables of the file with their numbers as float64 arrays, without units and sources."""
 
@@ -88,7 +68,7 @@ class Airframe:
         """
         paths = dict(_values(self.tables))
         if path not in paths:
-            raise ConfigError(f"airframe {self.name!r} has no value {path!r}. {_suggestion(path, list(paths))}")
+            raise ConfigError(f"airframe {self.name!r} has no value {path!r}. {_remedy(path, paths)}")
         value = paths[path]
         if shape is not None and value.shape != shape:
             raise ConfigError(f"airframe {self.name!r}: expected {path} of shape {shape}, got {value.shape}")
@@ -151,17 +131,18 @@ def load_airframe(source: str | Path | Mapping[str, Any] | Airframe) -> Airframe
 
     Raises:
         UnknownNameError: If the source is neither the name of an airframe nor a file.
-        ConfigError: If the contents cannot be those of a drone.
+        ConfigError: If a table or key does not exist, or the numbers cannot be those of a drone.
     """
     if isinstance(source, Airframe):
         return source
     if isinstance(source, Mapping):
-        name, tables = str(source.get("name", "custom")), dict(source)
+        default_name, origin, tables = "custom", "", dict(source)
     else:
-        name, tables = _read(source)
-    base = tables.pop("base", None)
-    tables = {key: table for key, table in tables.items() if key not in ("sources", "name")}
-    numbers = _numbers(name, tables, ())
+        default_name, origin, tables = _read(source)
+    name = str(tables.get("name", default_name))
+    check_keys(f"airframe {name!r}{origin}", tables)
+    base = tables.get("base")
+    numbers = _numbers(name, {key: table for key, table in tables.items() if key not in TOP_LEVEL}, ())
     if base is not None:
         numbers = _merged(load_airframe(base).tables, numbers)
     airframe = Airframe(name, numbers)
@@ -169,7 +150,8 @@ def load_airframe(source: str | Path | Mapping[str, Any] | Airframe) -> Airframe
     return airframe
 
 
-def _read(source: str | Path) -> tuple[str, dict[str, Any]]:
+def _read(source: str | Path) -> tuple[str, str, dict[str, Any]]:
+    """Return the name of an airframe, its origin for messages, and its tables."""
     if not isinstance(source, (str, Path)):
         raise ConfigError(f"expected a drone as a name, the path of a TOML file, a dict or an Airframe, got {source!r}")
     path = FOLDER / f"{source}.toml" if str(source) in airframe_names() else Path(source)
@@ -179,7 +161,7 @@ def _read(source: str | Path) -> tuple[str, dict[str, Any]]:
             f"got {str(source)!r}, and no file of that path exists"
         )
     try:
-        return path.stem, tomllib.loads(path.read_text(encoding="utf-8"))
+        return path.stem, f" in {path}", tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path} is not valid TOML: {error}; see {GUIDE} for the format") from error
 
@@ -218,16 +200,10 @@ def _values(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield f"{prefix}{key}", item
 
 
-def _suggestion(path: str, paths: list[str]) -> str:
-    """Return the paths that are probably meant: those of the same key in another table, then those spelt alike."""
-    key = path.rpartition(".")[2]
-    same_key = [p for p in paths if p.rpartition(".")[2] == key]
-    keys = {p.rpartition(".")[2]: p for p in paths}
-    near = [keys[k] for k in difflib.get_close_matches(key, keys)]
-    found = list(dict.fromkeys([*same_key, *difflib.get_close_matches(path, paths), *near]))[:3]
-    if found:
-        return f"Did you mean {' or '.join(map(repr, found))}? Otherwise add it; {GUIDE} lists all keys."
-    return f"Add it; {GUIDE} lists all keys."
+def _remedy(path: str, paths: Iterable[str]) -> str:
+    """Return the advice for a value that an airframe lacks: to add it if it exists, else the path that was meant."""
+    table, _, key = path.rpartition(".")
+    return f"Add {key} to its table [{table}]; {GUIDE} lists all keys." if path in KEYS else suggestion(path, paths)
 
 
 def _check(airframe: Airframe) -> None:
@@ -254,30 +230,14 @@ def _check(airframe: Airframe) -> None:
     low, high = airframe.value("rotors.thrust_min", ()), airframe.value("rotors.thrust_max", ())
     if not 0 <= low < high:
         raise refuse(f"expected 0 <= thrust_min < thrust_max, got {low} N and {high} N")
-    unknown = set(airframe.tables.get("shape", {})) - set(SHAPE_KEYS)
-    if unknown:
-        raise refuse(f"expected keys of [shape] among {sorted(SHAPE_KEYS)}, got {sorted(unknown)}")
-    values = dict(_values(airframe.tables))
-    for path, shapes in _optional_shapes(airframe, len(position)).items():
-        if path in values and values[path].shape not in shapes:
-            raise refuse(f"expected {path} of shape {' or '.join(map(str, shapes))}, got {values[path].shape}")
+    for path, value in _values(airframe.tables):
+        shapes = _shapes(path, len(position))
+        if value.shape not in shapes:
+            raise refuse(f"expected {path} of shape {' or '.join(map(str, shapes))}, got {value.shape}")
     if len(position) * high <= mass * 9.81:
         raise refuse(f"expected rotors that lift {mass} kg, got {len(position)} rotors of at most {high} N")
 
 
-def _optional_shapes(airframe: Airframe, n_rotors: int) -> dict[str, tuple[tuple[int, ...], ...]]:
-    """Return the allowed shapes of numbers that not every airframe has."""
-    shapes: dict[str, tuple[tuple[int, ...], ...]] = {
-        "rotors.inertia": ((), (n_rotors,)),
-        "rotors.thrust_curve": ((3,), (n_rotors, 3)),
-        "rotors.torque_curve": ((3,), (n_rotors, 3)),
-        "rotors.lag": ((4,), (n_rotors, 4)),
-        "drag.coefficients": ((3,), (3, 3)),
-        "battery.thrust_over_voltage": ((4,),),
-    }
-    shapes |= {f"shape.{key}": allowed for key, allowed in SHAPE_KEYS.items()}
-    for model in airframe.tables.get("fitted", {}):
-        shapes |= {f"fitted.{model}.{key}": ((3,),) for key in ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")}
-        shapes |= {f"fitted.{model}.{key}": ((),) for key in ("acc_coef", "cmd_f_coef", "thrust_dyn_coef")}
-        shapes[f"fitted.{model}.drag_coefficients"] = ((3,), (3, 3))
-    return shapes
+def _shapes(path: str, n_rotors: int) -> list[tuple[int, ...]]:
+    """Return the allowed shapes of a number."""
+    return [tuple(n_rotors if n == "n" else int(n) for n in shape) for shape in KEYS[path]]

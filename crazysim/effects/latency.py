@@ -114,9 +114,13 @@ def _controller(sim: Simulation) -> str:
 
 
 def _sent(data: SimData) -> Array:
-    """Return the staged command of the simulation's own level. (..., k)"""
+    """Return the staged command of the simulation's own level, with the feedforward of a setpoint. (..., k)"""
     controls = controls_of(data)
-    return controls.rotor_vel if controls.mode == Control.rotor_vel else getattr(controls, controls.mode).staged_cmd
+    if controls.mode == Control.rotor_vel:
+        return controls.rotor_vel
+    level = getattr(controls, controls.mode)
+    feedforward = getattr(level, "staged_feedforward", None)
+    return level.staged_cmd if feedforward is None else jnp.concatenate([level.staged_cmd, feedforward], axis=-1)
 
 
 def _send(data: SimData, command: Array) -> SimData:
@@ -124,5 +128,9 @@ def _send(data: SimData, command: Array) -> SimData:
     controls = controls_of(data)
     if controls.mode == Control.rotor_vel:
         return data.replace(controls=controls.replace(rotor_vel=command))
-    level = getattr(controls, controls.mode).replace(staged_cmd=command)
-    return data.replace(controls=controls.replace(**{controls.mode.value: level}))
+    level = getattr(controls, controls.mode)
+    n = level.staged_cmd.shape[-1]
+    changes = {"staged_cmd": command[..., :n]}
+    if command.shape[-1] > n:
+        changes["staged_feedforward"] = command[..., n:]
+    return data.replace(controls=controls.replace(**{controls.mode.value: level.replace(**changes)}))

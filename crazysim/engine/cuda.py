@@ -117,8 +117,8 @@ def fitted(kernel: Kernel, device: jax.Device) -> Kernel:
     with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
         least, *found = pool.map(lambda c: resources(c, device), candidates)
     bearable = 16 if least.registers <= 224 else 256  # measured on an H200: docs/concepts/engine.md
-    fitting = (c for c, r in zip(candidates[1:], found, strict=True) if r.spilled <= least.spilled + bearable)
-    return next(fitting, kernel)
+    suitable = (c for c, r in zip(candidates[1:], found, strict=True) if r.spilled <= least.spilled + bearable)
+    return next(suitable, kernel)
 
 
 @functools.cache

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
+
 import jax
+
+from crazysim.errors import ConfigError, EngineWarning
 
 
 class UnsupportedError(Exception):
@@ -49,3 +54,25 @@ class LimitError(UnsupportedError):
 
 class KernelError(UnsupportedError):
     """A kernel that its compiler refused, or did not finish in time."""
+
+
+def report_unsupported(problems: Sequence[str], strict: bool, reported: set[str], remedy: str) -> None:
+    """Warn once that a slower path computes some operations, which the engine does not support, or raise it.
+
+    Args:
+        problems: Unsupported operations, each with the reason; nothing happens if there are none.
+        strict: True to raise an error instead.
+        reported: Warnings that were given before; the new one is added.
+        remedy: Way out of the error, as the beginning of a sentence that ends with ``use strict=False``.
+
+    Raises:
+        ConfigError: With ``strict``.
+    """
+    if not problems:
+        return
+    text = "; ".join(problems) + f" (JAX {jax.__version__})"
+    if strict:
+        raise ConfigError(f"{text}. {remedy}, or use strict=False.")
+    if text not in reported:
+        reported.add(text)
+        warnings.warn(f"{text}. strict=True raises an error instead.", EngineWarning, stacklevel=2)

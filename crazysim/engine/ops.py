@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from crazysim.engine import numpy_forms as forms
 from crazysim.engine.errors import UnsupportedError
 
 DTYPES = frozenset(map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split()))
@@ -81,112 +82,6 @@ def unsupported(name: str, dtypes: Sequence[np.dtype], result: Any = bool) -> Un
     return UnsupportedError(f"operation {name!r} on {', '.join(dict.fromkeys(x.name for x in dtypes))}")
 
 
-# NumPy's forms, where NumPy itself differs from XLA ------------------------------------------------------------------
-
-
-def _divide(a: Any, b: Any) -> Any:
-    """Divide; integers towards zero, by zero to all bits set, the least by -1 to itself."""
-    if a.dtype.kind == "f":
-        return np.divide(a, b)
-    if a.dtype.kind == "u":
-        return np.where(b == 0, np.iinfo(a.dtype).max, a // np.where(b == 0, b.dtype.type(1), b))
-    unsafe = (b == 0) | (b == -1)
-    safe = np.where(unsafe, b.dtype.type(1), b)
-    floor = a // safe
-    quotient = floor + ((a % safe != 0) & ((a < 0) != (safe < 0)))
-    return np.where(b == 0, a.dtype.type(-1), np.where(b == -1, np.negative(a), quotient))
-
-
-def _remainder(a: Any, b: Any) -> Any:
-    """Return the remainder with the sign of the dividend; of a division by zero the dividend."""
-    if a.dtype.kind == "f":
-        return np.fmod(a, b)
-    unsafe = (b == 0) if b.dtype.kind == "u" else (b == 0) | (b == -1)
-    return np.where(b == 0, a, np.where(unsafe, a.dtype.type(0), np.fmod(a, np.where(unsafe, b.dtype.type(1), b))))
-
-
-def _sign(x: Any) -> Any:
-    return np.where(x > 0, x.dtype.type(1), np.where(x < 0, x.dtype.type(-1 if x.dtype.kind != "u" else 0), x))
-
-
-def _round_away(x: Any) -> Any:
-    whole = np.trunc(x)
-    return np.copysign(np.where(np.abs(x - whole) >= 0.5, np.abs(whole) + 1, np.abs(whole)), x)
-
-
-def _shift(shift: Callable[[Any, Any], Any], outside: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
-    """Return a shift that is defined for any number of bits."""
-
-    def shifted(x: Any, n: Any) -> Any:
-        bits = 8 * x.dtype.itemsize
-        inside = (n >= 0) & (n < bits) if n.dtype.kind == "i" else n < bits
-        return np.where(inside, shift(x, np.where(inside, n, n.dtype.type(0))), outside(x))
-
-    return shifted
-
-
-def _shift_logical(x: Any, n: Any) -> Any:
-    unsigned = np.dtype(f"u{x.dtype.itemsize}")
-    return np.right_shift(np.asarray(x).view(unsigned), np.asarray(n).view(unsigned)).view(x.dtype)
-
-
-def _shift_arithmetic(x: Any, n: Any) -> Any:
-    signed = np.dtype(f"i{x.dtype.itemsize}")
-    return np.right_shift(np.asarray(x).view(signed), np.asarray(n).view(signed)).view(x.dtype)
-
-
-def _sign_bits(x: Any) -> Any:
-    return _shift_arithmetic(x, x.dtype.type(8 * x.dtype.itemsize - 1))
-
-
-def convert(x: Any, dtype: Any) -> Any:
-    """Convert numbers as XLA does: a float to the nearest integer there is, NaN to 0."""
-    x, dtype = np.asarray(x), np.dtype(dtype)
-    if x.dtype.kind == "f" and dtype.kind in "iu":
-        limits = np.iinfo(dtype)
-        low, high = float(limits.min), float(limits.max) + 1  # both are exact
-        inside = (x > low - 1) & (x < high) if dtype.itemsize < 8 else (x >= low) & (x < high)
-        whole = np.where(inside, x, 0).astype(dtype)
-        outside = np.where(np.isnan(x), 0, np.where(x >= high, limits.max, limits.min)).astype(dtype)
-        return np.where(inside, whole, outside)
-    return x != 0 if dtype.kind == "b" else x.astype(dtype)
-
-
-def bitcast(x: Any, dtype: Any) -> Any:
-    """Return the same bits as another type."""
-    return np.asarray(x).view(dtype)
-
-
-def _power(a: Any, b: Any) -> Any:
-    """Raise to a power; for an exponent of 0.5 NumPy takes the root, which differs at -inf and -0."""
-    root = (b == 0.5) & ((a == 0) | np.isneginf(a))
-    return np.where(root, np.abs(a), np.power(a, b))
-
-
-def _integer_pow(x: Any, y: int) -> Any:
-    return x**y if y >= 0 else 1 / x**-y
-
-
-def _log_gamma(x: Any) -> Any:
-    return np.where(np.isinf(x), np.abs(x), _special("gammaln")(x))
-
-
-def _special(name: str) -> Callable[..., Any]:
-    """Return a function of ``scipy.special``, which JAX depends on; it is imported when it is called."""
-
-    def call(*args: Any) -> Any:
-        from scipy import special
-
-        return getattr(special, name)(*args)
-
-    return call
-
-
-def _digamma(x: Any) -> Any:
-    """Return the derivative of the logarithm of the gamma function; XLA has NaN at its poles."""
-    return np.where((x <= 0) & (x == np.floor(x)), x.dtype.type(np.nan), _special("digamma")(x))
-
-
 # CasADi's forms ------------------------------------------------------------------------------------------------------
 
 
@@ -226,9 +121,9 @@ def _rows() -> list[Row]:
         binary("sub", np.subtract, any_number, exact=True, source="{0} - {1}",
                casadi=lambda _, a, b: a - b, casadi_kinds="fiu"),
         binary("mul", np.multiply, any_number, exact=True, source="{0} * {1}", casadi=lambda _, a, b: a * b),
-        binary("div", _divide, any_number, 4, exact=True, source={"f": "{0} / {1}", "iu": "div_({all})"},
+        binary("div", forms.divide, any_number, 4, exact=True, source={"f": "{0} / {1}", "iu": "div_({all})"},
                casadi=lambda _, a, b: a / b, casadi_kinds="fiu"),
-        binary("rem", _remainder, any_number, 8, exact=True, casadi="fmod", casadi_kinds="fiu"),
+        binary("rem", forms.remainder, any_number, 8, exact=True, casadi="fmod", casadi_kinds="fiu"),
         binary("max", np.maximum, any_number, exact=True, casadi="fmax", casadi_kinds="fiu"),
         binary("min", np.minimum, any_number, exact=True, casadi="fmin", casadi_kinds="fiu"),
         Row(name="clamp", operands="TTT", kinds=any_number, exact=True, casadi_kinds="fi",
@@ -236,9 +131,9 @@ def _rows() -> list[Row]:
             casadi=lambda ca, low, x, high: ca.fmin(ca.fmax(x, low), high)),
         unary("neg", np.negative, 0, lambda _, x: -x, kinds=any_number, exact=True),
         unary("abs", np.abs, 0, "fabs", kinds="fi", exact=True),
-        unary("sign", _sign, 1, "sign", kinds=any_number, exact=True),
+        unary("sign", forms.sign, 1, "sign", kinds=any_number, exact=True),
         binary("nextafter", np.nextafter, "f", 4),
-        unary("integer_pow", _integer_pow, 4, lambda _, x, y: x**y, kinds=any_number,
+        unary("integer_pow", forms.integer_pow, 4, lambda _, x, y: x**y, kinds=any_number,
               source="integer_pow({0}, {y})"),
     ]  # fmt: skip
     rounding = [
@@ -246,7 +141,7 @@ def _rows() -> list[Row]:
         unary("ceil", np.ceil, 4, "ceil", exact=True),
         unary("round_even", np.rint, 4, _casadi_round_even, exact=True,
               xla=lambda x: _lax().round(x, _lax().RoundingMethod.TO_NEAREST_EVEN)),
-        unary("round_away", _round_away, 4, lambda ca, x: ca.sign(x) * ca.floor(ca.fabs(x) + 0.5), exact=True,
+        unary("round_away", forms.round_away, 4, lambda ca, x: ca.sign(x) * ca.floor(ca.fabs(x) + 0.5), exact=True,
               xla=lambda x: _lax().round(x, _lax().RoundingMethod.AWAY_FROM_ZERO)),
         unary("is_finite", np.isfinite, 1, lambda ca, x: ca.fabs(x) <= _LARGEST, results="b", exact=True),
     ]  # fmt: skip
@@ -273,12 +168,12 @@ def _rows() -> list[Row]:
         unary("asinh", np.arcsinh, 16, "asinh"),
         unary("acosh", np.arccosh, 16, "acosh"),
         unary("atanh", np.arctanh, 16, "atanh"),
-        binary("pow", _power, "f", 16, casadi="power"),
-        unary("erf", _special("erf"), 16, "erf"),
-        unary("erfc", _special("erfc"), 16, lambda ca, x: 1 - ca.erf(x)),
-        unary("erf_inv", _special("erfinv"), 16, _casadi_erf_inv),
-        unary("lgamma", _log_gamma, 32),
-        unary("digamma", _digamma, 32),
+        binary("pow", forms.power, "f", 16, casadi="power"),
+        unary("erf", forms.special("erf"), 16, "erf"),
+        unary("erfc", forms.special("erfc"), 16, lambda ca, x: 1 - ca.erf(x)),
+        unary("erf_inv", forms.special("erfinv"), 16, _casadi_erf_inv),
+        unary("lgamma", forms.log_gamma, 32),
+        unary("digamma", forms.digamma, 32),
     ]
     comparisons = [
         comparison("eq", np.equal, lambda _, a, b: a == b, "fiub"),
@@ -297,11 +192,12 @@ def _rows() -> list[Row]:
         binary("xor", np.bitwise_xor, "iub", exact=True, xla="bitwise_xor",
                casadi=lambda _, a, b: a != b, casadi_kinds="b"),
         unary("not", np.invert, 1, "logic_not", kinds="iub", exact=True, xla="bitwise_not", casadi_kinds="b"),
-        binary("shift_left", _shift(np.left_shift, np.zeros_like), integer, exact=True),
-        binary("shift_right_logical", _shift(_shift_logical, np.zeros_like), integer, exact=True),
-        binary("shift_right_arithmetic", _shift(_shift_arithmetic, _sign_bits), integer, exact=True),
-        Row(name="convert_element_type", operands="*", results="*", numpy=convert, exact=True, source="to_{type}({0})"),
-        Row(name="bitcast_convert_type", operands="*", results="*", numpy=bitcast, exact=True,
+        binary("shift_left", forms.shift(np.left_shift, np.zeros_like), integer, exact=True),
+        binary("shift_right_logical", forms.shift(forms.shift_logical, np.zeros_like), integer, exact=True),
+        binary("shift_right_arithmetic", forms.shift(forms.shift_arithmetic, forms.sign_bits), integer, exact=True),
+        Row(name="convert_element_type", operands="*", results="*", numpy=forms.convert, exact=True,
+            source="to_{type}({0})"),
+        Row(name="bitcast_convert_type", operands="*", results="*", numpy=forms.bitcast, exact=True,
             source="bits_{type}({0})"),
     ]  # fmt: skip
     structured = [
@@ -329,7 +225,7 @@ where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)``
 ``while(*carry)`` runs its second block as long as its first is true. ``custom_jvp(*args, slope=)`` runs its block, and
 has a derivative of its own. ``threefry2x32`` is the cipher of JAX's random numbers.
 ``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=)`` the entry at the sum of an int32 and a
-constant; whoever makes one sees to it that there is such an entry.
+constant; whoever makes one ensures that there is such an entry.
 
 Costs are counted with what decides them: comparisons with selections, signs with what takes them. Functions cost what
 hardware that approximates them and a step that refines take, or the shortest polynomial that is exact to float32;

@@ -14,12 +14,13 @@ from crazysim.core.pipeline import Pipeline
 from crazysim.core.stage import Axes, Stage, with_leaves
 from crazysim.core.stages import finite
 from crazysim.engine import jaxcompat
+from crazysim.engine.barriers import compute_once
 
 ResetFn = Callable[..., SimData]
 
 
 def build(
-    stages: Sequence[Stage], data: SimData, by_component: bool = True
+    stages: Sequence[Stage], data: SimData, by_component: bool = True, barriers: bool = True
 ) -> tuple[Callable[[list[Any], int | Array], tuple[list[Any], Array]], list[int]]:
     """Return a loop over steps on leaves, and which of them it writes.
 
@@ -30,6 +31,7 @@ def build(
         data: Data of the structure that is stepped.
         by_component: True to store vectors component by component. Not for data that is spread over devices: XLA
             gathers an array whose layout is set.
+        barriers: True to compute costly values of a stage once (``barriers``). For XLA's CPU backend.
 
     Returns:
         The function from leaves and a number of steps to the written leaves and the worlds that are flagged as not
@@ -38,11 +40,15 @@ def build(
     axes = Axes(data)
     by_component = by_component and all(stage.batched for stage in stages)  # XLA gives some operations no layout
 
+    def barrier(value: Any) -> Any:
+        return _stored(jax.lax.optimization_barrier(value), by_component)
+
     def single(leaves: list[Any]) -> list[Any]:
         data = axes.treedef.unflatten(leaves)
         for stage in stages:
             with jax.named_scope(stage.__name__):
-                data = _finish_stage(axes, stage, data, stage(data), by_component)
+                fn = compute_once(stage, data, data.core.n_worlds, barrier) if barriers else stage
+                data = _finish_stage(axes, stage, data, fn(data), by_component)
         return jax.tree.leaves(data)
 
     jaxpr = jax.make_jaxpr(single)(jax.tree.leaves(data))
@@ -76,11 +82,16 @@ def _finish_stage(axes: Axes, stage: Stage, before: SimData, after: SimData, by_
     written = axes.written(jax.tree.leaves(before), after, stage)
     new = jax.tree.leaves(after)
     for i, value in zip(written, jax.lax.optimization_barrier([new[i] for i in written]), strict=True):
-        if by_component and axes.scopes[i] == "drone" and value.ndim == 3:
-            many_worlds = value.shape[0] >= value.shape[1]
-            value = jaxcompat.with_major_to_minor(value, (2, 1, 0) if many_worlds else (2, 0, 1))
-        new[i] = value
+        new[i] = _stored(value, by_component and axes.scopes[i] == "drone")
     return axes.treedef.unflatten(new)
+
+
+def _stored(value: Any, by_component: bool) -> Any:
+    """Return a value, stored by component if it has vectors: (n_worlds, n_drones, n)."""
+    if not by_component or value.ndim != 3:
+        return value
+    many_worlds = value.shape[0] >= value.shape[1]
+    return jaxcompat.with_major_to_minor(value, (2, 1, 0) if many_worlds else (2, 0, 1))
 
 
 def build_reset(pipeline: Pipeline) -> ResetFn:

@@ -14,7 +14,6 @@ Everything that an engine can refuse it refuses here, before the first step. The
 from __future__ import annotations
 
 import functools
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -27,10 +26,10 @@ from crazysim.core.sharding import Location
 from crazysim.core.stage import Stage, with_leaves
 from crazysim.engine import fused, interpret, lanes, plain
 from crazysim.engine.build import build_program
-from crazysim.engine.errors import LimitError, UnsupportedError
+from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.flat import Zeros
 from crazysim.engine.program import Program
-from crazysim.errors import ConfigError, EngineWarning
+from crazysim.errors import ConfigError
 from crazysim.pytree import scopes
 
 ENGINES = ("auto", "plain", "lanes", "fused", "interpret")
@@ -156,7 +155,8 @@ class Planner(NamedTuple):
         return f"with a mesh every stage must be declared, and {undeclared[0]!r} is not" if undeclared else ""
 
     def _plain(self, data: SimData, why: str) -> Plan:
-        run, written = plain.build(self.stages, data, by_component=not self.location.spread)
+        on_cpu = self.location.platform == "cpu"
+        run, written = plain.build(self.stages, data, by_component=not self.location.spread, barriers=on_cpu)
         everything = tuple(range(len(jax.tree.leaves(data))))
         # XLA spreads the arrays of ``plain`` over devices by itself.
         return self._wrap("plain", why, data, None, everything, tuple(written), run, len(everything))
@@ -210,14 +210,7 @@ class Planner(NamedTuple):
 
     def _report(self, problems: list[str]) -> None:
         """Warn of the problems of a plan, all in one warning, or raise them."""
-        if not problems:
-            return
-        text = "; ".join(problems) + f" (JAX {jax.__version__})"
-        if self.strict:
-            raise ConfigError(f"{text}. Write the stage with supported operations, or use strict=False.")
-        if text not in self.reported:
-            self.reported.add(text)
-            warnings.warn(f"{text}. strict=True raises an error instead.", EngineWarning, stacklevel=2)
+        report_unsupported(problems, self.strict, self.reported, "Write the stage with supported operations")
 
     def _without_kernel(self, error: UnsupportedError) -> str:
         """Return what a kernel does not support, with its stage, or the stages of the kernel, for a message."""

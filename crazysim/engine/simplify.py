@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.engine.ops import TABLE, bitcast, convert
+from crazysim.engine.numpy_forms import bitcast, convert
+from crazysim.engine.ops import TABLE
 
 Element = Any
 

@@ -21,7 +21,8 @@ from crazysim.envs.actions import Actions, actions_of
 from crazysim.envs.default_data import compact, reset_world, spread, with_own
 from crazysim.envs.phases import act, all_worlds, begin, observe
 from crazysim.envs.state import EnvState, validate_action
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.task import Task
+from crazysim.envs.task_check import check_task, require_installed
 from crazysim.errors import ConfigError
 from crazysim.pytree import PER_WORLD, scopes, select_worlds
 from crazysim.sim.sim import Sim
@@ -152,17 +153,11 @@ class DroneEnv(Env):
             actions: Meaning of an action; None for ``actions_of``.
 
         Raises:
-            ConfigError: If the task is not installed, a rate does not divide, or the controller runs less often than
-                actions come.
+            ConfigError: If the task is not installed, lacks a method, or observes or rewards in a wrong shape; if a
+                rate does not divide, or the controller runs less often than actions come.
         """
         freq = positive("freq", freq)
-        if not isinstance(task, Task):
-            raise ConfigError(f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
-        if task.Record is not None and not isinstance(sim.data.plugins.get(NAME), task.Record):
-            raise ConfigError(
-                f"expected a simulation in which task {task.name!r} is installed, got one without its record. Call "
-                f"task.install(sim) first, or use crazysim.envs.make."
-            )
+        require_installed(sim, task)
         if sim.freq % freq:
             raise ConfigError(
                 f"expected an environment freq that divides the simulation's {sim.freq} Hz, got {freq} Hz. Use a "
@@ -175,6 +170,7 @@ class DroneEnv(Env):
             )
         self._sim, self._task, self.freq = sim, task, freq
         self._actions = actions_of(sim.airframe, sim.data.params, sim.control) if actions is None else actions
+        check_task(task, sim.default_data, self._actions.size)
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
         self._step = sim.build_step_fn()

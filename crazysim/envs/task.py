@@ -77,7 +77,7 @@ class Task:
             data: The world after its reset.
             key: Random key of the episode, for ``crazysim.envs.random`` or ``jax.random``. ()
         """
-        raise NotImplementedError(f"{type(self).__name__}.spawn")
+        raise NotImplementedError(self._undefined("spawn(data, key)"))
 
     def before_step(self, data: SimData) -> SimData:
         """Return the data before an environment step; for rewards of differences, note here what they start from."""
@@ -85,7 +85,7 @@ class Task:
 
     def observe(self, data: SimData) -> Obs:
         """Return the observations of every drone. (n_drones, k) each"""
-        raise NotImplementedError(f"{type(self).__name__}.observe")
+        raise NotImplementedError(self._undefined("observe(data)"))
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return the terms of the reward of an environment step, by name; the reward is their sum. (n_drones,) each
@@ -95,15 +95,15 @@ class Task:
             action: Action of this step, in [-1, 1]. (n_drones, k)
             last_action: Action of the step before; zero at the start of an episode. (n_drones, k)
         """
-        raise NotImplementedError(f"{type(self).__name__}.rewards")
+        raise NotImplementedError(self._undefined("rewards(data, action, last_action)"))
 
     def terminated(self, data: SimData) -> Array:
         """Return true where the episode ended by success or failure. ()"""
-        raise NotImplementedError(f"{type(self).__name__}.terminated")
+        raise NotImplementedError(self._undefined("terminated(data)"))
 
     def error(self, data: SimData) -> Array:
         """Return the task error of every drone, m unless the task says otherwise. (n_drones,)"""
-        raise NotImplementedError(f"{type(self).__name__}.error")
+        raise NotImplementedError(self._undefined("error(data)"))
 
     def info(self, data: SimData) -> dict[str, Array]:
         """Return further quantities for ``state.info``, by name. () or (n_drones, ...) each"""
@@ -124,6 +124,9 @@ class Task:
         """Return true where a drone has succeeded; None if success is an error that stays small. (n_drones,)"""
         del data
         return None
+
+    def _undefined(self, method: str) -> str:
+        return f"task {self.name!r}: expected class {type(self).__name__} to define {method}; see docs/guides/tasks.md"
 
 
 def total(terms: Mapping[str, Array]) -> Array:

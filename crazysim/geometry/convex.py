@@ -22,13 +22,13 @@ from jax import Array, lax
 
 from crazysim.geometry import support
 from crazysim.geometry.shapes import Shape
-from crazysim.geometry.support import end
-from crazysim.geometry.triangle import foot, mean, open_foot
+from crazysim.geometry.support import segment_support_point
+from crazysim.geometry.triangle import closest_point, closest_point_off_bc, from_barycentric
 from crazysim.geometry.vector import Vector, along, margin, select, stack, unit
 
 Best = tuple[Array, Vector]
 """Largest gap so far, m (...), and its direction."""
-Corner = tuple[Vector, list[Array]]
+SupportPoint = tuple[Vector, list[Array]]
 """Support point of the Minkowski difference, m, and the point of the segment or box it comes from, in its frame, m."""
 
 
@@ -42,31 +42,31 @@ class Pair:
     """Half lengths of the box, or half length of the segment, m. One or three numbers."""
     edges: list[Vector]
     """Unit directions of the edges of the box, or of the segment. One or three vectors."""
-    place: Vector
+    centre: Vector
     """Position of the centre of the box or segment, m."""
 
     def gap(self, n: Vector) -> Array:
         """Return the gap between the shapes along a unit direction from the other shape to this one, m. (...)"""
-        out = self.place.dot(n) - support.reach(self.other, n)
+        out = self.centre.dot(n) - support.support_function(self.other, n)
         for edge, half in zip(self.edges, self.half, strict=True):
             out = out - half * jnp.abs(edge.dot(n))
         return out
 
-    def ends(self, n: Vector) -> list[Array]:
+    def support_coordinates(self, n: Vector) -> list[Array]:
         """Return the support point of the segment or box against a direction, in its own frame, m. (...) each"""
-        return [-end(half, edge.dot(n)) for edge, half in zip(self.edges, self.half, strict=True)]
+        return [-segment_support_point(half, edge.dot(n)) for edge, half in zip(self.edges, self.half, strict=True)]
 
-    def at(self, ends: list[Array]) -> Vector:
+    def point_at(self, coordinates: list[Array]) -> Vector:
         """Return a point of the segment or box, given in its own frame, in the frame of the other shape, m."""
-        point = self.place
-        for edge, x in zip(self.edges, ends, strict=True):
+        point = self.centre
+        for edge, x in zip(self.edges, coordinates, strict=True):
             point = point + edge * x
         return point
 
-    def corner(self, n: Vector) -> Corner:
+    def support_point(self, n: Vector) -> SupportPoint:
         """Return the support point of the Minkowski difference against a direction."""
-        ends = self.ends(n)
-        return self.at(ends) - support.corner(self.other, n), ends
+        coordinates = self.support_coordinates(n)
+        return self.point_at(coordinates) - support.support_point(self.other, n), coordinates
 
     def consider(self, n: Vector, best: Best) -> Best:
         """Return the direction with the larger gap: the given one or the best so far."""
@@ -90,30 +90,30 @@ def separate(pair: Pair, n: Vector, steps: int) -> tuple[Best, list[Array]]:
         n: Initial direction.
         steps: Number of support points to add.
     """
-    up = along(2, pair.place.x)
+    fallback = along(2, pair.centre.x)
 
     def step(_: int, carry: Any) -> Any:
         triangle, nearest, best = carry
-        n = unit(nearest, up)
-        new = pair.corner(n)
+        n = unit(nearest, fallback)
+        new = pair.support_point(n)
         size = nearest.dot(nearest)
         kept = (triangle, nearest)
         p, q, r = (point for point, _ in triangle)
         b, c = stack([p, q, r]), stack([q, r, p])
-        feet = mean(open_foot(new[0], b, c), new[0], b, c)
-        squares = feet.dot(feet)
+        points = from_barycentric(closest_point_off_bc(new[0], b, c), new[0], b, c)
+        squares = points.dot(points)
         for k in range(3):
             closer = squares[k] < size * (1 - margin(size.dtype))
-            tried = ((new, triangle[k], triangle[(k + 1) % 3]), feet[k])
+            tried = ((new, triangle[k], triangle[(k + 1) % 3]), points[k])
             kept = jax.tree.map(partial(jnp.where, closer), tried, kept)
             size = jnp.where(closer, squares[k], size)
         return (*kept, pair.consider(n, best))
 
-    first = pair.corner(n)
+    first = pair.support_point(n)
     triangle, nearest, best = lax.fori_loop(0, steps, step, ((first,) * 3, first[0], (pair.gap(n), n)))
-    shares = foot(*(point for point, _ in triangle))
-    ends = [
+    shares = closest_point(*(point for point, _ in triangle))
+    coordinates = [
         jnp.asarray(sum(w * x for w, x in zip(shares, xs, strict=True)))
         for xs in zip(*(e for _, e in triangle), strict=True)
     ]
-    return pair.consider(unit(nearest, up), best), ends
+    return pair.consider(unit(nearest, fallback), best), coordinates

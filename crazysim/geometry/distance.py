@@ -63,27 +63,27 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
     if a.kind == "sphere":
         return point_distance(b, pos) - a.size[0]
     if b.kind == "plane":
-        return pos[..., 2] - _reach(a, rot[..., 2, :])
+        return pos[..., 2] - _support_function(a, rot[..., 2, :])
     if b.kind == "sphere":
-        return point_distance(a, _inverse(pos, rot)) - b.size[0]
+        return point_distance(a, _inverse_position(pos, rot)) - b.size[0]
     if a.kind == "capsule" and b.kind == "capsule":
         between = segment_to_segment(components(pos), components(rot[..., 2]), a.size[1], b.size[1])
         return between - a.size[0] - b.size[0]
     if a.kind == "capsule" and b.kind == "box":
         return segment_to_box(components(pos), components(rot[..., 2]), a.size[1], b.size) - a.size[0]
     if a.kind == "box" and b.kind == "capsule":
-        middle, axis = components(_inverse(pos, rot)), components(rot[..., 2, :])
+        middle, axis = components(_inverse_position(pos, rot)), components(rot[..., 2, :])
         return segment_to_box(middle, axis, b.size[1], a.size) - b.size[0]
     return convex_distance(a, b, pos, rot) - (a.size[0] if a.kind == "capsule" else 0.0)
 
 
-def _inverse(pos: Array, rot: Array) -> Array:
+def _inverse_position(pos: Array, rot: Array) -> Array:
     """Return the position of the inverse of the pose ``pos``, ``rot``. (..., 3)"""
     x, y, z = components(pos)
     return -jnp.stack([rot[..., 0, k] * x + rot[..., 1, k] * y + rot[..., 2, k] * z for k in range(3)], axis=-1)
 
 
-def _reach(shape: Shape, direction: Array) -> Array:
+def _support_function(shape: Shape, direction: Array) -> Array:
     """Return the support function of a capsule or box along a unit direction in its own frame, m. (...)"""
     x, y, z = (magnitude(d) for d in components(direction))
     if shape.kind == "capsule":

@@ -49,65 +49,70 @@ def _nearer(a: Hit, b: Hit) -> Hit:
     return jnp.where(a[0] < b[0], a[0], b[0]), select(a[0] < b[0], a[1], b[1])
 
 
-def _faces(half: tuple[float, float], o: Vector, d: Vector) -> list[tuple[Array, Vector, Array, Array]]:
+def _faces(half: tuple[float, float], origin: Vector, direction: Vector) -> list[tuple[Array, Vector, Array, Array]]:
     """Return for each of the four walls: distance, outward normal, and the x and y of the hit."""
-    zero = jnp.zeros_like(o.x)
+    zero = jnp.zeros_like(origin.x)
     out = []
     for side in (-1.0, 1.0):
-        for k, (p, v, h) in enumerate(((o.x, d.x, half[0]), (o.y, d.y, half[1]))):
+        for k, (p, v, h) in enumerate(((origin.x, direction.x, half[0]), (origin.y, direction.y, half[1]))):
             crosses = jnp.abs(v) > PARALLEL
             t = (side * h - p) / jnp.where(crosses, v, 1.0)
             n = Vector(zero + side, zero, zero) if k == 0 else Vector(zero, zero + side, zero)
-            along = o.y + t * d.y if k == 0 else o.x + t * d.x
+            along = origin.y + t * direction.y if k == 0 else origin.x + t * direction.x
             within = crosses & (t >= 0) & (jnp.abs(along) <= half[1 - k])
-            out.append((jnp.where(within, t, jnp.inf), n, o.x + t * d.x, o.y + t * d.y))
+            out.append((jnp.where(within, t, jnp.inf), n, origin.x + t * direction.x, origin.y + t * direction.y))
     return out
 
 
-def _base(shape: Shape, o: Vector, d: Vector) -> Hit:
+def _base(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     """Return the hits of the box below z = 0."""
     x_half, y_half, _, base = shape.size
-    zero = jnp.zeros_like(o.x)
+    zero = jnp.zeros_like(origin.x)
     hit = (zero + jnp.inf, Vector(zero, zero, zero))
-    for t, n, _, _ in _faces((x_half, y_half), o, d):
-        z = o.z + jnp.where(jnp.isfinite(t), t, 0.0) * d.z
+    for t, n, _, _ in _faces((x_half, y_half), origin, direction):
+        z = origin.z + jnp.where(jnp.isfinite(t), t, 0.0) * direction.z
         hit = _nearer((jnp.where((z <= 0) & (z >= -base), t, jnp.inf), n), hit)
-    crosses = jnp.abs(d.z) > PARALLEL
+    crosses = jnp.abs(direction.z) > PARALLEL
     for level, up in ((0.0, 1.0), (-base, -1.0)):
-        t = (level - o.z) / jnp.where(crosses, d.z, 1.0)
-        within = crosses & (t >= 0) & (jnp.abs(o.x + t * d.x) <= x_half) & (jnp.abs(o.y + t * d.y) <= y_half)
+        t = (level - origin.z) / jnp.where(crosses, direction.z, 1.0)
+        within = (
+            crosses
+            & (t >= 0)
+            & (jnp.abs(origin.x + t * direction.x) <= x_half)
+            & (jnp.abs(origin.y + t * direction.y) <= y_half)
+        )
         hit = _nearer((jnp.where(within, t, jnp.inf), Vector(zero, zero, zero + up)), hit)
     return hit
 
 
-def _walls(shape: Shape, o: Vector, d: Vector) -> Hit:
+def _walls(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     """Return the hits of the walls between z = 0 and the surface."""
-    zero = jnp.zeros_like(o.x)
+    zero = jnp.zeros_like(origin.x)
     hit = (zero + jnp.inf, Vector(zero, zero, zero))
-    for t, n, x, y in _faces(shape.size[:2], o, d):  # type: ignore[arg-type]
-        z = o.z + jnp.where(jnp.isfinite(t), t, 0.0) * d.z
+    for t, n, x, y in _faces(shape.size[:2], origin, direction):  # type: ignore[arg-type]
+        z = origin.z + jnp.where(jnp.isfinite(t), t, 0.0) * direction.z
         x, y = jnp.clip(x, -shape.size[0], shape.size[0]), jnp.clip(y, -shape.size[1], shape.size[1])
-        hit = _nearer((jnp.where((z >= 0) & (z <= height(shape, x, y, o)), t, jnp.inf), n), hit)
+        hit = _nearer((jnp.where((z >= 0) & (z <= height(shape, x, y, origin)), t, jnp.inf), n), hit)
     return hit
 
 
-def _surface(shape: Shape, o: Vector, d: Vector) -> Hit:
+def _surface(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     """Return the hits of the triangles, by traversing the cells below each ray in order."""
     ground = shape.array("heights")
     n_rows, n_columns = ground.shape
-    heights = jnp.asarray(ground, o.x.dtype)
+    heights = jnp.asarray(ground, origin.x.dtype)
     side_x, side_y = spacing(shape)
     # Origin and direction in units of cells.
-    u, v = (o.x + shape.size[0]) / side_x, (o.y + shape.size[1]) / side_y
-    du, dv = d.x / side_x, d.y / side_y
-    start = jnp.zeros_like(o.x)
+    u, v = (origin.x + shape.size[0]) / side_x, (origin.y + shape.size[1]) / side_y
+    du, dv = direction.x / side_x, direction.y / side_y
+    start = jnp.zeros_like(origin.x)
     for p, step, n in ((u, du, n_columns - 1), (v, dv, n_rows - 1)):
         moves = jnp.abs(step) > PARALLEL
         enters = (jnp.where(step > 0, 0.0, float(n)) - p) / jnp.where(moves, step, 1.0)
         start = jnp.where(moves & (enters > start), enters, start)
     column = jnp.clip(jnp.floor(u + start * du), 0, n_columns - 2).astype(jnp.int32)
     row = jnp.clip(jnp.floor(v + start * dv), 0, n_rows - 2).astype(jnp.int32)
-    slack = 1e-5 if o.x.dtype == jnp.float32 else 1e-10
+    slack = 1e-5 if origin.x.dtype == jnp.float32 else 1e-10
 
     def cell(_: int, carry: tuple[Array, Array, Hit]) -> tuple[Array, Array, Hit]:
         column, row, hit = carry
@@ -117,7 +122,7 @@ def _surface(shape: Shape, o: Vector, d: Vector) -> Hit:
         x, y = u - j.astype(u.dtype), v - i.astype(v.dtype)
         for rise_x, rise_y, right in ((b - a, c - b, 1.0), (c - e, e - a, -1.0)):
             # Height of the ray's origin above the plane of the triangle, and its rate of descent towards it.
-            above, sinks = o.z - a - rise_x * x - rise_y * y, rise_x * du + rise_y * dv - d.z
+            above, sinks = origin.z - a - rise_x * x - rise_y * y, rise_x * du + rise_y * dv - direction.z
             meets = jnp.abs(sinks) > PARALLEL
             t = above / jnp.where(meets, sinks, 1.0)
             at_x, at_y = x + t * du, y + t * dv
@@ -135,7 +140,7 @@ def _surface(shape: Shape, o: Vector, d: Vector) -> Hit:
         row = jnp.where(inside & ~by_x, row + jnp.where(up, 1, -1), row)
         return column, row, hit
 
-    zero = jnp.zeros_like(o.x)
+    zero = jnp.zeros_like(origin.x)
     none = (zero + jnp.inf, Vector(zero, zero, zero + 1))
     _, _, (t, n) = lax.fori_loop(0, n_rows + n_columns - 2, cell, (column, row, none))
     return t, unit(n, n)

@@ -26,28 +26,28 @@ def spacing(shape: Shape) -> tuple[float, float]:
     return 2 * shape.size[0] / (n_columns - 1), 2 * shape.size[1] / (n_rows - 1)
 
 
-def field_distance(shape: Shape, point: Array, reach: float = 0.0) -> Array:
+def field_distance(shape: Shape, point: Array, radius: float = 0.0) -> Array:
     """Return the signed distance from a point to the ground, m. (...)
 
-    The cell below the point and all cells within ``reach`` are examined. Distances of a magnitude up to ``reach`` are
+    The cell below the point and all cells within ``radius`` are examined. Distances of a magnitude up to ``radius`` are
     exact; larger ones are upper bounds, the distance to the nearest examined cell. The sign is always correct.
 
     Args:
         shape: Height field.
         point: Points in the frame of the field, m. (..., 3)
-        reach: Distance up to which the result is exact, m; at least one side of a cell.
+        radius: Distance up to which the result is exact, m; at least one side of a cell.
     """
-    place = vector(point)
+    position = vector(point)
     x_half, y_half, _, base = shape.size
-    grid = corners(shape, place, reach)
-    surface = triangles_distance(place, *triangles(grid))
+    grid = corners_near(shape, position, radius)
+    surface = triangles_distance(position, *triangles(grid))
     # The walls and the bottom can be nearer than the surface.
-    qx, qy = safe_clip(place.x, -x_half, x_half), safe_clip(place.y, -y_half, y_half)
-    below = place.z < height(shape, lax.stop_gradient(qx), lax.stop_gradient(qy), place)
-    dx, dy, dz = place.x - qx, place.y - qy, larger(-base - place.z, 0.0)
+    qx, qy = safe_clip(position.x, -x_half, x_half), safe_clip(position.y, -y_half, y_half)
+    below = position.z < height(shape, lax.stop_gradient(qx), lax.stop_gradient(qy), position)
+    dx, dy, dz = position.x - qx, position.y - qy, larger(-base - position.z, 0.0)
     beside = safe_sqrt(dx * dx + dy * dy + dz * dz)
-    wall = larger(larger(place.x - x_half, -x_half - place.x), larger(place.y - y_half, -y_half - place.y))
-    wall = larger(wall, -base - place.z)
+    wall = larger(larger(position.x - x_half, -x_half - position.x), larger(position.y - y_half, -y_half - position.y))
+    wall = larger(wall, -base - position.z)
     inside = larger(-surface, wall)
     return jnp.where(below, jnp.where(wall < 0, inside, beside), surface)
 
@@ -71,13 +71,15 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
     ends = jnp.asarray(signs * np.asarray(half), pos.dtype)
     tips = pos[..., None, :] + sum(rot[..., None, :, k] * ends[:, k, None] for k in range(3))
     out = jnp.min(field_distance(shape, tips, size), axis=-1)
-    grid = corners(shape, vector(lax.stop_gradient(pos)), 2 * size)
+    grid = corners_near(shape, vector(lax.stop_gradient(pos)), 2 * size)
     axes = [vector(rot[..., k]) for k in range(3)]
-    place = vector(pos)
+    position = vector(pos)
     a, b = edges(grid)
     middle, along = (a + b) * 0.5, b - a
     length = jnp.sqrt(along.dot(along))
-    away = Vector(*(m - p[..., None] for m, p in ((middle.x, place.x), (middle.y, place.y), (middle.z, place.z))))
+    away = Vector(
+        *(m - p[..., None] for m, p in ((middle.x, position.x), (middle.y, position.y), (middle.z, position.z)))
+    )
     wide = [Vector(axis.x[..., None], axis.y[..., None], axis.z[..., None]) for axis in axes]
     x, y, z = (away.dot(axis) for axis in wide)
     u, v, w = (along.dot(axis) / length for axis in wide)
@@ -85,23 +87,23 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
     return jnp.where(of_edges < out, of_edges, out)
 
 
-def corners(shape: Shape, place: Vector, reach: float) -> Vector:
-    """Return the corners of the cells within reach of a point, without derivatives, m. (..., n_y + 1, n_x + 1)"""
+def corners_near(shape: Shape, position: Vector, radius: float) -> Vector:
+    """Return the corners of the cells within a radius of a point, without derivatives, m. (..., n_y + 1, n_x + 1)"""
     heights = shape.array("heights")
     starts, counts = [], []
-    for position, half, side, n in (
-        (place.y, shape.size[1], spacing(shape)[1], heights.shape[0] - 1),
-        (place.x, shape.size[0], spacing(shape)[0], heights.shape[1] - 1),
+    for coordinate, half, side, n in (
+        (position.y, shape.size[1], spacing(shape)[1], heights.shape[0] - 1),
+        (position.x, shape.size[0], spacing(shape)[0], heights.shape[1] - 1),
     ):
-        around = max(1, math.ceil(reach / side))
+        around = max(1, math.ceil(radius / side))
         count = min(n, 2 * around + 1)
-        cell = jnp.floor((lax.stop_gradient(position) + half) / side).astype(jnp.int32)
+        cell = jnp.floor((lax.stop_gradient(coordinate) + half) / side).astype(jnp.int32)
         starts.append(jnp.clip(cell - around, 0, n - count))
         counts.append(count + 1)
     rows = starts[0][..., None, None] + jnp.arange(counts[0])[:, None]
     columns = starts[1][..., None, None] + jnp.arange(counts[1])
     rows, columns = jnp.broadcast_arrays(rows, columns)
-    dtype = place.x.dtype
+    dtype = position.x.dtype
     side_x, side_y = spacing(shape)
     z = jnp.asarray(heights, dtype)[rows, columns]
     return Vector(columns.astype(dtype) * side_x - shape.size[0], rows.astype(dtype) * side_y - shape.size[1], z)

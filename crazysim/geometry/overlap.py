@@ -24,7 +24,7 @@ SEPARATION_STEPS = 16
 """Steps towards the nearest points of separated shapes; polytopes need few, curved shapes more."""
 TOUCH_STEPS = 24
 """Further steps from the best direction towards the nearest or touching points."""
-PARTED = 0.02
+SEPARATION = 0.02
 """Distance to which overlapping shapes are separated for these steps, as a fraction of the moving half length."""
 ARCS = 16
 """Number of arcs of a circle of directions, each searched for the smallest depth."""
@@ -50,26 +50,26 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
         rot: Rotation matrix from the frame of ``a`` to that of ``b``. (..., 3, 3)
     """
     half = (a.size[1],) if a.kind == "capsule" else a.size
-    place, edges = vector(pos), [vector(rot[..., k]) for k in range(3)][-len(half) :]
-    fixed = Pair(b, half, *lax.stop_gradient((edges, place)))
-    up = along(2, place.x)
-    best, _ = separate(fixed, unit(fixed.place, up), SEPARATION_STEPS)
+    centre, edges = vector(pos), [vector(rot[..., k]) for k in range(3)][-len(half) :]
+    fixed = Pair(b, half, *lax.stop_gradient((edges, centre)))
+    fallback = along(2, centre.x)
+    best, _ = separate(fixed, unit(fixed.centre, fallback), SEPARATION_STEPS)
     gap, n = overlap(fixed, a.kind == "box", best)
     # Separated along the direction found, the shapes have nearest points, which are those of first contact.
-    aside = PARTED * max(half)
-    parted = dataclasses.replace(fixed, place=fixed.place + n * jnp.where(gap < aside, aside - gap, 0.0))
-    (_, m), ends = separate(parted, n, TOUCH_STEPS)
+    aside = SEPARATION * max(half)
+    parted = dataclasses.replace(fixed, centre=fixed.centre + n * jnp.where(gap < aside, aside - gap, 0.0))
+    (_, m), coordinates = separate(parted, n, TOUCH_STEPS)
     n = fixed.consider(m, (gap, n))[1]
-    n = unit(n, up)
+    n = unit(n, fallback)
     # The derivative of the distance is that of the nearest point of the moving shape.
-    moving = Pair(b, half, edges, place).at(ends).dot(n)
+    moving = Pair(b, half, edges, centre).point_at(coordinates).dot(n)
     return moving + lax.stop_gradient(fixed.gap(n) - moving)
 
 
 def overlap(pair: Pair, is_box: bool, best: Best) -> Best:
     """Return the best of a direction and all candidate normals of the Minkowski difference."""
     b, edges = pair.other, pair.edges
-    own = [along(k, pair.place.x) for k in range(3)]
+    own = [along(k, pair.centre.x) for k in range(3)]
     sides = {"box": own, "cylinder": own[2:]}.get(b.kind, [])
     faces = [*(edges if is_box else []), *sides]
     if b.kind == "box":
@@ -95,12 +95,12 @@ def _best_of(tried: Best, best: Best) -> Best:
 def _best_face(pair: Pair) -> Best:
     """Return the best of the face normals of a mesh."""
     normals, offsets = pair.other.array("normals"), pair.other.array("offsets")
-    x, y, z = (jnp.asarray(column, pair.place.x.dtype) for column in normals.T)
+    x, y, z = (jnp.asarray(column, pair.centre.x.dtype) for column in normals.T)
 
     def products(v: Vector) -> Array:
         return x * v.x[..., None] + y * v.y[..., None] + z * v.z[..., None]
 
-    gaps = products(pair.place) - jnp.asarray(offsets, pair.place.x.dtype)
+    gaps = products(pair.centre) - jnp.asarray(offsets, pair.centre.x.dtype)
     for edge, half in zip(pair.edges, pair.half, strict=True):
         gaps = gaps - half * jnp.abs(products(edge))
     is_best = jnp.arange(len(offsets)) == jnp.argmax(gaps, axis=-1)[..., None]
@@ -113,7 +113,7 @@ def _best_at_ends(pair: Pair, best: Best) -> Best:
     shortest = min(range(3), key=lambda k: pair.other.size[k])
 
     def at_end(k: Array, best: Best) -> Best:
-        point = pair.place
+        point = pair.centre
         for bit, (edge, half) in enumerate(zip(pair.edges, pair.half, strict=True)):
             point = point + edge * jnp.where((k >> bit) & 1 == 1, -half, half)
         n = unit(Vector(*ellipsoid_normal(pair.other, (point.x, point.y, point.z))), best[1])
@@ -142,9 +142,9 @@ def _best_across(pair: Pair, axis: Vector) -> Best:
     def direction(n: Flat) -> Vector:
         return e * n[0] + f * n[1]
 
-    def corner(n: Flat) -> Flat:
+    def support_point(n: Flat) -> Flat:
         """Return the projected support point along a direction in the plane."""
-        point, _ = pair.corner(direction(n))
+        point, _ = pair.support_point(direction(n))
         return point.dot(e), point.dot(f)
 
     def between(n: Flat, p: Flat, m: Flat, q: Flat) -> Flat:
@@ -160,7 +160,7 @@ def _best_across(pair: Pair, axis: Vector) -> Best:
         n, p, gap, kept = carry
         angle = (k + 1).astype(x.dtype) * (2 * math.pi / ARCS)
         m = (jnp.cos(angle) + 0 * x, jnp.sin(angle) + 0 * x)
-        q = corner(m)
+        q = support_point(m)
         top = between(n, p, m, q)
         here = pair.gap(direction(top))
         larger = here > gap
@@ -168,7 +168,7 @@ def _best_across(pair: Pair, axis: Vector) -> Best:
         return m, q, jnp.where(larger, here, gap), kept
 
     start = (jnp.ones_like(x), jnp.zeros_like(x))
-    first = corner(start)
+    first = support_point(start)
     _, _, gap, kept = lax.fori_loop(
         0, ARCS, arc, (start, first, jnp.full_like(x, -jnp.inf), (start, first, start, first, start))
     )
@@ -176,7 +176,7 @@ def _best_across(pair: Pair, axis: Vector) -> Best:
     def narrow(_: int, carry: tuple[Array, tuple[Flat, ...]]) -> tuple[Array, tuple[Flat, ...]]:
         gap, (n, p, m, q, top) = carry
         middle = between(n, p, m, q)
-        r, here = corner(middle), pair.gap(direction(middle))
+        r, here = support_point(middle), pair.gap(direction(middle))
         # The derivative of the gap with the angle is the component of the support point along the circle.
         rises = middle[0] * r[1] - middle[1] * r[0] > 0
         n, p = _choose(rises, middle, n), _choose(rises, r, p)

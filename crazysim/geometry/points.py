@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from crazysim.geometry.shapes import Shape
-from crazysim.geometry.triangle import foot, mean
+from crazysim.geometry.triangle import closest_point, from_barycentric
 from crazysim.geometry.vector import Vector, vector
 from crazysim.rotation import safe_clip, safe_sqrt
 
@@ -122,45 +122,45 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
 
 def _mesh(shape: Shape, point: Array) -> Array:
     """Return the distance to the nearest triangle outside, and to the nearest plane inside, m. (...)"""
-    place = vector(point)
-    inside = plane_distance(shape.array("normals"), shape.array("offsets"), place)
+    at = vector(point)
+    inside = plane_distance(shape.array("normals"), shape.array("offsets"), at)
     triangles = shape.array("vertices")[shape.array("faces")]
     corners = [Vector(*jnp.asarray(triangles[:, k].T, point.dtype)) for k in range(3)]
-    return jnp.where(inside > 0, triangles_distance(place, *corners), inside)
+    return jnp.where(inside > 0, triangles_distance(at, *corners), inside)
 
 
-def plane_distance(normals: np.ndarray, offsets: np.ndarray, place: Vector) -> Array:
+def plane_distance(normals: np.ndarray, offsets: np.ndarray, point: Vector) -> Array:
     """Return the largest signed distance from a point to planes, m. (...)
 
     The plane is selected first and its distance computed afterwards, because the gradient of the maximum, in a step
     under ``vmap``, lacked a component with XLA for CPUs in JAX 0.10.1.
     """
-    fixed = lax.stop_gradient(place)
-    columns = [jnp.asarray(column, place.x.dtype) for column in (*normals.T, offsets)]
+    fixed = lax.stop_gradient(point)
+    columns = [jnp.asarray(column, point.x.dtype) for column in (*normals.T, offsets)]
     x, y, z, offset = columns
     above = x * fixed.x[..., None] + y * fixed.y[..., None] + z * fixed.z[..., None] - offset
     is_highest = jnp.arange(len(offsets)) == jnp.argmax(above, axis=-1)[..., None]
     x, y, z, offset = (jnp.sum(jnp.where(is_highest, column, 0.0), axis=-1) for column in columns)
-    return x * place.x + y * place.y + z * place.z - offset
+    return x * point.x + y * point.y + z * point.z - offset
 
 
-def triangles_distance(place: Vector, a: Vector, b: Vector, c: Vector) -> Array:
+def triangles_distance(point: Vector, a: Vector, b: Vector, c: Vector) -> Array:
     """Return the distance from a point to the nearest triangle, m. (...)
 
     Args:
-        place: Point. (...)
+        point: Point. (...)
         a: First corners. (..., n_triangles) or (n_triangles,)
         b: Second corners.
         c: Third corners.
     """
-    fixed = lax.stop_gradient(place)
+    fixed = lax.stop_gradient(point)
     fixed = Vector(fixed.x[..., None], fixed.y[..., None], fixed.z[..., None])
     a, b, c = a - fixed, b - fixed, c - fixed
-    to = mean(foot(a, b, c), a, b, c)
+    to = from_barycentric(closest_point(a, b, c), a, b, c)
     nearest = jnp.argmin(to.dot(to), axis=-1)
     is_nearest = jnp.arange(to.x.shape[-1]) == nearest[..., None]
     to = Vector(*(jnp.sum(jnp.where(is_nearest, v, 0.0), axis=-1) for v in (to.x, to.y, to.z)))
-    away = place - lax.stop_gradient(place) - to
+    away = point - lax.stop_gradient(point) - to
     return safe_sqrt(away.dot(away))
 
 

@@ -36,12 +36,12 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
     if shape.kind == "plane":
         t, hit = _plane(origin, direction)
     else:
-        near, far, meets = LINE[shape.kind](shape, origin, direction)
+        near, far, meets = LINE_INTERVAL[shape.kind](shape, origin, direction)
         hit = meets & (far >= 0)
         t = jnp.where(near >= 0, near, far)
     # A miss must not contribute NaN, in gradients either.
     t = jnp.where(hit, t, 0.0)
-    normal = NORMAL[shape.kind](shape, origin + t[..., None] * direction)
+    normal = SURFACE_NORMAL[shape.kind](shape, origin + t[..., None] * direction)
     return jnp.where(hit, t, jnp.inf), jnp.where(hit[..., None], normal, 0.0)
 
 
@@ -51,7 +51,7 @@ def _plane(origin: Array, direction: Array) -> tuple[Array, Array]:
     return height / jnp.where(hit, down, 1.0), hit
 
 
-def slab(origin: Array, direction: Array, half: Array | float) -> Interval:
+def slab_line(origin: Array, direction: Array, half: Array | float) -> Interval:
     """Return the interval of a line between the planes at ``-half`` and ``half``, from its normal components."""
     parallel = jnp.abs(direction) < PARALLEL
     inverse = 1 / jnp.where(parallel, PARALLEL, direction)
@@ -59,20 +59,20 @@ def slab(origin: Array, direction: Array, half: Array | float) -> Interval:
     return jnp.where(a < b, a, b), jnp.where(a < b, b, a), ~parallel | (jnp.abs(origin) <= half)
 
 
-def both(p: Interval, q: Interval) -> Interval:
+def intersection(p: Interval, q: Interval) -> Interval:
     """Return the interval of a line in the intersection of two convex shapes."""
     near, far = jnp.where(p[0] > q[0], p[0], q[0]), jnp.where(p[1] < q[1], p[1], q[1])
     return near, far, p[2] & q[2] & (near <= far)
 
 
-def either(p: Interval, q: Interval) -> Interval:
+def union(p: Interval, q: Interval) -> Interval:
     """Return the interval of a line in the union of two shapes that is convex along the line."""
     near = jnp.where(p[2] & (~q[2] | (p[0] < q[0])), p[0], q[0])
     far = jnp.where(p[2] & (~q[2] | (p[1] > q[1])), p[1], q[1])
     return near, far, p[2] | q[2]
 
 
-def _ball(origin: list[Array], direction: list[Array], radius: float) -> Interval:
+def _ball_line(origin: list[Array], direction: list[Array], radius: float) -> Interval:
     """Return the interval of a line in a ball, or in a cylinder if two components are given.
 
     It uses the point of the line nearest to the centre, because the usual discriminant cancels far from the ball.
@@ -90,32 +90,34 @@ def _ball(origin: list[Array], direction: list[Array], radius: float) -> Interva
 
 
 def _sphere_line(shape: Shape, origin: Array, direction: Array) -> Interval:
-    return _ball(list(components(origin)), list(components(direction)), shape.size[0])
+    return _ball_line(list(components(origin)), list(components(direction)), shape.size[0])
 
 
 def _capsule_line(shape: Shape, origin: Array, direction: Array) -> Interval:
     radius, half = shape.size
     (x, y, z), d = components(origin), list(components(direction))
-    out = both(_ball([x, y], d[:2], radius), slab(z, d[2], half))
+    out = intersection(_ball_line([x, y], d[:2], radius), slab_line(z, d[2], half))
     for end in (-half, half):
-        out = either(out, _ball([x, y, z - end], d, radius))
+        out = union(out, _ball_line([x, y, z - end], d, radius))
     return out
 
 
 def _box_line(shape: Shape, origin: Array, direction: Array) -> Interval:
-    x, y, z = (slab(o, d, h) for o, d, h in zip(components(origin), components(direction), shape.size, strict=True))
-    return both(both(x, y), z)
+    x, y, z = (
+        slab_line(o, d, h) for o, d, h in zip(components(origin), components(direction), shape.size, strict=True)
+    )
+    return intersection(intersection(x, y), z)
 
 
 def _cylinder_line(shape: Shape, origin: Array, direction: Array) -> Interval:
     radius, half = shape.size
     (x, y, z), (u, v, w) = components(origin), components(direction)
-    return both(_ball([x, y], [u, v], radius), slab(z, w, half))
+    return intersection(_ball_line([x, y], [u, v], radius), slab_line(z, w, half))
 
 
 def _ellipsoid_line(shape: Shape, origin: Array, direction: Array) -> Interval:
     start, way = ([x / a for x, a in zip(components(v), shape.size, strict=True)] for v in (origin, direction))
-    return _ball(start, way, 1.0)
+    return _ball_line(start, way, 1.0)
 
 
 def _planes(shape: Shape, v: Array) -> Array:
@@ -135,7 +137,7 @@ def _mesh_line(shape: Shape, origin: Array, direction: Array) -> Interval:
     return near, far, (near <= far) & ~jnp.any(parallel & (below < 0), axis=-1)
 
 
-LINE = {
+LINE_INTERVAL = {
     "sphere": _sphere_line,
     "capsule": _capsule_line,
     "box": _box_line,
@@ -199,7 +201,7 @@ def _mesh_normal(shape: Shape, point: Array) -> Array:
     return jnp.take(jnp.asarray(shape.array("normals"), point.dtype), jnp.argmax(above, axis=-1), axis=0)
 
 
-NORMAL = {
+SURFACE_NORMAL = {
     "plane": _plane_normal,
     "sphere": _sphere_normal,
     "capsule": _capsule_normal,

@@ -21,53 +21,53 @@ def sharpness(dtype: jnp.dtype) -> float:
     return 1e3 if dtype == jnp.float32 else 1e7
 
 
-def end(half: float, along: Array) -> Array:
+def segment_support_point(half: float, along: Array) -> Array:
     """Return the support point of a segment, by the component of the direction along it, m. (...)"""
     return half * jnp.clip(along * sharpness(along.dtype), -1.0, 1.0)
 
 
-def reach(shape: Shape, n: Vector) -> Array:
+def support_function(shape: Shape, n: Vector) -> Array:
     """Return the support function of a shape along a unit direction, m. (...)"""
-    return REACH[shape.kind](shape, n)
+    return SUPPORT_FUNCTION[shape.kind](shape, n)
 
 
-def corner(shape: Shape, n: Vector) -> Vector:
+def support_point(shape: Shape, n: Vector) -> Vector:
     """Return the support point of a shape along a direction, m; interpolated near a tie."""
-    return CORNER[shape.kind](shape, n)
+    return SUPPORT_POINT[shape.kind](shape, n)
 
 
-def _box_reach(shape: Shape, n: Vector) -> Array:
+def _box_function(shape: Shape, n: Vector) -> Array:
     a, b, c = shape.size
     return a * jnp.abs(n.x) + b * jnp.abs(n.y) + c * jnp.abs(n.z)
 
 
-def _box_corner(shape: Shape, n: Vector) -> Vector:
+def _box_point(shape: Shape, n: Vector) -> Vector:
     a, b, c = shape.size
-    return Vector(end(a, n.x), end(b, n.y), end(c, n.z))
+    return Vector(segment_support_point(a, n.x), segment_support_point(b, n.y), segment_support_point(c, n.z))
 
 
-def _cylinder_reach(shape: Shape, n: Vector) -> Array:
+def _cylinder_function(shape: Shape, n: Vector) -> Array:
     radius, half = shape.size
     square = n.x * n.x + n.y * n.y
     return radius * jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0) + half * jnp.abs(n.z)
 
 
-def _cylinder_corner(shape: Shape, n: Vector) -> Vector:
+def _cylinder_point(shape: Shape, n: Vector) -> Vector:
     radius, half = shape.size
     square = n.x * n.x + n.y * n.y
     tie = 1 / sharpness(square.dtype) ** 2
     scale = radius * lax.rsqrt(jnp.where(square > tie, square, tie))
-    return Vector(n.x * scale, n.y * scale, end(half, n.z))
+    return Vector(n.x * scale, n.y * scale, segment_support_point(half, n.z))
 
 
-def _ellipsoid_reach(shape: Shape, n: Vector) -> Array:
+def _ellipsoid_function(shape: Shape, n: Vector) -> Array:
     a, b, c = shape.size
     return jnp.sqrt((a * n.x) ** 2 + (b * n.y) ** 2 + (c * n.z) ** 2)
 
 
-def _ellipsoid_corner(shape: Shape, n: Vector) -> Vector:
+def _ellipsoid_point(shape: Shape, n: Vector) -> Vector:
     a, b, c = shape.size
-    scale = 1 / _ellipsoid_reach(shape, n)
+    scale = 1 / _ellipsoid_function(shape, n)
     return Vector(a * a * scale * n.x, b * b * scale * n.y, c * c * scale * n.z)
 
 
@@ -76,11 +76,11 @@ def _mesh_products(shape: Shape, n: Vector) -> tuple[Array, list[Array]]:
     return x * n.x[..., None] + y * n.y[..., None] + z * n.z[..., None], [x, y, z]
 
 
-def _mesh_reach(shape: Shape, n: Vector) -> Array:
+def _mesh_function(shape: Shape, n: Vector) -> Array:
     return jnp.max(_mesh_products(shape, n)[0], axis=-1)
 
 
-def _mesh_corner(shape: Shape, n: Vector) -> Vector:
+def _mesh_point(shape: Shape, n: Vector) -> Vector:
     """Return the support point of a mesh, a weighted mean near a tie, without indexing."""
     products, columns = _mesh_products(shape, n)
     behind = jnp.max(products, axis=-1, keepdims=True) - products
@@ -89,15 +89,15 @@ def _mesh_corner(shape: Shape, n: Vector) -> Vector:
     return Vector(*(jnp.sum(weight * v, axis=-1) * share for v in columns))
 
 
-REACH: dict[str, Callable[[Shape, Vector], Array]] = {
-    "box": _box_reach,
-    "cylinder": _cylinder_reach,
-    "ellipsoid": _ellipsoid_reach,
-    "mesh": _mesh_reach,
+SUPPORT_FUNCTION: dict[str, Callable[[Shape, Vector], Array]] = {
+    "box": _box_function,
+    "cylinder": _cylinder_function,
+    "ellipsoid": _ellipsoid_function,
+    "mesh": _mesh_function,
 }
-CORNER: dict[str, Callable[[Shape, Vector], Vector]] = {
-    "box": _box_corner,
-    "cylinder": _cylinder_corner,
-    "ellipsoid": _ellipsoid_corner,
-    "mesh": _mesh_corner,
+SUPPORT_POINT: dict[str, Callable[[Shape, Vector], Vector]] = {
+    "box": _box_point,
+    "cylinder": _cylinder_point,
+    "ellipsoid": _ellipsoid_point,
+    "mesh": _mesh_point,
 }

@@ -11,25 +11,25 @@ THIN = 1e-10
 """Square of the sine below which the normal of a triangle is rounding error in float32."""
 
 
-Weights = tuple[Array, Array, Array]
+Barycentric = tuple[Array, Array, Array]
 """Barycentric coordinates of a point of a triangle; they add up to one. 3 of (...)"""
 
 
-def mean(weights: Weights, a: Vector, b: Vector, c: Vector) -> Vector:
+def from_barycentric(weights: Barycentric, a: Vector, b: Vector, c: Vector) -> Vector:
     """Return the point of a triangle with given barycentric coordinates."""
     u, v, w = weights
     return a * u + b * v + c * w
 
 
-def foot(a: Vector, b: Vector, c: Vector) -> Weights:
+def closest_point(a: Vector, b: Vector, c: Vector) -> Barycentric:
     """Return the barycentric coordinates of the point of a triangle nearest to the origin."""
     t = _along(b, c - b)
-    on_third, rest = (jnp.zeros_like(t), 1 - t, t), open_foot(a, b, c)
+    on_third, rest = (jnp.zeros_like(t), 1 - t, t), closest_point_off_bc(a, b, c)
     return _nearer(on_third, rest, a, b, c)
 
 
-def open_foot(a: Vector, b: Vector, c: Vector) -> Weights:
-    """Return the same as ``foot`` without trying the side from ``b`` to ``c``."""
+def closest_point_off_bc(a: Vector, b: Vector, c: Vector) -> Barycentric:
+    """Return the same, without trying the side from ``b`` to ``c``."""
     ab, ac = b - a, c - a
     s, t = _along(a, ab), _along(a, ac)
     on_side = _nearer((1 - t, jnp.zeros_like(t), t), (1 - s, s, jnp.zeros_like(s)), a, b, c)
@@ -46,13 +46,13 @@ def _along(a: Vector, side: Vector) -> Array:
     return jnp.clip(-a.dot(side) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
 
 
-def _nearer(new: Weights, old: Weights, a: Vector, b: Vector, c: Vector) -> Weights:
+def _nearer(new: Barycentric, old: Barycentric, a: Vector, b: Vector, c: Vector) -> Barycentric:
     """Return the point nearer to the origin; on a tie, the old one."""
-    p, q = mean(new, a, b, c), mean(old, a, b, c)
+    p, q = from_barycentric(new, a, b, c), from_barycentric(old, a, b, c)
     square = q.dot(q)
     return _choose(p.dot(p) < square * (1 - margin(square.dtype)), new, old)
 
 
-def _choose(condition: Array, new: Weights, old: Weights) -> Weights:
+def _choose(condition: Array, new: Barycentric, old: Barycentric) -> Barycentric:
     u, v, w = (jnp.where(condition, x, y) for x, y in zip(new, old, strict=True))
     return u, v, w

@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.engine import fused
-from crazysim.engine.lower import UnsupportedError
+from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.query import Query, query
 from crazysim.scene import report
 from crazysim.scene.collision import CollisionModel
@@ -25,9 +25,16 @@ from crazysim.scene.scene import Scene
 class SceneQueries:
     """Queries with the arguments seen so far, compiled until the scene changes."""
 
-    def __init__(self, scene: Scene, platform: str | None):
-        """Take the scene, and the platform whose kernels may run the queries; None to use XLA only."""
-        self._scene = scene
+    def __init__(self, scene: Scene, platform: str | None, strict: bool = False):
+        """Take the scene.
+
+        Args:
+            scene: The scene.
+            platform: Platform whose kernels may run the queries; None to use XLA only.
+            strict: True to raise an error where XLA would be used with an ``EngineWarning``.
+        """
+        self._scene, self._strict = scene, strict
+        self._reported: set[str] = set()
         self._platform = None if platform is None or fused.missing(platform) else platform
         self._model: Any = None
         self._compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}
@@ -82,7 +89,11 @@ class SceneQueries:
             try:
                 found = query(queries, with_mocap_bodies(model, data, mocap), platform)
                 return functools.reduce(ContactReport.joined, found)
-            except UnsupportedError:
+            except UnsupportedError as error:
+                if not isinstance(error, LimitError):
+                    problem = f"the contact report has no kernel: {error.reason}"
+                    remedy = "Leave out the geoms that need it with objects="
+                    report_unsupported([problem], self._strict, self._reported, remedy)
                 return by_xla(data, mocap)
 
         return contacts

@@ -2,15 +2,13 @@
 
 Time stepping on velocities (Moreau 1988; the convex form of Todorov 2014): after a step, impulses at the contact points
 change the velocity into one that no longer approaches. An overlap is pushed out with a time constant, so that the
-ground is soft and no drone is thrown out of it. The contact points of a drone are those of its collision box: the
-corners, and the points of its upper and lower plate that are nearest to each object.
+ground is soft and no drone is thrown out of it. The points are those of ``contact_points``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from itertools import product
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,21 +21,16 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
 from crazysim.deprecation import warn_renamed
 from crazysim.errors import ConfigError
-from crazysim.geometry import Shape, distance, point_distance
 from crazysim.pytree import PyTree, leaf
-from crazysim.scene.collision import CollisionGeom
-from crazysim.scene.report import Objects, choose
+from crazysim.scene.contact_points import Surface, contact_points, surfaces_of
+from crazysim.scene.report import Objects
 
-FLAT = ("plane", "box", "cylinder", "hfield")
-"""Kinds with faces, on which a drone stands by its corners."""
 SLOW = 0.1
 """Approach speed below which nothing bounces, m/s: five steps of free fall at 500 Hz."""
 STIFFNESS = 300.0
 """Penalty on the speed into a surface, in masses: costs a third of a percent of a bounce, solvable in float32."""
 STICKING = 1e-4
 """Slip speed treated as zero, m/s."""
-THIN = 0.05
-"""Height of the upper and lower plate of a drone's box, as a share of the box; both touch an object along its side."""
 FASTEST_PUSH = 0.25
 """Largest speed at which an overlap is pushed out, m/s."""
 
@@ -93,7 +86,7 @@ class ContactResponse(Plugin):
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that applies the impulses."""
         box = np.asarray(sim.airframe.value("shape.collision_box"), np.float64)
-        surfaces = _surfaces(sim, self.objects)
+        surfaces = surfaces_of(sim, self.objects)
 
         def respond(data: SimData) -> SimData:
             states, record = _respond(data, self.read(data), surfaces, box, self.iterations)
@@ -115,107 +108,8 @@ def add_contact_response(
     sim.add(ContactResponse(objects, friction, restitution, softness, iterations))
 
 
-class _Surface(NamedTuple):
-    """A geom, and the number of the movable object that carries it; None for a fixed one."""
-
-    part: CollisionGeom
-    place: int | None
-
-
-def _surfaces(sim: Simulation, objects: Objects) -> list[_Surface]:
-    model = sim.scene.collision_model
-    found = [_Surface(geom, None) for geom in model.floor]
-    for body in choose(model, objects):
-        found += [_Surface(geom, body.row) for geom in body.geoms]
-    return found
-
-
-class _ContactPoints(NamedTuple):
-    """Points that are or may come into contact, in the drone's body frame."""
-
-    gap: Array
-    """Distance to the surface, m. (..., n)"""
-    normal: Array
-    """Outward normal of the surface. (..., n, 3)"""
-    point: Array
-    """Position on the drone, from its centre of mass, m. (..., n, 3)"""
-    vel: Array
-    """Velocity of the surface, m/s. (..., n, 3)"""
-
-
-def _contact_points(data: SimData, surfaces: list[_Surface], box: np.ndarray) -> _ContactPoints:
-    pos, quat = data.states.pos, data.states.quat
-    dtype = pos.dtype
-    corners = jnp.asarray(box[:3] + box[3:] * np.array(list(product((-1, 1), repeat=3))), dtype)
-    plate = Shape("box", (*box[3:5].tolist(), THIN * box[5]))
-    middles = [jnp.asarray(box[:3] + np.array([0, 0, side * (1 - THIN) * box[5]]), dtype) for side in (-1, 1)]
-    turn = quat[..., None, :]
-    in_world = pos[..., None, :] + rotation.rotate(turn, corners)
-    found = []
-    for part, place in surfaces:
-        into, back, vel = _frame(data, part, place)
-        still = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(turn, vel[..., None, :])
-        if part.shape.kind in FLAT:
-            gap, pull = jax.vjp(lambda p, s=part.shape: point_distance(s, p), into(in_world, True))
-            normal = rotation.rotate_inverse(turn, back(pull(jnp.ones_like(gap))[0]))
-            found.append(_ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
-        if part.shape.kind not in ("plane", "hfield"):
-            found += [_nearest(data, part, into, plate, middle, still[..., :1, :]) for middle in middles]
-    joined = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True)))
-    return _ContactPoints(*joined)
-
-
-def _nearest(
-    data: SimData, part: CollisionGeom, into: Callable, shape: Shape, middle: Array, vel: Array
-) -> _ContactPoints:
-    """Return the point of a plate that is nearest to a geom.
-
-    The gradient of the gap with respect to the drone's position is the normal, and that with respect to its attitude is
-    the lever times the normal, which is all that turns the drone. The position along the normal affects friction only;
-    the plate's face is used.
-    """
-    pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
-
-    def gap_at(move: Array, turned: Array) -> Array:
-        q = rotation.turn(quat, turned, 1.0, normalize=False)
-        at = into(pos + move + rotation.rotate(q, middle), True)
-        columns = [into(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
-        return distance(shape, part.shape, at, jnp.stack(columns, axis=-1))
-
-    gap, pull = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
-    force, torque = pull(jnp.ones_like(gap))
-    normal = rotation.rotate_inverse(quat, force)
-    reach = jnp.sum(jnp.abs(normal) * jnp.asarray(shape.size, pos.dtype), axis=-1, keepdims=True)
-    point = rotation.cross(normal, torque) - reach * normal
-    return _ContactPoints(gap, normal, point, jnp.broadcast_to(vel, normal.shape))
-
-
-def _frame(data: SimData, part: CollisionGeom, place: int | None) -> tuple[Callable, Callable, Array | None]:
-    """Return functions that take points and directions into a geom's frame, and directions back, and its velocity."""
-    dtype = data.states.pos.dtype
-    at = jnp.asarray(part.pos, dtype)
-    rot = None if part.rot is None else jnp.asarray(part.rot, dtype)
-    if place is None:
-        own_pos = own_quat = vel = None
-    else:
-        objects = data.objects
-        own_pos, own_quat, vel = (x[..., place, :] for x in (objects.pos, objects.quat, objects.vel))
-
-    def into(x: Array, is_point: bool) -> Array:
-        if own_quat is not None and own_pos is not None:
-            x = rotation.rotate_inverse(own_quat[..., None, :], x - own_pos[..., None, :] if is_point else x)
-        x = x - at if is_point else x
-        return x if rot is None else rotation.matvec(rot.T, x)
-
-    def back(x: Array) -> Array:
-        x = x if rot is None else rotation.matvec(rot, x)
-        return x if own_quat is None else rotation.rotate(own_quat[..., None, :], x)
-
-    return into, back, vel
-
-
 def _respond(
-    data: SimData, record: ContactResponseData, surfaces: list[_Surface], box: np.ndarray, iterations: int
+    data: SimData, record: ContactResponseData, surfaces: list[Surface], box: np.ndarray, iterations: int
 ) -> tuple[SimState, ContactResponseData]:
     """Return the states with the velocity after contact, and the record with the impulse.
 
@@ -226,7 +120,7 @@ def _respond(
     (Kane 1984), or points that push against each other, is removed.
     """
     states, params = data.states, data.params
-    points = _contact_points(data, surfaces, box)
+    points = contact_points(data, surfaces, box)
     n, p, s = points.normal, points.point, points.vel
     active = points.gap < 0
     before = jnp.concatenate([rotation.rotate_inverse(states.quat, states.vel), states.ang_vel], axis=-1)

@@ -18,9 +18,9 @@ class Commands:
 
     _stepper: Stepper
 
-    def state_control(self, controls: Any, check_finite: bool = False) -> None:
+    def state_control(self, controls: Any, check_finite: bool = False, *, feedforward: Any = None) -> None:
         """Stage a full-state setpoint. (n_worlds, n_drones, 16)"""
-        self._stepper.data = F.state_control(self.data, controls, check_finite)
+        self._stepper.data = F.state_control(self.data, controls, check_finite, feedforward=feedforward)
 
     def attitude_control(self, controls: Any, check_finite: bool = False) -> None:
         """Stage roll, pitch, yaw, rad, and collective thrust, N. (n_worlds, n_drones, 4)"""

@@ -10,10 +10,11 @@ from typing import Any
 import jax
 from jax.sharding import Mesh
 
-from crazysim.control import Control
-from crazysim.core.data import require_pair
+from crazysim.control import Control, Controller
+from crazysim.control.controllers import find_controller
+from crazysim.core.data import require_controller, require_pair
 from crazysim.core.integration import Integrator
-from crazysim.core.settings import control_freqs, find_device, member, physics_freq, positive
+from crazysim.core.settings import control_freqs, controller_at_rates, find_device, member, physics_freq, positive
 from crazysim.drones import Airframe, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.core import require_support
@@ -38,7 +39,9 @@ class Configuration:
     freq: int
     """Physics steps per second, Hz."""
     control_freqs: Mapping[Control, int]
-    """Rate of each controller, Hz."""
+    """Rate of the commands of each level, Hz."""
+    controller: Controller | None
+    """Controller at its rates; None for Crazyflow's cascade."""
     device: jax.Device
     """Device of the data."""
     mesh: Mesh | None
@@ -62,6 +65,8 @@ class Configuration:
         mesh: Mesh | None,
         engine: str,
         strict: bool,
+        controller: Any,
+        switch: Any = None,
     ) -> Configuration:
         """Return the configuration for the arguments of ``Sim``, as users pass them.
 
@@ -74,6 +79,12 @@ class Configuration:
         require_pair(dynamics, control)
         airframe = load_airframe(drone)
         require_support(airframe, dynamics)
+        freqs, controller = control_freqs(control, freq, dict(rates)), find_controller(controller, switch)
+        if controller is not None:
+            require_controller(dynamics, control, controller)
+            controller = controller_at_rates(controller, control, freq, dict(rates))
+            with_outer = control == Control.state and controller.has_outer
+            freqs |= {control: controller.outer_freq if with_outer else controller.freq}
         return Configuration(
             n_worlds,
             n_drones,
@@ -82,7 +93,8 @@ class Configuration:
             control,
             integrator,
             freq,
-            control_freqs(control, freq, dict(rates)),
+            freqs,
+            controller,
             find_device(device),
             mesh,
             engine,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,11 @@ import jax.numpy as jnp
 from jax import Array
 from jax.sharding import Mesh
 
-from crazysim.control import Control
+from crazysim.control import Control, Controller
+from crazysim.control.controllers import CASCADE
 from crazysim.core import functional as F
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
-from crazysim.core.pipeline import Pipeline
 from crazysim.core.random import seed_sim
 from crazysim.core.registry import PluginRegistry
 from crazysim.core.settings import as_mask, positive
@@ -24,8 +24,7 @@ from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_
 from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameters import rotor_vel_limits
-from crazysim.engine import Step, Stepper, build_reset, explain
-from crazysim.engine.plain import ResetFn
+from crazysim.engine import Stepper, explain
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
 from crazysim.scene.queries import SceneQueries
@@ -33,6 +32,7 @@ from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim.commands import Commands
 from crazysim.sim.configuration import Configuration
+from crazysim.sim.pipelines import Pipelines
 from crazysim.sim.plugins import PluginMethods
 from crazysim.sim.scene_shell import SceneShell, use_box_collision
 
@@ -48,7 +48,7 @@ __all__ = [
 ]
 
 
-class Sim(Commands, PluginMethods, SceneShell):
+class Sim(Commands, Pipelines, PluginMethods, SceneShell):
     """Worlds of drones that advance together.
 
     ``data`` holds everything that changes, ``step_pipeline`` and ``reset_pipeline`` the stages that change it, ``spec``
@@ -75,6 +75,8 @@ class Sim(Commands, PluginMethods, SceneShell):
         mesh: Mesh | None = None,
         engine: str = "auto",
         strict: bool = False,
+        controller: str | Controller | Sequence[str | Controller] = CASCADE,
+        switch: Any = None,
     ):
         """Build the scene's spec, the data and both pipelines; MuJoCo allocates nothing per world.
 
@@ -97,6 +99,11 @@ class Sim(Commands, PluginMethods, SceneShell):
             engine: Engine that executes steps, one of ``crazysim.engine.ENGINES``; ``"auto"`` takes the fastest that
                 can run the step pipeline here. ``explain`` says which that is.
             strict: True to raise an error where a slower engine would be taken with an ``EngineWarning``.
+            controller: Controller that follows the commands: a name of ``crazysim.control.controllers.CONTROLLERS``, a
+                ``crazysim.control.Controller``, or ``"crazyflow"`` for the cascade of Crazyflow; or a list of several.
+                The rates above replace its own.
+            switch: Chooses among several controllers: a function ``(state, setpoint, time) -> index`` of one drone, or
+                indices, () or (n_worlds, n_drones).
 
         Raises:
             ValueError: If an argument is invalid, with what was expected.
@@ -108,7 +115,20 @@ class Sim(Commands, PluginMethods, SceneShell):
             Control.force_torque: force_torque_freq,
         }
         self.configuration = c = Configuration.create(
-            n_worlds, n_drones, drone, dynamics, control, integrator, freq, rates, device, mesh, engine, strict
+            n_worlds,
+            n_drones,
+            drone,
+            dynamics,
+            control,
+            integrator,
+            freq,
+            rates,
+            device,
+            mesh,
+            engine,
+            strict,
+            controller,
+            switch,
         )
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
         self.dynamics, self.control, self.integrator = c.dynamics, c.control, c.integrator
@@ -124,8 +144,8 @@ class Sim(Commands, PluginMethods, SceneShell):
         self.build_data()
         self.build_default_data()
 
-        self.step_pipeline: Pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator)
-        self.reset_pipeline: Pipeline = {"reset": reset}
+        self.step_pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
+        self.reset_pipeline = {"reset": reset}
         self.build_step_fn()
         self.build_reset_fn()
 
@@ -133,7 +153,7 @@ class Sim(Commands, PluginMethods, SceneShell):
 
     def _new_queries(self) -> SceneQueries:
         kernels = self.mesh is None and self.engine in ("auto", "fused")
-        return SceneQueries(self._scene, self.device.platform if kernels else None)
+        return SceneQueries(self._scene, self.device.platform if kernels else None, self.configuration.strict)
 
     @property
     def data(self) -> SimData:
@@ -195,6 +215,7 @@ class Sim(Commands, PluginMethods, SceneShell):
             dict(self.configuration.control_freqs),
             self._scene.drone_mocap_ids,
             self._seed,
+            self.configuration.controller,
         )
         self.data = data.replace(objects=self._scene.objects(None))
         self.plugins.build_records()
@@ -231,6 +252,7 @@ class Sim(Commands, PluginMethods, SceneShell):
         """Advance every world by a number of physics steps; any number uses the same compilation."""
         n_steps = positive("n_steps", n_steps)
         self._adopt_scene()
+        self._take_edits()
         self._stepper.advance(n_steps)
         self._scene.invalidate()
 
@@ -293,13 +315,3 @@ class Sim(Commands, PluginMethods, SceneShell):
         """Take data that a compiled call returned."""
         self._stepper.accept(data)
         self._scene.invalidate()
-
-    def build_step_fn(self) -> Step:
-        """Make the step pipeline as it is now take effect; return ``step(data, n_steps=1) -> data``, pure."""
-        self.step_fn = self._stepper.build(self.step_pipeline)
-        return self.step_fn
-
-    def build_reset_fn(self) -> ResetFn:
-        """Make the reset pipeline as it is now take effect; return ``reset(data, default_data, mask=None)``, pure."""
-        self.reset_fn = build_reset(self.reset_pipeline)
-        return self.reset_fn

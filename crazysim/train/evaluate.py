@@ -55,8 +55,8 @@ def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
     done = jnp.zeros(state.reward.shape, bool)
     carry = (state, jnp.zeros_like(state.terminated), jnp.zeros_like(state.reward), state.info["error"], done)
     (_, _, total, _, done), (error, over) = jax.lax.scan(step, carry, length=env.max_steps)
-    flown = {"error": error, "over": over, "reward": total}
-    return flown if env.succeeded(state) is None else flown | {"succeeded": done}
+    flight = {"error": error, "over": over, "reward": total}
+    return flight if env.succeeded(state) is None else flight | {"succeeded": done}
 
 
 def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None) -> dict[str, float]:
@@ -76,17 +76,17 @@ def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None)
         m (at the end of the episode for tasks with ``task.succeeded``); ``reward``: mean return of an episode.
     """
     compiled: Any = policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
-    flown = fly(env, compiled, jax.random.key(HELD_OUT) if key is None else key)
+    flight = fly(env, compiled, jax.random.key(HELD_OUT) if key is None else key)
     last = max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
-    over = flown["over"][-1]
-    settled = jnp.all(flown["error"][-last:] < env.task.tolerance, axis=0) & ~over[:, None]
-    if "succeeded" in flown:
-        last, settled = 1, flown["succeeded"]
+    over = flight["over"][-1]
+    settled = jnp.all(flight["error"][-last:] < env.task.tolerance, axis=0) & ~over[:, None]
+    if "succeeded" in flight:
+        last, settled = 1, flight["succeeded"]
     crashed = over & ~jnp.all(settled, axis=-1)
-    error = jnp.where(crashed[None, :, None], jnp.nan, flown["error"][-last:])
+    error = jnp.where(crashed[None, :, None], jnp.nan, flight["error"][-last:])
     return {
         "success": float(settled.mean()),
         "crashed": float(crashed.mean()),
         "error": float(jnp.nanmean(error)),
-        "reward": float(flown["reward"].mean()),
+        "reward": float(flight["reward"].mean()),
     }

@@ -110,9 +110,9 @@ class Follow(Plugin):
             ends=ends,
             coefficients=coefficients,
             repeats=repeats,
-            index=check_parameter(sim, "index", index, low=0, high=n_slots - 1, dtype=jnp.int32),
-            start=check_parameter(sim, "start", self.start),
-            rate=check_parameter(sim, "rate", self.rate, positive=True),
+            index=_checked(sim, "index", index, n_slots),
+            start=_checked(sim, "start", self.start, n_slots),
+            rate=_checked(sim, "rate", self.rate, n_slots),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
@@ -172,6 +172,27 @@ class Follow(Plugin):
         """
         sim.data = self.uploaded(sim.data, slot, trajectory)
 
+    def assign(self, sim: Simulation, index: Any = None, start: Any = None, rate: Any = None) -> None:
+        """Give drones other slots, starts or rates; whatever is None stays as it is.
+
+        Nothing is compiled again, except where a number of all drones becomes one per drone.
+
+        Args:
+            sim: The simulation.
+            index: Slots. () or (n_worlds, n_drones)
+            start: Times of the worlds at which the drones start, s. () or (n_worlds, n_drones)
+            rate: Speeds at which they go through their trajectories, 1. () or (n_worlds, n_drones)
+
+        Raises:
+            ConfigError: If a shape or a value is invalid.
+        """
+        record = self.read(sim.data)
+        new = {name: value for name, value in (("index", index), ("start", start), ("rate", rate)) if value is not None}
+        numbers = {name: _checked(sim, name, value, len(record.ends)) for name, value in new.items()}
+        shapes = {name: np.broadcast_shapes(x.shape, getattr(record, name).shape) for name, x in numbers.items()}
+        record = record.replace(**{name: jnp.broadcast_to(x, shapes[name]) for name, x in numbers.items()})
+        sim.data = self.write(sim.data, record)
+
     def draw(self, sim: Simulation, world: int) -> None:
         """Draw the path ahead and the setpoint of every drone."""
         if not self.visible:
@@ -198,6 +219,13 @@ class Follow(Plugin):
         if not given or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in given):
             raise ConfigError(f"expected one or more trajectories of one vehicle each, got {self.trajectories!r}")
         return list(given)
+
+
+def _checked(sim: Simulation, name: str, value: Any, n_slots: int) -> Array:
+    """Return an index, start or rate as ``check_parameter`` does."""
+    if name == "index":
+        return check_parameter(sim, name, value, low=0, high=n_slots - 1, dtype=jnp.int32)
+    return check_parameter(sim, name, value, positive=name == "rate")
 
 
 def _count(name: str, value: Any, least: int) -> int:

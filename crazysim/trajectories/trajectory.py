@@ -99,7 +99,7 @@ class Trajectory(PyTree):
         It reads the numbers that it needs and no others, so that many trajectories cost no more than one.
 
         Args:
-            index: Which of the trajectories along the one leading axis; the nearest one if there is none of this
+            index: Index along the one leading axis; the nearest trajectory if there is none of this
                 index. ()
             t: Time since the start of the trajectory, s. ()
         """

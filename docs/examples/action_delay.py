@@ -37,7 +37,6 @@ def add_delay(sim: Sim, n_steps: int) -> None:
     sim.data = sim.data.replace(plugins=sim.data.plugins | {"delay": Delay(queue)})
     sim.build_default_data()
     replace_fn(sim.step_pipeline, late_controller, "attitude_controller")
-    sim.build_step_fn()
 
 
 def main() -> None:

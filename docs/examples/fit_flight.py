@@ -65,8 +65,8 @@ def main() -> dict[str, tuple[float, float, float]]:
         drone = start.replace(params=with_physical(start.params, ratio * data_sheet))
         return jax.lax.scan(sample, drone, cmds)[1]
 
-    flown = jax.jit(fly)(TRUE_OVER_DATA_SHEET)
-    log = {name: x + NOISE[name] * rng.normal(size=x.shape) for name, x in flown.items()}
+    flight = jax.jit(fly)(TRUE_OVER_DATA_SHEET)
+    log = {name: x + NOISE[name] * rng.normal(size=x.shape) for name, x in flight.items()}
 
     def misfit(ratio: jax.Array) -> jax.Array:
         """Return the residuals of simulation and log, in units of the noise."""

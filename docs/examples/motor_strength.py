@@ -35,7 +35,6 @@ def main() -> None:
 
     for spread in (0.0, 0.02, 0.05):
         sim.reset_pipeline["motors"] = partial(randomize_motors, spread=spread)
-        sim.build_reset_fn()
         sim.reset()
         sim.state_control(setpoint)
         sim.step(5 * sim.freq)

@@ -77,7 +77,6 @@ def build() -> Sim:
     sim.add(ContactLog([gates, poles], drones=False))
     sim.add(Progress(gates))
     sim.reset_pipeline["place"] = place
-    sim.build_reset_fn()
     sim.reset()
     return sim
 

@@ -26,7 +26,6 @@ def randomize_inertia(data, default_data, mask=None):
 def main() -> None:
     sim = Sim(n_worlds=200, control="attitude", rng_key=1)
     append_fn(sim.reset_pipeline, randomize_inertia)
-    sim.build_reset_fn()
     sim.reset()
     states = sim.data.states
     rotor_vel = jnp.broadcast_to(hover_rotor_vel(sim.data.params), states.rotor_vel.shape)

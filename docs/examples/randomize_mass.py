@@ -24,7 +24,6 @@ def main() -> None:
     sim = Sim(n_worlds=256, n_drones=2, control="attitude", rng_key=7)
     weight = 9.81 * float(sim.data.params.mass[0])
     append_fn(sim.reset_pipeline, randomize_mass)
-    sim.build_reset_fn()
     sim.reset()
 
     thrust = np.zeros((sim.n_worlds, sim.n_drones, 4))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import Sim
+from crazysim import Sim, stage
 from crazysim.core.pipeline import (
     append_fn,
     insert_fn_after,
@@ -128,18 +128,80 @@ def double(data):
     return data.replace(states=data.states.replace(pos=data.states.pos * 2))
 
 
-def test_a_change_takes_effect_when_the_step_is_built(sim):
-    sim.step_pipeline = {"increment_steps": sim.step_pipeline["increment_steps"]}
-    before_building = sim.build_step_fn()
+EDITS = {
+    "append": lambda sim: append_fn(sim.step_pipeline, lift),
+    "replace": lambda sim: replace_fn(sim.step_pipeline, lift, "still"),
+    "assign an item": lambda sim: sim.step_pipeline.update(still=lift),
+    "assign a dict": lambda sim: setattr(sim, "step_pipeline", sim.step_pipeline | {"still": lift}),
+}
+
+
+def still(data):
+    return data
+
+
+@pytest.mark.parametrize("build", [False, True])
+@pytest.mark.parametrize("edit", EDITS)
+def test_an_edit_takes_effect_at_the_next_step(sim, edit, build):
+    sim.step_pipeline = {"still": still, "increment_steps": sim.step_pipeline["increment_steps"]}
+    before_editing = sim.build_step_fn()
     start = sim.data
-    append_fn(sim.step_pipeline, lift)
-    sim.step(3)
+    sim.step(2)
     np.testing.assert_array_equal(sim.data.states.pos, start.states.pos)
-    sim.build_step_fn()
+    EDITS[edit](sim)
+    if build:
+        sim.build_step_fn()
     sim.step(3)
     np.testing.assert_allclose(sim.data.states.pos[..., 2], start.states.pos[..., 2] + 3)
-    # What was built before is a snapshot, and stays one.
-    np.testing.assert_array_equal(before_building(start, 3).states.pos, start.states.pos)
+    np.testing.assert_array_equal(sim.data.core.steps, 5)
+    # A function that was built before is a snapshot, and stays one.
+    np.testing.assert_array_equal(before_editing(start, 3).states.pos, start.states.pos)
+    np.testing.assert_allclose(sim.step_fn(start, 3).states.pos, sim.data.states.pos)
+
+
+def test_the_order_and_the_end_of_a_pipeline_are_edits(sim):
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.zeros((2, 2, 3))))
+    sim.step_pipeline = {"lift": lift, "double": double}
+    sim.step()
+    assert float(sim.data.states.pos[0, 0, 2]) == 2.0
+    sim.step_pipeline = {"double": double, "lift": lift}
+    sim.step()
+    assert float(sim.data.states.pos[0, 0, 2]) == 5.0
+    remove_fn(sim.step_pipeline, "double")
+    sim.step()
+    assert float(sim.data.states.pos[0, 0, 2]) == 6.0
+
+
+def test_law_06_an_edit_compiles_once_and_an_undone_one_not_at_all(sim):
+    traces = []
+
+    def counted(data):
+        traces.append(1)
+        return data
+
+    sim.step()
+    step, integration = sim.step_fn, sim.step_pipeline["integration"]
+    append_fn(sim.step_pipeline, lift)
+    remove_fn(sim.step_pipeline, "lift")
+    replace_fn(sim.step_pipeline, integration, "integration")
+    sim.step()
+    assert sim.step_fn is step
+    append_fn(sim.step_pipeline, stage("drone")(counted), "counted")
+    sim.step()
+    step, n = sim.step_fn, len(traces)
+    assert n > 0
+    for _ in range(10):
+        sim.step()
+    assert sim.step_fn is step
+    assert len(traces) == n
+
+
+def test_rollouts_and_explanations_are_of_the_edited_pipeline(sim):
+    start = sim.data.states.pos
+    sim.step_pipeline = {"lift": lift, "increment_steps": sim.step_pipeline["increment_steps"]}
+    assert "lift" in sim.explain()
+    sim.rollout(lambda params, data: jnp.zeros((2, 2, 4)), n_control_steps=2)
+    np.testing.assert_allclose(sim.data.states.pos[..., 2], start[..., 2] + 2 * sim.freq // sim.control_freq)
 
 
 def test_stages_run_in_their_order(sim):
@@ -147,21 +209,27 @@ def test_stages_run_in_their_order(sim):
     heights = []
     for stages in ({"lift": lift, "double": double}, {"double": double, "lift": lift}):
         sim.step_pipeline = stages
-        heights.append(float(sim.build_step_fn()(sim.data, 2).states.pos[0, 0, 2]))
+        heights.append(float(sim.step_fn(sim.data, 2).states.pos[0, 0, 2]))
     assert heights == [6.0, 3.0]  # (((0 + 1) * 2) + 1) * 2, and ((0 * 2) + 1) * 2 + 1
 
 
-def test_reset_stages_take_effect_when_the_reset_is_built(sim):
+@pytest.mark.parametrize("build", [False, True])
+def test_an_edit_takes_effect_at_the_next_reset(sim, build):
     def raise_them(data, default_data, mask=None):
         del default_data, mask
         return lift(data)
 
+    before_editing = sim.build_reset_fn()
     append_fn(sim.reset_pipeline, raise_them)
-    sim.reset()
-    np.testing.assert_array_equal(sim.data.states.pos, sim.default_data.states.pos)
-    sim.build_reset_fn()
+    if build:
+        sim.build_reset_fn()
     sim.reset()
     np.testing.assert_allclose(sim.data.states.pos[..., 2], sim.default_data.states.pos[..., 2] + 1)
+    reset_fn = sim.reset_fn
+    sim.reset()
+    assert sim.reset_fn is reset_fn
+    old = before_editing(sim.data, sim.default_data)
+    np.testing.assert_array_equal(old.states.pos, sim.default_data.states.pos)
 
 
 def drops_a_field(data):
@@ -196,7 +264,6 @@ def casts_a_leaf(data):
 )
 def test_a_stage_that_changes_what_data_is_made_of_is_named(sim, stage, fragments):
     insert_fn_before(sim.step_pipeline, "integration", stage)
-    sim.build_step_fn()
     before = sim.data
     with pytest.raises(ValueError) as error:
         sim.step()

@@ -1,6 +1,7 @@
 """Airframes: what their files hold, the mixing that follows from rotor positions, and a user's own."""
 
 import copy
+import re
 import tomllib
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import pytest
 from crazysim import ConfigError, Sim
 from crazysim.control import AllocationParams, AttitudeParams, StateParams
 from crazysim.drones import Airframe, Drone, airframe_names, load_airframe
-from crazysim.drones.airframe import FOLDER, SHAPE_KEYS
+from crazysim.drones.airframe import FOLDER
 from crazysim.drones.body import body_geoms, outline
+from crazysim.drones.keys import KEYS, TABLES, TOP_LEVEL
 from crazysim.dynamics import Dynamics, first_principles, fitted, supported_drones, supported_dynamics
 
 FILES = sorted(FOLDER.glob("*.toml"))
@@ -230,13 +232,19 @@ def setting(path, value):
 
 WRONG = {
     "no rigid body": (without("rigid_body"), r"no table \[rigid_body\]"),
-    "no mass": (without("rigid_body.mass"), "has no value 'rigid_body.mass'. Did you mean 'controller.mass'"),
+    "no mass": (
+        without("rigid_body.mass"),
+        r"has no value 'rigid_body.mass'. Add mass to its table \[rigid_body\]; docs",
+    ),
     "mass a string": (
         setting("rigid_body.mass", "heavy"),
         "expected rigid_body.mass as a number or array, got 'heavy'",
     ),
     "mass a list": (setting("rigid_body.mass", [0.03]), r"expected rigid_body.mass of shape \(\), got \(1,\)"),
-    "mass a table": (setting("rigid_body.mass", {"kilos": 0.03}), "has no value 'rigid_body.mass'"),
+    "mass a table": (
+        setting("rigid_body.mass", {"kilos": 0.03}),
+        r"expected rigid_body.mass as a number, an array or \{ value, unit, source \}, got \{'kilos': 0.03\}",
+    ),
     "mass negative": (setting("rigid_body.mass", -0.03), "expected a positive mass, got -0.03 kg"),
     "mass nan": (setting("rigid_body.mass", float("nan")), "expected rigid_body.mass to be finite, got nan"),
     "too heavy": (setting("rigid_body.mass", 0.2), "expected rotors that lift 0.2 kg, got 4 rotors of at most 0.2 N"),
@@ -246,7 +254,7 @@ WRONG = {
         setting("rigid_body.inertia", [[1e-5, 1e-6, 0], [0, 1e-5, 0], [0, 0, 1e-5]]),
         "symmetric positive definite",
     ),
-    "rotors a number": (setting("rotors", 4), r"no table \[rotors\]"),
+    "rotors a number": (setting("rotors", 4), r"expected a table \[rotors\], got 4"),
     "positions flat": (
         setting("rotors.position", [0.1, 0.1]),
         r"expected rotors.position of shape \(n, 3\), got \(2,\)",
@@ -270,9 +278,38 @@ WRONG = {
         setting("fitted.so_rpy.rpy_coef", -150.0),
         r"expected fitted.so_rpy.rpy_coef of shape \(3,\), got \(\)",
     ),
-    "no gain": (without("controller.attitude.kR"), "has no value 'controller.attitude.kR'"),
-    "no controller": (without("controller"), "has no value 'controller."),
-    "shape misspelt": (setting("shape.propellor_radius", 0.02), r"got \['propellor_radius'\]"),
+    "no gain": (
+        without("controller.attitude.kR"),
+        r"has no value 'controller.attitude.kR'. Add kR to its table \[controller.attitude\]; docs",
+    ),
+    "no controller": (without("controller"), r"has no value 'controller.\w+.\w+'. Add \w+ to its table"),
+    "shape misspelt": (
+        setting("shape.propellor_radius", 0.02),
+        "expected a key that exists, got 'shape.propellor_radius'. Did you mean 'shape.propeller_radius'",
+    ),
+    "table misspelt": (
+        setting("rigidbody", {"mass": 0.05}),
+        r"airframe 'custom': expected a table that exists, got \[rigidbody\]. Did you mean \[rigid_body\]\? docs",
+    ),
+    "inner table misspelt": (
+        setting("controller.atitude", {"kR": [1, 1, 1]}),
+        r"got \[controller.atitude\]. Did you mean \[controller.attitude\]",
+    ),
+    "mass misspelt": (
+        setting("rigid_body.mas", 0.05),
+        "expected a key that exists, got 'rigid_body.mas'. Did you mean 'rigid_body.mass'",
+    ),
+    "base misspelt": (setting("bse", "cf2x_L250"), "expected a key that exists, got 'bse'. Did you mean 'base'"),
+    "mass in no table": (setting("mass", 0.05), "got 'mass'. Did you mean 'rigid_body.mass' or 'controller.mass'"),
+    "unit misspelt": (
+        setting("rigid_body.mass", {"value": 0.03, "units": "kg"}),
+        r"as a number, an array or \{ value, unit, source \}, got \{'value': 0.03, 'units': 'kg'\}",
+    ),
+    "a table of one's own": (setting("paint", {"colour": 3}), r"expected a table that exists, got \[paint\]. docs"),
+    "a coefficient of another model": (
+        setting("fitted.so_rpy.thrust_dyn_coef", 16.0),
+        "got 'fitted.so_rpy.thrust_dyn_coef'. Did you mean 'fitted.so_rpy_rotor.thrust_dyn_coef'",
+    ),
     "shape of two": (setting("shape.plate", [0.03, 0.03]), r"expected shape.plate of shape \(3,\), got \(2,\)"),
     "no drag": (without("drag"), "has no value 'drag.coefficients'"),
     "no thrust curve": (without("rotors.thrust_curve"), r"has parameters for \(so_rpy.*\), got 'first_principles'"),
@@ -305,6 +342,43 @@ def test_law_09_a_broken_toml_file_is_named(tmp_path):
         load_airframe(path)
 
 
+def test_law_09_an_unknown_key_is_answered_with_the_file(tmp_path):
+    path, heir = tmp_path / "mine.toml", tmp_path / "heir.toml"
+    path.write_text('base = "cf2x_L250"\n[rigid_body]\nmas = 0.05\n', encoding="utf-8")
+    heir.write_text(f'base = "{path}"\n', encoding="utf-8")
+    for source in (path, heir):
+        with pytest.raises(ConfigError, match=r"airframe 'mine' in .*mine\.toml: .*got 'rigid_body.mas'"):
+            load_airframe(source)
+
+
+def test_the_page_lists_all_tables_and_keys_and_no_others():
+    """Cells of the first two columns of the table "Keys", and the first of the table "Shape"."""
+    page = (Path(__file__).parents[2] / "docs/guides/airframes.md").read_text(encoding="utf-8")
+    section = page.split("## Keys")[1].split("## From a dict")[0]
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if re.match(r"\| (?!-)", line)
+    ]
+    found, table = set(), ""
+    for row in rows[1:]:
+        is_shape = len(row) == 3
+        if not is_shape and row[0]:
+            table = row[0].strip("`")
+        keys = re.findall(r"`(\w+)`", row[0] if is_shape else row[1])
+        found |= {f"shape.{key}" if is_shape else f"{table}.{key}".removeprefix(".") for key in keys}
+    assert found == {*KEYS, *TOP_LEVEL}
+
+
+def test_models_of_the_keys_are_those_of_the_dynamics():
+    fits = {table.removeprefix("fitted.") for table in TABLES if table.startswith("fitted.")}
+    assert fits == set(Dynamics) - {Dynamics.first_principles}
+
+
+def test_a_file_may_give_its_own_name(tmp_path):
+    path = tmp_path / "file.toml"
+    path.write_text('name = "racer"\nbase = "cf2x_L250"\n', encoding="utf-8")
+    assert load_airframe(path).name == "racer"
+
+
 def test_an_airframe_shows_its_name():
     assert repr(load_airframe("hb_x500")) == "Airframe('hb_x500')"
     assert isinstance(load_airframe("hb_x500"), Airframe)
@@ -321,7 +395,7 @@ def test_law_09_a_mistyped_path_is_answered_with_those_that_are_near():
     ):
         with pytest.raises(ConfigError, match=f"has no value '{path}'. Did you mean .*{near}"):
             airframe.value(path)
-    with pytest.raises(ConfigError, match=r"has no value 'qqq'. Add it; docs/guides/airframes.md"):
+    with pytest.raises(ConfigError, match=r"has no value 'qqq'. docs/guides/airframes.md lists"):
         airframe.value("qqq")
     with pytest.raises(ConfigError, match=r"has no table \[wings\], only \['battery', 'controller'"):
         airframe.table("wings")
@@ -374,12 +448,12 @@ def test_a_body_without_a_shape_is_about_as_large_as_the_real_one(name):
     tables = plain(name)
     true = outline(load_airframe(tables))
     derived = outline(load_airframe({k: v for k, v in tables.items() if k != "shape"}))
-    assert set(derived) == set(SHAPE_KEYS)
+    assert set(derived) == set(TABLES["shape"])
     for key in ("plate", "battery", "arm_radius", "motor_radius", "propeller_radius"):
         ratio = (derived[key] / true[key]).ravel()[:2]  # not the thickness of the plate
         assert np.all((ratio > 1 / 2.1) & (ratio < 2.1)), (key, ratio)
     np.testing.assert_allclose(derived["collision_sphere"][3], true["collision_sphere"][3], rtol=0.2)
-    assert {key: value.shape for key, value in derived.items()} == {k: v[0] for k, v in SHAPE_KEYS.items()}
+    assert {key: value.shape for key, value in derived.items()} == {k: v[0] for k, v in TABLES["shape"].items()}
     some = outline(load_airframe(tables | {"shape": {"propeller_radius": 0.02}}))
     assert some["propeller_radius"] == 0.02
     np.testing.assert_allclose(some["plate"], derived["plate"])

@@ -409,6 +409,20 @@ def gathers(d: Draw) -> str:
     ])  # fmt: skip
 
 
+@template("indexing", 4)
+def tables(d: Draw) -> str:
+    """Reads of constants at places that are computed, of more places than are selected from."""
+    i, j = d.value("iu", 0, 1), d.value("iu", 0, 0)
+    kind = d.choice(["np.float32", "np.int32", "np.uint32", "np.bool_"])
+    x = f"jnp.asarray(({kind})(np.arange({3 * d.int(9, 80)}) * {d.int(1, 7)} % 11).reshape(-1, 3))"
+    mode = d.choice(["clip", "fill", "wrap", "drop"])
+    return d.choice([
+        f"{x}[{i}]", f"{x}[{i}, {j}]", f"{x}[:, 1][{i}]", f"{x}.at[{i}, 2].get(mode={mode!r})", f"{x}[{j}][{j} % 3]",
+        f"lax.dynamic_slice({x}, [{j}, {j}], (2, 2))", f"{x}.T[{j}, {i}]", f"jnp.take({x}, {i}, 0, mode='wrap')",
+        f"jax.vmap(lambda k: {x}[k, {j}])(jnp.arange(3) + {j}.astype(np.int32))",
+    ])  # fmt: skip
+
+
 @template("indexing", 10)
 def scatters(d: Draw) -> str:
     """Writes at places that are known, or computed."""

@@ -93,7 +93,7 @@ REFUSED = {
     "eigh": (lambda d: wrote(d, jnp.linalg.eigh(d.states.pos * jnp.eye(3))[0]), "primitive 'eigh' has no rule"),
     "complex": (lambda d: wrote(d, jnp.fft.fft(d.states.pos).real), "numbers of type complex64"),
     "half": (lambda d: wrote(d, d.states.pos.astype(jnp.bfloat16).astype(jnp.float32)), "numbers of type bfloat16"),
-    "index": (lambda d: wrote(d, jnp.arange(100.0)[d.core.steps % 100]), "100"),
+    "index": (lambda d: wrote(d, (jnp.arange(100.0) + d.states.pos[0])[d.core.steps % 100]), "100"),
     "cholesky": (lambda d: wrote(d, jnp.linalg.cholesky(jnp.eye(7) + d.states.pos[0])), "size 7"),
     "sort": (lambda d: wrote(d, jnp.sort(jnp.zeros(65) + d.states.pos[0])), "65 elements"),
     "generator": (lambda d: wrote(d, jax.random.uniform(jax.random.key(0, impl="rbg")) + d.states.pos), "random"),

@@ -252,10 +252,10 @@ def test_records_of_other_libraries_are_reset_with_their_world(hover):
 
 
 class Buggy(Hover):
-    """Adds what cannot be added."""
+    """Adds what cannot be added, in a method that is not traced when the environment is made."""
 
-    def rewards(self, data, *_):
-        return {"bug": data.states.pos[..., 2] + None}
+    def before_step(self, data):
+        return data.replace(states=data.states.pos[..., 2] + None)
 
 
 def test_a_bug_in_a_task_is_not_taken_for_a_step_that_cannot_be_fused(hover):

@@ -91,3 +91,105 @@ def test_keys_depend_on_seed_world_episode_and_name_only():
     assert len(np.unique(np.concatenate([first, words(later), *others]), axis=0)) == 16
     ticked = four.replace(core=four.core.replace(steps=four.core.steps + 5))
     np.testing.assert_array_equal(words(ticked), first)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Still(Task):
+    """A task of two drones that does nothing."""
+
+    name = "still"
+
+    def spawn(self, data, key):
+        return data
+
+    def observe(self, data):
+        return {"pos": data.states.pos}
+
+    def rewards(self, data, action, last_action):
+        return {"height": data.states.pos[:, 2]}
+
+    def terminated(self, data):
+        return jnp.zeros((), bool)
+
+    def error(self, data):
+        return data.states.pos[:, 2]
+
+
+@pytest.fixture(scope="module")
+def two_drones():
+    return Sim(n_worlds=3, n_drones=2, control="attitude")
+
+
+WRONG = {
+    "flat": ("observe", lambda s, d: {"height": d.states.pos[:, 2]},
+             r"observation 'height' of shape \(n_drones, k\) = \(2, k\), got shape \(2,\) .*x\[:, None\]"),
+    "of the world": ("observe", lambda s, d: {"ok": d.states.pos, "all": d.states.pos.ravel()},
+                     r"observation 'all' of shape \(n_drones, k\) = \(2, k\), got shape \(6,\)"),
+    "matrix": ("observe", lambda s, d: {"m": jnp.zeros((2, 3, 3))},
+               r"observation 'm' of .*got shape \(2, 3, 3\) .*x.reshape\(n_drones, -1\)"),
+    "no dict": ("observe", lambda s, d: d.states.pos, r"observe to return a dict .*, got shape \(2, 3\)"),
+    "none": ("observe", lambda s, d: {"x": None}, "observation 'x' of .*got a NoneType"),
+    "no terms": ("rewards", lambda s, d, a, b: {}, "rewards to return a dict .*, got an empty dict"),
+    "column": ("rewards", lambda s, d, a, b: {"good": d.states.pos[:, 0], "bad": d.states.pos[:, :1]},
+               r"reward term 'bad' of shape \(n_drones,\) = \(2,\), got shape \(2, 1\)"),
+    "one for all": ("rewards", lambda s, d, a, b: {"any": jnp.sum(d.states.pos)},
+                    r"reward term 'any' of shape \(n_drones,\) = \(2,\), got shape \(\) .*jnp.full"),
+    "of actions": ("rewards", lambda s, d, a, b: {"a": a}, r"reward term 'a' of .* got shape \(2, 4\)"),
+    "error": ("error", lambda s, d: d.states.pos, r"error of shape \(n_drones,\) = \(2,\), got shape \(2, 3\)"),
+    "ends for each": ("terminated", lambda s, d: d.states.pos[:, 2] < 0,
+                      r"terminated of type bool and shape \(\), got shape \(2,\) .*jnp.any"),
+    "ends as a number": ("terminated", lambda s, d: jnp.float32(0), "terminated of type bool .*float32"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_law_09_wrong_shapes_of_a_task_are_refused_at_making(two_drones, case):
+    method, fn, words = WRONG[case]
+    wrong = type("Wrong", (Still,), {method: fn})()
+    DroneEnv(two_drones, Still())
+    with pytest.raises(ConfigError, match=f"task 'still': expected {words}"):
+        DroneEnv(two_drones, wrong)
+
+
+def test_law_09_shapes_of_a_batched_task_have_worlds_in_front(two_drones):
+    class Batched(Still):
+        """All worlds at once."""
+
+        batched = True
+
+        def rewards(self, data, action, last_action):
+            return {"height": data.states.pos[..., 2]}
+
+        def terminated(self, data):
+            return jnp.zeros(3, bool)
+
+        def error(self, data):
+            return data.states.pos[..., 2]
+
+    class Flat(Batched):
+        """Observations without the drones."""
+
+        def observe(self, data):
+            return {"pos": data.states.pos[:, 0]}
+
+    DroneEnv(two_drones, Batched())
+    with pytest.raises(
+        ConfigError, match=r"'pos' of shape \(n_worlds, n_drones, k\) = \(3, 2, k\), got shape \(3, 3\)"
+    ):
+        DroneEnv(two_drones, Flat())
+
+
+def test_law_09_missing_methods_are_named(two_drones):
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Half(Task):
+        """A task without observations and an error."""
+
+        name = "half"
+        spawn, rewards, terminated = Still.spawn, Still.rewards, Still.terminated
+
+    with pytest.raises(ConfigError, match=r"task 'half': expected class Half to define .*, got no observe, error\. "):
+        DroneEnv(two_drones, Half())
+    with pytest.raises(
+        NotImplementedError, match=r"task 'half': expected class Half to define observe\(data\); see docs"
+    ):
+        Half().observe(two_drones.data)

@@ -10,6 +10,8 @@ from cases import trees_equal
 from crazysim import ConfigError, ContactLog, Sim
 from crazysim.core.stage import stage
 from crazysim.engine import Step
+from crazysim.engine.lower import RULES
+from crazysim.errors import EngineWarning
 from crazysim.scene.report import CHUNK
 from crazysim.sim.sim import use_box_collision
 
@@ -368,3 +370,18 @@ def test_the_old_contact_log_warns_and_adds_the_same():
     assert not {"contacts", "contacts_of_drones"} & set(old.step_pipeline)
     with pytest.raises(ConfigError, match="expected something to check for contacts"):
         old.add(ContactLog((), floor=False, drones=False))
+
+
+def test_a_report_without_a_kernel_warns_once_or_raises(monkeypatch):
+    expected = Sim(n_worlds=3, n_drones=2, engine="plain").contact_report()
+    monkeypatch.delitem(RULES, "argmin")
+    sim = Sim(n_worlds=3, n_drones=2)
+    with pytest.warns(
+        EngineWarning, match="the contact report has no kernel: primitive 'argmin' has no rule"
+    ) as caught:
+        assert trees_equal(sim.contact_report(), expected)
+    assert len(caught) == 1
+    sim.contact_report(floor=False)  # warnings are errors here
+    with pytest.raises(ConfigError, match=r"'argmin' has no rule .*objects=, or use strict=False"):
+        Sim(n_worlds=3, n_drones=2, strict=True).contact_report()
+    Sim(n_worlds=3, n_drones=9, strict=True).contact_report(floor=False)  # a documented limit is no problem

@@ -94,6 +94,7 @@ def _top_k(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     places = constants(np.broadcast_to(numbers, x.shape), np.int32)
     key = x
     if dtype.kind == "f":  # the bits are in order but for negative numbers, of which the larger have the larger bits
+        ctx.builder.barrier()  # the sign of a NaN that XLA computes again, for another exchange, may be another
         whole = np.dtype(f"i{dtype.itemsize}")
         key = ctx.elementwise("bitcast_convert_type", [x], whole)
         turned = ctx.elementwise("xor", [key, constants(np.iinfo(whole).max, whole)], whole)

@@ -94,8 +94,9 @@ FN f64 erf_inv_(f64 x) {
   return x < 0 ? -y : x > 0 ? y : x;
 }
 
-// M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions (1964): 6.3.7 reflects, 6.3.5 steps up, and beyond
-// 10 the asymptotic series 6.3.18 is exact to float64.
+// NIST Digital Library of Mathematical Functions, https://dlmf.nist.gov/5: 5.5.4 reflects, 5.5.2 steps up, and beyond
+// 10 the asymptotic series 5.11.2 is exact to float64. Its coefficients are B(2k) / 2k with the Bernoulli numbers B;
+// Wikipedia, "Digamma function", has the first seven written out.
 FN f64 digamma_(f64 x) {
   f64 y = 0.0;
   if (x <= 0.0) {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -11,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import FunctionPlugin, Placement
 from crazysim.core.stage import Stage, stage
-from crazysim.envs.task import NAME
+from crazysim.envs.task import NAME, Task
 from crazysim.pytree import PyTree, leaf
 from crazysim.sim.sim import Sim
 
@@ -26,6 +28,43 @@ class Goal(PyTree):
     """Position, world frame, m. (n_worlds, n_drones, 3)"""
     vel: Array = leaf("drone", 1)
     """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
+
+
+class GoalTask(Task):
+    """Base of tasks in which every drone flies to its own goal, within an arena around the z axis.
+
+    Subclasses are frozen dataclasses that define ``spawn`` and ``rewards``.
+    """
+
+    Record = Goal
+    half_width: ClassVar[float]
+    """Largest distance from the z axis along x and y, m."""
+    height: ClassVar[float]
+    """Height of the arena, m."""
+
+    def install(self, sim: Sim) -> None:
+        """Give every drone a goal."""
+        install_goal(sim)
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state and the way to its goal, m."""
+        return state_of(data) | {"difference_to_goal": goal_of(data).pos - data.states.pos}
+
+    def crashed(self, data: SimData) -> Array:
+        """Return true where a drone has left the arena. (..., n_drones)"""
+        return out_of_bounds(data, self.half_width, self.height)
+
+    def terminated(self, data: SimData) -> Array:
+        """Return true where a drone has left the arena."""
+        return jnp.any(self.crashed(data))
+
+    def error(self, data: SimData) -> Array:
+        """Return the distance from the goal, m."""
+        return rotation.safe_norm(goal_of(data).pos - data.states.pos)[..., 0]
+
+    def target(self, data: SimData) -> Array:
+        """Return the goal, m."""
+        return goal_of(data).pos
 
 
 def install_goal(sim: Sim) -> None:
@@ -63,11 +102,6 @@ def state_of(data: SimData) -> dict[str, Array]:
         "vel": s.vel,
         "ang_vel": s.ang_vel,
     }
-
-
-def distance_to_goal(data: SimData) -> Array:
-    """Return the distance from the goal, m. (..., n_drones)"""
-    return rotation.safe_norm(goal_of(data).pos - data.states.pos)[..., 0]
 
 
 def on_floor(data: SimData) -> Array:

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -15,18 +14,14 @@ from crazysim.core.data import SimData
 from crazysim.envs import terms
 from crazysim.envs.random import draw, within
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import Task
-from crazysim.envs.tasks.core import Goal, distance_to_goal, goal_of, install_goal, out_of_bounds, state_of, with_goal
-from crazysim.sim.sim import Sim
+from crazysim.envs.tasks.core import GoalTask, with_goal
 
-HALF_WIDTH, HEIGHT = 3.0, 3.0
-"""Limits of the arena, m."""
 MIDDLE = np.array([0.0, 0.0, 1.2])
 """Middle of the box that starts and goals are drawn from, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hover(Task):
+class Hover(GoalTask):
     """Reach a random point and hover there.
 
     A drone starts in flight, slightly tilted and moving, in a box around (0, 0, 1.2); so does its goal. An episode ends
@@ -34,7 +29,7 @@ class Hover(Task):
     """
 
     name = "hover"
-    Record = Goal
+    half_width, height = 3.0, 3.0
 
     reach: float = 1.0
     """Half the width of the box of starts and goals, m; its half height is 0.7 of that."""
@@ -42,10 +37,6 @@ class Hover(Task):
     """Length of an episode, s."""
     tolerance: float = 0.05
     """Distance below which the goal counts as reached, m."""
-
-    def install(self, sim: Sim) -> None:
-        """Give every drone a goal."""
-        install_goal(sim)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight, and their goals."""
@@ -56,32 +47,16 @@ class Hover(Task):
         data = flying(data, MIDDLE + within(x["start"], box), quat, vel, ang_vel)
         return with_goal(data, MIDDLE + within(x["goal"], box))
 
-    def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state and the way to its goal, m."""
-        return state_of(data) | {"difference_to_goal": goal_of(data).pos - data.states.pos}
-
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return proximity to the goal, and costs of turning, of changing actions and of a crash."""
         return {
             "proximity": terms.proximity(self.error(data)),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "crash": -10.0 * out_of_bounds(data, HALF_WIDTH, HEIGHT),
+            "crash": -10.0 * self.crashed(data),
         }
-
-    def terminated(self, data: SimData) -> Array:
-        """Return true where a drone has left the arena."""
-        return jnp.any(out_of_bounds(data, HALF_WIDTH, HEIGHT))
-
-    def error(self, data: SimData) -> Array:
-        """Return the distance from the goal, m."""
-        return distance_to_goal(data)
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
         return {"lookat": (0, 0, 1.2), "distance": 4.5, "elevation": -20}
-
-    def target(self, data: SimData) -> Array:
-        """Return the goal, m."""
-        return goal_of(data).pos

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -15,22 +14,18 @@ from crazysim.core.data import SimData
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import any_attitude, flying
-from crazysim.envs.task import Task
-from crazysim.envs.tasks.core import Goal, distance_to_goal, goal_of, install_goal, out_of_bounds, state_of, with_goal
-from crazysim.sim.sim import Sim
+from crazysim.envs.tasks.core import GoalTask, with_goal
 
-HALF_WIDTH, HEIGHT = 8.0, 8.0
-"""Limits of the arena, m."""
 GOAL = np.array([0.0, 0.0, 3.0])
 """Goal of every drone, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recover(Task):
+class Recover(GoalTask):
     """Catch a thrown drone, with any attitude, speed and spin, and hover at (0, 0, 3)."""
 
     name = "recover"
-    Record = Goal
+    half_width, height = 8.0, 8.0
 
     speed: float = 2.0
     """Largest component of the velocity at the start, m/s."""
@@ -41,10 +36,6 @@ class Recover(Task):
     tolerance: float = 0.1
     """Distance below which the goal counts as reached, m."""
 
-    def install(self, sim: Sim) -> None:
-        """Give every drone a goal."""
-        install_goal(sim)
-
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones just thrown, and their goals."""
         x = draw(key, data.core.n_drones, start=3, vel=3, ang_vel=3, attitude=3)
@@ -53,10 +44,6 @@ class Recover(Task):
         vel, ang_vel = self.speed * (2 * x["vel"] - 1), self.spin * (2 * x["ang_vel"] - 1)
         return with_goal(flying(data, pos, any_attitude(x["attitude"]), vel, ang_vel), goal)
 
-    def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state and the way to its goal, m."""
-        return state_of(data) | {"difference_to_goal": goal_of(data).pos - data.states.pos}
-
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return proximity to the goal and uprightness, and costs of turning, of changing actions and of a crash."""
         return {
@@ -64,22 +51,10 @@ class Recover(Task):
             "upright": 0.5 * rotation.z_axis(data.states.quat)[..., 2],
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "crash": -20.0 * out_of_bounds(data, HALF_WIDTH, HEIGHT),
+            "crash": -20.0 * self.crashed(data),
         }
-
-    def terminated(self, data: SimData) -> Array:
-        """Return true where a drone has left the arena."""
-        return jnp.any(out_of_bounds(data, HALF_WIDTH, HEIGHT))
-
-    def error(self, data: SimData) -> Array:
-        """Return the distance from the goal, m."""
-        return distance_to_goal(data)
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
         return {"lookat": (0, 0, 2.5), "distance": 9.0, "elevation": -15}
-
-    def target(self, data: SimData) -> Array:
-        """Return the goal, m."""
-        return goal_of(data).pos

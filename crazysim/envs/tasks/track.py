@@ -6,20 +6,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.deprecation import warn_renamed
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.core import on_floor, state_of, with_record
-from crazysim.envs.trajectories import Trajectory, figure_eight
 from crazysim.pytree import PyTree, leaf
 from crazysim.sim.sim import Sim
+from crazysim.trajectories import Trajectory, figure_eight
 
 TOO_FAR = 1.5
 """Distance from the trajectory at which an episode ends, m."""
@@ -46,8 +48,7 @@ class TrackTrajectory(Task):
     Record = Phase
 
     trajectory: Trajectory = field(default_factory=figure_eight)
-    """Time to position and velocity; by default a figure eight of 2 m by 1 m in 5 s. See
-    ``crazysim.envs.trajectories``."""
+    """The trajectory; by default a figure eight of 2 m by 1 m in 5 s, which repeats."""
     n_samples: int = 5
     """Number of samples of the time ahead that a policy observes."""
     spacing: float = 0.1
@@ -61,6 +62,11 @@ class TrackTrajectory(Task):
     hold: float = 5.0
     """Time at the end of an episode during which it must stay there, s."""
 
+    def __post_init__(self) -> None:
+        """Accept functions of time, which this task took before there were trajectories."""
+        if not isinstance(self.trajectory, Trajectory):
+            warn_renamed("TrackTrajectory(trajectory=function)", "a crazysim.trajectories.Trajectory")
+
     def install(self, sim: Sim) -> None:
         """Give every drone its time on the trajectory."""
         self.add_record(sim, Phase(jnp.zeros_like(sim.data.states.pos[..., :1])))
@@ -72,19 +78,29 @@ class TrackTrajectory(Task):
         offset = (2 * x["offset"] - 1) * np.asarray(self.spread, dtype)
         rpy, vel = ((2 * x[name] - 1) * np.asarray(0.2, dtype) for name in ("rpy", "vel"))
         begin = LATEST * x["begin"]
-        pos, along = self.trajectory(begin[..., 0])
+        pos, along = self.motion(begin[..., 0])
         return with_record(flying(data, pos + offset, rotation.from_rpy(rpy), along + vel), Phase(begin))
 
     def time(self, data: SimData) -> Array:
         """Return the time on the trajectory, s. (n_drones,)"""
         return data.plugins[NAME].since[..., 0] + data.core.steps / data.core.freq
 
+    def motion(self, t: Array) -> tuple[Array, Array]:
+        """Return position, m, and velocity, m/s, at times on the trajectory, s. (...) to (..., 3) each"""
+        if not isinstance(self.trajectory, Trajectory):
+            return self.trajectory(t)
+        evaluate: Any = self.trajectory.evaluate
+        for _ in range(t.ndim):
+            evaluate = jax.vmap(evaluate)
+        setpoint = evaluate(t)
+        return setpoint.pos, setpoint.vel
+
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the differences from the trajectory, and the ways to its next samples, m."""
         t, s = self.time(data), data.states
         ahead = (self.spacing * (1 + np.arange(self.n_samples))).astype(t.dtype)
-        points = self.trajectory(t[..., None] + ahead)[0] - s.pos[..., None, :]
-        pos, vel = self.trajectory(t)
+        points = self.motion(t[..., None] + ahead)[0] - s.pos[..., None, :]
+        pos, vel = self.motion(t)
         return state_of(data) | {
             "difference_to_goal": pos - s.pos,
             "difference_to_target_vel": vel - s.vel,
@@ -118,4 +134,4 @@ class TrackTrajectory(Task):
 
     def target(self, data: SimData) -> Array:
         """Return the point of the trajectory, m."""
-        return self.trajectory(self.time(data))[0]
+        return self.motion(self.time(data))[0]

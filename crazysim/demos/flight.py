@@ -1,4 +1,4 @@
-"""End-to-end demonstration: worlds of drones fly figure eights around poles, with figures, a plot and a film."""
+"""Figure eights around poles in many worlds, with figures, a plot and a film."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax import Array
 
@@ -31,14 +30,18 @@ SETTLED = 2.0
 """Start of the interval in which the tracking error is measured, s."""
 WIDTH, DEPTH = 1.4, 0.7
 """Amplitudes of the figure eight along x and y, m."""
-POLE = """
-<mujoco><worldbody><body name="pole">
-  <geom type="capsule" fromto="0 0 0.035 0 0 2" size="0.03" rgba="0.85 0.35 0.25 1"/>
-</body></worldbody></mujoco>
-"""
+POLE_RADIUS = 0.03
+"""Radius of a pole, m."""
 
 
-def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, film: bool = True) -> None:
+def run(
+    n_worlds: int = 1024,
+    n_drones: int = 4,
+    seconds: float = 10.0,
+    device: str = "cpu",
+    out: Path = Path("out"),
+    film: bool = True,
+) -> None:
     """Fly, print figures, and write ``flight.npz``, ``tracks.png`` and ``flight.mp4`` into a folder.
 
     Args:
@@ -64,7 +67,7 @@ def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, fi
     compiled = fly_frame.lower(sim.data).compile()
     compile_s = time.perf_counter() - begin
     begin = time.perf_counter()
-    sim.contacts()
+    touches(sim)
     contacts_compile_s = time.perf_counter() - begin
 
     recorder = Recorder(sim, worlds=[0])
@@ -76,7 +79,7 @@ def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, fi
         step_s += time.perf_counter() - begin
         sim.data = data
         begin = time.perf_counter()
-        touching.append(np.asarray(sim.contacts()))
+        touching.append(touches(sim))
         contacts_s += time.perf_counter() - begin
         recorder.add()
         errors.append(np.asarray(error))
@@ -96,20 +99,9 @@ def run(n_worlds: int, n_drones: int, seconds: float, device: str, out: Path, fi
 def build(n_worlds: int, n_drones: int, device: str) -> Sim:
     """Return a simulation with two randomly placed poles per world and drones already on the figure eight."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, drone="cf2x_L250", control="state", device=device)
-    pole = mujoco.MjSpec.from_string(POLE)
-    frame = sim.spec.worldbody.add_frame()
-    for i in range(2):
-        frame.attach_body(pole.body("pole"), "pole_", f":{i}").mocap = True
-    sim.build_mjx()
-
-    poles = [sim.mj_model.body(f"pole_pole:{i}").mocapid.item() for i in range(2)]
-    rng = np.random.default_rng(0)
-    places = np.array([[-0.6 * WIDTH, 0, 0], [0.6 * WIDTH, 0, 0]]) + rng.uniform(-0.4, 0.4, (n_worlds, 2, 3)) * [
-        1,
-        1,
-        0,
-    ]
-    sim.mjx_data = sim.mjx_data.replace(mocap_pos=sim.mjx_data.mocap_pos.at[:, poles].set(jnp.asarray(places)))
+    offset = np.random.default_rng(0).uniform(-0.4, 0.4, (n_worlds, 2, 3)) * [1, 1, 0]
+    places = offset + [[-0.6 * WIDTH, 0, 0], [0.6 * WIDTH, 0, 0]]
+    sim.scene.add("pole", count=2, pos=places, height=2.0, radius=POLE_RADIUS)
 
     start = reference(jnp.zeros((n_worlds, 1)), n_drones)
     rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(sim.data.params), (n_worlds, n_drones, 4))
@@ -117,6 +109,11 @@ def build(n_worlds: int, n_drones: int, device: str) -> Sim:
     sim.data = sim.data.replace(states=states)
     sim.build_default_data()
     return sim
+
+
+def touches(sim: Sim) -> np.ndarray:
+    """Return True where a drone touches a pole. (n_worlds, n_drones, n_poles)"""
+    return np.asarray(sim.contact_report(floor=False, drones=False).objects)
 
 
 def reference(time: Array, n_drones: int) -> Array:
@@ -168,7 +165,7 @@ def report(errors: np.ndarray, touching: np.ndarray, n_steps: int, step_s: float
 
     Args:
         errors: Distances from the setpoint, m. (n_ticks, n_worlds, n_drones)
-        touching: True where the geoms of a contact slot touch. (n_frames, n_worlds, n_slots)
+        touching: True where a drone touches a pole. (n_frames, n_worlds, n_drones, n_poles)
         n_steps: Number of physics steps of all drones.
         step_s: Time of all steps, s.
         contact_s: Time of one contact query, s.
@@ -178,9 +175,10 @@ def report(errors: np.ndarray, touching: np.ndarray, n_steps: int, step_s: float
     began = touching[1:] & ~touching[:-1]
     print(f"steps per second  {n_steps / step_s / 1e6:.1f} M ({n_steps / 1e6:.1f} M drone steps in {step_s:.1f} s)")
     print(f"tracking error    {settled.mean():.1f} cm mean, {np.percentile(settled, 95):.1f} cm 95th percentile")
+    n_begun, n_worlds = int(began.sum() + touching[0].sum()), int(touching.any((0, 2, 3)).sum())
     print(
-        f"contacts          {int(began.sum() + touching[0].sum()):,} begun, in {int(touching.any((0, 2)).sum()):,} of "
-        f"{touching.shape[1]:,} worlds; {1e3 * contact_s:.0f} ms a query"
+        f"contacts          {n_begun:,} begun, in {n_worlds:,} of {touching.shape[1]:,} worlds; "
+        f"{1e3 * contact_s:.1f} ms a query"
     )
 
 
@@ -199,8 +197,8 @@ def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
     left.plot(setpoint[:, 0], setpoint[:, 1], "--", color="0.6", label="setpoint")
     for i in range(tracks.shape[1]):
         left.plot(tracks[:, i, 0], tracks[:, i, 1], color=COLORS[i % 4], label=f"drone {i}")
-    for place in np.asarray(sim.mjx_data.mocap_pos[0, sim.n_drones :]):
-        left.add_patch(plt.Circle(place[:2], 0.03, color="0.2"))
+    for place in np.asarray(sim.data.objects.pos[0, 0]):
+        left.add_patch(plt.Circle(place[:2], POLE_RADIUS, color="0.2"))
     left.set(title="Tracks in world 0, seen from above", xlabel="x, m", ylabel="y, m", aspect="equal")
     left.legend(loc="upper right", fontsize=8)
     flat = 100 * errors.reshape(len(errors), -1)

@@ -1,0 +1,49 @@
+"""Controllers by name."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from crazysim.control.protocol import Controller
+from crazysim.control.switch import switch_of
+from crazysim.errors import ConfigError, UnknownNameError
+
+CASCADE = "crazyflow"
+"""Name of Crazyflow's cascade, which is made of stages of its own and follows every command level."""
+CONTROLLERS = {
+    "pid": "crazysim.control.pid:PID",
+    "mellinger": "crazysim.control.mellinger:Mellinger",
+}
+"""Controllers by name, as ``"module:class"``; each is imported at its first use."""
+
+
+def find_controller(controller: Any, switch: Any = None) -> Controller | None:
+    """Return a controller by its name, or as it is given, or several with a switch; None for Crazyflow's cascade.
+
+    Raises:
+        UnknownNameError: If there is no controller of that name.
+        ConfigError: If it is neither a name nor a controller, or the switch does not fit.
+    """
+    if isinstance(controller, (list, tuple)):
+        found = [find_controller(each) for each in controller]
+        if None in found:
+            raise ConfigError(
+                f"expected controllers other than {CASCADE!r}, which is made of stages of its own, in a list. Use "
+                f"'mellinger'."
+            )
+        return switch_of([each for each in found if each is not None], switch)
+    if switch is not None:
+        raise ConfigError(f"expected a list of controllers for a switch, got {controller!r}. Use controller=[...].")
+    if isinstance(controller, Controller) or controller == CASCADE:
+        return None if controller == CASCADE else controller
+    if not isinstance(controller, str):
+        raise ConfigError(
+            f"expected a controller as a name or a Controller, got {controller!r}. Use controller='pid', or an "
+            f"instance of a subclass of crazysim.control.Controller."
+        )
+    if controller not in CONTROLLERS:
+        names = ", ".join(repr(name) for name in (CASCADE, *CONTROLLERS))
+        raise UnknownNameError(f"expected controller as one of {names}, got {controller!r}")
+    module, _, name = CONTROLLERS[controller].partition(":")
+    return getattr(importlib.import_module(module), name)()

@@ -1,0 +1,261 @@
+"""Mellinger's controller as the Crazyflie firmware flies it today."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control.core import Control
+from crazysim.control.power_distribution import (
+    PowerDistributionParams,
+    command_of_rotor_vel,
+    distribute,
+    pwm_of_thrust,
+    rotor_vel_of_pwm,
+)
+from crazysim.control.protocol import Controller
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import dot, safe_clip, safe_normalize
+
+_GAINS = ("kp", "kd", "ki", "integral_max", "kR", "kw", "ki_m", "kd_omega", "integral_m_max", "torque_max")
+
+
+class MellingerParams(PyTree):
+    """Gains and limits of the controller, each shared or one per drone."""
+
+    mass: Array = leaf("parameter", 1, (1,))
+    """Mass that the controller assumes, kg. (1,)"""
+    mass_thrust: Array = leaf("parameter", 1, (1,))
+    """Thrust of each motor over the collective thrust, PWM/N. (1,)"""
+    gravity_vec: Array = leaf("parameter", 1)
+    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
+    kp: Array = leaf("parameter", 1)
+    """Gain on position, N/m. (3,)"""
+    kd: Array = leaf("parameter", 1)
+    """Gain on velocity, N s/m. (3,)"""
+    ki: Array = leaf("parameter", 1)
+    """Gain on the integral of position, N/(m s). (3,)"""
+    integral_max: Array = leaf("parameter", 1)
+    """Limit of the integral of position, m s. (3,)"""
+    kR: Array = leaf("parameter", 1)
+    """Gain on the rotation error, PWM. (3,)"""
+    kw: Array = leaf("parameter", 1)
+    """Gain on the body rates, PWM s/rad. (3,)"""
+    ki_m: Array = leaf("parameter", 1)
+    """Gain on the integral of the rotation error, PWM/(rad s). (3,)"""
+    kd_omega: Array = leaf("parameter", 1)
+    """Gain on the derivative of the body rates, PWM s^2/rad. (3,)"""
+    integral_m_max: Array = leaf("parameter", 1)
+    """Limit of the integral of the rotation error, rad s. (3,)"""
+    torque_max: Array = leaf("parameter", 1)
+    """Limit of the torque, PWM. (3,)"""
+    motors: PowerDistributionParams
+    """Power distribution."""
+
+    @staticmethod
+    def create(airframe: Airframe) -> MellingerParams:
+        """Return the shared parameters of an airframe.
+
+        Raises:
+            ConfigError: If the airframe has no table for this controller.
+        """
+        airframe.table("mellinger")
+        gains = {key: as_parameter(airframe.value(f"mellinger.{key}", (3,))) for key in _GAINS}
+        return MellingerParams(
+            mass=as_parameter(airframe.value("mellinger.mass", ())),
+            mass_thrust=as_parameter(airframe.value("mellinger.mass_thrust", ())),
+            gravity_vec=as_parameter(GRAVITY),
+            motors=PowerDistributionParams.create(airframe),
+            **gains,
+        )
+
+
+class MellingerMemory(PyTree):
+    """Memory of the controller."""
+
+    integral: Array = leaf("drone", 1)
+    """Integral of the position error, m s. (n_worlds, n_drones, 3)"""
+    integral_m: Array = leaf("drone", 1)
+    """Integral of the rotation error, rad s. (n_worlds, n_drones, 3)"""
+    ang_vel: Array = leaf("drone", 1)
+    """Angular velocity at the last tick, rad/s. (n_worlds, n_drones, 3)"""
+    ang_vel_des: Array = leaf("drone", 1)
+    """Desired body rates at the last tick, rad/s. (n_worlds, n_drones, 3)"""
+
+    @staticmethod
+    def at_rest() -> MellingerMemory:
+        """Return the memory of one drone before the first tick."""
+        return MellingerMemory(*(np.zeros(3) for _ in range(4)))  # type: ignore[arg-type]
+
+
+def desired_force(
+    pos: Array, vel: Array, setpoint: Setpoint, integral: Array, freq: float, *, params: MellingerParams
+) -> tuple[Array, Array]:
+    """Return the force that leads to a setpoint, world frame, N, and the integral (Mellinger 2011, eq. 6). (..., 3)
+
+    Args:
+        pos: Position, world frame, m. (..., 3)
+        vel: Velocity, world frame, m/s. (..., 3)
+        setpoint: Setpoint.
+        integral: Integral of the position error, m s. (..., 3)
+        freq: Rate of this controller, Hz.
+        params: Gains.
+    """
+    p, error = params, setpoint.pos - pos
+    integral = safe_clip(integral + error / freq, -p.integral_max, p.integral_max)
+    force = p.mass * (setpoint.acc - p.gravity_vec) + p.kp * error + p.kd * (setpoint.vel - vel) + p.ki * integral
+    return force, integral
+
+
+def torque_of_rotation(
+    axes: Array,
+    axes_des: Array,
+    ang_vel: Array,
+    ang_vel_des: Array,
+    memory: MellingerMemory,
+    freq: float,
+    *,
+    params: MellingerParams,
+) -> tuple[Array, MellingerMemory]:
+    """Return the torque that turns the drone to an attitude, PWM, and the memory. (..., 3)
+
+    Mellinger 2011, eq. 10 to 13, without the factor one half on the rotation error, and with an integral and a
+    derivative of the rates.
+
+    Args:
+        axes: Rotation matrix, body to world. (..., 3, 3)
+        axes_des: Desired rotation matrix. (..., 3, 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        ang_vel_des: Desired body rates, rad/s. (..., 3)
+        memory: Memory of the controller.
+        freq: Rate of this controller, Hz.
+        params: Gains.
+    """
+    p, m = params, memory
+    error = rotation_error(axes, axes_des)
+    integral = safe_clip(m.integral_m - error / freq, -p.integral_m_max, p.integral_m_max)
+    rate_error_dot = ((ang_vel_des - m.ang_vel_des) - (ang_vel - m.ang_vel)) * freq
+    torque = -p.kR * error + p.kw * (ang_vel_des - ang_vel) + p.ki_m * integral + p.kd_omega * rate_error_dot
+    after = m.replace(integral_m=integral, ang_vel=ang_vel, ang_vel_des=ang_vel_des)
+    return safe_clip(torque, -p.torque_max, p.torque_max), after
+
+
+class Mellinger(Controller):
+    """The firmware's controller after Mellinger and Kumar (2011), position part included, at one rate.
+
+    Unlike Crazyflow's cascade, which descends from it, it lowers all motors where one would exceed its maximum, has no
+    minimum PWM, resets its integrals at zero thrust, and runs the position part at the rate of the attitude part. The
+    firmware's version has no rate mode: use ``controller="pid"`` for body rates. Source: controller_mellinger.c of
+    bitcraze/crazyflie-firmware, commit 2a18fc29.
+    """
+
+    name: ClassVar[str] = "mellinger"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state, Control.attitude)
+    output: ClassVar[Control] = Control.rotor_vel
+    freq: int = 500
+    """Rate, Hz (``ATTITUDE_RATE``)."""
+
+    def params(self, airframe: Airframe) -> MellingerParams:
+        """Return the gains of an airframe.
+
+        Raises:
+            ConfigError: If the airframe has no table for this controller.
+        """
+        return MellingerParams.create(airframe)
+
+    def memory(self, airframe: Airframe) -> MellingerMemory:
+        """Return the memory of one drone before the first tick."""
+        return MellingerMemory.at_rest()
+
+    def update(
+        self, data: Any, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
+    ) -> tuple[Array, MellingerMemory]:
+        """Return the rotor speeds, rpm, and the memory. (n_rotors,)"""
+        p = params
+        thrust, torque, memory, _ = self._command(data, command, memory, p)
+        off = thrust <= 0
+        memory = memory.replace(
+            integral=jnp.where(off, 0.0, memory.integral), integral_m=jnp.where(off, 0.0, memory.integral_m)
+        )
+        return rotor_vel_of_pwm(distribute(thrust, torque, params=p.motors), params=p.motors), memory
+
+    def take_over(
+        self,
+        data: Any,
+        command: Setpoint | Array,
+        memory: MellingerMemory,
+        params: MellingerParams,
+        rotor_vel: Array,
+    ) -> MellingerMemory:
+        """Return a memory with integrals that continue the present force and torque as far as their limits allow."""
+        p, s = params, data.states
+        rates = _desired_rates(data, command)
+        zero = jnp.zeros_like(s.ang_vel)
+        rest = MellingerMemory(zero, zero, s.ang_vel, rates)
+        thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
+        _, _, _, force = self._command(data, command, rest, p)
+        wanted = thrust / p.mass_thrust * rotation.z_axis(s.quat)
+        integral = safe_clip(_over(wanted - force, p.ki), -p.integral_max, p.integral_max)
+        integral = integral if isinstance(command, Setpoint) else zero
+        rest = rest.replace(integral=integral)
+        _, out, _, _ = self._command(data, command, rest, p)
+        return rest.replace(integral_m=safe_clip(_over(torque - out, p.ki_m), -p.integral_m_max, p.integral_m_max))
+
+    def _command(
+        self, data: Any, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
+    ) -> tuple[Array, Array, MellingerMemory, Array]:
+        """Return thrust and torque, PWM, the memory, and the desired force, N, which is zero without a setpoint."""
+        s, p, force = data.states, params, jnp.zeros_like(data.states.pos)
+        axes = rotation.matrix(s.quat)
+        if isinstance(command, Setpoint):
+            force, integral = desired_force(s.pos, s.vel, command, memory.integral, self.freq, params=p)
+            memory = memory.replace(integral=integral)
+            axes_des, thrust = axes_of_force(force, command.yaw), p.mass_thrust * dot(force, axes[:, 2])
+        else:
+            axes_des = rotation.matrix(rotation.from_rpy(command[:3]))
+            thrust = pwm_of_thrust(command[3:], params=p.motors)
+        rates = _desired_rates(data, command)
+        torque, memory = torque_of_rotation(axes, axes_des, s.ang_vel, rates, memory, self.freq, params=p)
+        return thrust, torque, memory, force
+
+
+def _desired_rates(data: Any, command: Setpoint | Array) -> Array:
+    """Return the desired body rates, rad/s: those of a full-state setpoint, otherwise zero. (3,)"""
+    if isinstance(command, Setpoint):
+        return data.controls.state.cmd[13:16]
+    return jnp.zeros_like(data.states.ang_vel)
+
+
+def _over(x: Array, gain: Array) -> Array:
+    """Return ``x / gain``, and zero where the gain is zero. (...)"""
+    return jnp.where(gain == 0, 0.0, x / jnp.where(gain == 0, 1.0, gain))
+
+
+def axes_of_force(force: Array, yaw: Array) -> Array:
+    """Return the rotation matrix with the body z axis along a force and the x axis closest to a yaw. (..., 3, 3)
+
+    Args:
+        force: Force, world frame, N. (..., 3)
+        yaw: Yaw, rad. (..., 1)
+    """
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    zero = jnp.zeros_like(yaw)
+    z_axis = safe_normalize(force, jnp.asarray([0.0, 0.0, 1.0], force.dtype))
+    ahead, left = jnp.concatenate([cos, sin, zero], axis=-1), jnp.concatenate([-sin, cos, zero], axis=-1)
+    y_axis = safe_normalize(rotation.cross(z_axis, ahead), left)
+    return jnp.stack([rotation.cross(y_axis, z_axis), y_axis, z_axis], axis=-1)
+
+
+def rotation_error(axes: Array, axes_des: Array) -> Array:
+    """Return the rotation error ``vee(Rd^T R - R^T Rd)``, twice the sine of the angle about the axis. (..., 3)"""
+    x, y, z = axes[..., 0], axes[..., 1], axes[..., 2]
+    xd, yd, zd = axes_des[..., 0], axes_des[..., 1], axes_des[..., 2]
+    parts = [dot(zd, y) - dot(yd, z), dot(xd, z) - dot(zd, x), dot(yd, x) - dot(xd, y)]
+    return jnp.concatenate(parts, axis=-1)

@@ -1,0 +1,317 @@
+"""PID cascade of the Crazyflie firmware: position, velocity, attitude and body rates."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control.core import Control
+from crazysim.control.pid_loop import Loop, LoopMemory, continued, pid_step
+from crazysim.control.power_distribution import (
+    PowerDistributionParams,
+    command_of_rotor_vel,
+    distribute,
+    pwm_of_thrust,
+    rotor_vel_of_pwm,
+)
+from crazysim.control.protocol import Controller
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import safe_clip
+
+DEGREES = 180 / np.pi
+THRUST_SCALE = 1000.0
+"""PWM per unit of the vertical velocity loop's output (``thrustScale``)."""
+TORQUE_MAX = 32767.0
+"""Limit of the outputs of the rate loops, PWM (``saturateSignedInt16``)."""
+
+
+class PIDParams(PyTree):
+    """Gains and limits of the cascade, each shared or one per drone. Angles are in degrees, as in the firmware."""
+
+    position: Loop
+    """Position loop, along and across the present yaw, m to m/s."""
+    velocity: Loop
+    """Velocity loop, along and across the present yaw: m/s to pitch and roll, degrees, and thrust, 1000 PWM."""
+    attitude: Loop
+    """Attitude loop, degrees to degrees/s."""
+    rate: Loop
+    """Rate loop, degrees/s to PWM."""
+    tilt_max: Array = leaf("parameter", 1)
+    """Limits of the desired roll and pitch, degrees. (2,)"""
+    thrust_base: Array = leaf("parameter", 1, (1,))
+    """Thrust that the velocity loop adds to, about that of hover, PWM. (1,)"""
+    thrust_min: Array = leaf("parameter", 1, (1,))
+    """Minimum thrust of the velocity loop, PWM. (1,)"""
+    motors: PowerDistributionParams
+    """Power distribution."""
+
+    @staticmethod
+    def create(airframe: Airframe, outer_freq: int, freq: int) -> PIDParams:
+        """Return the shared parameters of an airframe for the rates of the loops, Hz.
+
+        Raises:
+            ConfigError: If the airframe has no tables for this controller.
+        """
+        return PIDParams(
+            position=Loop.create(airframe, "pid.position", outer_freq),
+            velocity=Loop.create(airframe, "pid.velocity", outer_freq),
+            attitude=Loop.create(airframe, "pid.attitude", freq),
+            rate=Loop.create(airframe, "pid.rate", freq),
+            tilt_max=as_parameter(airframe.value("pid.tilt_max", (2,))),
+            thrust_base=as_parameter(airframe.value("pid.thrust_base", ())),
+            thrust_min=as_parameter(airframe.value("pid.thrust_min", ())),
+            motors=PowerDistributionParams.create(airframe),
+        )
+
+
+class PIDMemory(PyTree):
+    """Memory of the cascade."""
+
+    position: LoopMemory
+    """Position loop."""
+    velocity: LoopMemory
+    """Velocity loop."""
+    attitude: LoopMemory
+    """Attitude loop."""
+    rate: LoopMemory
+    """Rate loop."""
+    rpy_des: Array = leaf("drone", 1)
+    """Desired roll, pitch, yaw, degrees. (n_worlds, n_drones, 3)"""
+    thrust: Array = leaf("drone", 1)
+    """Desired thrust, PWM. (n_worlds, n_drones, 1)"""
+    started: Array = leaf("drone", 1)
+    """True from the first tick on. (n_worlds, n_drones, 1)"""
+
+    @staticmethod
+    def at_rest(params: PIDParams) -> PIDMemory:
+        """Return the memory of one drone before the first tick."""
+        p, zeros = params, np.zeros
+        loops = (p.position, p.velocity, p.attitude, p.rate)
+        return PIDMemory(*(LoopMemory.at_rest(loop) for loop in loops), zeros(3), zeros(1), np.zeros(1, bool))
+
+
+def velocity_of_position(
+    pos: Array, heading: Array, pos_des: Array, memory: LoopMemory, freq: float, *, loop: Loop
+) -> tuple[Array, LoopMemory]:
+    """Return the desired velocity, along and across the heading and up, and the memory: the position loop.
+
+    Args:
+        pos: Position, world frame, m. (..., 3)
+        heading: Cosine and sine of the yaw. (..., 2)
+        pos_des: Desired position, world frame, m. (..., 3)
+        memory: Memory of the loop.
+        freq: Rate of this loop, Hz.
+        loop: Gains and limits.
+
+    Returns:
+        Desired velocity, m/s (..., 3); the memory.
+    """
+    error = along_heading(heading, pos_des - pos)
+    return pid_step(error, along_heading(heading, pos), memory, freq, loop=loop)
+
+
+def attitude_of_velocity(
+    vel: Array, heading: Array, vel_des: Array, memory: LoopMemory, freq: float, *, params: PIDParams
+) -> tuple[Array, Array, LoopMemory]:
+    """Return the desired roll, pitch and thrust, and the memory: the velocity loop.
+
+    Args:
+        vel: Velocity, world frame, m/s. (..., 3)
+        heading: Cosine and sine of the yaw. (..., 2)
+        vel_des: Desired velocity along and across the heading and up, m/s. (..., 3)
+        memory: Memory of the loop.
+        freq: Rate of this loop, Hz.
+        params: Gains and limits of the cascade.
+
+    Returns:
+        Desired roll and pitch, degrees (..., 2); thrust of each motor, PWM (..., 1); the memory.
+    """
+    p, measured = params, along_heading(heading, vel)
+    out, memory = pid_step(vel_des - measured, measured, memory, freq, loop=p.velocity)
+    tilt = jnp.stack([-out[..., 1], out[..., 0]], axis=-1)
+    thrust = safe_clip(THRUST_SCALE * out[..., 2:] + p.thrust_base, p.thrust_min, p.motors.pwm_max)
+    return safe_clip(tilt, -p.tilt_max, p.tilt_max), thrust, memory
+
+
+def rates_of_attitude(
+    rpy: Array, rpy_des: Array, memory: LoopMemory, freq: float, *, loop: Loop
+) -> tuple[Array, LoopMemory]:
+    """Return the desired body rates, degrees/s, and the memory: the attitude loop, on Euler angles.
+
+    Args:
+        rpy: Roll, pitch, yaw, degrees. (..., 3)
+        rpy_des: Desired roll, pitch, yaw, degrees. (..., 3)
+        memory: Memory of the loop.
+        freq: Rate of this loop, Hz.
+        loop: Gains and limits.
+    """
+    return pid_step(rpy_des - rpy, rpy, memory, freq, loop=loop, wrapped=(False, False, True))
+
+
+def torque_of_rates(
+    ang_vel: Array, ang_vel_des: Array, memory: LoopMemory, freq: float, *, loop: Loop
+) -> tuple[Array, LoopMemory]:
+    """Return the torque that follows body rates, PWM, and the memory: the rate loop.
+
+    Args:
+        ang_vel: Angular velocity, body frame, degrees/s. (..., 3)
+        ang_vel_des: Desired angular velocity, body frame, degrees/s. (..., 3)
+        memory: Memory of the loop.
+        freq: Rate of this loop, Hz.
+        loop: Gains and limits.
+    """
+    torque, memory = pid_step(ang_vel_des - ang_vel, ang_vel, memory, freq, loop=loop)
+    return safe_clip(torque, -TORQUE_MAX, TORQUE_MAX), memory
+
+
+class PID(Controller):
+    """The firmware's default controller: PID loops for position, velocity, attitude and body rates.
+
+    At the level ``state`` it follows position and yaw, as the firmware does with a full-state setpoint: velocity and
+    acceleration are not fed forward. At the level ``body_rate`` rates are followed and nothing levels the drone, which
+    the literature calls CTBR. Source: controller_pid.c, position_controller_pid.c, attitude_pid_controller.c and pid.c
+    of bitcraze/crazyflie-firmware, commit 2a18fc29.
+    """
+
+    name: ClassVar[str] = "pid"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state, Control.attitude, Control.body_rate)
+    output: ClassVar[Control] = Control.rotor_vel
+    freq: int = 500
+    """Rate of the attitude and rate loops, Hz (``ATTITUDE_RATE``)."""
+    outer_freq: int = 100
+    """Rate of the position and velocity loops, Hz (``POSITION_RATE``)."""
+    hold_yaw: bool = False
+    """True if a commanded yaw rate moves a yaw angle that the attitude loop holds, as in the firmware. That loop acts
+    on Euler angles, so it disturbs the rates of a drone that is tilted far. False: the rate loop follows it."""
+
+    def params(self, airframe: Airframe) -> PIDParams:
+        """Return the gains of an airframe.
+
+        Raises:
+            ConfigError: If the airframe has no tables for this controller.
+        """
+        return PIDParams.create(airframe, self.outer_freq, self.freq)
+
+    def memory(self, airframe: Airframe) -> PIDMemory:
+        """Return the memory of one drone before the first tick."""
+        return PIDMemory.at_rest(self.params(airframe))
+
+    def outer(self, data: Any, command: Setpoint, memory: PIDMemory, params: PIDParams) -> PIDMemory:
+        """Return the memory after position and velocity loop, with the desired roll, pitch and thrust."""
+        s, heading = data.states, heading_of(data.states.quat)
+        position = memory.position.started_at(s.pos, memory.started)
+        vel_des, position = velocity_of_position(
+            s.pos, heading, command.pos, position, self.outer_freq, loop=params.position
+        )
+        tilt, thrust, velocity = attitude_of_velocity(
+            s.vel, heading, vel_des, memory.velocity, self.outer_freq, params=params
+        )
+        rpy_des = jnp.concatenate([tilt, memory.rpy_des[2:]])
+        return memory.replace(position=position, velocity=velocity, rpy_des=rpy_des, thrust=thrust)
+
+    def update(
+        self, data: Any, command: Setpoint | Array, memory: PIDMemory, params: PIDParams
+    ) -> tuple[Array, PIDMemory]:
+        """Return the rotor speeds, rpm, and the memory after the attitude and rate loops. (n_rotors,)"""
+        rpy, ang_vel = DEGREES * rotation.to_rpy(data.states.quat), DEGREES * data.states.ang_vel
+        thrust = memory.thrust if isinstance(command, Setpoint) else pwm_of_thrust(command[3:], params=params.motors)
+        rpy_des, attitude, ang_vel_des = self._desired_rates(data, command, memory, params, rpy)
+        torque, rate = torque_of_rates(ang_vel, ang_vel_des, memory.rate, self.freq, loop=params.rate)
+        rotor_vel = rotor_vel_of_pwm(distribute(thrust, torque, params=params.motors), params=params.motors)
+        after = memory.replace(
+            attitude=attitude, rate=rate, rpy_des=rpy_des, thrust=thrust, started=jnp.ones_like(memory.started)
+        )
+        return rotor_vel, _reset_at_zero_thrust(after, rpy, data.states.pos)
+
+    def take_over(
+        self, data: Any, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rotor_vel: Array
+    ) -> PIDMemory:
+        """Return a memory with integrals that continue the present thrust, roll, pitch and torque.
+
+        At the level ``state`` the integrals of the velocity loop take up the difference of thrust, roll and pitch, and
+        those of the rate loop at every level the difference of torque.
+        """
+        s, p, rest = data.states, params, jax.tree.map(jnp.zeros_like, memory)
+        rpy, ang_vel = DEGREES * rotation.to_rpy(s.quat), DEGREES * s.ang_vel
+        thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
+        if isinstance(command, Setpoint):
+            heading = heading_of(s.quat)
+            position = rest.position.started_at(along_heading(heading, s.pos), rest.started)
+            vel_des, _ = velocity_of_position(s.pos, heading, command.pos, position, self.outer_freq, loop=p.position)
+            measured = along_heading(heading, s.vel)
+            velocity = rest.velocity.started_at(measured, rest.started)
+            out, _ = pid_step(vel_des - measured, measured, velocity, self.outer_freq, loop=p.velocity)
+            lift = (thrust - p.thrust_base) / THRUST_SCALE
+            wanted = jnp.stack([rpy[1], -rpy[0], lift[0]])
+            velocity = continued(velocity, out, wanted, loop=p.velocity)
+            rest = rest.replace(position=position, velocity=velocity)
+        rest = rest.replace(
+            attitude=rest.attitude.started_at(rpy, rest.started), rate=rest.rate.started_at(ang_vel, rest.started)
+        )
+        started = rest.replace(rpy_des=rpy, thrust=thrust, started=jnp.ones_like(rest.started))
+        _, _, ang_vel_des = self._desired_rates(data, command, started, p, rpy)
+        out, _ = torque_of_rates(ang_vel, ang_vel_des, started.rate, self.freq, loop=p.rate)
+        return started.replace(rate=continued(started.rate, out, torque, loop=p.rate))
+
+    def _desired_rates(
+        self, data: Any, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rpy: Array
+    ) -> tuple[Array, LoopMemory, Array]:
+        """Return the desired angles, degrees, the memory of the attitude loop, and the desired rates, degrees/s."""
+        by_rate = data.controls.mode == Control.body_rate
+        if by_rate and not self.hold_yaw:
+            return memory.rpy_des, memory.attitude, DEGREES * command[:3]  # type: ignore[index]
+        if isinstance(command, Setpoint):
+            rpy_des = jnp.concatenate([memory.rpy_des[:2], DEGREES * command.yaw])
+        elif by_rate:
+            yaw = jnp.where(memory.started, memory.rpy_des[2:], rpy[2:]) + DEGREES * command[2:3] / self.freq
+            rpy_des = jnp.concatenate([rpy[:2], yaw])
+        else:
+            rpy_des = DEGREES * command[:3]
+        rpy_des = jnp.concatenate([rpy_des[:2], wrapped_angle(rpy_des[2:])])
+        attitude = memory.attitude.started_at(rpy, memory.started)
+        ang_vel_des, attitude = rates_of_attitude(rpy, rpy_des, attitude, self.freq, loop=params.attitude)
+        if by_rate:
+            ang_vel_des = jnp.concatenate([DEGREES * command[:2], ang_vel_des[2:]])  # type: ignore[index]
+        return rpy_des, attitude, ang_vel_des
+
+
+def along_heading(heading: Array, vector: Array) -> Array:
+    """Return a world vector along the heading, across it to the left, and up. (..., 3)
+
+    Args:
+        heading: Cosine and sine of the yaw. (..., 2)
+        vector: Vector, world frame. (..., 3)
+    """
+    cos, sin, x, y = heading[..., 0], heading[..., 1], vector[..., 0], vector[..., 1]
+    return jnp.stack([x * cos + y * sin, y * cos - x * sin, vector[..., 2]], axis=-1)
+
+
+def heading_of(quat: Array) -> Array:
+    """Return cosine and sine of the yaw of an attitude; one and zero where it points straight up or down. (..., 2)"""
+    x, y, z, w = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
+    ahead = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1)
+    return rotation.safe_normalize(ahead, jnp.asarray([1.0, 0.0], quat.dtype))
+
+
+def wrapped_angle(angle: Array) -> Array:
+    """Return the angles between -180 and 180 degrees. (...)"""
+    return angle - 360.0 * jnp.round(angle / 360.0)
+
+
+def _reset_at_zero_thrust(memory: PIDMemory, rpy: Array, pos: Array) -> PIDMemory:
+    """Return the memory with all loops reset, where the thrust is zero or less, as ``controllerPidReinitialize``."""
+    m, off = memory, memory.thrust <= 0
+    return m.replace(
+        position=m.position.reset_where(off, pos),
+        velocity=m.velocity.reset_where(off, jnp.zeros_like(pos)),
+        attitude=m.attitude.reset_where(off, rpy, filters=False),
+        rate=m.rate.reset_where(off, jnp.zeros_like(rpy), filters=False),
+        rpy_des=jnp.where(off, rpy, m.rpy_des),
+    )

@@ -1,0 +1,187 @@
+"""PID loops of the Crazyflie firmware, three at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.drones import Airframe
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import safe_clip
+
+DEFAULT_INTEGRAL_MAX = 5000.0
+"""Limit of the integral of a loop without a limit of its own (``DEFAULT_PID_INTEGRATION_LIMIT``)."""
+
+
+class Loop(PyTree):
+    """Gains and limits of three PID loops, each shared or one per drone.
+
+    A gain that is zero in all three loops is None, and its part of the loop and of the memory is omitted.
+    """
+
+    kp: Array = leaf("parameter", 1)
+    """Gains on the error, output per input. (3,)"""
+    ki: Array | None = leaf("parameter", 1)
+    """Gains on the integral of the error, output per input and s. (3,)"""
+    kd: Array | None = leaf("parameter", 1)
+    """Gains on the derivative of the measured values, output s per input. (3,)"""
+    integral_max: Array | None = leaf("parameter", 1)
+    """Limits of the integrals, input s; None without integrals. (3,)"""
+    output_max: Array | None = leaf("parameter", 1)
+    """Limits of the output; None for no limits. (3,)"""
+    low_pass: Array | None = leaf("parameter", 1)
+    """Coefficients b0, a1, a2 of the filter of the derivative, 1; None for no filter. (3,)"""
+
+    @staticmethod
+    def create(airframe: Airframe, path: str, freq: float) -> Loop:
+        """Return the loops of a table of an airframe, run at a rate, Hz.
+
+        Raises:
+            ConfigError: If the airframe has no such table, or it lacks the gains.
+        """
+        table = airframe.table(path)
+        gains = {key: airframe.value(f"{path}.{key}", (3,)) for key in ("kp", "ki", "kd")}
+        ki, kd = (as_parameter(gains[key]) if np.any(gains[key]) else None for key in ("ki", "kd"))
+        limit = airframe.value(f"{path}.integral_max", (3,)) if "integral_max" in table else [DEFAULT_INTEGRAL_MAX] * 3
+        filtered = kd is not None and "cutoff" in table
+        return Loop(
+            kp=as_parameter(gains["kp"]),
+            ki=ki,
+            kd=kd,
+            integral_max=None if ki is None else as_parameter(limit),
+            output_max=as_parameter(airframe.value(f"{path}.output_max", (3,))) if "output_max" in table else None,
+            low_pass=as_parameter(low_pass(airframe.value(f"{path}.cutoff", ()), freq)) if filtered else None,
+        )
+
+
+class LoopMemory(PyTree):
+    """Memory of three PID loops; None where the loops have no such part."""
+
+    integral: Array | None = leaf("drone", 1)
+    """Integrals of the error, input s. (n_worlds, n_drones, 3)"""
+    measured: Array | None = leaf("drone", 1)
+    """Measured values at the last tick. (n_worlds, n_drones, 3)"""
+    delays: Array | None = leaf("drone", 2)
+    """The two last internal values of the filter of the derivative. (n_worlds, n_drones, 2, 3)"""
+
+    @staticmethod
+    def at_rest(loop: Loop) -> LoopMemory:
+        """Return the memory of one drone before the first tick."""
+        return LoopMemory(
+            integral=None if loop.ki is None else np.zeros(3),  # type: ignore[arg-type]
+            measured=None if loop.kd is None else np.zeros(3),  # type: ignore[arg-type]
+            delays=None if loop.low_pass is None else np.zeros((2, 3)),  # type: ignore[arg-type]
+        )
+
+    def started_at(self, measured: Array, started: Array) -> LoopMemory:
+        """Return the memory in which the last measured values are given ones, where the loop has not started. (3,)"""
+        if self.measured is None:
+            return self
+        return self.replace(measured=jnp.where(started, self.measured, measured))
+
+    def reset_where(self, mask: Array, measured: Array, filters: bool = True) -> LoopMemory:
+        """Return the memory with zero integrals and given last measured values in loops of a mask.
+
+        Args:
+            mask: True where the loop is reset. (1,)
+            measured: Measured values. (3,)
+            filters: True to reset the filter of the derivative too.
+        """
+        return LoopMemory(
+            integral=None if self.integral is None else jnp.where(mask, 0.0, self.integral),
+            measured=None if self.measured is None else jnp.where(mask, measured, self.measured),
+            delays=jnp.where(mask, 0.0, self.delays) if filters and self.delays is not None else self.delays,
+        )
+
+
+def pid_step(
+    error: Array,
+    measured: Array,
+    memory: LoopMemory,
+    freq: float,
+    *,
+    loop: Loop,
+    wrapped: Sequence[bool] = (False, False, False),
+) -> tuple[Array, LoopMemory]:
+    """Return the outputs of three PID loops, and their memory after a tick.
+
+    The derivative is that of the measured value, so that a step of the setpoint gives no kick. Integral and output are
+    limited. Source: ``pidUpdate`` in pid.c of bitcraze/crazyflie-firmware, commit 2a18fc29, without its feedforward of
+    the setpoint, whose gains are zero on every platform.
+
+    Args:
+        error: Desired minus measured values. (..., 3)
+        measured: Measured values. (..., 3)
+        memory: Memory of the loops.
+        freq: Rate, Hz.
+        loop: Gains and limits, shared or with the leading axes of the error.
+        wrapped: True for loops of angles in degrees that wrap around.
+
+    Returns:
+        Outputs (..., 3); the memory.
+    """
+    error = _wrap(error, wrapped)
+    out = loop.kp * error
+    if loop.kd is not None:
+        derivative = _wrap(memory.measured - measured, wrapped) * freq
+        memory = memory.replace(measured=measured)
+        if loop.low_pass is not None:
+            derivative, delays = _filtered(derivative, memory.delays, loop.low_pass)
+            memory = memory.replace(delays=delays)
+        out = out + loop.kd * derivative
+    if loop.ki is not None:
+        integral = safe_clip(memory.integral + error / freq, -loop.integral_max, loop.integral_max)
+        memory = memory.replace(integral=integral)
+        out = out + loop.ki * integral
+    return (out if loop.output_max is None else safe_clip(out, -loop.output_max, loop.output_max)), memory
+
+
+def continued(memory: LoopMemory, out: Array, wanted: Array, *, loop: Loop) -> LoopMemory:
+    """Return the memory with integrals that turn the outputs of a tick into wanted ones, within their limits.
+
+    Args:
+        memory: Memory of the loops.
+        out: Outputs with this memory. (3,)
+        wanted: Wanted outputs. (3,)
+        loop: Gains and limits.
+    """
+    if loop.ki is None:
+        return memory
+    missing = jnp.where(loop.ki == 0, 0.0, (wanted - out) / jnp.where(loop.ki == 0, 1.0, loop.ki))
+    return memory.replace(integral=safe_clip(memory.integral + missing, -loop.integral_max, loop.integral_max))
+
+
+def low_pass(cutoff: float, freq: float) -> list[float]:
+    """Return the coefficients b0, a1, a2 of a Butterworth low-pass filter of second order.
+
+    ``b1 = 2 b0`` and ``b2 = b0``. Source: ``lpf2pSetCutoffFreq`` in filter.c of bitcraze/crazyflie-firmware.
+
+    Args:
+        cutoff: Cutoff frequency, Hz.
+        freq: Sampling rate, Hz.
+    """
+    ohm = math.tan(math.pi * float(cutoff) / freq)
+    damping = 2 * math.cos(math.pi / 4) * ohm
+    c = 1 + damping + ohm * ohm
+    return [ohm * ohm / c, 2 * (ohm * ohm - 1) / c, (1 - damping + ohm * ohm) / c]
+
+
+def _filtered(sample: Array, delays: Array, coefficients: Array) -> tuple[Array, Array]:
+    """Return the output of the low-pass filter, and its delays after a tick (``lpf2pApply``)."""
+    b0, a1, a2 = coefficients[..., 0:1], coefficients[..., 1:2], coefficients[..., 2:3]
+    first, second = delays[..., 0, :], delays[..., 1, :]
+    new = sample - first * a1 - second * a2
+    return b0 * (new + 2 * first + second), jnp.stack([new, first], axis=-2)
+
+
+def _wrap(angle: Array, wrapped: Sequence[bool]) -> Array:
+    """Return angles beyond 180 degrees one revolution less, and those below -180 degrees one more, where wrapped."""
+    if not any(wrapped):
+        return angle
+    mask = jnp.asarray(wrapped)
+    turns = jnp.where(angle > 180, 360.0, jnp.where(angle < -180, -360.0, 0.0))
+    return jnp.where(mask, angle - turns, angle)

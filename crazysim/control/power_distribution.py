@@ -1,0 +1,112 @@
+"""Power distribution of the Crazyflie firmware: thrust and torque in PWM units to the motors."""
+
+from __future__ import annotations
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.control.core import allocation_matrix
+from crazysim.drones import Airframe
+from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import matvec, safe_clip
+
+
+class PowerDistributionParams(PyTree):
+    """Parameters of the power distribution, each shared or one per drone."""
+
+    pwm_max: Array = leaf("parameter", 1, (1,))
+    """Maximum PWM of a motor, PWM. (1,)"""
+    thrust_max: Array = leaf("parameter", 1, (1,))
+    """Thrust of one rotor at maximum PWM, N. (1,)"""
+    rpm2thrust: Array = leaf("parameter", 2)
+    """Thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
+    torque_allocation: Array = leaf("parameter", 2)
+    """Torque commands to PWM of each rotor, with the firmware's factor 1/2 for roll and pitch, 1. (n_rotors, 3)"""
+    torque_of_pwm: Array = leaf("parameter", 2)
+    """Inverse of the allocation, PWM of each rotor to torque commands, 1. (3, n_rotors)"""
+
+    @staticmethod
+    def create(airframe: Airframe) -> PowerDistributionParams:
+        """Return the shared parameters of an airframe.
+
+        Raises:
+            ConfigError: If the airframe lacks one.
+        """
+        return PowerDistributionParams(
+            pwm_max=as_parameter(airframe.value("controller.pwm_max", ())),
+            thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
+            rpm2thrust=as_parameter(airframe.value("rotors.thrust_curve").reshape(-1, 3)),
+            torque_allocation=as_parameter(torque_allocation(airframe)),
+            torque_of_pwm=as_parameter(np.linalg.pinv(torque_allocation(airframe))),
+        )
+
+
+def torque_allocation(airframe: Airframe) -> np.ndarray:
+    """Return the shares of roll, pitch and yaw commands in the PWM of each rotor. (n_rotors, 3)
+
+    The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the least-norm
+    allocation of a quadrotor in X. Other layouts get the same factors.
+    """
+    return allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0]
+
+
+def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams) -> Array:
+    """Return the PWM of the motors for a thrust and a torque.
+
+    Where a motor would exceed its maximum, all motors are lowered by the largest excess, which keeps the torque at the
+    expense of thrust. Then negative PWM is raised to zero, the firmware's default idle thrust. A thrust of zero or less
+    switches the motors off. Source: ``powerDistributionLegacy`` and ``powerDistributionCap`` in
+    power_distribution_quadrotor.c of bitcraze/crazyflie-firmware, commit 2a18fc29, without its rounding to integers.
+
+    Args:
+        thrust: Thrust of each motor, PWM. (..., 1)
+        torque: Torque about the body axes, PWM. (..., 3)
+        params: Parameters, shared or with the leading axes of the command.
+
+    Returns:
+        PWM of each motor. (..., n_rotors)
+    """
+    p = params
+    pwm = thrust + matvec(p.torque_allocation, torque)
+    # The gradient of jnp.max divides by the number of equal elements, which is zero where XLA rounds a copy otherwise.
+    highest = functools.reduce(jnp.maximum, [pwm[..., i : i + 1] for i in range(pwm.shape[-1])])
+    excess = highest - p.pwm_max
+    pwm = pwm - jnp.where(excess > 0, excess, 0.0)
+    return jnp.where(thrust <= 0, 0.0, jnp.where(pwm < 0, 0.0, pwm))
+
+
+def rotor_vel_of_pwm(pwm: Array, *, params: PowerDistributionParams) -> Array:
+    """Return the rotor speeds for the PWM of the motors, rpm; zero for zero PWM. (..., n_rotors)
+
+    The thrust is proportional to the PWM, as the firmware's battery compensation makes it.
+
+    Args:
+        pwm: PWM of each motor. (..., n_rotors)
+        params: Parameters, shared or with the leading axes of the command.
+    """
+    p = params
+    rotor_vel = rotor_vel_of_thrust(safe_clip(pwm, 0.0, p.pwm_max) * (p.thrust_max / p.pwm_max), p.rpm2thrust)
+    return jnp.where(pwm <= 0, 0.0, rotor_vel)
+
+
+def pwm_of_thrust(thrust: Array, *, params: PowerDistributionParams) -> Array:
+    """Return the PWM of each motor at which all together give a collective thrust, N. (..., 1)"""
+    p = params
+    n_rotors = p.torque_allocation.shape[-2]
+    return thrust * (p.pwm_max / (n_rotors * p.thrust_max))
+
+
+def command_of_rotor_vel(rotor_vel: Array, *, params: PowerDistributionParams) -> tuple[Array, Array]:
+    """Return the thrust of each motor (..., 1) and the torque (..., 3) that lead to rotor speeds, PWM.
+
+    Args:
+        rotor_vel: Rotor speeds, rpm. (..., n_rotors)
+        params: Parameters, shared or with the leading axes of the rotor speeds.
+    """
+    p = params
+    pwm = jnp.where(rotor_vel > 0, curve(rotor_vel, p.rpm2thrust), 0.0) * (p.pwm_max / p.thrust_max)
+    return jnp.mean(pwm, axis=-1, keepdims=True), matvec(p.torque_of_pwm, pwm)

@@ -1,0 +1,110 @@
+"""The protocol of controllers: settings, parameters and memory, and one function from setpoint to command."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar, dataclass_transform
+
+from jax import Array
+
+from crazysim.control.core import Control
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.pytree import PyTree
+
+OUTPUTS = (Control.force_torque, Control.rotor_vel)
+"""Levels of the commands that controllers return."""
+
+
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(dataclasses.field,))
+class Controller:
+    """Base class of controllers, which ``Sim(controller=...)`` uses at one of their command levels.
+
+    A subclass lists its settings as annotated fields with defaults, one of which is ``freq``; it becomes a frozen
+    dataclass. Its methods are pure and written for one drone. A controller whose slow part runs at a lower rate has a
+    field ``outer_freq`` and overrides ``outer``, which then precedes ``update`` at the level ``state``.
+    """
+
+    name: ClassVar[str]
+    """Name of the controller."""
+    levels: ClassVar[tuple[Control, ...]]
+    """Command levels that it follows."""
+    output: ClassVar[Control]
+    """Level of the command that it returns, ``force_torque`` or ``rotor_vel``."""
+    freq: int
+    """Rate of ``update``, Hz. A default that does not divide the simulation's rate is lowered to the next divisor."""
+    outer_freq: int | None = None
+    """Rate of ``outer``, Hz; None for a controller without an outer loop."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Make every subclass a frozen dataclass, and check its declarations."""
+        super().__init_subclass__(**kwargs)
+        dataclasses.dataclass(frozen=True, eq=False)(cls)
+        if "freq" not in {f.name for f in dataclasses.fields(cls)}:  # type: ignore[arg-type]
+            raise TypeError(f"controller {cls.__name__} has no field 'freq'; add one, such as freq: int = 500")
+        missing = [key for key in ("name", "levels", "output") if not hasattr(cls, key)]
+        if missing:
+            raise TypeError(f"controller {cls.__name__} has no class variables {missing}; add them")
+        if cls.output not in OUTPUTS:
+            raise TypeError(f"controller {cls.__name__}: expected output as one of {OUTPUTS}, got {cls.output!r}")
+
+    def params(self, airframe: Airframe) -> PyTree | None:
+        """Return gains and constants for an airframe, in a record of leaves of scope ``parameter``, or None.
+
+        Raises:
+            ConfigError: If the airframe lacks one.
+        """
+        return None
+
+    def memory(self, airframe: Airframe) -> PyTree | None:
+        """Return the memory of one drone at rest, in a record of leaves of scope ``drone``, or None."""
+        return None
+
+    def outer(self, data: Any, command: Setpoint, memory: Any, params: Any) -> Any:
+        """Return the memory after a tick of the outer loop.
+
+        Args:
+            data: ``SimData`` of one drone.
+            command: The setpoint.
+            memory: Memory of the drone.
+            params: Parameters of the drone.
+        """
+        raise NotImplementedError(f"controller {self.name!r} has an outer_freq, and does not define outer")
+
+    def update(self, data: Any, command: Setpoint | Array, memory: Any, params: Any) -> tuple[Array, Any]:
+        """Return the command of the level ``output``, and the memory after a tick.
+
+        Args:
+            data: ``SimData`` of one drone, with the command in force in ``data.controls``.
+            command: Setpoint at the level ``state``; otherwise the command of the level ``data.controls.mode``. (4,)
+            memory: Memory of the drone.
+            params: Parameters of the drone.
+
+        Returns:
+            Collective thrust, N, and body torque, N m (4,), or rotor speeds, rpm (n_rotors,); the memory.
+        """
+        raise NotImplementedError(f"controller {self.name!r} does not define update")
+
+    def take_over(self, data: Any, command: Setpoint | Array, memory: Any, params: Any, rotor_vel: Array) -> Any:
+        """Return the memory with which the controller starts to command a drone in flight, in place of another one.
+
+        By default the memory of when it was last active. Override it to make the first command continue the last.
+
+        Args:
+            data: ``SimData`` of one drone.
+            command: Setpoint or command, as in ``update``.
+            memory: Memory of when the controller was last active.
+            params: Parameters of the drone.
+            rotor_vel: Rotor speeds that the other controller commanded last, rpm. (n_rotors,)
+        """
+        return memory
+
+    @property
+    def members(self) -> tuple[Controller, ...]:
+        """The controllers that take turns: this one."""
+        return (self,)
+
+    @property
+    def has_outer(self) -> bool:
+        """True if the controller has an outer loop."""
+        return self.outer_freq is not None

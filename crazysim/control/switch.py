@@ -1,0 +1,158 @@
+"""Several controllers on one drone, of which a function of state, setpoint and time chooses one at each tick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
+from crazysim.control.core import Control
+from crazysim.control.protocol import Controller
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, leaf
+
+
+class SwitchParams(PyTree):
+    """Parameters of several controllers."""
+
+    controllers: tuple[Any, ...]
+    """Parameters of each controller."""
+    allocation: AllocationParams
+    """Allocation of controllers that return a wrench."""
+    index: Array | None = leaf("parameter", 1, (1,))
+    """Number of the controller to use; None with a switch function. (1,)"""
+
+
+class SwitchMemory(PyTree):
+    """Memory of several controllers."""
+
+    controllers: tuple[Any, ...]
+    """Memory of each controller."""
+    active: Array = leaf("drone", 1)
+    """Number of the active controller; -1 before the first tick. (n_worlds, n_drones, 1)"""
+    rotor_vel: Array = leaf("drone", 1)
+    """Rotor speeds that were commanded last, rpm. (n_worlds, n_drones, n_rotors)"""
+
+
+class Switch(Controller):
+    """Several controllers, of which one commands a drone; ``Sim(controller=[...], switch=...)`` makes it.
+
+    Only the active controller runs: the memory of the others stands still. When a controller becomes active, its
+    ``take_over`` sets its memory so that its first command is as close to the last one as its limits allow. Wrenches
+    are allocated to the rotors here.
+    """
+
+    name: ClassVar[str] = "switch"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state, Control.attitude, Control.body_rate)
+    output: ClassVar[Control] = Control.rotor_vel
+    controllers: tuple[Controller, ...]
+    """The controllers."""
+    switch: Any
+    """Function ``(state, setpoint, time) -> index`` of one drone, or indices of all drones, () or (n_worlds, n_drones).
+
+    ``state`` is the ``SimState`` of the drone, ``setpoint`` its ``Setpoint`` (the command at other levels), ``time``
+    that since the last reset, s. An index beyond the last controller means the last one."""
+    freq: int = 500
+    """Rate at which the switch is evaluated, Hz; in a simulation, one that all the controllers' rates divide."""
+
+    @property
+    def members(self) -> tuple[Controller, ...]:
+        """The controllers."""
+        return self.controllers
+
+    def params(self, airframe: Airframe) -> SwitchParams:
+        """Return the parameters of all controllers.
+
+        Raises:
+            ConfigError: If the airframe lacks a number for one, or the indices are invalid.
+        """
+        index: Any = None if callable(self.switch) else _indices(self.switch, len(self.controllers))
+        params = tuple(c.params(airframe) for c in self.controllers)
+        return SwitchParams(params, AllocationParams.create(airframe), index)
+
+    def memory(self, airframe: Airframe) -> SwitchMemory:
+        """Return the memory of one drone before the first tick."""
+        memory = tuple(c.memory(airframe) for c in self.controllers)
+        rest: Any = np.zeros(airframe.n_rotors)
+        return SwitchMemory(memory, np.full(1, -1, np.int32), rest)  # type: ignore[arg-type]
+
+    def update(
+        self, data: Any, command: Setpoint | Array, memory: SwitchMemory, params: SwitchParams
+    ) -> tuple[Array, SwitchMemory]:
+        """Return the rotor speeds of the chosen controller, rpm, and the memory. (n_rotors,)"""
+        index = self._index(data, command, params)
+        switched = (memory.active[0] >= 0) & (memory.active[0] != index)
+        rotor_vel, after = memory.rotor_vel, []
+        for k, (controller, own, p) in enumerate(
+            zip(self.controllers, memory.controllers, params.controllers, strict=True)
+        ):
+            chosen = index == k
+            starts = chosen & switched
+            own = _where(starts, controller.take_over(data, command, own, p, memory.rotor_vel), own)
+            if isinstance(command, Setpoint) and controller.has_outer:
+                due = chosen & (starts | _due(data, controller.outer_freq))
+                own = _where(due, controller.outer(data, command, own, p), own)
+            due = chosen & (starts | _due(data, controller.freq))
+            out, new = controller.update(data, command, own, p)
+            if controller.output == Control.force_torque:
+                out = force_torque2rotor_vel(out, params=params.allocation)
+            rotor_vel = jnp.where(due, out, rotor_vel)
+            after.append(_where(due, new, own))
+        active = jnp.full_like(memory.active, index)
+        return rotor_vel, SwitchMemory(tuple(after), active, rotor_vel)
+
+    def _index(self, data: Any, command: Setpoint | Array, params: SwitchParams) -> Array:
+        """Return the number of the controller to use. ()"""
+        if params.index is not None:
+            index = params.index[0]
+        else:
+            index = jnp.asarray(self.switch(data.states, command, data.core.steps / data.core.freq))
+        if index.shape != () or not jnp.issubdtype(index.dtype, jnp.integer):
+            raise ConfigError(
+                f"expected one integer from the switch function, got shape {index.shape} and type {index.dtype}. "
+                f"Use jnp.where(..., 1, 0), for one drone."
+            )
+        return jnp.clip(index, 0, len(self.controllers) - 1).astype(jnp.int32)
+
+
+def switch_of(controllers: Sequence[Controller], switch: Callable[..., Any] | Any) -> Switch:
+    """Return several controllers with a switch.
+
+    Raises:
+        ConfigError: If there is no controller, or no switch.
+    """
+    if not controllers:
+        raise ConfigError("expected at least one controller, got an empty list. Use controller=['pid', 'mellinger'].")
+    if switch is None:
+        raise ConfigError(
+            "expected a switch for several controllers, got None. Use switch=fn with fn(state, setpoint, time) -> "
+            "index, or indices of the drones' controllers."
+        )
+    return Switch(tuple(controllers), switch)
+
+
+def _indices(switch: Any, n: int) -> np.ndarray:
+    indices = np.asarray(switch)
+    if indices.dtype.kind not in "iu" or indices.ndim not in (0, 2) or np.any((indices < 0) | (indices >= n)):
+        raise ConfigError(
+            f"expected switch as a function or as integers from 0 to {n - 1} of shape () or (n_worlds, n_drones), got "
+            f"{switch!r}. Use np.zeros((n_worlds, n_drones), int) for the first controller."
+        )
+    return indices[..., None].astype(np.int32)
+
+
+def _due(data: Any, freq: Any) -> Array | bool:
+    """Return True where a rate fires at this step. ()"""
+    return data.core.steps % (data.core.freq // freq) == 0
+
+
+def _where(mask: Any, new: Any, old: Any) -> Any:
+    """Return one of two trees. A leaf that is the same in both stays as it is."""
+    return jax.tree.map(lambda x, y: y if x is y else jnp.where(mask, x, y), new, old)

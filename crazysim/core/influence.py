@@ -1,0 +1,110 @@
+"""Calls of plugins within the integration, with checks of what they return."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Plugin
+from crazysim.errors import ConfigError
+from crazysim.pytree import scopes
+
+
+def influenced(plugin: Plugin, data: SimData) -> SimData:
+    """Return the data as the plugin's ``influence`` returns it, for the dynamics alone.
+
+    It may write what the dynamics read besides the states that they advance: ``states.force``, ``states.torque``, the
+    rotor command (``controls.attitude.cmd`` in fitted dynamics), and ``params``. Anything else would be discarded
+    without effect, or count in the derivative as a state that the drone does not have.
+
+    Raises:
+        ConfigError: If it wrote another field, or returned one in another shape.
+    """
+    where = f"influence of plugin {plugin.name!r} ({type(plugin).__name__})"
+    after = _called(where, plugin.influence, data)
+    if not isinstance(after, SimData):
+        raise ConfigError(f"expected {where} to return SimData, got {type(after).__name__}. Use 'return data'.")
+    paths, treedef = jax.tree_util.tree_flatten_with_path(data)
+    if jax.tree.structure(after) != treedef:
+        raise ConfigError(
+            f"expected {where} to keep the structure of SimData, but a field became None, or a record came or went. "
+            f"Add records with sim.add."
+        )
+    command = "controls.attitude.cmd" if data.controls.rotor_vel is None else "controls.rotor_vel"
+    keep_shape = ("states.force", "states.torque", command)
+    for (path, old), new in zip(paths, jax.tree.leaves(after), strict=True):
+        if new is old:
+            continue
+        field = jax.tree_util.keystr(path).lstrip(".")
+        if field in keep_shape:
+            if jnp.shape(new) != jnp.shape(old):
+                raise ConfigError(f"expected {where} to return {field} of shape {old.shape}, got {jnp.shape(new)}")
+        elif not field.startswith("params."):
+            raise ConfigError(
+                f"expected {where} to write only {', '.join(keep_shape)} and params, got other values of {field}. Use "
+                f"a stage of the plugin to change states, records or other commands, and 'derivative' for the rates of "
+                f"its own states."
+            )
+    _check_params(where, data.params, after.params)
+    return after
+
+
+def own_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
+    """Return the rates of the plugin's own states, checked.
+
+    Raises:
+        ConfigError: If a rate is not that of a state in the plugin's record, or has another shape or type.
+    """
+    where = f"derivative of plugin {plugin.name!r} ({type(plugin).__name__})"
+    rates = _called(where, plugin.derivative, data)
+    if not isinstance(rates, Mapping):
+        raise ConfigError(
+            f"expected {where} to return a dict of fields of its record to rates, got {type(rates).__name__}. Use "
+            f"'return {{}}' for none."
+        )
+    record = data.plugins.get(plugin.name)
+    kinds: dict[str, Any] = {} if record is None else vars(scopes(record))
+    states = [name for name, kind in kinds.items() if kind == "drone"]
+    for field, rate in rates.items():
+        if field not in states:
+            raise ConfigError(
+                f"expected {where} to return rates of leaves of drones in its record, which are "
+                f"{', '.join(map(repr, states)) or 'none'}, got one of {field!r}. Declare such a state with "
+                f"leaf('drone', ...)."
+            )
+        x = getattr(record, field)
+        same_type = jnp.issubdtype(x.dtype, jnp.floating) and jnp.result_type(x, rate) == x.dtype
+        if jnp.shape(rate) != x.shape or not same_type:
+            raise ConfigError(
+                f"expected {where} to return a rate of {field!r} with its shape {x.shape} and floating type "
+                f"{x.dtype}, got shape {jnp.shape(rate)} and type {jnp.result_type(rate)}"
+            )
+    return dict(rates)
+
+
+def _called(where: str, method: Callable[[SimData], Any], data: SimData) -> Any:
+    """Return the result of a plugin's method; its errors carry a note with plugin and method."""
+    try:
+        return method(data)
+    except Exception as error:
+        error.add_note(f"in {where}, which is written for one drone: data.states.pos is (3,)")
+        raise
+
+
+def _check_params(where: str, before: Any, after: Any) -> None:
+    """Check that parameters have shapes of one drone; curves may become those of every rotor."""
+    for f in dataclasses.fields(before):
+        old, new = getattr(before, f.name), getattr(after, f.name)
+        if new is old:
+            continue
+        core = f.metadata.get("core")
+        if jnp.ndim(new) != jnp.ndim(old) or (core is not None and jnp.shape(new)[-len(core) :] != core):
+            raise ConfigError(
+                f"expected {where} to return params.{f.name} of shape {core or jnp.shape(old)}, got {jnp.shape(new)}"
+            )

@@ -1,0 +1,8 @@
+"""Demonstrations: ``crazysim demo NAME`` runs the module of that name.
+
+A demonstration is a module with ``run(n_worlds, n_drones, seconds, device, out, film)``, all of which have defaults. It
+prints figures and writes files into the folder ``out``.
+"""
+
+DEMOS = {"flight": "fly figure eights around poles in many worlds; print figures, write a plot and a film"}
+"""Names of the demonstrations, and what they show."""

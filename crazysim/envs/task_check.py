@@ -1,0 +1,103 @@
+"""Checks of a task: that it is installed, has all methods, and returns arrays of the right shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from crazysim.core.data import SimData
+from crazysim.envs.task import NAME, Task
+from crazysim.errors import ConfigError
+from crazysim.pytree import scopes
+from crazysim.sim.sim import Sim
+
+GUIDE = "docs/guides/tasks.md"
+REQUIRED = ("spawn", "observe", "rewards", "terminated", "error")
+"""Methods that every task defines."""
+
+
+def require_installed(sim: Sim, task: Any) -> None:
+    """Check that a task was installed in a simulation.
+
+    Raises:
+        ConfigError: If it was not, or is no task.
+    """
+    if not isinstance(task, Task):
+        raise ConfigError(f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
+    if task.Record is not None and not isinstance(sim.data.plugins.get(NAME), task.Record):
+        raise ConfigError(
+            f"expected a simulation in which task {task.name!r} is installed, got one without its record. Call "
+            f"task.install(sim) first, or use crazysim.envs.make."
+        )
+
+
+def check_task(task: Task, data: SimData, action_size: int) -> None:
+    """Check that a task has all methods, and that observations and rewards have the documented shapes.
+
+    The methods are traced for shapes, once, and not executed.
+
+    Args:
+        task: The task, installed.
+        data: Data of all worlds.
+        action_size: Length of the action of one drone.
+
+    Raises:
+        ConfigError: If a method is missing, or returns another type or shape, with task, method and name.
+    """
+    title = f"task {task.name or type(task).__name__!r}"
+    missing = [name for name in REQUIRED if getattr(type(task), name) is getattr(Task, name)]
+    if missing:
+        raise ConfigError(
+            f"{title}: expected class {type(task).__name__} to define {', '.join(REQUIRED)}, got no "
+            f"{', '.join(missing)}. {GUIDE} describes each method."
+        )
+    n_worlds, n_drones = data.states.pos.shape[:2]
+    batch, names = ((n_worlds,), "n_worlds, ") if task.batched else ((), "")
+    one = data if task.batched else jax.tree.map(_of_world, scopes(data), data)
+    action = jax.ShapeDtypeStruct((*batch, n_drones, action_size), data.states.pos.dtype)
+    obs, rewards, terminated, error = jax.eval_shape(
+        lambda data, action: (
+            task.observe(data), task.rewards(data, action, action), task.terminated(data), task.error(data)
+        ), one, action,
+    )  # fmt: skip
+
+    for method, result in (("observe", obs), ("rewards", rewards)):
+        if not isinstance(result, Mapping) or not result:
+            raise ConfigError(
+                f"{title}: expected {method} to return a dict of names to arrays, got {_described(result)}. {GUIDE} "
+                f"has an example."
+            )
+    per_drone = (*batch, n_drones)
+    for name, x in obs.items():
+        shape = getattr(x, "shape", ())
+        if shape[:-1] != per_drone or len(shape) != len(per_drone) + 1:
+            raise ConfigError(
+                f"{title}: expected observation {name!r} of shape ({names}n_drones, k) = "
+                f"({', '.join(map(str, per_drone))}, k), got {_described(x)}. For one number per drone use x[:, None]; "
+                f"for one array per drone use x.reshape(n_drones, -1)."
+            )
+    for name, x in [(f"reward term {name!r}", x) for name, x in rewards.items()] + [("error", error)]:
+        if getattr(x, "shape", None) != per_drone:
+            raise ConfigError(
+                f"{title}: expected {name} of shape ({names}n_drones,) = {per_drone}, got {_described(x)}. For the "
+                f"same number for all drones use jnp.full(data.core.n_drones, x)."
+            )
+    if getattr(terminated, "shape", None) != batch or not jnp.issubdtype(terminated.dtype, jnp.bool_):
+        raise ConfigError(
+            f"{title}: expected terminated of type bool and shape ({names.removesuffix(', ')}), got "
+            f"{_described(terminated)}. It is of a world: use jnp.any or jnp.all over its drones."
+        )
+
+
+def _of_world(scope: str, x: Any) -> jax.ShapeDtypeStruct:
+    """Return shape and type of a leaf as functions of one world receive it."""
+    return jax.ShapeDtypeStruct(x.shape[{"drone": 1, "world": 2, "batched": 1}.get(scope, 0) :], x.dtype)
+
+
+def _described(x: Any) -> str:
+    if not hasattr(x, "shape"):
+        return f"a {type(x).__name__}" if not isinstance(x, Mapping) else "an empty dict"
+    return f"shape {x.shape} and type {x.dtype}"

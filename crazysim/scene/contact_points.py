@@ -1,0 +1,136 @@
+"""Contact points: the places of a drone's collision box that touch floor and objects, or may touch them next.
+
+They are the corners of the box, and the points of its upper and lower plate that are nearest to each object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation
+from crazysim.geometry import Shape, distance, point_distance
+from crazysim.scene.collision import CollisionGeom
+from crazysim.scene.report import Objects, choose
+
+FLAT = ("plane", "box", "cylinder", "hfield")
+"""Kinds with faces, on which a drone stands by its corners."""
+THIN = 0.05
+"""Height of the upper and lower plate of a drone's box, as a share of the box; both touch an object along its side."""
+
+
+class Surface(NamedTuple):
+    """Surface of a geom."""
+
+    geom: CollisionGeom
+    """The geom, in the frame of its object or of the world."""
+    row: int | None
+    """Row of the movable object that carries it in ``data.objects``; None for a fixed one."""
+
+
+def surfaces_of(sim: Simulation, objects: Objects) -> list[Surface]:
+    """Return the surfaces of the floor and of some objects."""
+    model = sim.scene.collision_model
+    found = [Surface(geom, None) for geom in model.floor]
+    for body in choose(model, objects):
+        found += [Surface(geom, body.row) for geom in body.geoms]
+    return found
+
+
+class ContactPoints(NamedTuple):
+    """Points that are or may come into contact, in the drone's body frame."""
+
+    gap: Array
+    """Distance to the surface, m. (..., n)"""
+    normal: Array
+    """Outward normal of the surface. (..., n, 3)"""
+    point: Array
+    """Position on the drone, from its centre of mass, m. (..., n, 3)"""
+    vel: Array
+    """Velocity of the surface, m/s. (..., n, 3)"""
+
+
+def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> ContactPoints:
+    """Return all contact points of every drone.
+
+    Args:
+        data: The simulation, or one drone of it.
+        surfaces: Surfaces of floor and objects.
+        box: Centre and half extents of the drone's collision box, body frame, m. (6,)
+    """
+    pos, quat = data.states.pos, data.states.quat
+    dtype = pos.dtype
+    corners = jnp.asarray(box[:3] + box[3:] * np.array(list(product((-1, 1), repeat=3))), dtype)
+    plate = Shape("box", (*box[3:5].tolist(), THIN * box[5]))
+    middles = [jnp.asarray(box[:3] + np.array([0, 0, side * (1 - THIN) * box[5]]), dtype) for side in (-1, 1)]
+    turn = quat[..., None, :]
+    in_world = pos[..., None, :] + rotation.rotate(turn, corners)
+    found = []
+    for geom, row in surfaces:
+        into, back, vel = _frame(data, geom, row)
+        still = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(turn, vel[..., None, :])
+        if geom.shape.kind in FLAT:
+            gap, pull = jax.vjp(lambda p, s=geom.shape: point_distance(s, p), into(in_world, True))
+            normal = rotation.rotate_inverse(turn, back(pull(jnp.ones_like(gap))[0]))
+            found.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
+        if geom.shape.kind not in ("plane", "hfield"):
+            found += [_nearest(data, geom, into, plate, middle, still[..., :1, :]) for middle in middles]
+    joined = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True)))
+    return ContactPoints(*joined)
+
+
+def _nearest(
+    data: SimData, geom: CollisionGeom, into: Callable, shape: Shape, middle: Array, vel: Array
+) -> ContactPoints:
+    """Return the point of a plate that is nearest to a geom.
+
+    The gradient of the gap with respect to the drone's position is the normal, and that with respect to its attitude is
+    the lever times the normal, which is all that turns the drone. The position along the normal affects friction only;
+    the plate's face is used.
+    """
+    pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
+
+    def gap_at(move: Array, turned: Array) -> Array:
+        q = rotation.turn(quat, turned, 1.0, normalize=False)
+        at = into(pos + move + rotation.rotate(q, middle), True)
+        columns = [into(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
+        return distance(shape, geom.shape, at, jnp.stack(columns, axis=-1))
+
+    gap, pull = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
+    force, torque = pull(jnp.ones_like(gap))
+    normal = rotation.rotate_inverse(quat, force)
+    reach = jnp.sum(jnp.abs(normal) * jnp.asarray(shape.size, pos.dtype), axis=-1, keepdims=True)
+    point = rotation.cross(normal, torque) - reach * normal
+    return ContactPoints(gap, normal, point, jnp.broadcast_to(vel, normal.shape))
+
+
+def _frame(data: SimData, geom: CollisionGeom, row: int | None) -> tuple[Callable, Callable, Array | None]:
+    """Return functions that take points and directions into a geom's frame, and directions back, and its velocity."""
+    dtype = data.states.pos.dtype
+    at = jnp.asarray(geom.pos, dtype)
+    rot = None if geom.rot is None else jnp.asarray(geom.rot, dtype)
+    if row is None:
+        own_pos = own_quat = vel = None
+    else:
+        objects = data.objects
+        own_pos, own_quat, vel = (x[..., row, :] for x in (objects.pos, objects.quat, objects.vel))
+
+    def into(x: Array, is_point: bool) -> Array:
+        if own_quat is not None and own_pos is not None:
+            x = rotation.rotate_inverse(own_quat[..., None, :], x - own_pos[..., None, :] if is_point else x)
+        x = x - at if is_point else x
+        return x if rot is None else rotation.matvec(rot.T, x)
+
+    def back(x: Array) -> Array:
+        x = x if rot is None else rotation.matvec(rot, x)
+        return x if own_quat is None else rotation.rotate(own_quat[..., None, :], x)
+
+    return into, back, vel

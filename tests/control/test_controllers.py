@@ -1,0 +1,297 @@
+"""Controllers in a simulation: the protocol, the firmware's controllers in flight, and several with a switch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Latency, Sim, make
+from crazysim.control import Control, Controller, Setpoint
+from crazysim.control.mellinger import Mellinger
+from crazysim.control.pid import PID
+from crazysim.core import functional as F
+from crazysim.core.sharding import world_mesh
+from crazysim.pytree import PyTree, as_parameter, leaf
+
+WORLDS, DRONES = 3, 2
+
+
+class TowardsMemory(PyTree):
+    n_ticks: jax.Array = leaf("drone", 1)
+    feedforward: jax.Array = leaf("drone", 1)
+
+
+class TowardsParams(PyTree):
+    mass: jax.Array = leaf("parameter", 1, (1,))
+
+
+class Towards(Controller):
+    """Weight and a spring along z, with a counter of its ticks."""
+
+    name = "towards"
+    levels = (Control.state,)
+    output = Control.force_torque
+    freq: int = 100
+
+    def params(self, airframe):
+        return TowardsParams(as_parameter(airframe.value("rigid_body.mass")))
+
+    def memory(self, airframe):
+        return TowardsMemory(np.zeros(1), np.zeros(8))
+
+    def update(self, data, command, memory, params):
+        s = data.states
+        force = params.mass * (9.81 + 4 * (command.pos - s.pos) - 4 * s.vel)[2:]
+        memory = TowardsMemory(memory.n_ticks + 1, command.feedforward())
+        return jnp.concatenate([force, -1e-3 * s.ang_vel]), memory
+
+
+def setpoint_of(sim, offset=(0.0, 0.0, 1.0), yaw=0.0):
+    cmd = np.zeros((sim.n_worlds, sim.n_drones, 16), np.float32)
+    cmd[..., :3] = np.asarray(sim.default_data.states.pos) + offset
+    cmd[..., 9:13] = [0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]
+    return cmd
+
+
+def flown(controller, n_steps, engine="auto", offset=(0.0, 0.0, 1.0), n_worlds=WORLDS, **settings):
+    """Return a simulation that has taken off; like the real one, PID takes off straight up only."""
+    sim = Sim(n_worlds, DRONES, drone="cf2x_L250", control="state", controller=controller, engine=engine, **settings)
+    sim.state_control(setpoint_of(sim, offset))
+    sim.step(n_steps)
+    return sim
+
+
+def memory_of(sim):
+    return sim.data.controls.controller.memory
+
+
+def test_the_default_has_no_controller_record():
+    sim = Sim(control="state")
+    assert sim.data.controls.controller is None
+    assert sim.data.controls.state.feedforward is sim.data.controls.state.staged_feedforward is None
+    assert list(sim.step_pipeline)[:3] == ["state_controller", "attitude_controller", "force_torque_controller"]
+    assert len(jax.tree.leaves(sim.data)) == 64
+
+
+@pytest.mark.parametrize("controller", ["pid", "mellinger", Towards()], ids=["pid", "mellinger", "own"])
+def test_every_engine_flies_it_alike_in_one_kernel(controller):
+    fused, plain = (flown(controller, 600, engine, strict=True) for engine in ("fused", "plain"))
+    assert "fused, for one drone: state_controller" in fused.explain()
+    assert "not fused" not in fused.explain()
+    for a, b in zip(jax.tree.leaves(fused.data.states), jax.tree.leaves(plain.data.states), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-3, rtol=2e-3)
+
+
+@pytest.mark.parametrize("drone", ["cf2x_L250", "cf21B_500"])
+@pytest.mark.parametrize("controller, error", [("pid", 0.02), ("mellinger", 0.09)])
+def test_the_firmware_reaches_a_setpoint(controller, error, drone):
+    """Mellinger's nominal mass leaves an offset in height; PID has an integral large enough."""
+    sim = Sim(drone=drone, control="state", controller=controller)
+    cmd = setpoint_of(sim)
+    sim.state_control(cmd)
+    sim.step(1000)
+    sim.state_control(cmd + np.eye(16, dtype=np.float32)[0])
+    sim.step(5000)
+    np.testing.assert_allclose(sim.data.states.pos[0, 0], [1.0, 0.0, 1.0], atol=error)
+
+
+@pytest.mark.parametrize("hold_yaw", [False, True])
+def test_body_rates_are_followed_and_nothing_levels(hold_yaw):
+    """The field's CTBR: a roll rate turns the drone over, where Crazyflow's cascade levels it."""
+    sims = [Sim(drone="cf2x_L250", control="body_rate", controller=c) for c in (PID(hold_yaw=hold_yaw), "crazyflow")]
+    for sim in sims:
+        states = sim.data.states
+        sim.data = sim.data.replace(states=states.replace(pos=states.pos + jnp.array([0, 0, 20.0])))
+        sim.body_rate_control(np.array([[[2.0, 0.0, 0.0, 0.3]]], np.float32))
+        sim.step(500)
+    np.testing.assert_allclose(sims[0].data.states.ang_vel[0, 0], [2.0, 0.0, 0.0], atol=0.05)
+    assert abs(sims[0].data.states.quat[0, 0, 0]) > 0.7  # over 90 degrees
+    assert abs(sims[1].data.states.quat[0, 0, 0]) < 0.3
+
+
+def test_rates_through_a_flip():
+    """A pitch rate through 90 degrees, where Euler angles jump, disturbs no other axis."""
+    sim = Sim(drone="cf2x_L250", control="body_rate", controller="pid")
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos + jnp.array([0, 0, 50.0])))
+    sim.body_rate_control(np.array([[[0.0, 6.0, 0.0, 0.25]]], np.float32))
+    for _ in range(10):
+        sim.step(50)
+        np.testing.assert_allclose(sim.data.states.ang_vel[0, 0, ::2], 0.0, atol=0.05)
+    assert sim.data.states.ang_vel[0, 0, 1] > 5.5
+
+
+def test_a_controller_fires_at_its_rate_and_resets_per_world():
+    sim = flown(Towards(), 101)
+    np.testing.assert_array_equal(memory_of(sim).n_ticks[..., 0], 21.0)
+    sim.reset(np.array([True, False, True]))
+    np.testing.assert_array_equal(memory_of(sim).n_ticks[:, 0, 0], [0, 21, 0])
+    assert sim.control_freq == 100
+
+
+def test_feedforward_reaches_the_controller():
+    sim = Sim(WORLDS, DRONES, control="state", controller=Towards())
+    cmd = setpoint_of(sim)
+    cmd[..., 15] = 0.7
+    sim.state_control(cmd)
+    sim.step()
+    np.testing.assert_allclose(memory_of(sim).feedforward[0, 0], [0, 0, 0, 0, 0, 0, 0.7, 0], atol=1e-6)
+    forward = np.arange(8 * WORLDS * DRONES).reshape(WORLDS, DRONES, 8)
+    sim.state_control(cmd, feedforward=forward)
+    np.testing.assert_array_equal(sim.data.controls.state.staged_feedforward, forward)
+    sim.step(5)
+    np.testing.assert_allclose(memory_of(sim).feedforward, forward)
+    with pytest.raises(ValueError, match=r"feedforward command has shape.*jerk"):
+        sim.state_control(cmd, feedforward=forward[0])
+    with pytest.raises(ConfigError, match="Crazyflow's cascade"):
+        Sim(control="state").state_control(cmd[:1, :1], feedforward=forward[:1, :1])
+
+
+def test_latency_delays_setpoint_and_feedforward():
+    sim = Sim(control="state", controller=Towards(freq=500))
+    sim.add(Latency(10))
+    cmd = setpoint_of(sim)
+    cmd[..., 15] = 0.5
+    sim.state_control(cmd)
+    sim.step(10)
+    assert memory_of(sim).feedforward[0, 0, 6] == 0
+    assert sim.data.controls.state.cmd[0, 0, 2] == 0
+    sim.step()
+    assert memory_of(sim).feedforward[0, 0, 6] == 0.5
+    np.testing.assert_array_equal(sim.data.controls.state.cmd, cmd)
+
+
+@pytest.mark.parametrize("freq, outer, inner", [(500, 100, 500), (240, 80, 240), (1000, 100, 500)])
+def test_default_rates_are_lowered_to_divisors(freq, outer, inner):
+    sim = Sim(control="state", controller="pid", freq=freq)
+    assert (sim.control_freq, sim.data.controls.controller.freq) == (outer, inner)
+
+
+def test_rates_of_the_simulation_replace_those_of_the_controller():
+    sim = Sim(control="state", controller="pid", state_freq=50, attitude_freq=250)
+    assert (sim.control_freq, sim.data.controls.controller.freq) == (50, 250)
+    assert Sim(control="attitude", controller="mellinger", attitude_freq=125).control_freq == 125
+
+
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        ({"controller": "pd"}, r"expected controller as one of 'crazyflow', 'pid', .*got 'pd'"),
+        ({"controller": 3}, r"expected a controller as a name or a Controller, got 3"),
+        ({"controller": "mellinger", "control": "body_rate"}, r"'mellinger' follows, state or attitude.*body_rate"),
+        ({"controller": "pid", "dynamics": "so_rpy"}, r"expected dynamics with rotors for controller 'pid'"),
+        ({"controller": Mellinger(freq=300)}, r"expected freq of controller 'mellinger' to divide.*250 Hz"),
+        ({"controller": "pid", "drone": "bumblebee"}, r"'bumblebee' has no table \[pid"),
+        ({"controller": ["pid", "mellinger"]}, r"expected a switch for several controllers, got None"),
+        ({"controller": "pid", "switch": 0}, r"expected a list of controllers for a switch"),
+        ({"controller": [], "switch": 0}, r"expected at least one controller"),
+        ({"controller": ["crazyflow"], "switch": 0}, r"other than 'crazyflow'"),
+        ({"controller": ["pid"], "switch": 1}, r"expected switch as a function or as integers from 0 to 0"),
+        ({"controller": ["pid"], "switch": lambda state, setpoint, time: time}, r"expected one integer"),
+    ],
+)
+def test_wrong_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Sim(**({"control": "state"} | settings)).step()
+
+
+def test_records_declare_their_scopes():
+    class Bare(Towards):
+        def memory(self, airframe):
+            return {"count": np.zeros(1)}
+
+    with pytest.raises(ConfigError, match=r"expected leaves of scope drone in dict of controller 'towards'.*opaque"):
+        Sim(control="state", controller=Bare())
+
+
+def test_incomplete_controllers_are_refused():
+    with pytest.raises(TypeError, match="no field 'freq'"):
+
+        class Rateless(Controller):
+            name = "rateless"
+
+    with pytest.raises(TypeError, match=r"no class variables \['levels', 'output'\]"):
+
+        class Undeclared(Controller):
+            name = "undeclared"
+            freq: int = 100
+
+
+@pytest.mark.parametrize("controller", ["pid", "mellinger"])
+def test_gradients_flow_through_the_step(controller):
+    sim = Sim(control="state", controller=controller, drone="cf2x_L250", engine="plain")
+    sim.state_control(setpoint_of(sim))
+    sim.step(1500)  # far away, the speed is limited
+    cmd = jnp.asarray(setpoint_of(sim))
+
+    @jax.grad
+    def slope(cmd):
+        return sim.step_fn(F.state_control(sim.data, cmd), 10).states.vel[0, 0, 2]
+
+    gradient = slope(cmd)
+    assert np.all(np.isfinite(gradient))
+    assert gradient[0, 0, 2] > 0
+
+
+def test_it_shards():
+    one, two = (flown("pid", 50, mesh=mesh, n_worlds=4) for mesh in (None, world_mesh(jax.devices()[:2])))
+    np.testing.assert_allclose(one.data.states.rotor_vel, two.data.states.rotor_vel, rtol=1e-5)
+
+
+def test_an_environment_uses_it():
+    env = make("hover", n_worlds=2, control="body_rate", controller="pid")
+    state = env.reset(jax.random.key(0))
+    state = env.step(state, jnp.zeros((2, 1, 4)))
+    assert np.all(np.isfinite(state.obs["pos"] if isinstance(state.obs, dict) else state.obs))
+
+
+# Several controllers --------------------------------------------------------------------------------------------
+
+
+def at_one_second(state, setpoint, time):
+    return jnp.where(time < 1.0, 0, 1)
+
+
+def test_a_switch_function_exchanges_controllers_in_flight():
+    fused, plain = (
+        flown(["pid", Towards()], 800, engine, switch=at_one_second, strict=True) for engine in ("fused", "plain")
+    )
+    for sim in (fused, plain):
+        np.testing.assert_array_equal(memory_of(sim).active, 1)
+        np.testing.assert_array_equal(memory_of(sim).controllers[1].n_ticks, 60.0)
+    assert "not fused" not in fused.explain()
+    np.testing.assert_allclose(fused.data.states.pos, plain.data.states.pos, atol=1e-3)
+
+
+def test_each_drone_has_its_own():
+    index = np.array([[0, 1], [1, 0], [0, 0]])
+    both = flown(["pid", "mellinger"], 300, switch=index)
+    apart = [flown(name, 300) for name in ("pid", "mellinger")]
+    expected = np.where(index[..., None] == 0, *(sim.data.states.pos for sim in apart))
+    np.testing.assert_allclose(both.data.states.pos, expected, atol=1e-5)
+    np.testing.assert_array_equal(memory_of(both).active[..., 0], index)
+    # The memory of an inactive controller stands still.
+    assert not np.any(memory_of(both).controllers[1].ang_vel[index == 0])
+
+
+def test_the_choice_sees_state_and_setpoint():
+    def high(state, setpoint, time):
+        assert isinstance(setpoint, Setpoint)
+        return (state.pos[2] > 0.5 * setpoint.pos[2]).astype(int)
+
+    sim = flown(["pid", "mellinger"], 10, switch=high)
+    np.testing.assert_array_equal(memory_of(sim).active, 0)
+    sim.step(1000)
+    np.testing.assert_array_equal(memory_of(sim).active, 1)
+
+
+@pytest.mark.parametrize("names, bump", [(["mellinger", "pid"], 200.0), (["pid", "mellinger"], 1500.0)])
+def test_a_switch_in_hover_is_bumpless(names, bump):
+    """PID continues thrust and torque; Mellinger's integral is limited to 0.02 N about its nominal mass."""
+    sim = flown(names, 6000, switch=lambda state, setpoint, time: jnp.where(time < 12.0, 0, 1))
+    before = np.asarray(sim.data.controls.rotor_vel)
+    sim.step()
+    np.testing.assert_array_equal(memory_of(sim).active, 1)
+    assert np.max(np.abs(np.asarray(sim.data.controls.rotor_vel) - before)) < bump
+    sim.step(1000)
+    assert np.max(np.abs(sim.data.states.vel)) < 0.1

@@ -1,0 +1,109 @@
+"""The firmware's PID and Mellinger controllers, against a second implementation and against what they are for."""
+
+import firmware_flights as flown
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import vectors
+from firmware_reference import ReferenceMellinger, ReferencePid
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crazysim.control.mellinger import Mellinger, rotation_error
+from crazysim.control.pid import PID
+from crazysim.control.power_distribution import PowerDistributionParams, distribute, rotor_vel_of_pwm
+from crazysim.drones import load_airframe
+from crazysim.dynamics.rotor import curve
+from crazysim.errors import ConfigError
+
+# Torques in PWM amplify rounding: yaw has a derivative gain of 0.35 * 500 * 120 PWM per degree.
+FLOAT32_PWM = 3.0
+FILTERED = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
+CASES = [
+    (PID(hold_yaw=True), "state", "cf2x_L250", lambda: ReferencePid("state")),
+    (PID(hold_yaw=True), "state", "cf21B_500", lambda: ReferencePid("state", "cf21bl")),
+    (PID(hold_yaw=True), "state", FILTERED, lambda: ReferencePid("state", "cf2", 0.3, 2.0)),
+    (PID(hold_yaw=True), "attitude", "cf2x_L250", lambda: ReferencePid("attitude")),
+    (PID(hold_yaw=True), "body_rate", "cf2x_L250", lambda: ReferencePid("body_rate")),
+    (Mellinger(), "state", "cf2x_L250", lambda: ReferenceMellinger("state")),
+    (Mellinger(), "attitude", "cf2x_L250", lambda: ReferenceMellinger("attitude")),
+    (Mellinger(), "state", "cf21B_500", lambda: ReferenceMellinger("state", 0.0393)),
+]
+NAMES = ["pid-state", "pid-brushless", "pid-filters", "pid-attitude", "pid-rate", "mellinger", "m-attitude", "m-heavy"]
+
+
+@pytest.mark.parametrize("controller, mode, drone, make", CASES, ids=NAMES)
+def test_the_motors_are_those_of_the_reference(controller, mode, drone, make):
+    """Several hundred ticks, through saturation, yaw wraps, full integrals, upside down, and motors off."""
+    states, commands = flown.flights(mode, 10, 400, seed=7)
+    states, commands = states.astype(np.float32), commands.astype(np.float32)
+    expected = flown.reference(make, mode, states.astype(float), commands.astype(float))
+    assert 0.05 < np.mean(expected == 0) < 0.5
+    assert 0.05 < np.mean(expected == 65535) < 0.5
+    np.testing.assert_allclose(flown.law(controller, mode, states, commands, drone), expected, atol=FLOAT32_PWM)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("controller, mode, drone, make", [CASES[2], CASES[4], CASES[5]], ids=["pid", "rate", "m"])
+def test_in_float64_they_agree_to_rounding(controller, mode, drone, make):
+    states, commands = flown.flights(mode, 6, 200, seed=8)
+    expected = flown.reference(make, mode, states, commands)
+    np.testing.assert_allclose(flown.law(controller, mode, states, commands, drone), expected, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def motors():
+    return PowerDistributionParams.create(load_airframe("cf2x_L250"))
+
+
+def test_saturation_lowers_all_motors_and_keeps_the_torque(motors):
+    """60000 +- 10000 PWM: the excess of 4465 leaves all four, so the difference stays 20000."""
+    pwm = distribute(jnp.array([60000.0]), jnp.array([20000.0, 0, 0]), params=motors)
+    np.testing.assert_allclose(pwm, [45535, 45535, 65535, 65535], atol=0.02)
+
+
+@given(vectors(3, 60000.0), st.floats(1.0, 65535.0))
+def test_power_distribution_stays_within_the_limits(torque, thrust):
+    motors = PowerDistributionParams.create(load_airframe("cf2x_L250"))
+    pwm = np.asarray(distribute(jnp.array([thrust]), jnp.asarray(torque, jnp.float32), params=motors))
+    assert pwm.min() >= 0
+    assert pwm.max() <= 65535.01
+    assert not np.any(distribute(jnp.array([0.0]), jnp.asarray(torque, jnp.float32), params=motors))
+
+
+def test_thrust_is_proportional_to_pwm_and_idle_is_off(motors):
+    pwm = jnp.array([0.0, 100.0, 32767.5, 65535.0])
+    rotor_vel = rotor_vel_of_pwm(pwm, params=motors)
+    assert rotor_vel[0] == 0
+    np.testing.assert_allclose(curve(rotor_vel, motors.rpm2thrust)[1:], 0.12 * pwm[1:] / 65535, rtol=1e-3)
+
+
+def test_the_rotation_error_is_twice_the_sine_of_the_angle():
+    def about_x(angle):
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        return jnp.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
+
+    np.testing.assert_allclose(rotation_error(about_x(0.3), jnp.eye(3)), [2 * np.sin(0.3), 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("controller", [PID(), Mellinger()], ids=["pid", "mellinger"])
+def test_an_airframe_without_gains_is_refused(controller):
+    with pytest.raises(ConfigError, match=rf"bumblebee.*{controller.name}.*airframes\.md"):
+        controller.params(load_airframe("bumblebee"))
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("controller", [PID(), Mellinger()], ids=["pid", "mellinger"])
+def test_gradients_are_finite_at_rest_and_at_saturation(controller):
+    """At rest the axes of a level drone coincide with the desired ones; far away every limit is active."""
+    states, commands = np.zeros((6, 2, 13)), np.zeros((6, 2, 16))
+    states[..., 9] = commands[..., 12] = 1.0
+    commands[:, 1, :3] = 50.0
+
+    def total(commands):
+        return flown.law_of(controller, "state", jnp.asarray(states), commands).sum()
+
+    gradient = jax.grad(total)(jnp.asarray(commands))
+    assert np.all(np.isfinite(gradient))
+    assert np.any(gradient[:, 0])

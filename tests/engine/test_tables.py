@@ -1,0 +1,220 @@
+"""Tables: shared arrays and constants that stages read at computed places, from memory, in every engine."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import PyTree, Sim, leaf, stage
+from crazysim.core.stage import as_stages
+from crazysim.engine import Step, cuda, interpret, kernel, native
+from crazysim.engine.build import build_program
+from crazysim.engine.ir import Builder, Numbers, Operation, Value
+from crazysim.engine.verify import VerificationError, verify, verify_block
+
+ENGINES = ("lanes", "interpret", *(("fused",) if native.compiler() else ()))
+RNG = np.random.default_rng(0)
+CONSTANTS = RNG.normal(size=(11, 2, 3)).astype(np.float32)
+CONSTANTS[:, 1, 2] = 0.25
+FAR = np.arange(70, dtype=np.int32)[::-1].copy()
+N_WORLDS, N_DRONES = 13, 2
+
+
+class Tables(PyTree):
+    """Shared arrays, and places of every drone, some of which do not exist."""
+
+    numbers: jax.Array = leaf("shared", 3)
+    """(9, 5, 4)"""
+    ends: jax.Array = leaf("shared", 1)
+    """(100,)"""
+    integers: jax.Array = leaf("shared", 1)
+    """(20,)"""
+    flags: jax.Array = leaf("shared", 1)
+    """(12,)"""
+    places: jax.Array = leaf("drone", 1)
+    """(n_worlds, n_drones, 3)"""
+    out: jax.Array = leaf("drone", 1)
+    """(n_worlds, n_drones, 8)"""
+
+
+CASES = {
+    "an entry": lambda t, i, j, k: t.ends[i],
+    "an entry of three axes": lambda t, i, j, k: t.numbers[i, j, k],
+    "a row": lambda t, i, j, k: t.numbers[i, j],
+    "a matrix, then a row of it": lambda t, i, j, k: t.numbers[i][j],
+    "a record of one, then a piece": lambda t, i, j, k: jax.tree.map(lambda x: x[i], t.numbers)[:, 1][j],
+    "along the last axis": lambda t, i, j, k: t.numbers[..., k][2, :3],
+    "a known and a computed place": lambda t, i, j, k: t.numbers[i, 3],
+    "part of a table": lambda t, i, j, k: t.ends[3:97:2][i],
+    "a table turned around": lambda t, i, j, k: t.ends[::-1][i],
+    "a transposed table": lambda t, i, j, k: t.numbers.T[k, j],
+    "a table in another shape": lambda t, i, j, k: t.numbers.reshape(45, 4)[i],
+    "filled outside": lambda t, i, j, k: t.numbers.at[i, j].get(mode="fill", fill_value=7.0),
+    "clipped": lambda t, i, j, k: t.numbers.at[i, j].get(mode="clip"),
+    "a slice": lambda t, i, j, k: jax.lax.dynamic_slice(t.ends, (i,), (4,)),
+    "a corner": lambda t, i, j, k: jax.lax.dynamic_slice(t.numbers, (i, j, k), (2, 1, 2)).ravel(),
+    "several places": lambda t, i, j, k: t.ends[jnp.stack([i, j, i + j])],
+    "several at once": lambda t, i, j, k: jax.vmap(lambda a: t.numbers[a, j, 1])(jnp.stack([i, k])),
+    "places from a table": lambda t, i, j, k: t.ends[t.integers[i]],
+    "truth values": lambda t, i, j, k: jnp.where(t.flags[i], 1.0, 2.0),
+    "integers": lambda t, i, j, k: t.integers[i].astype(jnp.float32),
+    "unsigned places": lambda t, i, j, k: t.ends[i.astype(jnp.uint32)],
+    "small places": lambda t, i, j, k: t.ends[i.astype(jnp.int8)],
+    "constants": lambda t, i, j, k: jnp.asarray(CONSTANTS)[i, :, 1:].ravel(),
+    "more constants than can be selected": lambda t, i, j, k: jnp.asarray(FAR)[i].astype(jnp.float32),
+    "in a branch": lambda t, i, j, k: jax.lax.cond(i > 2, lambda: t.ends[i], lambda: t.ends[j]),
+    "in a loop": lambda t, i, j, k: jax.lax.fori_loop(0, 7, lambda n, x: x + t.ends[n + i], 0.0),
+    "a bisection": lambda t, i, j, k: jnp.searchsorted(jnp.asarray(FAR)[::-1] * 0.5, i * 0.3).astype(jnp.float32),
+}
+
+
+@functools.cache
+def data():
+    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="rotor_vel")
+    places = RNG.integers(-3, 12, (N_WORLDS, N_DRONES, 3))
+    places[0] = [[2**31 - 1, -(2**31), 100], [99, -100, 5]]
+    tables = Tables(
+        jnp.asarray(RNG.normal(size=(9, 5, 4)), jnp.float32),
+        jnp.asarray(RNG.normal(size=100), jnp.float32),
+        jnp.asarray(RNG.integers(-5, 120, 20), jnp.int32),
+        jnp.asarray(RNG.integers(0, 2, 12), bool),
+        jnp.asarray(places, jnp.int32),
+        jnp.zeros((N_WORLDS, N_DRONES, 8), jnp.float32),
+    )
+    return sim.data.replace(plugins={"tables": tables})
+
+
+def of_case(name, scope="drone"):
+    def of_one(tables, places):
+        found = jnp.atleast_1d(CASES[name](tables, *places))
+        return jnp.pad(found.astype(jnp.float32), (0, 8 - len(found)))
+
+    @stage(scope, when=lambda data: data.core.steps % 2 == 0)
+    def read(data):
+        tables = data.plugins["tables"]
+        one = functools.partial(of_one, tables)
+        out = one(tables.places) if scope == "drone" else jnp.stack([one(p) for p in tables.places])
+        return data.replace(plugins={"tables": tables.replace(out=out)})
+
+    return read
+
+
+def pipeline(names, scope="drone"):
+    return {name: of_case(name, scope) for name in names}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("scope", ["drone", "world"])
+def test_every_engine_reads_what_plain_reads(engine, scope):
+    """Each case by itself in the interpreter; all of them, summed up, in what has to be compiled."""
+    chosen = list(CASES) if scope == "drone" else ["a matrix, then a row of it", "constants", "places from a table"]
+    if engine == "interpret":
+        for name in chosen:
+            expected = Step(pipeline([name], scope), "plain")(data(), jnp.int32(1)).plugins["tables"].out
+            program = build_program(as_stages(pipeline([name], scope)), data())
+            verify(program)
+            assert program.fused, program.unfused_stages[0].unfused
+            leaves = jax.tree.leaves(data())
+            (out,), _ = interpret.steps(program, [*leaves, _packed(program, leaves)], 1)
+            np.testing.assert_array_equal(out, expected, err_msg=name)
+        return
+
+    @stage(scope)
+    def total(data):
+        tables = data.plugins["tables"]
+        summed = 0.0
+        for n, name in enumerate(chosen):
+            after = of_case(name, scope).fn(data).plugins["tables"].out
+            summed = summed + after * 0.9**n
+        return data.replace(plugins={"tables": tables.replace(out=summed)})
+
+    expected = Step({"total": total}, "plain")(data(), jnp.int32(1)).plugins["tables"].out
+    found = Step({"total": total}, engine)(data(), jnp.int32(1)).plugins["tables"].out
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-3)
+
+
+def _packed(program, leaves):
+    return jnp.concatenate([leaves[i].ravel() for i in program.packed]) if program.packed else jnp.zeros(0)
+
+
+def test_a_table_is_read_where_it_is_and_never_selected_from():
+    program = build_program(as_stages(pipeline(["a matrix, then a row of it"])), data())
+    (segment,) = program.fused_segments
+    names = [op.name for op in segment.block.walk()]
+    assert names.count("lookup") == 4
+    assert names.count("select_n") < 4
+    assert "float32[180] = plugins['tables'].numbers[:]" in str(program)
+    assert "lookup(" in str(program)
+    assert not program.packed
+
+
+def test_constants_that_are_the_same_everywhere_are_no_lookups():
+    program = build_program(as_stages(pipeline(["constants"])), data())
+    (segment,) = program.fused_segments
+    names = [op.name for op in segment.block.walk()]
+    assert (names.count("table"), names.count("lookup")) == (1, 3)
+
+
+def test_the_source_for_gpus_is_well_formed():
+    """All cases in one kernel, compiled by NVRTC where there is one."""
+    program = build_program(as_stages(pipeline(CASES)), data())
+    text = kernel.write(program, "cuda").text
+    assert "TABLE f32 t" in text
+    assert text.count("lookup(p") > 20
+    if cuda.nvrtc() is None:
+        pytest.skip("no NVRTC here")
+    assert cuda._compile(text, cuda.DEFAULT_ARCHITECTURE, "PTX")
+
+
+@pytest.mark.parametrize("engine", ENGINES[:1] + ENGINES[2:])
+def test_gradients_by_states_and_entries_are_those_of_plain(engine):
+    @stage("drone")
+    def read(data):
+        tables, vel = data.plugins["tables"], data.states.vel
+        row = tables.numbers[tables.places[0], tables.places[1]]
+        return data.replace(states=data.states.replace(vel=vel * row[:3] + row[3]))
+
+    def loss(step, numbers, vel):
+        tables = data().plugins["tables"].replace(numbers=numbers)
+        start = data().replace(plugins={"tables": tables}, states=data().states.replace(vel=vel))
+        return jnp.sum(step(start, 2).states.vel ** 2)
+
+    numbers, vel = data().plugins["tables"].numbers, data().states.vel + jnp.asarray([1.0, 2.0, 3.0])
+    found, expected = (
+        jax.grad(functools.partial(loss, Step({"read": read}, e)), argnums=(0, 1))(numbers, vel)
+        for e in (engine, "plain")
+    )
+    for a, b in zip(found, expected, strict=True):
+        assert float(jnp.abs(b).max()) > 0.1
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+
+
+def test_another_table_of_the_same_shape_is_not_compiled_again():
+    step = Step(pipeline(["a row"]), "auto")
+    before = step(data(), jnp.int32(1)).plugins["tables"].out
+    tables = data().plugins["tables"]
+    other = data().replace(plugins={"tables": tables.replace(numbers=2 * tables.numbers)})
+    np.testing.assert_array_equal(step(other, jnp.int32(1)).plugins["tables"].out, 2 * before)
+    assert step.plan(other) is step.plan(data())
+
+
+def test_verify_finds_wrong_tables():
+    builder = Builder()
+    table, place = builder.input(np.float32, 4), builder.input(np.int32)
+    entry = builder.add("lookup", (table, place), np.float32, (("offset", 3),))
+    good = builder.finish([entry])
+    verify_block(good)
+    (op,) = good.operations
+    for wrong in (
+        op._replace(params=(("offset", 4),)),
+        op._replace(args=(place, place)),
+        op._replace(args=(table, table)),
+        Operation("add", (table, table), (Value(np.dtype(np.float32)),)),
+        Operation("table", (), (Value(np.dtype(np.float32), 3),), (("numbers", Numbers(np.zeros(2, np.float32))),)),
+    ):
+        with pytest.raises(VerificationError):
+            verify_block(type(good)(good.inputs, (wrong,), wrong.results))
+    with pytest.raises(VerificationError, match="table"):
+        verify_block(type(good)(good.inputs, (), (table,)))
