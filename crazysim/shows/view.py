@@ -27,9 +27,15 @@ SHOWN = 0.7
 """Time for which a collision is marked, s."""
 RED = (1.0, 0.1, 0.1, 0.55)
 """Colour of a mark."""
+NIGHT_LIGHT = 0.1
+"""Brightest light at night, 0 to 1."""
+NIGHT_SKY = (8, 10, 24)
+"""Brightest colour of the sky at night, 0 to 255."""
 
 
-def film(flight: ShowFlight, path: str | Path, fps: float = 25, progress: bool = False, **view: Any) -> int:
+def film(
+    flight: ShowFlight, path: str | Path, fps: float = 25, progress: bool = False, night: bool = True, **view: Any
+) -> int:
     """Film a flown show, and return the number of frames.
 
     Args:
@@ -37,6 +43,7 @@ def film(flight: ShowFlight, path: str | Path, fps: float = 25, progress: bool =
         path: ``.mp4`` or ``.gif`` file to write.
         fps: Frames per second.
         progress: True to show a progress bar, which needs tqdm.
+        night: True to darken the scene, which makes the lights stand out.
         view: Settings of ``crazysim.media.View`` other than its own.
 
     Raises:
@@ -44,6 +51,8 @@ def film(flight: ShowFlight, path: str | Path, fps: float = 25, progress: bool =
         ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
         RenderError: If this machine cannot draw, or the file cannot be written.
     """
+    if night:
+        darken(flight.sim)
     with Film(path, view_of(flight, **view), fps=fps, progress=progress) as recording:
         return recording.play(flight.sim, media_flight(flight))
 
@@ -106,7 +115,7 @@ def view_of(flight: ShowFlight, **settings: Any) -> View:
         color_leds(sim, lit, flight.colors[k])
         glow = np.concatenate([flight.colors[k], np.full((flight.show.n_drones, 1), 0.6)], axis=1)
         pos = np.asarray(sim.data.states.pos[world], float)
-        draw_points(sim, pos, glow, max(GLOW * size, MIN_GLOW))
+        sim.overlays.points(pos, glow, max(GLOW * size, MIN_GLOW), emission=1.0)
         for mark in marks:
             if 0 <= now - mark["time"] <= SHOWN:
                 ids = [flight.show.names.index(name) for name in mark["drones"]]
@@ -129,6 +138,20 @@ def color_leds(sim: Sim, materials: tuple[str, ...], colors: NDArray) -> None:
     rgba = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
     for material in materials:
         change_material(sim, material, np.arange(len(colors)), rgba=rgba, emission=colors.max(1))
+
+
+def darken(sim: Sim) -> None:
+    """Limit the lights and the sky of a simulation's scene to those of a night, before its first image."""
+    model = sim.mj_model
+    head = model.vis.headlight
+    for light in (model.light_diffuse, model.light_ambient, head.ambient, head.diffuse):
+        np.minimum(light, NIGHT_LIGHT, out=light)
+    haze = model.vis.rgba.haze
+    np.minimum(haze[:3], np.array(NIGHT_SKY) / 255, out=haze[:3])
+    for k in np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX):
+        n = model.tex_height[k] * model.tex_width[k] * model.tex_nchannel[k]
+        sky = model.tex_data[model.tex_adr[k] : model.tex_adr[k] + n].reshape(-1, model.tex_nchannel[k])
+        np.minimum(sky[:, :3], NIGHT_SKY, out=sky[:, :3], casting="unsafe")
 
 
 def _lit(sim: Sim) -> tuple[str, ...]:

@@ -137,24 +137,27 @@ def test_film_has_the_colours_of_the_lights(flight, tmp_path, opengl):
     bluish = [int(((x[..., 2] > 150) & (x[..., :2].max(-1) < 90)).sum()) for x in images]
     assert reddish[0] > reddish[1]
     assert bluish[1] > bluish[0]
+    flight.sim.close()
     assert film(flight, tmp_path / "show.mp4", fps=2, width=320, height=240) == 5
+    put(flight.sim, media_flight(flight), 1.95)
+    night = view.render(flight.sim).astype(int)
+    flight.sim.data = data
+    assert np.median(night) < 0.5 * np.median(images[1])  # the scene is dark, the lights are not
+    assert np.percentile(night.max(-1), 99.9) > 120
     assert (tmp_path / "show.mp4").stat().st_size > 1000
 
 
-def test_page_has_lights(flight, viser):
-    html = page(flight)
-    assert html.startswith("<!")
-    assert len(html) > 1000
+def test_page_has_lights_that_change(flight, viser):
     from crazysim.media import web
-
-    with pytest.raises(ConfigError, match="lights of shape"):
-        web.page(web_flight(flight), lights=flight.colors[:3])
-
-
-def web_flight(flight):
     from crazysim.shows.view import media_flight
 
-    return media_flight(flight)
+    recorded = media_flight(flight)
+    still = np.broadcast_to(flight.colors[:1], flight.colors.shape)
+    sizes = [len(web.page(recorded)), len(web.page(recorded, lights=still)), len(page(flight))]
+    assert sizes[0] < sizes[1]
+    assert sizes[1] + 300 < sizes[2]
+    with pytest.raises(ConfigError, match="lights of shape"):
+        web.page(recorded, lights=flight.colors[:3])
 
 
 def test_command(tmp_path, capsys):
