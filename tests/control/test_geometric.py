@@ -117,7 +117,8 @@ def test_a_wrench_is_brought_within_the_limits_by_priority(wrench):
     out = np.asarray(priority(wrench, params=p))
     low, high = float(p.thrust_min[0]), float(p.thrust_max[0])
     thrusts = thrusts_of(out, p)
-    assert np.all(thrusts > low - 1e-12) and np.all(thrusts < high + 1e-12)
+    assert np.all(thrusts > low - 1e-12)
+    assert np.all(thrusts < high + 1e-12)
     wanted = thrusts_of(wrench, p)
     if np.all((wanted >= low) & (wanted <= high)):
         np.testing.assert_allclose(out, wrench, atol=1e-12)
@@ -128,7 +129,8 @@ def test_a_wrench_is_brought_within_the_limits_by_priority(wrench):
         cosine = out[1:3] @ wrench[1:3] / np.linalg.norm(out[1:3]) / np.linalg.norm(wrench[1:3])
         np.testing.assert_allclose(cosine, 1.0)
         np.testing.assert_allclose(np.ptp(thrusts_of(np.array([0, *out[1:3], 0]), p)), high - low)
-    assert out[3] * wrench[3] >= 0 and abs(out[3]) <= abs(wrench[3]) + 1e-15
+    assert out[3] * wrench[3] >= 0
+    assert abs(out[3]) <= abs(wrench[3]) + 1e-15
 
 
 def test_full_thrust_keeps_the_torque():
