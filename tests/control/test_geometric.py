@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from crazysim import Sim, load_airframe
 from crazysim.control import Setpoint
 from crazysim.control.bandwidth import bandwidth, rotor_rate
-from crazysim.control.geometric import Geometric, GeometricParams, geometric_control
+from crazysim.control.flatness import Attitude
+from crazysim.control.geometric import Geometric, GeometricParams, attitude_errors, geometric_control
 from crazysim.control.priority import prioritized_wrench
 from crazysim.trajectories import Follow, shapes
 
@@ -89,6 +90,25 @@ def test_a_drone_that_tracks_gets_the_wrench_of_its_motion():
         np.testing.assert_allclose(wrench[0], 0.605 * np.linalg.norm(sp.acc + gravity), rtol=1e-9)
         np.testing.assert_allclose(wrench[1:], p.J @ now.ang_acc + np.cross(now.ang_vel, momentum), atol=1e-10)
         assert np.linalg.norm(now.ang_acc) > 0.2
+
+
+@pytest.mark.usefixtures("x64")
+@given(quat=unit_quats(), other=unit_quats(), ang_vel=vectors(3, 5.0), w_d=vectors(3, 5.0), acc_d=vectors(3, 9.0))
+def test_the_angular_acceleration_of_tracking_keeps_the_rate_error(quat, other, ang_vel, w_d, acc_d):
+    """Along R' = R w^, R_d' = R_d w_d^ and w' = acc, the error w - R^T R_d w_d does not change."""
+    matrix, desired = Rotation.from_quat(quat).as_matrix(), Rotation.from_quat(other).as_matrix()
+    acc = attitude_errors(matrix, ang_vel, Attitude(desired, w_d, acc_d))[2]
+    rates = matrix @ skew(ang_vel), desired @ skew(w_d)
+
+    def rate_error(matrix, desired, w, w_d):
+        return w - matrix.T @ desired @ w_d
+
+    slope = jax.jvp(rate_error, (matrix, desired, ang_vel, w_d), (*rates, np.asarray(acc), acc_d))[1]
+    np.testing.assert_allclose(slope, 0.0, atol=1e-10)
+
+
+def skew(w):
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
 
 
 @pytest.mark.usefixtures("x64")
