@@ -73,8 +73,10 @@ def test_flight_by_commands(sim):
 
     fleet.apply([Upload(7, line((2, 1, 0.8), (2, 0, 0.8))), Start(7)])
     sim.step(500)
+    staged = np.asarray(sim.data.controls.state.staged_cmd[0, 2, :3])
     fleet.apply([Hover(7)])
     here = fleet.setpoint(2)
+    np.testing.assert_allclose(staged, here[:3], atol=0.03)  # up to a tick apart
     assert 0.2 < here[1] < 0.8
     sim.step(1000)
     np.testing.assert_allclose(pos(sim)[2], here[:3], atol=SETTLED)

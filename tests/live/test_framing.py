@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from crazysim.live import framing
 from crazysim.live.framing import Frames, FramingError, Message, Request, ShowFile
 
-TRICKY = {"name": '_EOF "quoted\\" {', "a_b": {"points": [[0.0, [1, 2, 3], []]]}, "SKYC": "START"}
+TRICKY = {"name": '_EOF "quoted\\" {', "odd": '" {', "a_b": {"points": [[0.0, [1, 2, 3], []]]}, "SKYC": "START"}
 JSON = json.dumps(TRICKY).encode()
 ARCHIVE = (
     b"PK\x03\x04 data with SKYC and PK\x05\x06 inside" + bytes(30) + b"PK\x05\x06" + bytes(16) + b"\x04\x00" + b"note"

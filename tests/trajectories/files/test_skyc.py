@@ -3,6 +3,7 @@
 import copy
 import json
 import random
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -205,6 +206,13 @@ def test_bombs_are_refused():
     zeros = b"0" * (17 * 2**20)
     with pytest.raises(ConfigError, match="at most 16777216 bytes"):
         parse_show(show_files.archive({"show.json": zeros}))
+    bomb = show_files.archive({"show.json": zeros * 8})
+    tracemalloc.start()
+    with pytest.raises(ConfigError, match="at most 16777216 bytes"):
+        parse_show(bomb)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * 2**24  # not the whole of it
     lying = bytearray(show_files.archive({"show.json": zeros}))
     for signature, offset in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):  # both state a size of 10 bytes
         at = lying.index(signature) + offset
