@@ -88,13 +88,13 @@ def attitude_of_thrust(
     """Return the attitude whose z axis is along a thrust vector and whose x axis is closest to a heading.
 
     With the thrust ``f``, the heading ``c = (cos yaw, sin yaw, 0)`` and ``l = e_z x c``, the axes are ``z = f / |f|``,
-    ``y = z x c / |z x c|`` and ``x = y x z`` (Mellinger and Kumar 2011, eq. 4 to 6). The rates follow from two
+    ``y = z x c / |z x c|`` and ``x = y x z`` (Mellinger and Kumar 2011). The rates follow from two
     conditions, differentiated once and twice: ``z' = w_y x - w_x y``, and ``y . c = 0``:
 
         w_z x.c = w_x z.c + yaw' y.l
 
-    A thrust below ``NO_THRUST`` counts as one along z that does not change. Where thrust and heading are parallel, y is the horizontal ``l``, and the
-    rate about z is limited (``HORIZONTAL``).
+    A thrust below ``NO_THRUST`` counts as one along z that does not change. Where thrust and heading are parallel, y is
+    the horizontal ``l``, and the rate about z is limited (``HORIZONTAL``).
 
     Args:
         thrust: Thrust vector over the mass, world frame, m/s^2. (..., 3)
@@ -106,17 +106,10 @@ def attitude_of_thrust(
     """
     cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
     ahead, left = jnp.concatenate([cos, sin, zero], axis=-1), jnp.concatenate([-sin, cos, zero], axis=-1)
-    falls = dot(thrust, thrust) < NO_THRUST**2
-    inverse = jnp.where(falls, 0.0, 1 / rotation.safe_norm(jnp.where(falls, 1.0, thrust)))
-    z = jnp.where(falls, jnp.asarray([0.0, 0.0, 1.0], thrust.dtype), thrust * inverse)
+    z, z_rate, z_acc = direction_of(thrust, thrust_rate, thrust_acc)
     across = cross(z, ahead)
     y = jnp.where(dot(across, across) < 1e-10, left, rotation.safe_normalize(across, left))
     x = rotation.safe_normalize(cross(y, z), ahead)  # exactly one unless thrust and heading are parallel
-
-    growth = dot(z, thrust_rate) * inverse
-    z_rate = thrust_rate * inverse - growth * z
-    growth_rate = (dot(z_rate, thrust_rate) + dot(z, thrust_acc)) * inverse
-    z_acc = thrust_acc * inverse - 2 * growth * z_rate - growth_rate * z
 
     x_ahead = jnp.maximum(dot(x, ahead), HORIZONTAL)
     z_ahead, y_left, x_left, z_left = dot(z, ahead), dot(y, left), dot(x, left), dot(z, left)
@@ -127,3 +120,23 @@ def attitude_of_thrust(
     az = wx * wy + swing / x_ahead
     ang_vel, ang_acc = jnp.concatenate([wx, wy, wz], axis=-1), jnp.concatenate([ax, ay, az], axis=-1)
     return Attitude(jnp.stack([x, y, z], axis=-1), ang_vel, ang_acc)
+
+
+def direction_of(thrust: Array, thrust_rate: Array, thrust_acc: Array) -> tuple[Array, Array, Array]:
+    """Return the unit vector along a vector, and its first two derivatives; e_z at rest below ``NO_THRUST``.
+
+    Args:
+        thrust: Vector, m/s^2. (..., 3)
+        thrust_rate: Its derivative, m/s^3. (..., 3)
+        thrust_acc: Its second derivative, m/s^4. (..., 3)
+
+    Returns:
+        Direction, its derivative, 1/s, and its second derivative, 1/s^2. (..., 3) each
+    """
+    falls = dot(thrust, thrust) < NO_THRUST**2
+    inverse = jnp.where(falls, 0.0, 1 / rotation.safe_norm(jnp.where(falls, 1.0, thrust)))
+    z = jnp.where(falls, jnp.asarray([0.0, 0.0, 1.0], thrust.dtype), thrust * inverse)
+    growth = dot(z, thrust_rate) * inverse
+    z_rate = thrust_rate * inverse - growth * z
+    growth_rate = (dot(z_rate, thrust_rate) + dot(z, thrust_acc)) * inverse
+    return z, z_rate, thrust_acc * inverse - 2 * growth * z_rate - growth_rate * z

@@ -56,6 +56,7 @@ TABLES: dict[str, dict[str, Shapes]] = {
         "kd_omega": _VECTOR,
         "int_err_max": _VECTOR,
     },
+    "geometric": {"kr": _NUMBER, "kv": _NUMBER, "kR": _NUMBER, "kw": _NUMBER},
     "mellinger": {
         "mass": _NUMBER,
         "mass_thrust": _NUMBER,

@@ -1,0 +1,18 @@
+"""Loads that hang from drones: on rods and cables, on hooks, and below several drones."""
+
+from crazysim.payloads.core import LoadData, direction, load_pos, load_vel
+from crazysim.payloads.hook import Hook, HookData
+from crazysim.payloads.shared import SharedLoad, SharedLoadData
+from crazysim.payloads.slung import SlungLoad
+
+__all__ = [
+    "Hook",
+    "HookData",
+    "LoadData",
+    "SharedLoad",
+    "SharedLoadData",
+    "SlungLoad",
+    "direction",
+    "load_pos",
+    "load_vel",
+]
