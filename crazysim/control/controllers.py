@@ -12,13 +12,13 @@ from crazysim.errors import ConfigError, UnknownNameError
 CASCADE = "crazyflow"
 """Name of Crazyflow's cascade, which is made of stages of its own and follows every command level."""
 CONTROLLERS = {
+    "pid": "crazysim.control.pid:PID",
+    "mellinger": "crazysim.control.mellinger:Mellinger",
     "geometric": "crazysim.control.geometric:Geometric",
     "indi": "crazysim.control.indi:INDI",
     "lqr": "crazysim.control.lqr:LQR",
     "load_lqr": "crazysim.control.load_lqr:LoadLQR",
     "tracking_lqr": "crazysim.control.tracking_lqr:TrackingLQR",
-    "pid": "crazysim.control.pid:PID",
-    "mellinger": "crazysim.control.mellinger:Mellinger",
 }
 """Controllers by name, as ``"module:class"``; each is imported at its first use."""
 

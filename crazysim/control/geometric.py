@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,9 +19,6 @@ from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
-
-if TYPE_CHECKING:  # data belong to a layer above
-    from crazysim.core.data import SimData
 
 Gains = Literal["bandwidth", "airframe"]
 """Rule for the gains: by bandwidth, or from the airframe's table ``[geometric]``."""
@@ -191,13 +188,13 @@ class Geometric(Controller):
     gains: Gains = "bandwidth"
     """Rule for the gains, as for ``GeometricParams.create``."""
     feedforward: bool = True
-    """False for the law of AIMotionLab-Virtual, without feed-forward."""
+    """True to feed the derivatives of the setpoint forward; without, it is the law of AIMotionLab-Virtual."""
 
     def params(self, airframe: Airframe) -> GeometricParams:
         """Return gains and constants for an airframe."""
         return GeometricParams.create(airframe, self.freq, self.gains)
 
-    def update(self, data: SimData, command: Any, memory: Any, params: GeometricParams) -> tuple[Array, Any]:
+    def update(self, data: Any, command: Any, memory: Any, params: GeometricParams) -> tuple[Array, Any]:
         """Return the wrench."""
         s = data.states
         state = (s.pos, s.quat, s.vel, s.ang_vel)

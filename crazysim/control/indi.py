@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,9 +22,6 @@ from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
-
-if TYPE_CHECKING:  # data belong to a layer above
-    from crazysim.core.data import SimData
 
 LEAD = 2.0
 """Factor by which the feedback of rotor speeds makes the rotors faster than their own lag, 1."""
@@ -230,7 +227,7 @@ class INDI(Controller):
         """Return the memory before the first tick."""
         return INDIMemory.at_rest()
 
-    def update(self, data: SimData, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:
+    def update(self, data: Any, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:
         """Return the rotor speeds."""
         s = data.states
         state = (s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel)

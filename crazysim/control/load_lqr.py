@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,7 @@ from crazysim.control.bandwidth import bandwidth
 from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust, direction_of
 from crazysim.control.linear import linearize, load_derivative, rod_angles
-from crazysim.control.lqr import GRAVITY_VEC, Reference, into_heading, as_weights, on_host, state_error
+from crazysim.control.lqr import GRAVITY_VEC, Reference, as_weights, into_heading, on_host, state_error
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.riccati import gain_discrete
@@ -23,11 +23,8 @@ from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
-if TYPE_CHECKING:  # data belong to a layer above
-    from crazysim.core.data import SimData
-
 Target = Literal["load", "drone"]
-"""What a setpoint describes."""
+"""Body that a setpoint describes."""
 
 
 class LoadLQRParams(PyTree):
@@ -258,7 +255,7 @@ class LoadLQR(Controller):
     length: float = 0.4
     """Length of the rod, m."""
     target: Target = "load"
-    """What setpoints describe."""
+    """Body that setpoints describe."""
     load: str = "load"
     """Name of the plugin of the load, whose record has ``pos`` and ``vel`` of the load."""
     Q: Any = None
@@ -275,7 +272,7 @@ class LoadLQR(Controller):
         return LoadLQRMemory(as_parameter(np.zeros(3)), as_parameter(0.0))
 
     def update(
-        self, data: SimData, command: Any, memory: LoadLQRMemory, params: LoadLQRParams
+        self, data: Any, command: Any, memory: LoadLQRMemory, params: LoadLQRParams
     ) -> tuple[Array, LoadLQRMemory]:
         """Return the wrench."""
         s, load = data.states, data.plugins[self.load]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +23,6 @@ from crazysim.drones import Airframe
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
-
-if TYPE_CHECKING:  # data belong to a layer above
-    from crazysim.core.data import SimData
 
 GRAVITY_VEC = np.array([0.0, 0.0, -9.81])
 
@@ -245,7 +242,7 @@ class LQR(Controller):
         """Return gain and constants for an airframe."""
         return LQRParams.create(airframe, self.freq, self.Q, self.R)
 
-    def update(self, data: SimData, command: Any, memory: Any, params: LQRParams) -> tuple[Array, Any]:
+    def update(self, data: Any, command: Any, memory: Any, params: LQRParams) -> tuple[Array, Any]:
         """Return the wrench."""
         s = data.states
         return lqr_control(s.pos, s.quat, s.vel, s.ang_vel, command, params=params), memory

@@ -23,8 +23,8 @@ def solve_discrete(A: Array, B: Array, Q: Array, R: Array) -> Array:
         P = A^T P A - A^T P B (R + B^T P B)^-1 B^T P A + Q
 
     The structure-preserving doubling algorithm (Chu, Fan, Lin and Wang 2004): with ``G = B R^-1 B^T``, ``H = Q``,
-    ``W = (I + G H)^-1``, each step replaces A by ``A W A``, G by ``G + A W G A^T`` and H by ``H + A^T H W A``. H converges
-    quadratically to P, and A to zero if and only if the closed loop is stable, which decides between P and NaN. The
+    ``W = (I + G H)^-1``, each step replaces A by ``A W A``, G by ``G + A W G A^T`` and H by ``H + A^T H W A``. H
+    converges quadratically to P, and A to zero if and only if the closed loop is stable: otherwise P is NaN. The
     number of steps is fixed, so the function has derivatives of either kind. Newton's method (Hewer 1971) removes the
     rounding errors.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,9 +31,6 @@ from crazysim.drones import Airframe
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, matvec
-
-if TYPE_CHECKING:  # data belong to a layer above
-    from crazysim.core.data import SimData
 
 MAX_KNOTS = 60
 """Largest number of gains in a table."""
@@ -243,7 +240,7 @@ class TrackingLQR(Controller):
             allocation=hover.allocation,
         )
 
-    def update(self, data: SimData, command: Any, memory: Any, params: TrackingLQRParams) -> tuple[Array, Any]:
+    def update(self, data: Any, command: Any, memory: Any, params: TrackingLQRParams) -> tuple[Array, Any]:
         """Return the wrench."""
         s, core = data.states, data.core
         time = core.steps.astype(s.pos.dtype) / core.freq

@@ -203,8 +203,8 @@ class Plugin:
         has at most one plugin that constrains.
 
         Args:
-            data: Data of one drone, or of one world where ``coupling`` says so; with all influences applied if of one
-                drone.
+            data: Data of one drone with all influences applied, or of one world, without them, if ``coupling`` is
+                ``"world"``.
             deriv: Derivative of the free drone or drones.
             dt: Duration of the step that the derivative is for, s, in schemes of order 1: impulses of the step are
                 returned as mean accelerations, and added to ``vel`` and ``ang_vel`` too, with which the scheme moves

@@ -1,4 +1,4 @@
-"""What loads share: forces of air and floor, placing in the scene, and reading the swing."""
+"""Parts common to all loads: forces of air and floor, poses in the scene, and the swing of the rod."""
 
 from __future__ import annotations
 
@@ -127,9 +127,7 @@ def load_vel(data: SimData, name: str = "load") -> Array:
 # Scene ------------------------------------------------------------------------------------------------------
 
 
-def add_to_scene(
-    sim: Simulation, name: str, size: Any, rgba: Any, length: float, n_loads: int, n_pieces: int
-) -> None:
+def add_to_scene(sim: Simulation, name: str, size: Any, rgba: Any, length: float, n_loads: int, n_pieces: int) -> None:
     """Add the loads and links of a plugin to the scene, if they are not there yet.
 
     Args:
@@ -182,7 +180,9 @@ def pieces(top: Array, offset: Array, length: Array, n: int) -> tuple[Array, Arr
     """
     span = rotation.safe_norm(offset)
     # Length of a flat parabola of sag d over a span b: b + 8 d^2 / (3 b).
-    sag = rotation.safe_sqrt(0.375 * jnp.maximum(length - span, 0.0) * jnp.maximum(span, 0.1 * length)) if n > 1 else 0.0
+    sag = (
+        rotation.safe_sqrt(0.375 * jnp.maximum(length - span, 0.0) * jnp.maximum(span, 0.1 * length)) if n > 1 else 0.0
+    )
     share = jnp.linspace(0.0, 1.0, n + 1)[:, None, None]
     down = jnp.asarray([0.0, 0.0, -1.0], top.dtype)
     nodes = top + share * offset + 4 * share * (1 - share) * sag * down

@@ -1,8 +1,8 @@
 """Differential flatness of a drone with a point load: states and inputs from the path of the load.
 
-The load's position and the yaw are a flat output (Sreenath, Lee and Kumar 2013). With the load's mass m_L, the drone's m
-and the rod's length L the tension is ``T q = -m_L (x_L'' - g)``, so the load's acceleration gives the direction q of the
-rod, its next two derivatives give q' and q'', the drone is at ``x = x_L - L q``, and its thrust is
+The load's position and the yaw are a flat output (Sreenath, Lee and Kumar 2013). With the load's mass m_L, the drone's
+mass m and the rod's length L the tension is ``T q = -m_L (x_L'' - g)``, so the load's acceleration gives the direction
+q of the rod, its next two derivatives give q' and q'', the drone is at ``x = x_L - L q``, and its thrust is
 ``F = m (x'' - g) + m_L (x_L'' - g)``. The drone's jerk and snap need the fifth and sixth derivative of the path.
 """
 

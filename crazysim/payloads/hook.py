@@ -109,9 +109,7 @@ class Hook(Plugin):
             pos = jnp.broadcast_to(at, load.pos.shape)
             pos = pos.at[..., 2].set(jnp.maximum(pos[..., 2], load.clearance[..., 0]))
             values |= {"pos": pos, "vel": jnp.zeros_like(pos), "attached": jnp.zeros_like(load.attached)}
-            tip_pos, tip_vel = hanging(
-                sim.data.states, load.attach, load.length, jnp.zeros_like(load.clearance), False
-            )
+            tip_pos, tip_vel = hanging(sim.data.states, load.attach, load.length, jnp.zeros_like(load.clearance), False)
         return HookData(
             **values,
             tip_pos=jnp.array(tip_pos),
@@ -168,9 +166,7 @@ class Hook(Plugin):
             return jnp.where(picks, new, old)
 
         tip_vel = change(tip_vel, load.tip_vel)
-        held = held.replace(
-            tip_vel=tip_vel, vel=change(tip_vel, load.vel), pos=change(load.tip_pos, load.pos)
-        )
+        held = held.replace(tip_vel=tip_vel, vel=change(tip_vel, load.vel), pos=change(load.tip_pos, load.pos))
         states = s.replace(vel=change(after.vel, s.vel), ang_vel=change(after.ang_vel, s.ang_vel))
         return self.write(data.replace(states=states), held)
 

@@ -6,8 +6,8 @@ vector q from the attachment p to the mass, the tension T per mass (the *specifi
     t (1 + m_tip q.A q) = q.(a_tip - a_p) + |w|^2 / L + impulses
 
 where a_tip and a_p are the accelerations of mass and attachment without the link, w is the velocity of the mass across
-the link, relative to the attachment, and ``A`` maps a force at the attachment to its acceleration. Nothing divides by m_tip: at zero the
-body is free, and the mass still swings.
+the link, relative to the attachment, and A maps a force at the attachment to its acceleration. Nothing divides by
+m_tip: at zero the body is free, and the mass still swings.
 
 A hinge about the body's y axis keeps the mass in the body's x-z plane. That is a second constraint along the body's y
 axis, whose force acts on the body as if the rod were part of it, and so turns it.

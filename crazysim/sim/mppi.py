@@ -95,7 +95,7 @@ class MPPI:
     seed, equal calls return equal commands.
 
     Drones of a world are sampled together and weighted each on its own, which suits drones that do not interact.
-    Rollouts begin at step 0: effects that depend on the time since the reset start anew in each.
+    Rollouts begin at step 0, also for effects that depend on the time since the reset.
     """
 
     def __init__(

@@ -1,6 +1,7 @@
 """Trajectories: a record of piecewise polynomials, its constructors and checks, and the plugin that follows them."""
 
 from crazysim.trajectories.approaches import Approach
+from crazysim.trajectories.files import Lights, Show, load_csv, load_show, save_csv, save_show
 from crazysim.trajectories.follow import Follow, FollowData
 from crazysim.trajectories.limits import Limits, Report, Violation, check
 from crazysim.trajectories.shapes import circle, figure_eight, helix, hover, line, lissajous
@@ -13,8 +14,10 @@ __all__ = [
     "Approach",
     "Follow",
     "FollowData",
+    "Lights",
     "Limits",
     "Report",
+    "Show",
     "Trajectory",
     "Violation",
     "check",
@@ -24,9 +27,13 @@ __all__ = [
     "hover",
     "line",
     "lissajous",
+    "load_csv",
+    "load_show",
     "minimum_jerk",
     "minimum_snap",
     "of_bezier",
+    "save_csv",
+    "save_show",
     "smoothest",
     "spline",
 ]

@@ -10,11 +10,13 @@ from flights import figure_eight, fly, hover, rms, setpoint_of, simulation, star
 from hypothesis import given
 from scipy.spatial.transform import Rotation
 
-from crazysim import load_airframe
+from crazysim import Sim, load_airframe
 from crazysim.control import Setpoint
 from crazysim.control.bandwidth import bandwidth, rotor_rate
-from crazysim.control.geometric import GeometricParams, geometric_control
+from crazysim.control.flatness import Attitude
+from crazysim.control.geometric import Geometric, GeometricParams, attitude_errors, geometric_control
 from crazysim.control.priority import prioritized_wrench
+from crazysim.trajectories import Follow, shapes
 
 ZERO, LEVEL = np.zeros(3), np.array([0.0, 0, 0, 1])
 control = jax.jit(geometric_control, static_argnames="feedforward")
@@ -91,6 +93,25 @@ def test_a_drone_that_tracks_gets_the_wrench_of_its_motion():
 
 
 @pytest.mark.usefixtures("x64")
+@given(quat=unit_quats(), other=unit_quats(), ang_vel=vectors(3, 5.0), w_d=vectors(3, 5.0), acc_d=vectors(3, 9.0))
+def test_the_angular_acceleration_of_tracking_keeps_the_rate_error(quat, other, ang_vel, w_d, acc_d):
+    """Along R' = R w^, R_d' = R_d w_d^ and w' = acc, the error w - R^T R_d w_d does not change."""
+    matrix, desired = Rotation.from_quat(quat).as_matrix(), Rotation.from_quat(other).as_matrix()
+    acc = attitude_errors(matrix, ang_vel, Attitude(desired, w_d, acc_d))[2]
+    rates = matrix @ skew(ang_vel), desired @ skew(w_d)
+
+    def rate_error(matrix, desired, w, w_d):
+        return w - matrix.T @ desired @ w_d
+
+    slope = jax.jvp(rate_error, (matrix, desired, ang_vel, w_d), (*rates, np.asarray(acc), acc_d))[1]
+    np.testing.assert_allclose(slope, 0.0, atol=1e-10)
+
+
+def skew(w):
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
+@pytest.mark.usefixtures("x64")
 def test_drag_is_compensated():
     """At 2 m/s along x a Crazyflie Brushless has 0.0433 N of drag, and leans into it by its ratio to the weight."""
     p = params("cf21B_500", "bandwidth")
@@ -117,7 +138,8 @@ def test_a_wrench_is_brought_within_the_limits_by_priority(wrench):
     out = np.asarray(priority(wrench, params=p))
     low, high = float(p.thrust_min[0]), float(p.thrust_max[0])
     thrusts = thrusts_of(out, p)
-    assert np.all(thrusts > low - 1e-12) and np.all(thrusts < high + 1e-12)
+    assert np.all(thrusts > low - 1e-12)
+    assert np.all(thrusts < high + 1e-12)
     wanted = thrusts_of(wrench, p)
     if np.all((wanted >= low) & (wanted <= high)):
         np.testing.assert_allclose(out, wrench, atol=1e-12)
@@ -128,7 +150,8 @@ def test_a_wrench_is_brought_within_the_limits_by_priority(wrench):
         cosine = out[1:3] @ wrench[1:3] / np.linalg.norm(out[1:3]) / np.linalg.norm(wrench[1:3])
         np.testing.assert_allclose(cosine, 1.0)
         np.testing.assert_allclose(np.ptp(thrusts_of(np.array([0, *out[1:3], 0]), p)), high - low)
-    assert out[3] * wrench[3] >= 0 and abs(out[3]) <= abs(wrench[3]) + 1e-15
+    assert out[3] * wrench[3] >= 0
+    assert abs(out[3]) <= abs(wrench[3]) + 1e-15
 
 
 def test_full_thrust_keeps_the_torque():
@@ -209,3 +232,18 @@ def test_it_recovers_from_upside_down():
     states, _, _, _ = fly(sim, law("cf21B_500"), lambda t: hover(t) + np.array([0, 0, 19.0, 0]), 12.0)
     assert states.pos[:, 2].min() > 1.0
     np.testing.assert_allclose(states.pos[-1], [0, 0, 20], atol=0.02)
+
+
+@pytest.mark.parametrize("freq", [100, 500])
+def test_figure_eight_in_a_simulation(freq):
+    """By ``Follow`` and ``Sim(controller=Geometric(...))``: 2 cm RMS in the step itself, which is fused."""
+    eight = shapes.figure_eight(2.0, 1.0, speed=2.0)
+    sim = Sim(control="state", controller=Geometric(freq=freq), strict=True)
+    sim.add(Follow(eight))
+    start_at(sim, figure_eight)
+    evaluate, errors = jax.jit(eight.evaluate), []
+    for k in range(300):
+        sim.step(10)
+        target = evaluate(np.float32((k + 1) * 0.02)).pos
+        errors.append(np.linalg.norm(np.asarray(sim.data.states.pos)[0, 0] - target))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.02

@@ -27,9 +27,7 @@ def test_below_one_drone_it_is_the_slung_load(x64):
         record = load.read(sim.data)
         at = sim.data.states.pos[:, :1] + jnp.array([0.02, 0.01, -0.43])
         vel = jnp.array([0.5, 0.2, 0.0])
-        sim.data = load.write(
-            sim.data, record.replace(pos=at.reshape(record.pos.shape), vel=record.vel * 0 + vel)
-        )
+        sim.data = load.write(sim.data, record.replace(pos=at.reshape(record.pos.shape), vel=record.vel * 0 + vel))
         sim.step(200)
         ends.append(np.concatenate([np.ravel(load.read(sim.data).pos), np.ravel(sim.data.states.ang_vel)]))
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)  # SOFT is a millionth of the tension

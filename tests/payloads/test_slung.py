@@ -76,6 +76,7 @@ def test_law_08_energy_never_grows_below_a_heavy_drone(integrator, cable):
     angle = np.linspace(0.2, 2.5, 8)
     pos = np.stack([0.4 * np.sin(angle), 0 * angle, 2 - 0.4 * np.cos(angle)], axis=-1)[:, None]
     sim.data = with_load(load, sim.data, pos=pos)
+
     def energy():
         r = load.read(sim.data)
         speed = jnp.sum((r.vel - sim.data.states.vel) ** 2, axis=-1)

@@ -271,6 +271,7 @@ FN void store_row(b1* p, int n, b1v x) { store_each(p, 1, 1, 0, n, -x.m); }
 template <class V> struct four { V x[4]; };
 template <class T> FN T lookup(const T* p, i32 index, i32 k) { return p[index + k]; }
 template <class T> FN typename vec<T>::type lookup(const T* p, i32v index, i32 k) {
+  if (!any(ne_(index, index[0]))) return lift(p[index[0] + k]);  // drones that move alike
   typename vec<T>::type x;
   for (int i = 0; i < W; ++i) x[i] = p[index[i] + k];
   return x;
@@ -288,6 +289,10 @@ FN four<f32> lookup_four(const f32* p, i32 index, i32 k) {
 // Rows of four numbers are loaded whole and transposed, four at a time.
 typedef f32 f32x4 __attribute__((vector_size(16)));
 FN four<f32v> lookup_four(const f32* p, i32v index, i32 k) {
+  if (!any(ne_(index, index[0]))) {
+    const four<f32> r = lookup_four(p, index[0], k);
+    return {{lift(r.x[0]), lift(r.x[1]), lift(r.x[2]), lift(r.x[3])}};
+  }
   f32 columns[4][W];
   int i = 0;
 #if defined(__GNUC__) && !defined(__clang__)
