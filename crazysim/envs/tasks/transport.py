@@ -211,12 +211,17 @@ class Transport(Task):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return progress and proximity of the load, and costs of swinging, turning, changing actions and a crash."""
+        """Return progress and proximity of the load, and costs of swinging, turning, changing actions and a crash.
+
+        The approach reaches far, so that waiting before the gate pays less than passing it; proximity rewards rest at
+        the goal.
+        """
         own, to_go = delivery_of(data), self.to_go(data)
         rate = direction(data)[1]
         return {
             "progress": 5.0 * (own.to_go_before - to_go),
-            "proximity": terms.proximity(to_go, coarse=1.0),
+            "approach": 0.5 * jnp.exp(-to_go),
+            "proximity": terms.proximity(self.error(data), coarse=5.0),
             "swing": -0.01 * rotation.dot(rate, rate)[..., 0],
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
