@@ -45,9 +45,9 @@ AT_GOAL = {
 
 
 def environment(n_worlds, n_drones=1, **options):
-    """Return an environment."""
+    """Return an environment whose gate has an opening of 0.8 m."""
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
-    task = Transport(**options)
+    task = Transport(opening=0.8, **options)
     task.install(sim)
     return DroneEnv(sim, task)
 

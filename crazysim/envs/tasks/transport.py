@@ -82,7 +82,7 @@ class Transport(Task):
     """Length of rod or cable, m."""
     cable: bool = False
     """True for a cable, False for a rigid rod."""
-    opening: float = 0.8
+    opening: float = 1.0
     """Width and height of the gate's opening, m."""
     swing: float = 0.4
     """Largest angle of the load from the vertical at the start along x and y, rad; its rate is up to 1.5 times that,
