@@ -28,7 +28,7 @@ LANE = 3.0
 """Distance between the gates of several drones along y, m; each drone stays in its own lane."""
 HALF_SIZE, CEILING = (2.6, 1.4), 2.5
 """Largest distance of a drone from the middle of its lane along x and y, and largest height, m."""
-START = ((-2.0, -0.5, 1.3), (-1.2, 0.5, 1.8))
+START = ((-2.2, -0.5, 1.2), (-1.4, 0.5, 1.7))
 """Lowest and highest start of a drone in its lane, m."""
 GOAL = ((1.0, -0.5, 1.0), (1.8, 0.5, 1.5))
 """Lowest and highest goal of a load in its lane, m."""
