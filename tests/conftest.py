@@ -1,5 +1,6 @@
 """Shared by all tests: two host devices, a persistent compilation cache, and simulations built once."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -9,6 +10,8 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 # XLA logs an error of 3,000 characters for every program from the cache that could use another vector width.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ.update(compiling.environment(os.environ))
+# A program's operations do not carry the lines of Python that made them: writing it takes less time.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
 import jax
 import numpy as np
@@ -30,6 +33,16 @@ settings.register_profile(
     "crazysim", deadline=None, derandomize=True, max_examples=30, suppress_health_check=list(HealthCheck)
 )
 settings.load_profile("crazysim")
+
+
+def pytest_collection_finish():
+    """Look for cyclic garbage seldom: tracing makes millions of objects, and a quarter of the time went into looking.
+
+    What is imported by now stays.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 100)
 
 
 @pytest.hookimpl(hookwrapper=True)
