@@ -19,6 +19,7 @@ from crazysim.version import __version__
 if TYPE_CHECKING:
     from crazysim.core import functional as functional
     from crazysim.envs import make
+    from crazysim.payloads import Hook, SharedLoad, SlungLoad
     from crazysim.scene.contact_log import ContactLog
     from crazysim.scene.range_finder import RangeFinder
     from crazysim.scene.response import ContactResponse
@@ -34,6 +35,7 @@ __all__ = [
     "Drone",
     "Dynamics",
     "GroundEffect",
+    "Hook",
     "Integrator",
     "Latency",
     "MotorFailure",
@@ -41,8 +43,10 @@ __all__ = [
     "Plugin",
     "PyTree",
     "RangeFinder",
+    "SharedLoad",
     "Sim",
     "SimData",
+    "SlungLoad",
     "Wind",
     "__version__",
     "leaf",
@@ -58,6 +62,9 @@ __getattr__ = lazy(
     {
         "ContactLog": "crazysim.scene.contact_log",
         "ContactResponse": "crazysim.scene.response",
+        "Hook": "crazysim.payloads",
+        "SharedLoad": "crazysim.payloads",
+        "SlungLoad": "crazysim.payloads",
         "RangeFinder": "crazysim.scene.range_finder",
         "functional": "crazysim.core",
         "make": "crazysim.envs",

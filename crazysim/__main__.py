@@ -38,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     replay.add_argument("--port", type=int, default=8080, help="port of the server; 0 for any free port")
     replay.add_argument("--host", default="127.0.0.1", help="address of the server; 0.0.0.0 to accept other machines")
     replay.add_argument("--export", type=Path, metavar="FILE", help="write the page to an .html file instead")
+    _add_show(commands)
     _add_training(commands)
     options = parser.parse_args(arguments)
     if options.command is None:
@@ -51,6 +52,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     return 0
+
+
+def _add_show(commands: Any) -> None:
+    """Add the command that flies light shows."""
+    show = commands.add_parser(
+        "show",
+        help="fly a light show; print separation and tracking errors, write a film or a report",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    show.add_argument("file", type=Path, help="show to fly, a .skyc file")
+    show.add_argument("--film", type=Path, metavar="FILE", help="film to write, .mp4 or .gif")
+    show.add_argument("--page", type=Path, metavar="FILE", help="page to write, .html, which plays in a browser")
+    show.add_argument("--browser", action="store_true", help="serve that page until interrupted")
+    show.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any free port")
+    show.add_argument("--host", default="127.0.0.1", help="address of the page; 0.0.0.0 to accept other machines")
+    show.add_argument("--window", action="store_true", help="play the show in a window")
+    show.add_argument("--report", type=Path, metavar="FILE", help="figures to write, .json")
+    show.add_argument("--seconds", type=float, help="duration of the flight, s; by default that of the show")
+    show.add_argument("--fps", type=float, default=25.0, help="frames per second of the film")
+    show.add_argument("--drone", help="airframe; by default that of Sim")
+    show.add_argument("--controller", help="controller that follows the trajectories; by default that of Sim")
+    show.add_argument("--device", default="cpu", help="device: cpu, gpu")
 
 
 def _listed(names: Mapping[str, str]) -> str:
@@ -112,6 +135,42 @@ def _replay(options: argparse.Namespace) -> None:
     else:
         export(flight, options.export, options.world)
         print(f"wrote {options.export}")
+
+
+def _show(options: argparse.Namespace) -> None:
+    from crazysim.errors import ConfigError
+    from crazysim.progress import progress
+    from crazysim.shows import film, fly, page, report, summary
+    from crazysim.shows.view import play
+    from crazysim.trajectories.files import load_show
+
+    for path, suffixes in ((options.report, (".json",)), (options.page, (".html",)), (options.film, (".mp4", ".gif"))):
+        if path is not None and path.suffix not in suffixes:
+            raise ConfigError(f"expected the name of a file that ends with {' or '.join(suffixes)}, got {str(path)!r}")
+        if path is not None and not path.parent.is_dir():
+            raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
+    show = load_show(options.file)
+    given = {name: getattr(options, name) for name in ("drone", "controller") if getattr(options, name) is not None}
+    flight = fly(show, options.seconds, progress, device=options.device, **given)
+    figures = report(flight)
+    print(summary(flight, figures))
+    if options.report is not None:
+        options.report.write_text(json.dumps(figures))
+        print(f"wrote {options.report}")
+    if options.film is not None:
+        film(flight, options.film, options.fps, progress=True)
+        print(f"wrote {options.film}")
+    if options.window:
+        play(flight)
+    if options.page is not None or options.browser:
+        html = page(flight)
+        if options.page is not None:
+            options.page.write_text(html, encoding="utf-8")
+            print(f"wrote {options.page}")
+        if options.browser:
+            from crazysim.media.web import serve_page
+
+            serve_page(html, options.port, options.host)
 
 
 def _pairs(texts: Sequence[str]) -> dict[str, Any]:
@@ -197,6 +256,7 @@ def _render(options: argparse.Namespace) -> None:
 COMMANDS = {
     "demo": _demo,
     "replay": _replay,
+    "show": _show,
     "train": _train,
     "evaluate": _evaluate,
     "export": _export,

@@ -237,3 +237,22 @@ def from_axes(x: Array, y: Array, z: Array) -> Array:
         ],
         axis=-1,
     )
+
+
+def quat_from_axes(x: Array, y: Array, z: Array) -> Array:
+    """Return the quaternion of the frame with these orthonormal axes in the world frame. (..., 3) -> (..., 4)
+
+    The products ``4 q_i q`` are linear in the axes. One with ``q_i^2 >= 1 / 4`` is scaled to length one, so that
+    nothing small is divided by, and value and gradient are accurate at every attitude. The sign varies.
+    """
+    xx, yy, zz = x[..., 0], y[..., 1], z[..., 2]
+    xy, xz, yz = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]
+    wx, wy, wz = y[..., 2] - z[..., 1], z[..., 0] - x[..., 2], x[..., 1] - y[..., 0]
+    by_x = jnp.stack([1 + xx - yy - zz, xy, xz, wx], axis=-1)
+    by_y = jnp.stack([xy, 1 - xx + yy - zz, yz, wy], axis=-1)
+    by_z = jnp.stack([xz, yz, 1 - xx - yy + zz, wz], axis=-1)
+    by_w = jnp.stack([wx, wy, wz, 1 + xx + yy + zz], axis=-1)
+    x_or_y = jnp.where((xx > yy)[..., None], by_x, by_y)
+    z_or_w = jnp.where((xx + yy < 0)[..., None], by_z, by_w)
+    product = jnp.where((zz < 0)[..., None], x_or_y, z_or_w)
+    return product * lax.rsqrt(dot(product, product))

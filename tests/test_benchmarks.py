@@ -209,3 +209,17 @@ def test_learning_curves_of_several_seeds_are_drawn(run, tmp_path):
     pixels = (plt.imread(picture)[..., :3].reshape(-1, 3) * 255).round()
     for color in ((31, 119, 180), (255, 127, 14)):  # matplotlib's first two, a line for each seed; smoothed
         assert (np.abs(pixels - color).max(axis=-1) < 40).sum() > 20, color
+
+
+def test_mppi_prints_the_rate_of_commands(run):
+    (line,) = run("mppi.py", "--samples", "16", "--horizon", "5", "--repeats", "2")
+    assert line["commands_per_s"] > 0
+    assert (line["samples"], line["horizon"], line["engine"]) == (16, 5, "fused")
+
+
+def test_controllers_are_compared_on_the_same_flights(run):
+    lines = run("controllers.py", "--controllers", "geometric", "--worlds", "4", "--repeats", "1")
+    assert [line["controller"] for line in lines] == ["geometric"]
+    assert lines[0]["tracking_rms"] < 0.02
+    assert lines[0]["pushed_after"] == pytest.approx(0.289, abs=0.02)
+    assert lines[0]["steps_per_s"] > 0

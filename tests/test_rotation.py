@@ -165,3 +165,22 @@ def test_law_07_jacobians_are_finite_for_tiny_rotations(tiny, dtype):
     quat = jnp.array([0.0, 0.0, 0.0, 1.0], dtype)
     for argnum in (0, 1):
         assert np.all(np.isfinite(jax.jacobian(rot.turn, argnum)(quat, jnp.full(3, tiny, dtype), 1.0)))
+
+
+@given(q=unit_quats)
+def test_quaternion_of_axes_gives_the_same_rotation_back(q):
+    same_rotation(rot.quat_from_axes(*np.swapaxes(rot.matrix(q), -1, -2)), q)
+
+
+@pytest.mark.parametrize("q", [*np.eye(4), [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, 0.5, 0.0], [0.7, 0.7, 0.0, 1e-9]])
+def test_quaternion_of_axes_is_accurate_at_half_turns(q):
+    q = np.asarray(q) / np.linalg.norm(q)
+
+    def there_and_back(rotvec):
+        axes = jnp.moveaxis(rot.matrix(rot.multiply(jnp.asarray(q), rot.turn(jnp.eye(4)[3], rotvec, 1.0))), -1, 0)
+        return rot.quat_from_axes(*axes)
+
+    back, slope = there_and_back(np.zeros(3)), jax.jacfwd(there_and_back)(np.zeros(3))
+    same_rotation(back, q)
+    expected = np.stack([rot.multiply(back, np.append(0.5 * axis, 0.0)) for axis in np.eye(3)], axis=-1)
+    np.testing.assert_allclose(slope, expected, atol=1e-12)

@@ -48,7 +48,8 @@ def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
     """Return the rotor speeds that produce a wrench, each within its limits.
 
     The wrench is allocated with the least-norm inverse of the mixing matrix, and each thrust is clipped on its own, as
-    in the firmware's power distribution. A collective thrust of zero or less switches the motors off.
+    in Crazyflow. The firmware lowers all motors by the excess of the highest instead, which keeps the torque; see
+    ``crazysim.control.power_distribution``. A collective thrust of zero or less switches the motors off.
 
     Args:
         cmd: Collective thrust, N, and body torque, N m. (..., 4)

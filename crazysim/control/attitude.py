@@ -82,8 +82,9 @@ def attitude2force_torque(
     """Return the wrench that rotates the drone to an attitude, and the new integral.
 
     The attitude part of the controller of Mellinger and Kumar (2011, eq. 10 to 13) as in the Crazyflie firmware:
-    without the factor one half on the rotation error, with a derivative on the rates, and in PWM units that saturate
-    per torque and per rotor. A thrust of zero or less switches the motors off.
+    without the factor one half on the rotation error, with a derivative on the rates, and in PWM units. Torques and
+    then rotors are clipped one by one, where the firmware lowers all rotors by the excess. A thrust of zero or less
+    switches the motors off.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)
@@ -132,8 +133,9 @@ def body_rate2force_torque(
 ) -> tuple[Array, Array]:
     """Return the wrench that follows body rates, and the new integral.
 
-    The firmware has no separate rate controller: a rate setpoint enters the attitude controller, which also levels the
-    drone at its present yaw. Set ``kR`` and ``ki_m`` to zero to follow rates only.
+    As in Crazyflow, a rate setpoint enters the attitude controller, which also levels the drone at its present yaw.
+    ``Sim(controller="pid")`` follows rates only, as the firmware's rate mode does; so does this function with ``kR``
+    and ``ki_m`` of zero.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)

@@ -14,6 +14,11 @@ CASCADE = "crazyflow"
 CONTROLLERS = {
     "pid": "crazysim.control.pid:PID",
     "mellinger": "crazysim.control.mellinger:Mellinger",
+    "geometric": "crazysim.control.geometric:Geometric",
+    "indi": "crazysim.control.indi:INDI",
+    "lqr": "crazysim.control.lqr:LQR",
+    "load_lqr": "crazysim.control.load_lqr:LoadLQR",
+    "tracking_lqr": "crazysim.control.tracking_lqr:TrackingLQR",
 }
 """Controllers by name, as ``"module:class"``; each is imported at its first use."""
 

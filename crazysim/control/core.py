@@ -17,7 +17,7 @@ class Control(StrEnum):
     attitude = "attitude"
     """Roll, pitch, yaw, rad, and collective thrust, N."""
     body_rate = "body_rate"
-    """Body rates, rad/s, and collective thrust, N."""
+    """Body rates, rad/s, and collective thrust, N. Crazyflow's cascade also levels the drone."""
     force_torque = "force_torque"
     """Collective thrust, N, and body torque, N m."""
     rotor_vel = "rotor_vel"

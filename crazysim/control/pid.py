@@ -92,9 +92,10 @@ class PIDMemory(PyTree):
     @staticmethod
     def at_rest(params: PIDParams) -> PIDMemory:
         """Return the memory of one drone before the first tick."""
-        p, zeros = params, np.zeros
-        loops = (p.position, p.velocity, p.attitude, p.rate)
-        return PIDMemory(*(LoopMemory.at_rest(loop) for loop in loops), zeros(3), zeros(1), np.zeros(1, bool))
+        p, rest = params, LoopMemory.at_rest
+        zeros: Any = np.zeros(3)
+        loops = {name: rest(getattr(p, name)) for name in ("position", "velocity", "attitude", "rate")}
+        return PIDMemory(**loops, rpy_des=zeros, thrust=zeros[:1], started=zeros[:1] > 0)
 
 
 def velocity_of_position(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -54,7 +55,7 @@ class Loop(PyTree):
             kd=kd,
             integral_max=None if ki is None else as_parameter(limit),
             output_max=as_parameter(airframe.value(f"{path}.output_max", (3,))) if "output_max" in table else None,
-            low_pass=as_parameter(low_pass(airframe.value(f"{path}.cutoff", ()), freq)) if filtered else None,
+            low_pass=as_parameter(low_pass(float(airframe.value(f"{path}.cutoff", ())), freq)) if filtered else None,
         )
 
 
@@ -134,7 +135,8 @@ def pid_step(
             memory = memory.replace(delays=delays)
         out = out + loop.kd * derivative
     if loop.ki is not None:
-        integral = safe_clip(memory.integral + error / freq, -loop.integral_max, loop.integral_max)
+        integral_max: Any = loop.integral_max
+        integral = safe_clip(memory.integral + error / freq, -integral_max, integral_max)
         memory = memory.replace(integral=integral)
         out = out + loop.ki * integral
     return (out if loop.output_max is None else safe_clip(out, -loop.output_max, loop.output_max)), memory
@@ -149,10 +151,11 @@ def continued(memory: LoopMemory, out: Array, wanted: Array, *, loop: Loop) -> L
         wanted: Wanted outputs. (3,)
         loop: Gains and limits.
     """
+    integral_max: Any = loop.integral_max
     if loop.ki is None:
         return memory
     missing = jnp.where(loop.ki == 0, 0.0, (wanted - out) / jnp.where(loop.ki == 0, 1.0, loop.ki))
-    return memory.replace(integral=safe_clip(memory.integral + missing, -loop.integral_max, loop.integral_max))
+    return memory.replace(integral=safe_clip(memory.integral + missing, -integral_max, integral_max))
 
 
 def low_pass(cutoff: float, freq: float) -> list[float]:
@@ -164,7 +167,7 @@ def low_pass(cutoff: float, freq: float) -> list[float]:
         cutoff: Cutoff frequency, Hz.
         freq: Sampling rate, Hz.
     """
-    ohm = math.tan(math.pi * float(cutoff) / freq)
+    ohm = math.tan(math.pi * cutoff / freq)
     damping = 2 * math.cos(math.pi / 4) * ohm
     c = 1 + damping + ohm * ohm
     return [ohm * ohm / c, 2 * (ohm * ohm - 1) / c, (1 - damping + ohm * ohm) / c]

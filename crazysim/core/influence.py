@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.core.data import SimData
+from crazysim.core.data import SimData, SimStateDeriv
 from crazysim.core.plugin import Plugin
 from crazysim.errors import ConfigError
 from crazysim.pytree import scopes
@@ -88,12 +88,19 @@ def own_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
     return dict(rates)
 
 
-def _called(where: str, method: Callable[[SimData], Any], data: SimData) -> Any:
+def constrained(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
+    """Return the derivative under the constraint of a plugin; its errors carry a note with plugin and method."""
+    where = f"constrain of plugin {plugin.name!r} ({type(plugin).__name__})"
+    return _called(where, lambda seen: plugin.constrain(seen, deriv, dt), data, plugin.coupling)
+
+
+def _called(where: str, method: Callable[[SimData], Any], data: SimData, scope: str = "drone") -> Any:
     """Return the result of a plugin's method; its errors carry a note with plugin and method."""
     try:
         return method(data)
     except Exception as error:
-        error.add_note(f"in {where}, which is written for one drone: data.states.pos is (3,)")
+        shape = "(3,)" if scope == "drone" else "(n_drones, 3)"
+        error.add_note(f"in {where}, which is written for one {scope}: data.states.pos is {shape}")
         raise
 
 

@@ -11,9 +11,9 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimStateDeriv
-from crazysim.core.influence import influenced, own_rates
+from crazysim.core.influence import constrained, influenced, own_rates
 from crazysim.core.plugin import Plugin
-from crazysim.core.stage import Stage
+from crazysim.core.stage import Stage, over_drones
 
 DerivFn = Callable[[SimData], SimStateDeriv]
 
@@ -50,8 +50,8 @@ def euler(data: SimData, deriv_fn: DerivFn) -> SimData:
 def symplectic_euler(data: SimData, deriv_fn: DerivFn) -> SimData:
     """Return the data one semi-implicit Euler step later: positions move with the new velocities."""
     deriv, dt = deriv_fn(data), 1 / data.core.freq
-    vel = deriv.vel + dt * deriv.acc
-    ang_vel = limit_ang_vel(deriv.ang_vel + dt * deriv.ang_acc, data.core.freq)
+    vel = data.states.vel + dt * deriv.acc
+    ang_vel = limit_ang_vel(data.states.ang_vel + dt * deriv.ang_acc, data.core.freq)
     return apply_derivative(data, deriv.replace(vel=vel, ang_vel=ang_vel), dt)
 
 
@@ -129,14 +129,35 @@ class Integration:
         """Return the data one step later."""
         return self.method(data, self.derivative)
 
+    @property
+    def couples_world(self) -> bool:
+        """True if a plugin couples the drones of a world, so that the stage is of one world."""
+        return any(plugin.constrains and plugin.coupling == "world" for plugin in self.plugins)
+
     def derivative(self, data: SimData) -> SimStateDeriv:
         """Return the derivative of the drones' states under all influences, and of the plugins' own states."""
+        if self.couples_world:
+            seen, deriv = data, over_drones(lambda one: self._free(one)[1])(data)
+        else:
+            seen, deriv = self._free(data)
+        constraining = [plugin for plugin in self.plugins if plugin.constrains]
+        if not constraining:
+            return deriv
+        dt = None if self.method is rk4 else 1 / data.core.freq
+        if self.method is symplectic_euler:
+            vel, ang_vel = deriv.vel + dt * deriv.acc, deriv.ang_vel + dt * deriv.ang_acc
+            deriv = deriv.replace(vel=vel, ang_vel=ang_vel)
+        return constrained(constraining[0], seen, deriv, dt)
+
+    def _free(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
+        """Return the data under all influences, and the derivative without constraints."""
         for plugin in self.plugins:
             data = influenced(plugin, data)
         deriv = self.deriv_fn(data)
         own = {plugin.name: rates for plugin in self.plugins if (rates := own_rates(plugin, data))}
-        return deriv.replace(plugins=own) if own else deriv
+        return data, deriv.replace(plugins=own) if own else deriv
 
     def stage(self) -> Stage:
-        """Return the stage. Plugins are written for one drone, the rest takes any leading axes."""
-        return Stage(self, "drone", batched=not self.plugins, name="integration")
+        """Return the stage. Plugins are written for one drone or one world, the rest takes any leading axes."""
+        scope = "world" if self.couples_world else "drone"
+        return Stage(self, scope, batched=not self.plugins, name="integration")

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Protocol, dataclass_transform
+from typing import Any, ClassVar, Literal, Protocol, dataclass_transform
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.core.data import SimData
+from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, UnknownNameError
@@ -135,6 +135,8 @@ class Plugin:
     order: ClassVar[int] = 0
     """Influences are applied in ascending order, those of the same order by name. Negative: replaces commands that
     the others limit."""
+    coupling: ClassVar[Literal["drone", "world"]] = "drone"
+    """Data that ``constrain`` is written for: those of one drone, or of one world."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make every subclass a frozen dataclass."""
@@ -145,9 +147,15 @@ class Plugin:
 
     @property
     def is_dynamic(self) -> bool:
-        """True if the integrator must call ``influence`` or ``derivative``."""
+        """True if the integrator must call ``influence``, ``derivative`` or ``constrain``."""
         cls = type(self)
-        return cls.influence is not Plugin.influence or cls.derivative is not Plugin.derivative
+        changed = cls.influence is not Plugin.influence or cls.derivative is not Plugin.derivative
+        return changed or self.constrains
+
+    @property
+    def constrains(self) -> bool:
+        """True if the plugin couples bodies of its own to the drones by ``constrain``."""
+        return type(self).constrain is not Plugin.constrain
 
     def record(self, sim: Simulation) -> PyTree | None:
         """Return the plugin's record for all worlds, or None if it has none; check settings and simulation.
@@ -185,6 +193,31 @@ class Plugin:
         all influences applied. A rate has the shape of its field, which is declared with ``leaf("drone", ...)``.
         """
         return {}
+
+    def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
+        """Return the derivative with the reaction of bodies that are joined to the drone, and the rates of these.
+
+        A joint is a constraint: the accelerations of drone and joined body follow from one system of equations. Here
+        ``deriv`` is the derivative of the drone as if it were free, evaluated once. The reaction is added to ``acc``
+        and ``ang_acc``, and the rates of fields of the record are put into ``deriv.plugins[self.name]``. A simulation
+        has at most one plugin that constrains.
+
+        Args:
+            data: Data of one drone with all influences applied, or of one world, without them, if ``coupling`` is
+                ``"world"``.
+            deriv: Derivative of the free drone or drones.
+            dt: Duration of the step that the derivative is for, s, in schemes of order 1: impulses of the step are
+                returned as mean accelerations, and added to ``vel`` and ``ang_vel`` too, with which the scheme moves
+                position and attitude. None for the derivative at an instant.
+        """
+        return deriv
+
+    def place(self, data: SimData) -> Objects:
+        """Return ``data.objects`` with the plugin's objects of the scene at their poses; for the data of one world.
+
+        It is called when the scene is read, not in the step.
+        """
+        return data.objects  # type: ignore[return-value]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return named measurements of one drone. (k,) each"""

@@ -15,7 +15,7 @@ from crazysim.core.data import SimData
 from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, insert_fn_before
 from crazysim.core.plugin import Placement, Plugin, Simulation
-from crazysim.core.stage import Axes
+from crazysim.core.stage import Axes, over_drones, over_worlds
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import PyTree
 
@@ -42,6 +42,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         """Start without plugins."""
         self._sim = sim
         self._installed: dict[str, _Installed] = {}
+        self._placing: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
 
     def __getitem__(self, name: str) -> Plugin:
         """Return a plugin.
@@ -138,11 +139,19 @@ class PluginRegistry(Mapping[str, Plugin]):
             return {f"{p.name}.{key}": x for p in self.values() for key, x in p.observations(one).items()}
 
         leaves, axes = jax.tree.leaves(data), Axes(data)
-        drones = [0 if scope == "drone" else None for scope in axes.scopes]
         worlds = [0 if scope in ("drone", "world") else None for scope in axes.scopes]
-        over_drones = jax.vmap(lambda values: of_one(axes.treedef.unflatten(values)), (drones,))
+        of_drones = over_drones(of_one)
         of_world = [x[:, 0] if scope == "world" else x for scope, x in zip(axes.scopes, leaves, strict=True)]
-        return jax.vmap(over_drones, (worlds,))(of_world)
+        return jax.vmap(lambda values: of_drones(axes.treedef.unflatten(values)), (worlds,))(of_world)
+
+    def placed(self, data: SimData) -> SimData:
+        """Return the data with the plugins' objects of the scene at their poses."""
+        for name, plugin in self.items():
+            if type(plugin).place is not Plugin.place and data.objects is not None:
+                if self._placing.get(name, (None, None))[0] is not plugin:
+                    self._placing[name] = plugin, jax.jit(over_worlds(plugin.place))
+                data = data.replace(objects=self._placing[name][1](data))
+        return data
 
     def draw(self, world: int) -> None:
         """Draw the overlays of all plugins into the next image of a world."""
@@ -223,6 +232,12 @@ def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | 
         ConfigError: If the one that is being added has any, and the integration is not the built-in one.
     """
     dynamic = tuple(sorted((p for p in plugins if p.is_dynamic), key=lambda p: (p.order, p.name)))
+    constraining = [p.name for p in dynamic if p.constrains]
+    if len(constraining) > 1:
+        raise ConfigError(
+            f"expected at most one plugin that joins bodies to the drones, got {' and '.join(constraining)}. Use one "
+            f"plugin for all drones; its parameters can differ between them."
+        )
     integration = getattr(pipeline.get("integration"), "fn", None)
     if isinstance(integration, Integration):
         return pipeline | {"integration": dataclasses.replace(integration, plugins=dynamic).stage()}

@@ -211,6 +211,21 @@ def over_worlds(fn: Callable[..., Any], split: Sequence[str] = PER_WORLD) -> Cal
     return of_all
 
 
+def over_drones(fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return a function of the data of one drone as a function of the data of one world.
+
+    Args:
+        fn: From the data of one drone to any tree of arrays, each of which gets a first axis over drones.
+    """
+
+    def of_world(data: Any) -> Any:
+        leaves, treedef = jax.tree.flatten(data)
+        axes = [0 if scope == "drone" else None for scope in jax.tree.leaves(scopes(data))]
+        return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,))(leaves)
+
+    return of_world
+
+
 def _kinds(tree: Any) -> list[str]:
     """Return the scope of every leaf: as its record declares it, and ``batched`` outside of records."""
 

@@ -4,5 +4,8 @@ A demonstration is a module with ``run(n_worlds, n_drones, seconds, device, out,
 prints figures and writes files into the folder ``out``.
 """
 
-DEMOS = {"flight": "fly figure eights around poles in many worlds; print figures, write a plot and a film"}
+DEMOS = {
+    "flight": "fly figure eights around poles in many worlds; print figures, write a plot and a film",
+    "load": "carry a swinging load on a hook in hover; print how it comes to rest, write a film",
+}
 """Names of the demonstrations, and what they show."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from crazysim.dynamics import first_principles
 from crazysim.errors import RenderError
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.trail import COLORS
+from crazysim.progress import progress
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material
 
@@ -229,13 +230,3 @@ def record(sim: Sim, flight: Flight, path: Path) -> None:
 def orbiting_camera(time: float) -> dict[str, Any]:
     """Return the settings of a free camera that orbits the scene slowly."""
     return {"lookat": [0, 0, 0.9], "distance": 3.6, "azimuth": 110 + 3 * time, "elevation": -28}
-
-
-def progress(items: Iterable[Any], label: str) -> Iterable[Any]:
-    """Return the items with a progress bar, if tqdm is installed."""
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        print(f"{label} ...")
-        return items
-    return tqdm(items, desc=label, unit="frame", ncols=80)

@@ -56,6 +56,7 @@ TABLES: dict[str, dict[str, Shapes]] = {
         "kd_omega": _VECTOR,
         "int_err_max": _VECTOR,
     },
+    "geometric": {"kr": _NUMBER, "kv": _NUMBER, "kR": _NUMBER, "kw": _NUMBER},
     "mellinger": {
         "mass": _NUMBER,
         "mass_thrust": _NUMBER,
@@ -73,8 +74,8 @@ TABLES: dict[str, dict[str, Shapes]] = {
     "pid": {"tilt_max": ((2,),), "thrust_base": _NUMBER, "thrust_min": _NUMBER},
     "pid.position": _PID | {"output_max": _VECTOR, "cutoff": _NUMBER},
     "pid.velocity": _PID | {"output_max": _VECTOR, "cutoff": _NUMBER},
-    "pid.attitude": _PID | {"integral_max": _VECTOR},
-    "pid.rate": _PID | {"integral_max": _VECTOR},
+    "pid.attitude": _PID | {"integral_max": _VECTOR, "cutoff": _NUMBER},
+    "pid.rate": _PID | {"integral_max": _VECTOR, "cutoff": _NUMBER},
     "shape": {
         "plate": _VECTOR,
         "battery": _VECTOR,

@@ -16,7 +16,17 @@ from crazysim.deprecation import renamed, warn_renamed
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.drag import drag_force
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree
+from crazysim.pytree import PyTree, leaf
+
+
+class Exposed(PyTree):
+    """Record of bodies that wind and downwash act on: one for each drone, such as its load."""
+
+    pos: Array = leaf("drone", 1)
+    """Position of the body, world frame, m. (n_worlds, n_drones, 3)"""
+    air_vel: Array | None = leaf("drone", 1)
+    """Velocity of the air at the body from the jets of all drones, world frame, m/s; None without drag.
+    (n_worlds, n_drones, 3)"""
 
 
 def with_moving_air(data: SimData, air_vel: Array) -> SimData:

@@ -16,7 +16,7 @@ from crazysim.core.stage import stage
 from crazysim.deprecation import warn_renamed
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve
-from crazysim.effects.core import require_drag, with_moving_air, zeros
+from crazysim.effects.core import Exposed, require_drag, with_moving_air, zeros
 from crazysim.pytree import PyTree, leaf
 
 DECAY, SPREAD = 5.8, 0.094
@@ -66,13 +66,21 @@ class Downwash(Plugin):
         return with_moving_air(data, self.read(data).air_vel)
 
     def sum_jets(self, data: SimData) -> SimData:
-        """Add up the jets of the drones of one world at each of them; a jet does not act on its own drone."""
+        """Add up the jets of the drones of one world at each of them; a jet does not act on its own drone.
+
+        They are added up at loads too, where the jet of the drone above counts.
+        """
         record, s = self.read(data), data.states
-        axis = rotation.z_axis(s.quat)
-        offset = s.pos[:, None] - s.pos[None]
-        speed = jet(offset, axis, collective_thrust(data), record.diameter, record.air_density)
-        air_vel = jnp.sum(-speed * axis, axis=1)
-        return self.write(data, record.replace(air_vel=air_vel))
+        axis, thrust = rotation.z_axis(s.quat), collective_thrust(data)
+
+        def air_at(pos: Array) -> Array:
+            speed = jet(pos[:, None] - s.pos[None], axis, thrust, record.diameter, record.air_density)
+            return jnp.sum(-speed * axis, axis=1)
+
+        bodies = {name: x for name, x in data.plugins.items() if isinstance(x, Exposed) and x.air_vel is not None}
+        moved = {name: x.replace(air_vel=air_at(x.pos)) for name, x in bodies.items()}
+        data = data.replace(plugins=data.plugins | moved)
+        return self.write(data, record.replace(air_vel=air_at(s.pos)))
 
 
 def add(sim: Simulation, propeller_radius: Any = None, air_density: Any = AIR_DENSITY) -> None:

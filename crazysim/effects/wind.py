@@ -95,6 +95,15 @@ class Wind(Plugin):
         return self.write(data, wind.replace(filters=filters, gust=gust))
 
 
+def wind_at(data: SimData) -> Array:
+    """Return the velocity of the wind at a drone, the sum over all winds, world frame, m/s; of one drone. (3,)"""
+    total = jnp.zeros_like(data.states.vel)
+    for record in data.plugins.values():
+        if isinstance(record, WindData):
+            total = total + record.velocity + (0.0 if record.gust is None else record.gust)
+    return total
+
+
 def add(sim: Simulation, velocity: Any = (0.0, 0.0, 0.0), speed_20ft: Any = None) -> None:
     """Add wind. Deprecated: use ``sim.add(Wind(...))``."""
     warn_renamed("effects.wind.add(sim, ...)", "sim.add(Wind(...))")

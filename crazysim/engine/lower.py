@@ -53,6 +53,8 @@ class Entry(NamedTuple):
     """Computed part of the index; the constant 0 if there is none."""
     offset: int
     """Constant part."""
+    aligned: bool = True
+    """True where the base is a multiple of four."""
 
 
 class Lowering:
@@ -131,10 +133,10 @@ class Lowering:
         """Return a lowering into a new block inside this one."""
         return Lowering(Builder(self.builder), self.entries)
 
-    def lookup(self, table: Value, base: Element, offset: int) -> Element:
-        """Return a number of a table."""
-        found = self.builder.add("lookup", (table, base), table.dtype, (("offset", offset),))
-        self.entries[found] = Entry(table, base, offset)
+    def lookup(self, table: Value, base: Element, offset: int, aligned: bool) -> Element:
+        """Return a number of a table, whose base is a multiple of four if it is aligned."""
+        found = self.builder.add("lookup", (table, base), table.dtype, (("offset", offset), ("aligned", aligned)))
+        self.entries[found] = Entry(table, base, offset, aligned)
         return found
 
     def finish(self, outputs: Sequence[Elements]) -> Block:

@@ -224,8 +224,8 @@ TABLE: Mapping[str, Row] = {row.name: row for row in _rows()}
 where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)`` runs its block that often;
 ``while(*carry)`` runs its second block as long as its first is true. ``custom_jvp(*args, slope=)`` runs its block, and
 has a derivative of its own. ``threefry2x32`` is the cipher of JAX's random numbers.
-``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=)`` the entry at the sum of an int32 and a
-constant; whoever makes one ensures that there is such an entry.
+``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=, aligned=)`` the entry at the sum of an
+int32, which is a multiple of four if that is aligned, and a constant; whoever makes one ensures that there is one.
 
 Costs are counted with what decides them: comparisons with selections, signs with what takes them. Functions cost what
 hardware that approximates them and a step that refines take, or the shortest polynomial that is exact to float32;

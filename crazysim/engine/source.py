@@ -6,6 +6,7 @@ functions are defined by a preamble for each target (``targets/``); the source o
 
 from __future__ import annotations
 
+import collections
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -48,6 +49,7 @@ class Writer:
         self.pairs: dict[str, str] = {}
         self.tests: dict[Value, Operation] = {}
         self.tables: list[str] = []
+        self.fours: dict[tuple[Element, Element, int], str] = {}
         self._count = 0
 
     def new(self, prefix: str = "v") -> str:
@@ -62,10 +64,11 @@ class Writer:
     def block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
         """Write a block's operations, and return the names of its outputs."""
         self.names.update(zip(block.inputs, inputs, strict=True))
-        outside = dict(self.pairs)  # what is computed inside a block is not defined outside
+        outside = dict(self.pairs), self.fours  # what is computed inside a block is not defined outside
+        self.fours = dict.fromkeys(_fours(block), "")
         for op in block.operations:
             self._operation(op, depth)
-        self.pairs = outside
+        self.pairs, self.fours = outside
         return [self.element(x) for x in block.outputs]
 
     def element(self, x: Element) -> str:
@@ -90,8 +93,7 @@ class Writer:
             case "table":
                 self._table(op)
             case "lookup":
-                name = self.names[op.results[0]] = self.new()
-                self.line(f"const auto {name} = lookup({args[0]}, {args[1]}, {op.param('offset')});", depth)
+                self._lookup(op, args, depth)
             case "sin" | "cos":
                 self._sin_cos(op, args[0], depth)
             case "custom_jvp":  # no derivative is taken of a kernel
@@ -118,6 +120,18 @@ class Writer:
         name = self.names[op.results[0]] = self.new("t")
         numbers = ", ".join(_entry(x) for x in op.param("numbers").array)
         self.tables.append(f"TABLE {type_name(op.dtype)} {name}[] = {{{numbers}}};")
+
+    def _lookup(self, op: Operation, args: list[str], depth: int) -> None:
+        """Write a read of an entry, with its three neighbours if those are read too."""
+        offset, key = op.param("offset"), _four_of(op)
+        if key not in self.fours:
+            name = self.names[op.results[0]] = self.new()
+            self.line(f"const auto {name} = lookup({args[0]}, {args[1]}, {offset});", depth)
+            return
+        if not self.fours[key]:
+            name = self.fours[key] = self.new()
+            self.line(f"const auto {name} = lookup_four({args[0]}, {args[1]}, {offset // 4 * 4});", depth)
+        self.names[op.results[0]] = f"{self.fours[key]}.x[{offset % 4}]"
 
     def _sin_cos(self, op: Operation, x: str, depth: int) -> None:
         """Write sine and cosine at once: most of the work for one of the two is that for the other."""
@@ -169,6 +183,19 @@ class Writer:
             self.line(f"const auto {f} = {out if mask is None else f'select_n_({mask}, {name}_{k}, {out})'};", depth)
         for k, f in enumerate(fresh):
             self.line(f"{name}_{k} = {f};", depth)
+
+
+def _four_of(op: Operation) -> tuple[Element, Element, int]:
+    """Return the table, index and number of the four entries that a lookup is one of."""
+    return op.args[0], op.args[1], op.param("offset") // 4
+
+
+def _fours(block: Block) -> list[tuple[Element, Element, int]]:
+    """Return the aligned groups of four entries in float32 of which a block reads at least three."""
+    lookups = [op for op in block.operations if op.name == "lookup" and op.param("aligned") and op.dtype == np.float32]
+    counts = collections.Counter(_four_of(op) for op in lookups if isinstance(op.args[1], Value))
+    sizes = {_four_of(op): op.args[0].size for op in lookups}
+    return [key for key, n in counts.items() if n >= 3 and key[2] * 4 + 4 <= sizes[key]]
 
 
 def expression(op: Operation, args: Sequence[str]) -> str:

@@ -22,11 +22,13 @@ FPS = 30
 """Samples per second of a page."""
 PLANE_SIZE = 20.0
 """Half size of infinite planes, m."""
+LIGHT_RADIUS = 0.03
+"""Radius of a light, m."""
 FOV = 50.0
 """Initial vertical field of view, degrees."""
 
 
-def page(flight: Flight, world: int | None = None) -> str:
+def page(flight: Flight, world: int | None = None, lights: NDArray | None = None) -> str:
     """Return one world of a flight as an HTML page with drones, obstacles, setpoints and trails.
 
     The page contains viewer and flight: it opens from a file, without a server or a network.
@@ -34,19 +36,24 @@ def page(flight: Flight, world: int | None = None) -> str:
     Args:
         flight: Flight.
         world: Index of the world in the simulation; None for the first that was recorded.
+        lights: Colours of a light on every drone at the flight's times, 0 to 1; None for no lights.
+            (n, n_drones, 3)
 
     Raises:
-        ConfigError: If that world was not recorded.
+        ConfigError: If that world was not recorded, or the lights have another shape.
         ImportError: If viser is not installed.
     """
     k = 0 if world is None else flight.index(world)
+    needed = (len(flight.time), flight.n_drones, 3)
+    if lights is not None and np.shape(lights) != needed:
+        raise ConfigError(f"expected lights of shape {needed} = (n, n_drones, 3), got {np.shape(lights)}")
     viser = _viser()
     with contextlib.redirect_stdout(
         io.StringIO()
     ):  # viser prints the address of its server, which runs for this call only
         server = viser.ViserServer(host="127.0.0.1", port=_free_port(), verbose=False)
         try:
-            return _record(server, flight, k).as_html()
+            return _record(server, flight, k, lights).as_html()
         finally:
             server.stop()
 
@@ -113,13 +120,22 @@ def serve(flight: Flight, world: int | None = None, port: int = 8080, host: str 
         ImportError: If viser is not installed.
         RenderError: If it cannot listen there.
     """
-    with server_of(page(flight, world), port, host) as server:
+    serve_page(page(flight, world), port, host)
+
+
+def serve_page(html: str, port: int = 8080, host: str = "127.0.0.1") -> None:
+    """Serve a page of a flight at a port until interrupted.
+
+    Raises:
+        RenderError: If it cannot listen there.
+    """
+    with server_of(html, port, host) as server:
         print(f"serving the flight at http://{host}:{server.server_port}; stop with Ctrl-C", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             server.serve_forever()
 
 
-def _record(server: Any, flight: Flight, k: int) -> Any:
+def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
     """Return viser's recording of the k-th world of a flight."""
     scene = server.scene
     scene.set_up_direction("+z")
@@ -151,10 +167,16 @@ def _record(server: Any, flight: Flight, k: int) -> Any:
         for drone in range(flight.setpoint.shape[2])
     ]
 
+    bulbs = [
+        scene.add_icosphere(f"/bodies/{mocap}/light", radius=LIGHT_RADIUS, color=_rgb(color), opacity=0.8)
+        for mocap, color in zip(flight.drone_ids, [] if lights is None else lights[0], strict=False)
+    ]
+
     recording = server.get_scene_serializer()
     end = float(flight.time[-1])
     times = np.linspace(0, end, int(np.ceil(FPS * end)) + 1)  # viser does not interpolate
     shown: dict[Any, NDArray] = {}
+    lit: dict[str, tuple[int, int, int]] = {}
 
     def move(handle: Any, pos: NDArray, quat: NDArray | None = None) -> None:
         pose = np.concatenate([pos, [] if quat is None else np.roll(quat, 1)])
@@ -177,6 +199,11 @@ def _record(server: Any, flight: Flight, k: int) -> Any:
                 move(frames[int(mocap)], p, q)
         for ball, p in zip(balls, now["setpoint"][k], strict=True):
             move(ball, p)
+        if lights is not None:
+            colors = lights[min(int(np.searchsorted(flight.time, time)), len(lights) - 1)]
+            for bulb, color in zip(bulbs, colors, strict=True):
+                if (rgb := _rgb(color)) != lit.get(bulb.name):
+                    lit[bulb.name] = bulb.color = rgb
     return recording
 
 

@@ -50,9 +50,9 @@ class Overlays:
         segments = zip(points[:-1], points[1:], widths, strict=False)
         self._add([(mujoco.mjtGeom.mjGEOM_LINE, width, a, b) for a, b, width in segments], rgba)
 
-    def points(self, points: NDArray, rgba: ArrayLike, size: float) -> None:
-        """Add spheres of radius ``size``, m, at points in the world frame, m. (n, 3)"""
-        self._add([(mujoco.mjtGeom.mjGEOM_SPHERE, size, point, None) for point in points], rgba)
+    def points(self, points: NDArray, rgba: ArrayLike, size: float, emission: float = 0.0) -> None:
+        """Add spheres of radius ``size``, m, at points in the world frame, m, that emit some of their colour. (n, 3)"""
+        self._add([(mujoco.mjtGeom.mjGEOM_SPHERE, size, point, None) for point in points], rgba, emission)
 
     def capsule(self, p1: NDArray, p2: NDArray, radius: float, rgba: ArrayLike, cylinder: bool) -> None:
         """Add a capsule or cylinder between two points, world frame, m. (3,)"""
@@ -70,24 +70,25 @@ class Overlays:
         above = self._texts.get(corner)
         self._texts[corner] = _readable(text) if above is None else f"{above}\n{_readable(text)}"
 
-    def _add(self, geoms: list[tuple], rgba: ArrayLike) -> None:
+    def _add(self, geoms: list[tuple], rgba: ArrayLike, emission: float = 0.0) -> None:
         if len(self) + len(geoms) > self.limit:
             raise ValueError(
                 f"expected at most {self.limit} overlays in one image, got {len(self) + len(geoms)}. Increase "
                 f"sim.max_visual_geom before drawing."
             )
         colors = np.broadcast_to(np.asarray(rgba, np.float32), (len(geoms), 4))
-        self._geoms += [(*geom, color) for geom, color in zip(geoms, colors, strict=True)]
+        self._geoms += [(*geom, color, emission) for geom, color in zip(geoms, colors, strict=True)]
 
     def write(self, scene: mujoco.MjvScene) -> None:
         """Append the geoms to a scene that is about to be drawn."""
-        for kind, size, a, b, rgba in self._geoms:
+        for kind, size, a, b, rgba, emission in self._geoms:
             if scene.ngeom >= scene.maxgeom:
                 raise ValueError(
                     f"expected at most {scene.maxgeom} geoms in one image, got more. Increase sim.max_visual_geom."
                 )
             geom = scene.geoms[scene.ngeom]
             mujoco.mjv_initGeom(geom, kind, np.full(3, size), a, np.eye(3).ravel(), rgba)
+            geom.emission = emission
             if isinstance(b, str):
                 geom.label = b
             elif b is not None:

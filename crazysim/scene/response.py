@@ -21,6 +21,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
 from crazysim.deprecation import warn_renamed
 from crazysim.errors import ConfigError
+from crazysim.geometry.linear import solve
 from crazysim.pytree import PyTree, leaf
 from crazysim.scene.contact_points import Surface, contact_points, surfaces_of
 from crazysim.scene.report import Objects
@@ -150,11 +151,11 @@ def _respond(
         matrix = inertia + _tangential(w_t, p) + steep
         held = w_t[..., None] * jnp.concatenate([s, rotation.cross(p, s)], axis=-1)
         driven = (rest * along + w_n * wanted)[..., None] * row
-        return _solve(matrix, rotation.matvec(inertia, before) + jnp.sum(held + driven, axis=-2))
+        return solve(matrix, rotation.matvec(inertia, before) + jnp.sum(held + driven, axis=-2))
 
     after = jax.lax.fori_loop(0, iterations, turn, before)
     push = jnp.where(active, stiff * jnp.maximum(wanted - slip(after)[0], 0.0), 0.0)
-    after = after + record.restitution * _solve(inertia, jnp.sum(jnp.where(fast, push, 0.0)[..., None] * row, axis=-2))
+    after = after + record.restitution * solve(inertia, jnp.sum(jnp.where(fast, push, 0.0)[..., None] * row, axis=-2))
     # Energy is measured relative to the surfaces that push.
     total = jnp.sum(push, axis=-1, keepdims=True)
     moves = jnp.sum(push[..., None] * s, axis=-2) / jnp.where(total > 0, total, 1.0)
@@ -187,25 +188,3 @@ def _tangential(weight: Array, p: Array) -> Array:
     turned = square - jnp.sum(weight[..., None, None] * p[..., None] * p[..., None, :], axis=-3)
     upper = jnp.concatenate([total, -cross], axis=-1)
     return jnp.concatenate([upper, jnp.concatenate([cross, turned], axis=-1)], axis=-2)
-
-
-def _solve(matrix: Array, b: Array) -> Array:
-    """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive definite, unrolled. (..., n)
-
-    Scaled to a unit diagonal first: mass and moments of inertia are four orders apart.
-    """
-    n = b.shape[-1]
-    scale = [jax.lax.rsqrt(matrix[..., k, k]) for k in range(n)]
-    a = [[matrix[..., i, j] * scale[i] * scale[j] for j in range(i + 1)] for i in range(n)]
-    y = [b[..., k] * scale[k] for k in range(n)]
-    low: list[list[Array]] = []
-    for i in range(n):
-        low.append([])
-        for j in range(i):
-            low[i].append((a[i][j] - sum(low[i][k] * low[j][k] for k in range(j))) / low[j][j])
-        low[i].append(jnp.sqrt(a[i][i] - sum(low[i][k] ** 2 for k in range(i))))
-    for i in range(n):
-        y[i] = (y[i] - sum(low[i][k] * y[k] for k in range(i))) / low[i][i]
-    for i in reversed(range(n)):
-        y[i] = (y[i] - sum(low[k][i] * y[k] for k in range(i + 1, n))) / low[i][i]
-    return jnp.stack([y[k] * scale[k] for k in range(n)], axis=-1)

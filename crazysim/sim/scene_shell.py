@@ -20,6 +20,7 @@ from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Scene
 
 if TYPE_CHECKING:
+    from crazysim.core.data import SimData
     from crazysim.core.registry import PluginRegistry
     from crazysim.engine import Stepper
 
@@ -50,6 +51,8 @@ class SceneAttribute(Generic[T]):
 class SceneShell:
     """The part of ``Sim`` that concerns its scene."""
 
+    data: SimData
+    """Everything that changes."""
     n_worlds: int
     """Number of worlds."""
     n_drones: int
@@ -116,7 +119,11 @@ class SceneShell:
         if world is not None and not 0 <= world < self.n_worlds:
             raise ValueError(f"expected a world from 0 to {self.n_worlds - 1}, got {world}")
         self._scene.compile_if_edited()
-        self._stepper.data = self._scene.sync(self.data, world)
+        self._stepper.data = self._scene.sync(self._placed(), world)
+
+    def _placed(self) -> SimData:
+        """Return the data with the objects of plugins, such as loads, at their poses."""
+        return self.plugins.placed(self.data)
 
     def contacts(self, body: str | None = None) -> Array:
         """Return which contact slots touch, after a sync if anything has changed.
@@ -152,7 +159,7 @@ class SceneShell:
         Raises:
             ValueError: If nothing is requested, or an object does not exist.
         """
-        return self._queries.contact_report(self.data, objects, floor, drones)
+        return self._queries.contact_report(self._placed(), objects, floor, drones)
 
     def depth(
         self,
@@ -170,7 +177,7 @@ class SceneShell:
         Raises:
             ValueError: If the camera does not exist, or the resolution is not positive.
         """
-        return self._queries.depth(self.data, camera, width, height, drones, hide_own, along)
+        return self._queries.depth(self._placed(), camera, width, height, drones, hide_own, along)
 
     def render(
         self,

@@ -1,17 +1,39 @@
-"""Trajectories: a record of piecewise polynomials, its constructors, and the plugin that follows them in the step."""
+"""Trajectories: a record of piecewise polynomials, its constructors and checks, and the plugin that follows them."""
 
+from crazysim.trajectories.approaches import Approach
+from crazysim.trajectories.files import Lights, Show, load_csv, load_show, save_csv, save_show
 from crazysim.trajectories.follow import Follow, FollowData
+from crazysim.trajectories.limits import Limits, Report, Violation, check
 from crazysim.trajectories.shapes import circle, figure_eight, helix, hover, line, lissajous
+from crazysim.trajectories.smoothest import smoothest
+from crazysim.trajectories.splines import of_bezier, spline
 from crazysim.trajectories.trajectory import Trajectory
+from crazysim.trajectories.waypoints import minimum_jerk, minimum_snap
 
 __all__ = [
+    "Approach",
     "Follow",
     "FollowData",
+    "Lights",
+    "Limits",
+    "Report",
+    "Show",
     "Trajectory",
+    "Violation",
+    "check",
     "circle",
     "figure_eight",
     "helix",
     "hover",
     "line",
     "lissajous",
+    "load_csv",
+    "load_show",
+    "minimum_jerk",
+    "minimum_snap",
+    "of_bezier",
+    "save_csv",
+    "save_show",
+    "smoothest",
+    "spline",
 ]

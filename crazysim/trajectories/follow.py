@@ -124,7 +124,7 @@ class Follow(Plugin):
         """Stage the setpoint of one drone."""
         state, s = data.controls.state, self.setpoint(data)
         state = state.replace(staged_cmd=s.command())
-        if getattr(state, "staged_feedforward", None) is not None:
+        if state.staged_feedforward is not None:
             state = state.replace(staged_feedforward=s.feedforward())
         return data.replace(controls=data.controls.replace(state=state))
 

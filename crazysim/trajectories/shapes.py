@@ -1,8 +1,8 @@
 """Trajectories of standard shapes: figure eight, Lissajous, circle, helix, line, hover.
 
 Curves are fitted piecewise by polynomials of degree 7 that have the curve's position and first three derivatives at
-both ends of each piece, in float64. The remainder of Hermite's interpolation, ``p^(8)(s) t^4 (t - h)^4 / 8!`` in a piece
-of length h, is at most ``max |p^(8)| (h / 2)^8 / 8!``, which decides the number of pieces.
+both ends of each piece, in float64. The remainder of Hermite's interpolation in a piece of length h,
+``p^(8)(s) t^4 (t - h)^4 / 8!``, is at most ``max |p^(8)| (h / 2)^8 / 8!``, which decides the number of pieces.
 """
 
 from __future__ import annotations

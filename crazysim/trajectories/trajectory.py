@@ -107,14 +107,16 @@ class Trajectory(PyTree):
         end, repeats = _at(ends, index, ends.shape[1] - 1), _at(jnp.asarray(self.repeats), index)
         t = jnp.asarray(t, ends.dtype)
         local = jnp.where(t < 0, 0.0, t)
-        local = jnp.where(repeats, lax.rem(local, end), jnp.where(t > end, end, local))
+        # A remainder by floor, which is a vector instruction where that of lax.rem is a call for each number.
+        local = local - jnp.where(repeats, end * lax.floor(local / end), 0.0)
+        local = jnp.where(local > end, end, jnp.where(local < 0, 0.0, local))
         inside = (t >= 0) & (repeats | (t <= end))
         piece = _piece(ends, index, local)
         begin = jnp.where(piece > 0, _at(ends, index, jnp.maximum(piece - 1, 0)), 0.0)
         length = _at(ends, index, piece) - begin
-        length = jnp.where(length > 0, length, 1.0)  # of padding
-        values = _derivatives(_at(coefficients, index, piece), (local - begin) / length, N_DERIVATIVES)
-        rate = jnp.where(inside, 1 / length, 0.0)
+        inverse = 1 / jnp.where(length > 0, length, 1.0)  # padding has no length
+        values = _derivatives(_at(coefficients, index, piece), (local - begin) * inverse, N_DERIVATIVES)
+        rate = jnp.where(inside, inverse, 0.0)
         pos = values[0]
         vel, acc, jerk, snap = (value * rate**k for k, value in enumerate(values[1:], start=1))
         return Setpoint(

@@ -1,14 +1,15 @@
 """Controllers in a simulation: the protocol, the firmware's controllers in flight, and several with a switch."""
 
+import inspect
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from crazysim import ConfigError, Latency, Sim, make
-from crazysim.control import Control, Controller, Setpoint
-from crazysim.control.mellinger import Mellinger
-from crazysim.control.pid import PID
+from crazysim.control import PID, Control, Controller, Mellinger, Setpoint
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
 from crazysim.pytree import PyTree, as_parameter, leaf
@@ -295,3 +296,98 @@ def test_a_switch_in_hover_is_bumpless(names, bump):
     assert np.max(np.abs(np.asarray(sim.data.controls.rotor_vel) - before)) < bump
     sim.step(1000)
     assert np.max(np.abs(sim.data.states.vel)) < 0.1
+
+
+# Laws -----------------------------------------------------------------------------------------------------------
+
+EXTREME = {
+    "level": [0.0, 0, 0, 1],
+    "upside down": [1.0, 0, 0, 0],
+    "straight up": [0.0, -np.sqrt(0.5), 0, np.sqrt(0.5)],
+    "turned": [0.0, 0, 1, 0],
+}
+COMMANDS = {
+    "state": np.r_[50.0, -50, 50, np.zeros(9), 1, 0, 0, 3],
+    "attitude": [3.0, -3, 3, 0.4],
+    "body_rate": [40.0, -40, 40, 0.4],
+}
+LEVELS = [
+    ("pid", "state"),
+    ("pid", "attitude"),
+    ("pid", "body_rate"),
+    ("mellinger", "state"),
+    ("mellinger", "attitude"),
+]
+
+
+@pytest.mark.parametrize("controller, control", LEVELS)
+def test_no_nan_in_values_or_gradients(controller, control):
+    """Law 7: from any attitude, at rest, spinning at 100 rad/s, with commands far beyond all limits, and motors off."""
+    sim = Sim(8, drone="cf2x_L250", control=control, controller=controller)
+    states = sim.data.states
+    quat = np.repeat(np.array(list(EXTREME.values()), np.float32), 2, axis=0)[:, None]
+    ang_vel = np.tile(np.array([[0.0] * 3, [100.0, -100, 100]], np.float32), (4, 1))[:, None]
+    start = sim.data.replace(states=states.replace(quat=jnp.asarray(quat), ang_vel=jnp.asarray(ang_vel)))
+    for scale in (1.0, 0.0):
+        command = np.broadcast_to(np.float32(COMMANDS[control]) * scale, (8, 1, len(COMMANDS[control])))
+        sim.data = F.stage_command(start, jnp.asarray(command))
+        sim.step(2000)
+        assert not np.any(sim.data.core.nonfinite)
+        for leaf_ in jax.tree.leaves((sim.data.states, sim.data.controls)):
+            assert np.all(np.isfinite(leaf_))
+
+    def height(command, data):
+        return jnp.sum(sim.step_fn(F.stage_command(data, command), 3).states.vel[..., 2])
+
+    assert np.all(np.isfinite(jax.grad(height)(jnp.asarray(command), start)))
+
+
+@pytest.mark.parametrize("controller", [PID(), Mellinger(), "several"], ids=["pid", "mellinger", "several"])
+def test_every_record_documents_its_shapes(controller):
+    """Law 2: scopes are declared, and the docstrings of leaves of drones give the shape in a simulation."""
+    several = {"controller": ["pid", "mellinger"], "switch": at_one_second}
+    sim = Sim(WORLDS, DRONES, control="state", **(several if controller == "several" else {"controller": controller}))
+    sizes = {"n_worlds": WORLDS, "n_drones": DRONES, "n_rotors": 4}
+    seen = []
+
+    def check(record):
+        for field in [f for f in record.__dataclass_fields__.values() if not f.metadata.get("static")]:
+            value = getattr(record, field.name)
+            parts = value if isinstance(value, tuple) else (value,)
+            for part in parts:
+                if isinstance(part, PyTree):
+                    check(part)
+                elif part is not None:
+                    shape = re.search(r"\(([\w, ]*)\)\"\"\"", source_of(type(record), field.name))[1]
+                    words = [sizes.get(word) or int(word) for word in re.findall(r"\w+", shape)]
+                    assert tuple(words) == part.shape, (type(record), field.name)
+                    seen.append(part)
+
+    check(sim.data.controls.controller)
+    assert len(seen) == len(jax.tree.leaves(sim.data.controls.controller))
+
+
+def source_of(record, name):
+    """Return the source of a field of a record from its name to the end of its docstring."""
+    return re.search(rf"    {name}: .*?\"\"\".*?\"\"\"", inspect.getsource(record), re.DOTALL)[0]
+
+
+def test_ten_steps_and_commands_trace_once():
+    """Law 6: NumPy, JAX and lists, with and without feedforward."""
+    sim = Sim(control="state", controller="pid", engine="plain")
+    n_traces = 0
+
+    def counted(data):
+        nonlocal n_traces
+        n_traces += 1
+        return data
+
+    sim.step_pipeline["counted"] = counted
+    sim.build_step_fn()
+    cmd = setpoint_of(sim)
+    for each in (cmd, jnp.asarray(cmd), cmd.tolist(), cmd.astype(np.float64)):
+        sim.state_control(each)
+        sim.step(5)
+        sim.state_control(each, feedforward=np.zeros((1, 1, 8)))
+        sim.step(3)
+    assert n_traces == 1

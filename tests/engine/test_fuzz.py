@@ -117,3 +117,14 @@ def test_a_wrong_rule_is_found(monkeypatch, name, wrong, line):
     (find,) = Fuzzer(2, engines=("interpret",)).check([Case(Program(("f33",), (line,)), "drone")])
     assert find.engine == "interpret"
     assert line in str(find)
+
+
+def test_a_rule_that_fails_is_found_and_what_jax_refuses_is_not(monkeypatch):
+    monkeypatch.setitem(RULES, "rev", lambda ctx, eqn, args: 1 / 0)
+    fuzzer = Fuzzer(2, engines=("interpret",))
+    (find,) = fuzzer.check([Case(Program(("f33",), ("jnp.flip(v0)",)), "drone")])
+    assert find.engine == "lowering"
+    assert "ZeroDivisionError" in find.what
+    monkeypatch.setattr(fuzzer, "run", lambda *args: 1 / 0)
+    assert not list(fuzzer.check([Case(Program(("f33",), ("jnp.flip(v0)",)), "drone")]))
+    assert fuzzer.counts["refused by JAX"] == 1

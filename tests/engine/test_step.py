@@ -455,10 +455,25 @@ def test_law_09_an_engine_that_does_not_exist_is_refused():
         Sim(engine="warp")
 
 
-@pytest.mark.parametrize("dynamics, control", PAIRS)
-def test_every_pipeline_compiles_for_a_gpu(dynamics, control):
+def turns(state, setpoint, time):
+    """Return the number of the controller that flies: PID for a second, then Mellinger."""
+    return jnp.where(time < 1.0, 0, 1)
+
+
+CONTROLLERS = [{"control": control, "controller": "pid"} for control in ("state", "attitude", "body_rate")] + [
+    {"control": "state", "controller": "mellinger"},
+    {"control": "state", "controller": ("pid", "mellinger"), "switch": turns},
+]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"dynamics": dynamics, "control": control} | SLOW.get(control, {}) for dynamics, control in PAIRS] + CONTROLLERS,
+    ids=lambda settings: "-".join(str(s) for s in settings.values() if isinstance(s, (str, tuple))),
+)
+def test_every_pipeline_compiles_for_a_gpu(settings):
     """NVRTC needs no GPU to compile for one."""
-    sim = shared_sim(n_worlds=2, n_drones=3, dynamics=dynamics, control=control, **SLOW.get(control, {}))
+    sim = shared_sim(n_worlds=2, n_drones=3, **settings)
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
     step = Step(sim.step_pipeline, "fused", "gpu")

@@ -42,5 +42,5 @@ def test_polynomials_still_repeat():
     pos, vel = function(jnp.asarray([0.5, 2.5, 3.5]))
     np.testing.assert_allclose(pos, [[0.5, 1, 0], [1, 1, 0], [0.5, 1, 0]], atol=1e-6)
     np.testing.assert_allclose(vel[:, 0], [1, -2, 1], atol=1e-6)
-    with pytest.warns(DeprecationWarning), pytest.raises(ConfigError):
+    with pytest.warns(DeprecationWarning, match="of_pieces"), pytest.raises(ConfigError):
         trajectories.polynomial(np.zeros((2, 3, 2)), [1.0, -1.0])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from crazysim.engine.ir import Element, Numbers, Value, constant, is_constant
-from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, as_elements
+from crazysim.engine.lower import MAX_UNROLL, Elements, Entry, Lowering, as_elements
 
 MAX_SELECTED = 4
 """Most places from which an entry of a shared array is selected: its numbers are in registers already."""
@@ -20,9 +20,10 @@ ZERO = constant(0, np.int32)
 class Table:
     """An array of elements as a table: all indices of its entries share a computed base, and differ by constants."""
 
-    def __init__(self, ctx: Lowering, table: Value, base: Element, offsets: np.ndarray, strides: dict[int, int]):
-        """Hold the table, the index of each element less the base, and the steps of the index along axes."""
-        self.ctx, self.table, self.base, self.offsets, self.strides = ctx, table, base, offsets, strides
+    def __init__(self, ctx: Lowering, entry: Entry, offsets: np.ndarray, strides: dict[int, int]):
+        """Hold the table and base, the index of each element less the base, and the steps of the index along axes."""
+        self.ctx, self.table, self.base, self.offsets, self.strides = ctx, entry.table, entry.base, offsets, strides
+        self.aligned = entry.aligned and all(stride % 4 == 0 for stride in strides.values())
         self.same: dict[int, Element] = {}
         """Entries that are the same constant at all places, by the offset of the first."""
 
@@ -43,7 +44,7 @@ class Table:
         """Return the entries with these offsets, each from its base."""
         flat = [int(k) for k in offsets.reshape(-1)]
         found = [
-            self.same[k] if k in self.same else self.ctx.lookup(self.table, base, k)
+            self.same[k] if k in self.same else self.ctx.lookup(self.table, base, k, self.aligned)
             for k, base in zip(flat, bases, strict=True)
         ]
         return as_elements(found, offsets.shape)
@@ -71,7 +72,7 @@ def find(ctx: Lowering, x: Elements, axes: Sequence[int], n_places: int) -> Tabl
         return None
     offsets = np.array([p.offset for p in places if p is not None]).reshape(x.shape)
     strides = _strides(offsets, axes)
-    return None if strides is None else Table(ctx, first.table, first.base, offsets, strides)
+    return None if strides is None else Table(ctx, first, offsets, strides)
 
 
 def _of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> Table | None:
@@ -81,7 +82,7 @@ def _of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> Table | No
         return None
     offsets = np.arange(x.size).reshape(x.shape)
     (value,) = ctx.builder.add_many("table", (), (numbers.dtype,), (("numbers", Numbers(numbers)),))
-    table = Table(ctx, value, ZERO, offsets, _strides(offsets, axes) or {})
+    table = Table(ctx, Entry(value, ZERO, 0), offsets, _strides(offsets, axes) or {})
     first = tuple([slice(0, 1) if axis in axes else slice(None) for axis in range(x.ndim)])
     bits = numbers.view(f"u{numbers.itemsize}").reshape(x.shape)
     same = np.all(bits == bits[first], tuple(axes), keepdims=True)

@@ -266,10 +266,12 @@ FN void store_row(b1* p, int n, b1v x) { store_each(p, 1, 1, 0, n, -x.m); }
 #define LOAD_ROW(p, k) load_row(p + (k) * n_lanes + first, n_active)
 #define STORE_ROW(p, k, value) store_row(p + (k) * n_lanes + first, n_active, value);
 
-// Tables: constants, and the entry of one at index + k.
+// Tables: constants, and the entry of one at index + k; where that is a multiple of four, also that and the next three.
 #define TABLE static const
+template <class V> struct four { V x[4]; };
 template <class T> FN T lookup(const T* p, i32 index, i32 k) { return p[index + k]; }
 template <class T> FN typename vec<T>::type lookup(const T* p, i32v index, i32 k) {
+  if (!any(ne_(index, index[0]))) return lift(p[index[0] + k]);  // drones that move alike
   typename vec<T>::type x;
   for (int i = 0; i < W; ++i) x[i] = p[index[i] + k];
   return x;
@@ -278,6 +280,37 @@ FN b1v lookup(const b1* p, i32v index, i32 k) {
   i32v x;
   for (int i = 0; i < W; ++i) x[i] = p[index[i] + k];
   return {-x};
+}
+FN four<f32> lookup_four(const f32* p, i32 index, i32 k) {
+  four<f32> r;
+  std::memcpy(&r, p + index + k, sizeof(r));
+  return r;
+}
+// Rows of four numbers are loaded whole and transposed, four at a time.
+typedef f32 f32x4 __attribute__((vector_size(16)));
+FN four<f32v> lookup_four(const f32* p, i32v index, i32 k) {
+  if (!any(ne_(index, index[0]))) {
+    const four<f32> r = lookup_four(p, index[0], k);
+    return {{lift(r.x[0]), lift(r.x[1]), lift(r.x[2]), lift(r.x[3])}};
+  }
+  f32 columns[4][W];
+  int i = 0;
+#if defined(__GNUC__) && !defined(__clang__)
+  typedef i32 i32x4 __attribute__((vector_size(16)));
+  for (; i + 4 <= W; i += 4) {
+    f32x4 r[4];
+    for (int j = 0; j < 4; ++j) std::memcpy(&r[j], p + index[i + j] + k, 16);
+    const f32x4 a = __builtin_shuffle(r[0], r[1], i32x4{0, 4, 1, 5}), b = __builtin_shuffle(r[2], r[3], i32x4{0, 4, 1, 5});
+    const f32x4 c = __builtin_shuffle(r[0], r[1], i32x4{2, 6, 3, 7}), d = __builtin_shuffle(r[2], r[3], i32x4{2, 6, 3, 7});
+    const f32x4 out[4] = {__builtin_shuffle(a, b, i32x4{0, 1, 4, 5}), __builtin_shuffle(a, b, i32x4{2, 3, 6, 7}),
+                          __builtin_shuffle(c, d, i32x4{0, 1, 4, 5}), __builtin_shuffle(c, d, i32x4{2, 3, 6, 7})};
+    for (int j = 0; j < 4; ++j) std::memcpy(&columns[j][i], &out[j], 16);
+  }
+#endif
+  for (; i < W; ++i) for (int j = 0; j < 4; ++j) columns[j][i] = p[index[i] + k + j];
+  four<f32v> r;
+  std::memcpy(&r, columns, sizeof(r));
+  return r;
 }
 
 // Work that is worth it is shared between the cores, in whole blocks of lanes. Of the system's headers the small ones:

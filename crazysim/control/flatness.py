@@ -1,0 +1,142 @@
+"""Differential flatness: attitude, body rates and angular acceleration of a thrust vector and a yaw that change."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control.setpoint import Setpoint
+from crazysim.pytree import PyTree, leaf
+from crazysim.rotation import cross, dot, matvec
+
+HORIZONTAL = 0.05
+"""Sine of the angle between thrust and heading below which the yaw rate that holds the heading is limited.
+
+Below 3 degrees the heading does not determine the attitude, and the rate that holds it grows without bound.
+"""
+
+NO_THRUST = 1e-3
+"""Thrust over mass below which its direction counts as undefined, m/s^2: a ten-thousandth of hover."""
+
+
+class Attitude(NamedTuple):
+    """Attitude with its first two derivatives."""
+
+    matrix: Array
+    """Rotation matrix, body to world. (..., 3, 3)"""
+    ang_vel: Array
+    """Angular velocity, body frame, rad/s. (..., 3)"""
+    ang_acc: Array
+    """Angular acceleration, body frame, rad/s^2. (..., 3)"""
+
+
+class FlatState(PyTree):
+    """Attitude, rates and wrench of a drone that flies a setpoint exactly."""
+
+    quat: Array = leaf("drone", 1)
+    """Attitude, body to world, unit, xyzw. (..., 4)"""
+    ang_vel: Array = leaf("drone", 1)
+    """Angular velocity, body frame, rad/s. (..., 3)"""
+    ang_acc: Array = leaf("drone", 1)
+    """Angular acceleration, body frame, rad/s^2. (..., 3)"""
+    thrust: Array = leaf("drone", 1)
+    """Collective thrust, N. (..., 1)"""
+    torque: Array = leaf("drone", 1)
+    """Torque, body frame, N m. (..., 3)"""
+
+
+def flat_state(
+    setpoint: Setpoint, mass: Array | float, inertia: Array, gravity_vec: Array | tuple[float, ...] = (0.0, 0.0, -9.81)
+) -> FlatState:
+    """Return attitude, rates and wrench with which a drone without drag flies a setpoint.
+
+    Position and yaw are flat outputs of a multirotor: with their derivatives they determine its state and its inputs
+    (Mellinger and Kumar 2011, section III). The thrust is ``m |acc - g|`` along ``acc - g``, and the torque follows
+    from Euler's equation, ``J w' + w x J w``. The docstring of ``attitude_of_thrust`` has the rules for attitudes that
+    are not determined.
+
+    Args:
+        setpoint: Position, yaw and their derivatives.
+        mass: Mass, kg. () or (..., 1)
+        inertia: Inertia about the centre of mass, body frame, kg m^2. (3, 3) or (..., 3, 3)
+        gravity_vec: Gravitational acceleration, world frame, m/s^2. (3,)
+    """
+    thrust = setpoint.acc - jnp.asarray(gravity_vec, setpoint.acc.dtype)
+    s = setpoint
+    attitude = attitude_of_thrust(thrust, s.jerk, s.snap, s.yaw, s.yaw_rate, s.yaw_acc)
+    axes = (attitude.matrix[..., 0], attitude.matrix[..., 1], attitude.matrix[..., 2])
+    return FlatState(
+        quat=rotation.quat_from_axes(*axes),
+        ang_vel=attitude.ang_vel,
+        ang_acc=attitude.ang_acc,
+        thrust=mass * rotation.safe_norm(thrust),
+        torque=matvec(inertia, attitude.ang_acc) + cross(attitude.ang_vel, matvec(inertia, attitude.ang_vel)),
+    )
+
+
+def attitude_of_thrust(
+    thrust: Array,
+    thrust_rate: Array,
+    thrust_acc: Array,
+    yaw: Array,
+    yaw_rate: Array,
+    yaw_acc: Array,
+) -> Attitude:
+    """Return the attitude whose z axis is along a thrust vector and whose x axis is closest to a heading.
+
+    With the thrust ``f``, the heading ``c = (cos yaw, sin yaw, 0)`` and ``l = e_z x c``, the axes are ``z = f / |f|``,
+    ``y = z x c / |z x c|`` and ``x = y x z`` (Mellinger and Kumar 2011). The rates follow from two
+    conditions, differentiated once and twice: ``z' = w_y x - w_x y``, and ``y . c = 0``:
+
+        w_z x.c = w_x z.c + yaw' y.l
+
+    A thrust below ``NO_THRUST`` counts as one along z that does not change. Where thrust and heading are parallel, y is
+    the horizontal ``l``, and the rate about z is limited (``HORIZONTAL``).
+
+    Args:
+        thrust: Thrust vector over the mass, world frame, m/s^2. (..., 3)
+        thrust_rate: Its derivative, m/s^3. (..., 3)
+        thrust_acc: Its second derivative, m/s^4. (..., 3)
+        yaw: Heading, rad. (..., 1)
+        yaw_rate: Its derivative, rad/s. (..., 1)
+        yaw_acc: Its second derivative, rad/s^2. (..., 1)
+    """
+    cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
+    ahead, left = jnp.concatenate([cos, sin, zero], axis=-1), jnp.concatenate([-sin, cos, zero], axis=-1)
+    z, z_rate, z_acc = direction_of(thrust, thrust_rate, thrust_acc)
+    across = cross(z, ahead)
+    y = jnp.where(dot(across, across) < 1e-10, left, rotation.safe_normalize(across, left))
+    x = rotation.safe_normalize(cross(y, z), ahead)  # exactly one unless thrust and heading are parallel
+
+    x_ahead = jnp.maximum(dot(x, ahead), HORIZONTAL)
+    z_ahead, y_left, x_left, z_left = dot(z, ahead), dot(y, left), dot(x, left), dot(z, left)
+    wx, wy = -dot(y, z_rate), dot(x, z_rate)
+    wz = (wx * z_ahead + yaw_rate * y_left) / x_ahead
+    ax, ay = wy * wz - dot(y, z_acc), dot(x, z_acc) - wx * wz
+    swing = z_ahead * (ax + wy * wz) + 2 * yaw_rate * (wx * z_left - wz * x_left) + yaw_acc * y_left
+    az = wx * wy + swing / x_ahead
+    ang_vel, ang_acc = jnp.concatenate([wx, wy, wz], axis=-1), jnp.concatenate([ax, ay, az], axis=-1)
+    return Attitude(jnp.stack([x, y, z], axis=-1), ang_vel, ang_acc)
+
+
+def direction_of(thrust: Array, thrust_rate: Array, thrust_acc: Array) -> tuple[Array, Array, Array]:
+    """Return the unit vector along a vector, and its first two derivatives; e_z at rest below ``NO_THRUST``.
+
+    Args:
+        thrust: Vector, m/s^2. (..., 3)
+        thrust_rate: Its derivative, m/s^3. (..., 3)
+        thrust_acc: Its second derivative, m/s^4. (..., 3)
+
+    Returns:
+        Direction, its derivative, 1/s, and its second derivative, 1/s^2. (..., 3) each
+    """
+    falls = dot(thrust, thrust) < NO_THRUST**2
+    inverse = jnp.where(falls, 0.0, 1 / rotation.safe_norm(jnp.where(falls, 1.0, thrust)))
+    z = jnp.where(falls, jnp.asarray([0.0, 0.0, 1.0], thrust.dtype), thrust * inverse)
+    growth = dot(z, thrust_rate) * inverse
+    z_rate = thrust_rate * inverse - growth * z
+    growth_rate = (dot(z_rate, thrust_rate) + dot(z, thrust_acc)) * inverse
+    return z, z_rate, thrust_acc * inverse - 2 * growth * z_rate - growth_rate * z

@@ -1,0 +1,201 @@
+"""Geometric tracking control on SE(3), from a setpoint to a wrench, without angles and their singularities."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control.allocation import AllocationParams
+from crazysim.control.bandwidth import bandwidth
+from crazysim.control.core import Control
+from crazysim.control.flatness import Attitude, attitude_of_thrust
+from crazysim.control.priority import prioritized_wrench
+from crazysim.control.protocol import Controller
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import cross, dot, matvec
+
+Gains = Literal["bandwidth", "airframe"]
+"""Rule for the gains: by bandwidth, or from the airframe's table ``[geometric]``."""
+
+
+class GeometricParams(PyTree):
+    """Gains and parameters of geometric control, each shared or one per drone."""
+
+    mass: Array = leaf("parameter", 1, (1,))
+    """Mass that the controller assumes, kg. (1,)"""
+    gravity_vec: Array = leaf("parameter", 1)
+    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
+    J: Array = leaf("parameter", 2)
+    """Inertia that the controller assumes, body frame, kg m^2. (3, 3)"""
+    drag_matrix: Array = leaf("parameter", 2)
+    """Linear drag coefficients that the controller compensates, body frame, N s/m. (3, 3)"""
+    kr: Array = leaf("parameter", 1)
+    """Gain on position, N/m. (3,)"""
+    kv: Array = leaf("parameter", 1)
+    """Gain on velocity, N s/m. (3,)"""
+    kR: Array = leaf("parameter", 1)
+    """Gain on the rotation error, N m. (3,)"""
+    kw: Array = leaf("parameter", 1)
+    """Gain on the body rates, N m s. (3,)"""
+    allocation: AllocationParams
+    """Limits of the rotors."""
+
+    @staticmethod
+    def create(airframe: Airframe, freq: int, gains: Gains = "bandwidth") -> GeometricParams:
+        """Return the shared parameters of an airframe.
+
+        Args:
+            airframe: The airframe.
+            freq: Rate of the controller, Hz.
+            gains: ``"bandwidth"``: by the rule of ``crazysim.control.bandwidth``, times mass and inertia.
+                ``"airframe"``: the table ``[geometric]`` of the airframe, in the lab's airframes the gains
+                of AIMotionLab.
+
+        Raises:
+            ConfigError: If the airframe lacks a value.
+        """
+        mass, drag = airframe.value("rigid_body.mass", ()), airframe.value("drag.coefficients")
+        if gains == "airframe":
+            table = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
+        else:
+            rates, moments = bandwidth(airframe, freq), np.diag(airframe.inertia)
+            table = {
+                "kr": mass * rates.position**2,
+                "kv": mass * 2 * rates.position,
+                "kR": moments * rates.stiffness,
+                "kw": moments * rates.damping,
+            }
+        return GeometricParams(
+            mass=as_parameter(mass),
+            gravity_vec=as_parameter([0.0, 0.0, -9.81]),
+            J=as_parameter(airframe.inertia),
+            drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
+            **{key: as_parameter(np.broadcast_to(value, (3,))) for key, value in table.items()},
+            allocation=AllocationParams.create(airframe),
+        )
+
+
+def geometric_control(
+    pos: Array,
+    quat: Array,
+    vel: Array,
+    ang_vel: Array,
+    setpoint: Setpoint,
+    *,
+    params: GeometricParams,
+    feedforward: bool = True,
+) -> Array:
+    """Return the wrench that tracks a setpoint.
+
+    The controller of Lee, Leok and McClamroch (2010): a force from the errors of position and velocity,
+    an attitude whose z axis is along that force, and a torque from the errors of rotation and body rates. Attitude,
+    rates and angular acceleration are those of a drone whose thrust is that force and changes with jerk and snap of the
+    setpoint (``attitude_of_thrust``). The drag of the setpoint's velocity is compensated, with its derivatives at the
+    present attitude (Faessler, Franchi and Scaramuzza 2018). The rotors' limits are respected by priority
+    (``prioritized_wrench``), so a saturated drone keeps its attitude and the motors stay on.
+
+    Args:
+        pos: Position, world frame, m. (..., 3)
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        vel: Velocity, world frame, m/s. (..., 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        setpoint: Setpoint with the leading axes of the state.
+        params: Gains, shared or with the leading axes of the state.
+        feedforward: False for the law of AIMotionLab-Virtual, in which acceleration, jerk, snap, yaw rates and drag
+            are not fed forward.
+
+    Returns:
+        Collective thrust, N, and body torque, N m. (..., 4)
+    """
+    p, sp = params, setpoint
+    if not feedforward:
+        zero, still = jnp.zeros_like(pos), jnp.zeros_like(sp.yaw)
+        sp = sp.replace(acc=zero, jerk=zero, snap=zero, yaw_rate=still, yaw_acc=still)
+    matrix = rotation.matrix(quat)
+    feedback = -(p.kr * (pos - sp.pos) + p.kv * (vel - sp.vel)) / p.mass
+
+    def undragged(motion: Array, rate: Array) -> Array:
+        """Return the acceleration, or a derivative of it, that the rotors give for a motion under drag."""
+        if not feedforward:
+            return rate
+        return rate - matvec(matrix, matvec(p.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), motion))) / p.mass
+
+    specific = undragged(sp.vel, sp.acc) - p.gravity_vec + feedback
+    desired = attitude_of_thrust(
+        specific, undragged(sp.acc, sp.jerk), undragged(sp.jerk, sp.snap), sp.yaw, sp.yaw_rate, sp.yaw_acc
+    )
+    thrust = p.mass * dot(specific, matrix[..., 2])
+    torque = attitude_torque(matrix, ang_vel, desired, params=p)
+    return prioritized_wrench(jnp.concatenate([thrust, torque], axis=-1), params=p.allocation)
+
+
+def attitude_torque(matrix: Array, ang_vel: Array, desired: Attitude, *, params: GeometricParams) -> Array:
+    """Return the torque that tracks an attitude with its rates (Lee, Leok and McClamroch 2010).
+
+    Args:
+        matrix: Rotation matrix, body to world. (..., 3, 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        desired: Attitude to track.
+        params: Gains and inertia.
+
+    Returns:
+        Torque, body frame, N m. (..., 3)
+    """
+    p = params
+    rotation_error, rate_error, ang_acc = attitude_errors(matrix, ang_vel, desired)
+    inertial = cross(ang_vel, matvec(p.J, ang_vel)) + matvec(p.J, ang_acc)
+    return inertial - p.kR * rotation_error - p.kw * rate_error
+
+
+def attitude_errors(matrix: Array, ang_vel: Array, desired: Attitude) -> tuple[Array, Array, Array]:
+    """Return rotation error, error of the body rates, and the desired angular acceleration, all in the body frame.
+
+    The rotation error is ``vee(R_d^T R - R^T R_d) / 2``, rad for small errors; the rates compare after rotation from
+    the desired frame into the body's.
+
+    Args:
+        matrix: Rotation matrix R, body to world. (..., 3, 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        desired: Attitude R_d to track, with its derivatives.
+
+    Returns:
+        Rotation error, rad; rate error, rad/s; angular acceleration of a body that tracks, rad/s^2. (..., 3) each
+    """
+    columns = [(matrix[..., i], desired.matrix[..., i]) for i in range(3)]
+    # vee(R_d^T R - R^T R_d) is R^T times the sum of x_d cross x over the three axes.
+    to_body = jnp.swapaxes(matrix, -1, -2)
+    crossed = [cross(axis_d, axis) for axis, axis_d in columns]
+    rotation_error = 0.5 * matvec(to_body, crossed[0] + crossed[1] + crossed[2])
+    rate = matvec(to_body, matvec(desired.matrix, desired.ang_vel))
+    acc = matvec(to_body, matvec(desired.matrix, desired.ang_acc))
+    return rotation_error, ang_vel - rate, acc - cross(ang_vel, rate)
+
+
+class Geometric(Controller):
+    """Geometric tracking control (``geometric_control``) of setpoints."""
+
+    name: ClassVar[str] = "geometric"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state,)
+    output: ClassVar[Control] = Control.force_torque
+    freq: int = 500
+    """Rate, Hz."""
+    gains: Gains = "bandwidth"
+    """Rule for the gains, as for ``GeometricParams.create``."""
+    feedforward: bool = True
+    """True to feed the derivatives of the setpoint forward; without, it is the law of AIMotionLab-Virtual."""
+
+    def params(self, airframe: Airframe) -> GeometricParams:
+        """Return gains and constants for an airframe."""
+        return GeometricParams.create(airframe, self.freq, self.gains)
+
+    def update(self, data: Any, command: Any, memory: Any, params: GeometricParams) -> tuple[Array, Any]:
+        """Return the wrench."""
+        s = data.states
+        state = (s.pos, s.quat, s.vel, s.ang_vel)
+        return geometric_control(*state, command, params=params, feedforward=self.feedforward), memory

@@ -1,0 +1,234 @@
+"""Incremental nonlinear dynamic inversion: geometric tracking that measures disturbances instead of modelling them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control.allocation import force_torque2rotor_vel
+from crazysim.control.bandwidth import bandwidth, rotor_rate
+from crazysim.control.core import Control
+from crazysim.control.flatness import attitude_of_thrust
+from crazysim.control.geometric import GeometricParams, attitude_errors
+from crazysim.control.priority import prioritized_wrench
+from crazysim.control.protocol import Controller
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import cross, dot, matvec
+
+LEAD = 2.0
+"""Factor by which the feedback of rotor speeds makes the rotors faster than their own lag, 1."""
+
+DISTURBANCE_MAX = 5.0
+"""Largest acceleration by a disturbance that is compensated along an axis, m/s^2: half of the weight."""
+TORQUE_MAX = 0.5
+"""Largest torque by a disturbance that is compensated, as the rotation error against which it holds, rad."""
+
+
+class INDIParams(PyTree):
+    """Gains and parameters of INDI, each shared or one per drone."""
+
+    geometric: GeometricParams
+    """Gains, mass, inertia and limits."""
+    mixing_matrix: Array = leaf("parameter", 2)
+    """Rotor thrusts to collective thrust, 1, and body torque, m. (4, n_rotors)"""
+    lead: Array = leaf("parameter", 1)
+    """Factor on the difference of commanded and present rotor speeds, 1. (1,)"""
+    filter: Array = leaf("parameter", 1)
+    """Coefficients b0, b1, b2, a1, a2 of the low-pass filter. (5,)"""
+
+    @staticmethod
+    def create(airframe: Airframe, freq: int, cutoff: float) -> INDIParams:
+        """Return the shared parameters of an airframe.
+
+        The gains follow the rule of ``crazysim.control.bandwidth`` for rotors that are ``LEAD`` times as fast.
+
+        Args:
+            airframe: The airframe.
+            freq: Rate of the controller, Hz.
+            cutoff: Cutoff frequency of the filter, Hz.
+
+        Raises:
+            ConfigError: If the airframe lacks a value.
+        """
+        params = GeometricParams.create(airframe, freq)
+        moments, mass = np.diag(airframe.inertia), float(airframe.value("rigid_body.mass", ()))
+        rates = bandwidth(airframe, freq, LEAD * rotor_rate(airframe))
+        gains = {
+            "kr": mass * rates.position**2,
+            "kv": mass * 2 * rates.position,
+            "kR": moments * rates.stiffness,
+            "kw": moments * rates.damping,
+        }
+        arms = np.array([airframe.arm, airframe.arm, float(airframe.value("controller.thrust2torque", ()))])
+        mixing = np.vstack([np.ones(airframe.n_rotors), arms[:, None] * airframe.mixing_matrix])
+        return INDIParams(
+            geometric=params.replace(**{key: as_parameter(np.broadcast_to(x, (3,))) for key, x in gains.items()}),
+            mixing_matrix=as_parameter(mixing),
+            lead=as_parameter(LEAD),
+            filter=as_parameter(butterworth(cutoff, freq)),
+        )
+
+
+class INDIMemory(PyTree):
+    """Memory of INDI: the velocities of the last tick, and the states of the filter."""
+
+    vel: Array = leaf("drone", 1)
+    """Velocity at the last tick, world frame, m/s. (n_worlds, n_drones, 3)"""
+    ang_vel: Array = leaf("drone", 1)
+    """Angular velocity at the last tick, body frame, rad/s. (n_worlds, n_drones, 3)"""
+    filter: Array = leaf("drone", 1)
+    """Two states of the filter for each of its 12 signals. (n_worlds, n_drones, 24)"""
+    started: Array = leaf("drone", 1)
+    """One after the first tick, zero before. (n_worlds, n_drones, 1)"""
+
+    @staticmethod
+    def at_rest() -> INDIMemory:
+        """Return the memory of one drone before the first tick."""
+        return INDIMemory(*(as_parameter(np.zeros(n)) for n in (3, 3, 24, 1)))
+
+
+def butterworth(cutoff: float, freq: float) -> np.ndarray:
+    """Return the coefficients b0, b1, b2, a1, a2 of a low-pass Butterworth filter of order 2.
+
+    By the bilinear transform with its frequency warped, so that the gain at the cutoff is 1/sqrt(2).
+
+    Args:
+        cutoff: Cutoff frequency, Hz.
+        freq: Sampling rate, Hz.
+    """
+    k = math.tan(math.pi * min(cutoff / freq, 0.45))
+    scale = 1 / (1 + math.sqrt(2) * k + k * k)
+    b = k * k * scale
+    return np.array([b, 2 * b, b, 2 * (k * k - 1) * scale, (1 - math.sqrt(2) * k + k * k) * scale])
+
+
+def filtered(x: Array, state: Array, coefficients: Array) -> tuple[Array, Array]:
+    """Return signals after a filter of order 2, and the filter's new states (direct form II transposed).
+
+    Args:
+        x: Signals. (..., n)
+        state: States. (..., 2 n)
+        coefficients: From ``butterworth``. (..., 5)
+    """
+    b0, b1, b2, a1, a2 = (coefficients[..., i : i + 1] for i in range(5))
+    n = x.shape[-1]
+    first, second = state[..., :n], state[..., n:]
+    y = b0 * x + first
+    return y, jnp.concatenate([b1 * x - a1 * y + second, b2 * x - a2 * y], axis=-1)
+
+
+def steady(x: Array, coefficients: Array) -> Array:
+    """Return the states of a filter whose signals have always been ``x``. (..., n) -> (..., 2 n)"""
+    _, b1, b2, a1, a2 = (coefficients[..., i : i + 1] for i in range(5))
+    return jnp.concatenate([(b1 - a1 + b2 - a2) * x, (b2 - a2) * x], axis=-1)
+
+
+def indi_control(
+    pos: Array,
+    quat: Array,
+    vel: Array,
+    ang_vel: Array,
+    rotor_vel: Array,
+    setpoint: Setpoint,
+    memory: INDIMemory,
+    freq: float,
+    *,
+    params: INDIParams,
+) -> tuple[Array, INDIMemory]:
+    """Return the rotor speeds that track a setpoint under unknown forces and torques, and the memory.
+
+    The loops are those of ``geometric_control``. Its models of force and torque are replaced by increments on what the
+    rotors exert at present (Smeur, Chu and de Croon 2016 for the torque, Tal and Karaman 2018 for the force):
+
+        f = f_rotors + m (a_desired - a),   tau = tau_rotors + J (w'_desired - w')
+
+    The disturbances ``m a - f_rotors - m g`` and ``J w' - tau_rotors`` are limited (``DISTURBANCE_MAX``,
+    ``TORQUE_MAX``): the floor under a drone that stands is none that the rotors should push against.
+
+    Acceleration a and angular acceleration w' are differences of the velocities over one tick. They and the force and
+    torque of the rotors, from their measured speeds, pass through the same low-pass filter, so that their delays
+    cancel. Whatever the model leaves out, such as wind, a shifted load or a wrong mass, shows in a and w', and is
+    compensated. The rotors are driven beyond the commanded speed by ``params.lead`` times what is missing, which makes
+    them faster than their lag.
+
+    Args:
+        pos: Position, world frame, m. (..., 3)
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        vel: Velocity, world frame, m/s. (..., 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        rotor_vel: Rotor speeds, rpm. (..., n_rotors)
+        setpoint: Setpoint with the leading axes of the state.
+        memory: Memory of the last tick.
+        freq: Rate of this controller, Hz.
+        params: Gains, shared or with the leading axes of the state.
+
+    Returns:
+        Rotor speeds, rpm (..., n_rotors); the memory.
+    """
+    p, sp, allocation = params.geometric, setpoint, params.geometric.allocation
+    matrix = rotation.matrix(quat)
+    wrench = matvec(params.mixing_matrix, curve(rotor_vel, allocation.rpm2thrust))
+    push = matrix[..., 2] * wrench[..., :1] / p.mass
+    fresh = memory.started == 0
+    torque_acc = (wrench[..., 1:] - cross(ang_vel, matvec(p.J, ang_vel))) / _moments(p.J)
+    ang_acc = jnp.where(fresh, torque_acc, (ang_vel - memory.ang_vel) * freq)
+    acc = jnp.where(fresh, push + p.gravity_vec, (vel - memory.vel) * freq)
+    signals = jnp.concatenate([acc, push, ang_acc, wrench[..., 1:]], axis=-1)
+    state = jnp.where(fresh, steady(signals, params.filter), memory.filter)
+    signals, state = filtered(signals, state, params.filter)
+    acc, push, ang_acc, torque = (signals[..., i : i + 3] for i in (0, 3, 6, 9))
+
+    feedback = -(p.kr * (pos - sp.pos) + p.kv * (vel - sp.vel)) / p.mass
+    disturbance = rotation.safe_clip(acc - push - p.gravity_vec, -DISTURBANCE_MAX, DISTURBANCE_MAX)
+    specific = sp.acc - p.gravity_vec + feedback - disturbance
+    attitude = attitude_of_thrust(specific, sp.jerk, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
+    rotation_error, rate_error, ang_acc_des = attitude_errors(matrix, ang_vel, attitude)
+    wanted = matvec(p.J, ang_acc_des) - p.kR * rotation_error - p.kw * rate_error
+    limit = TORQUE_MAX * p.kR
+    torque = wanted - rotation.safe_clip(matvec(p.J, ang_acc) - torque, -limit, limit)
+
+    thrust = p.mass * dot(specific, matrix[..., 2])
+    command = prioritized_wrench(jnp.concatenate([thrust, torque], axis=-1), params=allocation)
+    desired = force_torque2rotor_vel(command, params=allocation)
+    slowest = rotor_vel_of_thrust(allocation.thrust_min, allocation.rpm2thrust)
+    driven = jnp.maximum(rotor_vel + params.lead * (desired - rotor_vel), jnp.maximum(slowest, 1.0))
+    return driven, INDIMemory(vel, ang_vel, state, jnp.ones_like(memory.started))
+
+
+def _moments(J: Array) -> Array:
+    """Return the diagonal of an inertia. (..., 3)"""
+    return jnp.stack([J[..., i, i] for i in range(3)], axis=-1)
+
+
+class INDI(Controller):
+    """Incremental nonlinear dynamic inversion (``indi_control``) for setpoints; needs measured rotor speeds."""
+
+    name: ClassVar[str] = "indi"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state,)
+    output: ClassVar[Control] = Control.rotor_vel
+    freq: int = 500
+    """Rate, Hz."""
+    cutoff: float = 12.0
+    """Cutoff frequency of the filter, Hz."""
+
+    def params(self, airframe: Airframe) -> INDIParams:
+        """Return gains and constants for an airframe."""
+        return INDIParams.create(airframe, self.freq, self.cutoff)
+
+    def memory(self, airframe: Airframe) -> INDIMemory:
+        """Return the memory before the first tick."""
+        return INDIMemory.at_rest()
+
+    def update(self, data: Any, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:
+        """Return the rotor speeds."""
+        s = data.states
+        state = (s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel)
+        return indi_control(*state, command, memory, self.freq, params=params)

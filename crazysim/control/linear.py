@@ -1,0 +1,122 @@
+"""Rigid-body models of a drone, alone and with a load on a rod, and their linearisation about an equilibrium."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim import rotation
+from crazysim.rotation import cross, dot, matvec
+
+STATES = 12
+"""States of the drone: position, velocity, roll, pitch, yaw, body rates."""
+LOAD_STATES = 16
+"""States of the drone with a load: those of the drone, two angles of the rod, and their rates."""
+
+Model = Callable[[Array, Array], Array]
+"""State and input to the derivative of the state."""
+
+
+def drone_derivative(x: Array, u: Array, mass: Array, J: Array, gravity_vec: Array) -> Array:
+    """Return the derivative of the state of a rigid body under a wrench.
+
+    Args:
+        x: Position, m, and velocity, m/s, world frame; roll, pitch, yaw, rad; body rates, rad/s. (12,)
+        u: Collective thrust, N, and body torque, N m. (4,)
+        mass: Mass, kg. (1,)
+        J: Inertia, body frame, kg m^2. (3, 3)
+        gravity_vec: Gravitational acceleration, m/s^2. (3,)
+
+    Returns:
+        Derivative, per second. (12,)
+    """
+    vel, rpy, ang_vel = x[3:6], x[6:9], x[9:12]
+    acc = u[0] * _z_axis(rpy) / mass + gravity_vec
+    return jnp.concatenate([vel, acc, *_rotational(rpy, ang_vel, u[1:], J)])
+
+
+def load_derivative(
+    x: Array, u: Array, mass: Array, J: Array, gravity_vec: Array, load_mass: Array, length: Array
+) -> Array:
+    """Return the derivative of the state of a drone with a point load on a rigid, massless rod.
+
+    The rod hangs from the centre of mass by a joint without friction, so it exerts no torque on the drone. With the
+    thrust ``f`` and the unit vector q from drone to load (Sreenath, Lee and Kumar 2013):
+
+        m L q'' = q x (q x f) - m L |q'|^2 q
+        (m + m_L) (v' - g) = f - m_L L q''
+
+    Two angles give the direction, ``q = (-sin b cos a, sin a, -cos b cos a)``: the rod turns about y by b, then about
+    its own x by a.
+
+    Args:
+        x: The 12 states of the drone; a, b, rad; a', b', rad/s. (16,)
+        u: Collective thrust, N, and body torque, N m. (4,)
+        mass: Mass of the drone, kg. (1,)
+        J: Inertia of the drone, body frame, kg m^2. (3, 3)
+        gravity_vec: Gravitational acceleration, m/s^2. (3,)
+        load_mass: Mass of the load, kg. (1,)
+        length: Length of the rod, m. (1,)
+
+    Returns:
+        Derivative, per second. (16,)
+    """
+    vel, rpy, ang_vel, angles, rates = x[3:6], x[6:9], x[9:12], x[12:14], x[14:16]
+    force = u[0] * _z_axis(rpy)
+    q, q_rate = jax.jvp(rod_direction, (angles,), (rates,))
+    q_acc = cross(q, cross(q, force)) / (mass * length) - dot(q_rate, q_rate) * q
+    acc = (force - load_mass * length * q_acc) / (mass + load_mass) + gravity_vec
+    # q'' = J a'' + J' a': the columns of J are orthogonal, so the angles' accelerations are two projections.
+    slope, slope_rate = jax.jvp(jax.jacfwd(rod_direction), (angles,), (rates,))
+    rest = q_acc - slope_rate @ rates
+    angles_acc = slope.T @ rest / jnp.sum(slope * slope, axis=0)
+    return jnp.concatenate([vel, acc, *_rotational(rpy, ang_vel, u[1:], J), rates, angles_acc])
+
+
+def rod_direction(angles: Array) -> Array:
+    """Return the direction of a rod from its angles a and b, rad: straight down at zero. (2,) -> (3,)"""
+    a, b = angles[0], angles[1]
+    return jnp.stack([-jnp.sin(b) * jnp.cos(a), jnp.sin(a), -jnp.cos(b) * jnp.cos(a)])
+
+
+def rod_angles(direction: Array, direction_rate: Array) -> tuple[Array, Array]:
+    """Return the angles a, b of a rod, rad, and their rates, rad/s; the inverse of ``rod_direction``.
+
+    Finite everywhere: where the rod is level along y, b is zero and its rate is limited.
+
+    Args:
+        direction: Unit vector from drone to load. (..., 3)
+        direction_rate: Its derivative, 1/s. (..., 3)
+
+    Returns:
+        Angles (..., 2), rates (..., 2).
+    """
+    x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
+    across = rotation.safe_norm(jnp.stack([x, z], axis=-1))[..., 0]
+    angles = jnp.stack([jnp.arctan2(y, across), rotation.safe_arctan2(-x, -z)], axis=-1)
+    safe = jnp.maximum(across, 1e-3)
+    b_rate = (direction_rate[..., 0] * z - x * direction_rate[..., 2]) / safe**2
+    a_rate = direction_rate[..., 1] / safe
+    return angles, jnp.stack([a_rate, b_rate], axis=-1)
+
+
+def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
+    """Return the matrices A (n, n) and B (n, m) of ``x' = A x + B u`` about a state and an input."""
+    return jax.jacfwd(model, 0)(x, u), jax.jacfwd(model, 1)(x, u)
+
+
+def _z_axis(rpy: Array) -> Array:
+    return rotation.z_axis(rotation.from_rpy(rpy))
+
+
+def _rotational(rpy: Array, ang_vel: Array, torque: Array, J: Array) -> tuple[Array, Array]:
+    """Return the derivatives of roll, pitch, yaw and of the body rates."""
+    roll, pitch = rpy[0], rpy[1]
+    turning = jnp.sin(roll) * ang_vel[1] + jnp.cos(roll) * ang_vel[2]
+    yaw_rate = turning / jnp.cos(pitch)
+    pitch_rate = jnp.cos(roll) * ang_vel[1] - jnp.sin(roll) * ang_vel[2]
+    rpy_rate = jnp.stack([ang_vel[0] + jnp.sin(pitch) * yaw_rate, pitch_rate, yaw_rate])
+    return rpy_rate, jnp.linalg.solve(J, torque - cross(ang_vel, matvec(J, ang_vel)))

@@ -1,0 +1,291 @@
+"""Linear quadratic regulator of a drone with a load on a rod, about hover, for setpoints of load or drone."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control.allocation import AllocationParams
+from crazysim.control.bandwidth import bandwidth
+from crazysim.control.core import Control
+from crazysim.control.flatness import attitude_of_thrust, direction_of
+from crazysim.control.linear import linearize, load_derivative, rod_angles
+from crazysim.control.lqr import GRAVITY_VEC, Reference, as_weights, into_heading, on_host, state_error
+from crazysim.control.priority import prioritized_wrench
+from crazysim.control.protocol import Controller
+from crazysim.control.riccati import gain_discrete
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import cross, dot, matvec
+
+Target = Literal["load", "drone"]
+"""Body that a setpoint describes."""
+
+
+class LoadLQRParams(PyTree):
+    """Gain and parameters of the LQR with load, each shared or one per drone."""
+
+    mass: Array = leaf("parameter", 1, (1,))
+    """Mass of the drone that the controller assumes, kg. (1,)"""
+    load_mass: Array = leaf("parameter", 1, (1,))
+    """Mass of the load that the controller assumes, kg. (1,)"""
+    length: Array = leaf("parameter", 1, (1,))
+    """Length of the rod that the controller assumes, m. (1,)"""
+    gravity_vec: Array = leaf("parameter", 1)
+    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
+    J: Array = leaf("parameter", 2)
+    """Inertia that the controller assumes, body frame, kg m^2. (3, 3)"""
+    drag_matrix: Array = leaf("parameter", 2)
+    """Linear drag coefficients that the controller compensates, body frame, N s/m. (3, 3)"""
+    gain: Array = leaf("parameter", 2)
+    """Gain K from the errors of position, velocity, rotation, body rates, rod angles and their rates to the wrench.
+    (4, 16)"""
+    allocation: AllocationParams
+    """Limits of the rotors."""
+
+    @staticmethod
+    def create(
+        airframe: Airframe, freq: int, load_mass: float, length: float, Q: Any = None, R: Any = None
+    ) -> LoadLQRParams:
+        """Return the shared parameters of an airframe, with the gain computed in float64.
+
+        Args:
+            airframe: The airframe.
+            freq: Rate of the controller, Hz, for which the model is discretised.
+            load_mass: Mass of the load, kg.
+            length: Length of the rod, m.
+            Q: Weights of position, velocity, roll, pitch, yaw, body rates, rod angles and their rates, (16,) or
+                (16, 16); None for ``default_load_weights``.
+            R: Weights of collective thrust and torque (4,) or (4, 4); None for ``default_load_weights``.
+
+        Raises:
+            ConfigError: If the airframe lacks a value, a weight has another shape, or no gain stabilises the drone.
+        """
+        mass, inertia, drag = airframe.value("rigid_body.mass"), airframe.inertia, airframe.value("drag.coefficients")
+        weights = default_load_weights(airframe, freq, load_mass, length)
+        Q = as_weights("Q", weights[0] if Q is None else Q, 16)
+        R = as_weights("R", weights[1] if R is None else R, 4)
+        gain = on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R)
+        return LoadLQRParams(
+            mass=as_parameter(mass),
+            load_mass=as_parameter(load_mass),
+            length=as_parameter(length),
+            gravity_vec=as_parameter(GRAVITY_VEC),
+            J=as_parameter(inertia),
+            drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
+            gain=as_parameter(gain),
+            allocation=AllocationParams.create(airframe),
+        )
+
+
+def default_load_weights(
+    airframe: Airframe, freq: int, load_mass: float, length: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the diagonals of Q (16,) and R (4,) that suit an airframe's bandwidth, by Bryson's rule.
+
+    As ``crazysim.control.lqr.default_weights``, for drone and load together. The angle of the rod counts as a shift of
+    the load: 1 m of position is 1 / length rad, and its rate as the natural frequency times that.
+    """
+    rates, g = bandwidth(airframe, freq), 9.81
+    w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
+    tilt = w**2 / g
+    angle = [1 / length, 1 / length, w / length, w / length]
+    errors = np.concatenate([np.ones(3), np.full(3, w), np.full(3, tilt), np.full(3, tilt * w), angle])
+    inputs = np.array([(mass + load_mass) * w**2, *(moments * rates.stiffness * tilt)])
+    return errors**-2, inputs**-2
+
+
+def load_gain(mass: Array, J: Array, load_mass: Array, length: Array, dt: Array, Q: Array, R: Array) -> Array:
+    """Return the gain of the discrete LQR about hover with a load, or NaN if there is none; pure and differentiable.
+
+    The model is that of ``load_derivative``, discretised by ``A_d = I + dt A``, ``B_d = dt B``.
+
+    Args:
+        mass: Mass of the drone, kg. (1,)
+        J: Inertia, body frame, kg m^2. (3, 3)
+        load_mass: Mass of the load, kg. (1,)
+        length: Length of the rod, m. (1,)
+        dt: Period of the controller, s. ()
+        Q: Weights of the states. (16, 16)
+        R: Weights of collective thrust and torque. (4, 4)
+
+    Returns:
+        Gain K of ``u = -K x``. (4, 16)
+    """
+    mass, load_mass = jnp.reshape(mass, (1,)), jnp.reshape(load_mass, (1,))
+    gravity = jnp.asarray(GRAVITY_VEC, J.dtype)
+
+    def model(x: Array, u: Array) -> Array:
+        return load_derivative(x, u, mass, J, gravity, load_mass, jnp.reshape(length, (1,)))
+
+    x, u = jnp.zeros(16, J.dtype), jnp.concatenate([9.81 * (mass + load_mass), jnp.zeros(3, J.dtype)])
+    A, B = linearize(model, x, u)
+    return gain_discrete(jnp.eye(16, dtype=J.dtype) + dt * A, dt * B, Q, R)
+
+
+def load_reference(
+    setpoint: Setpoint, params: LoadLQRParams, rod_jerk: Array | None = None
+) -> tuple[Reference, Array, Array]:
+    """Return the motion of the drone that carries a load along a setpoint, and direction and rate of the rod.
+
+    The rod pulls the load along its specific force, ``q = -(a_L - g) / |a_L - g|``, so the drone is at ``r_L - L q``,
+    and its thrust is ``f = (m + m_L)(a_L - g) - m L q_tt``, plus the drag of a level drone. The body rates follow from
+    ``f_t = (m + m_L) j_L - m L q_ttt``, in which the last term needs the fifth derivative of the load's position: more
+    than a setpoint has.
+
+    Args:
+        setpoint: Setpoint of the load.
+        params: Masses, length, inertia.
+        rod_jerk: Third derivative q_ttt of the direction, 1/s^3; None for zero. (..., 3)
+
+    Returns:
+        Reference of the drone; direction of the rod from drone to load (..., 3); its derivative, 1/s (..., 3).
+    """
+    p, sp = params, setpoint
+    up, up_rate, up_acc = direction_of(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
+    vel, total = sp.vel + p.length * up_rate, p.mass + p.load_mass
+    force = total * (sp.acc - p.gravity_vec) + p.mass * p.length * up_acc - matvec(p.drag_matrix, vel)
+    rate = total * sp.jerk - (0.0 if rod_jerk is None else p.mass * p.length * rod_jerk)
+    rate = rate - matvec(p.drag_matrix, sp.acc + p.length * up_acc)
+    reference = _reference(sp.pos + p.length * up, vel, force, rate, sp, p)
+    return reference, -up, -up_rate
+
+
+def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Reference, Array, Array]:
+    """Return the reference of a setpoint of the drone, with a load that hangs as if its acceleration were constant.
+
+    Args:
+        setpoint: Setpoint of the drone.
+        params: Masses, length, inertia.
+
+    Returns:
+        As ``load_reference``.
+    """
+    p, sp = params, setpoint
+    up, up_rate, _ = direction_of(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
+    total = p.mass + p.load_mass
+    force = total * (sp.acc - p.gravity_vec) - matvec(p.drag_matrix, sp.vel)
+    rate = total * sp.jerk - matvec(p.drag_matrix, sp.acc)
+    return _reference(sp.pos, sp.vel, force, rate, sp, p), -up, -up_rate
+
+
+def _reference(pos: Array, vel: Array, force: Array, rate: Array, sp: Setpoint, p: LoadLQRParams) -> Reference:
+    """Return the reference of a drone whose thrust vector is ``force``, N, with the derivative ``rate``, N/s."""
+    total = p.mass + p.load_mass
+    attitude = attitude_of_thrust(force / total, rate / total, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
+    torque = matvec(p.J, attitude.ang_acc) + cross(attitude.ang_vel, matvec(p.J, attitude.ang_vel))
+    wrench = jnp.concatenate([rotation.safe_norm(force), torque], axis=-1)
+    return Reference(pos, vel, attitude.matrix, attitude.ang_vel, wrench)
+
+
+def load_lqr_control(
+    pos: Array,
+    quat: Array,
+    vel: Array,
+    ang_vel: Array,
+    direction: Array,
+    direction_rate: Array,
+    setpoint: Setpoint,
+    *,
+    params: LoadLQRParams,
+    target: Target = "load",
+    rod_jerk: Array | None = None,
+) -> Array:
+    """Return the wrench of the LQR with load, with the wrench of the setpoint's motion as feed-forward.
+
+    ``u = u_ref - K e`` with the errors of the drone as in ``lqr_control``, and those of the two angles of the rod and
+    their rates (``rod_angles``), all in the frame of the desired heading.
+
+    Args:
+        pos: Position of the drone, world frame, m. (..., 3)
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        vel: Velocity of the drone, world frame, m/s. (..., 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        direction: Unit vector from drone to load, world frame. (..., 3)
+        direction_rate: Its derivative, 1/s. (..., 3)
+        setpoint: Setpoint with the leading axes of the state.
+        params: Gain, shared or with the leading axes of the state.
+        target: ``"load"`` if the setpoint is of the load, ``"drone"`` if it is of the drone.
+        rod_jerk: As for ``load_reference``. (..., 3)
+
+    Returns:
+        Collective thrust, N, and body torque, N m, within the limits of the rotors. (..., 4)
+    """
+    p = params
+    if target == "load":
+        reference, rod, rod_rate = load_reference(setpoint, p, rod_jerk)
+    else:
+        reference, rod, rod_rate = hanging_reference(setpoint, p)
+    rods = [into_heading(x, setpoint.yaw) for x in (direction, direction_rate, rod, rod_rate)]
+    angles, rates = rod_angles(rods[0], rods[1])
+    angles_ref, rates_ref = rod_angles(rods[2], rods[3])
+    error = state_error(pos, quat, vel, ang_vel, reference, setpoint.yaw)
+    error = jnp.concatenate([error, angles - angles_ref, rates - rates_ref], axis=-1)
+    return prioritized_wrench(reference.wrench - matvec(p.gain, error), params=p.allocation)
+
+
+class LoadLQRMemory(PyTree):
+    """Memory of the LQR with load: the setpoint of the last tick, of which a difference gives one more derivative."""
+
+    rod_acc: Array = leaf("drone", 1)
+    """Second derivative of the direction of the rod at the last tick, 1/s^2. (n_worlds, n_drones, 3)"""
+    started: Array = leaf("drone", 1)
+    """One after the first tick, zero before. (n_worlds, n_drones, 1)"""
+
+
+ROD_JERK_MAX = 500.0
+"""Largest third derivative of the direction of the rod that is fed forward, 1/s^3: a swing of 0.5 rad at 10 rad/s."""
+
+
+class LoadLQR(Controller):
+    """Linear quadratic regulator of a drone with a load (``load_lqr_control``) for setpoints of load or drone."""
+
+    name: ClassVar[str] = "load_lqr"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state,)
+    output: ClassVar[Control] = Control.force_torque
+    freq: int = 500
+    """Rate, Hz."""
+    load_mass: float = 0.05
+    """Mass of the load, kg."""
+    length: float = 0.4
+    """Length of the rod, m."""
+    target: Target = "load"
+    """Body that setpoints describe."""
+    load: str = "load"
+    """Name of the plugin of the load, whose record has ``pos`` and ``vel`` of the load."""
+    Q: Any = None
+    """Weights of the states, as for ``LoadLQRParams.create``."""
+    R: Any = None
+    """Weights of the inputs, as for ``LoadLQRParams.create``."""
+
+    def params(self, airframe: Airframe) -> LoadLQRParams:
+        """Return gain and constants for an airframe."""
+        return LoadLQRParams.create(airframe, self.freq, self.load_mass, self.length, self.Q, self.R)
+
+    def memory(self, airframe: Airframe) -> LoadLQRMemory:
+        """Return the memory before the first tick."""
+        return LoadLQRMemory(as_parameter(np.zeros(3)), as_parameter(0.0))
+
+    def update(
+        self, data: Any, command: Any, memory: LoadLQRMemory, params: LoadLQRParams
+    ) -> tuple[Array, LoadLQRMemory]:
+        """Return the wrench."""
+        s, load = data.states, data.plugins[self.load]
+        offset, rate = load.pos - s.pos, load.vel - s.vel
+        distance = jnp.maximum(rotation.safe_norm(offset), 1e-3)
+        direction = offset / distance
+        turning = (rate - dot(direction, rate) * direction) / distance
+        rod_acc = -direction_of(command.acc - params.gravity_vec, command.jerk, command.snap)[2]
+        rod_jerk = memory.started * (rod_acc - memory.rod_acc) * self.freq
+        wrench = load_lqr_control(
+            *(s.pos, s.quat, s.vel, s.ang_vel, direction, turning, command),
+            params=params,
+            target=self.target,
+            rod_jerk=rotation.safe_clip(rod_jerk, -ROD_JERK_MAX, ROD_JERK_MAX),
+        )
+        return wrench, memory.replace(rod_acc=rod_acc, started=jnp.ones_like(memory.started))

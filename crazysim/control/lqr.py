@@ -1,0 +1,248 @@
+"""Linear quadratic regulator about hover, for setpoints that move."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control.allocation import AllocationParams
+from crazysim.control.bandwidth import bandwidth
+from crazysim.control.core import Control
+from crazysim.control.flatness import attitude_of_thrust
+from crazysim.control.linear import drone_derivative, linearize
+from crazysim.control.priority import prioritized_wrench
+from crazysim.control.protocol import Controller
+from crazysim.control.riccati import check_gain, gain_continuous
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import cross, dot, matvec
+
+GRAVITY_VEC = np.array([0.0, 0.0, -9.81])
+
+
+class LQRParams(PyTree):
+    """Gain and parameters of the LQR about hover, each shared or one per drone."""
+
+    mass: Array = leaf("parameter", 1, (1,))
+    """Mass that the controller assumes, kg. (1,)"""
+    gravity_vec: Array = leaf("parameter", 1)
+    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
+    J: Array = leaf("parameter", 2)
+    """Inertia that the controller assumes, body frame, kg m^2. (3, 3)"""
+    drag_matrix: Array = leaf("parameter", 2)
+    """Linear drag coefficients that the controller compensates, body frame, N s/m. (3, 3)"""
+    gain: Array = leaf("parameter", 2)
+    """Gain K from the errors of position, velocity, rotation and body rates to the wrench. (4, 12)"""
+    allocation: AllocationParams
+    """Limits of the rotors."""
+
+    @staticmethod
+    def create(airframe: Airframe, freq: int, Q: Any = None, R: Any = None) -> LQRParams:
+        """Return the shared parameters of an airframe, with the gain computed in float64.
+
+        Args:
+            airframe: The airframe.
+            freq: Rate of the controller, Hz, which enters the default weights.
+            Q: Weights of position, velocity, roll, pitch, yaw and body rates, a diagonal (12,) or a matrix (12, 12);
+                None for ``default_weights``.
+            R: Weights of collective thrust and torque (4,) or (4, 4); None for ``default_weights``.
+
+        Raises:
+            ConfigError: If the airframe lacks a value, a weight has another shape, or no gain stabilises the drone.
+        """
+        mass, inertia, drag = airframe.value("rigid_body.mass"), airframe.inertia, airframe.value("drag.coefficients")
+        weights = default_weights(airframe, freq)
+        Q = as_weights("Q", weights[0] if Q is None else Q, 12)
+        R = as_weights("R", weights[1] if R is None else R, 4)
+        return LQRParams(
+            mass=as_parameter(mass),
+            gravity_vec=as_parameter(GRAVITY_VEC),
+            J=as_parameter(inertia),
+            drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
+            gain=as_parameter(on_host(hover_gain, mass, inertia, Q, R)),
+            allocation=AllocationParams.create(airframe),
+        )
+
+
+def default_weights(airframe: Airframe, freq: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the diagonals of Q (12,) and R (4,) that suit an airframe's bandwidth.
+
+    Bryson's rule: each weight is one over the square of an acceptable error. An error of position of 1 m counts as
+    much as the velocity, the tilt, the body rates, the thrust and the torque that the rule of
+    ``crazysim.control.bandwidth`` would give it: w, w^2 / g, w^3 / g, m w^2 and J k w^2 / g, with the natural frequency
+    w of the position and the attitude stiffness k. Yaw counts as roll and pitch.
+    """
+    rates, g = bandwidth(airframe, freq), 9.81
+    w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
+    tilt = w**2 / g
+    errors = np.concatenate([np.ones(3), np.full(3, w), np.full(3, tilt), np.full(3, tilt * w)])
+    inputs = np.array([mass * w**2, *(moments * rates.stiffness * tilt)])
+    return errors**-2, inputs**-2
+
+
+def as_weights(name: str, weights: Any, n: int) -> np.ndarray:
+    """Return weights as a matrix (n, n) of float64.
+
+    Raises:
+        ConfigError: If they are neither n numbers nor a symmetric matrix, or not finite.
+    """
+    array = np.asarray(weights, np.float64)
+    array = np.diag(array) if array.shape == (n,) else array
+    if array.shape != (n, n) or not np.all(np.isfinite(array)) or not np.allclose(array, array.T):
+        raise ConfigError(
+            f"expected weights {name} as {n} finite numbers or a symmetric matrix {(n, n)}, got shape "
+            f"{np.shape(weights)}. Give a diagonal of {n} numbers."
+        )
+    return array
+
+
+def on_host(gain: Any, *args: Any) -> np.ndarray:
+    """Return a gain computed in float64 on the CPU.
+
+    Raises:
+        ConfigError: If the Riccati equation has no stabilising solution.
+    """
+    with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
+        args = jax.tree.map(lambda x: np.asarray(x, np.float64), args, is_leaf=lambda x: isinstance(x, list))
+        return check_gain(np.asarray(jax.jit(gain)(*args)))
+
+
+def hover_gain(mass: Array, J: Array, Q: Array, R: Array) -> Array:
+    """Return the gain of the LQR about hover at yaw zero, or NaN if there is none; pure and differentiable.
+
+    Args:
+        mass: Mass, kg. () or (1,)
+        J: Inertia, body frame, kg m^2. (3, 3)
+        Q: Weights of position, velocity, roll, pitch, yaw and body rates. (12, 12)
+        R: Weights of collective thrust and torque. (4, 4)
+
+    Returns:
+        Gain K of ``u = -K x``. (4, 12)
+    """
+    gravity = jnp.asarray(GRAVITY_VEC, J.dtype)
+    mass = jnp.reshape(mass, (1,))
+
+    def model(x: Array, u: Array) -> Array:
+        return drone_derivative(x, u, mass, J, gravity)
+
+    x, u = jnp.zeros(12, J.dtype), jnp.concatenate([9.81 * mass, jnp.zeros(3, J.dtype)])
+    return gain_continuous(*linearize(model, x, u), Q, R)
+
+
+class Reference(NamedTuple):
+    """State and wrench of a drone that flies a setpoint."""
+
+    pos: Array
+    """Position, world frame, m. (..., 3)"""
+    vel: Array
+    """Velocity, world frame, m/s. (..., 3)"""
+    matrix: Array
+    """Rotation matrix, body to world. (..., 3, 3)"""
+    ang_vel: Array
+    """Angular velocity, body frame, rad/s. (..., 3)"""
+    wrench: Array
+    """Collective thrust, N, and body torque, N m. (..., 4)"""
+
+
+def reference_of(setpoint: Setpoint, params: Any) -> Reference:
+    """Return the reference of a setpoint, from flatness, with the drag of a level drone compensated.
+
+    Args:
+        setpoint: The setpoint.
+        params: A record with ``mass``, ``gravity_vec``, ``J`` and ``drag_matrix``.
+    """
+    p, sp = params, setpoint
+    specific = sp.acc - p.gravity_vec - matvec(p.drag_matrix, sp.vel) / p.mass
+    rate = sp.jerk - matvec(p.drag_matrix, sp.acc) / p.mass
+    second = sp.snap - matvec(p.drag_matrix, sp.jerk) / p.mass
+    attitude = attitude_of_thrust(specific, rate, second, sp.yaw, sp.yaw_rate, sp.yaw_acc)
+    thrust = p.mass * rotation.safe_norm(specific)
+    torque = matvec(p.J, attitude.ang_acc) + cross(attitude.ang_vel, matvec(p.J, attitude.ang_vel))
+    return Reference(sp.pos, sp.vel, attitude.matrix, attitude.ang_vel, jnp.concatenate([thrust, torque], axis=-1))
+
+
+def state_error(
+    pos: Array, quat: Array, vel: Array, ang_vel: Array, reference: Reference, yaw: Array | None = None
+) -> Array:
+    """Return the errors of position, velocity, rotation and body rates. (..., 12)
+
+    The rotation error is ``vee(R_d^T R - R^T R_d) / 2``: near hover the errors of roll, pitch and yaw.
+
+    Args:
+        pos: Position, world frame, m. (..., 3)
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        vel: Velocity, world frame, m/s. (..., 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        reference: Reference.
+        yaw: Heading in whose frame position and velocity are given, rad; None for the world frame. (..., 1)
+    """
+    matrix = rotation.matrix(quat)
+    relative = [[dot(reference.matrix[..., i], matrix[..., j])[..., 0] for j in range(3)] for i in range(3)]  # R_d^T R
+    rotation_error = 0.5 * jnp.stack(
+        [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]], axis=-1
+    )
+    to_body = jnp.swapaxes(matrix, -1, -2)
+    rate_error = ang_vel - matvec(to_body, matvec(reference.matrix, reference.ang_vel))
+    errors = [pos - reference.pos, vel - reference.vel]
+    if yaw is not None:
+        errors = [into_heading(error, yaw) for error in errors]
+    return jnp.concatenate([*errors, rotation_error, rate_error], axis=-1)
+
+
+def into_heading(vector: Array, yaw: Array) -> Array:
+    """Return a world vector in the frame that is turned by the yaw about z. (..., 3)"""
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    x, y, z = vector[..., :1], vector[..., 1:2], vector[..., 2:]
+    return jnp.concatenate([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
+
+
+def lqr_control(pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: Setpoint, *, params: LQRParams) -> Array:
+    """Return the wrench of the LQR about hover, with the wrench of the setpoint's motion as feed-forward.
+
+    ``u = u_ref - K e``. Errors of position and velocity are taken in the frame of the desired heading, so that one gain
+    serves every yaw, and reference attitude, rates and wrench come from flatness (``reference_of``).
+
+    Args:
+        pos: Position, world frame, m. (..., 3)
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        vel: Velocity, world frame, m/s. (..., 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        setpoint: Setpoint with the leading axes of the state.
+        params: Gain, shared or with the leading axes of the state.
+
+    Returns:
+        Collective thrust, N, and body torque, N m, within the limits of the rotors. (..., 4)
+    """
+    reference = reference_of(setpoint, params)
+    error = state_error(pos, quat, vel, ang_vel, reference, setpoint.yaw)
+    return prioritized_wrench(reference.wrench - matvec(params.gain, error), params=params.allocation)
+
+
+class LQR(Controller):
+    """Linear quadratic regulator about hover (``lqr_control``) for setpoints."""
+
+    name: ClassVar[str] = "lqr"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state,)
+    output: ClassVar[Control] = Control.force_torque
+    freq: int = 500
+    """Rate, Hz."""
+    Q: Any = None
+    """Weights of the states, as for ``LQRParams.create``."""
+    R: Any = None
+    """Weights of the inputs, as for ``LQRParams.create``."""
+
+    def params(self, airframe: Airframe) -> LQRParams:
+        """Return gain and constants for an airframe."""
+        return LQRParams.create(airframe, self.freq, self.Q, self.R)
+
+    def update(self, data: Any, command: Any, memory: Any, params: LQRParams) -> tuple[Array, Any]:
+        """Return the wrench."""
+        s = data.states
+        return lqr_control(s.pos, s.quat, s.vel, s.ang_vel, command, params=params), memory

@@ -1,0 +1,247 @@
+"""Time-varying linear quadratic regulator along a flat trajectory: gains from a backward Riccati recursion."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control.allocation import AllocationParams
+from crazysim.control.core import Control
+from crazysim.control.lqr import (
+    LQRParams,
+    Reference,
+    as_weights,
+    default_weights,
+    on_host,
+    reference_of,
+    state_error,
+)
+from crazysim.control.priority import prioritized_wrench
+from crazysim.control.protocol import Controller
+from crazysim.control.riccati import gain_continuous, solve_lyapunov
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import cross, matvec
+
+MAX_KNOTS = 60
+"""Largest number of gains in a table."""
+
+
+class TrackingLQRParams(PyTree):
+    """Gains and parameters of the LQR along a trajectory, each shared or one per drone."""
+
+    mass: Array = leaf("parameter", 1, (1,))
+    """Mass that the controller assumes, kg. (1,)"""
+    gravity_vec: Array = leaf("parameter", 1)
+    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
+    J: Array = leaf("parameter", 2)
+    """Inertia that the controller assumes, body frame, kg m^2. (3, 3)"""
+    drag_matrix: Array = leaf("parameter", 2)
+    """Linear drag coefficients that the controller compensates, body frame, N s/m. (3, 3)"""
+    gains: Array = leaf("parameter", 3)
+    """Gains at the knots. (n_knots, 4, 12)"""
+    dt: Array = leaf("parameter", 1)
+    """Time from one knot to the next, s. (1,)"""
+    start: Array = leaf("parameter", 1)
+    """Time of the first knot, s since the reset. (1,)"""
+    allocation: AllocationParams
+    """Limits of the rotors."""
+
+
+class _Model(NamedTuple):
+    """Parameters of a reference."""
+
+    mass: Array
+    gravity_vec: Array
+    J: Array
+    drag_matrix: Array
+
+
+def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc: Array, mass: Array, J: Array) -> Array:
+    """Return the derivative of the errors of a drone about a reference, under an error of its wrench.
+
+    The errors are those of ``state_error`` to first order: position, velocity, a small rotation e_R with
+    ``R = R_d exp(e_R^)``, and ``e_w = w - R^T R_d w_d``, so that ``e_R' = e_w``.
+
+    Args:
+        error: Errors. (12,)
+        wrench: Error of collective thrust, N, and torque, N m. (4,)
+        reference: Reference.
+        ang_acc: Angular acceleration of the reference, body frame, rad/s^2. (3,)
+        mass: Mass, kg. (1,)
+        J: Inertia, body frame, kg m^2. (3, 3)
+
+    Returns:
+        Derivative, per second. (12,)
+    """
+    vel, turn, rate = error[3:6], error[6:9], error[9:12]
+    w_d = reference.ang_vel
+    w = w_d + rate - cross(turn, w_d)
+    z = reference.matrix[..., 2]
+    tilted = z + matvec(reference.matrix, cross(turn, jnp.asarray([0.0, 0.0, 1.0], turn.dtype)))
+    acc = ((reference.wrench[:1] + wrench[:1]) * tilted - reference.wrench[:1] * z) / mass
+    w_rate = jnp.linalg.solve(J, reference.wrench[1:] + wrench[1:] - cross(w, matvec(J, w)))
+    return jnp.concatenate([vel, acc, rate, w_rate - ang_acc + cross(rate, w_d) + cross(turn, ang_acc)])
+
+
+def tracking_gains(
+    setpoints: Setpoint, dt: Array, mass: Array, J: Array, drag_matrix: Array, Q: Array, R: Array, substeps: int = 1
+) -> Array:
+    """Return the gains of the LQR about the references of setpoints in a row, or NaN; pure and differentiable.
+
+    The error dynamics are linearised at every setpoint, and count until the next. A scan from the end backwards runs
+    the Riccati recursion in steps of ``dt / substeps``, discretised to second order. It starts from the solution of the
+    algebraic equation at the last setpoint, as if that were held forever.
+
+    Args:
+        setpoints: Setpoints ``dt`` apart. (n, ...)
+        dt: Time from one to the next, s. ()
+        mass: Mass, kg. () or (1,)
+        J: Inertia, body frame, kg m^2. (3, 3)
+        drag_matrix: Linear drag coefficients, body frame, N s/m. (3, 3)
+        Q: Weights of the errors, per second. (12, 12)
+        R: Weights of the wrench, per second. (4, 4)
+        substeps: Steps of the recursion from one setpoint to the next; few milliseconds each.
+
+    Returns:
+        (n, 4, 12)
+    """
+    mass = jnp.reshape(mass, (1,))
+    params = _Model(mass, jnp.asarray([0.0, 0.0, -9.81], J.dtype), J, drag_matrix)
+
+    def matrices(setpoint: Setpoint) -> tuple[Array, Array]:
+        reference = reference_of(setpoint, params)
+        w = reference.ang_vel
+        ang_acc = jnp.linalg.solve(J, reference.wrench[1:] - cross(w, matvec(J, w)))
+
+        def of(error: Array, wrench: Array) -> Array:
+            return error_derivative(error, wrench, reference, ang_acc, mass, J)
+
+        zero, none = jnp.zeros(12, J.dtype), jnp.zeros(4, J.dtype)
+        return jax.jacfwd(of, 0)(zero, none), jax.jacfwd(of, 1)(zero, none)
+
+    A, B = jax.vmap(matrices)(setpoints)
+    eye, h = jnp.eye(12, dtype=J.dtype), dt / substeps
+    moved, pushed = eye + h * A + h * h / 2 * A @ A, h * B + h * h / 2 * A @ B
+    end = gain_continuous(A[-1], B[-1], Q, R)
+    P = solve_lyapunov(A[-1] - B[-1] @ end, Q + end.T @ R @ end)
+
+    def backward(P: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        F, G = step
+
+        def once(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
+            P, _ = carry
+            K = jnp.linalg.solve(h * R + G.T @ P @ G, G.T @ P @ F)
+            closed = F - G @ K
+            P = closed.T @ P @ closed + h * (Q + K.T @ R @ K)
+            return ((P + P.T) / 2, K), None
+
+        (P, K), _ = jax.lax.scan(once, (P, end), length=substeps)
+        return P, K
+
+    _, gains = jax.lax.scan(backward, P, (moved, pushed), reverse=True)
+    return gains
+
+
+def gain_at(time: Array, gains: Array, dt: Array) -> Array:
+    """Return the gain at a time, s, interpolated linearly between knots ``dt`` apart and held at the ends. (4, 12)"""
+    last = gains.shape[-3] - 1
+    place = rotation.safe_clip(time / dt, 0.0, float(last))
+    gains, below = jnp.asarray(gains), jnp.minimum(jnp.floor(place).astype(jnp.int32), last - 1)
+    share = place - below
+    return (1 - share) * gains[below] + share * gains[below + 1]
+
+
+def tracking_lqr_control(
+    pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: Setpoint, time: Array, *, params: TrackingLQRParams
+) -> Array:
+    """Return the wrench of the LQR along a trajectory, ``u = u_ref - K(t) e``.
+
+    Args:
+        pos: Position, world frame, m. (3,)
+        quat: Attitude, body to world, unit, xyzw. (4,)
+        vel: Velocity, world frame, m/s. (3,)
+        ang_vel: Angular velocity, body frame, rad/s. (3,)
+        setpoint: Setpoint of one drone at this time.
+        time: Time since the reset, s. ()
+        params: Gains.
+
+    Returns:
+        Collective thrust, N, and body torque, N m, within the limits of the rotors. (4,)
+    """
+    p = params
+    reference = reference_of(setpoint, p)
+    error = state_error(pos, quat, vel, ang_vel, reference)
+    gain = gain_at(time - p.start[0], p.gains, p.dt[0])
+    return prioritized_wrench(reference.wrench - matvec(gain, error), params=p.allocation)
+
+
+class TrackingLQR(Controller):
+    """Time-varying LQR (``tracking_lqr_control``) along a trajectory that is known in advance.
+
+    The gains belong to times since the reset of a world, so the setpoints that arrive must be those of the trajectory,
+    as from ``Follow`` with the same start.
+    """
+
+    name: ClassVar[str] = "tracking_lqr"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state,)
+    output: ClassVar[Control] = Control.force_torque
+    setpoints: Any = None
+    """Setpoints of the trajectory, ``dt`` apart: a ``Setpoint`` with one leading axis, 2 to ``MAX_KNOTS`` long."""
+    dt: float = 0.1
+    """Time from one setpoint to the next, s."""
+    start: float = 0.0
+    """Time of the first setpoint, s since the reset."""
+    freq: int = 500
+    """Rate, Hz."""
+    Q: Any = None
+    """Weights of the states, as for ``LQRParams.create``."""
+    R: Any = None
+    """Weights of the inputs, as for ``LQRParams.create``."""
+
+    def params(self, airframe: Airframe) -> TrackingLQRParams:
+        """Return gains and constants for an airframe.
+
+        Raises:
+            ConfigError: If the setpoints are missing or too many, or no gain stabilises the drone.
+        """
+        n = np.shape(self.setpoints.pos)[0] if isinstance(self.setpoints, Setpoint) else 0
+        if not 2 <= n <= MAX_KNOTS or self.dt <= 0:
+            raise ConfigError(
+                f"expected setpoints of one drone with a leading axis of 2 to {MAX_KNOTS}, and a positive dt, got "
+                f"{n} and {self.dt}. Use jax.vmap(trajectory.evaluate)(times) with a larger dt."
+            )
+        hover = LQRParams.create(airframe, self.freq, self.Q, self.R)
+        weights = default_weights(airframe, self.freq)
+        Q = as_weights("Q", weights[0] if self.Q is None else self.Q, 12)
+        R = as_weights("R", weights[1] if self.R is None else self.R, 4)
+        mass = airframe.value("rigid_body.mass")
+        drag = airframe.value("drag.coefficients")
+        drag = np.diag(drag) if drag.ndim == 1 else drag
+        gains_of = functools.partial(tracking_gains, substeps=math.ceil(self.dt * self.freq))
+        gains = on_host(gains_of, self.setpoints, self.dt, mass, airframe.inertia, drag, Q, R)
+        return TrackingLQRParams(
+            mass=hover.mass,
+            gravity_vec=hover.gravity_vec,
+            J=hover.J,
+            drag_matrix=hover.drag_matrix,
+            gains=as_parameter(gains),
+            dt=as_parameter(self.dt),
+            start=as_parameter(self.start),
+            allocation=hover.allocation,
+        )
+
+    def update(self, data: Any, command: Any, memory: Any, params: TrackingLQRParams) -> tuple[Array, Any]:
+        """Return the wrench."""
+        s, core = data.states, data.core
+        time = core.steps.astype(s.pos.dtype) / core.freq
+        return tracking_lqr_control(s.pos, s.quat, s.vel, s.ang_vel, command, time, params=params), memory

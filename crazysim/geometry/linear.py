@@ -1,0 +1,29 @@
+"""Small systems of linear equations, unrolled."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+
+def solve(matrix: Array, b: Array) -> Array:
+    """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive definite, unrolled. (..., n)
+
+    Scaled to a unit diagonal first: mass and moments of inertia are four orders apart.
+    """
+    n = b.shape[-1]
+    scale = [jax.lax.rsqrt(matrix[..., k, k]) for k in range(n)]
+    a = [[matrix[..., i, j] * scale[i] * scale[j] for j in range(i + 1)] for i in range(n)]
+    y = [b[..., k] * scale[k] for k in range(n)]
+    low: list[list[Array]] = []
+    for i in range(n):
+        low.append([])
+        for j in range(i):
+            low[i].append((a[i][j] - sum(low[i][k] * low[j][k] for k in range(j))) / low[j][j])
+        low[i].append(jnp.sqrt(a[i][i] - sum(low[i][k] ** 2 for k in range(i))))
+    for i in range(n):
+        y[i] = (y[i] - sum(low[i][k] * y[k] for k in range(i))) / low[i][i]
+    for i in reversed(range(n)):
+        y[i] = (y[i] - sum(low[k][i] * y[k] for k in range(i + 1, n))) / low[i][i]
+    return jnp.stack([y[k] * scale[k] for k in range(n)], axis=-1)

@@ -1,0 +1,226 @@
+"""Messages in a stream of bytes: where each begins and ends, however the stream is split.
+
+The stream has the lab's messages ``<ID>_CMDSTART_<command>_<argument>_EOF`` and ``CMDSTART_<command>_<argument>_EOF``,
+whose argument may be a JSON object with any characters, ``REQ_<ID>``, ``START``, and shows: a zip archive followed by
+``SKYC``. Nothing is searched for inside JSON or archives: their own structure shows where they end.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+MAX_TEXT = 200
+"""Longest message without JSON, bytes."""
+MAX_JSON = 4 * 2**20
+"""Longest JSON object, bytes."""
+MAX_SHOW = 64 * 2**20
+"""Largest show, bytes."""
+
+ZIP, ZIP_END = b"PK\x03\x04", b"PK\x05\x06"
+STARTS = (b"CMDSTART_", b"REQ_", b"START", ZIP)
+HEAD = re.compile(rb"(?:(\d{1,4})_)?CMDSTART_(?:(\d{1,4})_)?([a-z]{1,20})_")
+TOKEN = re.compile(rb'["\\{}]')
+SPACE = b" \r\n\t\0"
+
+
+class FramingError(ValueError):
+    """Bytes that are no message; the stream cannot be read on."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """A command in text."""
+
+    drone: int | None
+    """ID of the drone; None if there is none."""
+    command: str
+    """Name of the command."""
+    argument: str
+    """Argument; empty if there is none."""
+    payload: bytes | None = None
+    """JSON object; None if there is none."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """A request for the control of a drone."""
+
+    drone: int
+    """ID of the drone."""
+
+
+@dataclass(frozen=True)
+class ShowFile:
+    """The contents of a ``.skyc`` file."""
+
+    content: bytes
+    """Contents."""
+
+
+class Frames:
+    """Buffer of a stream.
+
+    frames = Frames()
+    for message in frames.feed(received): ...
+    """
+
+    def __init__(self) -> None:
+        """Begin with an empty buffer."""
+        self._buffer = bytearray()
+        self._reset_scan()
+
+    def _reset_scan(self) -> None:
+        """Forget how far the message at the front has been searched for its end."""
+        self._at = self._depth = 0
+        self._in_string = False
+
+    @property
+    def pending(self) -> bool:
+        """True where the buffer holds the begin of a message."""
+        return bool(self._buffer)
+
+    def feed(self, received: bytes) -> Iterator[Message | Request | ShowFile]:
+        """Yield the messages that are complete with these bytes.
+
+        Raises:
+            FramingError: If something else than a message follows, or a message is too long. The stream is lost then.
+        """
+        self._buffer += received
+        while (message := self._next()) is not None:
+            yield message
+
+    def _next(self) -> Message | Request | ShowFile | None:
+        """Return the message at the front of the buffer and remove it; None if it is incomplete."""
+        if not self._at and self._buffer[:1] and self._buffer[0] in SPACE:
+            del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(SPACE))]
+        buffer = self._buffer
+        if not buffer:
+            return None
+        if buffer.startswith(ZIP):
+            return self._show()
+        if buffer.startswith(b"START"):
+            self._take(5)
+            return Message(None, "show", "")
+        if buffer.startswith(b"REQ_"):
+            digits = bytes(buffer[4:6])
+            if len(digits) == 2 and digits.isdigit():
+                self._take(6)
+                return Request(int(digits))
+            if digits and not digits.isdigit():
+                raise FramingError(f"expected REQ_ and an ID of two digits, got {_shown(buffer)}")
+            return None
+        head = HEAD.match(buffer)
+        if head is not None:
+            return self._message(head)
+        if not self._may_begin(bytes(buffer[: MAX_TEXT + 1])):
+            raise FramingError(f"expected a message such as 07_CMDSTART_land_EOF, got {_shown(buffer)}")
+        return None
+
+    def _may_begin(self, front: bytes) -> bool:
+        """Return True where these bytes may be the begin of a message."""
+        if any(start.startswith(front[: len(start)]) for start in STARTS) and len(front) <= MAX_TEXT:
+            rest = front[len(b"CMDSTART_") :]
+            return not front.startswith(b"CMDSTART_") or bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", rest))
+        after = re.sub(rb"^\d{1,4}", b"", front)
+        if after == front or not b"_CMDSTART_".startswith(after[:10]):
+            return False
+        return bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", after[10:]))
+
+    def _message(self, head: re.Match[bytes]) -> Message | None:
+        """Return the text message at the front of the buffer."""
+        buffer = self._buffer
+        brace = buffer.find(b"{", head.end() - 1, MAX_TEXT)
+        end = buffer.find(b"_EOF", head.end() - 1, MAX_TEXT)
+        if brace >= 0 and (end < 0 or brace < end):
+            return self._json_message(head, brace)
+        if end < 0:
+            if len(buffer) >= MAX_TEXT:
+                raise FramingError(f"expected _EOF or JSON within {MAX_TEXT} bytes, got {_shown(buffer)}")
+            return None
+        message = _message(head, bytes(buffer[head.end() : end]))
+        self._take(end + 4)
+        return message
+
+    def _json_message(self, head: re.Match[bytes], brace: int) -> Message | None:
+        """Return the message at the front of the buffer, whose JSON begins at ``brace``."""
+        buffer = self._buffer
+        end = self._end_of_json(brace)
+        if end is None:
+            if len(buffer) > MAX_JSON:
+                raise FramingError(f"expected JSON of at most {MAX_JSON} bytes, got more")
+            return None
+        rest = bytes(buffer[end : end + 16]).lstrip(SPACE)
+        if not rest.startswith(b"_EOF"):
+            if len(rest) >= 4 or not b"_EOF".startswith(rest) or len(buffer) - end >= 16:
+                raise FramingError(f"expected _EOF after the JSON, got {_shown(buffer[end:])}")
+            return None
+        message = _message(head, bytes(buffer[head.end() : brace]).rstrip(b"_"), bytes(buffer[brace:end]))
+        self._take(buffer.index(b"_EOF", end) + 4)
+        return message
+
+    def _end_of_json(self, brace: int) -> int | None:
+        """Return the end of a JSON object; every byte is examined once, however it arrives."""
+        self._at = max(self._at, brace)
+        while (token := TOKEN.search(self._buffer, self._at)) is not None:
+            kind = token[0]
+            if kind == b"\\":
+                if token.end() >= len(self._buffer):
+                    self._at = token.start()
+                    return None
+                self._at = token.end() + 1  # whatever is escaped
+                continue
+            self._at = token.end()
+            if kind == b'"':
+                self._in_string = not self._in_string
+            elif not self._in_string:
+                self._depth += 1 if kind == b"{" else -1
+                if not self._depth:
+                    return self._ended()
+        self._at = len(self._buffer)
+        return None
+
+    def _ended(self) -> int:
+        """Return the end that was found; it is found again if the message is still incomplete."""
+        end = self._at
+        self._at, self._depth = end - 1, 1
+        return end
+
+    def _show(self) -> ShowFile | None:
+        """Return the show at the front of the buffer: an archive ends with its directory, and then comes SKYC."""
+        buffer = self._buffer
+        while (at := buffer.find(ZIP_END, self._at)) >= 0:
+            if at + 22 > len(buffer):
+                self._at = at
+                break
+            end = at + 22 + struct.unpack_from("<H", buffer, at + 20)[0]
+            if buffer[end : end + 4] == b"SKYC":
+                content = bytes(buffer[:end])
+                self._take(end + 4)
+                return ShowFile(content)
+            if end + 4 > len(buffer):
+                self._at = at
+                break
+            self._at = at + 4
+        else:
+            self._at = max(len(buffer) - 3, 0)
+        if len(buffer) > MAX_SHOW:
+            raise FramingError(f"expected a show of at most {MAX_SHOW} bytes, got more")
+        return None
+
+    def _take(self, n: int) -> None:
+        del self._buffer[:n]
+        self._reset_scan()
+
+
+def _message(head: re.Match[bytes], argument: bytes, payload: bytes | None = None) -> Message:
+    drone = head[1] or head[2]
+    return Message(
+        None if drone is None else int(drone), head[3].decode(), argument.decode("ascii", "replace"), payload
+    )
+
+
+def _shown(buffer: bytes | bytearray) -> str:
+    return repr(bytes(buffer[:40]))

@@ -1,0 +1,140 @@
+"""Differential flatness of a drone with a point load: states and inputs from the path of the load.
+
+The load's position and the yaw are a flat output (Sreenath, Lee and Kumar 2013). With the load's mass m_L, the drone's
+mass m and the rod's length L the tension is ``T q = -m_L (x_L'' - g)``, so the load's acceleration gives the direction
+q of the rod, its next two derivatives give q' and q'', the drone is at ``x = x_L - L q``, and its thrust is
+``F = m (x'' - g) + m_L (x_L'' - g)``. The drone's jerk and snap need the fifth and sixth derivative of the path.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim import rotation
+
+ORDER = 6
+"""Highest derivative of the load's path that is needed."""
+
+
+class LoadedState(NamedTuple):
+    """States and inputs of a drone that carries a load along a path. Leading axes are those of the path."""
+
+    pos: Array
+    """Position of the drone, world frame, m. (..., 3)"""
+    vel: Array
+    """Velocity of the drone, m/s. (..., 3)"""
+    acc: Array
+    """Acceleration of the drone, m/s^2. (..., 3)"""
+    direction: Array
+    """Unit vector from drone to load. (..., 3)"""
+    direction_rate: Array
+    """Its rate, 1/s. (..., 3)"""
+    quat: Array
+    """Attitude, body to world, xyzw. (..., 4)"""
+    ang_vel: Array
+    """Angular velocity, body frame, rad/s. (..., 3)"""
+    ang_acc: Array
+    """Angular acceleration, body frame, rad/s^2. (..., 3)"""
+    tension: Array
+    """Tension of the rod, N. (..., 1)"""
+    thrust: Array
+    """Collective thrust, N. (..., 1)"""
+    torque: Array
+    """Torque, body frame, N m. (..., 3)"""
+
+
+def flat_states(
+    path: Array, yaw: Array, mass: Array, load_mass: Array, length: Array, inertia: Array, gravity_vec: Array
+) -> LoadedState:
+    """Return states and inputs with which a drone carries a point load along a path.
+
+    The rod is attached at the drone's centre of mass. Time derivatives are taken by differentiating the equations
+    along the Taylor polynomial of the path. A load in free fall has no tension and no direction; there the results are
+    not finite.
+
+    Args:
+        path: Position of the load and its time derivatives up to the sixth, world frame, m, m/s, ... (..., 7, 3)
+        yaw: Heading and its first two derivatives, rad, rad/s, rad/s^2. (..., 3)
+        mass: Mass of the drone, kg. ()
+        load_mass: Mass of the load, kg. ()
+        length: Length of the rod, m. ()
+        inertia: Inertia of the drone, body frame, kg m^2. (3, 3)
+        gravity_vec: Gravitational acceleration, world frame, m/s^2. (3,)
+    """
+    if path.ndim > 2:
+        one = lambda p, y: flat_states(p, y, mass, load_mass, length, inertia, gravity_vec)  # noqa: E731
+        return jax.vmap(one)(path, yaw)
+
+    def derivatives(order: int, t: Array) -> Array:
+        """Return a derivative of the path as a function of the time from now."""
+        terms, factor = path[ORDER], 1.0
+        total = jnp.zeros_like(terms)
+        for k in range(ORDER - order + 1):
+            factor = factor / k if k else factor
+            total = total + path[order + k] * factor * t**k
+        return total
+
+    def pull(t: Array) -> Array:
+        return load_mass * (derivatives(2, t) - gravity_vec)
+
+    def pos(t: Array) -> Array:
+        return derivatives(0, t) + length * pull(t) / jnp.linalg.norm(pull(t))
+
+    velocity = jax.jacfwd(pos)
+    acceleration = jax.jacfwd(velocity)
+
+    def force(t: Array) -> Array:
+        return mass * (acceleration(t) - gravity_vec) + pull(t)
+
+    def attitude(t: Array) -> Array:
+        """Return the rotation matrix whose z axis is along the thrust and whose x axis has the heading."""
+        heading = yaw[0] + yaw[1] * t + yaw[2] * t * t / 2
+        z = force(t) / jnp.linalg.norm(force(t))
+        ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading), jnp.zeros_like(t)])
+        y = rotation.cross(z, ahead)
+        y = y / jnp.linalg.norm(y)
+        return jnp.stack([rotation.cross(y, z), y, z], axis=-1)
+
+    def ang_vel(t: Array) -> Array:
+        """Return the angular velocity of ``R' = R [w]``."""
+        rot = attitude(t)
+        turned = jnp.sum(rot[:, :, None] * jax.jacfwd(attitude)(t)[:, None, :], axis=0)
+        return jnp.stack([turned[2, 1], turned[0, 2], turned[1, 0]])
+
+    now = jnp.zeros((), path.dtype)
+    rot, w, w_rate = attitude(now), ang_vel(now), jax.jacfwd(ang_vel)(now)
+    tension = jnp.linalg.norm(pull(now))[None]
+    offset = path[0] - pos(now)
+    torque = rotation.matvec(inertia, w_rate) + rotation.cross(w, rotation.matvec(inertia, w))
+    return LoadedState(
+        pos=pos(now),
+        vel=velocity(now),
+        acc=acceleration(now),
+        direction=offset / length,
+        direction_rate=(path[1] - velocity(now)) / length,
+        quat=_quaternion(rot),
+        ang_vel=w,
+        ang_acc=w_rate,
+        tension=tension,
+        thrust=jnp.linalg.norm(force(now))[None],
+        torque=torque,
+    )
+
+
+def _quaternion(rot: Array) -> Array:
+    """Return the quaternion of a rotation matrix, xyzw, by the largest of its four components. (4,)"""
+    xx, yy, zz = rot[0, 0], rot[1, 1], rot[2, 2]
+    d = [rot[2, 1] - rot[1, 2], rot[0, 2] - rot[2, 0], rot[1, 0] - rot[0, 1]]
+    s = [rot[1, 0] + rot[0, 1], rot[2, 0] + rot[0, 2], rot[2, 1] + rot[1, 2]]
+    rows = jnp.stack([
+        jnp.stack([1 + xx - yy - zz, s[0], s[1], d[0]]),
+        jnp.stack([s[0], 1 - xx + yy - zz, s[2], d[1]]),
+        jnp.stack([s[1], s[2], 1 - xx - yy + zz, d[2]]),
+        jnp.stack([d[0], d[1], d[2], 1 + xx + yy + zz]),
+    ])  # fmt: skip
+    row = rows[jnp.argmax(jnp.diagonal(rows))]
+    return row / jnp.linalg.norm(row)

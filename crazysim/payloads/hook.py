@@ -1,0 +1,223 @@
+"""A hook on a rod below each drone, which picks up a load and sets it down."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import Objects, SimData, SimStateDeriv
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.stage import Stage
+from crazysim.errors import ConfigError
+from crazysim.payloads.core import LoadData, air_and_gravity, hanging, on_floor
+from crazysim.payloads.link import TINY, Link, couple, end_relative_motion
+from crazysim.payloads.slung import load_record, place_loads, rest_height
+from crazysim.pytree import leaf, select_worlds
+from crazysim.rotation import dot
+
+
+class HookData(LoadData):
+    """State and parameters of the hook of each drone, and of its load."""
+
+    tip_pos: Array = leaf("drone", 1)
+    """Position of the hook, world frame, m. (n_worlds, n_drones, 3)"""
+    tip_vel: Array = leaf("drone", 1)
+    """Velocity of the hook, world frame, m/s. (n_worlds, n_drones, 3)"""
+    grip: Array = leaf("drone", 0)
+    """Command: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones)"""
+    hook_mass: Array = leaf("parameter", 1, (1,))
+    """Mass of the hook, kg. (1,)"""
+    reach: Array = leaf("parameter", 1, (1,))
+    """Distance of the hook from the ring below which it picks up, m. (1,)"""
+    max_speed: Array = leaf("parameter", 1, (1,))
+    """Speed of the hook relative to the ring below which it picks up, m/s. (1,)"""
+
+
+class Hook(Plugin):
+    """A hook on a rigid rod, with one load for each drone.
+
+    With two degrees of freedom the rod swings freely. With one it turns about the body's y axis, and passes roll and
+    yaw torque to the drone. A load is a point mass in its ring. It is picked up where the hook is near and slow, with
+    the impulse of two bodies that stay together; a load that is let go falls freely.
+    """
+
+    mass: Any = parameter()
+    """Mass of the load, kg; zero for none. () or (n_worlds, n_drones)"""
+    dof: int = 2
+    """Degrees of freedom of the rod, 1 or 2."""
+    length: Any = parameter(default=0.4)
+    """Length of the rod, m. () or (n_worlds, n_drones)"""
+    attach: Any = parameter(default=(0.0, 0.0, 0.0))
+    """Joint, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    hook_mass: Any = parameter(default=0.0203)
+    """Mass of the hook, kg. () or (n_worlds, n_drones)"""
+    damping: Any = parameter(default=0.001)
+    """Viscous torque of the joint over its angular velocity, N m s. () or (n_worlds, n_drones)"""
+    reach: Any = parameter(default=0.05)
+    """Distance of the hook from the ring below which it picks up, m. () or (n_worlds, n_drones)"""
+    max_speed: Any = parameter(default=0.5)
+    """Speed of the hook relative to the ring below which it picks up, m/s. () or (n_worlds, n_drones)"""
+    drag: Any = parameter(default=0.0)
+    """Linear drag coefficient of the load, N s/m. () or (n_worlds, n_drones)"""
+    friction: Any = parameter(default=0.6)
+    """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
+    size: Any = (0.14, 0.14, 0.08)
+    """Radius of a ball, or full lengths of a box, m: () or (3,)."""
+    ring: float = 0.1275
+    """Height of the ring above the middle of the load, m."""
+    load_at: Any = None
+    """Initial position of the loads' rings, world frame, m; None for loads on the hooks. (3,) or (n_worlds, n_drones,
+    3)"""
+    rgba: Any = None
+    """Colour of the loads; None for the default. (4,)"""
+    in_scene: bool = True
+    """True to put loads and rods into the scene."""
+    name: str = "load"
+
+    @staticmethod
+    def bumblebee(mass: Any = 0.2, dof: int = 2, **settings: Any) -> Hook:
+        """Return the hook of AIMotionLab's Bumblebee with a load; the rod turns about the drone's centre of mass.
+
+        Rod of 0.4 m, hook of 0.0203 kg, joint damping 0.001 N m s, ring 0.1275 m above the load's middle (facts of
+        AIMotionLab-Virtual, July 2026; the joint lies at (0.0085, 0, 0) of the lab's body frame, as the centre of mass
+        does).
+
+        Args:
+            mass: Mass of the load, kg.
+            dof: Degrees of freedom of the rod, 1 or 2.
+            **settings: Other settings.
+        """
+        return Hook(mass, dof, **settings)
+
+    def record(self, sim: Simulation) -> HookData:
+        """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
+        if self.dof not in (1, 2):
+            raise ConfigError(f"expected dof as 1 or 2, got {self.dof!r}")
+        load = load_record(self, sim, False, rest_height(self.size) + self.ring)
+
+        def check(name: str) -> Array:
+            return check_parameter(sim, name, getattr(self, name), low=0.0)
+
+        values = {field: getattr(load, field) for field in load.__dataclass_fields__}
+        tip_pos, tip_vel = load.pos, load.vel
+        if self.load_at is not None:
+            at = check_parameter(sim, "load_at", self.load_at, (3,))
+            pos = jnp.broadcast_to(at, load.pos.shape)
+            pos = pos.at[..., 2].set(jnp.maximum(pos[..., 2], load.clearance[..., 0]))
+            values |= {"pos": pos, "vel": jnp.zeros_like(pos), "attached": jnp.zeros_like(load.attached)}
+            tip_pos, tip_vel = hanging(sim.data.states, load.attach, load.length, jnp.zeros_like(load.clearance), False)
+        return HookData(
+            **values,
+            tip_pos=jnp.array(tip_pos),
+            tip_vel=jnp.array(tip_vel),
+            grip=jnp.array(values["attached"]),
+            hook_mass=check("hook_mass"),
+            reach=check("reach"),
+            max_speed=check("max_speed"),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages of picking up and letting go, and of the floor."""
+        return [
+            Placement(Stage(self.grip, "drone"), "integration", name=f"{self.name}_grip"),
+            Placement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor"),
+        ]
+
+    def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
+        """Return the derivative with the pull of hook and load, and their rates; of one drone."""
+        load, p = self.read(data), data.params
+        falling = air_and_gravity(data, load, load.vel)
+        link = self._link(load)
+        free = jnp.where(
+            load.attached,
+            p.gravity_vec + load.mass / (link.mass + TINY) * (falling - p.gravity_vec),
+            p.gravity_vec,
+        )
+        linked = couple(data.states, deriv, p.mass, p.J_inv, link, load.tip_pos, load.tip_vel, free, dt, data.core.freq)
+        loose = load.vel if dt is None else load.vel + dt * falling
+        rates = {
+            "tip_pos": linked.rate,
+            "tip_vel": linked.acc,
+            "pos": jnp.where(load.attached, linked.rate, loose),
+            "vel": jnp.where(load.attached, linked.acc, falling),
+        }
+        return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
+
+    def grip(self, data: SimData) -> SimData:
+        """Pick up a load that is near and slow, or let go, as ``grip`` of the record commands; of one drone.
+
+        Hook and ring stay together after an impact that keeps momentum: the mean of their velocities by mass, then the
+        impulse along the rod that a rigid rod passes on to the drone.
+        """
+        load, p, s = self.read(data), data.params, data.states
+        apart, speed = load.pos - load.tip_pos, load.vel - load.tip_vel
+        near = (dot(apart, apart) < load.reach**2) & (dot(speed, speed) < load.max_speed**2) & (load.mass > 0)
+        picks = load.grip & ~load.attached & near[..., 0]
+        held = load.replace(attached=load.grip & (load.attached | picks))
+        link = self._link(held)
+        joint = load.tip_vel + load.mass / (link.mass + TINY) * speed
+        after, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, load.tip_pos, joint)
+
+        def change(new: Array, old: Array) -> Array:
+            return jnp.where(picks, new, old)
+
+        tip_vel = change(tip_vel, load.tip_vel)
+        held = held.replace(tip_vel=tip_vel, vel=change(tip_vel, load.vel), pos=change(load.tip_pos, load.pos))
+        states = s.replace(vel=change(after.vel, s.vel), ang_vel=change(after.ang_vel, s.ang_vel))
+        return self.write(data.replace(states=states), held)
+
+    def stop_at_floor(self, data: SimData) -> SimData:
+        """Stop hook and load at the floor; of one drone."""
+        load = self.read(data)
+        height = jnp.where(load.attached, load.clearance, jnp.zeros_like(load.clearance))
+        tip_pos, tip_vel = on_floor(load.tip_pos, load.tip_vel, height, load.friction)
+        pos, vel = on_floor(load.pos, load.vel, load.clearance, load.friction)
+        pos, vel = jnp.where(load.attached, tip_pos, pos), jnp.where(load.attached, tip_vel, vel)
+        return self.write(data, load.replace(pos=pos, vel=vel, tip_pos=tip_pos, tip_vel=tip_vel))
+
+    def command(self, data: SimData, grip: Any) -> SimData:
+        """Return the data with another command to the hooks.
+
+        Args:
+            data: Simulation.
+            grip: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones), or
+                broadcast to that
+        """
+        load = self.read(data)
+        return self.write(data, load.replace(grip=jnp.broadcast_to(jnp.asarray(grip, bool), load.grip.shape)))
+
+    def hang(self, data: SimData, mask: Any = None) -> SimData:
+        """Return the data with hooks at rest below their drones, for drones that were moved; of all worlds.
+
+        Args:
+            data: Simulation.
+            mask: True in the worlds to change; None for all. (n_worlds,)
+        """
+        load = self.read(data)
+        height = jnp.where(load.attached[..., None], load.clearance, 0.0)
+        tip_pos, tip_vel = hanging(data.states, load.attach, load.length, height, False)
+        tip_pos, tip_vel = select_worlds(mask, tip_pos, load.tip_pos), select_worlds(mask, tip_vel, load.tip_vel)
+        on_hook = load.attached[..., None]
+        new = load.replace(
+            tip_pos=tip_pos,
+            tip_vel=tip_vel,
+            pos=jnp.where(on_hook, tip_pos, load.pos),
+            vel=jnp.where(on_hook, tip_vel, load.vel),
+        )
+        return self.write(data, new)
+
+    def place(self, data: SimData) -> Objects:
+        """Return the scene's objects with loads and rods at their poses; of one world."""
+        if not self.in_scene:
+            return data.objects  # type: ignore[return-value]
+        load = self.read(data)
+        holds = np.ones(load.tip_pos.shape[0], bool)
+        return place_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring)  # type: ignore[arg-type]
+
+    def _link(self, load: HookData) -> Link:
+        mass = load.hook_mass + jnp.where(load.attached, load.mass, jnp.zeros_like(load.mass))
+        return Link(load.attach, load.length, mass, load.damping, is_hinge=self.dof == 1)

@@ -1,0 +1,204 @@
+"""A load on a rod or a cable below each drone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import Objects, SimData, SimStateDeriv
+from crazysim.core.integration import rk4
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.stage import Stage
+from crazysim.effects.core import zeros
+from crazysim.errors import ConfigError
+from crazysim.payloads.core import (
+    CABLE_SEGMENTS,
+    LoadData,
+    add_to_scene,
+    air_and_gravity,
+    hanging,
+    on_floor,
+    pieces,
+    placed,
+    turned_z,
+)
+from crazysim.payloads.link import Link, couple, end_relative_motion, relative
+from crazysim.pytree import select_worlds
+
+
+class SlungLoad(Plugin):
+    """A load on a rod or a cable, a point mass that hangs from each drone.
+
+    Load and drone are integrated together. A cable is slack while the load is nearer than its length, and pulls as soon
+    as it is taut. The load starts at rest below the drone, where the drone is when the plugin is added.
+    """
+
+    mass: Any = parameter()
+    """Mass of the load, kg; at zero the drone flies as without it. () or (n_worlds, n_drones)"""
+    length: Any = parameter(default=0.4)
+    """Length of rod or cable, m. () or (n_worlds, n_drones)"""
+    cable: bool = False
+    """True for a cable, False for a rigid rod."""
+    attach: Any = parameter(default=(0.0, 0.0, 0.0))
+    """Attachment, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    damping: Any = parameter(default=0.0)
+    """Viscous torque of the joint over its angular velocity, N m s. () or (n_worlds, n_drones)"""
+    restitution: Any = parameter(default=0.0)
+    """Ratio of the radial speeds after and before a cable becomes taut, 0 to 1. () or (n_worlds, n_drones)"""
+    drag: Any = parameter(default=0.0)
+    """Linear drag coefficient of the load, N s/m, through which wind and downwash act on it.
+    () or (n_worlds, n_drones)"""
+    friction: Any = parameter(default=0.6)
+    """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
+    size: Any = 0.03
+    """Radius of a ball, or full lengths of a box, m: () or (3,). For contacts, the floor and images."""
+    rgba: Any = None
+    """Colour; None for the default. (4,)"""
+    in_scene: bool = True
+    """True to put loads and links into the scene, where they are drawn and reported as contacts of drones."""
+    name: str = "load"
+
+    def record(self, sim: Simulation) -> LoadData:
+        """Return loads at rest below their drones."""
+        return load_record(self, sim, self.cable, rest_height(self.size))
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage of the floor, and for cables in schemes of higher order that of becoming taut."""
+        found = [Placement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor")]
+        method = getattr(getattr(sim.step_pipeline.get("integration"), "fn", None), "method", None)
+        if self.cable and method is rk4:
+            found.append(Placement(Stage(self.become_taut, "drone"), "integration", name=f"{self.name}_taut"))
+        return found
+
+    def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
+        """Return the derivative with the pull of the load, and the load's rates; of one drone."""
+        load, p = self.read(data), data.params
+        free = air_and_gravity(data, load, load.vel)
+        linked = couple(
+            data.states, deriv, p.mass, p.J_inv, self._link(load), load.pos, load.vel, free, dt, data.core.freq
+        )
+        rates = {"pos": linked.rate, "vel": linked.acc}
+        return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
+
+    def stop_at_floor(self, data: SimData) -> SimData:
+        """Stop the load at the floor; of one drone."""
+        load = self.read(data)
+        pos, vel = on_floor(load.pos, load.vel, load.clearance, load.friction)
+        return self.write(data, load.replace(pos=pos, vel=vel))
+
+    def become_taut(self, data: SimData) -> SimData:
+        """Apply the impulse of a cable that is taut while the load moves outwards; of one drone."""
+        load, p = self.read(data), data.params
+        states, vel = end_relative_motion(data.states, p.mass, p.J_inv, self._link(load), load.pos, load.vel)
+        return self.write(data.replace(states=states), load.replace(vel=vel))
+
+    def hang(self, data: SimData, mask: Any = None) -> SimData:
+        """Return the data with attached loads at rest below their drones, for drones that were moved; of all worlds.
+
+        Args:
+            data: Simulation.
+            mask: True in the worlds to change; None for all. (n_worlds,)
+        """
+        load = self.read(data)
+        pos, vel = hanging(data.states, load.attach, load.length, load.clearance, self.cable)
+        new = load.replace(
+            pos=select_worlds(mask, pos, load.pos),
+            vel=select_worlds(mask, vel, load.vel),
+            attached=select_worlds(mask, jnp.ones_like(load.attached), load.attached),
+        )
+        return self.write(data, new)
+
+    def release(self, data: SimData, mask: Any = True) -> SimData:
+        """Return the data with loads cut loose; they fall freely.
+
+        Args:
+            data: Simulation.
+            mask: True for drones that let go. (n_worlds, n_drones), or broadcast to that
+        """
+        load = self.read(data)
+        return self.write(data, load.replace(attached=load.attached & ~jnp.asarray(mask, bool)))
+
+    def place(self, data: SimData) -> Objects:
+        """Return the scene's objects with loads and links at their poses; of one world."""
+        if not self.in_scene:
+            return data.objects  # type: ignore[return-value]
+        load = self.read(data)
+        return place_loads(data, self.name, load, load.pos, load.attached, CABLE_SEGMENTS if self.cable else 1)
+
+    def _link(self, load: LoadData) -> Link:
+        return Link(load.attach, load.length, load.mass, load.damping, load.restitution, load.attached, self.cable)
+
+
+def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float) -> LoadData:
+    """Return the record of loads at rest below their drones, from the settings of a plugin, which are checked."""
+
+    def check(name: str, core: tuple[int, ...] = (1,), **limits: Any) -> Array:
+        return check_parameter(sim, name, getattr(plugin, name), core, **limits)
+
+    def optional(name: str, core: tuple[int, ...] = (1,), **limits: Any) -> Array | None:
+        """Return a setting, or None where it is zero everywhere: what is not there is not computed."""
+        value = check(name, core, **limits)
+        return value if np.any(np.asarray(value)) else None
+
+    length, attach = check("length", positive=True), optional("attach", (3,))
+    rest, drag = check_parameter(sim, "size", clearance, low=0.0), optional("drag", low=0.0)
+    if plugin.in_scene:
+        add_to_scene(
+            sim, plugin.name, plugin.size, plugin.rgba, float(jnp.max(length)), sim.n_drones,
+            CABLE_SEGMENTS if is_cable else 1,
+        )  # fmt: skip
+    states = sim.data.states
+    pos, vel = hanging(states, attach, length, rest, is_cable)
+    return LoadData(
+        pos=pos,
+        vel=vel + jnp.zeros_like(states.vel),
+        air_vel=None if drag is None else zeros(sim, 3),
+        attached=jnp.ones(states.pos.shape[:2], bool),
+        mass=check("mass", low=0.0),
+        length=length,
+        attach=attach,
+        damping=optional("damping", low=0.0),
+        restitution=optional("restitution", low=0.0, high=1.0) if is_cable else None,
+        drag=drag,
+        friction=check("friction", low=0.0),
+        clearance=rest,
+    )
+
+
+def place_loads(
+    data: SimData, name: str, load: LoadData, tip: Array, holds: Array, n_pieces: int, ring: float = 0.0
+) -> Objects:
+    """Return the scene's objects with loads and links at their poses; of one world.
+
+    Args:
+        data: One world.
+        name: Name of the plugin.
+        load: Its record.
+        tip: Ends of the links, world frame, m. (n_drones, 3)
+        holds: True where something is attached to the end; other links hang along the body's z axis. (n_drones,)
+        n_pieces: Straight pieces of a link.
+        ring: Height of the point by which a load hangs above its middle, m.
+    """
+    r = relative(data.states, tip, load.vel, load.attach)
+    offset = jnp.where(holds[..., None], r.offset, -load.length * r.rot[..., 2])
+    up = jnp.where(load.attached[..., None], -r.direction, jnp.asarray([0.0, 0.0, 1.0], tip.dtype))
+    top = data.states.pos if r.arm is None else data.states.pos + r.arm
+    links = pieces(top, offset, load.length, n_pieces)
+    rows = {name: (load.pos - ring * up, turned_z(up)), f"{name}_link": links}
+    return placed(data.objects, rows)  # type: ignore[arg-type]
+
+
+def rest_height(size: Any) -> float:
+    """Return the height of the middle of a ball or box above the floor on which it stands, m.
+
+    Raises:
+        ConfigError: If the size is neither a radius nor three lengths.
+    """
+    shape = np.shape(size)
+    if shape not in ((), (3,)) or not np.all(np.asarray(size) > 0):
+        raise ConfigError(f"expected size as a positive radius, or as three positive lengths of a box, m, got {size!r}")
+    return float(size) if shape == () else float(size[2]) / 2

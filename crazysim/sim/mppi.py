@@ -1,0 +1,319 @@
+"""Sampling model-predictive control (MPPI), whose rollouts are worlds of the engine with the full dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control import Control, Setpoint
+from crazysim.core.data import SimData, SimState
+from crazysim.core.settings import positive
+from crazysim.core.stage import Stage
+from crazysim.dynamics.parameters import rotor_vel_limits
+from crazysim.engine import Step
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, floating, leaf, scopes
+from crazysim.sim.sim import Sim
+
+Cost = Callable[[SimState, Setpoint, Array], Array]
+"""States of one drone, its setpoint at the same time and its command to the cost of one control step. ()"""
+
+NAME = "mppi"
+"""Key in ``data.plugins`` of a rollout's record."""
+MAX_KNOTS = 64
+"""Largest number of knots; the engine selects among that many."""
+LEVELS = (Control.attitude, Control.body_rate, Control.force_torque, Control.rotor_vel)
+"""Command levels that can be sampled."""
+
+
+class MPPIMemory(PyTree):
+    """The plan of every drone, from one command to the next."""
+
+    plan: Array = leaf("drone", 2)
+    """Commands at the knots of the horizon. (n_worlds, n_drones, n_knots, k)"""
+    count: Array = leaf("shared", 0)
+    """Number of commands so far; enters the random numbers. ()"""
+
+
+class RolloutRecord(PyTree):
+    """Plan, setpoint and cost of one rollout."""
+
+    knots: Array = leaf("drone", 2)
+    """Commands at the knots of the horizon. (n_worlds, n_drones, n_knots, k)"""
+    setpoint: Setpoint
+    """Setpoint at the start."""
+    cost: Array = leaf("drone", 1)
+    """Sum of the costs of the control steps so far. (n_worlds, n_drones, 1)"""
+
+
+def tracking_cost(states: SimState, setpoint: Setpoint, command: Array) -> Array:
+    """Return the cost of a drone off its setpoint: squared errors in m, m/s, yaw, and body rates. ()
+
+    A metre counts as much as 2 m/s, 1 rad of yaw, or 10 rad/s; drones within 5 cm of the floor pay 10 more.
+    """
+    del command
+    pos, vel = states.pos - setpoint.pos, states.vel - setpoint.vel
+    yaw = rotation.yaw(states.quat) - setpoint.yaw[0]
+    rates = jnp.sum(states.ang_vel * states.ang_vel)
+    crash = jnp.where(states.pos[2] < 0.05, 10.0, 0.0)
+    return jnp.sum(pos * pos) + 0.25 * jnp.sum(vel * vel) + (1 - jnp.cos(yaw)) + 0.01 * rates + crash
+
+
+def setpoint_after(setpoint: Setpoint, t: Array) -> Setpoint:
+    """Return a setpoint some time later, by the Taylor polynomials of its position and yaw.
+
+    Args:
+        setpoint: The setpoint.
+        t: Time, s. ()
+    """
+    pos, vel, acc, jerk, snap = setpoint.pos, setpoint.vel, setpoint.acc, setpoint.jerk, setpoint.snap
+    return Setpoint(
+        pos=pos + t * (vel + t / 2 * (acc + t / 3 * (jerk + t / 4 * snap))),
+        vel=vel + t * (acc + t / 2 * (jerk + t / 3 * snap)),
+        acc=acc + t * (jerk + t / 2 * snap),
+        jerk=jerk + t * snap,
+        snap=snap,
+        yaw=setpoint.yaw + t * (setpoint.yaw_rate + t / 2 * setpoint.yaw_acc),
+        yaw_rate=setpoint.yaw_rate + t * setpoint.yaw_acc,
+        yaw_acc=setpoint.yaw_acc,
+    )
+
+
+class MPPI:
+    """Model-predictive path integral control of every drone of a simulation.
+
+    At each call, ``samples`` plans around the last one are flown from the present state by the engine, each in a world
+    of its own, with the simulation's dynamics, command level, effects and parameters. The new plan is their mean,
+    weighted by ``exp(-cost / temperature)`` (Williams, Aldrich and Theodorou 2017); its first command is returned, and
+    the plan moves on by one control step. A plan is a polyline through ``knots`` commands over the horizon. With one
+    seed, equal calls return equal commands.
+
+    Drones of a world are sampled together and weighted each on its own, which suits drones that do not interact.
+    Rollouts begin at step 0, also for effects that depend on the time since the reset.
+    """
+
+    def __init__(
+        self,
+        sim: Sim,
+        horizon: int = 50,
+        samples: int = 1024,
+        substeps: int = 2,
+        *,
+        knots: int = 10,
+        freq: int | None = None,
+        noise: Any = None,
+        temperature: float = 0.05,
+        cost: Cost = tracking_cost,
+        seed: int = 0,
+    ):
+        """Build the rollouts.
+
+        Args:
+            sim: Simulation that is controlled; its settings and plugins at this time are those of the rollouts.
+            horizon: Number of control steps of a rollout.
+            samples: Number of rollouts for each world.
+            substeps: Physics steps of a control step.
+            knots: Number of commands that make a plan, 2 to ``MAX_KNOTS``.
+            freq: Rate of the rollouts' physics, Hz; None for that of the simulation. A control step lasts
+                ``substeps / freq`` s, and ``command`` must be called once in that time.
+            noise: Standard deviation of the samples around the plan, in the units of the command, (k,); None for a
+                default of the level.
+            temperature: Temperature over the mean excess of the costs over the least, 1.
+            cost: Cost of a control step; the cost of a rollout is the sum over its control steps.
+            seed: Seed of the samples.
+
+        Raises:
+            ConfigError: If a setting is invalid.
+        """
+        c = sim.configuration
+        if c.control not in LEVELS:
+            raise ConfigError(
+                f"expected a simulation with control as one of {', '.join(map(repr, map(str, LEVELS)))}, got "
+                f"{c.control.value!r}. Use Sim(control='attitude')."
+            )
+        self.horizon, self.samples = positive("horizon", horizon), positive("samples", samples)
+        self.substeps, self.knots = positive("substeps", substeps), positive("knots", knots)
+        if not 2 <= self.knots <= MAX_KNOTS or self.horizon < 2:
+            raise ConfigError(f"expected 2 to {MAX_KNOTS} knots and a horizon from 2 on, got {knots} and {horizon}")
+        if not temperature > 0:
+            raise ConfigError(f"expected a positive temperature, got {temperature!r}")
+        self.temperature, self.cost, self._key = temperature, cost, jax.random.key(seed)
+        freq = c.freq if freq is None else positive("freq", freq)
+        self._sim = Sim(
+            sim.n_worlds * self.samples, sim.n_drones, c.airframe, c.dynamics, c.control, c.integrator, freq,
+            device=c.device, engine=c.engine, controller="crazyflow" if c.controller is None else c.controller,
+        )  # fmt: skip
+        for plugin in sim.plugins.values():
+            self._sim.add(plugin)
+        self.period = self.substeps / freq
+        """Time from one command to the next, s."""
+        self.hover, self.low, self.high, default = _command_range(sim)
+        self.noise = default if noise is None else np.asarray(noise, floating())
+        if self.noise.shape != self.hover.shape or not np.all(self.noise >= 0):
+            raise ConfigError(f"expected noise as {len(self.hover)} numbers from zero on, got {noise!r}")
+        pipeline = {
+            "mppi_command": Stage(self._command_stage, "drone", self._control_tick),
+            **self._sim.step_pipeline,
+            "mppi_cost": Stage(self._cost_stage, "drone", self._control_tick),
+        }
+        self._step = Step(pipeline, c.engine, c.device.platform, device=c.device)
+        self._device = c.device
+        self._memory = jax.device_put(self.init(sim.n_worlds, sim.n_drones), c.device)
+        self._jitted = jax.jit(self.plan)
+
+    def init(self, n_worlds: int, n_drones: int) -> MPPIMemory:
+        """Return the memory before the first command: plans that hover."""
+        shape = (n_worlds, n_drones, self.knots, len(self.hover))
+        return MPPIMemory(jnp.asarray(np.broadcast_to(self.hover, shape), floating()), jnp.int32(0))
+
+    @property
+    def engine(self) -> str:
+        """Engine of the rollouts; empty before the first command."""
+        return ", ".join({plan.engine for plan in self._step._plans.values()})
+
+    def reset(self) -> None:
+        """Forget the plans of ``command``."""
+        self._memory = jax.device_put(self.init(*self._memory.plan.shape[:2]), self._device)
+
+    def command(self, data: SimData, setpoint: Setpoint) -> Array:
+        """Return the command of every drone, and keep the plan for the next call; one compiled call.
+
+        Args:
+            data: The data of the simulation, from which rollouts start.
+            setpoint: Setpoint now: of every drone, or one for all. (n_worlds, n_drones, ...) or (...)
+
+        Returns:
+            Command of the simulation's level. (n_worlds, n_drones, k)
+        """
+        command, self._memory = self._jitted(self._memory, data, setpoint)
+        return command
+
+    def plan(self, memory: MPPIMemory, data: SimData, setpoint: Setpoint) -> tuple[Array, MPPIMemory]:
+        """Return the command of every drone and the memory for the next call; pure.
+
+        Args:
+            memory: From ``init``, or from the last call.
+            data: The data of the simulation.
+            setpoint: As for ``command``.
+
+        Returns:
+            Command of the simulation's level (n_worlds, n_drones, k); the memory.
+        """
+        key, plan = jax.random.fold_in(self._key, memory.count), memory.plan
+        n_worlds, n_drones = plan.shape[:2]
+        shape = (n_worlds, self.samples, *plan.shape[1:])
+        noise = jax.random.normal(key, shape, plan.dtype) * jnp.asarray(self.noise, plan.dtype)
+        noise = noise.at[:, 0].set(0.0)  # the plan itself is a sample
+        knots = rotation.safe_clip(plan[:, None] + noise, self.low, self.high)
+
+        repeated = jax.tree.map(lambda x: jnp.broadcast_to(x, (n_worlds, n_drones, x.shape[-1])), setpoint)
+        record = RolloutRecord(
+            knots=knots.reshape(n_worlds * self.samples, *plan.shape[1:]),
+            setpoint=jax.tree.map(self._repeat, repeated),
+            cost=jnp.zeros((n_worlds * self.samples, n_drones, 1), plan.dtype),
+        )
+        final = self._step(self._rollouts(data, record), self.horizon * self.substeps)
+        costs = final.plugins[NAME].cost.reshape(n_worlds, self.samples, n_drones)
+        costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
+        excess = costs - jnp.min(costs, axis=1, keepdims=True)
+        finite = jnp.isfinite(excess)  # a drone whose rollouts all failed keeps its plan
+        spread = jnp.sum(jnp.where(finite, excess, 0.0), axis=1, keepdims=True) / jnp.maximum(
+            jnp.sum(finite, axis=1, keepdims=True), 1
+        )
+        weights = jnp.where(finite, jnp.exp(-jnp.where(finite, excess, 0.0) / (self.temperature * spread + 1e-9)), 0.0)
+        weights = weights / jnp.maximum(jnp.sum(weights, axis=1, keepdims=True), 1e-9)
+        moved = plan + jnp.einsum("wsd,wsdkc->wdkc", weights, knots - plan[:, None])
+        return moved[:, :, 0], MPPIMemory(self._shifted(moved), memory.count + 1)
+
+    # Rollouts -------------------------------------------------------------------------------------------------------
+
+    def _repeat(self, x: Array) -> Array:
+        return jnp.repeat(x, self.samples, axis=0)
+
+    def _rollouts(self, data: SimData, record: RolloutRecord) -> SimData:
+        """Return the data of the rollouts: that of the simulation, once for every sample, at step 0."""
+        template = self._sim.data
+
+        def of_rollouts(scope: str, own: Any, x: Any) -> Any:
+            return self._repeat(x) if scope in ("drone", "world") else own if scope != "shared" else x
+
+        leaves = [
+            of_rollouts(*pair)
+            for pair in zip(
+                jax.tree.leaves(scopes(data)), jax.tree.leaves(template), jax.tree.leaves(data), strict=True
+            )
+        ]
+        started = jax.tree.unflatten(jax.tree.structure(template), leaves)
+        core = started.core.replace(
+            steps=jnp.zeros_like(template.core.steps),
+            world_id=template.core.world_id,
+            drone_mocap_ids=template.core.drone_mocap_ids,
+        )
+        return started.replace(core=core, plugins=started.plugins | {NAME: record})
+
+    def _control_tick(self, data: SimData) -> Array:
+        return data.core.steps % self.substeps == 0
+
+    def _command_stage(self, data: SimData) -> SimData:
+        """Stage the command of the plan at this time."""
+        command = self._planned(data, data.core.steps)
+        controls: Any = data.controls
+        if controls.mode == Control.rotor_vel:
+            return data.replace(controls=controls.replace(rotor_vel=command))
+        level = controls.mode.value
+        staged = getattr(controls, level).replace(staged_cmd=command)
+        return data.replace(controls=controls.replace(**{level: staged}))
+
+    def _cost_stage(self, data: SimData) -> SimData:
+        """Add the cost of the control step that ends; the clock has moved on."""
+        record = data.plugins[NAME]
+        t = data.core.steps.astype(record.cost.dtype) / data.core.freq
+        command = self._planned(data, data.core.steps - self.substeps)
+        cost = self.cost(data.states, setpoint_after(record.setpoint, t), command)
+        record = record.replace(cost=record.cost + jnp.reshape(cost, (1,)))
+        return data.replace(plugins=data.plugins | {NAME: record})
+
+    def _planned(self, data: SimData, step: Array) -> Array:
+        """Return the command of one drone's plan at a step. (k,)"""
+        knots = data.plugins[NAME].knots
+        place = step.astype(knots.dtype) * ((self.knots - 1) / ((self.horizon - 1) * self.substeps))
+        below = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, self.knots - 2)
+        return knots[below] + (place - below) * (knots[below + 1] - knots[below])
+
+    def _shifted(self, plan: Array) -> Array:
+        """Return the plan one control step later; its end is held."""
+        place = np.arange(self.knots) + (self.knots - 1) / (self.horizon - 1)
+        below = np.minimum(np.floor(place).astype(int), self.knots - 2)
+        share = np.minimum(place - below, 1.0).astype(np.asarray(self.noise).dtype)[:, None]
+        return plan[:, :, below] + share * (plan[:, :, below + 1] - plan[:, :, below])
+
+
+def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the command of hover, the least, the largest and the standard deviation of samples. (k,) each"""
+    airframe, level = sim.airframe, sim.control
+    mass = float(airframe.value("rigid_body.mass", ()))
+    low = airframe.n_rotors * float(airframe.value("rotors.thrust_min", ()))
+    high = airframe.n_rotors * float(airframe.value("rotors.thrust_max", ()))
+    weight = mass * 9.81
+    thrust, spread = (weight, low, high), 0.2 * (high - low)
+    if level == Control.rotor_vel:
+        least, most = rotor_vel_limits(sim.dynamics, airframe)
+        hover = least + (most - least) * np.sqrt(max(weight - low, 0.0) / (high - low))
+        n = airframe.n_rotors
+        rows = [[hover] * n, [least] * n, [most] * n, [0.05 * most] * n]
+    elif level == Control.force_torque:
+        arm = 0.5 * airframe.arm * (high - low)
+        torque = np.array([arm, arm, 0.1 * arm])
+        rows = [[thrust[0], 0, 0, 0], [low, *-torque], [high, *torque], [spread, *(0.05 * torque)]]
+    else:
+        limit, deviation = (
+            ((0.7, 0.7, np.pi), (0.1, 0.1, 0.05)) if level == Control.attitude else ((8, 8, 3), (2, 2, 1))
+        )
+        rows = [[0, 0, 0, weight], [*(-x for x in limit), low], [*limit, high], [*deviation, spread]]
+    return tuple(np.asarray(row, floating()) for row in rows)  # type: ignore[return-value]

@@ -1,0 +1,100 @@
+"""Archives of JSON files that refer to each other, with bounds on what is unpacked."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories.files import checks
+
+MAX_MEMBERS = 20_100
+"""Most files of an archive: four for each of 5,000 drones, Skybrush's limit, and those of the show."""
+MAX_MEMBER = 16 * 2**20
+"""Largest file of an archive that is unpacked, bytes."""
+MAX_TOTAL = 512 * 2**20
+"""Most bytes that are unpacked from an archive."""
+MAX_CHAIN = 8
+"""Longest chain of references."""
+
+
+class Archive:
+    """A zip archive of JSON files."""
+
+    def __init__(self, content: bytes, place: str):
+        """Open an archive.
+
+        Args:
+            content: Contents of the file.
+            place: Name of the file, for messages.
+
+        Raises:
+            ConfigError: If it is no zip archive, or has too many files.
+        """
+        self.place, self._unpacked = place, 0
+        self._parsed: dict[str, Any] = {}
+        try:
+            self._zip = zipfile.ZipFile(io.BytesIO(content))
+            members = self._zip.infolist()
+        except Exception as error:  # damaged archives raise errors of any type
+            raise ConfigError(f"expected a zip archive, got {place!r}: {str(error)[:100]}") from error
+        if len(members) > MAX_MEMBERS:
+            checks.refuse(f"at most {MAX_MEMBERS} files", str(len(members)), place)
+        self._members = {str(PurePosixPath(member.filename)): member for member in members}
+
+    def json(self, name: str) -> Any:
+        """Return the contents of a JSON file of the archive.
+
+        Raises:
+            ConfigError: If it is missing, too large, damaged, or not JSON.
+        """
+        if name in self._parsed:
+            return self._parsed[name]
+        place = f"{self.place}: {name}"
+        if name not in self._members:
+            raise ConfigError(f"expected a file {name!r} in {self.place}, got an archive without it")
+        try:
+            with self._zip.open(self._members[name]) as file:
+                content = file.read(MAX_MEMBER + 1)  # what the archive states about its size may be wrong
+        except Exception as error:  # damaged archives raise errors of any type
+            raise ConfigError(f"expected a file that can be unpacked, got {place}: {str(error)[:100]}") from error
+        self._unpacked += len(content)
+        if len(content) > MAX_MEMBER or self._unpacked > MAX_TOTAL:
+            checks.refuse(f"files of at most {MAX_MEMBER} bytes, {MAX_TOTAL} in all", "more", place)
+        self._parsed[name] = checks.parse_json(content, place)
+        return self._parsed[name]
+
+    def resolve(self, value: Any, place: str) -> tuple[Any, str]:
+        """Return a value, or the contents of the file it refers to by ``{"$ref": "./name#"}``, and its place.
+
+        Raises:
+            ConfigError: If the file is missing, or references form a long chain or a circle.
+        """
+        for _ in range(MAX_CHAIN):
+            if not isinstance(value, dict) or "$ref" not in value:
+                return value, place
+            reference = checks.text(value["$ref"], f"{place}, $ref", 1000)
+            name, _, fragment = reference.partition("#")
+            if fragment.strip("/"):
+                checks.refuse("a reference to a whole file, such as ./cues.json#", checks.shown(reference), place)
+            name = str(PurePosixPath(name))
+            value, place = self.json(name), f"{self.place}: {name}"
+        return checks.refuse(f"a chain of at most {MAX_CHAIN} references", "a longer one", place)
+
+
+def write_archive(path: str | Path, files: Mapping[str, str]) -> None:
+    """Write a compressed zip archive of text files; the same contents give the same bytes.
+
+    Raises:
+        ConfigError: If the folder does not exist.
+    """
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, content)
+    checks.write_bytes(path, buffer.getvalue())

@@ -1,0 +1,88 @@
+"""Polynomials in Bernstein and in power form, on the host in float64."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@lru_cache
+def _to_power(degree: int) -> NDArray:
+    """Return the matrix from control points to coefficients. (degree + 1, degree + 1)"""
+    matrix = np.zeros((degree + 1, degree + 1))
+    for j in range(degree + 1):
+        for i in range(j + 1):
+            matrix[j, i] = (-1) ** (j - i) * comb(degree, j) * comb(j, i)
+    return matrix
+
+
+@lru_cache
+def _to_bernstein(degree: int) -> NDArray:
+    """Return the matrix from coefficients to control points. (degree + 1, degree + 1)"""
+    matrix = np.zeros((degree + 1, degree + 1))
+    for i in range(degree + 1):
+        for j in range(i + 1):
+            matrix[i, j] = comb(i, j) / comb(degree, j)
+    return matrix
+
+
+def power_of(points: NDArray) -> NDArray:
+    """Return the coefficients of a Bezier curve of u in [0, 1], constant term first.
+
+    Args:
+        points: Control points. (degree + 1, k)
+
+    Returns:
+        (k, degree + 1)
+    """
+    return (_to_power(len(points) - 1) @ points).T
+
+
+def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
+    """Return the control points of polynomials of u in [0, 1], of their own degree or a higher one.
+
+    Args:
+        coefficients: Constant term first. (k, n)
+        degree: Degree of the curve, at least ``n - 1``; None for that.
+
+    Returns:
+        (degree + 1, k)
+    """
+    n = coefficients.shape[1]
+    raised = n - 1 if degree is None else degree
+    padded = np.pad(coefficients, ((0, 0), (0, raised + 1 - n)))
+    return _to_bernstein(raised) @ padded.T
+
+
+def restricted(coefficients: NDArray, begin: float, end: float) -> NDArray:
+    """Return polynomials of u in [0, 1] as polynomials on the part from ``begin`` to ``end``, scaled to [0, 1].
+
+    Args:
+        coefficients: Constant term first. (k, n)
+        begin: Argument where the part begins.
+        end: Argument where the part ends.
+
+    Returns:
+        (k, n)
+    """
+    n = coefficients.shape[1]
+    matrix = np.zeros((n, n))
+    for j in range(n):
+        for i in range(j + 1):
+            matrix[j, i] = comb(j, i) * begin ** (j - i) * (end - begin) ** i
+    return coefficients @ matrix
+
+
+def significant_degree(coefficients: NDArray, tolerance: float) -> int:
+    """Return the smallest degree that reproduces polynomials of u in [0, 1] within a tolerance.
+
+    Args:
+        coefficients: Constant term first. (k, n)
+        tolerance: Largest sum of the omitted coefficients.
+    """
+    tails = np.cumsum(np.abs(coefficients)[:, ::-1], axis=1)[:, ::-1].max(axis=0)
+    above = np.flatnonzero(tails[1:] > tolerance)
+    return int(above[-1]) + 1 if len(above) else 0

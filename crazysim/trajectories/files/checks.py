@@ -1,0 +1,145 @@
+"""Checks of values that come from a file or a socket, with bounds on their sizes, and messages that name the place."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+
+MAX_FILE = 256 * 2**20
+"""Largest file that is read, bytes."""
+MAX_POINTS = 20_000
+"""Most points of a trajectory."""
+MAX_TIME = 7200.0
+"""Latest time, s: up to there float32 resolves half a millisecond."""
+MIN_LENGTH = 1e-3
+"""Shortest piece, s: the resolution of Skybrush and of the Crazyflie's compressed trajectories."""
+MAX_COORDINATE = 1e5
+"""Largest coordinate, m, and largest yaw, degrees."""
+
+
+def refuse(expected: str, got: str, place: str) -> NoReturn:
+    """Raise the error of a value that is not accepted.
+
+    Args:
+        expected: Description of an accepted value.
+        got: Description of the value.
+        place: File and place in it.
+
+    Raises:
+        ConfigError: Always.
+    """
+    raise ConfigError(f"expected {expected}, got {got} in {place}")
+
+
+def shown(value: Any) -> str:
+    """Return a value for a message, at most 60 characters of it."""
+    text = repr(value) if not isinstance(value, (list, dict, str)) or len(value) < 60 else f"a {type(value).__name__}"
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return the contents of a file of at most ``MAX_FILE`` bytes.
+
+    Raises:
+        ConfigError: If it does not exist, cannot be read, or is larger.
+    """
+    path = Path(path)
+    try:
+        if not path.is_file():
+            raise ConfigError(f"expected an existing file, got {str(path)!r}")
+        if path.stat().st_size > MAX_FILE:
+            refuse(f"a file of at most {MAX_FILE} bytes", f"{path.stat().st_size}", str(path))
+        return path.read_bytes()
+    except (OSError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"expected a file that can be read, got {str(path)!r}: {error}") from error
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file.
+
+    Raises:
+        ConfigError: If the folder does not exist.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
+    path.write_bytes(content)
+
+
+def parse_json(content: bytes | str, place: str) -> Any:
+    """Return a JSON document.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"expected JSON in {place}, got {type(error).__name__}: {str(error)[:100]}") from error
+
+
+def record(value: Any, place: str) -> dict[str, Any]:
+    """Return a value that must be a JSON object."""
+    if not isinstance(value, dict):
+        refuse("an object {...}", shown(value), place)
+    return value
+
+
+def sequence(value: Any, n_max: int, place: str) -> list[Any]:
+    """Return a value that must be a JSON array of at most some entries."""
+    if not isinstance(value, list):
+        refuse("an array [...]", shown(value), place)
+    if len(value) > n_max:
+        refuse(f"at most {n_max} entries", str(len(value)), place)
+    return value
+
+
+def version_one(value: dict[str, Any], place: str) -> None:
+    """Check that an object has version 1."""
+    version = value.get("version")
+    if version != 1 or isinstance(version, bool):
+        refuse("version 1", shown(version), place)
+
+
+def number(value: Any, place: str, low: float = -np.inf, high: float = np.inf) -> float:
+    """Return a value that must be a finite number in a range."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high or value != value:
+        refuse("a number" if np.isinf([low, high]).any() else f"a number from {low:g} to {high:g}", shown(value), place)
+    return float(value)
+
+
+def text(value: Any, place: str, n_max: int = 200) -> str:
+    """Return a value that must be a string of at most some characters."""
+    if not isinstance(value, str) or len(value) > n_max:
+        refuse(f"a text of at most {n_max} characters", shown(value), place)
+    return value
+
+
+def numbers(value: Any, lengths: Sequence[int], bound: float, place: str) -> NDArray:
+    """Return a value that must be an array of finite numbers, of one of some lengths, up to a bound in size."""
+    if isinstance(value, tuple):
+        value = list(value)
+    if not isinstance(value, list) or len(value) not in lengths:
+        refuse(f"an array of {' or '.join(map(str, lengths))} numbers", shown(value), place)
+    return np.array([number(x, place, -bound, bound) for x in value])
+
+
+def ascending(times: NDArray, least: float, place: str) -> None:
+    """Check that times ascend by a least difference: there are neither overlaps nor pieces without length."""
+    steps = np.diff(times)
+    if len(steps) and steps.min() < least * (1 - 1e-6):
+        k = int(np.argmin(steps))
+        refuse(
+            f"times that ascend by at least {least:g} s",
+            f"{times[k]:g} s followed by {times[k + 1]:g} s at entry {k + 1}",
+            place,
+        )

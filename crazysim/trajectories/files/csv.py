@@ -1,0 +1,124 @@
+"""Trajectories as CSV: Crazyswarm's polynomials, and positions with time stamps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories.files import checks
+from crazysim.trajectories.files.pieces import trajectory_of
+from crazysim.trajectories.files.polynomials import of_rows, rows_of
+from crazysim.trajectories.trajectory import Trajectory
+
+POLYNOMIALS = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y", "z", "yaw") for k in range(8))])
+"""Header of Crazyswarm's files, as ``uav_trajectories`` writes them."""
+
+
+def load_csv(path: str | Path) -> Trajectory:
+    """Return the trajectory in a CSV file, of one of two kinds that differ in the number of columns.
+
+    - 33 or 25: Crazyswarm's polynomials. Duration, s, and eight coefficients, constant term first, of the time since
+      the begin of the piece, s, for each of x, y, z, m, and, with 33 columns, yaw, rad.
+    - 4 or 5: samples. Time, s, x, y, z, m, and, with 5 columns, yaw, rad. Times count from the first row. Between the
+      samples the trajectory is cubic, with velocities by central differences, and at rest at both ends.
+
+    Lines that are empty, begin with ``#``, or contain a header of names are ignored.
+
+    Raises:
+        ConfigError: If the file does not exist, or a row is invalid, with its line.
+    """
+    content = checks.read_bytes(path)
+    try:
+        lines = content.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"expected text in {path}, got other bytes: {error}") from error
+    rows = _table(lines, str(path))
+    return of_rows(rows, str(path)) if rows.shape[1] > 5 else _of_samples(rows, str(path))
+
+
+def _table(lines: list[str], place: str) -> NDArray:
+    """Return the numbers of the lines. (n, n_columns)"""
+    rows: list[list[float]] = []
+    for i, line in enumerate(lines, start=1):
+        cells = [cell.strip() for cell in line.strip().rstrip(",").split(",")]
+        if cells == [""] or cells[0].startswith("#"):
+            continue
+        if len(rows) >= checks.MAX_POINTS:
+            checks.refuse(f"at most {checks.MAX_POINTS} rows", "more", f"{place}, line {i}")
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError:
+            if not rows and any(cell[:1].isalpha() for cell in cells):
+                continue  # the header
+            checks.refuse("numbers", checks.shown(line), f"{place}, line {i}")
+        if len(row) not in (4, 5, 25, 33) or (rows and len(row) != len(rows[0])):
+            expected = f"{len(rows[0])} columns, as before" if rows else "4, 5, 25 or 33 columns"
+            checks.refuse(expected, str(len(row)), f"{place}, line {i}")
+        rows.append(row)
+    if not rows:
+        checks.refuse("at least one row of numbers", "none", place)
+    return np.array(rows)
+
+
+def _of_samples(rows: NDArray, place: str) -> Trajectory:
+    """Return the cubic trajectory through samples of time, position and perhaps yaw."""
+    if not np.all(np.isfinite(rows)) or np.abs(rows[:, 1:]).max() > checks.MAX_COORDINATE:
+        checks.refuse(f"finite numbers up to {checks.MAX_COORDINATE:g}", "others", place)
+    if len(rows) < 2:
+        checks.refuse("at least two samples", "one", place)
+    times = rows[:, 0] - rows[0, 0]
+    checks.ascending(times, checks.MIN_LENGTH, place)
+    if times[-1] > checks.MAX_TIME:
+        checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1]:g} s", place)
+    values = np.zeros((len(rows), 4))
+    values[:, : rows.shape[1] - 1] = rows[:, 1:]
+    values[:, 3] = np.unwrap(values[:, 3])
+    rates = np.zeros_like(values)
+    rates[1:-1] = (values[2:] - values[:-2]) / (times[2:] - times[:-2])[:, None]
+    lengths = np.diff(times)[:, None]
+    begin, end, first, last = values[:-1], values[1:], rates[:-1] * lengths, rates[1:] * lengths
+    # Cubic Hermite polynomial of u in [0, 1].
+    c = [begin, first, 3 * (end - begin) - 2 * first - last, 2 * (begin - end) + first + last]
+    return trajectory_of(times[1:], np.stack(c, axis=-1))
+
+
+def save_csv(trajectory: Trajectory, path: str | Path) -> None:
+    """Write a trajectory as Crazyswarm's polynomials.
+
+    Args:
+        trajectory: Trajectory of one vehicle, of degree 7 at most.
+        path: File to write.
+
+    Raises:
+        ConfigError: If its degree is higher, or the folder does not exist.
+    """
+    lines = [POLYNOMIALS, *(",".join(f"{x:.9g}" for x in row) for row in rows_of(trajectory))]
+    checks.write_bytes(path, "".join(f"{line}\n" for line in lines).encode())
+
+
+def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayLike | None = None) -> None:
+    """Write positions with time stamps, for example those of a flight, as ``load_csv`` reads them.
+
+    Args:
+        path: File to write.
+        times: Times, s. (n,)
+        pos: Positions, world frame, m. (n, 3)
+        yaw: Yaw, rad; None for none. (n,)
+
+    Raises:
+        ConfigError: If the shapes do not fit, or the folder does not exist.
+    """
+    columns = [np.asarray(times, float)[:, None], np.asarray(pos, float)]
+    header = "t,x,y,z"
+    if yaw is not None:
+        columns.append(np.asarray(yaw, float)[:, None])
+        header += ",yaw"
+    if len({len(column) for column in columns}) != 1 or columns[1].shape[1:] != (3,):
+        raise ConfigError(
+            f"expected times (n,), positions (n, 3) and yaw (n,), got shapes {[column.shape for column in columns]}"
+        )
+    lines = [header, *(",".join(f"{x:.9g}" for x in row) for row in np.concatenate(columns, axis=1))]
+    checks.write_bytes(path, "".join(f"{line}\n" for line in lines).encode())

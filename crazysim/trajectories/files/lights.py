@@ -1,0 +1,112 @@
+"""Lights: the colours of the drones' LEDs over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, floating, leaf
+
+
+class Lights(PyTree):
+    """Colours of one drone's LED as pieces of constant or linearly fading colour, with any leading axes for several.
+
+    Before its first piece the LED has the first colour; the last piece is constant and has no end.
+    """
+
+    times: Array = leaf("shared", 1)
+    """Begin of each piece, s, ascending. Padding repeats the last one. (n_pieces,)"""
+    begins: Array = leaf("shared", 2)
+    """Colour where each piece begins, red, green and blue, 0 to 1. (n_pieces, 3)"""
+    ends: Array = leaf("shared", 2)
+    """Colour that each piece approaches at the begin of the next; ``begins`` where it is constant. (n_pieces, 3)"""
+
+    @staticmethod
+    def of_pieces(times: Any, begins: Any, ends: Any = None) -> Lights:
+        """Return the lights of one drone.
+
+        Args:
+            times: Begin of each piece, s, ascending. (n_pieces,)
+            begins: Colour where each piece begins, 0 to 1. (n_pieces, 3)
+            ends: Colour that each piece fades to until the next begins; None for constant colours. The last piece is
+                constant in any case. (n_pieces, 3)
+
+        Raises:
+            ConfigError: If the shapes do not fit, a number is out of range, or the times do not ascend.
+        """
+        t, a = np.asarray(times, float), np.asarray(begins, float)
+        b = a.copy() if ends is None else np.array(ends, float)
+        if t.ndim != 1 or not t.size or a.shape != (len(t), 3) or b.shape != a.shape:
+            raise ConfigError(
+                f"expected times (n_pieces,) and colours (n_pieces, 3), got shapes {t.shape}, {a.shape} and {b.shape}"
+            )
+        if not np.all(np.isfinite(t)) or not np.all(np.diff(t) >= 0):
+            raise ConfigError("expected ascending, finite times of lights; sort the pieces by time")
+        if not (np.all((a >= 0) & (a <= 1)) and np.all((b >= 0) & (b <= 1))):
+            raise ConfigError("expected colours from 0 to 1; divide colours from 0 to 255 by 255")
+        b[-1] = a[-1]
+        return Lights(*(x.astype(floating()) for x in (t, a, b)))  # type: ignore[arg-type]
+
+    @staticmethod
+    def constant(color: Any = (1.0, 1.0, 1.0)) -> Lights:
+        """Return lights of one colour; white by default.
+
+        Args:
+            color: Red, green and blue, 0 to 1. (3,)
+        """
+        return Lights.of_pieces([0.0], [color])
+
+    @staticmethod
+    def stack(lights: Sequence[Lights]) -> Lights:
+        """Return the lights of several drones as one record with a new first axis, padded to a common size.
+
+        Raises:
+            ConfigError: If there are none.
+        """
+        if not lights:
+            raise ConfigError("expected the lights of at least one drone, got none")
+        n = max(x.times.shape[-1] for x in lights)
+
+        def padded(x: Any) -> Any:
+            x = np.asarray(x)
+            return np.concatenate([x, np.repeat(x[-1:], n - len(x), axis=0)])
+
+        return jax.tree.map(lambda *leaves: np.stack([padded(x) for x in leaves]), *lights)
+
+    def evaluate(self, t: Any) -> Array:
+        """Return the colour of one drone at one time, 0 to 1; where two pieces meet, the later one counts.
+
+        Args:
+            t: Time, s. ()
+
+        Returns:
+            Red, green and blue. (3,)
+        """
+        times = jnp.asarray(self.times)
+        n, t = times.shape[0], jnp.asarray(t, times.dtype)
+        i = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, n - 1)
+        begin, end = times[i], times[jnp.minimum(i + 1, n - 1)]
+        length = end - begin
+        weight = jnp.where(length > 0, jnp.clip((t - begin) / jnp.where(length > 0, length, 1.0), 0.0, 1.0), 0.0)
+        a, b = jnp.asarray(self.begins)[i], jnp.asarray(self.ends)[i]
+        return a + weight * (b - a)
+
+    def colors(self, times: Any) -> np.ndarray:
+        """Return the colours of several drones at several times, 0 to 1.
+
+        Args:
+            times: Times, s. (n,)
+
+        Returns:
+            (n, n_drones, 3)
+        """
+        return np.asarray(_colors(self, jnp.asarray(times, jnp.asarray(self.times).dtype)))
+
+
+_colors = jax.jit(jax.vmap(jax.vmap(Lights.evaluate, in_axes=(0, None)), in_axes=(None, 0)))

@@ -1,0 +1,68 @@
+"""The pieces of a trajectory on the host, without padding, as files need them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories.files.bezier import restricted
+from crazysim.trajectories.trajectory import Trajectory
+
+
+def pieces_of(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
+    """Return the ends of a trajectory's pieces and their coefficients, in float64.
+
+    Times are the shortest decimals that stand for the trajectory's, so that 0.1 s is written as 0.1.
+
+    Args:
+        trajectory: Trajectory of one vehicle.
+
+    Returns:
+        Ends, s (n_pieces,), and coefficients of the pieces' times scaled to [0, 1], constant term first, of x, y, z, m,
+        and yaw, rad. (n_pieces, 4, degree + 1)
+
+    Raises:
+        ConfigError: If it is the record of several vehicles.
+    """
+    ends = np.asarray(trajectory.ends)
+    if ends.ndim != 1:
+        raise ConfigError(
+            f"expected a trajectory of one vehicle, got ends of shape {ends.shape}. Save each one by itself, or all as "
+            f"a show."
+        )
+    times = np.array([float(str(x)) for x in ends])
+    kept = np.diff(times, prepend=0.0) > 0
+    return times[kept], np.asarray(trajectory.coefficients, float)[kept]
+
+
+def split(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the same pieces, split at further times.
+
+    Args:
+        ends: End of each piece, s. (n_pieces,)
+        coefficients: Of the pieces' times scaled to [0, 1]. (n_pieces, k, degree + 1)
+        times: Times, s. (n,)
+    """
+    inside = times[(times > 0) & (times < ends[-1])]
+    cuts = np.union1d(ends, inside)
+    cuts = cuts[np.diff(cuts, append=np.inf) > 1e-6]  # a cut beside an end is that end
+    cuts[-1] = ends[-1]
+    begins = np.concatenate([[0.0], cuts[:-1]])
+    starts, lengths = np.concatenate([[0.0], ends[:-1]]), np.diff(ends, prepend=0.0)
+    piece = np.minimum(np.searchsorted(ends, 0.5 * (begins + cuts)), len(ends) - 1)
+    parts = [
+        restricted(coefficients[k], (begin - starts[k]) / lengths[k], (end - starts[k]) / lengths[k])
+        for k, begin, end in zip(piece, begins, cuts, strict=True)
+    ]
+    return cuts, np.stack(parts)
+
+
+def trajectory_of(ends: NDArray, coefficients: NDArray) -> Trajectory:
+    """Return the trajectory of pieces as ``pieces_of`` returns them.
+
+    Raises:
+        ConfigError: If there is no piece, or a number is not finite.
+    """
+    lengths = np.diff(ends, prepend=0.0)
+    return Trajectory.of_pieces(lengths, coefficients / lengths[:, None, None] ** np.arange(coefficients.shape[2]))

@@ -1,0 +1,211 @@
+"""The Crazyflie's trajectory memory: the polynomials that its high-level commander flies.
+
+Formats as packed by Bitcraze's cflib (``cflib/crazyflie/mem/trajectory_memory.py``: Poly4D, CompressedStart,
+CompressedSegment) and read by the firmware (``src/modules/src/pptraj_compressed.c``).
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories.files import checks
+from crazysim.trajectories.files.bezier import control_points, power_of, significant_degree
+from crazysim.trajectories.files.pieces import pieces_of, split, trajectory_of
+from crazysim.trajectories.trajectory import Trajectory
+
+POLY4D_FLOATS = 33
+"""Numbers of a Poly4D: eight coefficients for each of x, y, z and yaw, and the duration."""
+DISTANCE = 1e-3
+"""Unit of compressed coordinates, m."""
+ANGLE = np.deg2rad(0.1)
+"""Unit of compressed yaw, rad: a tenth of a degree."""
+MILLISECOND = 1e-3
+"""Unit of compressed durations, s."""
+MAX_PIECE = 65.0
+"""Longest compressed piece, s: durations have 16 bits."""
+STORED = (0, 1, 3, 7)
+"""Degree of an axis for each code of two bits; as many control points are stored, all but the first."""
+UNITS = np.array([DISTANCE, DISTANCE, DISTANCE, ANGLE])
+
+
+def pack_poly4d(trajectory: Trajectory) -> bytes:
+    """Return a trajectory as uncompressed polynomials: 33 floats a piece, coefficients of the time in seconds.
+
+    Args:
+        trajectory: Trajectory of one vehicle, of degree 7 at most.
+
+    Raises:
+        ConfigError: If its degree is higher.
+    """
+    return rows_of(trajectory).astype("<f4")[:, [*range(1, POLY4D_FLOATS), 0]].tobytes()
+
+
+def unpack_poly4d(content: bytes, place: str = "a trajectory memory") -> Trajectory:
+    """Return the trajectory of uncompressed polynomials.
+
+    Args:
+        content: Contents of the memory.
+        place: File, for messages.
+
+    Raises:
+        ConfigError: If the size is wrong, or a number is out of range.
+    """
+    size = 4 * POLY4D_FLOATS
+    if not content or len(content) % size or len(content) // size > checks.MAX_POINTS:
+        checks.refuse(f"1 to {checks.MAX_POINTS} pieces of {size} bytes", f"{len(content)} bytes", place)
+    rows = np.frombuffer(content, "<f4").reshape(-1, POLY4D_FLOATS).astype(float)
+    return of_rows(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], place)
+
+
+def of_rows(rows: NDArray, place: str) -> Trajectory:
+    """Return the trajectory of rows of duration, s, and coefficients of x, y, z, m, and yaw, rad, per second.
+
+    Args:
+        rows: (n_pieces, 33), or (n_pieces, 25) without yaw
+        place: File, for messages.
+
+    Raises:
+        ConfigError: If a number is out of range.
+    """
+    lengths, c = rows[:, 0], rows[:, 1:].reshape(len(rows), -1, 8)
+    if not np.all(np.isfinite(rows)):
+        checks.refuse("finite numbers", "others", f"{place}, piece {int(np.argmin(np.isfinite(rows).all(1)))}")
+    if not np.all(lengths >= checks.MIN_LENGTH * (1 - 1e-6)) or lengths.sum() > checks.MAX_TIME:
+        k = int(np.argmin(lengths))
+        checks.refuse(
+            f"durations of at least {checks.MIN_LENGTH:g} s and at most {checks.MAX_TIME:g} s in all",
+            f"{lengths[k]:g} s and {lengths.sum():g} s",
+            f"{place}, piece {k}",
+        )
+    scaled = np.abs(c) * lengths[:, None, None] ** np.arange(8)
+    if not np.all(scaled < checks.MAX_COORDINATE):
+        k = int(np.argmax(scaled.max((1, 2))))
+        checks.refuse(f"coordinates up to {checks.MAX_COORDINATE:g}", f"{scaled[k].max():g}", f"{place}, piece {k}")
+    return Trajectory.of_pieces(lengths, c)
+
+
+def rows_of(trajectory: Trajectory) -> NDArray:
+    """Return duration and coefficients per second of each piece. (n_pieces, 33)"""
+    ends, c = pieces_of(trajectory)
+    if c.shape[2] > 8:
+        raise ConfigError(
+            f"expected polynomials of degree 7 at most, as the Crazyflie flies, got degree {c.shape[2] - 1}"
+        )
+    lengths = np.diff(ends, prepend=0.0)
+    c = np.pad(c, ((0, 0), (0, 0), (0, 8 - c.shape[2]))) / lengths[:, None, None] ** np.arange(8)
+    return np.concatenate([lengths[:, None], c.reshape(len(c), -1)], axis=1)
+
+
+def pack_compressed(trajectory: Trajectory) -> bytes:
+    """Return a trajectory as compressed polynomials: control points in millimetres and tenths of degrees.
+
+    Every axis of a piece has the lowest of the degrees 0, 1, 3 and 7 that is right within a tenth of a unit. Pieces of
+    more than 65 s are split.
+
+    Args:
+        trajectory: Trajectory of one vehicle, of degree 7 at most.
+
+    Raises:
+        ConfigError: If its degree is higher, or it leaves the 32.767 m and 3276.7 degrees that 16 bits can hold.
+    """
+    ends, c = pieces_of(trajectory)
+    if c.shape[2] > 8:
+        raise ConfigError(
+            f"expected polynomials of degree 7 at most, as the Crazyflie flies, got degree {c.shape[2] - 1}"
+        )
+    ends, c = split(ends, c, np.arange(MAX_PIECE, ends[-1], MAX_PIECE))
+    c = c / UNITS[:, None]
+    stamps = np.round(ends / MILLISECOND).astype(int)
+    durations = np.diff(stamps, prepend=0)
+    if not np.all(durations > 0):
+        raise ConfigError(f"expected pieces of at least 1 ms, got {int(durations.min())} ms. Merge shorter pieces.")
+    content = bytearray(_short(c[0, :, 0]))
+    for duration, axes in zip(durations, c, strict=True):
+        degrees = [min(d for d in STORED if d >= significant_degree(axis[None], 0.1)) for axis in axes]
+        header = sum(STORED.index(degree) << 2 * k for k, degree in enumerate(degrees))
+        content += struct.pack("<BH", header, duration)
+        for axis, degree in zip(axes, degrees, strict=True):
+            content += _short(control_points(axis[None, : degree + 1], degree)[1:, 0])
+    return bytes(content) + struct.pack("<BH", 0, 0)  # a piece of no duration ends the trajectory
+
+
+def _short(values: NDArray) -> bytes:
+    rounded = np.round(values)
+    if rounded.size and np.abs(rounded).max() > 32767:
+        raise ConfigError(
+            "expected coordinates within 32.767 m and 3276.7 degrees of zero, which 16 bits can hold, got others. "
+            "Move the trajectory, or save it uncompressed."
+        )
+    return rounded.astype("<i2").tobytes()
+
+
+def unpack_compressed(content: bytes, place: str = "a trajectory memory") -> Trajectory:
+    """Return the trajectory of compressed polynomials.
+
+    Args:
+        content: Contents of the memory; bytes after the piece of no duration are ignored.
+        place: File, for messages.
+
+    Raises:
+        ConfigError: If the contents end within a piece, or have no piece.
+    """
+    try:
+        points = np.array(struct.unpack_from("<hhhh", content), float)
+        at, durations, pieces = 8, [], []
+        while at < len(content):
+            header, duration = struct.unpack_from("<BH", content, at)
+            at += 3
+            if not duration:
+                break
+            piece, last = np.zeros((4, 8)), points.copy()
+            for axis in range(4):
+                degree = STORED[header >> 2 * axis & 3]
+                stored = struct.unpack_from(f"<{degree}h", content, at)
+                at += 2 * degree
+                curve = np.array([points[axis], *stored], float)
+                piece[axis, : degree + 1] = power_of(curve[:, None])[0]
+                last[axis] = curve[-1]
+            points = last
+            durations.append(duration)
+            pieces.append(piece)
+            if len(pieces) > checks.MAX_POINTS:
+                checks.refuse(f"at most {checks.MAX_POINTS} pieces", "more", place)
+    except struct.error:
+        checks.refuse("complete pieces", f"{len(content)} bytes that end within one", place)
+    ends = MILLISECOND * np.cumsum(durations)
+    if not pieces or ends[-1] > checks.MAX_TIME:
+        checks.refuse(f"pieces of up to {checks.MAX_TIME:g} s in all", "none" if not pieces else "longer ones", place)
+    return trajectory_of(ends, np.stack(pieces) * UNITS[:, None])
+
+
+def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = False) -> None:
+    """Write a trajectory as it is uploaded to the Crazyflie's trajectory memory.
+
+    Args:
+        trajectory: Trajectory of one vehicle.
+        path: File to write.
+        compressed: True for the compressed format.
+
+    Raises:
+        ConfigError: If the folder does not exist, or the format cannot hold the trajectory.
+    """
+    checks.write_bytes(path, pack_compressed(trajectory) if compressed else pack_poly4d(trajectory))
+
+
+def load_memory(path: str | Path, compressed: bool = False) -> Trajectory:
+    """Return the trajectory in a file that ``save_memory`` has written, or that was read from a Crazyflie.
+
+    Args:
+        path: File.
+        compressed: True for the compressed format; the contents do not show which it is.
+
+    Raises:
+        ConfigError: If the file does not exist or is not of that format.
+    """
+    content = checks.read_bytes(path)
+    return (unpack_compressed if compressed else unpack_poly4d)(content, str(path))

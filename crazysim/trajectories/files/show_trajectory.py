@@ -1,0 +1,151 @@
+"""Trajectories in a show's JSON: chains of Bezier curves, with or without yaw."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories.files import checks
+from crazysim.trajectories.files.bezier import control_points, power_of, significant_degree
+from crazysim.trajectories.files.pieces import pieces_of, split, trajectory_of
+from crazysim.trajectories.trajectory import Trajectory
+
+ENCODINGS = ("COMPRESSED", "POLY4D")
+MAX_DEGREE = 7
+TOLERANCE = 1e-6
+"""Size of coefficients that a file omits, m or rad."""
+
+
+def parse_trajectory(value: Any, place: str, yaw_control: Any = None) -> tuple[Trajectory, str]:
+    """Return the trajectory in a ``trajectory.json``, from the begin of the show on, and its encoding.
+
+    Each point is ``[t, [x, y, z], [control points]]``: the end of a Bezier curve that begins at the previous point,
+    with up to six inner control points. Times count from ``takeoffTime``; until the first point the vehicle rests
+    there. A fourth coordinate is the yaw, degrees. Keys other than those are ignored.
+
+    Args:
+        value: The JSON object.
+        place: File and place in it, for messages.
+        yaw_control: Skybrush's ``yawControl`` object, whose setpoints, degrees, are connected linearly and replace the
+            yaw of the points; None for none.
+
+    Raises:
+        ConfigError: If it is invalid, with the place.
+    """
+    value = checks.record(value, place)
+    checks.version_one(value, place)
+    encoding = value.get("type", ENCODINGS[0])
+    if encoding not in ENCODINGS:
+        checks.refuse(f"type {' or '.join(ENCODINGS)}", checks.shown(encoding), place)
+    points = checks.sequence(value.get("points"), checks.MAX_POINTS, f"{place}, points")
+    if not points:
+        checks.refuse("at least one point", "none", place)
+    for key in ("takeoffTime", "landingTime"):
+        if value.get(key) is not None:
+            checks.number(value[key], f"{place}, {key}", 0.0, checks.MAX_TIME)
+    takeoff = float(value.get("takeoffTime") or 0.0)
+
+    times, curves, last = [], [], None
+    n_axes = len(points[0][1]) if _is_point(points[0]) else 3
+    for i, point in enumerate(points):
+        at = f"{place}, point {i}"
+        if not _is_point(point):
+            checks.refuse("[time, [x, y, z], [control points]]", checks.shown(point), at)
+        times.append(checks.number(point[0], at, 0.0, checks.MAX_TIME))
+        end = checks.numbers(point[1], [n_axes] if i else [3, 4], checks.MAX_COORDINATE, at)
+        inner = checks.sequence(point[2], MAX_DEGREE - 1, f"{at}, control points") if len(point) > 2 else []
+        if last is None and inner:
+            checks.refuse("no control points of the first point", f"{len(inner)}", at)
+        if last is not None:
+            via = [checks.numbers(x, [n_axes], checks.MAX_COORDINATE, at) for x in inner]
+            curves.append(np.stack([last, *via, end]))
+        last = end
+    checks.ascending(np.array(times), checks.MIN_LENGTH, place)
+    begin = takeoff + times[0]
+    if times[-1] + takeoff > checks.MAX_TIME:
+        checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1] + takeoff:g} s", place)
+    first = curves[0][:1] if curves else np.asarray(last)[None]
+    ends = [takeoff + t for t in times[1:]]
+    if begin >= checks.MIN_LENGTH or not curves:  # a shorter rest belongs to the first curve
+        ends, curves = [max(begin, checks.MIN_LENGTH), *ends], [first, *curves]
+    return _of_curves(np.array(ends), curves, yaw_control, place), encoding
+
+
+def _is_point(point: Any) -> bool:
+    return isinstance(point, list) and 2 <= len(point) <= 3 and isinstance(point[1], list)
+
+
+def _of_curves(ends: Any, curves: list, yaw_control: Any, place: str) -> Trajectory:
+    """Return the trajectory of Bezier curves."""
+    degree = max(len(curve) for curve in curves) - 1
+    c = np.zeros((len(curves), 4, max(degree, 1) + 1))
+    for k, curve in enumerate(curves):
+        c[k, : curve.shape[1], : len(curve)] = power_of(curve)
+    c[:, 3] = np.deg2rad(c[:, 3])
+    if yaw_control is not None:
+        ends, c = _with_yaw(ends, c, yaw_control, f"{place}, yawControl")
+    return trajectory_of(ends, c)
+
+
+def _with_yaw(ends: Any, c: Any, yaw_control: Any, place: str) -> tuple[Any, Any]:
+    """Return the pieces with the yaw of setpoints that are connected linearly, in the time of the show."""
+    value = checks.record(yaw_control, place)
+    checks.version_one(value, place)
+    setpoints = checks.sequence(value.get("setpoints"), checks.MAX_POINTS, place)
+    if not setpoints:
+        return ends, c
+    pairs = np.array(
+        [checks.numbers(x, [2], checks.MAX_COORDINATE, f"{place}, entry {i}") for i, x in enumerate(setpoints)]
+    )
+    times, yaw = pairs[:, 0], np.deg2rad(pairs[:, 1])
+    checks.ascending(times, checks.MIN_LENGTH, place)
+    ends, c = split(ends, c, times)
+    begins = np.concatenate([[0.0], ends[:-1]])
+    c[:, 3] = 0.0
+    c[:, 3, 0] = np.interp(begins, times, yaw)
+    c[:, 3, 1] = np.interp(ends, times, yaw) - c[:, 3, 0]
+    return ends, c
+
+
+def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw: bool = True) -> dict[str, Any]:
+    """Return a trajectory as the contents of a ``trajectory.json``.
+
+    A compressed trajectory has curves of degree 1, 3 or 7, any other of up to 7.
+
+    Args:
+        trajectory: Trajectory of one vehicle.
+        encoding: ``COMPRESSED`` or ``POLY4D``.
+        yaw: True to write the yaw as the fourth coordinate, degrees.
+
+    Raises:
+        ConfigError: If the encoding does not exist, or the degree is higher than 7.
+    """
+    if encoding not in ENCODINGS:
+        raise ConfigError(f"expected type {' or '.join(ENCODINGS)}, got {encoding!r}")
+    ends, c = pieces_of(trajectory)
+    degrees = (1, 3, 7) if encoding == "COMPRESSED" else range(1, MAX_DEGREE + 1)
+    c = c if yaw else c[:, :3]
+    digits = np.asarray(trajectory.coefficients).dtype
+
+    def written(point: Any) -> list[float]:
+        point = np.array(point)
+        point[3:] = np.rad2deg(point[3:])
+        return [float(str(x)) for x in point.astype(digits)]
+
+    points: list[Any] = [[0.0, written(c[0, :, 0]), []]]
+    for end, axes in zip(ends, c, strict=True):
+        needed = significant_degree(axes, TOLERANCE)
+        if needed > MAX_DEGREE:
+            raise ConfigError(f"expected polynomials of degree {MAX_DEGREE} at most, got degree {needed}")
+        degree = min(d for d in degrees if d >= needed)
+        curve = control_points(axes[:, : degree + 1], degree)
+        points.append([float(end), written(curve[-1]), [written(x) for x in curve[1:-1]]])
+    return {
+        "version": 1,
+        "points": points,
+        "takeoffTime": 0.0,
+        "landingTime": float(ends[-1]),
+        "type": encoding,
+    }

@@ -1,0 +1,148 @@
+"""Several trajectories on one clock, in float64 on the host, for checks at many times of many drones."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories.trajectory import N_DERIVATIVES, Trajectory
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """Pieces of several trajectories on one clock, sorted by drone and time."""
+
+    duration: float
+    """Duration, s."""
+    drone: Ints
+    """Drone of each piece. (n_pieces,)"""
+    begin: Floats
+    """Begin of each piece, s. (n_pieces,)"""
+    length: Floats
+    """Length of each piece, s. (n_pieces,)"""
+    coefficients: Floats
+    """Coefficients of x, y, z, m, and yaw, rad, of a piece's time divided by its length. (n_pieces, 4, degree + 1)"""
+
+    @staticmethod
+    def of(trajectories: Sequence[Trajectory], starts: Any = 0.0, duration: float | None = None) -> Fleet:
+        """Return the pieces of trajectories, with those at rest before the start and after the end.
+
+        Args:
+            trajectories: Trajectories, one for each drone.
+            starts: Start of each, s. () or (n_drones,)
+            duration: Duration, s; None for the time at which the last drone ends, where a trajectory that repeats
+                counts once.
+
+        Raises:
+            ConfigError: If there is no trajectory, a start is negative or the duration is not positive.
+        """
+        if not trajectories:
+            raise ConfigError("expected at least one trajectory, got none")
+        begins = np.asarray(starts, float)
+        n_drones = len(trajectories)
+        if begins.shape not in ((), (n_drones,)) or not np.all(begins >= 0) or not np.all(np.isfinite(begins)):
+            raise ConfigError(f"expected one start, or one for each of {n_drones} drones, at least 0 s, got {starts!r}")
+        begins = np.broadcast_to(begins, (n_drones,))
+        host = [jax.tree.map(np.asarray, trajectory) for trajectory in trajectories]
+        ends = [begin + float(t.ends[-1]) for begin, t in zip(begins, host, strict=True)]
+        end = max(ends) if duration is None else float(duration)
+        if not 0 < end < np.inf:
+            raise ConfigError(f"expected a positive, finite duration, s, got {duration!r}")
+        size = max(t.coefficients.shape[-1] for t in host)
+        parts = [_pieces(t, begin, end, size) for t, begin in zip(host, begins, strict=True)]
+        drone = np.repeat(np.arange(n_drones), [len(part[0]) for part in parts])
+        return Fleet(end, drone, *(np.concatenate(x) for x in zip(*parts, strict=True)))
+
+    @property
+    def n_drones(self) -> int:
+        """Number of drones."""
+        return int(self.drone[-1]) + 1
+
+    @functools.cached_property
+    def first(self) -> Ints:
+        """First piece of each drone. (n_drones,)"""
+        return np.searchsorted(self.drone, np.arange(self.n_drones))
+
+    @functools.cached_property
+    def _keys(self) -> Floats:
+        """Begins on a common axis, on which one search finds the pieces of all drones. (n_pieces,)"""
+        return self.drone * (self.duration + 1) + self.begin
+
+    @functools.cached_property
+    def _derivatives(self) -> list[Floats]:
+        """Coefficients of the derivatives with respect to time, up to snap."""
+        found, c = [self.coefficients], self.coefficients
+        for _ in range(N_DERIVATIVES):
+            c = c[..., 1:] * np.arange(1, c.shape[-1]) if c.shape[-1] > 1 else np.zeros_like(c)
+            c = c / self.length[:, None, None]
+            found.append(c)
+        return found
+
+    def coefficients_of(self, order: int) -> Floats:
+        """Return the coefficients of a derivative, up to snap. (n_pieces, 4, degree + 1 - order)"""
+        return self._derivatives[order]
+
+    def piece(self, drone: Any, t: Any) -> Ints:
+        """Return the piece that each drone is in at a time; where two meet, the later one. (...)"""
+        t = np.clip(t, 0.0, self.duration)
+        found = np.searchsorted(self._keys, np.asarray(drone) * (self.duration + 1) + t, side="right") - 1
+        return np.maximum(found, self.first[drone])
+
+    def within(self, piece: Ints, u: Floats, order: int = 0) -> Floats:
+        """Return a derivative of x, y, z and yaw at times within pieces.
+
+        Args:
+            piece: Numbers of pieces. (...)
+            u: Time since the begin of the piece over its length. (...)
+            order: Order of the derivative.
+
+        Returns:
+            (..., 4)
+        """
+        c = self._derivatives[order][piece]
+        value = c[..., -1]
+        for k in reversed(range(c.shape[-1] - 1)):
+            value = value * u[..., None] + c[..., k]
+        return value
+
+    def at(self, drone: Any, t: Any, order: int = 0) -> Floats:
+        """Return a derivative of x, y, z and yaw of drones at times. (...) -> (..., 4)"""
+        piece = self.piece(drone, t)
+        return self.within(piece, (t - self.begin[piece]) / self.length[piece], order)
+
+
+def _pieces(t: Any, start: float, duration: float, size: int) -> tuple[Floats, Floats, Floats]:
+    """Return begins, lengths and coefficients of the pieces of one trajectory up to a duration."""
+    ends = np.asarray(t.ends, float)
+    begins = np.concatenate([[0.0], ends[:-1]])
+    real = ends > begins  # others are padding
+    begins, lengths = begins[real], (ends - begins)[real]
+    c = np.zeros((len(begins), 4, size))
+    c[..., : t.coefficients.shape[-1]] = t.coefficients[real]
+    n_rounds = max(1, int(np.ceil((duration - start) / ends[-1] - 1e-9))) if t.repeats else 1
+    begins = (start + ends[-1] * np.arange(n_rounds)[:, None] + begins).ravel()
+    parts = [(begins, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))]
+    first, last = c[0, :, :1], c[-1].sum(axis=-1, keepdims=True)
+    end = start + ends[-1] * n_rounds
+    if start > 0:
+        parts.insert(0, _rest(0.0, start, first, size))
+    if end < duration:
+        parts.append(_rest(end, duration - end, last, size))
+    begins, lengths, c = (np.concatenate(x) for x in zip(*parts, strict=True))
+    inside = begins < duration
+    return begins[inside], lengths[inside], c[inside]
+
+
+def _rest(begin: float, length: float, at: Floats, size: int) -> tuple[Floats, Floats, Floats]:
+    """Return a piece that stays at one position and yaw, (4, 1)."""
+    return np.array([begin]), np.array([length]), np.pad(at, ((0, 0), (0, size - 1)))[None]

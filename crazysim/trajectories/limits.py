@@ -1,0 +1,213 @@
+"""Limits of trajectories: what a drone and a fleet may do, and the check that they do."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from crazysim.drones import Airframe, load_airframe
+from crazysim.errors import ConfigError
+from crazysim.trajectories.approaches import Approach, closest_approaches
+from crazysim.trajectories.fleet import Fleet
+from crazysim.trajectories.peaks import GRAVITY, QUANTITIES, Peak, peaks
+from crazysim.trajectories.trajectory import Trajectory
+
+ROUNDING = 1e-4
+"""Part of a limit by which a value may exceed it: derivatives of polynomials in float32 are that exact."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a trajectory and of a fleet; None for no limit."""
+
+    speed: float | None = None
+    """Largest speed, m/s."""
+    horizontal_speed: float | None = None
+    """Largest speed in the horizontal plane, m/s."""
+    vertical_speed: float | None = None
+    """Largest speed of climb and descent, m/s."""
+    acceleration: float | None = None
+    """Largest acceleration, m/s^2."""
+    jerk: float | None = None
+    """Largest third derivative of the position, m/s^3."""
+    thrust: float | None = None
+    """Largest collective thrust over the weight, more than 1."""
+    min_thrust: float | None = None
+    """Smallest collective thrust over the weight, less than 1."""
+    body_rate: float | None = None
+    """Largest angular velocity, rad/s."""
+    yaw_rate: float | None = None
+    """Largest rate of the yaw, rad/s."""
+    height: float | None = None
+    """Largest height, m."""
+    separation: float | None = None
+    """Smallest distance between the positions of two drones, m."""
+
+    def __post_init__(self) -> None:
+        """Check the limits.
+
+        Raises:
+            ConfigError: If a limit is not positive, or the weight is not within those of the thrust.
+        """
+        for name, value in self.given().items():
+            is_number = isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool)
+            if not is_number or not np.isfinite(value) or value < 0 or (value == 0 and name != "min_thrust"):
+                raise ConfigError(f"expected a positive, finite limit {name}, got {value!r}. Use None for no limit.")
+        if self.thrust is not None and self.thrust <= 1:
+            raise ConfigError(
+                f"expected a largest thrust of more than 1 weight, got {self.thrust}. A drone with less cannot hover."
+            )
+        if self.min_thrust is not None and self.min_thrust >= 1:
+            raise ConfigError(
+                f"expected a smallest thrust of less than 1 weight, got {self.min_thrust}. With more, it must climb."
+            )
+
+    def given(self) -> dict[str, float]:
+        """Return the limits that are not None, by name."""
+        fields = dataclasses.fields(self)
+        return {field.name: getattr(self, field.name) for field in fields if getattr(self, field.name) is not None}
+
+    def of_airframe(self, airframe: str | Path | Mapping[str, Any] | Airframe) -> Limits:
+        """Return these limits with the thrusts of an airframe where there are none.
+
+        Args:
+            airframe: Name of a built-in airframe, path, dict or airframe.
+        """
+        frame = load_airframe(airframe)
+        low, high = (
+            frame.n_rotors * float(frame.value(f"rotors.{key}", ())) / float(frame.value("rigid_body.mass")) / GRAVITY
+            for key in ("thrust_min", "thrust_max")
+        )
+        return dataclasses.replace(
+            self,
+            thrust=high if self.thrust is None else self.thrust,
+            min_thrust=low if self.min_thrust is None else self.min_thrust,
+        )
+
+
+@dataclass(frozen=True)
+class Violation:
+    """A limit that one drone, or a pair of drones, exceeds."""
+
+    limit: str
+    """Name of the limit, a field of ``Limits``."""
+    drones: tuple[int, ...]
+    """Number of the drone, or of both drones of a pair."""
+    time: float
+    """Time at which the limit is exceeded most, s."""
+    value: float
+    """Value at this time, in the unit of the limit."""
+    allowed: float
+    """The limit."""
+    names: tuple[str, ...]
+    """Names of the drones."""
+
+    def __str__(self) -> str:
+        """Return the violation in one line."""
+        unit = "m" if self.limit == "separation" else QUANTITIES[self.limit].unit
+        relation = "below" if self.limit in ("separation", "min_thrust") else "above"
+        return (
+            f"{' and '.join(self.names)}: {self.limit} {self.value:.4g} {unit} at {self.time:.2f} s, {relation} the "
+            f"limit of {self.allowed:.4g}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Result of a check."""
+
+    violations: tuple[Violation, ...]
+    """Violations: one for each drone and limit, and one for each pair that comes too close."""
+    closest: tuple[Approach, ...]
+    """Closest approach of every pair, nearest pair first; empty for one drone."""
+    peaks: Mapping[str, Peak]
+    """Largest value of each quantity, and smallest thrust, of every drone, with its time."""
+    names: tuple[str, ...]
+    """Names of the drones. (n_drones,)"""
+    duration: float
+    """Duration, s."""
+
+    @property
+    def ok(self) -> bool:
+        """True if there is no violation."""
+        return not self.violations
+
+    def __str__(self) -> str:
+        """Return the extremes of the fleet and every violation, a line each."""
+        lines = [f"{len(self.names)} drone{'s' * (len(self.names) > 1)}, {self.duration:.2f} s"]
+        for name, peak in self.peaks.items():
+            k = int(np.argmax(QUANTITIES[name].sign * peak.value))
+            lines.append(
+                f"{name}: {peak.value[k]:.4g} {QUANTITIES[name].unit} ({self.names[k]} at {peak.time[k]:.2f} s)"
+            )
+        if self.closest:
+            pair = self.closest[0]
+            who = " and ".join(self.names[k] for k in pair.drones)
+            lines.append(f"separation: {pair.distance:.4g} m ({who} at {pair.time:.2f} s)")
+        lines += [f"{len(self.violations) or 'no'} violation{'s' * (len(self.violations) != 1)}"]
+        return "\n".join([*lines, *map(str, self.violations)])
+
+
+def check(
+    trajectories: Trajectory | Sequence[Trajectory],
+    limits: Limits,
+    airframe: str | Path | Mapping[str, Any] | Airframe | None = None,
+    *,
+    starts: Any = 0.0,
+    duration: float | None = None,
+    names: Sequence[str] | None = None,
+    tolerance: float = 1e-3,
+) -> Report:
+    """Check trajectories against limits, and find the closest approach of every pair.
+
+    Thrust and body rate are those of a drone without drag that flies its trajectory exactly (differential flatness).
+
+    Args:
+        trajectories: One trajectory, or one for each drone: a sequence, or a record with one leading axis.
+        limits: Limits.
+        airframe: Airframe whose thrusts are limits where ``limits`` has none; None for no such limits.
+        starts: Start of each drone, s. () or (n_drones,)
+        duration: Duration, s; None for the time at which the last drone ends. A trajectory that repeats counts once.
+        names: Names of the drones for the report; None for their numbers.
+        tolerance: Largest error of a distance, m.
+
+    Raises:
+        ConfigError: If there is no trajectory, or the number of names or starts differs from that of the trajectories.
+    """
+    several = _unstacked(trajectories) if isinstance(trajectories, Trajectory) else list(trajectories)
+    fleet = Fleet.of(several, starts, duration)
+    labels = tuple(names) if names is not None else tuple(f"drone {k}" for k in range(len(several)))
+    if len(labels) != len(several):
+        raise ConfigError(f"expected {len(several)} names, one for each drone, got {len(labels)}")
+    if tolerance <= 0:
+        raise ConfigError(f"expected a positive tolerance, m, got {tolerance!r}")
+    allowed = (limits if airframe is None else limits.of_airframe(airframe)).given()
+    found, closest = peaks(fleet, tuple(QUANTITIES)), tuple(closest_approaches(fleet, tolerance))
+    violations = []
+    for name, peak in found.items():
+        if name not in allowed:
+            continue
+        limit, sign = allowed[name], QUANTITIES[name].sign
+        for k in np.flatnonzero(sign * (peak.value - limit) > ROUNDING * limit):
+            violations.append(
+                Violation(name, (int(k),), float(peak.time[k]), float(peak.value[k]), limit, (labels[k],))
+            )
+    separation = allowed.get("separation", 0.0)
+    for pair in closest:
+        if pair.distance < separation * (1 - ROUNDING):
+            who = tuple(labels[k] for k in pair.drones)
+            violations.append(Violation("separation", pair.drones, pair.time, pair.distance, separation, who))
+    return Report(tuple(violations), closest, found, labels, fleet.duration)
+
+
+def _unstacked(trajectories: Trajectory) -> list[Trajectory]:
+    """Return the single trajectories of a record with at most one leading axis."""
+    if trajectories.ends.ndim == 1:
+        return [trajectories]
+    return [jax.tree.map(lambda x, k=k: x[k], trajectories) for k in range(len(trajectories.ends))]

@@ -1,0 +1,154 @@
+"""Largest speeds, accelerations, thrusts and rates of trajectories, found in float64 on the host."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from crazysim.control.flatness import attitude_of_thrust
+from crazysim.trajectories.fleet import Fleet, Floats, Ints
+
+GRAVITY = 9.81
+"""Gravitational acceleration, m/s^2: that of the dynamics and controllers."""
+N_INTERVALS = 64
+"""Number of intervals into which each piece is divided by the samples."""
+NEAR = 0.05
+"""Part of the range of the samples by which one may lie below the largest and still be refined."""
+N_SECTIONS = 40
+"""Golden sections: they shorten two intervals to 1e-10 of a piece."""
+CHUNK = 4096
+"""Number of times at which rates are computed at once, so that one compilation serves all."""
+PIECES = 2048
+"""Number of pieces that are sampled at once, which bounds the memory."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A function of position, yaw and their derivatives that has a limit."""
+
+    unit: str
+    """Unit."""
+    orders: tuple[int, ...]
+    """Orders of the derivatives that it is computed from."""
+    compute: Callable[..., Floats]
+    """Function of these derivatives of x, y, z and yaw, (..., 4) each. (...)"""
+    sign: int = 1
+    """1 if the largest value counts, -1 if the smallest."""
+
+
+def _specific_thrust(acc: Floats) -> Floats:
+    return acc[..., :3] + np.array([0.0, 0.0, GRAVITY])
+
+
+def _thrust(acc: Floats) -> Floats:
+    return np.linalg.norm(_specific_thrust(acc), axis=-1) / GRAVITY
+
+
+def _body_rate(pos: Floats, vel: Floats, acc: Floats, jerk: Floats) -> Floats:
+    """Return the size of the angular velocity of a drone that flies these derivatives exactly."""
+    columns = (_specific_thrust(acc), jerk[..., :3], pos[..., 3:], vel[..., 3:])
+    rows = np.concatenate(columns, axis=-1).reshape(-1, 8)
+    padded = np.zeros((-(-len(rows) // CHUNK) * CHUNK, 8))
+    padded[: len(rows)] = rows
+    with jax.enable_x64(True):
+        rates = [np.asarray(_compiled_body_rate(padded[k : k + CHUNK])) for k in range(0, len(padded), CHUNK)]
+    return np.concatenate(rates)[: len(rows)].reshape(acc.shape[:-1])
+
+
+@jax.jit
+def _compiled_body_rate(rows: jax.Array) -> jax.Array:
+    f, jerk, yaw, yaw_rate = rows[:, :3], rows[:, 3:6], rows[:, 6:7], rows[:, 7:]
+    zero = jax.numpy.zeros_like
+    return jax.numpy.linalg.norm(attitude_of_thrust(f, jerk, zero(f), yaw, yaw_rate, zero(yaw)).ang_vel, axis=-1)
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "speed": Quantity("m/s", (1,), lambda vel: np.linalg.norm(vel[..., :3], axis=-1)),
+    "horizontal_speed": Quantity("m/s", (1,), lambda vel: np.linalg.norm(vel[..., :2], axis=-1)),
+    "vertical_speed": Quantity("m/s", (1,), lambda vel: np.abs(vel[..., 2])),
+    "acceleration": Quantity("m/s^2", (2,), lambda acc: np.linalg.norm(acc[..., :3], axis=-1)),
+    "jerk": Quantity("m/s^3", (3,), lambda jerk: np.linalg.norm(jerk[..., :3], axis=-1)),
+    "thrust": Quantity("weights", (2,), _thrust),
+    "min_thrust": Quantity("weights", (2,), _thrust, -1),
+    "body_rate": Quantity("rad/s", (0, 1, 2, 3), _body_rate),
+    "yaw_rate": Quantity("rad/s", (1,), lambda vel: np.abs(vel[..., 3])),
+    "height": Quantity("m", (0,), lambda pos: pos[..., 2]),
+}
+"""Quantities by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Peak:
+    """Largest value of a quantity, or the smallest where that counts, for each drone."""
+
+    value: Floats
+    """Value, in the unit of the quantity. (n_drones,)"""
+    time: Floats
+    """Time at which it is reached, s. (n_drones,)"""
+
+
+def peaks(fleet: Fleet, names: Sequence[str]) -> dict[str, Peak]:
+    """Return the peaks of some quantities.
+
+    Each piece is sampled at ``N_INTERVALS + 1`` times; every local maximum of the samples that lies at most ``NEAR`` of
+    their range below the largest is refined by golden sections. The squares of speed, acceleration and jerk are
+    polynomials of degree 12 at most, whose maxima the samples separate, so that the error is that of rounding, about
+    1e-9 of the value. Body rates can have narrower peaks, where the thrust almost vanishes or is almost horizontal; one
+    narrower than an interval may be missed.
+
+    Args:
+        fleet: Trajectories.
+        names: Names of quantities, keys of ``QUANTITIES``.
+    """
+    return {name: _peak(fleet, QUANTITIES[name]) for name in names}
+
+
+def _peak(fleet: Fleet, quantity: Quantity) -> Peak:
+    u = np.linspace(0.0, 1.0, N_INTERVALS + 1)
+    powers = u ** np.arange(fleet.coefficients.shape[-1])[:, None]
+
+    def sampled(part: slice) -> Floats:
+        derivatives = [fleet.coefficients_of(k)[part] for k in quantity.orders]
+        values = [np.swapaxes(c @ powers[: c.shape[-1]], 1, 2) for c in derivatives]
+        return quantity.sign * quantity.compute(*values)
+
+    samples = np.concatenate([sampled(slice(k, k + PIECES)) for k in range(0, len(fleet.drone), PIECES)])
+    high = np.maximum.reduceat(samples.max(axis=1), fleet.first)
+    low = np.minimum.reduceat(samples.min(axis=1), fleet.first)
+    piece, at = _candidates(samples, (high - NEAR * (high - low))[fleet.drone])
+
+    def value(u: Floats) -> Floats:
+        return quantity.sign * quantity.compute(*(fleet.within(piece, u, k) for k in quantity.orders))
+
+    refined, where = _golden_sections(value, np.maximum(u[at] - u[1], 0.0), np.minimum(u[at] + u[1], 1.0))
+    is_better = refined > samples[piece, at]
+    best, where = np.where(is_better, refined, samples[piece, at]), np.where(is_better, where, u[at])
+    order = np.lexsort((-best, fleet.drone[piece]))
+    first = order[np.searchsorted(fleet.drone[piece][order], np.arange(fleet.n_drones))]
+    time = fleet.begin[piece] + where * fleet.length[piece]
+    return Peak(quantity.sign * best[first], time[first])
+
+
+def _candidates(samples: Floats, threshold: Floats) -> tuple[Ints, Ints]:
+    """Return piece and sample of the local maxima of each piece above its threshold, plateaus by their first sample."""
+    padded = np.pad(samples, ((0, 0), (1, 1)), constant_values=-np.inf)
+    is_maximum = (samples > padded[:, :-2]) & (samples >= padded[:, 2:])
+    return np.nonzero(is_maximum & (samples >= threshold[:, None]))  # type: ignore[return-value]
+
+
+def _golden_sections(function: Callable[[Floats], Floats], low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Return the maxima of a function in intervals in which it has one, and their arguments. (n,) each"""
+    ratio = (np.sqrt(5) - 1) / 2
+    left, right = high - ratio * (high - low), low + ratio * (high - low)
+    at_left, at_right = function(left), function(right)
+    for _ in range(N_SECTIONS):
+        goes_left = at_left > at_right
+        low, high = np.where(goes_left, low, left), np.where(goes_left, right, high)
+        new = np.where(goes_left, high - ratio * (high - low), low + ratio * (high - low))
+        at_new = function(new)
+        left, right = np.where(goes_left, new, right), np.where(goes_left, left, new)
+        at_left, at_right = np.where(goes_left, at_new, at_right), np.where(goes_left, at_left, at_new)
+    return np.where(at_left > at_right, at_left, at_right), np.where(at_left > at_right, left, right)

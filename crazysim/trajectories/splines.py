@@ -1,0 +1,146 @@
+"""Trajectories from splines: through points at given times, and from Bezier control points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories import interpolation
+from crazysim.trajectories.trajectory import Trajectory
+
+SPLINE_ORDERS = {3: 2, 5: 3, 7: 4}
+"""Degree of a spline and the derivative whose square it minimises."""
+
+
+def spline(times: Any, points: Any, degree: int = 5, yaw: Any = 0.0, at_rest: bool = True) -> Trajectory:
+    """Return the smoothest spline through points at given times.
+
+    Of all curves through the points, the spline of degree 3, 5 or 7 has the smallest integral of the squared
+    acceleration, jerk or snap, and continuous derivatives up to the second, fourth or sixth.
+
+    Args:
+        times: Time of each point, s, ascending. The trajectory starts at the first. (n_points,)
+        points: Positions, world frame, m. (n_points, 3)
+        degree: Degree of the polynomials: 3, 5 or 7.
+        yaw: Yaw, rad: one for all points, or one for each, between which the drone turns the shorter way. () or
+            (n_points,)
+        at_rest: True to start and end at rest; otherwise the derivatives at the ends are free, as of a natural spline.
+
+    Raises:
+        ConfigError: If the shapes do not fit, a number is not finite, the times do not ascend, or there are too few
+            points.
+    """
+    if degree not in SPLINE_ORDERS:
+        raise ConfigError(f"expected a spline of degree 3, 5 or 7, got {degree!r}")
+    at, x = np.asarray(times, float), np.asarray(points, float)
+    if at.ndim != 1 or x.shape != (len(at), 3):
+        raise ConfigError(f"expected times (n_points,) and points (n_points, 3), got shapes {at.shape} and {x.shape}")
+    least = 2 if at_rest else SPLINE_ORDERS[degree]
+    if len(at) < least:
+        raise ConfigError(f"expected at least {least} points for a spline of degree {degree}, got {len(at)}")
+    durations = np.diff(at)
+    if not np.all(np.isfinite(at)) or not np.all(durations > 0):
+        raise ConfigError(f"expected finite, ascending times, got {at.tolist()}. Remove points that share their time.")
+    nodes = np.full((len(at), SPLINE_ORDERS[degree], 4), np.nan)
+    nodes[:, 0] = np.concatenate([finite(x, "points"), unwrapped(yaw, len(at))[:, None]], axis=1)
+    if at_rest:
+        nodes[[0, -1], 1:] = 0.0
+    filled = interpolation.fill(nodes, durations)
+    return of_unit_pieces(durations, interpolation.unit_coefficients(filled, durations))
+
+
+def of_bezier(ends: Any, control_points: Sequence[Any], repeats: bool = False) -> Trajectory:
+    """Return the trajectory of a sequence of Bezier curves.
+
+    The Bernstein polynomials are expanded in float64: ``c_k = C(n, k) sum_i (-1)^(k - i) C(k, i) P_i``.
+
+    Args:
+        ends: End of each curve, s since the start of the trajectory, ascending. (n_pieces,)
+        control_points: Control points of each curve, the first and the last included: x, y, z, m, and, in all curves
+            or in none, yaw, rad. The degrees may differ. n_pieces times (degree + 1, 3) or (degree + 1, 4)
+        repeats: True to start again after the end.
+
+    Raises:
+        ConfigError: If the shapes do not fit, a number is not finite, or the ends do not ascend.
+    """
+    at = np.asarray(ends, float)
+    curves = [np.asarray(points, float) for points in control_points]
+    shapes = [curve.shape for curve in curves]
+    if at.shape != (len(curves),) or not curves:
+        raise ConfigError(f"expected ends (n_pieces,) for {len(curves)} curves, at least one, got shape {at.shape}")
+    is_curve = [len(shape) == 2 and shape[0] > 0 and shape[1] in (3, 4) for shape in shapes]
+    if not all(is_curve) or len({shape[1] for shape in shapes}) != 1:
+        raise ConfigError(
+            f"expected control points (degree + 1, 3) for all curves or (degree + 1, 4) for all, got {shapes}"
+        )
+    durations = np.diff(at, prepend=0.0)
+    if not np.all(np.isfinite(at)) or not np.all(durations > 0):
+        raise ConfigError(
+            f"expected finite, positive, ascending ends, got {at.tolist()}. Remove curves without length."
+        )
+    degree = max(len(curve) for curve in curves) - 1
+    pieces = [
+        interpolation.pad_degree((_power_basis(len(curve) - 1) @ finite(curve, "control points")).T, degree)
+        for curve in curves
+    ]
+    return of_unit_pieces(durations, np.stack(pieces), repeats)
+
+
+def _power_basis(degree: int) -> NDArray[np.float64]:
+    """Return the matrix from control points to coefficients, constant term first. (degree + 1, degree + 1)"""
+    return np.array(
+        [
+            [math.comb(degree, k) * (-1) ** (k - i) * math.comb(k, i) if i <= k else 0 for i in range(degree + 1)]
+            for k in range(degree + 1)
+        ],
+        float,
+    )
+
+
+def of_unit_pieces(durations: Any, coefficients: Any, repeats: bool = False) -> Trajectory:
+    """Return the trajectory of polynomials of each piece's time divided by its length.
+
+    Args:
+        durations: Length of each piece, s. (n_pieces,)
+        coefficients: Constant term first. (n_pieces, 3 or 4, degree + 1)
+        repeats: True to start again after the end.
+    """
+    c, lengths = np.asarray(coefficients, float), np.asarray(durations, float)
+    return Trajectory.of_pieces(lengths, c / lengths[:, None, None] ** np.arange(c.shape[-1]), repeats)
+
+
+def unwrapped(yaw: Any, n_points: int) -> NDArray[np.float64]:
+    """Return the yaw at each point, rad, without jumps of a revolution. (n_points,)
+
+    Args:
+        yaw: One yaw for all points, or one for each, rad. () or (n_points,)
+        n_points: Number of points.
+
+    Raises:
+        ConfigError: If the shape does not fit or a number is not finite.
+    """
+    angles = finite(np.asarray(yaw, float), "yaw")
+    if angles.shape not in ((), (n_points,)):
+        raise ConfigError(f"expected one yaw, or one for each of {n_points} points, got shape {angles.shape}")
+    return np.unwrap(np.broadcast_to(angles, (n_points,)))
+
+
+def finite(values: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    """Return the values.
+
+    Args:
+        values: Numbers. (...)
+        name: Name for the message.
+
+    Raises:
+        ConfigError: If one is NaN or infinite.
+    """
+    if not np.all(np.isfinite(values)):
+        where = np.argwhere(~np.isfinite(values))[0].tolist()
+        raise ConfigError(f"expected finite {name}, got {values[tuple(where)]} at index {where}. Remove or replace it.")
+    return values

@@ -1,0 +1,129 @@
+"""Durations of the pieces of a trajectory: their ratios by the cost, their sum by the limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories import interpolation
+from crazysim.trajectories.fleet import Fleet
+from crazysim.trajectories.interpolation import Floats
+from crazysim.trajectories.limits import Limits
+from crazysim.trajectories.peaks import QUANTITIES, peaks
+
+MARGIN = 1e-4
+"""Part of a limit that is left unused, for the rounding of trajectories in float32."""
+PRECISION = 1e-5
+"""Relative precision of the factor of time."""
+STEP = 1.25
+"""Factor by which the durations are changed until the limits are met, then until they are not."""
+N_STEPS = 50
+"""Largest number of such steps: a factor of 70,000."""
+
+
+def trapezoids(distances: Floats, limits: Limits) -> Floats:
+    """Return the shortest durations from rest to rest over distances at bounded speed and acceleration. (n_pieces,)
+
+    Only the ratios matter, so 1 m/s and one second to speed up serve where there is no limit.
+    """
+    speed = limits.speed or 1.0
+    acceleration = limits.acceleration or speed
+    is_short = distances < speed**2 / acceleration
+    return np.where(is_short, 2 * np.sqrt(distances / acceleration), distances / speed + speed / acceleration)
+
+
+def best_ratios(nodes: Floats, durations: Floats) -> Floats:
+    """Return the durations of the same sum at which the cost is smallest.
+
+    A quasi-Newton method over the logarithms of the ratios, with the exact gradient (``interpolation.cost_gradient``);
+    it finds a local minimum.
+
+    Args:
+        nodes: Derivatives at each waypoint, NaN where free. (n_pieces + 1, k, 3)
+        durations: First guess, s. (n_pieces,)
+    """
+    from scipy.optimize import minimize  # a fifth of a second to import
+
+    total = float(np.sum(durations))
+
+    def of(ratios: Floats) -> Floats:
+        weights = np.exp(ratios - np.max(ratios))
+        return total * weights / np.sum(weights)
+
+    def logarithm_of_cost(ratios: Floats) -> tuple[float, Floats]:
+        lengths = of(ratios)
+        filled = interpolation.fill(nodes, lengths)
+        cost = interpolation.cost(filled, lengths)
+        slope = interpolation.cost_gradient(filled, lengths) * lengths
+        return float(np.log(cost)), (slope - lengths / total * np.sum(slope)) / cost
+
+    if len(durations) == 1:
+        return durations
+    found = minimize(logarithm_of_cost, np.log(durations / total), jac=True, method="L-BFGS-B")
+    return of(found.x)
+
+
+def violated(durations: Floats, coefficients: Floats, limits: Limits) -> list[str]:
+    """Return the names of the limits that polynomials exceed.
+
+    Args:
+        durations: Length of each piece, s. (n_pieces,)
+        coefficients: Coefficients of x, y, z and yaw, of a piece's time divided by its length.
+            (n_pieces, 4, degree + 1)
+        limits: Limits; the separation is that of a fleet, and not checked.
+    """
+    given = {name: limit for name, limit in limits.given().items() if name in QUANTITIES}
+    ends = np.cumsum(durations)
+    fleet = Fleet(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
+    found = peaks(fleet, tuple(given))
+    signs = {name: QUANTITIES[name].sign for name in given}
+    return [
+        name for name, limit in given.items() if signs[name] * (found[name].value[0] - limit) > -MARGIN * abs(limit)
+    ]
+
+
+def shortest(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:
+    """Return the durations, in the same ratios, at which a trajectory just meets its limits.
+
+    The search starts slow. A smallest thrust can be exceeded at one speed and met again at a higher one, where the
+    thrust turns faster than the drone falls; such speeds are not looked for.
+
+    Args:
+        solve: Function that returns the coefficients for durations.
+        durations: First guess, s. (n_pieces,)
+        limits: Limits.
+
+    Raises:
+        ConfigError: If the limits cannot be met however slow the flight, or do not bound its speed.
+    """
+
+    def excess(factor: float) -> list[str]:
+        return violated(durations * factor, solve(durations * factor), limits)
+
+    high = 1.0
+    for _ in range(N_STEPS):
+        names = excess(high)
+        if not names:
+            break
+        high *= STEP
+    else:
+        raise ConfigError(
+            f"expected waypoints that can be flown within the limits, got some that exceed {' and '.join(names)} "
+            f"however slow the flight. Raise the limit, or change waypoints or fixed derivatives."
+        )
+    low = high / STEP
+    for _ in range(N_STEPS):
+        if excess(low):
+            break
+        low, high = low / STEP, low
+    else:
+        raise ConfigError(
+            f"expected limits that bound the speed of the flight, got {limits}. Set a limit of speed or acceleration, "
+            f"or pass durations."
+        )
+    while high > low * (1 + PRECISION):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if excess(middle) else (low, middle)
+    return durations * high

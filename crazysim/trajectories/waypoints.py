@@ -1,0 +1,170 @@
+"""Trajectories through waypoints: minimum snap and minimum jerk, with corridors, durations and limits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from crazysim.errors import ConfigError
+from crazysim.trajectories import interpolation, timing
+from crazysim.trajectories.corridors import fill_in_corridors
+from crazysim.trajectories.interpolation import Floats
+from crazysim.trajectories.limits import Limits
+from crazysim.trajectories.splines import finite, of_unit_pieces, unwrapped
+from crazysim.trajectories.trajectory import Trajectory
+
+YAW_ORDER = 2
+"""Derivative of the yaw whose square is minimised: the torque depends on the second (Mellinger and Kumar 2011)."""
+
+
+def minimum_snap(
+    waypoints: Any,
+    durations: Any = None,
+    *,
+    limits: Limits | None = None,
+    yaw: Any = 0.0,
+    corridors: Any = None,
+    velocities: Any = None,
+    accelerations: Any = None,
+    jerks: Any = None,
+) -> Trajectory:
+    """Return the trajectory through waypoints with the smallest integral of the squared snap.
+
+    The torque of a multirotor follows from the snap of its path (Mellinger and Kumar, "Minimum snap trajectory
+    generation and control for quadrotors", ICRA 2011). Pieces have degree 7, and derivatives up to the sixth are
+    continuous. By default the drone starts and ends at rest and passes the other waypoints without a stop.
+
+    Args:
+        waypoints: Positions, world frame, m. (n, 3)
+        durations: Time from each waypoint to the next, s. None for the shortest in ratios of least snap that meet the
+            limits. (n - 1,)
+        limits: Limits, needed without durations. With durations they are checked. The separation is that of a fleet,
+            which ``check`` compares.
+        yaw: Yaw at the waypoints, rad: one for all, or one for each, between which the drone turns the shorter way with
+            the smallest integral of the squared angular acceleration. () or (n,)
+        corridors: Largest distance from the line segment between two waypoints, m, infinite for no bound: one for all
+            or one for each. None for none. () or (n - 1,)
+        velocities: Velocities at the waypoints, world frame, m/s, NaN where free. None for rest at both ends and free
+            elsewhere. (n, 3)
+        accelerations: Accelerations, likewise, m/s^2. (n, 3)
+        jerks: Jerks, likewise, m/s^3. (n, 3)
+
+    Raises:
+        ConfigError: If a shape does not fit, a number is not finite, or the waypoints cannot be flown within the limits
+            or corridors.
+    """
+    return _plan(waypoints, durations, (velocities, accelerations, jerks), limits, yaw, corridors)
+
+
+def minimum_jerk(
+    waypoints: Any,
+    durations: Any = None,
+    *,
+    limits: Limits | None = None,
+    yaw: Any = 0.0,
+    corridors: Any = None,
+    velocities: Any = None,
+    accelerations: Any = None,
+) -> Trajectory:
+    """Return the trajectory through waypoints with the smallest integral of the squared jerk.
+
+    As ``minimum_snap``, with pieces of degree 5 and continuous derivatives up to the fourth: closer to the straight
+    lines, with less smooth body rates.
+
+    Args:
+        waypoints: Positions, world frame, m. (n, 3)
+        durations: As for ``minimum_snap``. (n - 1,)
+        limits: As for ``minimum_snap``.
+        yaw: As for ``minimum_snap``. () or (n,)
+        corridors: As for ``minimum_snap``. () or (n - 1,)
+        velocities: As for ``minimum_snap``. (n, 3)
+        accelerations: As for ``minimum_snap``. (n, 3)
+
+    Raises:
+        ConfigError: As for ``minimum_snap``.
+    """
+    return _plan(waypoints, durations, (velocities, accelerations), limits, yaw, corridors)
+
+
+def _plan(waypoints: Any, durations: Any, fixed: tuple[Any, ...], limits: Limits | None, yaw: Any, corridors: Any):
+    nodes = _nodes(waypoints, fixed)
+    n_pieces = len(nodes) - 1
+    angles = np.full((n_pieces + 1, YAW_ORDER, 1), np.nan)
+    angles[:, 0, 0], angles[[0, -1], 1:] = unwrapped(yaw, n_pieces + 1), 0.0
+    radii = _radii(corridors, n_pieces)
+
+    def solve(lengths: Floats) -> Floats:
+        try:
+            filled = interpolation.fill(nodes, lengths)
+            if np.any(np.isfinite(radii)):
+                filled = fill_in_corridors(nodes, lengths, radii)
+        except np.linalg.LinAlgError as error:
+            raise ConfigError(
+                f"expected a unique trajectory, got {n_pieces + 1} waypoints with too few fixed derivatives. Add "
+                f"waypoints, or fix the derivatives at the ends."
+            ) from error
+        paths = interpolation.unit_coefficients(filled, lengths)
+        turns = interpolation.unit_coefficients(interpolation.fill(angles, lengths), lengths)
+        return np.concatenate([paths, interpolation.pad_degree(turns, paths.shape[-1] - 1)], axis=1)
+
+    if durations is not None:
+        lengths = _given(durations, n_pieces)
+        coefficients = solve(lengths)
+        if limits is not None and (names := timing.violated(lengths, coefficients, limits)):
+            factor = timing.shortest(solve, lengths, limits)[0] / lengths[0]
+            raise ConfigError(
+                f"expected durations that meet the limits, got a trajectory that exceeds {' and '.join(names)}. "
+                f"Multiply the durations by {factor * 1.001:.4g}, or omit them."
+            )
+        return of_unit_pieces(lengths, coefficients)
+    if limits is None:
+        raise ConfigError("expected durations or limits, got neither. Pass limits=Limits(speed=..., acceleration=...).")
+    distances = np.linalg.norm(np.diff(nodes[:, 0], axis=0), axis=-1)
+    if not np.all(distances > 0):
+        k = int(np.argmin(distances))
+        raise ConfigError(
+            f"expected waypoints that differ from their neighbours, got {nodes[k, 0].tolist()} as number {k} and "
+            f"{k + 1}. Remove one, or pass durations."
+        )
+    guess = timing.best_ratios(nodes, timing.trapezoids(distances, limits))
+    is_scalable = np.all(np.nan_to_num(nodes[:, 1:]) == 0)  # then the path is the same at any speed
+    if is_scalable:
+        coefficients = solve(guess)
+        return of_unit_pieces(timing.shortest(lambda _: coefficients, guess, limits), coefficients)
+    lengths = timing.shortest(solve, guess, limits)
+    return of_unit_pieces(lengths, solve(lengths))
+
+
+def _nodes(waypoints: Any, fixed: tuple[Any, ...]) -> Floats:
+    """Return the derivatives at each waypoint, NaN where free. (n, k, 3)"""
+    at = np.asarray(waypoints, float)
+    if at.ndim != 2 or at.shape[1] != 3 or len(at) < 2:
+        raise ConfigError(f"expected waypoints (n, 3), at least two, got shape {at.shape}")
+    nodes = np.full((len(at), len(fixed) + 1, 3), np.nan)
+    nodes[:, 0] = finite(at, "waypoints")
+    for k, (name, values) in enumerate(zip(("velocities", "accelerations", "jerks"), fixed, strict=False), start=1):
+        if values is None:
+            nodes[[0, -1], k] = 0.0
+            continue
+        given = np.asarray(values, float)
+        if given.shape != at.shape or np.any(np.isinf(given)):
+            raise ConfigError(f"expected finite {name} {at.shape}, NaN where free, got shape {given.shape}")
+        nodes[:, k] = given
+    return nodes
+
+
+def _radii(corridors: Any, n_pieces: int) -> Floats:
+    """Return the radius of the corridor of each piece, m. (n_pieces,)"""
+    radii = np.asarray(np.inf if corridors is None else corridors, float)
+    if radii.shape not in ((), (n_pieces,)) or not np.all(radii > 0):
+        raise ConfigError(f"expected positive corridors, one or {n_pieces}, got {corridors!r}. Use inf for no bound.")
+    return np.broadcast_to(radii, (n_pieces,))
+
+
+def _given(durations: Any, n_pieces: int) -> Floats:
+    """Return the durations of the pieces, s. (n_pieces,)"""
+    lengths = np.asarray(durations, float)
+    if lengths.shape != (n_pieces,) or not np.all(np.isfinite(lengths)) or not np.all(lengths > 0):
+        raise ConfigError(f"expected {n_pieces} positive, finite durations, one less than waypoints, got {durations!r}")
+    return lengths

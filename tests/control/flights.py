@@ -1,0 +1,82 @@
+"""Flights of a control law on arrays, in closed loop with the full dynamics."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from crazysim import Sim
+from crazysim.control import Setpoint
+from crazysim.core import functional as F
+
+
+def setpoint_of(path, t):
+    """Return the setpoint of a path (x, y, z, yaw) of time at an instant, differentiated by jax.jvp."""
+    values = []
+    for _ in range(5):
+        values.append(path)
+        path = (lambda f: lambda t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1])(path)
+    pos, vel, acc, jerk, snap = (f(t) for f in values)
+    return Setpoint(pos[:3], vel[:3], acc[:3], jerk[:3], snap[:3], pos[3:], vel[3:], acc[3:])
+
+
+def figure_eight(t, width=2.0, speed=2.0, height=1.0):
+    """Return a figure eight, ``width`` m wide, whose greatest speed is ``speed``; half as high as wide."""
+    rate = speed / (width / np.sqrt(2))
+    x, y = width / 2 * jnp.sin(rate * t), width / 4 * jnp.sin(2 * rate * t)
+    return jnp.stack([x, y, height + 0 * t, 0 * t])
+
+
+def hover(t):
+    """Return a point 1 m above the floor."""
+    return jnp.stack([0 * t, 0 * t, 1 + 0 * t, 0 * t])
+
+
+def start_at(sim, path):
+    """Put every drone where a path begins, with its velocity, and rotors at hover."""
+    from crazysim.dynamics import first_principles
+
+    sp = setpoint_of(path, jnp.float32(0))
+    states, data = sim.data.states, sim.data
+    rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(data.params), states.rotor_vel.shape)
+    to = lambda x, like: jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape)  # noqa: E731
+    states = states.replace(pos=to(sp.pos, states.pos), vel=to(sp.vel, states.vel), rotor_vel=rotor_vel)
+    sim.data = data.replace(states=states)
+
+
+def fly(sim, law, path, seconds, memory=None, change=None):
+    """Return the states over time, and the setpoints, of one drone under ``law(data, setpoint, memory)``.
+
+    The law runs at every tick of the commands of ``sim``, whose level is that of its output. ``change(data, t)``
+    changes the data before each tick.
+    """
+    step, every = sim.build_step_fn(), sim.freq // sim.control_freq
+    zeros, command = step.zeros(sim.data), {"force_torque": F.force_torque_control, "rotor_vel": F.rotor_vel_control,
+                                            "body_rate": F.body_rate_control}[sim.control.value]  # fmt: skip
+
+    @jax.jit
+    def run(data, memory):
+        def tick(carry, k):
+            data, memory = carry
+            t = k * (every / sim.freq)
+            data = data if change is None else change(data, t)
+            setpoint = setpoint_of(path, t)
+            out, memory = law(data, setpoint, memory)
+            data = step(command(data, out.reshape(1, 1, -1)), every, zeros)
+            return (data, memory), (data.states, setpoint_of(path, t + every / sim.freq), out)
+
+        times = jnp.arange(round(seconds * sim.control_freq), dtype=jnp.float32)
+        return jax.lax.scan(tick, (data, memory), times)
+
+    (data, memory), (states, setpoints, out) = run(sim.data, memory)
+    return jax.tree.map(lambda x: np.asarray(x)[:, 0, 0], states), setpoints, np.asarray(out), data
+
+
+def rms(states, setpoints, after=0.0, total=1.0):
+    """Return the root of the mean square of the position error, m, in the part of a flight after a fraction of it."""
+    error = np.linalg.norm(states.pos - np.asarray(setpoints.pos), axis=-1)
+    return float(np.sqrt(np.mean(error[int(len(error) * after / total) :] ** 2)))
+
+
+def simulation(drone="cf21B_500", control="force_torque", **settings):
+    """Return a simulation of one drone."""
+    return Sim(drone=drone, control=control, **settings)

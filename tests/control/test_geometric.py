@@ -1,0 +1,249 @@
+"""Geometric tracking control: its torque, its feed-forward, its limits, and flights."""
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+from cases import unit_quats, vectors
+from flights import figure_eight, fly, hover, rms, setpoint_of, simulation, start_at
+from hypothesis import given
+from scipy.spatial.transform import Rotation
+
+from crazysim import Sim, load_airframe
+from crazysim.control import Setpoint
+from crazysim.control.bandwidth import bandwidth, rotor_rate
+from crazysim.control.flatness import Attitude
+from crazysim.control.geometric import Geometric, GeometricParams, attitude_errors, geometric_control
+from crazysim.control.priority import prioritized_wrench
+from crazysim.trajectories import Follow, shapes
+
+ZERO, LEVEL = np.zeros(3), np.array([0.0, 0, 0, 1])
+control = jax.jit(geometric_control, static_argnames="feedforward")
+
+
+@functools.cache
+def params(drone="bumblebee", gains="airframe", freq=500):
+    return GeometricParams.create(load_airframe(drone), freq, gains)
+
+
+def setpoint(**changes):
+    zeros = {key: ZERO for key in ("pos", "vel", "acc", "jerk", "snap")} | {
+        key: np.zeros(1) for key in ("yaw", "yaw_rate", "yaw_acc")
+    }
+    return Setpoint(**zeros | {key: np.asarray(value, float) for key, value in changes.items()})
+
+
+def law(drone, gains="bandwidth", freq=500, feedforward=True):
+    p = params(drone, gains, freq)
+
+    def wrench(data, setpoint, memory):
+        s = data.states
+        one = (s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0])
+        return geometric_control(*one, setpoint, params=p, feedforward=feedforward), memory
+
+    return wrench
+
+
+def lab_wrench(pos, matrix, vel, ang_vel, yaw, drone):
+    """Return the wrench of the facts on AIMotionLab-Virtual, section 2.3, in NumPy and apart from the code tested."""
+    kr, kv, kR, kw = {"crazyflie": (0.15, 0.2, 0.007, 0.0015), "bumblebee_lab": (4.0, 2.0, 1.7, 0.2)}[drone]
+    mass = {"crazyflie": 0.028, "bumblebee_lab": 0.605}[drone]
+    inertia = np.diag({"crazyflie": [1.4e-5, 1.4e-5, 2.17e-5], "bumblebee_lab": [1.5e-3, 1.45e-3, 2.66e-3]}[drone])
+    force = -kr * pos - kv * vel + mass * 9.81 * np.array([0, 0, 1])
+    z = force / np.linalg.norm(force)
+    y = np.cross(z, [np.cos(yaw), np.sin(yaw), 0])
+    y = y / np.linalg.norm(y)
+    desired = np.stack([np.cross(y, z), y, z], axis=-1)
+    e = desired.T @ matrix - matrix.T @ desired
+    error = 0.5 * np.array([e[2, 1], e[0, 2], e[1, 0]])
+    torque = -kR * error - kw * ang_vel + np.cross(ang_vel, inertia @ ang_vel)
+    return np.array([force @ matrix[:, 2], *torque])
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("drone", ["crazyflie", "bumblebee_lab"])
+def test_the_lab_law_and_its_gains(drone, rng):
+    """Small errors, so that no rotor saturates; the lab's law has no limits."""
+    p = GeometricParams.create(load_airframe(drone), 500, "airframe")
+    for _ in range(20):
+        rotation = Rotation.from_rotvec(rng.normal(size=3) * 0.05)
+        pos, vel, ang_vel, yaw = 0.05 * rng.normal(size=3), 0.05 * rng.normal(size=3), 0.02 * rng.normal(size=3), 0.05
+        sp = setpoint(yaw=[yaw], acc=[3, 2, 1], jerk=[1, 1, 1], yaw_rate=[1])
+        wrench = control(pos, rotation.as_quat(), vel, ang_vel, sp, params=p, feedforward=False)
+        np.testing.assert_allclose(wrench, lab_wrench(pos, rotation.as_matrix(), vel, ang_vel, yaw, drone), atol=1e-12)
+
+
+@pytest.mark.usefixtures("x64")
+def test_a_drone_that_tracks_gets_the_wrench_of_its_motion():
+    """On a figure eight, without drag: thrust and torque of Newton and Euler, J w' + w x J w."""
+    from crazysim.control.flatness import attitude_of_thrust
+
+    p = GeometricParams.create(load_airframe("bumblebee"), 500)
+    for t in (0.3, 1.0, 2.2):
+        sp = setpoint_of(figure_eight, t)
+        gravity = np.array([0, 0, 9.81])
+        now = attitude_of_thrust(sp.acc + gravity, sp.jerk, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
+        quat = Rotation.from_matrix(now.matrix).as_quat()
+        wrench = np.asarray(control(sp.pos, quat, sp.vel, now.ang_vel, sp, params=p))
+        momentum = p.J @ now.ang_vel
+        np.testing.assert_allclose(wrench[0], 0.605 * np.linalg.norm(sp.acc + gravity), rtol=1e-9)
+        np.testing.assert_allclose(wrench[1:], p.J @ now.ang_acc + np.cross(now.ang_vel, momentum), atol=1e-10)
+        assert np.linalg.norm(now.ang_acc) > 0.2
+
+
+@pytest.mark.usefixtures("x64")
+@given(quat=unit_quats(), other=unit_quats(), ang_vel=vectors(3, 5.0), w_d=vectors(3, 5.0), acc_d=vectors(3, 9.0))
+def test_the_angular_acceleration_of_tracking_keeps_the_rate_error(quat, other, ang_vel, w_d, acc_d):
+    """Along R' = R w^, R_d' = R_d w_d^ and w' = acc, the error w - R^T R_d w_d does not change."""
+    matrix, desired = Rotation.from_quat(quat).as_matrix(), Rotation.from_quat(other).as_matrix()
+    acc = attitude_errors(matrix, ang_vel, Attitude(desired, w_d, acc_d))[2]
+    rates = matrix @ skew(ang_vel), desired @ skew(w_d)
+
+    def rate_error(matrix, desired, w, w_d):
+        return w - matrix.T @ desired @ w_d
+
+    slope = jax.jvp(rate_error, (matrix, desired, ang_vel, w_d), (*rates, np.asarray(acc), acc_d))[1]
+    np.testing.assert_allclose(slope, 0.0, atol=1e-10)
+
+
+def skew(w):
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
+@pytest.mark.usefixtures("x64")
+def test_drag_is_compensated():
+    """At 2 m/s along x a Crazyflie Brushless has 0.0433 N of drag, and leans into it by its ratio to the weight."""
+    p = params("cf21B_500", "bandwidth")
+    wrench = control(ZERO, LEVEL, np.array([2.0, 0, 0]), ZERO, setpoint(vel=[2, 0, 0]), params=p)
+    lean = np.arctan(0.021643637770852733 * 2 / (0.0434 * 9.81))
+    np.testing.assert_allclose(wrench[2], p.kR[1] * np.sin(lean), rtol=1e-6)
+
+
+# Limits ---------------------------------------------------------------------------------------------------------
+
+
+def thrusts_of(wrench, p):
+    return np.asarray(p.allocation_matrix) @ np.concatenate([wrench[:1], wrench[1:] / np.asarray(p.arms)])
+
+
+priority = jax.jit(prioritized_wrench)
+
+
+@pytest.mark.usefixtures("x64")
+@given(wrench=vectors(4, 1.0))
+def test_a_wrench_is_brought_within_the_limits_by_priority(wrench):
+    p = params("cf21B_500", "bandwidth").allocation
+    wrench = np.array([2.0, 0.04, 0.04, 0.01]) * wrench
+    out = np.asarray(priority(wrench, params=p))
+    low, high = float(p.thrust_min[0]), float(p.thrust_max[0])
+    thrusts = thrusts_of(out, p)
+    assert np.all(thrusts > low - 1e-12)
+    assert np.all(thrusts < high + 1e-12)
+    wanted = thrusts_of(wrench, p)
+    if np.all((wanted >= low) & (wanted <= high)):
+        np.testing.assert_allclose(out, wrench, atol=1e-12)
+    tilt = thrusts_of(np.array([0, *wrench[1:3], 0]), p)
+    if np.ptp(tilt) <= high - low:
+        np.testing.assert_allclose(out[1:3], wrench[1:3], atol=1e-12)  # thrust and yaw give way
+    else:
+        cosine = out[1:3] @ wrench[1:3] / np.linalg.norm(out[1:3]) / np.linalg.norm(wrench[1:3])
+        np.testing.assert_allclose(cosine, 1.0)
+        np.testing.assert_allclose(np.ptp(thrusts_of(np.array([0, *out[1:3], 0]), p)), high - low)
+    assert out[3] * wrench[3] >= 0
+    assert abs(out[3]) <= abs(wrench[3]) + 1e-15
+
+
+def test_full_thrust_keeps_the_torque():
+    """Clipping each rotor on its own would halve it: two rotors are at their limit already."""
+    p = params("cf21B_500", "bandwidth").allocation
+    out = np.asarray(priority(np.array([0.8, 0.004, 0.0, 0.0]), params=p))
+    np.testing.assert_allclose(out[1:], [0.004, 0, 0], atol=1e-7)
+    assert 0.6 < out[0] < 0.8
+
+
+# Singularities ----------------------------------------------------------------------------------------------------
+
+
+@given(quat=unit_quats(), pos=vectors(3, 100.0), vel=vectors(3, 50.0), ang_vel=vectors(3, 100.0), acc=vectors(3, 40.0))
+def test_any_state_gives_a_finite_wrench_within_the_limits(quat, pos, vel, ang_vel, acc):
+    p = params("cf21B_500", "bandwidth")
+    sp = setpoint(acc=acc, jerk=acc, snap=acc, yaw_rate=[1])
+    wrench = np.asarray(control(*(np.float32(x) for x in (pos, quat, vel, ang_vel)), sp, params=p))
+    assert np.isfinite(wrench).all()
+    assert 0 < wrench[0] <= 4 * 0.2 + 1e-6
+
+
+@pytest.mark.parametrize("acc", [[0, 0, -9.81], [1e3, 0, -9.81], [-9.81, 0, -9.81], [0, 0, -30]])
+@pytest.mark.parametrize("quat", [LEVEL, [1.0, 0, 0, 0], [0, np.sqrt(0.5), 0, np.sqrt(0.5)]])
+def test_singular_commands_have_finite_gradients(acc, quat):
+    """Free fall, thrust along the heading, upside down."""
+    p, sp = params("crazyflie", "bandwidth"), setpoint(acc=acc, jerk=[1, 2, 3], snap=[1, 2, 3], yaw_rate=[1])
+    slopes = jax.jit(jax.jacrev(lambda *x: geometric_control(*x, sp, params=p), argnums=(0, 1, 2, 3)))
+    assert all(np.isfinite(x).all() for x in slopes(ZERO, np.asarray(quat, float), ZERO, ZERO))
+
+
+# Gains and flights --------------------------------------------------------------------------------------------------
+
+
+def test_rotor_rates_by_hand():
+    """13.996 + 2 x 1.1093e-4 x 15900 = 17.5 up, 5.933 + 2 x 3.1951e-4 x 15900 = 16.1 down; no lag term there: 50."""
+    assert rotor_rate(load_airframe("cf21B_500")) == pytest.approx(16.094, abs=2e-3)
+    assert rotor_rate(load_airframe("crazyflie")) == 50
+
+
+@pytest.mark.parametrize("drone", ["cf21B_500", "cf2x_L250", "crazyflie", "bumblebee"])
+def test_gains_by_bandwidth_are_stable_and_damped(drone):
+    """Poles of position, velocity, attitude, body rate and a rotor with lag: damping ratios of 0.39 and more."""
+    rates, lag = bandwidth(load_airframe(drone), 10**9), rotor_rate(load_airframe(drone))
+    kp, kd, w = rates.stiffness[0], rates.damping[0], rates.position
+    system = np.diag([1.0, 1, 1, 1, 0][:4], 1)
+    system[4] = lag * np.array([-kp * w**2, -kp * 2 * w, -kp, -kd, -1])
+    poles = np.linalg.eigvals(system)
+    assert np.max(poles.real) < -0.07 * lag
+    assert np.min(-poles.real / np.abs(poles)) > 0.39
+
+
+@pytest.mark.parametrize(("drone", "freq", "bound"), [("cf21B_500", 500, 0.02), ("cf21B_500", 100, 0.02),
+                                                      ("bumblebee", 500, 0.02)])  # fmt: skip
+def test_figure_eight_of_two_metres_at_two_metres_per_second(drone, freq, bound):
+    """2 cm RMS from the start, which is not at rest, with the full dynamics: rotor lag, drag and limits."""
+    sim = simulation(drone, force_torque_freq=freq)
+    start_at(sim, figure_eight)
+    states, setpoints, _, _ = fly(sim, law(drone, freq=freq), figure_eight, 9.0)
+    assert 1.95 < np.linalg.norm(states.vel, axis=-1).max() < 2.15
+    assert rms(states, setpoints) < bound
+
+
+def test_without_feedforward_the_error_is_tens_of_centimetres():
+    sim = simulation("cf21B_500")
+    start_at(sim, figure_eight)
+    states, setpoints, _, _ = fly(sim, law("cf21B_500", feedforward=False), figure_eight, 9.0)
+    assert rms(states, setpoints) > 0.3
+
+
+def test_it_recovers_from_upside_down():
+    sim = simulation("cf21B_500")
+    start_at(sim, hover)
+    s = sim.data.states
+    upside_down = np.broadcast_to([np.sqrt(0.99), 0, 0, 0.1], s.quat.shape)
+    high = np.broadcast_to([0, 0, 20.0], s.pos.shape)
+    sim.data = sim.data.replace(states=s.replace(quat=upside_down.astype("f4"), pos=high.astype("f4")))
+    states, _, _, _ = fly(sim, law("cf21B_500"), lambda t: hover(t) + np.array([0, 0, 19.0, 0]), 12.0)
+    assert states.pos[:, 2].min() > 1.0
+    np.testing.assert_allclose(states.pos[-1], [0, 0, 20], atol=0.02)
+
+
+@pytest.mark.parametrize("freq", [100, 500])
+def test_figure_eight_in_a_simulation(freq):
+    """By ``Follow`` and ``Sim(controller=Geometric(...))``: 2 cm RMS in the step itself, which is fused."""
+    eight = shapes.figure_eight(2.0, 1.0, speed=2.0)
+    sim = Sim(control="state", controller=Geometric(freq=freq), strict=True)
+    sim.add(Follow(eight))
+    start_at(sim, figure_eight)
+    evaluate, errors = jax.jit(eight.evaluate), []
+    for k in range(300):
+        sim.step(10)
+        target = evaluate(np.float32((k + 1) * 0.02)).pos
+        errors.append(np.linalg.norm(np.asarray(sim.data.states.pos)[0, 0] - target))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.02

@@ -1,0 +1,108 @@
+"""Incremental nonlinear dynamic inversion: its filter, its start, and what it compensates."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+from flights import figure_eight, fly, hover, rms, simulation, start_at
+
+from crazysim import Sim, load_airframe
+from crazysim.control.geometric import GeometricParams, geometric_control
+from crazysim.control.indi import INDIMemory, INDIParams, butterworth, filtered, indi_control, steady
+
+
+def test_the_filter_is_that_of_scipy():
+    b, a = scipy.signal.butter(2, 12.0, fs=500.0)
+    np.testing.assert_allclose(butterworth(12.0, 500.0), [*b, *a[1:]], rtol=1e-12)
+    x = np.random.default_rng(0).normal(size=(50, 2))
+    state, out = jnp.zeros(4), []
+    for value in x:
+        y, state = filtered(jnp.asarray(value), state, jnp.asarray(butterworth(12.0, 500.0)))
+        out.append(y)
+    np.testing.assert_allclose(out, scipy.signal.lfilter(b, a, x, axis=0), atol=1e-5)
+
+
+def test_a_filter_in_its_steady_state_stays_there():
+    x, c = jnp.array([3.0, -1.0]), jnp.asarray(butterworth(12.0, 500.0))
+    y, state = filtered(x, steady(x, c), c)
+    np.testing.assert_allclose(y, x, rtol=1e-5)
+    np.testing.assert_allclose(state, steady(x, c), rtol=1e-5)
+
+
+@functools.cache
+def law(drone):
+    p = INDIParams.create(load_airframe(drone), 500, 12.0)
+
+    def rotors(data, setpoint, memory):
+        s = data.states
+        one = (s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0], s.rotor_vel[0, 0])
+        return indi_control(*one, setpoint, memory, 500, params=p)
+
+    return rotors
+
+
+def memory():
+    return jax.tree.map(jnp.asarray, INDIMemory.at_rest())
+
+
+def test_figure_eight_of_two_metres_at_two_metres_per_second():
+    sim = simulation("cf21B_500", "rotor_vel")
+    start_at(sim, figure_eight)
+    states, setpoints, _, _ = fly(sim, law("cf21B_500"), figure_eight, 9.0, memory())
+    assert rms(states, setpoints) < 0.02
+
+
+def pushed(data, t):
+    """A tenth of the weight along x, and a torque about y that would turn the drone by 0.2 rad, from 2 s on."""
+    s = data.states
+    force = jnp.asarray([0.0426, 0, 0], jnp.float32) * (t > 2)
+    torque = jnp.asarray([0, 3e-4, 0], jnp.float32) * (t > 2)
+    states = s.replace(force=jnp.broadcast_to(force, s.force.shape), torque=jnp.broadcast_to(torque, s.torque.shape))
+    return data.replace(states=states)
+
+
+def test_a_force_and_a_torque_are_compensated():
+    """Within 1 mm after 7 s; geometric control without an integral stays decimetres away."""
+    sim = simulation("cf21B_500", "rotor_vel")
+    start_at(sim, hover)
+    states, setpoints, _, _ = fly(sim, law("cf21B_500"), hover, 9.0, memory(), pushed)
+    error = np.linalg.norm(states.pos - np.asarray(setpoints.pos), axis=-1)
+    assert error[-1] < 1e-3
+    assert error.max() < 0.1
+
+    p = GeometricParams.create(load_airframe("cf21B_500"), 500)
+
+    def geometric(data, setpoint, nothing):
+        s = data.states
+        one = (s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0])
+        return geometric_control(*one, setpoint, params=p), nothing
+
+    sim = simulation("cf21B_500")
+    start_at(sim, hover)
+    states, setpoints, _, _ = fly(sim, geometric, hover, 9.0, None, pushed)
+    assert np.linalg.norm(states.pos[-1] - np.asarray(setpoints.pos)[-1]) > 0.2
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """Four worlds from the floor to a point 1 m high and 1 m aside, for 6 s, by each controller."""
+    ends = {}
+    for name in ("geometric", "indi", "lqr"):
+        sim = Sim(n_worlds=4, control="state", controller=name, strict=True)
+        cmd = np.zeros((4, 1, 16), np.float32)
+        cmd[..., :3], cmd[..., 12] = [1.0, 0.5, 1.0], 1.0
+        sim.state_control(cmd)
+        sim.step(3000)
+        ends[name] = sim
+    return ends
+
+
+@pytest.mark.parametrize("name", ["geometric", "indi", "lqr"])
+def test_from_the_floor_in_a_simulation(flown, name):
+    """By name, fused (``strict``), and alike in every world."""
+    pos = np.asarray(flown[name].data.states.pos)
+    np.testing.assert_allclose(pos[:, 0], np.broadcast_to([1.0, 0.5, 1.0], (4, 3)), atol=0.05)
+    np.testing.assert_array_equal(pos, np.broadcast_to(pos[:1], pos.shape))

@@ -1,0 +1,260 @@
+"""Linear quadratic regulators: gains of the literature, errors, limits of the weights, and flights."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flights import figure_eight, fly, hover, rms, setpoint_of, simulation, start_at
+from scipy.spatial.transform import Rotation
+
+from crazysim import Sim, load_airframe
+from crazysim.control import Setpoint
+from crazysim.control.linear import linearize, load_derivative, rod_angles, rod_direction
+from crazysim.control.load_lqr import LoadLQR, LoadLQRParams, load_gain, load_lqr_control, load_reference
+from crazysim.control.lqr import LQR, LQRParams, hover_gain, lqr_control, reference_of, state_error
+from crazysim.control.tracking_lqr import (
+    TrackingLQR,
+    error_derivative,
+    gain_at,
+    tracking_gains,
+    tracking_lqr_control,
+)
+from crazysim.errors import ConfigError
+
+LAB_Q, LAB_R = [100] * 6 + [10] * 3 + [1] * 3, [50] * 4
+LAB_LOAD_Q = [10, 10, 100, 1, 1, 10, 0.1, 0.1, 1, 0.4, 0.4, 0.4, 0.1, 0.1, 0.05, 0.05]
+LAB_LOAD_R = [1, 80, 80, 80]
+GRAVITY = np.array([0, 0, -9.81])
+
+
+def rounded(x):
+    return [round(float(v), 4) for v in x]
+
+
+# Gains ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("x64")
+def test_gain_about_hover_as_the_lab():
+    """The facts on AIMotionLab-Virtual, section 2.4, for the Bumblebee and the Crazyflie."""
+    gain = np.asarray(LQRParams.create(load_airframe("bumblebee_lab"), 500, LAB_Q, LAB_R).gain)
+    assert rounded(gain[0, [2, 5]]) == [1.4142, 1.9264]
+    assert rounded(gain[2, [0, 3, 7, 10]]) == [1.4142, 1.6341, 2.3243, 0.1635]
+    assert rounded(gain[1, [1, 4, 6, 9]]) == [-1.4142, -1.6345, 2.3295, 0.1643]
+    assert rounded(gain[3, [8, 11]]) == [0.4472, 0.1496]
+    gain = np.asarray(LQRParams.create(load_airframe("crazyflie"), 500, LAB_Q, LAB_R).gain)
+    assert rounded(gain[0, [2, 5]]) == [1.4142, 1.4419]
+    assert rounded(gain[2, [0, 3, 7, 10]]) == [1.4142, 1.6202, 2.1684, 0.1416]
+    assert rounded(gain[3, [8, 11]]) == [0.4472, 0.1415]
+
+
+@pytest.mark.usefixtures("x64")
+def test_gain_with_load_as_the_lab():
+    """The same facts: 0.05 kg on a rod of 0.4 m, 100 Hz."""
+    params = LoadLQRParams.create(load_airframe("bumblebee"), 100, 0.05, 0.4, LAB_LOAD_Q, LAB_LOAD_R)
+    gain = np.asarray(params.gain)
+    assert rounded(gain[0, [2, 5]]) == [9.6398, 4.7304]
+    assert rounded(gain[1, [1, 4, 6, 9, 12, 14]]) == [-0.2667, -0.2000, 0.6085, 0.0705, -0.0137, 0.0184]
+    assert rounded(gain[2, [0, 3, 7, 10, 13, 15]]) == [0.2646, 0.1982, 0.6021, 0.0695, -0.0131, 0.0183]
+    assert rounded(gain[3, [8, 11]]) == [0.0972, 0.0660]
+
+    def model(x, u):
+        args = (params.mass, params.J, params.gravity_vec, params.load_mass, params.length)
+        return load_derivative(x, u, *args)
+
+    A, B = linearize(model, np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0]))
+    closed = np.eye(16) + 0.01 * A - 0.01 * B @ gain
+    assert round(float(np.abs(np.linalg.eigvals(closed)).max()), 5) == 0.99168
+
+
+def test_gains_inside_jit_have_gradients():
+    """A heavier drone needs a stiffer velocity gain about z: sqrt(R_z Q_vz + 2 m sqrt(Q_z R_z)) / R_z, by hand."""
+    inertia, Q, R = np.diag([1.5e-3, 1.45e-3, 2.66e-3]).astype("f4"), np.diag(LAB_Q), np.diag(LAB_R)
+
+    def gain(mass):
+        return hover_gain(mass, inertia, Q.astype("f4"), R.astype("f4"))[0, 5]
+
+    value, slope = jax.jit(jax.value_and_grad(gain))(jnp.float32(0.605))
+    root = np.sqrt(100 / 50 + 2 * 0.605 * np.sqrt(100 / 50))
+    np.testing.assert_allclose([value, slope], [root, np.sqrt(2) / root], rtol=1e-3)
+
+
+BAD = {
+    "number of weights": ({"Q": [1, 2, 3]}, "12 finite numbers"),
+    "asymmetric": ({"Q": np.triu(np.ones((12, 12)))}, "symmetric"),
+    "not finite": ({"R": [1, np.nan, 1, 1]}, "4 finite numbers"),
+    "no weight on the position": ({"Q": [0] * 3 + [1] * 9}, "stabilising solution"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_wrong_weights(case):
+    settings, message = BAD[case]
+    with pytest.raises(ConfigError, match=message):
+        LQR(**settings).params(load_airframe("bumblebee"))
+
+
+def test_a_trajectory_is_needed_along_a_trajectory():
+    with pytest.raises(ConfigError, match="setpoints of one drone"):
+        Sim(control="state", controller="tracking_lqr")
+
+
+# Along a trajectory -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def knots():
+    times = np.arange(50) * 0.1
+    return jax.vmap(lambda t: setpoint_of(figure_eight, t))(times)
+
+
+@pytest.mark.usefixtures("x64")
+def test_error_dynamics_are_those_of_the_drone(knots):
+    """By differences: reference and disturbed drone both fly 1e-5 s, and the errors compare."""
+    p = LQRParams.create(load_airframe("bumblebee"), 500)
+    p = jax.tree.map(jnp.asarray, p)
+    sp = jax.tree.map(lambda x: jnp.asarray(x[7], jnp.float64), knots)
+    sp = sp.replace(yaw_rate=jnp.array([0.7]), yaw_acc=jnp.array([-0.4]))
+    reference = reference_of(sp, p)
+    w = reference.ang_vel
+    ang_acc = np.linalg.solve(p.J, reference.wrench[1:] - np.cross(w, p.J @ w))
+    size, h = 1e-5, 1e-5
+    rng = np.random.default_rng(4)
+    error, extra = size * rng.normal(size=12), size * rng.normal(size=4)
+    slope = error_derivative(error, extra, reference, ang_acc, p.mass, p.J)
+
+    def flown(matrix, ang_vel, vel, pos, wrench):
+        turned = matrix @ Rotation.from_rotvec(h * np.array(ang_vel)).as_matrix()
+        rate = np.linalg.solve(p.J, wrench[1:] - np.cross(ang_vel, p.J @ ang_vel))
+        return turned, ang_vel + h * rate, vel + h * (wrench[0] * matrix[:, 2] / p.mass + GRAVITY), pos + h * vel
+
+    target = np.array(reference.matrix)
+    matrix = target @ Rotation.from_rotvec(np.array(error[6:9])).as_matrix()
+    ang_vel = error[9:] + matrix.T @ target @ w
+    after = flown(matrix, ang_vel, reference.vel + error[3:6], reference.pos + error[:3], reference.wrench + extra)
+    later = flown(target, np.asarray(w), reference.vel, reference.pos, reference.wrench)
+    moved = reference._replace(pos=later[3], vel=later[2], matrix=later[0], ang_vel=later[1])
+    quat = Rotation.from_matrix(np.array(after[0])).as_quat()
+    found = state_error(after[3], quat, after[2], after[1], moved)
+    np.testing.assert_allclose((found - error) / h / size, slope / size, atol=2e-2)
+
+
+@pytest.mark.usefixtures("x64")
+def test_gains_along_a_hover_are_those_of_hover():
+    p = LQRParams.create(load_airframe("bumblebee"), 500)
+    still = jax.vmap(lambda t: setpoint_of(hover, t))(np.arange(4) * 0.1)
+    Q, R = np.diag(LAB_Q).astype(float), np.diag(LAB_R).astype(float)
+    gains = jax.jit(tracking_gains, static_argnames="substeps")(
+        still, 0.1, np.asarray(p.mass), np.asarray(p.J), np.zeros((3, 3)), Q, R, substeps=2000
+    )
+    expected = hover_gain(np.asarray(p.mass), np.asarray(p.J), Q, R)
+    np.testing.assert_allclose(gains[0], expected, atol=5e-3 * np.abs(expected).max())
+
+
+def test_the_table_is_interpolated_and_held():
+    gains = np.arange(3.0)[:, None, None] * np.ones((4, 12))
+    for time, expected in ((-1, 0), (0.05, 0.5), (0.1, 1), (0.17, 1.7), (9, 2)):
+        np.testing.assert_allclose(gain_at(jnp.asarray(time), gains, 0.1), expected, rtol=1e-6)
+
+
+# Flights ----------------------------------------------------------------------------------------------------------
+
+
+def state_of(data):
+    s = data.states
+    return s.pos[0, 0], s.quat[0, 0], s.vel[0, 0], s.ang_vel[0, 0]
+
+
+@pytest.mark.parametrize(("drone", "bound"), [("cf21B_500", 0.04), ("bumblebee", 0.01)])
+def test_figure_eight(drone, bound, knots):
+    """Of 2 m at 2 m/s, with the gain about hover, and with that along the trajectory."""
+    sim = simulation(drone)
+    p = LQRParams.create(load_airframe(drone), 500)
+    start_at(sim, figure_eight)
+    states, setpoints, _, _ = fly(sim, lambda d, sp, m: (lqr_control(*state_of(d), sp, params=p), m), figure_eight, 4.8)
+    assert rms(states, setpoints) < bound
+
+    along = TrackingLQR(setpoints=knots, dt=0.1).params(load_airframe(drone))
+    assert np.ptp(np.asarray(along.gains), axis=0).max() > 0.01 * np.abs(along.gains).max()
+
+    def law(data, sp, tick):
+        return tracking_lqr_control(*state_of(data), sp, tick / 500, params=along), tick + 1
+
+    sim.reset()
+    start_at(sim, figure_eight)
+    states, setpoints, _, _ = fly(sim, law, figure_eight, 4.8, jnp.float32(0))
+    assert rms(states, setpoints) < bound
+
+
+def test_heading_turns_the_gain():
+    """Behind its setpoint along its nose, the drone pitches down to go there, whatever its yaw."""
+    p = LQRParams.create(load_airframe("bumblebee"), 500)
+    for yaw in (0.0, 1.0, -2.5):
+        nose = jnp.array([np.cos(yaw), np.sin(yaw), 0.0])
+        zero, none = jnp.zeros(3), jnp.zeros(1)
+        sp = Setpoint(nose, zero, zero, zero, zero, jnp.array([yaw]), none, none)
+        quat = jnp.asarray(Rotation.from_euler("z", yaw).as_quat(), jnp.float32)
+        wrench = np.asarray(lqr_control(zero, quat, zero, zero, sp, params=p))
+        assert wrench[2] > 1e-3
+        np.testing.assert_allclose(wrench[[1, 3]], 0, atol=1e-6)
+
+
+def fly_with_load(load_mass, length, seconds, freq=500):
+    """Return load and setpoint along a figure eight, of the model of ``load_derivative`` with rotors of a 30 ms lag."""
+    controller = LoadLQR(load_mass=load_mass, length=length, freq=freq)
+    airframe = load_airframe("bumblebee")
+    p, memory = controller.params(airframe), jax.tree.map(jnp.asarray, controller.memory(airframe))
+    n, dt = 1000 // freq, 1e-3
+
+    def deriv(x, u):
+        args = (p.mass, p.J, p.gravity_vec, p.load_mass, p.length)
+        return jnp.concatenate([load_derivative(x[:16], x[16:], *args), (u - x[16:]) / 0.03])
+
+    def tick(carry, k):
+        from types import SimpleNamespace as Record
+
+        from crazysim import rotation
+
+        x, memory = carry
+        q, q_rate = jax.jvp(rod_direction, (x[12:14],), (x[14:16],))
+        states = Record(pos=x[:3], quat=rotation.from_rpy(x[6:9]), vel=x[3:6], ang_vel=x[9:12])
+        load = Record(pos=x[:3] + length * q, vel=x[3:6] + length * q_rate)
+        data = Record(states=states, plugins={"load": load})
+        u, memory = controller.update(data, setpoint_of(figure_eight, k / freq), memory, p)
+        for _ in range(n):
+            x = x + dt * deriv(x + dt / 2 * deriv(x, u), u)
+        return (x, memory), (x[:3] + length * rod_direction(x[12:14]), setpoint_of(figure_eight, (k + 1) / freq).pos)
+
+    reference, rod, rod_rate = load_reference(setpoint_of(figure_eight, jnp.float32(0)), p)
+    start = [reference.pos, reference.vel, jnp.zeros(6), *rod_angles(rod, rod_rate), reference.wrench]
+    steps = jnp.arange(seconds * freq, dtype=jnp.float32)
+    _, out = jax.jit(lambda c: jax.lax.scan(tick, c, steps))((jnp.concatenate(start), memory))
+    return [np.asarray(x) for x in out]
+
+
+@pytest.mark.parametrize(("load_mass", "length", "freq"), [(0.05, 0.4, 500), (0.2, 0.57, 100)])
+def test_load_along_a_figure_eight(load_mass, length, freq):
+    """Of 2 m at 2 m/s, at the load: 5 cm RMS is the requirement, and 1 cm is reached."""
+    load, target = fly_with_load(load_mass, length, 9, freq)
+    assert np.sqrt(np.mean(np.sum((load - target) ** 2, axis=-1))) < 0.01
+
+
+@pytest.mark.usefixtures("x64")
+def test_load_gain_at_zero_load_and_any_rod_is_that_of_the_drone():
+    """Without weights on the rod, which then moves nothing."""
+    J, mass, none = np.diag([1.5e-3, 1.45e-3, 2.66e-3]), np.array([0.605]), np.zeros(1)
+    Q = np.diag([*LAB_Q, 1e-9, 1e-9, 1e-9, 1e-9])
+    gain = load_gain(mass, J, none, np.array([0.4]), 1e-4, 1e-4 * Q, 1e-4 * np.diag(LAB_R).astype(float))
+    np.testing.assert_allclose(gain[:, :12], hover_gain(mass, J, np.diag(LAB_Q) * 1.0, np.diag(LAB_R) * 1.0), atol=0.02)
+
+
+def test_setpoints_of_the_drone_leave_it_where_they_say():
+    """At rest below its setpoint nothing turns; the load hangs, and the thrust carries both."""
+    p = LoadLQRParams.create(load_airframe("bumblebee"), 500, 0.1, 0.4)
+    zero, down, none = jnp.zeros(3), jnp.array([0, 0, -1.0]), jnp.zeros(1)
+    sp = Setpoint(zero, zero, zero, zero, zero, none, none, none)
+    state = (zero, jnp.array([0, 0, 0, 1.0]), zero, zero, down, zero)
+    wrench = load_lqr_control(*state, sp, params=p, target="drone")
+    np.testing.assert_allclose(wrench, [0.705 * 9.81, 0, 0, 0], rtol=1e-6)
+    above = (jnp.array([0, 0, 0.4]), *state[1:])
+    np.testing.assert_allclose(load_lqr_control(*above, sp, params=p), [0.705 * 9.81, 0, 0, 0], rtol=1e-6)

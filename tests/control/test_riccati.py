@@ -1,0 +1,90 @@
+"""Riccati equations: against SciPy, in both precisions, with gradients, and without a solution."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from jax.test_util import check_grads
+
+from crazysim.control.riccati import check_gain, gain_continuous, gain_discrete, solve_continuous, solve_discrete
+from crazysim.errors import ConfigError
+
+SOLVERS = {
+    "continuous": (jax.jit(solve_continuous), scipy.linalg.solve_continuous_are),
+    "discrete": (jax.jit(solve_discrete), scipy.linalg.solve_discrete_are),
+}
+SIZES = [(2, 1), (4, 2), (12, 4), (16, 4)]
+
+
+def problem(n, m, seed):
+    rng = np.random.default_rng(seed)
+    A, B = rng.normal(size=(n, n)) / np.sqrt(n), rng.normal(size=(n, m))
+    return A, B, np.diag(rng.uniform(0.01, 10, n)), np.diag(rng.uniform(0.1, 10, m))
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("kind", SOLVERS)
+@pytest.mark.parametrize(("n", "m"), SIZES)
+def test_as_scipy(kind, n, m):
+    solve, reference = SOLVERS[kind]
+    for seed in range(5):
+        expected = reference(*problem(n, m, seed))
+        np.testing.assert_allclose(solve(*problem(n, m, seed)), expected, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("kind", SOLVERS)
+@pytest.mark.parametrize(("n", "m"), SIZES)
+def test_in_float32(kind, n, m):
+    """To three digits: 30 doublings of matrices of up to 16 x 16 add up thousands of roundings of 6e-8."""
+    solve, reference = SOLVERS[kind]
+    for seed in range(5):
+        matrices = [x.astype(np.float32) for x in problem(n, m, seed)]
+        expected, found = reference(*problem(n, m, seed)), solve(*matrices)
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("gain", [gain_continuous, gain_discrete])
+def test_gradients_of_gains(gain):
+    """Of either kind, against differences; the weights enter through their logarithms, which keeps them positive."""
+    A, B, Q, R = problem(4, 2, 3)
+
+    def of(A, B, q, r):
+        return gain(A, B, jnp.diag(jnp.exp(q)), jnp.diag(jnp.exp(r)))
+
+    args = (A, B, np.log(np.diag(Q)), np.log(np.diag(R)))
+    check_grads(jax.jit(of), args, order=1, modes=("fwd", "rev"), atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.usefixtures("x64")
+def test_a_double_integrator_by_hand():
+    """Position weight 1, input weight 1: K = (1, sqrt(2)), the damping ratio of 0.707 that every textbook has."""
+    A, B = np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]])
+    np.testing.assert_allclose(gain_continuous(A, B, np.diag([1.0, 0]), np.eye(1)), [[1, np.sqrt(2)]], rtol=1e-12)
+
+
+UNSOLVABLE = {
+    "unstable mode without input": (np.diag([1.0, -1.0]), np.diag([2.0, 0.5]), [[0.0], [1.0]], np.eye(2)),
+    "integrator without input": (np.zeros((2, 2)), np.eye(2), [[0.0], [1.0]], np.eye(2)),
+    "integrator without weight": (np.zeros((2, 2)), np.eye(2), np.eye(2), np.diag([0.0, 1.0])),
+    "not a number": (np.full((2, 2), np.nan), np.full((2, 2), np.nan), np.eye(2), np.eye(2)),
+}
+
+
+@pytest.mark.parametrize("case", UNSOLVABLE)
+def test_without_a_solution_it_is_nan_and_the_host_raises(case):
+    continuous, discrete, B, Q = UNSOLVABLE[case]
+    B = np.asarray(B, float)
+    for gain, A in ((gain_continuous, continuous), (gain_discrete, discrete)):
+        K = jax.jit(gain)(A, B, Q, np.eye(B.shape[1]))
+        assert np.isnan(K).all()
+        with pytest.raises(ConfigError, match="stabilising solution"):
+            check_gain(K)
+
+
+def test_a_slow_closed_loop_is_solved():
+    """A mode of 1e-3 of the fastest, stable by a weight of 1e-6."""
+    K = gain_continuous(*(np.asarray(x, np.float32) for x in ([[0]], [[1]], [[1e-6]], [[1]])))
+    np.testing.assert_allclose(K, [[1e-3]], rtol=1e-4)

@@ -1,0 +1,98 @@
+"""The hook: picking up with the impulse, letting go, and a hinge that turns the drone."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import with_states
+
+from crazysim import ConfigError, Sim, rotation
+from crazysim.payloads import Hook
+
+MASS, LOAD, HOOK = 0.605, 0.2, 0.0203
+SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "lanes"}
+
+
+def hooked(height=5.0, integrator="euler", **settings):
+    sim = Sim(**SETTINGS, integrator=integrator)
+    sim.data = with_states(sim.data, pos=np.array([0.0, 0.0, height]))
+    return sim, sim.add(Hook.bumblebee(**{"in_scene": False} | settings))
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+def test_picking_up_keeps_momentum(integrator, x64):
+    """Without a mass at the hook, P = (q.u - q.v) / (1/m + 1/m_L), and q' = (I - q q^T) (u - v) / L."""
+    sim, hook = hooked(integrator=integrator, hook_mass=0.0, damping=0.0, load_at=(0.0, 0.0, 4.59))
+    sim.data = with_states(hook.command(sim.data, True), vel=np.array([0.1, 0.0, 0.0]))
+    record = hook.read(sim.data)
+    u = np.array([0.2, 0.1, -0.2])
+    sim.data = hook.write(
+        sim.data, record.replace(vel=record.vel + u, tip_vel=record.tip_vel + np.array([0.1, 0.0, 0.0]))
+    )
+    after = hook.grip(sim.data.replace(
+        states=type(sim.data.states)(**{k: v[0, 0] for k, v in vars(sim.data.states).items()}),
+        plugins={"load": type(record)(**{
+            k: v[0, 0] if v is not None and v.ndim > 1 else v for k, v in vars(hook.read(sim.data)).items()
+        })},
+    ))  # fmt: skip
+    got, v, q = after.plugins["load"], np.array([0.1, 0, 0]), np.array([0, 0, -1.0])
+    assert bool(got.attached)
+    impulse = (q @ u - q @ v) / (1 / MASS + 1 / LOAD)
+    np.testing.assert_allclose(after.states.vel, v + impulse * q / MASS, atol=1e-12)
+    swing = np.asarray(got.vel - after.states.vel) / 0.4
+    np.testing.assert_allclose(swing, (u - v - q * (q @ (u - v))) / 0.4, atol=1e-9)
+    np.testing.assert_allclose(MASS * after.states.vel + LOAD * got.vel, MASS * v + LOAD * u, atol=1e-12)
+
+
+def test_conditions_of_picking_up_and_letting_go():
+    """Only with the command, near and slow; a load that is let go falls freely, and the drone is rid of it."""
+    sim, hook = hooked(load_at=(0.0, 0.0, 4.5))
+    sim.data = hook.command(sim.data, True)
+    sim.step()
+    assert not hook.read(sim.data).attached.any(), "0.1 m is beyond its reach"
+    for vel, grip, holds in (((0.8, 0, 0), True, False), ((0.2, 0, 0), False, False), ((0.2, 0, 0), True, True)):
+        sim, hook = hooked(load_at=(0.0, 0.0, 4.58))
+        record = hook.read(sim.data)
+        sim.data = hook.command(hook.write(sim.data, record.replace(vel=record.vel + np.array(vel))), grip)
+        sim.step()
+        assert bool(hook.read(sim.data).attached[0, 0]) == holds
+    sim.step(50)
+    sim.data = hook.command(sim.data, False)
+    before = hook.read(sim.data)
+    sim.step(100)
+    after = hook.read(sim.data)
+    assert not after.attached.any()
+    np.testing.assert_allclose(after.vel[0, 0] - before.vel[0, 0], [0, 0, -9.81 * 0.2], atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(after.tip_pos - sim.data.states.pos), 0.4, atol=1e-4)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+def test_a_hinge_keeps_the_rod_in_its_plane_and_turns_the_drone(integrator, x64):
+    ends = {}
+    for dof in (1, 2):
+        sim, hook = hooked(500.0, dof=dof, damping=0.0, integrator=integrator)
+        record = hook.read(sim.data)
+        push = np.array([0.5, 0.4, 0.0])
+        sim.data = hook.write(sim.data, record.replace(vel=record.vel + push, tip_vel=record.tip_vel + push))
+        sim.step(250)
+        s, record = sim.data.states, hook.read(sim.data)
+        in_body = rotation.rotate_inverse(s.quat, record.tip_pos - s.pos)[0, 0]
+        ends[dof] = np.asarray(in_body), np.asarray(s.ang_vel[0, 0])
+    assert abs(ends[1][0][1]) < 1e-4
+    assert abs(ends[2][0][1]) > 0.1
+    assert np.abs(ends[1][1][[0, 2]]).max() > 0.5, "roll or yaw of the drone"
+    assert np.abs(ends[2][1]).max() < 1e-9, "a force at the centre of mass does not turn it"
+
+
+def test_wrong_settings_are_errors():
+    for settings, message in (({"dof": 3}, "dof"), ({"load_at": (1, 2)}, "load_at"), ({"mass": -1}, "mass")):
+        with pytest.raises(ConfigError, match=message):
+            hooked(**settings)
+
+
+def test_a_load_on_the_floor_waits(x64):
+    sim, hook = hooked(2.0, load_at=(1.0, 0.5, 0.0))
+    sim.step(50)
+    record = hook.read(sim.data)
+    np.testing.assert_allclose(record.pos[0, 0], [1.0, 0.5, 0.04 + 0.1275])
+    np.testing.assert_allclose(record.vel, 0, atol=1e-12)
+    assert jnp.isfinite(record.tip_pos).all()

@@ -1,0 +1,312 @@
+"""Loads on rods and cables: invariants, impacts, the bare drone in the limit, and the laws."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import INTEGRATORS, with_states
+
+from crazysim import ConfigError, Downwash, Sim, Wind, rotation
+from crazysim.payloads import SlungLoad, direction
+from crazysim.payloads.link import Link, end_relative_motion
+
+MASS, LOAD = 0.605, 0.2
+OFFSET = (0.02, 0.01, -0.03)
+
+
+def flying(n_worlds=1, n_drones=1, height=500.0, **kwargs):
+    options = {"drone": "bumblebee", "control": "rotor_vel", "engine": "lanes"} | kwargs
+    sim = Sim(n_worlds, n_drones, **options)
+    sim.data = with_states(sim.data, pos=np.asarray(sim.data.states.pos) + [0, 0, height])
+    return sim
+
+
+def with_load(load, data, **changes):
+    record = load.read(data)
+    new = {k: jnp.broadcast_to(jnp.asarray(v, record.vel.dtype), getattr(record, k).shape) for k, v in changes.items()}
+    return load.write(data, record.replace(**new))
+
+
+def momentum(load, data):
+    """Return momentum, and angular momentum about the common centre of mass. (3,) each"""
+    s, r = data.states, load.read(data)
+    x, y, v, u = (np.asarray(a[0, 0]) for a in (s.pos, r.pos, s.vel, r.vel))
+    centre, mean = (MASS * x + LOAD * y) / (MASS + LOAD), (MASS * v + LOAD * u) / (MASS + LOAD)
+    spin = rotation.rotate(s.quat[0, 0], rotation.matvec(data.params.J, s.ang_vel[0, 0]))
+    orbit = MASS * np.cross(x - centre, v - mean) + LOAD * np.cross(y - centre, u - mean)
+    return MASS * v + LOAD * u, orbit + np.asarray(spin)
+
+
+def inner_energy(load, data):
+    """Return the kinetic energy of drone and load relative to their centre of mass, J."""
+    s, r = data.states, load.read(data)
+    v, u, w = (np.asarray(a[0, 0]) for a in (s.vel, r.vel, s.ang_vel))
+    relative, reduced = v - u, MASS * LOAD / (MASS + LOAD)
+    return reduced / 2 * relative @ relative + w @ np.asarray(data.params.J) @ w / 2
+
+
+@pytest.mark.parametrize("attach", [(0, 0, 0), OFFSET])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_law_08_momentum_and_energy_of_drone_and_load_are_kept(integrator, attach, x64):
+    """In free fall the tension is the only force between them: for 10 s at 500 Hz."""
+    sim = flying(integrator=integrator)
+    load = sim.add(SlungLoad(mass=LOAD, attach=attach, in_scene=False))
+    sim.data = with_load(load, sim.data, vel=(1.0, 0.5, 0.0))
+    (p0, l0), e0 = momentum(load, sim.data), inner_energy(load, sim.data)
+    n = 5000
+    sim.step(n)
+    p, spin = momentum(load, sim.data)
+    np.testing.assert_allclose(p, p0 + [0, 0, -9.81 * n / 500 * (MASS + LOAD)], atol=1e-11)
+    assert abs(inner_energy(load, sim.data) / e0 - 1) < 2e-3
+    np.testing.assert_allclose(spin, l0, atol=1e-2 * np.linalg.norm(l0))
+    arm = rotation.rotate(sim.data.states.quat[0, 0], jnp.asarray(attach, float))
+    length = np.linalg.norm(load.read(sim.data).pos[0, 0] - sim.data.states.pos[0, 0] - arm)
+    assert abs(length - 0.4) < 1e-4
+
+
+@pytest.mark.parametrize("cable", [False, True])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_law_08_energy_never_grows_below_a_heavy_drone(integrator, cable):
+    """A pendulum below a body of 1e9 kg that hovers: 60 s at 500 Hz in float32, at amplitudes up to 2.5 rad."""
+    sim = flying(8, integrator=integrator, height=2.0)
+    params = sim.data.params
+    sim.data = sim.data.replace(params=params.replace(mass=jnp.full(1, 1e9)))
+    sim.data = with_states(sim.data, force=np.array([0, 0, 9.81e9]))
+    load = sim.add(SlungLoad(mass=LOAD, cable=cable, in_scene=False))
+    angle = np.linspace(0.2, 2.5, 8)
+    pos = np.stack([0.4 * np.sin(angle), 0 * angle, 2 - 0.4 * np.cos(angle)], axis=-1)[:, None]
+    sim.data = with_load(load, sim.data, pos=pos)
+
+    def energy():
+        r = load.read(sim.data)
+        speed = jnp.sum((r.vel - sim.data.states.vel) ** 2, axis=-1)
+        height = (r.pos - sim.data.states.pos)[..., 2]
+        return np.asarray(9.81 * height + speed / 2)[:, 0]
+
+    start, seen = energy(), []
+    for _ in range(60):
+        sim.step(497)
+        seen.append(energy())
+    span = 2 * 9.81 * 0.4
+    # Semi-implicit schemes oscillate within a band of dt, which does not widen.
+    assert (np.array(seen) - start).max() < 0.01 * span
+    assert (np.array(seen)[-20:].max(0) - np.array(seen)[:20].max(0)).max() < 0.002 * span
+    if not cable:
+        assert np.abs(np.array(seen) - start).max() < 0.01 * span
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_without_mass_the_drone_flies_as_without_load(integrator):
+    flights = []
+    for mass in (None, 0.0):
+        sim = flying(integrator=integrator, height=5.0)
+        if mass is not None:
+            load = sim.add(SlungLoad(mass=mass, attach=OFFSET, damping=0.001, drag=0.1, in_scene=False))
+        sim.rotor_vel_control(np.array([[[12000.0, 12100, 12050, 11990]]]))
+        sim.step(300)
+        flights.append(sim.data.states)
+    for name in ("pos", "quat", "vel", "ang_vel"):
+        np.testing.assert_allclose(getattr(flights[1], name), getattr(flights[0], name), rtol=1e-5, atol=1e-5)
+    assert np.isfinite(load.read(sim.data).pos).all()
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.6])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_cable_that_becomes_taut(integrator, restitution, x64):
+    """The impulse of two masses along the line: speeds afterwards as worked out by hand."""
+    sim = flying(integrator=integrator)
+    load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=restitution, in_scene=False))
+    start = np.asarray(sim.data.states.pos)
+    sim.data = with_load(load, sim.data, pos=start + [0, 0, -0.35], vel=(0.0, 0.0, -1.0))
+    sim.step(15)  # 3 cm: still slack
+    assert np.isclose(float(sim.data.states.vel[0, 0, 2] - load.read(sim.data).vel[0, 0, 2]), 1.0, atol=1e-9)
+    sim.step(15)
+    t = 30 / 500
+    mean = -LOAD / (MASS + LOAD) - 9.81 * t
+    apart = -restitution  # speed of separation after the impact
+    v, u = float(sim.data.states.vel[0, 0, 2]), float(load.read(sim.data).vel[0, 0, 2])
+    np.testing.assert_allclose(MASS * v + LOAD * u, (MASS + LOAD) * mean, rtol=1e-9)
+    np.testing.assert_allclose(v - u, apart, atol=1e-3)
+
+
+def test_impulse_by_hand():
+    """P = q.(u - v) / (1/m + 1/m_L), which changes v by P q / m and u by -P q / m_L."""
+    sim = flying()
+    s = jax.tree.map(lambda x: x[0, 0], sim.data.states)
+    s = s.replace(vel=jnp.array([0.1, 0.2, 0.3]))
+    q, p = np.array([0.6, 0.0, -0.8]), sim.data.params
+    link = Link(None, jnp.full(1, 0.4), jnp.full(1, LOAD))
+    u = np.array([1.0, -1.0, 0.5])
+    after, vel = end_relative_motion(s, p.mass, p.J_inv, link, s.pos + 0.4 * q, jnp.asarray(u))
+    impulse = q @ (u - [0.1, 0.2, 0.3]) / (1 / MASS + 1 / LOAD)
+    np.testing.assert_allclose(after.vel, np.array([0.1, 0.2, 0.3]) + impulse * q / MASS, rtol=1e-4)
+    np.testing.assert_allclose(vel, u - impulse * q / LOAD, rtol=1e-4)
+    np.testing.assert_allclose(q @ (vel - after.vel), 0, atol=1e-4)
+
+
+def test_order_of_convergence(x64):
+    """Runge-Kutta keeps order four with a load, the schemes of order one theirs."""
+    ends = {}
+    for integrator, freqs in (("rk4", (100, 200, 400, 3200)), ("euler", (250, 500, 1000, 16000))):
+        for freq in freqs:
+            sim = flying(integrator=integrator, freq=freq)
+            load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, in_scene=False))
+            sim.data = with_states(sim.data, ang_vel=np.array([0.5, -1.0, 2.0]), vel=np.array([0.3, 0, 0]))
+            sim.data = load.hang(sim.data)
+            sim.rotor_vel_control(np.full((1, 1, 4), 13000.0))
+            sim.step(freq // 2)
+            ends[integrator, freq] = np.concatenate([load.read(sim.data).pos[0, 0], sim.data.states.ang_vel[0, 0]])
+        errors = [np.abs(ends[integrator, f] - ends[integrator, freqs[-1]]).max() for f in freqs[:-1]]
+        slope = -np.polyfit(np.log(freqs[:-1]), np.log(errors), 1)[0]
+        assert abs(slope - (4 if integrator == "rk4" else 1)) < 0.4, (integrator, errors)
+
+
+@pytest.mark.parametrize("cable", [False, True])
+def test_law_08_gradients_are_central_differences(cable, x64):
+    sim = flying(height=2.0, engine="plain")
+    load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, damping=0.001, cable=cable, in_scene=False))
+    sim.rotor_vel_control(np.full((1, 1, 4), 13000.0))
+    step, data = sim.build_step_fn(), sim.data
+
+    def end(x):
+        record = load.read(data)
+        changed = load.write(data, record.replace(mass=x[:1], length=x[1:2], vel=record.vel + x[2:5]))
+        after = step(changed, 40)
+        return jnp.sum(after.states.pos**2) + jnp.sum(after.states.ang_vel) + jnp.sum(load.read(after).vel[..., 0])
+
+    x = jnp.array([LOAD, 0.4, 0.3, 0.2, -0.1])
+    gradient = jax.jit(jax.grad(lambda x: end(x)))(x)
+    value = jax.jit(end)
+    for k in range(5):
+        d = 1e-5 * jnp.eye(5)[k]
+        np.testing.assert_allclose(gradient[k], (value(x + d) - value(x - d)) / 2e-5, rtol=2e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_law_07_no_nan(integrator):
+    """Upside down with the load above, on the floor, load in the attachment, at the fastest spin, for 10 s."""
+    for cable in (False, True):
+        sim = flying(5, integrator=integrator, height=0.5, engine="auto")
+        load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, cable=cable, damping=0.001, drag=0.05, in_scene=False))
+        quat = np.tile([0, 0, 0, 1.0], (5, 1, 1))
+        quat[0], ang_vel, pos = [1, 0, 0, 0], np.zeros((5, 1, 3)), np.array(load.read(sim.data).pos)
+        pos[0] = np.asarray(sim.data.states.pos)[0] + [0, 0, 0.4]
+        pos[1] = sim.data.states.pos[1]
+        ang_vel[2] = [300.0, -200.0, 500.0]
+        height = np.array(sim.data.states.pos)
+        height[3:, :, 2] = 0.0
+        sim.data = with_states(sim.data, quat=quat, ang_vel=ang_vel, pos=height)
+        sim.data = with_load(load, sim.data, pos=pos)
+        sim.rotor_vel_control(np.full((5, 1, 4), 20000.0) * np.array([1, 1, 1, 0, 1])[:, None, None])
+        for _ in range(10):
+            sim.step(500)
+            for x in jax.tree.leaves((sim.data.states, load.read(sim.data))):
+                assert np.isfinite(x).all()
+
+
+def test_law_07_no_nan_in_gradients():
+    sim = flying(2, height=0.0, engine="plain")
+    load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=0.3, in_scene=False))
+    sim.data = with_load(load, sim.data, pos=sim.data.states.pos)  # in the attachment, on the floor
+    gradient = jax.jit(jax.grad(lambda d: jnp.sum(sim.step_fn(d, 2).states.pos), allow_int=True))(sim.data)
+    for x in jax.tree.leaves((gradient.states, gradient.plugins["load"])):
+        assert x.dtype == jax.dtypes.float0 or np.isfinite(x).all()
+
+
+def test_law_01_all_engines_and_all_worlds_agree():
+    """Worlds of drones with loads of their own masses fly as alone, on every engine."""
+    masses = np.array([[0.0, 0.1], [0.2, 0.3]])
+    ends = {}
+    for engine in ("plain", "lanes", "fused"):
+        sim = flying(2, 2, height=2.0, engine=engine, strict=True)
+        load = sim.add(SlungLoad(mass=masses, attach=OFFSET, cable=True, in_scene=False))
+        sim.data = load.release(sim.data, np.array([[False, False], [False, True]]))
+        sim.rotor_vel_control(np.full((2, 2, 4), 13000.0))
+        sim.step(50)
+        ends[engine] = np.concatenate([sim.data.states.pos, load.read(sim.data).pos], axis=-1)
+    np.testing.assert_allclose(ends["lanes"], ends["plain"], atol=1e-5)
+    np.testing.assert_allclose(ends["fused"], ends["plain"], atol=1e-5)
+    alone = flying(1, 1, height=2.0)
+    load = alone.add(SlungLoad(mass=0.2, attach=OFFSET, cable=True, in_scene=False))
+    alone.rotor_vel_control(np.full((1, 1, 4), 13000.0))
+    alone.step(50)
+    rise = np.asarray(load.read(alone.data).pos[0, 0, 2])
+    np.testing.assert_allclose(ends["plain"][1, 0, 5], rise, atol=1e-5)
+    np.testing.assert_allclose(ends["plain"][1, 1, 5], 2 - 0.03 - 0.4 - 9.81 * 0.1**2 / 2, atol=3e-3)  # cut loose
+
+
+def test_rest_on_the_floor_and_release(x64):
+    sim = flying(height=1.0)
+    load = sim.add(SlungLoad(mass=LOAD, cable=True, size=(0.1, 0.1, 0.06), in_scene=False))
+    sim.data = with_load(load, load.release(sim.data), vel=(0.5, 0.0, 0.0))
+    sim.step(500)
+    r = load.read(sim.data)
+    np.testing.assert_allclose(r.pos[0, 0, 2], 0.03, atol=1e-12)
+    np.testing.assert_allclose(r.vel[0, 0], 0, atol=1e-12)
+    assert 0.1 < float(r.pos[0, 0, 0]) < 0.3  # it fell for 0.34 s at 0.5 m/s, and friction stopped it
+
+
+def test_direction_and_its_rate(x64):
+    sim = flying()
+    load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, in_scene=False))
+    sim.data = with_states(sim.data, ang_vel=np.array([1.0, 2.0, 3.0]))
+    sim.data = with_load(load, sim.data, vel=(0.3, 0.2, 0.1))
+    q, rate = direction(sim.data)
+    np.testing.assert_allclose(q[0, 0], [0, 0, -1], atol=1e-12)
+    lever = np.cross([1.0, 2.0, 3.0], OFFSET)
+    np.testing.assert_allclose(rate[0, 0], (np.array([0.3, 0.2, 0]) - lever * [1, 1, 0]) / 0.4, atol=1e-12)
+
+
+def test_wind_and_downwash_push_the_load():
+    sim = flying(drone="cf21B_500", height=2.0)
+    load = sim.add(SlungLoad(mass=0.01, drag=0.01, in_scene=False))
+    sim.add(Downwash())
+    sim.add(Wind(velocity=(1.0, 0.0, 0.0)))
+    sim.rotor_vel_control(np.full((1, 1, 4), 15000.0))
+    sim.step(100)
+    record = load.read(sim.data)
+    assert float(record.air_vel[0, 0, 2]) < -1.0, "the drone's own jet"
+    assert float(record.vel[0, 0, 0] - sim.data.states.vel[0, 0, 0]) > 0.05
+
+
+def test_loads_are_objects_of_the_scene():
+    sim = flying(2, 2, height=1.0)
+    load = sim.add(SlungLoad(mass=0.05, cable=True, size=0.05))
+    pos = np.asarray(load.read(sim.data).pos).copy()
+    pos[1, 0] = np.asarray(sim.data.states.pos)[1, 1]  # into the other drone
+    sim.data = with_load(load, sim.data, pos=pos)
+    report = sim.contact_report(floor=False, drones=False)
+    assert report.object_names == ("load:0", "load:1")
+    touched = np.asarray(report.objects)
+    assert touched[1, 1, 0]
+    assert not touched[0].any()
+    assert not touched[1, 0].any()
+    sim.sync(1)
+    body = sim.mj_model.body("load:0").mocapid.item()
+    np.testing.assert_allclose(sim.mj_data.mocap_pos[body], pos[1, 0], atol=1e-6)
+    sim.step()
+    sim.sync(1)
+    np.testing.assert_allclose(sim.mj_data.mocap_pos[body], load.read(sim.data).pos[1, 0], atol=1e-6)
+
+
+def test_law_09_wrong_settings_are_errors():
+    sim = flying()
+    for settings, message in (
+        ({"mass": -1.0}, "mass"), ({"mass": 0.1, "length": 0.0}, "length"), ({"mass": 0.1, "size": (1, 2)}, "size"),
+        ({"mass": 0.1, "cable": True, "restitution": 2.0}, "restitution"), ({"mass": [1.0, 2.0]}, "mass"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=message):
+            sim.add(SlungLoad(**settings, in_scene=False))
+    sim.add(SlungLoad(mass=0.1, in_scene=False))
+    with pytest.raises(ConfigError, match="at most one plugin"):
+        sim.add(SlungLoad(mass=0.1, name="second", in_scene=False))
+
+
+def test_other_numbers_compile_nothing():
+    sim = flying()
+    load = sim.add(SlungLoad(mass=0.1, in_scene=False))
+    sim.step()
+    before = sim.step_fn
+    sim.replace(SlungLoad(mass=0.3, length=0.5, in_scene=False))
+    assert sim.step_fn is before
+    assert float(load.read(sim.data).mass[0]) == pytest.approx(0.3)

@@ -1,0 +1,129 @@
+"""Sampling model-predictive control: it flies, repeats itself, and refuses what it cannot sample."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import Sim
+from crazysim.control import Setpoint
+from crazysim.errors import ConfigError
+from crazysim.sim.mppi import MPPI, setpoint_after, tracking_cost
+from crazysim.trajectories import figure_eight
+
+
+def point(x=0.0, y=0.0, z=1.0):
+    zero, none = jnp.zeros(3), jnp.zeros(1)
+    return Setpoint(jnp.array([x, y, z]), zero, zero, zero, zero, none, none, none)
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return Sim(n_worlds=2, control="attitude")
+
+
+@pytest.fixture(scope="module")
+def mppi(sim):
+    return MPPI(sim, samples=256, freq=125)
+
+
+def place(sim, pos, quat=(0, 0, 0, 1), vel=(0, 0, 0)):
+    sim.reset()
+    s = sim.data.states
+    new = {"pos": pos, "quat": quat, "vel": vel}
+    new = {key: np.broadcast_to(np.float32(x), getattr(s, key).shape) for key, x in new.items()}
+    sim.data = sim.data.replace(states=s.replace(**new, rotor_vel=np.full_like(s.rotor_vel, 15900.0)))
+
+
+def errors(sim, mppi, setpoint_at, seconds):
+    """Return the distance of every drone from its setpoint after each control step. (n, n_worlds)"""
+    n_steps, found = round(mppi.period * sim.freq), []
+    for k in range(round(seconds / mppi.period)):
+        sim.attitude_control(mppi.command(sim.data, setpoint_at(jnp.float32(k * mppi.period))))
+        sim.step(n_steps)
+        target = setpoint_at(jnp.float32((k + 1) * mppi.period)).pos
+        found.append(np.linalg.norm(np.asarray(sim.data.states.pos)[:, 0] - target, axis=-1))
+    return np.array(found)
+
+
+def test_it_hovers_from_a_bad_start(sim, mppi):
+    """1.5 m away and rolled by 69 degrees."""
+    mppi.reset()
+    place(sim, [1.0, -1.0, 1.5], [np.sin(0.6), 0, 0, np.cos(0.6)])
+    found = errors(sim, mppi, lambda t: point(), 4.0)
+    assert found[0].min() > 1.0
+    assert found[-50:].max() < 0.3
+    assert mppi._jitted._cache_size() == 1
+
+
+def test_it_follows_a_figure_eight(sim, mppi):
+    """Of 2 m at 2 m/s: decimetres from a setpoint that would be 3 m away after the horizon if it stood still."""
+    eight = figure_eight(2.0, 1.0, speed=2.0)
+    start = jax.tree.map(np.asarray, eight.evaluate(jnp.float32(0)))
+    mppi.reset()
+    place(sim, start.pos, vel=start.vel)
+    found = errors(sim, mppi, jax.jit(eight.evaluate), 4.0)
+    assert np.sqrt(np.mean(found**2)) < 0.25
+
+
+def test_equal_seeds_give_equal_commands(sim, mppi):
+    place(sim, [0.3, 0.2, 1.0])
+    first, memory = jax.jit(mppi.plan)(mppi.init(2, 1), sim.data, point())
+    again, _ = jax.jit(mppi.plan)(mppi.init(2, 1), sim.data, point())
+    np.testing.assert_array_equal(first, again)
+    assert np.ptp(np.asarray(first), axis=0).max() > 0  # the worlds have samples of their own
+    later, _ = jax.jit(mppi.plan)(memory, sim.data, point())
+    assert np.any(np.asarray(later) != np.asarray(first))
+
+
+def test_the_cost_decides(sim):
+    """A cost of the thrust alone drops the drone; the command is within the limits."""
+    place(sim, [0, 0, 1.0])
+    lazy = MPPI(sim, samples=256, freq=125, horizon=20, cost=lambda states, setpoint, command: command[3] ** 2)
+    for _ in range(20):
+        command = np.asarray(lazy.command(sim.data, point()))
+    assert np.all(command[..., 3] < 0.15)
+    assert np.all(command[..., 3] >= 4 * 0.02136 - 1e-4)
+
+
+def test_a_sample_that_is_not_finite_has_no_weight(sim):
+    place(sim, [0, 0, 1.0])
+    some = MPPI(sim, samples=64, freq=125, horizon=10, cost=lambda s, p, u: jnp.where(u[0] > 0, jnp.nan, 1 + u[0] ** 2))
+    assert np.isfinite(some.command(sim.data, point())).all()
+    none = MPPI(sim, samples=64, freq=125, horizon=10, cost=lambda s, p, u: jnp.nan * u[0])
+    np.testing.assert_allclose(
+        none.command(sim.data, point()), np.broadcast_to([0, 0, 0, 0.0434 * 9.81], (2, 1, 4)), rtol=1e-5
+    )
+
+
+def test_the_setpoint_moves_along_its_taylor_polynomial():
+    ones = jnp.ones(3)
+    sp = Setpoint(ones, 2 * ones, 3 * ones, 4 * ones, 5 * ones, *(jnp.full(1, x) for x in (0.1, 0.2, 0.3)))
+    after = setpoint_after(sp, 0.5)
+    np.testing.assert_allclose(after.pos, 1 + 2 / 2 + 3 / 8 + 4 / 48 + 5 / 384, rtol=1e-6)
+    np.testing.assert_allclose(after.vel, 2 + 3 / 2 + 4 / 8 + 5 / 48, rtol=1e-6)
+    np.testing.assert_allclose(after.yaw, 0.1 + 0.2 / 2 + 0.3 / 8, rtol=1e-6)
+
+
+def test_the_cost_of_a_drone_on_its_setpoint_is_zero(sim):
+    place(sim, [0, 0, 1.0])
+    states = jax.tree.map(lambda x: x[0, 0], sim.data.states)
+    assert tracking_cost(states, point(), jnp.zeros(4)) == 0
+    assert tracking_cost(states, point(2.0), jnp.zeros(4)) == 4
+
+
+WRONG = {
+    "level": (lambda sim: MPPI(Sim(control="state")), "control"),
+    "knots": (lambda sim: MPPI(sim, knots=65), "knots"),
+    "horizon": (lambda sim: MPPI(sim, horizon=1), "horizon"),
+    "samples": (lambda sim: MPPI(sim, samples=0), "samples"),
+    "temperature": (lambda sim: MPPI(sim, temperature=0.0), "temperature"),
+    "noise": (lambda sim: MPPI(sim, noise=[1.0, 2.0]), "noise"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_settings(sim, case):
+    make, message = WRONG[case]
+    with pytest.raises(ConfigError, match=message):
+        make(sim)

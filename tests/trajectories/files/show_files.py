@@ -1,0 +1,148 @@
+"""Shows as other programs write them: the structures of the public sample shows and of Skybrush Studio."""
+
+import base64
+import copy
+import io
+import json
+import zipfile
+
+RED_3_S = base64.b64encode(bytes([0x04, 255, 0, 0, 0x96, 0x01, 0x00])).decode()
+"""Red for 150 ticks of 20 ms, then the end: the code of the lab's samples."""
+
+
+def archive(files):
+    """Return a zip archive of JSON documents, or of bytes as they are."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, value in files.items():
+            file.writestr(name, value if isinstance(value, (str, bytes)) else json.dumps(value))
+    return buffer.getvalue()
+
+
+def show_json(n, **settings):
+    drones = []
+    for i in range(n):
+        own = {
+            "trajectory": {"$ref": f"./drones/drone_{i}/trajectory.json#"},
+            "lights": {"$ref": f"./drones/drone_{i}/lights.json#"},
+            "home": [float(i), 0.0, 0.0],
+            "startYaw": 0.0,
+            "landAt": [float(i), 0.0, 0.1],
+            "name": f"cf{i}",
+        }
+        drones.append({"type": "generic", "settings": own | settings})
+    validation = {"maxAltitude": 2.0, "maxVelocityXY": 2.0, "maxVelocityZ": 1.5, "minDistance": 0.8}
+    return {
+        "version": 1,
+        "settings": {"cues": {"$ref": "./cues.json"}, "validation": validation},
+        "swarm": {"drones": drones},
+        "environment": {"type": "indoor"},
+        "meta": {"id": "make.py", "inputs": ["make.py"]},
+        "media": {},
+    }
+
+
+CUES = {"version": 1, "items": [{"time": 4.0, "name": "land"}, {"time": 0.0, "name": "start"}]}
+
+
+def compressed(x=0.0):
+    """Three curves of degrees 1, 3 and 7 with yaw, degrees."""
+    return {
+        "version": 1,
+        "points": [
+            [0.0, [x, 0.0, 0.0, 0.0], []],
+            [1.0, [x, 0.0, 1.0, 0.0], []],
+            [3.0, [x, 1.0, 1.0, 90.0], [[x, 0.0, 1.0, 0.0], [x, 1.0, 1.0, 90.0]]],
+            [4.5, [x, 0.0, 1.0, 90.0], [[x, 1.0, 1.0, 90.0]] * 3 + [[x, 0.0, 1.0, 90.0]] * 3],
+        ],
+        "takeoffTime": 0.0,
+        "landingTime": 4.5,
+        "type": "COMPRESSED",
+    }
+
+
+def poly4d(x=0.0):
+    """Curves of degree 5 with the lab's tables for an onboard LQR."""
+    inner = [[x, 0.0, 0.0, 0.0]] * 2 + [[x, 0.0, 1.0, 0.0]] * 2
+    return {
+        "version": 1,
+        "points": [[0.0, [x, 0.0, 0.0, 0.0], []], [2.0, [x, 0.0, 1.0, 0.0], inner]],
+        "takeoffTime": 0.0,
+        "landingTime": 2.0,
+        "type": "POLY4D",
+        "K": [0] * 240 * 64,
+        "bounds": [0.0] * 128,
+    }
+
+
+def lab(n=2):
+    """A show of the lab: compressed, with yaw and the older form of colours."""
+    lights = {"version": 1, "data": RED_3_S, "colors": [["255, 0, 0", 3.0]]}
+    files = {"show.json": show_json(n), "cues.json": CUES}
+    for i in range(n):
+        files[f"drones/drone_{i}/trajectory.json"] = compressed(float(i))
+        files[f"drones/drone_{i}/lights.json"] = lights
+    return files
+
+
+def lab_poly4d(n=2):
+    """A show of the lab: POLY4D, parameters, and the newer form of colours alone."""
+    lights = {"version": 1, "colors": [[0.0, [0, 0, 255]], [1.0, [255, 255, 0]]]}
+    files = {"show.json": show_json(n, parameters=[[0.5, "stabilizer.controller", 6]]), "cues.json": CUES}
+    for i in range(n):
+        files[f"drones/drone_{i}/trajectory.json"] = poly4d(float(i))
+        files[f"drones/drone_{i}/lights.json"] = lights
+    return files
+
+
+def lab_older(n=2):
+    """An older show of the lab: no lights, start yaw, yaw or types."""
+    files = {"show.json": show_json(n), "cues.json": CUES}
+    for i, drone in enumerate(files["show.json"]["swarm"]["drones"]):
+        del drone["settings"]["lights"], drone["settings"]["startYaw"]
+        points = [[t, point[:3], [x[:3] for x in inner]] for t, point, inner in compressed(float(i))["points"]]
+        files[f"drones/drone_{i}/trajectory.json"] = {"version": 1, "points": points}
+    return files
+
+
+def studio():
+    """A show of Skybrush Studio: names by index, take-off time, yaw control, lights as code alone, and no cues."""
+    trajectory = {
+        "version": 1,
+        "points": [
+            [0.0, [17.5, 10.0, 1.0], []],
+            [0.5, [17.5, 10.0, 1.72], []],
+            [2.5, [18.5, 10.0, 2.0], [[17.5, 10.0, 2.0], [18.0, 10.0, 2.0]]],
+        ],
+        "takeoffTime": 11.66,
+        "landingTime": 225.92,
+    }
+    settings = {
+        "trajectory": {"$ref": "./drones/drone_01/trajectory.json#"},
+        "lights": {"$ref": "./drones/drone_01/lights.json#"},
+        "yawControl": {"version": 1, "setpoints": [[0, 0], [12.0, 90], [13.5, -90]]},
+        "mode": "show",
+        "home": [17.5, 10.0, 0.0],
+    }
+    return {
+        "show.json": {
+            "version": 1,
+            "meta": {"title": "Show"},
+            "swarm": {"drones": [{"type": "generic", "settings": settings}]},
+        },
+        "drones/drone_01/trajectory.json": trajectory,
+        "drones/drone_01/lights.json": {"version": 1, "data": "DAMHBQYFDQwACAAA/zIKMgj/AAAyCjIIAP8AMgoyCw0A"},
+    }
+
+
+ALL = {"lab": lab, "lab_poly4d": lab_poly4d, "lab_older": lab_older, "studio": studio}
+
+
+def changed(files, name, path, value):
+    """Return the files with one value exchanged, at a path of keys and indices."""
+    files = copy.deepcopy(files)
+    holder = files[name]
+    for key in path[:-1]:
+        holder = holder[key]
+    holder[path[-1]] = value
+    return files

@@ -1,0 +1,104 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import BPoly, CubicSpline, make_interp_spline
+
+from crazysim import ConfigError
+from crazysim.trajectories import of_bezier, spline
+
+RNG = np.random.default_rng(5)
+TIMES = np.array([0.0, 0.7, 1.0, 2.5, 3.1, 4.0])
+POINTS = RNG.normal(size=(6, 3))
+
+
+def positions(trajectory, times):
+    return np.stack([trajectory.evaluate(t).pos for t in times])
+
+
+@pytest.mark.parametrize("degree", [3, 5, 7])
+def test_a_spline_at_rest_is_that_of_scipy(degree, x64):
+    rest = [(k, np.zeros(3)) for k in range(1, (degree + 1) // 2)]
+    expected = make_interp_spline(TIMES, POINTS, k=degree, bc_type=(rest, rest))
+    trajectory = spline(TIMES, POINTS, degree)
+    times = np.linspace(0, 4, 23)
+    np.testing.assert_allclose(positions(trajectory, times), expected(times), atol=1e-9)
+    setpoint = trajectory.evaluate(1.7)
+    for k, value in enumerate([setpoint.vel, setpoint.acc, setpoint.jerk], start=1):
+        np.testing.assert_allclose(value, expected.derivative(k)(1.7), rtol=1e-7)
+
+
+def test_a_natural_spline_is_that_of_scipy(x64):
+    expected = CubicSpline(TIMES, POINTS, bc_type="natural")
+    times = np.linspace(0, 4, 23)
+    np.testing.assert_allclose(positions(spline(TIMES, POINTS, 3, at_rest=False), times), expected(times), atol=1e-12)
+
+
+@pytest.mark.parametrize("start", [-2.0, 5.0])
+def test_the_first_time_is_the_start(start):
+    trajectory = spline(TIMES + start, POINTS)
+    np.testing.assert_allclose(trajectory.evaluate(0.7).pos, POINTS[1], atol=1e-5)
+    assert float(trajectory.duration) == 4.0
+
+
+def test_yaw_turns_the_shorter_way(x64):
+    trajectory = spline([0.0, 1.0], [[0, 0, 1], [1, 0, 1]], 3, yaw=[3.0, -3.0])
+    np.testing.assert_allclose(trajectory.evaluate(1.0).yaw, [2 * np.pi - 3.0])
+    np.testing.assert_allclose(trajectory.evaluate(0.5).yaw, [np.pi])
+
+
+@given(
+    counts=st.lists(st.integers(1, 8), min_size=1, max_size=4),
+    n_axes=st.sampled_from([3, 4]),
+    seed=st.integers(0, 1000),
+)
+def test_bezier_curves_are_those_of_scipy(counts, n_axes, seed):
+    rng = np.random.default_rng(seed)
+    curves = [rng.uniform(-3, 3, (count, n_axes)) for count in counts]
+    ends = np.cumsum(rng.uniform(0.1, 3.0, len(counts)))
+    trajectory = of_bezier(ends, curves)
+    for curve, begin, end in zip(curves, np.concatenate([[0.0], ends[:-1]]), ends, strict=True):
+        t = begin + 0.4 * (end - begin)
+        expected = BPoly(curve[:, None], [begin, end])
+        setpoint = trajectory.evaluate(t)
+        value = np.concatenate([setpoint.pos, setpoint.yaw])[:n_axes]
+        np.testing.assert_allclose(value, expected(t), atol=2e-5)
+        rate = np.concatenate([setpoint.vel, setpoint.yaw_rate])[:n_axes]
+        np.testing.assert_allclose(rate * (end - begin), expected(t, 1) * (end - begin), atol=5e-4)
+
+
+def test_bezier_without_yaw_faces_along_x():
+    assert float(of_bezier([1.0], [np.ones((4, 3))]).evaluate(0.5).yaw[0]) == 0.0
+
+
+def test_bezier_repeats_on_request():
+    trajectory = of_bezier([1.0], [[[0, 0, 0], [1, 0, 0]]], repeats=True)
+    np.testing.assert_allclose(trajectory.evaluate(2.25).pos, [0.25, 0, 0])
+    assert trajectory.coefficients.dtype == jnp.float32
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: spline(TIMES, POINTS, 4), "degree 3, 5 or 7"),
+        (lambda: spline(TIMES[:-1], POINTS), "shapes"),
+        (lambda: spline(TIMES[::-1], POINTS), "ascending"),
+        (lambda: spline(TIMES * np.nan, POINTS), "ascending"),
+        (lambda: spline(TIMES, np.where(POINTS[2, 1] == POINTS, np.inf, POINTS)), r"points, got inf at index \[2, 1\]"),
+        (lambda: spline(TIMES, POINTS, yaw=[0.0, 1.0]), "one for each of 6"),
+        (lambda: spline(TIMES, POINTS, yaw=np.nan), "finite yaw"),
+        (lambda: spline(TIMES[:1], POINTS[:1]), "at least 2"),
+        (lambda: spline(TIMES[:3], POINTS[:3], 7, at_rest=False), "at least 4"),
+        (lambda: of_bezier([1.0, 2.0], [np.ones((4, 3))]), "1 curves"),
+        (lambda: of_bezier([], []), "at least one"),
+        (lambda: of_bezier([1.0], [np.ones((4, 2))]), "control points"),
+        (lambda: of_bezier([1.0, 2.0], [np.ones((4, 3)), np.ones((4, 4))]), "for all"),
+        (lambda: of_bezier([1.0, 1.0], [np.ones((4, 3))] * 2), "ascending"),
+        (lambda: of_bezier([0.0], [np.ones((4, 3))]), "positive"),
+        (lambda: of_bezier([1.0], [np.full((4, 3), np.nan)]), "finite control points"),
+    ],
+)
+def test_law_09_bad_splines_are_errors(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()

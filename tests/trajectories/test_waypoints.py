@@ -1,0 +1,293 @@
+"""Minimum snap and minimum jerk, against two independent solutions, with limits, corridors and durations."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import make_interp_spline
+from scipy.optimize import minimize
+
+from crazysim import ConfigError
+from crazysim.trajectories import Limits, check, minimum_jerk, minimum_snap
+from crazysim.trajectories.fleet import Fleet
+from crazysim.trajectories.peaks import QUANTITIES
+
+WAYPOINTS = np.array([[0, 0, 1], [2, 0, 1], [2, 2, 1.5], [0, 2, 1], [-1, 0, 1.0]])
+DURATIONS = np.array([1.5, 1.2, 1.4, 1.0])
+LIMITS = Limits(speed=2.0, acceleration=4.0)
+METHODS = {minimum_snap: 4, minimum_jerk: 3}
+
+
+def pieces(trajectory):
+    """Return the coefficients of x, y, z by time in seconds. (n_pieces, 3, degree + 1)"""
+    c, lengths = np.asarray(trajectory.coefficients, float), np.diff(np.asarray(trajectory.ends, float), prepend=0)
+    return c[:, :3] / lengths[:, None, None] ** np.arange(c.shape[-1])
+
+
+def derivative_rows(t, size):
+    """Return the derivatives of the monomials at a time. (n_derivatives, size)"""
+    factors = [[np.prod(np.arange(j - k + 1, j + 1.0)) if j >= k else 0.0 for j in range(size)] for k in range(size)]
+    return np.array([[f * t ** max(j - k, 0) for j, f in enumerate(row)] for k, row in enumerate(factors)])
+
+
+def snap_by_lagrange(waypoints, durations, order, velocity):
+    """Return the minimum over monomials with every waypoint and all continuity as a constraint, by its KKT system.
+
+    Args:
+        waypoints: (n, 3)
+        durations: (n - 1,)
+        order: Derivative whose square is minimised.
+        velocity: Velocity at the second waypoint; NaN where free. (3,)
+    """
+    size, n = 2 * order, len(durations)
+    cost = np.zeros((n * size, n * size))
+    for p, h in enumerate(durations):
+        for i in range(order, size):
+            for j in range(order, size):
+                factor = np.prod(np.arange(i - order + 1, i + 1.0)) * np.prod(np.arange(j - order + 1, j + 1.0))
+                cost[p * size + i, p * size + j] = factor * h ** (i + j - 2 * order + 1) / (i + j - 2 * order + 1)
+    solution = np.zeros((n, 3, size))
+    for axis in range(3):
+        rows, right = [], []
+
+        def equal(terms, value, rows=rows, right=right):
+            row = np.zeros(n * size)
+            for p, part in terms:
+                row[p * size : (p + 1) * size] += part
+            rows.append(row), right.append(value)
+
+        for k in range(1, order):
+            equal([(0, derivative_rows(0.0, size)[k])], 0.0)
+            equal([(n - 1, derivative_rows(durations[-1], size)[k])], 0.0)
+        for p, h in enumerate(durations):
+            equal([(p, derivative_rows(0.0, size)[0])], waypoints[p, axis])
+            equal([(p, derivative_rows(h, size)[0])], waypoints[p + 1, axis])
+            for k in range(1, order if p + 1 < n else 0):
+                equal([(p, derivative_rows(h, size)[k]), (p + 1, -derivative_rows(0.0, size)[k])], 0.0)
+        if np.isfinite(velocity[axis]):
+            equal([(1, derivative_rows(0.0, size)[1])], velocity[axis])
+        a = np.array(rows)
+        system = np.block([[cost, a.T], [a, np.zeros((len(a), len(a)))]])
+        found = np.linalg.lstsq(system, np.concatenate([np.zeros(len(cost)), right]), rcond=None)[0]
+        solution[:, axis] = found[: n * size].reshape(n, size)
+    return solution
+
+
+@pytest.mark.parametrize("velocity", [[np.nan] * 3, [1.0, np.nan, -0.5]])
+@pytest.mark.parametrize("method", METHODS)
+def test_it_is_the_solution_of_the_kkt_system(method, velocity, x64):
+    velocities = np.full_like(WAYPOINTS, np.nan)
+    velocities[[0, -1]], velocities[1] = 0.0, velocity
+    trajectory = method(WAYPOINTS, DURATIONS, velocities=velocities)
+    expected = snap_by_lagrange(WAYPOINTS, DURATIONS, METHODS[method], velocity)
+    np.testing.assert_allclose(pieces(trajectory), expected, atol=1e-7 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_sixty_pieces_are_the_spline_of_scipy(method, x64):
+    rng = np.random.default_rng(7)
+    waypoints, durations = np.cumsum(rng.normal(size=(61, 3)), axis=0), rng.uniform(0.3, 3.0, 60)
+    order, at = METHODS[method], np.concatenate([[0.0], np.cumsum(durations)])
+    rest = [(k, np.zeros(3)) for k in range(1, order)]
+    expected = make_interp_spline(at, waypoints, k=2 * order - 1, bc_type=(rest, rest))
+    times = np.linspace(0, at[-1], 500)
+    fleet = Fleet.of([method(waypoints, durations)])
+    for k in range(3):
+        values = expected.derivative(k)(times) if k else expected(times)
+        found = fleet.at(np.zeros(500, int), times, k)[:, :3]
+        np.testing.assert_allclose(found, values, atol=1e-8 * np.abs(values).max())
+
+
+@settings(max_examples=10)
+@pytest.mark.parametrize("method", METHODS)
+@given(seed=st.integers(0, 10_000), n=st.integers(2, 9))
+def test_planned_flights_pass_the_waypoints_at_rest_within_tight_limits(method, seed, n):
+    rng = np.random.default_rng(seed)
+    waypoints = rng.uniform(-3, 3, (n, 3))
+    limits = Limits(
+        speed=rng.uniform(0.5, 5), acceleration=rng.uniform(1, 10), jerk=rng.uniform(5, 100), thrust=rng.uniform(1.1, 2)
+    )
+    trajectory = method(waypoints, limits=limits, yaw=rng.uniform(-3, 3, n))
+    report = check(trajectory, limits)
+    assert report.ok, str(report)
+    use = [report.peaks[name].value[0] / limit for name, limit in limits.given().items()]
+    assert max(use) > 0.999
+    ends = np.concatenate([[0.0], trajectory.ends])
+    fleet = Fleet.of([trajectory])
+    np.testing.assert_allclose(fleet.at(np.zeros(n, int), ends)[:, :3], waypoints, atol=1e-4)
+    for order in (1, 2):
+        at_ends = fleet.at(np.zeros(2, int), ends[[0, -1]], order)[:, :3]
+        np.testing.assert_allclose(at_ends, 0.0, atol=1e-3 * max(limits.acceleration, limits.speed))
+
+
+@pytest.mark.parametrize("name, value", [("body_rate", 1.0), ("yaw_rate", 0.5), ("vertical_speed", 0.3)])
+def test_each_limit_alone_sets_the_duration(name, value):
+    limits = Limits(**{name: value})
+    report = check(minimum_snap(WAYPOINTS, limits=limits, yaw=[0, 1, 2, 3, 4]), limits)
+    assert report.ok
+    np.testing.assert_allclose(report.peaks[name].value, value, rtol=1e-3)
+
+
+def test_a_smallest_thrust_bounds_how_fast_a_climb_ends():
+    limits = Limits(min_thrust=0.5)
+    report = check(minimum_snap([[0, 0, 1], [0, 0, 3]], limits=limits), limits)
+    assert report.ok
+    np.testing.assert_allclose(report.peaks["min_thrust"].value, 0.5, rtol=1e-3)
+    np.testing.assert_allclose(report.peaks["thrust"].value, 1.5, rtol=1e-3)  # the climb is symmetric
+
+
+def test_ratios_of_the_durations_are_those_of_least_snap():
+    trajectory = minimum_snap(WAYPOINTS, limits=LIMITS)
+    durations = np.diff(np.asarray(trajectory.ends, float), prepend=0)
+
+    def cost(durations):
+        durations = durations * np.sum(DURATIONS) / np.sum(durations)
+        c, lengths = pieces(minimum_snap(WAYPOINTS, durations)), durations
+        snap = c[..., 4:] * [24, 120, 360, 840]
+        weights = [[1 / (i + j + 1) for i in range(4)] for j in range(4)]
+        scaled = snap * lengths[:, None, None] ** (np.arange(4) + 0.5)
+        return np.einsum("pai,ij,paj->", scaled, weights, scaled)
+
+    least = cost(durations)
+    assert least < 0.8 * cost(DURATIONS)
+    rng = np.random.default_rng(0)
+    assert all(cost(durations * np.exp(0.05 * rng.normal(size=4))) > least for _ in range(20))
+
+
+def test_fixed_derivatives_are_met_and_the_others_are_free():
+    velocities = np.full_like(WAYPOINTS, np.nan)
+    velocities[[0, -1]], velocities[2] = 0.0, [0.0, 1.0, 0.5]
+    trajectory = minimum_snap(WAYPOINTS, limits=LIMITS, velocities=velocities)
+    assert check(trajectory, LIMITS).ok
+    fleet, at = Fleet.of([trajectory]), float(trajectory.ends[1])
+    np.testing.assert_allclose(fleet.at(0, at, 1)[:3], velocities[2], atol=1e-4)
+    passing = minimum_snap(WAYPOINTS[:2], [1.0], velocities=[[1, 0, 0], [1, 0, 0]], jerks=np.full((2, 3), np.nan))
+    np.testing.assert_allclose(Fleet.of([passing]).at(0, 1.0, 1)[:3], [1, 0, 0], atol=1e-5)
+
+
+def test_yaw_turns_the_shorter_way_and_ends_at_rest(x64):
+    trajectory = minimum_snap(WAYPOINTS, DURATIONS, yaw=[3.0, -3.0, -2.0, 0.0, 1.0])
+    expected = np.unwrap([3.0, -3.0, -2.0, 0.0, 1.0])
+    fleet, at = Fleet.of([trajectory]), np.concatenate([[0], np.cumsum(DURATIONS)])
+    np.testing.assert_allclose(fleet.at(np.zeros(5, int), at)[:, 3], expected, atol=1e-9)
+    np.testing.assert_allclose(fleet.at(np.zeros(2, int), at[[0, -1]], 1)[:, 3], 0.0, atol=1e-9)
+    rest = [(1, 0.0)]
+    spline = make_interp_spline(at, expected, k=3, bc_type=(rest, rest))
+    np.testing.assert_allclose(fleet.at(0, 2.0)[3], spline(2.0), atol=1e-9)
+
+
+def deviations(trajectory, waypoints):
+    """Return the largest distance of each piece from its line segment, m."""
+    fleet, found = Fleet.of([trajectory]), []
+    for p, (a, b) in enumerate(pairwise(waypoints)):
+        pos = fleet.within(np.full(2001, p), np.linspace(0, 1, 2001))[:, :3]
+        part = np.clip((pos - a) @ (b - a) / max((b - a) @ (b - a), 1e-12), 0, 1)
+        found.append(np.linalg.norm(pos - a - part[:, None] * (b - a), axis=-1).max())
+    return np.array(found)
+
+
+@settings(max_examples=15)
+@pytest.mark.parametrize("method", METHODS)
+@given(seed=st.integers(0, 1000), n=st.integers(2, 7), radius=st.floats(0.01, 0.5))
+def test_flights_stay_in_their_corridors(method, seed, n, radius):
+    rng = np.random.default_rng(seed)
+    waypoints = rng.uniform(-2, 2, (n, 3))
+    radii = radius * rng.uniform(0.5, 1.5, n - 1)
+    trajectory = method(waypoints, rng.uniform(0.5, 2.0, n - 1), corridors=radii)
+    found = deviations(trajectory, waypoints)
+    assert np.all(found <= radii + 1e-5)
+
+
+def test_a_wide_corridor_changes_nothing_and_one_may_be_bounded_alone():
+    free = minimum_snap(WAYPOINTS, DURATIONS)
+    wide = minimum_snap(WAYPOINTS, DURATIONS, corridors=10.0)
+    np.testing.assert_array_equal(wide.coefficients, free.coefficients)
+    one = deviations(minimum_snap(WAYPOINTS, DURATIONS, corridors=[np.inf, 0.1, np.inf, np.inf]), WAYPOINTS)
+    assert one[1] <= 0.1 < 0.3 < deviations(free, WAYPOINTS)[1]
+    assert one[[0, 2, 3]].max() > 0.1
+
+
+def test_the_corridor_costs_no_more_than_the_optimum_of_scipy(x64):
+    """Two pieces in a plane; SciPy minimises the same cost under the same bound at 60 times of each piece."""
+    waypoints, durations, radius = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1.0]]), np.array([1.0, 1.0]), 0.05
+    found = pieces(minimum_snap(waypoints, durations, corridors=radius))
+
+    def coefficients(x):
+        """Return both pieces for velocity, acceleration and jerk in x and y at the second waypoint."""
+        solved = []
+        for axis in range(2):
+            ends = np.array([derivative_rows(t, 8)[k] for t in (0.0, 1.0) for k in range(4)])
+            middle = [waypoints[1, axis], *x[3 * axis : 3 * axis + 3]]
+            first = np.linalg.solve(ends, [waypoints[0, axis], 0, 0, 0, *middle])
+            solved.append([first, np.linalg.solve(ends, [*middle, waypoints[2, axis], 0, 0, 0])])
+        return np.swapaxes(solved, 0, 1)
+
+    def cost(c):
+        snap = c[..., 4:] * [24, 120, 360, 840]
+        return np.einsum("pai,ij,paj->", snap, [[1 / (i + j + 1) for i in range(4)] for j in range(4)], snap)
+
+    powers = np.linspace(0, 1, 61)[:, None] ** np.arange(8)
+    base = coefficients(np.zeros(6))
+    parts = np.array([coefficients(e) - base for e in np.eye(6)])
+
+    def room(x):
+        """Return the squared radius, of which 0.5% to 1% is kept free, less the squared distance to the segments."""
+        pos = np.einsum("uk,pak->pua", powers, base + np.tensordot(x, parts, 1))
+        begin, along = waypoints[:2, None, :2], np.diff(waypoints, axis=0)[:, None, :2]
+        nearest = begin + np.clip(np.sum((pos - begin) * along, axis=-1), 0, 1)[..., None] * along
+        return ((0.9925 * radius) ** 2 - np.sum((pos - nearest) ** 2, axis=-1)).ravel()
+
+    bound = {"type": "ineq", "fun": room}
+    least = 1e4 * minimize(lambda x: cost(coefficients(x)) / 1e4, np.zeros(6), constraints=bound, method="SLSQP").fun
+    free = cost(pieces(minimum_snap(waypoints, durations))[:, :2])
+    assert free < 0.7 * least  # the corridor matters
+    np.testing.assert_allclose(cost(found[:, :2]), least, rtol=3e-3)
+
+
+def test_coincident_waypoints_are_fine_with_durations():
+    trajectory = minimum_snap([[0, 0, 1], [0, 0, 1], [1, 0, 1]], [1.0, 2.0], corridors=0.1, yaw=[0, 1, 1])
+    assert deviations(trajectory, np.array([[0, 0, 1], [0, 0, 1], [1, 0, 1.0]]))[0] <= 0.1
+
+
+BENT = [[0, 0, 1], [1, 0, 1], [1, 1, 1]]
+NAN = np.full((3, 3), np.nan)
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: minimum_snap([[0, 0, 1]], limits=LIMITS), "at least two"),
+        (lambda: minimum_snap(np.zeros((3, 2)), limits=LIMITS), "waypoints"),
+        (lambda: minimum_snap([[0, 0, 1], [0, np.nan, 1]], limits=LIMITS), "finite waypoints"),
+        (lambda: minimum_snap(BENT), "durations or limits"),
+        (lambda: minimum_snap(BENT, [1.0]), "2 positive, finite durations"),
+        (lambda: minimum_snap(BENT, [1.0, 0.0]), "positive, finite durations"),
+        (lambda: minimum_snap(BENT, [1.0, np.inf]), "positive, finite durations"),
+        (lambda: minimum_snap([*BENT, BENT[-1]], limits=LIMITS), "number 2 and 3"),
+        (lambda: minimum_snap(BENT, [0.5, 0.5], limits=LIMITS), "exceeds speed and acceleration. Multiply"),
+        (lambda: minimum_snap(BENT, limits=Limits(height=0.5)), "exceed height however slow"),
+        (lambda: minimum_snap(BENT, limits=Limits(height=5.0)), "bound the speed"),
+        (lambda: minimum_snap(BENT, limits=LIMITS, corridors=0.0), "positive corridors"),
+        (lambda: minimum_snap(BENT, limits=LIMITS, corridors=[0.1] * 3), "positive corridors, one or 2"),
+        (lambda: minimum_snap(BENT, limits=LIMITS, yaw=[0.0, 1.0]), "one for each of 3"),
+        (lambda: minimum_snap(BENT, limits=LIMITS, velocities=np.zeros((2, 3))), "velocities"),
+        (lambda: minimum_snap(BENT, limits=LIMITS, velocities=np.full((3, 3), np.inf)), "velocities"),
+        (lambda: minimum_snap(BENT, limits=LIMITS, velocities=np.full((3, 3), 3.0)), "however slow"),
+        (lambda: minimum_snap(BENT[:2], [1.0], velocities=NAN[:2], accelerations=NAN[:2], jerks=NAN[:2]), "unique"),
+        (lambda: minimum_snap(BENT, [1.0, 1.0], velocities=[[0, 0, 9]] * 3, corridors=0.001), "corridors"),
+    ],
+)
+def test_law_09_waypoints_that_cannot_be_flown_are_errors(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()
+
+
+def test_the_factor_of_the_error_is_the_remedy():
+    with pytest.raises(ConfigError, match="Multiply the durations by") as caught:
+        minimum_snap(BENT, [0.5, 0.5], limits=LIMITS)
+    factor = float(str(caught.value).split("durations by ")[1].split(",")[0])
+    report = check(minimum_snap(BENT, [0.5 * factor, 0.5 * factor], limits=LIMITS), LIMITS)
+    assert max(report.peaks[name].value[0] / limit for name, limit in LIMITS.given().items()) > 0.99
+    assert "separation" not in QUANTITIES
