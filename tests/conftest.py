@@ -22,7 +22,7 @@ from crazysim.engine import cuda
 
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
 
-# What was compiled once, in any worker or run, is kept, however little it was: to read takes half the time of compiling.
+# What was compiled once, in any worker or run, is kept, small programs too: reading takes half the time of compiling.
 CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -33,6 +33,29 @@ settings.register_profile(
     "crazysim", deadline=None, derandomize=True, max_examples=30, suppress_health_check=list(HealthCheck)
 )
 settings.load_profile("crazysim")
+
+
+LONGEST = ("engine/test_step.py", "scene/test_response.py", "train/test_run.py", "envs", "laws", "engine", "scene")
+"""Files and folders that take longest, first."""
+SEPARATE = "docs"
+"""Folder whose tests share nothing and go last, one by one, to the worker that has no more to do."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Let one worker run what is in one file, which shares simulations and programs, and the longest files first."""
+
+    def path(item):
+        return item.path.relative_to(Path(__file__).parent).as_posix()
+
+    def rank(item):
+        first = next((i for i, name in enumerate(LONGEST) if path(item).startswith(name)), len(LONGEST))
+        return first + path(item).startswith(SEPARATE)
+
+    for item in items:
+        if not path(item).startswith(SEPARATE) and item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(path(item)))
+    items.sort(key=rank)
 
 
 def pytest_collection_finish():
