@@ -45,8 +45,8 @@ class FollowData(PyTree):
     """Time of the world at which a drone starts, s. (1,)"""
     rate: Array = leaf("parameter", 1, (1,))
     """Speed at which a drone goes through its trajectory, 1: at 2 it takes half the time. (1,)"""
-    degrees: tuple[int, int, int, int] = static()
-    """Largest degrees of x, y, z and yaw in the slots, -1 for zero; no trajectory in them may exceed them."""
+    degrees: tuple[int, ...] = static()
+    """Largest degrees of x, y, z and yaw in the slots, -1 for zero; no trajectory in them may exceed them. (4,)"""
 
     @property
     def trajectories(self) -> Trajectory:

@@ -146,7 +146,7 @@ class Trajectory(PyTree):
             yaw=pos[3:], yaw_rate=vel[3:], yaw_acc=acc[3:],
         )  # fmt: skip
 
-    def degrees(self) -> tuple[int, int, int, int]:
+    def degrees(self) -> tuple[int, ...]:
         """Return the largest degrees of x, y, z and yaw with a coefficient that is not zero, -1 for zero, on the host.
 
         With coefficients that are not known yet, as under ``jax.jit``, it is the largest degree for all.
@@ -155,7 +155,7 @@ class Trajectory(PyTree):
             return (self.degree,) * 4
         c = np.asarray(self.coefficients)
         used = np.any(c.reshape(-1, *c.shape[-2:]) != 0, axis=0)
-        return tuple([int(np.max(np.flatnonzero(row), initial=-1)) for row in used])  # type: ignore[return-value]
+        return tuple([int(np.max(np.flatnonzero(row), initial=-1)) for row in used])
 
     @staticmethod
     def stack(trajectories: Sequence[Trajectory]) -> Trajectory:
