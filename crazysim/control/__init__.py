@@ -15,11 +15,11 @@ from crazysim.control.switch import Switch
 from crazysim.lazy import lazy
 
 if TYPE_CHECKING:
-    from crazysim.control.geometric import Geometric
-    from crazysim.control.indi import INDI
-    from crazysim.control.load_lqr import LoadLQR
-    from crazysim.control.lqr import LQR
-    from crazysim.control.tracking_lqr import TrackingLQR
+    from crazysim.control.geometric import Geometric, geometric_control
+    from crazysim.control.indi import INDI, indi_control
+    from crazysim.control.load_lqr import LoadLQR, load_lqr_control
+    from crazysim.control.lqr import LQR, lqr_control
+    from crazysim.control.tracking_lqr import TrackingLQR, tracking_lqr_control
 
 __all__ = [
     "COMMAND_FIELDS",
@@ -41,9 +41,14 @@ __all__ = [
     "body_rate2force_torque",
     "command_size",
     "force_torque2rotor_vel",
+    "geometric_control",
+    "indi_control",
     "load_fn_params",
+    "load_lqr_control",
     "load_params",
+    "lqr_control",
     "state2attitude",
+    "tracking_lqr_control",
 ]
 
 __getattr__ = lazy(
@@ -54,6 +59,11 @@ __getattr__ = lazy(
         "LQR": "crazysim.control.lqr",
         "LoadLQR": "crazysim.control.load_lqr",
         "TrackingLQR": "crazysim.control.tracking_lqr",
+        "geometric_control": "crazysim.control.geometric",
+        "indi_control": "crazysim.control.indi",
+        "load_lqr_control": "crazysim.control.load_lqr",
+        "lqr_control": "crazysim.control.lqr",
+        "tracking_lqr_control": "crazysim.control.tracking_lqr",
     },
 )
 
