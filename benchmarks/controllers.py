@@ -27,8 +27,8 @@ from crazysim.dynamics import first_principles
 from crazysim.trajectories import Follow, figure_eight, hover
 
 CONTROLLERS = ("crazyflow", "mellinger", "pid", "geometric", "lqr", "tracking_lqr", "indi")
-LOAD = {"load_mass": 0.2, "length": 0.4}
-"""Load of load_lqr, kg and m."""
+LOAD_MASS, LENGTH = 0.2, 0.4
+"""Mass of the load of load_lqr, kg, and length of its rod, m."""
 KNOTS = 0.15
 """Time between gains of tracking_lqr, s; 60 of them last 9 s."""
 
@@ -82,7 +82,7 @@ def cost(name: str, args: argparse.Namespace) -> dict[str, Any]:
 def controller_of(name: str, trajectory: Any) -> Any:
     """Return the argument ``controller`` of a simulation that follows a trajectory."""
     if name == "load_lqr":
-        return LoadLQR(**LOAD)
+        return LoadLQR(load_mass=LOAD_MASS, length=LENGTH)
     if name == "tracking_lqr":
         return TrackingLQR(jax.vmap(trajectory.evaluate)(KNOTS * np.arange(60, dtype=np.float32)), dt=KNOTS)
     return name
@@ -95,12 +95,12 @@ def flight(name: str, args: argparse.Namespace, trajectory: Any, moving: bool, n
     sim.add(Follow(trajectory, visible=False))
     start, s = trajectory.evaluate(jnp.float32(0)), sim.data.states
     rotors = first_principles.hover_rotor_vel(sim.data.params)
-    above = jnp.array([0, 0, LOAD["length"] if name == "load_lqr" else 0.0])
+    above = jnp.array([0, 0, LENGTH if name == "load_lqr" else 0.0])
     new = {"pos": start.pos + above, "rotor_vel": rotors} | ({"vel": start.vel} if moving else {})
     placed = {key: jnp.broadcast_to(jnp.asarray(x), getattr(s, key).shape) for key, x in new.items()}
     sim.data = sim.data.replace(states=s.replace(**placed))
     if name == "load_lqr":
-        sim.add(SlungLoad(mass=LOAD["load_mass"], length=LOAD["length"]))
+        sim.add(SlungLoad(mass=LOAD_MASS, length=LENGTH))
     return sim
 
 
