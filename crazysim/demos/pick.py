@@ -65,7 +65,7 @@ def run(
     sim, hook, plans = build(n_worlds, n_drones, device)
     engine = sim.explain().splitlines()[0]
     print(f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
-    view = View(width=960, height=544, follow=0, trail=1.5, cam_config={"distance": 1.9, "elevation": -14})
+    view = View(width=960, height=544, follow=0, trail=1.5, cam_config={"distance": 1.5, "elevation": -16})
     out.mkdir(parents=True, exist_ok=True)
     recorder, movie = Recorder(sim, worlds=[0]), Film(out / "pick.mp4", view, fps=FPS) if film else None
     setpoints = jax.jit(lambda t: jax.vmap(lambda plan: plan.evaluate(t).pos)(plans).reshape(n_worlds, n_drones, 3))
@@ -119,7 +119,7 @@ def build(n_worlds: int, n_drones: int, device: str) -> tuple[Sim, Hook, Traject
     plans = Trajectory.stack(
         [plan(loads[w, k] - aisles[k], carry).moved(aisles[k]) for w in range(n_worlds) for k in range(n_drones)]
     )
-    sim.add(Follow(plans, index=np.arange(n_worlds * n_drones).reshape(shape)))
+    sim.add(Follow(plans, index=np.arange(n_worlds * n_drones).reshape(shape), visible=False))
     sim.build_default_data()
     return sim, hook, plans
 
@@ -144,17 +144,11 @@ def plan(load: np.ndarray, carry: Trajectory) -> Trajectory:
 def carrying() -> Trajectory:
     """Return the path along the figure eight, down to the second pad, and away without the load."""
     eight = figure_eight(WIDTH, DEPTH, period=PERIOD, height=float(HEIGHT[2])).replace(repeats=np.bool_(False))
-    # Position and its first three derivatives in the middle of the eight, where it begins and ends; 0 / 0 at rest.
-    w = 2 * np.pi / PERIOD
-    middle = [HEIGHT, *(s * np.array([WIDTH / 2 * w**n, DEPTH / 2 * (2 * w) ** n, 0]) for n, s in ((1, 1), (2, 0), (3, -1)))]
-    names = ("velocities", "accelerations", "jerks")
-
-    def joined(*nodes: list[np.ndarray]) -> Trajectory:
-        rates = {name: [node[k + 1] for node in nodes] for k, name in enumerate(names)}
-        return minimum_snap([node[0] for node in nodes], [2.0], **rates)
-
-    first, last = ([x + HEIGHT, *np.zeros((3, 3))] for x in (FROM, TO))
-    path = joined(first, middle).then(eight).then(joined(middle, last))
+    # The eight begins and ends in its middle, with the velocity and jerk of (sin wt, sin 2wt) and no acceleration.
+    w, rest = 2 * np.pi / PERIOD, np.zeros(3)
+    vel, jerk = (sign * np.array([WIDTH / 2 * w**n, DEPTH / 2 * (2 * w) ** n, 0]) for n, sign in ((1, 1), (3, -1)))
+    path = minimum_snap([FROM + HEIGHT, HEIGHT], [2.0], velocities=[rest, vel], jerks=[rest, jerk]).then(eight)
+    path = path.then(minimum_snap([HEIGHT, TO + HEIGHT], [2.0], velocities=[vel, rest], jerks=[jerk, rest]))
     path = path.then(line(TO + HEIGHT, TO + ABOVE, duration=2)).then(hover(TO + ABOVE))
     return path.then(line(TO + ABOVE, TO + HEIGHT, duration=2)).then(line(TO + HEIGHT, END + HEIGHT, duration=3))
 

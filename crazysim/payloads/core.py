@@ -20,12 +20,12 @@ CABLE_SEGMENTS = 8
 """Straight pieces by which a cable is drawn."""
 LINK_RADIUS = 0.004
 """Radius of a drawn rod or cable, m."""
-WIRE_RADIUS = 0.003
-"""Radius of the wire of drawn hooks and of the wires by which a load hangs, m."""
+WIRE_RADIUS, HOOK_RADIUS = 0.003, 0.0045
+"""Radii of the wires by which a drawn load hangs, and of a drawn hook, m."""
 HOOK_OUTLINE = ((0, -0.045), (-0.02, -0.025), (-0.014, -0.004), (0, 0.003), (0.014, -0.004), (0.02, -0.02))
 """Drawn shape of a hook: x, and z towards the load from the hook's position, m."""
-DARK, STEEL = (0.15, 0.15, 0.15, 1.0), (0.6, 0.6, 0.65, 1.0)
-"""Colours of rods and of wires."""
+DARK, STEEL, YELLOW = (0.15, 0.15, 0.15, 1.0), (0.35, 0.35, 0.4, 1.0), (0.95, 0.75, 0.1, 1.0)
+"""Colours of rods, wires and hooks."""
 
 
 class LoadData(Exposed):
@@ -167,7 +167,7 @@ def add_to_scene(
         ends = [(side * half[0], 0, 0 if kind == "sphere" else half[2]) for side in (-1, 1)]
         body += "".join(_rod(end, (0, 0, ring), WIRE_RADIUS, STEEL) for end in ends)
         link += "".join(
-            _rod((x, 0, length / 2 + z), (x_2, 0, length / 2 + z_2), WIRE_RADIUS, STEEL)
+            _rod((x, 0, length / 2 + z), (x_2, 0, length / 2 + z_2), HOOK_RADIUS, YELLOW)
             for (x, z), (x_2, z_2) in zip(HOOK_OUTLINE[:-1], HOOK_OUTLINE[1:], strict=True)
         )
     for text, kind, count in ((body, name, n_loads), (link, f"{name}_link", sim.n_drones * n_pieces)):

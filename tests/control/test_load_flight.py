@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from cases import with_states
 
-from crazysim import Sim, SlungLoad
+from crazysim import Hook, Sim, SlungLoad
 from crazysim.control.load_lqr import LoadLQR
+from crazysim.dynamics.first_principles import rotor_vel_of_thrust
 from crazysim.payloads import flat_states
 from crazysim.trajectories import Follow, figure_eight
 
 LOAD, LENGTH = 0.2, 0.4
 SIZE, SPEED = np.array([1.0, 0.5]), 2.0
 """Half of the figure eight, m, and its speed in the middle, m/s."""
-THRUST_COEFFICIENT = 1.030222e-8
-"""Thrust of a rotor of the Bumblebee, N/rpm^2."""
 
 
 def at_the_start(sim):
@@ -38,7 +37,8 @@ def test_load_along_a_figure_eight(freq):
     sim.add(Follow(eight, visible=False))
     start, path = at_the_start(sim)
     motion = {"pos": start.pos, "vel": start.vel, "quat": start.quat, "ang_vel": start.ang_vel}
-    sim.data = with_states(sim.data, **motion, rotor_vel=np.sqrt(start.thrust / 4 / THRUST_COEFFICIENT))
+    rotor_vel = rotor_vel_of_thrust(jnp.broadcast_to(start.thrust / 4, (4,)), sim.data.params.rpm2thrust)
+    sim.data = with_states(sim.data, **motion, rotor_vel=rotor_vel)
     load = sim.add(SlungLoad(mass=LOAD, length=LENGTH, in_scene=False))
     record = load.read(sim.data)
     new = {"pos": path[0], "vel": path[1]}
@@ -50,3 +50,19 @@ def test_load_along_a_figure_eight(freq):
         errors.append(load.read(sim.data).pos[0, 0] - evaluate(np.float32((k + 1) * 0.02)).pos)
     errors = np.linalg.norm(np.array(errors), axis=-1)
     assert np.sqrt(np.mean(errors**2)) < 0.01
+
+
+def test_an_empty_hook_is_the_load():
+    """Its load stands elsewhere: the tip of the hook goes to the setpoint, and its swing is damped."""
+    sim = Sim(drone="bumblebee", control="state", controller=LoadLQR(load_mass=0.0203, length=LENGTH))
+    sim.data = with_states(sim.data, pos=np.array([0.0, 0.0, 1.4]))
+    hook = sim.add(Hook.bumblebee(LOAD, load_at=(2.0, 1.0, 0.0), in_scene=False))
+    record = hook.read(sim.data)
+    sim.data = hook.write(sim.data, record.replace(tip_vel=record.tip_vel + np.array([0.5, -0.5, 0.0])))
+    command = np.zeros((1, 1, 16))
+    command[..., :3], command[..., 12] = [0.3, 0.2, 1.0], 1.0
+    sim.state_control(command)
+    sim.step(1500)
+    record = hook.read(sim.data)
+    np.testing.assert_allclose(record.tip_pos[0, 0], [0.3, 0.2, 1.0], atol=2e-3)
+    np.testing.assert_allclose(record.tip_vel[0, 0], 0, atol=5e-3)
