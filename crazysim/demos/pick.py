@@ -65,7 +65,7 @@ def run(
     sim, hook, plans = build(n_worlds, n_drones, device)
     engine = sim.explain().splitlines()[0]
     print(f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
-    view = View(width=960, height=544, follow=0, trail=1.5, cam_config={"distance": 1.5, "elevation": -16})
+    view = View(width=960, height=544, follow=0, trail=1.5, cam_config={"distance": 1.7, "elevation": -20})
     out.mkdir(parents=True, exist_ok=True)
     recorder, movie = Recorder(sim, worlds=[0]), Film(out / "pick.mp4", view, fps=FPS) if film else None
     setpoints = jax.jit(lambda t: jax.vmap(lambda plan: plan.evaluate(t).pos)(plans).reshape(n_worlds, n_drones, 3))
@@ -124,7 +124,7 @@ def build(n_worlds: int, n_drones: int, device: str) -> tuple[Sim, Hook, Traject
     return sim, hook, plans
 
 
-def is_loaded(state: SimState, setpoint: Setpoint, time: Array) -> Array:
+def is_loaded(state: SimState, setpoint: Setpoint, time: Array) -> Array:  # noqa: ARG001
     """Return the index of the controller: 1 between the commands to pick up and to let go. ()"""
     return jnp.where((time >= GRIP) & (time < RELEASE), 1, 0)
 
@@ -172,4 +172,6 @@ def report(sim: Sim, hook: Hook, held: np.ndarray, errors: np.ndarray) -> None:
         print(f"distance          {100 * away[held].mean():.2f} cm mean, {100 * away[held].max():.2f} cm at most")
     if len(errors) and held.any():
         carried = 100 * errors[:, held]
-        print(f"tracking error    {np.sqrt(np.mean(carried**2)):.2f} cm RMS at the load, {carried.max():.2f} cm at most")
+        print(
+            f"tracking error    {np.sqrt(np.mean(carried**2)):.2f} cm RMS at the load, {carried.max():.2f} cm at most"
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
@@ -162,13 +163,14 @@ def add_to_scene(
     half = np.full(3, float(size)) if np.ndim(size) == 0 else np.asarray(size, float) / 2
     kind = "sphere" if np.ndim(size) == 0 else "box"
     body = f'<geom type="{kind}" size="{_numbers(half)}" contype="0" conaffinity="2" rgba="{_numbers(rgba)}"/>'
-    link = _rod((0, 0, -length / n_pieces / 2), (0, 0, length / n_pieces / 2), LINK_RADIUS, DARK)
+    shank = 0.0 if ring is None else HOOK_OUTLINE[0][1]
+    link = _rod((0, 0, -length / n_pieces / 2), (0, 0, length / n_pieces / 2 + shank), LINK_RADIUS, DARK)
     if ring is not None:
         ends = [(side * half[0], 0, 0 if kind == "sphere" else half[2]) for side in (-1, 1)]
         body += "".join(_rod(end, (0, 0, ring), WIRE_RADIUS, STEEL) for end in ends)
         link += "".join(
             _rod((x, 0, length / 2 + z), (x_2, 0, length / 2 + z_2), HOOK_RADIUS, YELLOW)
-            for (x, z), (x_2, z_2) in zip(HOOK_OUTLINE[:-1], HOOK_OUTLINE[1:], strict=True)
+            for (x, z), (x_2, z_2) in pairwise(HOOK_OUTLINE)
         )
     for text, kind, count in ((body, name, n_loads), (link, f"{name}_link", sim.n_drones * n_pieces)):
         sim.scene.add(f"<mujoco><worldbody>{text}</worldbody></mujoco>", kind, count=count)
@@ -177,9 +179,7 @@ def add_to_scene(
 def _rod(start: Any, end: Any, radius: float, rgba: Any) -> str:
     """Return MJCF of a rod that touches nothing."""
     ends = f"{_numbers(start)} {_numbers(end)}"
-    return (
-        f'<geom type="capsule" fromto="{ends}" size="{radius}" contype="0" conaffinity="0" rgba="{_numbers(rgba)}"/>'
-    )
+    return f'<geom type="capsule" fromto="{ends}" size="{radius}" contype="0" conaffinity="0" rgba="{_numbers(rgba)}"/>'
 
 
 def _numbers(values: Any) -> str:

@@ -133,9 +133,7 @@ class SlungLoad(Plugin):
         return Link(load.attach, load.length, load.mass, load.damping, load.restitution, load.attached, self.cable)
 
 
-def load_record(
-    plugin: Any, sim: Simulation, is_cable: bool, clearance: float, ring: float | None = None
-) -> LoadData:
+def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, ring: float | None = None) -> LoadData:
     """Return the record of loads at rest below their drones, from the settings of a plugin, which are checked.
 
     Args:
