@@ -24,7 +24,7 @@ FPS = 25
 MASS, HOOK_MASS, LENGTH, RING = 0.2, 0.0203, 0.4, 0.1675
 """Masses of load and hook, kg, length of the rod, m, and height of a standing load's ring, m."""
 START, FROM, TO, END = (np.array([x, y, 0.0]) for x, y in ((-1.2, 1.2), (-1.2, -1.2), (1.2, 1.2), (1.2, -1.2)))
-"""Where the hook starts, the two pads, and where the hook ends, m."""
+"""First position of the hook on the ground plane, middles of the two pads, and last position of the hook, m."""
 HEIGHT, ABOVE = np.array([0.0, 0.0, 0.7]), np.array([0.0, 0.0, RING])
 """Height of the hook in flight, and on a standing load, m."""
 WIDTH, DEPTH, PERIOD = 2.0, 1.0, 5.0
