@@ -62,7 +62,7 @@ def test_an_empty_hook_is_the_load():
     command = np.zeros((1, 1, 16))
     command[..., :3], command[..., 12] = [0.3, 0.2, 1.0], 1.0
     sim.state_control(command)
-    sim.step(1500)
+    sim.step(2500)
     record = hook.read(sim.data)
     np.testing.assert_allclose(record.tip_pos[0, 0], [0.3, 0.2, 1.0], atol=2e-3)
     np.testing.assert_allclose(record.tip_vel[0, 0], 0, atol=5e-3)
