@@ -97,7 +97,7 @@ class Hook(Plugin):
         """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
         if self.dof not in (1, 2):
             raise ConfigError(f"expected dof as 1 or 2, got {self.dof!r}")
-        load = load_record(self, sim, False, rest_height(self.size) + self.ring)
+        load = load_record(self, sim, False, rest_height(self.size) + self.ring, self.ring)
 
         def check(name: str) -> Array:
             return check_parameter(sim, name, getattr(self, name), low=0.0)

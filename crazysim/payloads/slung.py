@@ -133,8 +133,16 @@ class SlungLoad(Plugin):
         return Link(load.attach, load.length, load.mass, load.damping, load.restitution, load.attached, self.cable)
 
 
-def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float) -> LoadData:
-    """Return the record of loads at rest below their drones, from the settings of a plugin, which are checked."""
+def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, ring: float | None = None) -> LoadData:
+    """Return the record of loads at rest below their drones, from the settings of a plugin, which are checked.
+
+    Args:
+        plugin: The plugin.
+        sim: Simulation.
+        is_cable: True for cables.
+        clearance: Height of a load's position above the floor where it rests, m.
+        ring: Height of the ring above the middle of the load, m, by which a hook holds it; None without a hook.
+    """
 
     def check(name: str, core: tuple[int, ...] = (1,), **limits: Any) -> Array:
         return check_parameter(sim, name, getattr(plugin, name), core, **limits)
@@ -149,7 +157,7 @@ def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float) 
     if plugin.in_scene:
         add_to_scene(
             sim, plugin.name, plugin.size, plugin.rgba, float(jnp.max(length)), sim.n_drones,
-            CABLE_SEGMENTS if is_cable else 1,
+            CABLE_SEGMENTS if is_cable else 1, ring,
         )  # fmt: skip
     states = sim.data.states
     pos, vel = hanging(states, attach, length, rest, is_cable)
