@@ -84,7 +84,7 @@ class Configuration:
             require_controller(dynamics, control, controller)
             controller = controller_at_rates(controller, control, freq, dict(rates))
             with_outer = control == Control.state and controller.has_outer
-            freqs[control] = controller.outer_freq if with_outer else controller.freq
+            freqs = {**freqs, control: controller.outer_freq if with_outer else controller.freq}
         return Configuration(
             n_worlds,
             n_drones,
