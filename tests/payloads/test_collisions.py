@@ -47,41 +47,41 @@ def of_load(load, sim):
     return np.asarray(record.pos[..., 0, :]), np.asarray(record.vel[..., 0, :])
 
 
-@pytest.mark.parametrize("kind", ["wall", "pole", "box", "sphere"])
-@pytest.mark.parametrize("restitution", [0.0, 0.5, 0.8])
-def test_a_swing_ends_at_an_obstacle_with_the_restitution(kind, restitution):
+@pytest.mark.parametrize("kind", ["wall", "pole", "sphere"])
+def test_a_swing_ends_at_an_obstacle_with_the_restitution(kind):
     """Below a heavy drone, released from the side, into an obstacle at the lowest point, where it moves level."""
     options = {
-        "wall": {"thickness": 0.1, "height": 6.0}, "pole": {"radius": 0.05, "height": 6.0},
-        "box": {"size": (0.1, 0.1, 0.1)}, "sphere": {"radius": 0.05},
+        "wall": {"thickness": 0.1, "height": 2.7}, "pole": {"radius": 0.05, "height": 2.7}, "sphere": {"radius": 0.05},
     }[kind]  # fmt: skip
-    sim = flying()
+    sim = flying(3)
     heavy(sim)
     load = sim.add(SlungLoad(mass=0.1, length=LENGTH, size=RADIUS))
-    height = 0.0 if kind in ("wall", "pole") else 2.6
-    sim.scene.add(kind, pos=[0.05 + RADIUS, 0, height], **options)
-    sim.add(ContactResponse(friction=0.0, restitution=restitution))
+    sim.scene.add(kind, pos=[0.05 + RADIUS, 0, 2.6 if kind == "sphere" else 0.0], **options)
+    response = sim.add(ContactResponse(friction=0.0))
+    restitution = np.array([0.0, 0.5, 0.8])
+    record = response.read(sim.data).replace(restitution=jnp.asarray(restitution, jnp.float32)[:, None, None])
     angle = 0.5
+    sim.data = response.write(sim.data, record)
     sim.data = with_load(load, sim.data, pos=[-LENGTH * np.sin(angle), 0, 3 - LENGTH * np.cos(angle)])
     fall = np.sqrt(2 * 9.81 * LENGTH * (1 - np.cos(angle)))
     seen = []
-    for _ in range(250):
+    for _ in range(200):
         sim.step()
-        seen.append(np.concatenate(of_load(load, sim), axis=-1)[0])
-    x, v = np.array(seen)[:, 0], np.array(seen)[:, 3]
-    hit = int(np.argmax(v < 0.5 * v.max()))
-    np.testing.assert_allclose(v.max(), fall, rtol=0.02)
+        seen.append(np.concatenate(of_load(load, sim), axis=-1))
+    x, v = np.array(seen)[..., 0], np.array(seen)[..., 3]
+    hit = np.argmax(v[:, 0]) + 1
+    np.testing.assert_allclose(v[hit - 1], fall, rtol=0.02)
     np.testing.assert_allclose(v[hit], -restitution * fall, atol=0.02 * fall)
-    assert x.max() < v.max() / 500 + 1e-3  # one step beyond
-    if restitution == 0:
-        assert abs(x[-1]) < 2e-3  # rests in it
+    assert (x.max(axis=0) < fall / 500 + 1e-3).all()  # one step beyond
+    assert abs(x[-1, 0]) < 2e-3, "it rests at the obstacle"
+    assert x[-1, 1] < -0.02
 
 
 def test_without_a_response_it_swings_through():
     sim = flying()
     heavy(sim)
     load = sim.add(SlungLoad(mass=0.1, length=LENGTH, size=RADIUS))
-    sim.scene.add("wall", pos=[0.05 + RADIUS, 0, 0], thickness=0.1, height=6.0)
+    sim.scene.add("wall", pos=[0.05 + RADIUS, 0, 0], thickness=0.1, height=2.7)
     sim.data = with_load(load, sim.data, vel=[1.5, 0, 0])
     sim.step(60)
     assert of_load(load, sim)[0][0, 0] > 0.1
@@ -94,7 +94,7 @@ def test_a_free_load_slides_on_a_pad_as_friction_has_it():
     sim.scene.add("box", pos=[0, 0, 0.5], size=(3.0, 3.0, 0.2), mocap=False)
     sim.add(ContactResponse(friction=0.4))
     sim.data = with_load(load, load.release(sim.data), pos=[0, 0, 0.63], vel=[1.0, 0, 0])
-    sim.step(400)
+    sim.step(250)
     pos, vel = of_load(load, sim)
     np.testing.assert_allclose(pos[0], [1 / (2 * 0.4 * 9.81), 0, 0.63], atol=0.006)
     assert np.abs(vel).max() < 1e-3
@@ -130,12 +130,12 @@ def energy(load, sim, mass):
 @pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
 def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, x64, rng):
     """Loose loads against two drones, from all sides: of the contact stage alone, momentum exactly, energy no more."""
-    sim = weightless(flying(n_drones=2))
+    sim = weightless(flying(n_drones=2, engine="plain"))
     load = sim.add(SlungLoad(mass=0.2, size=size))
     sim.add(ContactResponse(restitution=0.7, friction=0.5))
     sim.data = load.release(sim.data)
     stage = sim.step_pipeline["contact_response_of_load_and_drones"]
-    step, hits = Step({"hit": stage}), 0
+    step, hits = Step({"hit": stage}, "plain"), 0
     start = sim.data
     quat = rng.normal(size=(60, 2, 4))
     for k in range(60):
@@ -223,7 +223,7 @@ def test_the_log_has_the_step_in_which_a_load_touches():
     assert record.object_names == ("load:0", "load:1", "sphere:0")
     np.testing.assert_array_equal(np.asarray(record.objects)[0], [[False, True, False], [True, False, False]])
     assert np.abs(np.asarray(record.first) - first).max() <= 1
-    sim.data = pole.set_pose(sim.data, sim.data.states.pos[:, 0])
+    sim.data = pole.set_pose(sim.data, sim.data.states.pos[:, :1])
     sim.step()
     assert bool(log.read(sim.data).objects[0, 0, 2])
 
@@ -242,7 +242,7 @@ def test_law_01_all_engines_agree():
     ends = {}
     for engine in ("plain", "lanes", "fused"):
         sim = flying(2, 2, height=1.0, engine=engine, strict=True)
-        load = sim.add(SlungLoad(mass=0.2, cable=True, size=(0.06, 0.06, 0.06)))
+        load = sim.add(SlungLoad(mass=0.2, cable=True, size=RADIUS))
         sim.scene.add("wall", pos=[0.3, 0, 0], height=3.0)
         sim.scene.add("pole", pos=[-0.3, 0.1, 0], height=3.0, mocap=False)
         sim.add(ContactResponse(restitution=0.4))
