@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.stage import with_leaves
-from crazysim.engine import cuda, jaxcompat, kernel, lanes, native
+from crazysim.engine import cuda, jaxcompat, kernel, lanes, native, passes
 from crazysim.engine.native import Launch
 from crazysim.engine.program import Program
 
@@ -54,7 +54,8 @@ def build(
         return source, cuda.compiled(source, devices) if platform == "gpu" else native.compiled(source)
 
     run = _one_kernel(program, compiled(program)) if program.fused else _split(program, compiled)
-    return differentiable(program, _over_batches(program, run))
+    on_lanes = program if platform == "gpu" else passes.separate(program)
+    return differentiable(on_lanes, _over_batches(program, run))
 
 
 def differentiable(program: Program, run: Run) -> Callable[[list[Any], int | Array], tuple[list[Any], Array]]:

@@ -24,7 +24,7 @@ from jax.sharding import PartitionSpec
 from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Stage, with_leaves
-from crazysim.engine import fused, interpret, lanes, plain
+from crazysim.engine import fused, interpret, lanes, passes, plain
 from crazysim.engine.build import build_program
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.flat import Zeros
@@ -127,7 +127,8 @@ class Planner(NamedTuple):
         problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
         if self.location.spread and split:
             return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}"), problems
-        engine, why, run = "lanes", "it was chosen", functools.partial(lanes.steps, program)
+        on_lanes = passes.separate(program) if self.location.platform == "cpu" else program
+        engine, why, run = "lanes", "it was chosen", functools.partial(lanes.steps, on_lanes)
         if self.engine == "interpret":
             engine, run = "interpret", functools.partial(interpret.steps, program)
         elif self.engine != "lanes":

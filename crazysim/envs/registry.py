@@ -19,6 +19,7 @@ from crazysim.envs.tasks.reach_vel import ReachVel
 from crazysim.envs.tasks.recover import Recover
 from crazysim.envs.tasks.swarm import Swarm
 from crazysim.envs.tasks.track import TrackTrajectory
+from crazysim.envs.tasks.transport import Transport
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.sim.sim import Sim
 
@@ -51,6 +52,7 @@ TASKS: dict[str, Entry] = {
     "race": Entry(Race, "crazysim/Race-v0"),
     "multi_race": Entry(Race, "crazysim/MultiRace-v0", n_drones=2),
     "avoid": Entry(Avoid, "crazysim/Avoid-v0"),
+    "transport": Entry(Transport, "crazysim/Transport-v0"),
     "swarm": Entry(Swarm, "crazysim/Swarm-v0", n_drones=4),
 }
 """All registered tasks, by name."""

@@ -87,6 +87,22 @@ def test_hoisting_takes_work_out_of_the_loop(pipeline):
         np.testing.assert_allclose(found[slot], x, rtol=2e-4, atol=2e-5, err_msg=str(slot))
 
 
+def test_barriers_separate_runs_of_operations_and_change_no_number(pipeline):
+    program, numbers = pipeline
+    fused = passes.fuse(program)
+    separated = verify(passes.separate(fused))
+    (before,), (after,) = fused.segments, separated.segments
+    names = [op.name for op in after.block.operations]
+    runs = "".join("|" if name == "barrier" else "." for name in names).split("|")
+    assert max(map(len, runs)) == passes.SPAN
+    assert [name for name in names if name != "barrier"] == [
+        op.name for op in before.block.operations if op.name != "barrier"
+    ]
+    expected, found = run(fused, numbers, 3), run(separated, numbers, 3)
+    for slot, x in expected.items():
+        np.testing.assert_array_equal(found[slot], x, err_msg=str(slot))
+
+
 def test_packing_moves_shared_numbers_into_one_leaf(pipeline):
     program, numbers = pipeline
     fused = passes.fuse(program)

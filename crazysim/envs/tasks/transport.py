@@ -1,0 +1,299 @@
+"""Carry a swinging load through a gate to a goal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.stage import stage
+from crazysim.envs import terms
+from crazysim.envs.random import between, draw, within
+from crazysim.envs.spawn import flying
+from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.core import install_rules, pick, state_of, with_record
+from crazysim.errors import ConfigError
+from crazysim.payloads import SlungLoad, direction, load_pos, load_vel
+from crazysim.pytree import PyTree, leaf, static
+from crazysim.scene.objects import Handle
+from crazysim.sim.sim import Sim
+
+LANE = 3.0
+"""Distance between the gates of several drones along y, m; each drone stays in its own lane."""
+HALF_SIZE, CEILING = (2.6, 1.4), 2.5
+"""Largest distance of a drone from the middle of its lane along x and y, and largest height, m."""
+START = ((-2.2, -0.5, 1.2), (-1.4, 0.5, 1.7))
+"""Lowest and highest start of a drone in its lane, m."""
+GOAL = ((1.0, -0.5, 1.0), (1.8, 0.5, 1.5))
+"""Lowest and highest goal of a load in its lane, m."""
+GATE = ((0.0, -0.3, 1.2), (0.0, 0.3, 1.5))
+"""Lowest and highest middle of a gate in its lane, m."""
+TURN = 0.3
+"""Largest yaw of a gate, rad."""
+BAR = 0.05
+"""Thickness of a gate's frame, m."""
+RADIUS = 0.03
+"""Radius of a load, m."""
+ROOM = 0.25
+"""Smallest height of the opening above the length of the link, m: the drone and its load hang in it together."""
+SLOW = 0.2
+"""Largest speed of a load that is delivered, m/s."""
+
+
+class Delivery(PyTree):
+    """Goal of each load, and the outcome of its flight."""
+
+    goal: Array = leaf("drone", 1)
+    """Goal of the load, m. (n_worlds, n_drones, 3)"""
+    to_go_before: Array = leaf("drone", 0)
+    """Way of the load to its goal before this environment step, m. (n_worlds, n_drones)"""
+    steps_there: Array = leaf("drone", 0)
+    """Physics steps that the load has been at its goal without a break. (n_worlds, n_drones)"""
+    delivered: Array = leaf("drone", 0)
+    """True where the load has stayed at its goal for long enough. (n_worlds, n_drones)"""
+    crashed: Array = leaf("drone", 0)
+    """True where drone or load has touched something, missed the gate, or left its lane. (n_worlds, n_drones)"""
+    gates: Handle = static()
+    """Handle of the gates, one per drone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Transport(Task):
+    """Carry a load on a rod or cable through a gate, and hold it at a goal behind it.
+
+    A drone starts in flight with a swinging load. The gate stands in a lane of its own; drone and load must pass its
+    plane through the opening. Missing it is a crash, as is touching the frame or the floor, and leaving the lane; this
+    is checked at every physics step. A load is delivered when it has been within ``tolerance`` of its goal, behind the
+    gate, at most 0.2 m/s fast, for ``hold`` seconds. An episode ends when a drone crashes.
+    """
+
+    name = "transport"
+    Record = Delivery
+
+    mass: float = 0.01
+    """Mass of the load, kg."""
+    length: float = 0.3
+    """Length of rod or cable, m."""
+    cable: bool = False
+    """True for a cable, False for a rigid rod."""
+    opening: float = 1.0
+    """Width and height of the gate's opening, m."""
+    swing: float = 0.4
+    """Largest angle of the load from the vertical at the start along x and y, rad; its rate is up to 1.5 times that,
+    rad/s."""
+    seconds: float = 6.0
+    """Length of an episode, s."""
+    tolerance: float = 0.1
+    """Distance of the load from its goal below which it counts as there, m."""
+    hold: float = 0.5
+    """Time that the load must stay there, s."""
+
+    def __post_init__(self) -> None:
+        """Check the settings.
+
+        Raises:
+            ConfigError: If drone and load do not fit through the opening together, or the swing is out of range.
+        """
+        if not self.length + ROOM <= self.opening <= 1.6:
+            raise ConfigError(
+                f"expected opening from {self.length + ROOM:g} m, {ROOM} m above the length of the link, to 1.6 m, got "
+                f"{self.opening!r}"
+            )
+        if not 0 <= self.swing <= 1:
+            raise ConfigError(f"expected swing from 0 to 1 rad, got {self.swing!r}")
+
+    def install(self, sim: Sim) -> None:
+        """Add the loads, the gates and the check of both."""
+        sim.add(SlungLoad(mass=self.mass, length=self.length, cable=self.cable, size=RADIUS))
+        middle = lanes(sim.n_drones) + np.mean(GATE, axis=0)
+        gates = sim.scene.add("gate", count=sim.n_drones, pos=middle, width=self.opening, height=self.opening, bar=BAR)
+        contacts = sim.scene.contact_fn([gates], drones=False)
+        enough = round(self.hold * sim.freq)
+
+        @stage("drone")
+        def judge(data: SimData) -> SimData:
+            """Note a crash, and a load that stays at its goal."""
+            own = delivery_of(data)
+            crashed = own.crashed | contacts(data).any | self.misses(data) | out_of_lane(data)
+            steps = jnp.where(self.at_goal(data) & ~crashed, own.steps_there + 1, 0)
+            delivered = own.delivered | (steps >= enough)
+            return with_record(data, own.replace(crashed=crashed, steps_there=steps, delivered=delivered))
+
+        pos, no = sim.data.states.pos, jnp.zeros((sim.n_worlds, sim.n_drones), bool)
+        record = Delivery(jnp.zeros_like(pos), jnp.zeros_like(pos[..., 0]), no.astype(jnp.int32), no, no, gates)
+        install_rules(sim, record, judge)
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return drones in flight with swinging loads before the gates, and goals behind them."""
+        n_drones, own = data.core.n_drones, delivery_of(data)
+        x = draw(key, n_drones, start=3, goal=3, gate=3, turn=1, rpy=3, vel=3, swing=2, swing_rate=2)
+        lane = jnp.asarray(lanes(n_drones), data.states.pos.dtype)
+        quat = rotation.from_rpy(within(x["rpy"], 0.1))
+        data = flying(data, lane + between(x["start"], *np.array(START)), quat, within(x["vel"], 0.3))
+        yaw = within(x["turn"], TURN)
+        turned = rotation.from_rpy(jnp.concatenate([0 * yaw, 0 * yaw, yaw], axis=-1))
+        data = own.gates.set_pose(data, lane + between(x["gate"], *np.array(GATE)), turned)
+        data = self.hang(data, within(x["swing"], self.swing), within(x["swing_rate"], 1.5 * self.swing))
+        return with_record(data, own.replace(goal=lane + between(x["goal"], *np.array(GOAL))))
+
+    def hang(self, data: SimData, angle: Array, rate: Array) -> SimData:
+        """Return the data with loads on taut links.
+
+        Args:
+            data: One world.
+            angle: Angle of the link from the vertical towards x, and then towards y, rad. (n_drones, 2)
+            rate: Rates of both, rad/s. (n_drones, 2)
+        """
+        (sin_a, sin_b), (cos_a, cos_b), (da, db) = (
+            jnp.moveaxis(f, -1, 0) for f in (jnp.sin(angle), jnp.cos(angle), rate)
+        )
+        link = jnp.stack([sin_a * cos_b, sin_b, -cos_a * cos_b], axis=-1)
+        turning = jnp.stack(
+            [da * cos_a * cos_b - db * sin_a * sin_b, db * cos_b, da * sin_a * cos_b + db * cos_a * sin_b], axis=-1
+        )
+        s, load = data.states, data.plugins["load"]
+        load = load.replace(pos=s.pos + self.length * link, vel=s.vel + self.length * turning)
+        return data.replace(plugins=data.plugins | {"load": load})
+
+    def before_step(self, data: SimData) -> SimData:
+        """Note the way to go."""
+        return with_record(data, delivery_of(data).replace(to_go_before=self.to_go(data)))
+
+    def to_go(self, data: SimData) -> Array:
+        """Return the way of the load to its goal, before the gate by way of its opening, m. (...)
+
+        There the load aims half the link's length below the middle, so that drone and load pass with equal margins.
+        """
+        pos, quat = gate_of(data)
+        load, goal = load_pos(data), delivery_of(data).goal
+        aim = pos - np.array([0.0, 0.0, self.length / 2], pos.dtype)
+        around = rotation.safe_norm(aim - load)[..., 0] + rotation.safe_norm(goal - aim)[..., 0]
+        return jnp.where(is_behind(load, pos, quat), self.error(data), around)
+
+    def misses(self, data: SimData) -> Array:
+        """Return true where a drone or its load is between the faces of its gate, but not in the opening. (...)"""
+        pos, quat = gate_of(data)
+        outside = [
+            (jnp.abs(place[..., 0]) <= BAR / 2) & (jnp.any(jnp.abs(place[..., 1:]) > self.opening / 2 - r, axis=-1))
+            for place, r in (
+                (rotation.rotate_inverse(quat, data.states.pos - pos), 0.0),
+                (rotation.rotate_inverse(quat, load_pos(data) - pos), RADIUS),
+            )
+        ]
+        return outside[0] | outside[1]
+
+    def at_goal(self, data: SimData) -> Array:
+        """Return true where a load is near its goal, slow, and behind the gate. (...)"""
+        vel = load_vel(data)
+        slow = rotation.dot(vel, vel)[..., 0] < SLOW**2
+        return is_behind(load_pos(data), *gate_of(data)) & slow & (self.error(data) < self.tolerance)
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state, and load, gate and goal relative to it.
+
+        Those are ``load_pos``, m, and ``load_vel``, m/s, relative to the drone; ``difference_to_gate``, from the drone
+        to the middle of the gate, m; ``gate_axis``, the unit vector along which it is passed; and
+        ``difference_to_goal``, from the load to its goal, m.
+        """
+        s, (pos, quat) = data.states, gate_of(data)
+        return state_of(data) | {
+            "load_pos": load_pos(data) - s.pos,
+            "load_vel": load_vel(data) - s.vel,
+            "difference_to_gate": pos - s.pos,
+            "gate_axis": gate_axis(quat),
+            "difference_to_goal": delivery_of(data).goal - load_pos(data),
+        }
+
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return progress and proximity of the load, and costs of swinging, turning, changing actions and a crash.
+
+        The approach reaches far, so that waiting before the gate pays less than passing it; proximity rewards rest at
+        the goal.
+        """
+        own, to_go = delivery_of(data), self.to_go(data)
+        rate = direction(data)[1]
+        return {
+            "progress": 5.0 * (own.to_go_before - to_go),
+            "approach": 0.5 * jnp.exp(-to_go),
+            "proximity": terms.proximity(self.error(data), coarse=5.0),
+            "swing": -0.01 * rotation.dot(rate, rate)[..., 0],
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "crash": -10.0 * own.crashed,
+        }
+
+    def terminated(self, data: SimData) -> Array:
+        """Return true where a drone has crashed."""
+        return jnp.any(delivery_of(data).crashed)
+
+    def error(self, data: SimData) -> Array:
+        """Return the distance of the load from its goal, m."""
+        return rotation.safe_norm(delivery_of(data).goal - load_pos(data))[..., 0]
+
+    def info(self, data: SimData) -> dict[str, Array]:
+        """Return which loads are behind the gate and delivered, and which drones have crashed."""
+        own = delivery_of(data)
+        behind = is_behind(load_pos(data), *gate_of(data))
+        return {"passed": behind & ~own.crashed, "delivered": own.delivered, "crashed": own.crashed}
+
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        """Return the camera of images and films."""
+        del n_drones
+        return {"lookat": (0, 0, 1.1), "distance": 5.0, "azimuth": 60, "elevation": -20}
+
+    def target(self, data: SimData) -> Array:
+        """Return the goal of the load, m."""
+        return delivery_of(data).goal
+
+    def succeeded(self, data: SimData) -> Array:
+        """Return which loads have been delivered."""
+        return delivery_of(data).delivered
+
+
+def delivery_of(data: SimData) -> Delivery:
+    """Return the task's record."""
+    return data.plugins[NAME]
+
+
+def lanes(n_drones: int) -> np.ndarray:
+    """Return the middle of each drone's lane on the floor, m. (n_drones, 3)"""
+    y = LANE * (np.arange(n_drones) - (n_drones - 1) / 2)
+    return np.stack([0 * y, y, 0 * y], axis=-1)
+
+
+def gate_of(data: SimData) -> tuple[Array, Array]:
+    """Return position, m, and attitude, xyzw, of each drone's gate, of one drone or one world. (..., 3), (..., 4)"""
+    rows = delivery_of(data).gates.rows
+    some = slice(rows[0], rows[-1] + 1)
+    pos, quat = (x[..., some, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
+    return pick(pos, data.core.drone_id), pick(quat, data.core.drone_id)
+
+
+def gate_axis(quat: Array) -> Array:
+    """Return the unit vector along which a gate is passed. (..., 3)"""
+    return rotation.matrix(quat)[..., 0]
+
+
+def is_behind(place: Array, pos: Array, quat: Array) -> Array:
+    """Return true where a place is behind the plane of a gate. (...)
+
+    Args:
+        place: Position, m. (..., 3)
+        pos: Position of the gate, m. (..., 3)
+        quat: Its attitude, xyzw. (..., 4)
+    """
+    return rotation.dot(place - pos, gate_axis(quat))[..., 0] > 0
+
+
+def out_of_lane(data: SimData) -> Array:
+    """Return true where a drone has left its lane, or its load touches the floor. (...)"""
+    pos = data.states.pos
+    middle = pick(jnp.asarray(lanes(data.core.n_drones), pos.dtype), data.core.drone_id)
+    far = jnp.any(jnp.abs(pos - middle)[..., :2] > np.array(HALF_SIZE, pos.dtype), axis=-1) | (pos[..., 2] > CEILING)
+    return far | (load_pos(data)[..., 2] <= RADIUS)

@@ -1,0 +1,198 @@
+"""Transport: what passes the gate and what misses it, when a load is delivered, and how progress is rewarded."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.core.stage import over_worlds
+from crazysim.envs import DroneEnv, make
+from crazysim.envs.tasks.transport import Transport, gate_axis, is_behind
+from crazysim.train.evaluate import evaluate
+
+N_SPAWNS, LENGTH = 512, 0.3
+GATE, GOAL = np.array([0.0, 0.0, 1.3], np.float32), np.array([1.4, 0.0, 1.2], np.float32)
+DOWN = (0.0, 0.0, -LENGTH)
+CASES = {
+    # Place of the drone from the middle of the gate, m, load from the drone, m, velocity of both, m/s.
+    "through": ((-0.005, 0.0, 0.15), DOWN, (1.0, 0.0, 0.0)),
+    "backwards": ((0.005, 0.0, 0.15), DOWN, (-1.0, 0.0, 0.0)),
+    "before": ((-0.5, 0.0, 0.15), DOWN, (0.0, 0.0, 0.0)),
+    "behind": ((0.5, 0.0, 0.15), DOWN, (0.0, 0.0, 0.0)),
+    "load just inside": ((0.0, 0.2, 0.15), (0.0, 0.16, -0.2538), (0.0, 0.0, 0.0)),
+    "load outside": ((0.0, 0.2, 0.15), (0.0, 0.18, -0.24), (0.0, 0.0, 0.0)),
+    "load below": ((0.0, 0.0, -0.15), DOWN, (0.0, 0.0, 0.0)),
+    "frame": ((0.0, 0.0, 0.36), DOWN, (0.0, 0.0, 0.0)),
+    "above": ((-0.005, 0.0, 0.8), DOWN, (1.0, 0.0, 0.0)),
+    "beside": ((-0.005, 1.0, 0.15), DOWN, (1.0, 0.0, 0.0)),
+    "beside, backwards": ((0.005, 1.0, 0.15), DOWN, (-1.0, 0.0, 0.0)),
+    "floor": ((-1.0, 0.0, -0.98), DOWN, (0.0, 0.0, -0.1)),
+    "far": ((2.61, 0.0, 0.0), DOWN, (0.0, 0.0, 0.0)),
+    "aside": ((1.0, 1.41, 0.0), DOWN, (0.0, 0.0, 0.0)),
+    "high": ((-1.0, 0.0, 1.21), DOWN, (0.0, 0.0, 0.0)),
+}
+"""One world each, with an unturned gate."""
+SAFE = {"through", "backwards", "before", "behind", "load just inside"}
+AT_GOAL = {
+    # Place of the load from its goal, m, velocity, m/s, and x of the goal, m.
+    "there": ((0.0, 0.05, 0.0), (0.0, 0.0, 0.0), 1.4),
+    "off": ((0.0, 0.12, 0.0), (0.0, 0.0, 0.0), 1.4),
+    "fast": ((0.0, 0.0, 0.0), (0.0, 0.25, 0.0), 1.4),
+    "before the gate": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), -0.6),
+}
+"""One world each."""
+
+
+def environment(n_worlds, n_drones=1, **options):
+    """Return an environment whose gate has an opening of 0.8 m."""
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
+    task = Transport(opening=0.8, **options)
+    task.install(sim)
+    return DroneEnv(sim, task)
+
+
+def placed(state, drone, load, vel, goal=GOAL):
+    """Return a state of single drones with level drones and loads in other places, and an unturned gate."""
+    data = state.data
+    s, own, hanging = data.states, data.plugins["task"], data.plugins["load"]
+    drone, load, vel, goal = (jnp.broadcast_to(jnp.asarray(x, jnp.float32), (len(s.pos), 3))[:, None]
+                              for x in (drone, load, vel, goal))  # fmt: skip
+    level = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), s.quat.shape)
+    data = data.replace(states=s.replace(pos=drone, vel=vel, quat=level, ang_vel=0 * vel))
+    plugins = data.plugins | {"task": own.replace(goal=goal), "load": hanging.replace(pos=load, vel=vel)}
+    return state.replace(data=own.gates.set_pose(data.replace(plugins=plugins), GATE, level[0, 0]))
+
+
+def to_go(env, data):
+    """Return the way to go of single drones, m. (n_worlds,)"""
+    return np.asarray(over_worlds(env.task.to_go)(data))[:, 0]
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """Return names of all cases to worlds, and the state after a step."""
+    env = environment(len(CASES))
+    place, hang, vel = (np.array(x, np.float32) for x in zip(*CASES.values(), strict=True))
+    before = placed(jax.jit(env.reset)(jax.random.key(0)), GATE + place, GATE + place + hang, vel)
+    return {name: k for k, name in enumerate(CASES)}, jax.jit(env.step)(before, before.action)
+
+
+def test_touching_and_missing_the_gate_or_leaving_the_lane_is_a_crash(flown):
+    world, after = flown
+    crashed = np.asarray(after.info["crashed"])[:, 0]
+    assert {name for name, k in world.items() if crashed[k]} == set(CASES) - SAFE
+    np.testing.assert_array_equal(after.terminated, crashed)
+    np.testing.assert_array_equal(np.asarray(after.reward)[:, 0] < -5, crashed)
+
+
+def test_a_gate_is_passed_where_the_load_is_behind_it_without_a_crash(flown):
+    world, after = flown
+    passed = np.asarray(after.info["passed"])[:, 0]
+    assert {name for name, k in world.items() if passed[k]} - {"load just inside"} == {"through", "behind"}
+
+
+def test_a_load_is_delivered_after_it_has_stayed_at_its_goal_slowly_and_behind_the_gate():
+    env = environment(len(AT_GOAL))
+    offset, vel, x = (np.array(v, np.float32) for v in zip(*AT_GOAL.values(), strict=True))
+    goal = np.broadcast_to(GOAL, offset.shape) * [0, 1, 1] + x[:, None] * [1, 0, 0]
+    state = placed(jax.jit(env.reset)(jax.random.key(0)), goal + offset - DOWN, goal + offset, vel, goal)
+    step, hold = jax.jit(env.step), round(env.task.hold * env.sim.freq)
+    waiting = np.array([[hold - 15]] * len(AT_GOAL), np.int32)
+    own = state.data.plugins["task"].replace(steps_there=jnp.asarray(waiting))
+    state = state.replace(data=state.data.replace(plugins=state.data.plugins | {"task": own}))
+    first = step(state, state.action)
+    assert not first.info["delivered"].any()
+    np.testing.assert_array_equal(first.data.plugins["task"].steps_there[:, 0], [hold - 5, 0, 0, 0])
+    second = step(first, state.action)
+    np.testing.assert_array_equal(env.succeeded(second)[:, 0], [True, False, False, False])
+    away = placed(second, GOAL + np.array([0.0, 0.5, LENGTH]), GOAL + np.array([0.0, 0.5, 0.0]), 0.0)
+    assert step(away, state.action).info["delivered"][0, 0], "it stays delivered"
+
+
+def test_progress_pays_for_the_way_only_and_passing_the_gate_never_costs(rng):
+    """The sum over a way there and back is zero, and the way jumps down or not at all where the gate is passed."""
+    env = environment(64)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    corner = np.array([0.0, 0.35, 0.35])
+    at = GATE + rng.uniform(-corner, corner, (64, 3))
+    aim = GATE - np.array([0.0, 0.0, LENGTH / 2], np.float32)
+    at[0] = aim
+    ways = []
+    for x in (-1.0, -1e-3, 1e-3, 1.0):
+        load = (at + np.array([x, 0.0, 0.0])).astype(np.float32)
+        ways.append(to_go(env, placed(state, load - DOWN, load, 0.0).data))
+        around = np.linalg.norm(load - aim, axis=-1) + np.linalg.norm(GOAL - aim)
+        expected = around if x < 0 else np.linalg.norm(load - GOAL, axis=-1)
+        np.testing.assert_allclose(ways[-1], expected, atol=1e-5)
+    assert np.all(ways[1] - ways[2] > -1e-3)
+    np.testing.assert_allclose(ways[1][0], ways[2][0], atol=3e-3)
+    data = placed(state, GOAL - DOWN, GOAL, 0.0).data
+    own = data.plugins["task"].replace(to_go_before=jnp.asarray(ways[0])[:, None])
+    paid = over_worlds(env.task.rewards)(data.replace(plugins=data.plugins | {"task": own}), state.action, state.action)
+    np.testing.assert_allclose(paid["progress"][:, 0], 5 * ways[0], rtol=1e-4)
+    np.testing.assert_allclose(paid["proximity"], 1.5, rtol=1e-3)
+    assert not np.any(paid["crash"])
+
+
+def test_starts_are_clear_of_the_gates_and_links_are_taut():
+    env = environment(N_SPAWNS, 2, swing=0.6)
+    data = jax.jit(env.reset)(jax.random.key(3)).data
+    env.sim.data = data
+    report = env.sim.contact_report()
+    assert report.floor_distance.min() > 0.5
+    own, load, s = data.plugins["task"], data.plugins["load"], data.states
+    link, swing = load.pos - s.pos, load.vel - s.vel
+    np.testing.assert_allclose(np.linalg.norm(link, axis=-1), LENGTH, rtol=1e-5)
+    np.testing.assert_allclose(np.sum(link * swing, axis=-1), 0.0, atol=1e-5)
+    assert 0.1 < np.linalg.norm(swing, axis=-1).mean() < 0.4
+    tilt = np.arctan2(np.linalg.norm(link[..., :2], axis=-1), -link[..., 2])
+    assert 0.5 < tilt.max() < 0.9
+    rows = own.gates.rows
+    pos, quat = data.objects.pos[:, 0, rows[0] :], data.objects.quat[:, 0, rows[0] :]
+    assert np.ptp(pos[..., 1], axis=0).min() > 0.5
+    np.testing.assert_allclose(pos[:, 1, 1].mean() - pos[:, 0, 1].mean(), 3.0, atol=0.1)
+    assert gate_axis(quat)[..., 0].min() > 0.95
+    for place, expected in ((s.pos, False), (load.pos, False), (own.goal, True)):
+        assert np.all(is_behind(place, pos, quat) == expected)
+    assert np.all(over_worlds(env.task.error)(data) > 2.0)
+
+
+def test_a_pilot_that_aims_at_the_opening_and_damps_the_swing_delivers_and_one_that_idles_does_not():
+    env = environment(64, seconds=9.0)
+
+    def pilot(obs):
+        """Fly along the gate's axis at up to 0.8 m/s, where it is centred, and then bring the load to its goal."""
+        gate, axis, load = obs["difference_to_gate"], obs["gate_axis"], obs["load_pos"]
+        gate = gate + jnp.array([0.0, 0.0, LENGTH / 2])
+        ahead = jnp.sum(gate * axis, axis=-1, keepdims=True)
+        aside = gate - ahead * axis
+        pace = jnp.clip(1 - 4 * jnp.linalg.norm(aside, axis=-1, keepdims=True), 0.0, 1.0)
+        to_goal = obs["difference_to_goal"] + load + jnp.array([0.0, 0.0, LENGTH])
+        wanted = jnp.where(ahead > -0.2, 0.8 * pace * axis + 1.5 * aside, jnp.clip(1.2 * to_goal, -0.8, 0.8))
+        level = jnp.array([1.0, 1.0, 0.0])
+        acc = 3 * (wanted - obs["vel"]) + 2 * level * obs["load_vel"]
+        roll, pitch = -acc[..., 1:2] / 9.81, acc[..., :1] / 9.81
+        thrust = 0.26 + 0.14 * acc[..., 2:]
+        return jnp.clip(jnp.concatenate([roll / (jnp.pi / 4), pitch / (jnp.pi / 4), 0 * roll, thrust], axis=-1), -1, 1)
+
+    judged = evaluate(env, jax.tree_util.Partial(pilot))
+    assert judged["success"] > 0.95
+    assert judged["crashed"] < 0.05
+    assert judged["error"] < 0.1
+    idle = evaluate(env, jax.tree_util.Partial(lambda obs: 0 * pilot(obs)))
+    assert idle["success"] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"opening": 0.5}, "expected opening from 0.55 m, 0.25 m above the length of the link, to 1.6 m, got 0.5"),
+        ({"length": 1.0}, "expected opening from 1.25 m"),
+        ({"swing": -0.1}, "expected swing from 0 to 1 rad, got -0.1"),
+        ({"mass": -1.0}, "mass"),
+    ],
+)
+def test_what_cannot_be_carried_is_refused(options, message):
+    with pytest.raises(ConfigError, match=message):
+        make("transport", 1, **options)
