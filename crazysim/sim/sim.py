@@ -194,16 +194,6 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         """Time since each world's last reset, s. (n_worlds, 1)"""
         return F.time(self.data)
 
-    @property
-    def control_freq(self) -> int:
-        """Rate at which staged commands take effect, Hz; with rotor commands that is every step."""
-        return self.configuration.control_freqs.get(self.control, self.freq)
-
-    @property
-    def controllable(self) -> Array:
-        """True in worlds where a staged command takes effect at the next step. (n_worlds, 1)"""
-        return F.controllable(self.data)
-
     def build_data(self) -> SimData:
         """Return new data at rest, as at construction, with a new record of every plugin; make it the simulation's."""
         data = SimData.create(
