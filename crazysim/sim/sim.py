@@ -141,6 +141,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self._queries = self._new_queries()
         self._seed = as_key(rng_key)
         self.plugins = PluginRegistry(self)  # type: ignore[arg-type]  # properties serve as attributes
+        self._scene.plugins = self.plugins.values
         self.build_data()
         self.build_default_data()
 
