@@ -29,7 +29,8 @@ def test_a_demo_has_a_name(capsys, monkeypatch):
     assert ran == [{}, {"n_worlds": 8, "film": False}]
     with pytest.raises(SystemExit):
         main(["demo", "dance"])
-    assert all(name in capsys.readouterr().err for name in DEMOS)
+    message = capsys.readouterr().err
+    assert all(name in message for name in DEMOS)
 
 
 def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):

@@ -43,7 +43,7 @@ def test_lines_fade_towards_their_beginning():
     moments(trail, np.arange(5.0), n_drones=2)
     trail.draw(overlays, 1, rgba=[[1, 0, 0, 1], [0, 0, 1, 0.5]])
     assert len(overlays) == 8
-    alphas = np.array([geom[-1][3] for geom in overlays._geoms]).reshape(2, 4)
+    alphas = np.array([rgba[3] for *_, rgba, _ in overlays._geoms]).reshape(2, 4)
     np.testing.assert_allclose(alphas[:, -1], [1.0, 0.5])
     assert (np.diff(alphas) > 0.05).all()
 
