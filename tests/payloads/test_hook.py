@@ -9,7 +9,7 @@ from crazysim import ConfigError, Sim, rotation
 from crazysim.payloads import Hook
 
 MASS, LOAD, HOOK = 0.605, 0.2, 0.0203
-SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "lanes"}
+SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "strict": True}
 
 
 def hooked(height=5.0, integrator="euler", **settings):

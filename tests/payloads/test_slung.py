@@ -15,7 +15,7 @@ OFFSET = (0.02, 0.01, -0.03)
 
 
 def flying(n_worlds=1, n_drones=1, height=500.0, **kwargs):
-    options = {"drone": "bumblebee", "control": "rotor_vel", "engine": "lanes"} | kwargs
+    options = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "strict": True} | kwargs
     sim = Sim(n_worlds, n_drones, **options)
     sim.data = with_states(sim.data, pos=np.asarray(sim.data.states.pos) + [0, 0, height])
     return sim
