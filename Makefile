@@ -18,7 +18,7 @@ demo: $(VENV)/installed
 	$(RUN) -m crazysim demo
 
 test: $(VENV)/installed
-	$(RUN) -m pytest -n 2 --dist loadgroup $(TESTS)
+	$(RUN) -m pytest -n 2 --dist loadgroup --no-loadscope-reorder $(TESTS)
 
 # Physics, control, geometry, data, and the engine on its interpreter: what compiles little.
 FAST = tests/control tests/dynamics tests/drones tests/geometry tests/core/test_data.py tests/core/test_pipeline.py \
@@ -28,7 +28,7 @@ FAST = tests/control tests/dynamics tests/drones tests/geometry tests/core/test_
   tests/test_rotation.py tests/test_prose.py tests/test_package.py
 
 test-fast: $(VENV)/installed
-	$(RUN) -m pytest -n 2 --dist loadgroup $(FAST)
+	$(RUN) -m pytest -n 2 --dist loadgroup --no-loadscope-reorder $(FAST)
 
 check: $(VENV)/installed
 	$(VENV)/bin/ruff format --check .

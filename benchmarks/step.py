@@ -4,7 +4,7 @@
 
 Engines alternate. ``compile_s`` of ``fused`` includes the kernel only the first time that a process needs it;
 ``scaling.py`` runs each size in its own process. Other scripts: ``compile.py``, ``scaling.py``,
-``limits.py``, ``versus_crazyflow.py``.
+``limits.py``, ``flight_stack.py``, ``versus_crazyflow.py``.
 """
 
 from __future__ import annotations

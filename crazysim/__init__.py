@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from crazysim.control import Control
+from crazysim.control import Control, Controller
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.plugin import Placement, Plugin, parameter
@@ -23,17 +23,22 @@ if TYPE_CHECKING:
     from crazysim.scene.contact_log import ContactLog
     from crazysim.scene.range_finder import RangeFinder
     from crazysim.scene.response import ContactResponse
+    from crazysim.sim.mppi import MPPI
+    from crazysim.trajectories import Follow
 
 __all__ = [
+    "MPPI",
     "Airframe",
     "Battery",
     "ConfigError",
     "ContactLog",
     "ContactResponse",
     "Control",
+    "Controller",
     "Downwash",
     "Drone",
     "Dynamics",
+    "Follow",
     "GroundEffect",
     "Hook",
     "Integrator",
@@ -62,7 +67,9 @@ __getattr__ = lazy(
     {
         "ContactLog": "crazysim.scene.contact_log",
         "ContactResponse": "crazysim.scene.response",
+        "Follow": "crazysim.trajectories",
         "Hook": "crazysim.payloads",
+        "MPPI": "crazysim.sim.mppi",
         "SharedLoad": "crazysim.payloads",
         "SlungLoad": "crazysim.payloads",
         "RangeFinder": "crazysim.scene.range_finder",

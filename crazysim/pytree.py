@@ -203,3 +203,8 @@ def as_parameter(value: Any) -> Any:
     It is a NumPy array, which needs no compilation; the simulation moves it to its device with the other data.
     """
     return np.atleast_1d(np.asarray(value, floating()))
+
+
+def of_host(value: Any, *shape: int, dtype: Any = None) -> Any:
+    """Return a value broadcast to a shape as a NumPy array, of floating dtype by default; it needs no compilation."""
+    return np.array(np.broadcast_to(value, shape), dtype or floating())

@@ -226,6 +226,21 @@ def yaw(q: Array) -> Array:
     return safe_arctan2(2 * (x * y + w * z), x * x + w * w - y * y - z * z)
 
 
+def heading(q: Array) -> tuple[Array, Array]:
+    """Return the horizontal unit vectors along the yaw of a quaternion of any length, and to the left. (..., 3) each
+
+    They need no angle. Those of yaw zero are returned for a quaternion shorter than 1e-6.
+    """
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    along = jnp.stack([x * x + w * w - y * y - z * z, 2 * (x * y + w * z)], axis=-1)
+    square = dot(along, along)
+    is_zero = square < 1e-24  # the gradient divides by its power 3/2
+    inverse = 1 / jnp.sqrt(jnp.where(is_zero, 1.0, square))
+    along = jnp.where(is_zero, jnp.asarray([1.0, 0.0], q.dtype), along * inverse)
+    cos, sin, zero = along[..., 0], along[..., 1], jnp.zeros_like(x)
+    return jnp.stack([cos, sin, zero], axis=-1), jnp.stack([-sin, cos, zero], axis=-1)
+
+
 def from_axes(x: Array, y: Array, z: Array) -> Array:
     """Return roll, pitch, yaw of the frame with these orthonormal axes in the world frame, rad. (..., 3)"""
     cos_pitch = safe_norm(jnp.stack([x[..., 0], x[..., 1]], axis=-1))[..., 0]

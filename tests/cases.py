@@ -10,7 +10,8 @@ from hypothesis.extra.numpy import arrays
 
 from crazysim import Sim, load_airframe
 from crazysim.core import functional as F
-from crazysim.core.data import SimControls, create_params
+from crazysim.core.controls import SimControls
+from crazysim.core.data import create_params
 from crazysim.dynamics import first_principles
 
 FITTED = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")

@@ -1,5 +1,6 @@
 """Shared by all tests: two host devices, a persistent compilation cache, and simulations built once."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -9,6 +10,8 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 # XLA logs an error of 3,000 characters for every program from the cache that could use another vector width.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ.update(compiling.environment(os.environ))
+# A program's operations do not carry the lines of Python that made them: writing it takes less time.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
 import jax
 import numpy as np
@@ -19,10 +22,10 @@ from crazysim.engine import cuda
 
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
 
-# What was compiled once, in any worker or run, is kept.
+# What was compiled once, in any worker or run, is kept, small programs too: reading takes half the time of compiling.
 CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 # Compilation inside an example must not count as slowness, and CI must not depend on luck.
@@ -30,6 +33,39 @@ settings.register_profile(
     "crazysim", deadline=None, derandomize=True, max_examples=30, suppress_health_check=list(HealthCheck)
 )
 settings.load_profile("crazysim")
+
+
+LONGEST = ("engine/test_step.py", "scene/test_response.py", "train/test_run.py", "envs", "laws", "engine", "scene")
+"""Files and folders that take longest, first."""
+SEPARATE = "docs"
+"""Folder whose tests share nothing and go last, one by one, to the worker that has no more to do."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Let one worker run what is in one file, which shares simulations and programs, and the longest files first."""
+
+    def path(item):
+        return item.path.relative_to(Path(__file__).parent).as_posix()
+
+    def rank(item):
+        first = next((i for i, name in enumerate(LONGEST) if path(item).startswith(name)), len(LONGEST))
+        return first + path(item).startswith(SEPARATE)
+
+    for item in items:
+        if not path(item).startswith(SEPARATE) and item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(path(item)))
+    items.sort(key=rank)
+
+
+def pytest_collection_finish():
+    """Look for cyclic garbage seldom: tracing makes millions of objects, and a quarter of the time went into looking.
+
+    What is imported by now stays.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 100)
 
 
 @pytest.hookimpl(hookwrapper=True)

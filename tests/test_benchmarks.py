@@ -223,3 +223,11 @@ def test_controllers_are_compared_on_the_same_flights(run):
     assert lines[0]["tracking_rms"] < 0.02
     assert lines[0]["pushed_after"] == pytest.approx(0.289, abs=0.02)
     assert lines[0]["steps_per_s"] > 0
+
+
+def test_the_flight_stack_is_timed_against_its_references(run):
+    lines = run("flight_stack.py", "--worlds", "4", "--cases", "geometric", "rod", "--repeats", "1", "--operations")
+    assert [(line["case"], line["reference"]) for line in lines] == [
+        ("state", "state"), ("rotor", "rotor"), ("geometric", "state"), ("rod", "rotor")
+    ]  # fmt: skip
+    assert all(line["ratio"] > 0 and line["operations"]["mul"] > 0 for line in lines)

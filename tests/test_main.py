@@ -52,6 +52,23 @@ def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
     assert np.mean(np.abs(frames[-1].astype(float) - frames[0])) > 1, "nothing moves in the film"
 
 
+def test_pick_and_place_succeeds_in_every_world(tmp_path, capsys):
+    """From random places of the loads: all are set down within millimetres, and carried within 3 cm RMS."""
+    assert main(["demo", "pick", "--worlds", "3", "--no-film", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    for word in ("engine: fused", "picked up         3 of 3", "placed            3 of 3", "steps per second"):
+        assert word in out
+    assert float(out.split("distance")[1].split("cm")[0]) < 0.5
+    assert float(out.split("tracking error")[1].split("cm")[0]) < 3
+    flown = Flight.load(tmp_path / "flight.npz")
+    assert flown.pos.shape == (625, 1, 1, 3)
+    away = np.linalg.norm(flown.body_pos[:, 0] - [1.2, 1.2, 0.04], axis=-1)
+    load = np.argmin(away[-1])
+    assert away[-1, load] < 5e-3
+    from_middle = np.linalg.norm(flown.body_pos[0, 0, load] - [-1.2, -1.2, 0.04])
+    assert 0.01 < from_middle < 0.18, "it starts at a random place on the other pad"
+
+
 def test_without_opengl_the_demo_says_so_and_does_the_rest(tmp_path, capsys, monkeypatch):
     def no_picture(*args, **kwargs):
         raise flight.RenderError("no OpenGL context could be made")

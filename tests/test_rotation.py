@@ -109,6 +109,25 @@ def test_yaw_is_that_of_to_rpy_for_any_length(q, scale):
     assert abs(np.angle(np.exp(1j * difference))) < 1e-12
 
 
+@given(q=unit_quats, scale=st.floats(1e-3, 1e3))
+def test_heading_is_along_the_yaw(q, scale):
+    q = jnp.asarray(q * scale)
+    yaw = rot.yaw(q)
+    x, y, z, w = q / scale
+    assume(np.hypot(x * x + w * w - y * y - z * z, 2 * (x * y + w * z)) > 1e-3)  # it has a heading
+    ahead, left = rot.heading(q)
+    np.testing.assert_allclose(ahead, [np.cos(yaw), np.sin(yaw), 0], atol=1e-12)
+    np.testing.assert_allclose(left, [-np.sin(yaw), np.cos(yaw), 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-30, 1e-12, 2e-6, 1.0])
+def test_law_07_heading_has_finite_gradients(length):
+    q = jnp.asarray(length * np.array([0.1, -0.2, 0.3, 0.9]), jnp.float32)
+    assert np.all(np.isfinite(jax.jacobian(lambda q: rot.heading(q)[0])(q)))
+    if length < 1e-6:
+        np.testing.assert_array_equal(rot.heading(q)[0], [1, 0, 0])
+
+
 def test_yaw_of_the_zero_quaternion_is_zero():
     assert rot.yaw(jnp.zeros(4)) == 0
     np.testing.assert_array_equal(jax.grad(rot.yaw)(jnp.zeros(4)), np.zeros(4))

@@ -1,5 +1,7 @@
 """Controllers: pure functions for one drone, with any leading axes, and the protocol of ``Sim(controller=...)``."""
 
+from typing import TYPE_CHECKING
+
 from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
 from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque
 from crazysim.control.core import COMMAND_FIELDS, Control, command_size
@@ -10,23 +12,62 @@ from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.control.state import StateParams, state2attitude
 from crazysim.control.switch import Switch
+from crazysim.lazy import lazy
+
+if TYPE_CHECKING:
+    from crazysim.control.geometric import Geometric, geometric_control
+    from crazysim.control.indi import INDI, indi_control
+    from crazysim.control.load_lqr import LoadLQR, load_lqr_control
+    from crazysim.control.lqr import LQR, lqr_control
+    from crazysim.control.tracking_lqr import TrackingLQR, tracking_lqr_control
 
 __all__ = [
     "COMMAND_FIELDS",
+    "INDI",
+    "LQR",
     "PID",
     "AllocationParams",
     "AttitudeParams",
     "Control",
     "Controller",
+    "Geometric",
+    "LoadLQR",
     "Mellinger",
     "Setpoint",
     "StateParams",
     "Switch",
+    "TrackingLQR",
     "attitude2force_torque",
     "body_rate2force_torque",
     "command_size",
     "force_torque2rotor_vel",
+    "geometric_control",
+    "indi_control",
     "load_fn_params",
+    "load_lqr_control",
     "load_params",
+    "lqr_control",
     "state2attitude",
+    "tracking_lqr_control",
 ]
+
+__getattr__ = lazy(
+    __name__,
+    {
+        "Geometric": "crazysim.control.geometric",
+        "INDI": "crazysim.control.indi",
+        "LQR": "crazysim.control.lqr",
+        "LoadLQR": "crazysim.control.load_lqr",
+        "TrackingLQR": "crazysim.control.tracking_lqr",
+        "geometric_control": "crazysim.control.geometric",
+        "indi_control": "crazysim.control.indi",
+        "load_lqr_control": "crazysim.control.load_lqr",
+        "lqr_control": "crazysim.control.lqr",
+        "tracking_lqr_control": "crazysim.control.tracking_lqr",
+    },
+)
+
+
+def __dir__() -> list[str]:
+    """Return the public names, those not yet imported included."""
+    return __all__

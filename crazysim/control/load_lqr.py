@@ -257,7 +257,8 @@ class LoadLQR(Controller):
     target: Target = "load"
     """Body that setpoints describe."""
     load: str = "load"
-    """Name of the plugin of the load, whose record has ``pos`` and ``vel`` of the load."""
+    """Name of the plugin of the load, whose record has ``tip_pos`` and ``tip_vel`` of a hook, or else ``pos`` and
+    ``vel`` of the load."""
     Q: Any = None
     """Weights of the states, as for ``LoadLQRParams.create``."""
     R: Any = None
@@ -276,7 +277,9 @@ class LoadLQR(Controller):
     ) -> tuple[Array, LoadLQRMemory]:
         """Return the wrench."""
         s, load = data.states, data.plugins[self.load]
-        offset, rate = load.pos - s.pos, load.vel - s.vel
+        # An empty hook swings too, and its load stands elsewhere.
+        tip_pos, tip_vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
+        offset, rate = tip_pos - s.pos, tip_vel - s.vel
         distance = jnp.maximum(rotation.safe_norm(offset), 1e-3)
         direction = offset / distance
         turning = (rate - dot(direction, rate) * direction) / distance

@@ -1,4 +1,4 @@
-"""PID cascade of the Crazyflie firmware: position, velocity, attitude and body rates."""
+"""Controller ``"pid"``: the PID cascade of the Crazyflie firmware at each of its command levels."""
 
 from __future__ import annotations
 
@@ -11,165 +11,25 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.core import Control
-from crazysim.control.pid_loop import Loop, LoopMemory, continued, pid_step
-from crazysim.control.power_distribution import (
-    PowerDistributionParams,
-    command_of_rotor_vel,
-    distribute,
-    pwm_of_thrust,
-    rotor_vel_of_pwm,
+from crazysim.control.pid_cascade import (
+    THRUST_SCALE,
+    PIDMemory,
+    PIDParams,
+    along_heading,
+    attitude_of_velocity,
+    heading_of,
+    rates_of_attitude,
+    torque_of_rates,
+    velocity_of_position,
+    wrapped_angle,
 )
+from crazysim.control.pid_loop import LoopMemory, continued, pid_step
+from crazysim.control.power_distribution import command_of_rotor_vel, distribute, pwm_of_thrust, rotor_vel_of_pwm
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import safe_clip
 
 DEGREES = 180 / np.pi
-THRUST_SCALE = 1000.0
-"""PWM per unit of the vertical velocity loop's output (``thrustScale``)."""
-TORQUE_MAX = 32767.0
-"""Limit of the outputs of the rate loops, PWM (``saturateSignedInt16``)."""
-
-
-class PIDParams(PyTree):
-    """Gains and limits of the cascade, each shared or one per drone. Angles are in degrees, as in the firmware."""
-
-    position: Loop
-    """Position loop, along and across the present yaw, m to m/s."""
-    velocity: Loop
-    """Velocity loop, along and across the present yaw: m/s to pitch and roll, degrees, and thrust, 1000 PWM."""
-    attitude: Loop
-    """Attitude loop, degrees to degrees/s."""
-    rate: Loop
-    """Rate loop, degrees/s to PWM."""
-    tilt_max: Array = leaf("parameter", 1)
-    """Limits of the desired roll and pitch, degrees. (2,)"""
-    thrust_base: Array = leaf("parameter", 1, (1,))
-    """Thrust that the velocity loop adds to, about that of hover, PWM. (1,)"""
-    thrust_min: Array = leaf("parameter", 1, (1,))
-    """Minimum thrust of the velocity loop, PWM. (1,)"""
-    motors: PowerDistributionParams
-    """Power distribution."""
-
-    @staticmethod
-    def create(airframe: Airframe, outer_freq: int, freq: int) -> PIDParams:
-        """Return the shared parameters of an airframe for the rates of the loops, Hz.
-
-        Raises:
-            ConfigError: If the airframe has no tables for this controller.
-        """
-        return PIDParams(
-            position=Loop.create(airframe, "pid.position", outer_freq),
-            velocity=Loop.create(airframe, "pid.velocity", outer_freq),
-            attitude=Loop.create(airframe, "pid.attitude", freq),
-            rate=Loop.create(airframe, "pid.rate", freq),
-            tilt_max=as_parameter(airframe.value("pid.tilt_max", (2,))),
-            thrust_base=as_parameter(airframe.value("pid.thrust_base", ())),
-            thrust_min=as_parameter(airframe.value("pid.thrust_min", ())),
-            motors=PowerDistributionParams.create(airframe),
-        )
-
-
-class PIDMemory(PyTree):
-    """Memory of the cascade."""
-
-    position: LoopMemory
-    """Position loop."""
-    velocity: LoopMemory
-    """Velocity loop."""
-    attitude: LoopMemory
-    """Attitude loop."""
-    rate: LoopMemory
-    """Rate loop."""
-    rpy_des: Array = leaf("drone", 1)
-    """Desired roll, pitch, yaw, degrees. (n_worlds, n_drones, 3)"""
-    thrust: Array = leaf("drone", 1)
-    """Desired thrust, PWM. (n_worlds, n_drones, 1)"""
-    started: Array = leaf("drone", 1)
-    """True from the first tick on. (n_worlds, n_drones, 1)"""
-
-    @staticmethod
-    def at_rest(params: PIDParams) -> PIDMemory:
-        """Return the memory of one drone before the first tick."""
-        p, rest = params, LoopMemory.at_rest
-        zeros: Any = np.zeros(3)
-        loops = {name: rest(getattr(p, name)) for name in ("position", "velocity", "attitude", "rate")}
-        return PIDMemory(**loops, rpy_des=zeros, thrust=zeros[:1], started=zeros[:1] > 0)
-
-
-def velocity_of_position(
-    pos: Array, heading: Array, pos_des: Array, memory: LoopMemory, freq: float, *, loop: Loop
-) -> tuple[Array, LoopMemory]:
-    """Return the desired velocity, along and across the heading and up, and the memory: the position loop.
-
-    Args:
-        pos: Position, world frame, m. (..., 3)
-        heading: Cosine and sine of the yaw. (..., 2)
-        pos_des: Desired position, world frame, m. (..., 3)
-        memory: Memory of the loop.
-        freq: Rate of this loop, Hz.
-        loop: Gains and limits.
-
-    Returns:
-        Desired velocity, m/s (..., 3); the memory.
-    """
-    error = along_heading(heading, pos_des - pos)
-    return pid_step(error, along_heading(heading, pos), memory, freq, loop=loop)
-
-
-def attitude_of_velocity(
-    vel: Array, heading: Array, vel_des: Array, memory: LoopMemory, freq: float, *, params: PIDParams
-) -> tuple[Array, Array, LoopMemory]:
-    """Return the desired roll, pitch and thrust, and the memory: the velocity loop.
-
-    Args:
-        vel: Velocity, world frame, m/s. (..., 3)
-        heading: Cosine and sine of the yaw. (..., 2)
-        vel_des: Desired velocity along and across the heading and up, m/s. (..., 3)
-        memory: Memory of the loop.
-        freq: Rate of this loop, Hz.
-        params: Gains and limits of the cascade.
-
-    Returns:
-        Desired roll and pitch, degrees (..., 2); thrust of each motor, PWM (..., 1); the memory.
-    """
-    p, measured = params, along_heading(heading, vel)
-    out, memory = pid_step(vel_des - measured, measured, memory, freq, loop=p.velocity)
-    tilt = jnp.stack([-out[..., 1], out[..., 0]], axis=-1)
-    thrust = safe_clip(THRUST_SCALE * out[..., 2:] + p.thrust_base, p.thrust_min, p.motors.pwm_max)
-    return safe_clip(tilt, -p.tilt_max, p.tilt_max), thrust, memory
-
-
-def rates_of_attitude(
-    rpy: Array, rpy_des: Array, memory: LoopMemory, freq: float, *, loop: Loop
-) -> tuple[Array, LoopMemory]:
-    """Return the desired body rates, degrees/s, and the memory: the attitude loop, on Euler angles.
-
-    Args:
-        rpy: Roll, pitch, yaw, degrees. (..., 3)
-        rpy_des: Desired roll, pitch, yaw, degrees. (..., 3)
-        memory: Memory of the loop.
-        freq: Rate of this loop, Hz.
-        loop: Gains and limits.
-    """
-    return pid_step(rpy_des - rpy, rpy, memory, freq, loop=loop, wrapped=(False, False, True))
-
-
-def torque_of_rates(
-    ang_vel: Array, ang_vel_des: Array, memory: LoopMemory, freq: float, *, loop: Loop
-) -> tuple[Array, LoopMemory]:
-    """Return the torque that follows body rates, PWM, and the memory: the rate loop.
-
-    Args:
-        ang_vel: Angular velocity, body frame, degrees/s. (..., 3)
-        ang_vel_des: Desired angular velocity, body frame, degrees/s. (..., 3)
-        memory: Memory of the loop.
-        freq: Rate of this loop, Hz.
-        loop: Gains and limits.
-    """
-    torque, memory = pid_step(ang_vel_des - ang_vel, ang_vel, memory, freq, loop=loop)
-    return safe_clip(torque, -TORQUE_MAX, TORQUE_MAX), memory
 
 
 class PID(Controller):
@@ -281,29 +141,6 @@ class PID(Controller):
         if by_rate:
             ang_vel_des = jnp.concatenate([DEGREES * command[:2], ang_vel_des[2:]])  # type: ignore[index]
         return rpy_des, attitude, ang_vel_des
-
-
-def along_heading(heading: Array, vector: Array) -> Array:
-    """Return a world vector along the heading, across it to the left, and up. (..., 3)
-
-    Args:
-        heading: Cosine and sine of the yaw. (..., 2)
-        vector: Vector, world frame. (..., 3)
-    """
-    cos, sin, x, y = heading[..., 0], heading[..., 1], vector[..., 0], vector[..., 1]
-    return jnp.stack([x * cos + y * sin, y * cos - x * sin, vector[..., 2]], axis=-1)
-
-
-def heading_of(quat: Array) -> Array:
-    """Return cosine and sine of the yaw of an attitude; one and zero where it points straight up or down. (..., 2)"""
-    x, y, z, w = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
-    ahead = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1)
-    return rotation.safe_normalize(ahead, jnp.asarray([1.0, 0.0], quat.dtype))
-
-
-def wrapped_angle(angle: Array) -> Array:
-    """Return the angles between -180 and 180 degrees. (...)"""
-    return angle - 360.0 * jnp.round(angle / 360.0)
 
 
 def _reset_at_zero_thrust(memory: PIDMemory, rpy: Array, pos: Array) -> PIDMemory:

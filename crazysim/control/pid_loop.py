@@ -62,11 +62,11 @@ class Loop(PyTree):
 class LoopMemory(PyTree):
     """Memory of three PID loops; None where the loops have no such part."""
 
-    integral: Array | None = leaf("drone", 1)
+    integral: Any = leaf("drone", 1)
     """Integrals of the error, input s. (n_worlds, n_drones, 3)"""
-    measured: Array | None = leaf("drone", 1)
+    measured: Any = leaf("drone", 1)
     """Measured values at the last tick. (n_worlds, n_drones, 3)"""
-    delays: Array | None = leaf("drone", 2)
+    delays: Any = leaf("drone", 2)
     """The two last internal values of the filter of the derivative. (n_worlds, n_drones, 2, 3)"""
 
     @staticmethod

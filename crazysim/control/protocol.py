@@ -75,7 +75,8 @@ class Controller:
         """Return the command of the level ``output``, and the memory after a tick.
 
         Args:
-            data: ``SimData`` of one drone, with the command in force in ``data.controls``.
+            data: ``SimData`` of one drone, with the command in force in ``data.controls``; body rates of a state
+                command, which a ``Setpoint`` lacks, are ``data.controls.state.cmd[13:16]``.
             command: Setpoint at the level ``state``; otherwise the command of the level ``data.controls.mode``. (4,)
             memory: Memory of the drone.
             params: Parameters of the drone.

@@ -10,7 +10,11 @@ from crazysim.pytree import PyTree, leaf
 
 
 class Setpoint(PyTree):
-    """Desired motion of one drone at one instant, with any leading axes: position, yaw and derivatives, world frame."""
+    """Desired motion of one drone at one instant, with any leading axes: position, yaw and derivatives, world frame.
+
+    It has no body rates: they follow from the derivatives (``flatness.attitude_of_thrust``). A controller that follows
+    the body rates of a state command reads them from the command in force, ``data.controls.state.cmd[13:16]``.
+    """
 
     pos: Array = leaf("drone", 1)
     """Position, world frame, m. (..., 3)"""

@@ -83,9 +83,7 @@ def state2attitude(
     pos_err_i = rotation.safe_clip(pos_err_i + pos_err / ctrl_freq, -p.int_err_max, p.int_err_max)
     force = p.mass * (cmd[..., 6:9] - p.gravity_vec) + p.kp * pos_err + p.kd * vel_err + p.ki * pos_err_i
 
-    yaw = rotation.yaw(cmd[..., 9:13])
-    cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
-    ahead, left = jnp.stack([cos, sin, zero], axis=-1), jnp.stack([-sin, cos, zero], axis=-1)
+    ahead, left = rotation.heading(cmd[..., 9:13])
     z_axis = rotation.safe_normalize(force, jnp.asarray([0.0, 0.0, 1.0], force.dtype))
     y_axis = rotation.safe_normalize(rotation.cross(z_axis, ahead), left)
     rpy = rotation.from_axes(rotation.cross(y_axis, z_axis), y_axis, z_axis)

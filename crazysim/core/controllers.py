@@ -29,7 +29,8 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
     def outer(data: SimData) -> SimData:
         data = taken_over(data)
         own = data.controls.controller
-        memory = controller.outer(data, command_in_force(data), own.memory, own.params)
+        setpoint: Any = command_in_force(data)
+        memory = controller.outer(data, setpoint, own.memory, own.params)
         return data.replace(controls=data.controls.replace(controller=own.replace(memory=memory)))
 
     def inner(data: SimData) -> SimData:

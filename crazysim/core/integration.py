@@ -143,11 +143,11 @@ class Integration:
         constraining = [plugin for plugin in self.plugins if plugin.constrains]
         if not constraining:
             return deriv
-        dt = None if self.method is rk4 else 1 / data.core.freq
+        dt = 1 / data.core.freq
         if self.method is symplectic_euler:
             vel, ang_vel = deriv.vel + dt * deriv.acc, deriv.ang_vel + dt * deriv.ang_acc
             deriv = deriv.replace(vel=vel, ang_vel=ang_vel)
-        return constrained(constraining[0], seen, deriv, dt)
+        return constrained(constraining[0], seen, deriv, None if self.method is rk4 else dt)
 
     def _free(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
         """Return the data under all influences, and the derivative without constraints."""

@@ -215,9 +215,19 @@ class Plugin:
     def place(self, data: SimData) -> Objects:
         """Return ``data.objects`` with the plugin's objects of the scene at their poses; for the data of one world.
 
-        It is called when the scene is read, not in the step.
+        It is called when the scene is read, and by queries of the scene within a step.
         """
         return data.objects  # type: ignore[return-value]
+
+    @property
+    def placed_kinds(self) -> tuple[str, ...] | None:
+        """Names of the objects that ``place`` moves, without their numbers; None for any object that can move."""
+        return None
+
+    @property
+    def places(self) -> bool:
+        """True if the plugin puts objects of the scene at their poses by ``place``."""
+        return type(self).place is not Plugin.place
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return named measurements of one drone. (k,) each"""

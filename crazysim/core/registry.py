@@ -147,7 +147,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def placed(self, data: SimData) -> SimData:
         """Return the data with the plugins' objects of the scene at their poses."""
         for name, plugin in self.items():
-            if type(plugin).place is not Plugin.place and data.objects is not None:
+            if plugin.places and data.objects is not None:
                 if self._placing.get(name, (None, None))[0] is not plugin:
                     self._placing[name] = plugin, jax.jit(over_worlds(plugin.place))
                 data = data.replace(objects=self._placing[name][1](data))

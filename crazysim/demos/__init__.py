@@ -7,5 +7,6 @@ prints figures and writes files into the folder ``out``.
 DEMOS = {
     "flight": "fly figure eights around poles in many worlds; print figures, write a plot and a film",
     "load": "carry a swinging load on a hook in hover; print how it comes to rest, write a film",
+    "pick": "pick up a load, carry it along a figure eight, set it down on a pad; print how many succeed, write a film",
 }
 """Names of the demonstrations, and what they show."""

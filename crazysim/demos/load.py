@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from crazysim.control.load_lqr import LoadLQR
+from crazysim.control import LoadLQR
 from crazysim.errors import RenderError
 from crazysim.media import Film, View
 from crazysim.payloads import Hook

@@ -25,7 +25,8 @@ WORTH = 8.0
 4 to 16 gave the fastest steps on one core of a CPU; larger values compile sooner."""
 
 MOVES = frozenset(
-    "broadcast_in_dim concatenate convert_element_type copy reshape rev slice split squeeze stack transpose".split()
+    "broadcast_in_dim concatenate convert_element_type copy reshape rev slice split squeeze stack transpose "
+    "unstack".split()
 )
 """Fused primitives without arithmetic."""
 

@@ -36,7 +36,7 @@ def build_program(
         rows: From the leaves that are written to those that are stored as rows of one number of all drones each.
     """
     program = lower_stages(stages, data, zeros, watched, first, last, scratch)
-    then: list[passes.Pass] = [passes.fuse, passes.hoist, pack_shared]
+    then: list[passes.Pass] = [passes.fuse, passes.join_ticks, passes.hoist, pack_shared]
     if rows is not None:
         stored = functools.partial(as_rows, select=rows)
         then.append(functools.update_wrapper(stored, as_rows))

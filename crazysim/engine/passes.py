@@ -82,6 +82,42 @@ def _joined(segments: list[Segment]) -> Segment:
     return Segment(segments[0].scope, stages, segments[0].phase, block, reads, tuple(writes))
 
 
+def join_ticks(program: Program) -> Program:
+    """Join neighbouring stages that run at the same ticks.
+
+    What one stage writes and the next reads is then not selected between old and new first, and a constant stays one.
+    """
+    segments = [
+        dataclasses.replace(s, block=_with_joined_ticks(s.block)) if isinstance(s, Segment) else s
+        for s in program.segments
+    ]
+    return dataclasses.replace(program, segments=tuple(segments))
+
+
+def _with_joined_ticks(block: Block) -> Block:
+    operations: list[Operation] = []
+    for op in block.operations:
+        last = next((i for i in reversed(range(len(operations))) if operations[i].name != "barrier"), None)
+        if last is not None and op.name == operations[last].name == "when" and op.args[0] is operations[last].args[0]:
+            operations[last:] = [_joined_ticks(operations[last], op)]
+        else:
+            operations.append(op)
+    return dataclasses.replace(block, operations=tuple(operations))
+
+
+def _joined_ticks(first: Operation, second: Operation) -> Operation:
+    """Return one ``when`` that does what two under the same condition do."""
+    builder = Builder(stage=first.stage)
+    new = inline(builder, first.blocks[0], {})
+    builder.barrier()
+    builder.stage = second.stage
+    new += inline(builder, second.blocks[0], dict(zip(first.results, new, strict=True)))
+    before = dict(zip(first.results, first.args[1:], strict=True))
+    old = [before.get(x, x) if isinstance(x, Value) else x for x in second.args[1:]]
+    args, results = (*first.args, *old), (*first.results, *second.results)
+    return first._replace(args=args, results=results, blocks=(prune(builder.finish(new)),))
+
+
 SPAN = 40
 """Operations between two barriers of ``separate``. Of 20, 30, 40, 60, 80 and 150, 20 to 40 gave the fastest gradients
 on two cores with jax 0.11.2; smaller numbers take longer to compile."""

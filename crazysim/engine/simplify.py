@@ -43,7 +43,7 @@ def simplify(name: str, args: tuple[Element, ...], dtype: np.dtype, params: tupl
         simple = _without_zero_terms(name, args, dtype)
         if simple is not None:
             return simple
-    if n_known == len(args):
+    if n_known == len(args) and TABLE[name].exact:
         return fold(name, args, dtype, params)
     match name:
         case "add" if n_known:
@@ -59,6 +59,10 @@ def simplify(name: str, args: tuple[Element, ...], dtype: np.dtype, params: tupl
         case "and" | "or" if n_known and dtype.kind == "b":
             known, other = args if isinstance(args[0], np.generic) else args[::-1]
             return other if bool(known) == (name == "and") else known
+        case "sin" | "cos" if n_known and _equals(args[0], 0):  # exact everywhere, as other values are not
+            return dtype.type(name == "cos")
+        case "atan2" if n_known == 2 and _equals(args[0], 0) and args[1] > 0:
+            return args[0]
         case "select_n":
             return _select(*args)
         case "convert_element_type" | "bitcast_convert_type" if args[0].dtype == dtype:

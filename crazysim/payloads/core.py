@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,6 +21,12 @@ CABLE_SEGMENTS = 8
 """Straight pieces by which a cable is drawn."""
 LINK_RADIUS = 0.004
 """Radius of a drawn rod or cable, m."""
+WIRE_RADIUS, HOOK_RADIUS = 0.003, 0.0045
+"""Radii of the wires by which a drawn load hangs, and of a drawn hook, m."""
+HOOK_OUTLINE = ((0, -0.045), (-0.02, -0.025), (-0.014, -0.004), (0, 0.003), (0.014, -0.004), (0.02, -0.02))
+"""Drawn shape of a hook: x, and z towards the load from the hook's position, m."""
+DARK, STEEL, YELLOW = (0.15, 0.15, 0.15, 1.0), (0.35, 0.35, 0.4, 1.0), (0.95, 0.75, 0.1, 1.0)
+"""Colours of rods, wires and hooks."""
 
 
 class LoadData(Exposed):
@@ -127,7 +134,16 @@ def load_vel(data: SimData, name: str = "load") -> Array:
 # Scene ------------------------------------------------------------------------------------------------------
 
 
-def add_to_scene(sim: Simulation, name: str, size: Any, rgba: Any, length: float, n_loads: int, n_pieces: int) -> None:
+def add_to_scene(
+    sim: Simulation,
+    name: str,
+    size: Any,
+    rgba: Any,
+    length: float,
+    n_loads: int,
+    n_pieces: int,
+    ring: float | None = None,
+) -> None:
     """Add the loads and links of a plugin to the scene, if they are not there yet.
 
     Args:
@@ -138,18 +154,36 @@ def add_to_scene(sim: Simulation, name: str, size: Any, rgba: Any, length: float
         length: Length of a link, m.
         n_loads: Number of loads in a world; there is a link for each drone.
         n_pieces: Straight pieces of each.
+        ring: Height of the loads' rings above their middles, m, for links that end in a hook; None for others.
     """
     objects = sim.data.objects
     if objects is not None and f"{name}:0" in objects.names:
         return
     rgba = (0.85, 0.55, 0.2, 1.0) if rgba is None else rgba
-    if np.ndim(size) == 0:
-        sim.scene.add("sphere", name, count=n_loads, radius=float(size), rgba=rgba)
-    else:
-        sim.scene.add("box", name, count=n_loads, size=tuple(map(float, size)), rgba=rgba)
-    piece = f"""<mujoco><worldbody><geom type="capsule" size="{LINK_RADIUS} {length / n_pieces / 2}"
-      contype="0" conaffinity="0" rgba="0.15 0.15 0.15 1"/></worldbody></mujoco>"""
-    sim.scene.add(piece, f"{name}_link", count=sim.n_drones * n_pieces)
+    half = np.full(3, float(size)) if np.ndim(size) == 0 else np.asarray(size, float) / 2
+    kind = "sphere" if np.ndim(size) == 0 else "box"
+    body = f'<geom type="{kind}" size="{_numbers(half)}" contype="0" conaffinity="2" rgba="{_numbers(rgba)}"/>'
+    shank = 0.0 if ring is None else HOOK_OUTLINE[0][1]
+    link = _rod((0, 0, -length / n_pieces / 2), (0, 0, length / n_pieces / 2 + shank), LINK_RADIUS, DARK)
+    if ring is not None:
+        ends = [(side * half[0], 0, 0 if kind == "sphere" else half[2]) for side in (-1, 1)]
+        body += "".join(_rod(end, (0, 0, ring), WIRE_RADIUS, STEEL) for end in ends)
+        link += "".join(
+            _rod((x, 0, length / 2 + z), (x_2, 0, length / 2 + z_2), HOOK_RADIUS, YELLOW)
+            for (x, z), (x_2, z_2) in pairwise(HOOK_OUTLINE)
+        )
+    for text, kind, count in ((body, name, n_loads), (link, f"{name}_link", sim.n_drones * n_pieces)):
+        sim.scene.add(f"<mujoco><worldbody>{text}</worldbody></mujoco>", kind, count=count)
+
+
+def _rod(start: Any, end: Any, radius: float, rgba: Any) -> str:
+    """Return MJCF of a rod that touches nothing."""
+    ends = f"{_numbers(start)} {_numbers(end)}"
+    return f'<geom type="capsule" fromto="{ends}" size="{radius}" contype="0" conaffinity="0" rgba="{_numbers(rgba)}"/>'
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{float(value):.9g}" for value in values)
 
 
 def placed(objects: Objects, rows: dict[str, tuple[Array, Array]]) -> Objects:

@@ -13,9 +13,11 @@ from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
-from crazysim.payloads.core import LoadData, air_and_gravity, hanging, on_floor
+from crazysim.geometry import Shape
+from crazysim.payloads.body import Colliding, LoadBody, rest_height, shape_of
+from crazysim.payloads.core import LoadData, air_and_gravity, hanging, on_floor, turned_z
 from crazysim.payloads.link import TINY, Link, couple, end_relative_motion
-from crazysim.payloads.slung import load_record, place_loads, rest_height
+from crazysim.payloads.slung import load_record, place_loads, upward
 from crazysim.pytree import leaf, select_worlds
 from crazysim.rotation import dot
 
@@ -37,7 +39,7 @@ class HookData(LoadData):
     """Speed of the hook relative to the ring below which it picks up, m/s. (1,)"""
 
 
-class Hook(Plugin):
+class Hook(Colliding, Plugin):
     """A hook on a rigid rod, with one load for each drone.
 
     With two degrees of freedom the rod swings freely. With one it turns about the body's y axis, and passes roll and
@@ -97,7 +99,7 @@ class Hook(Plugin):
         """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
         if self.dof not in (1, 2):
             raise ConfigError(f"expected dof as 1 or 2, got {self.dof!r}")
-        load = load_record(self, sim, False, rest_height(self.size) + self.ring)
+        load = load_record(self, sim, False, rest_height(self.size) + self.ring, self.ring)
 
         def check(name: str) -> Array:
             return check_parameter(sim, name, getattr(self, name), low=0.0)
@@ -217,6 +219,35 @@ class Hook(Plugin):
         load = self.read(data)
         holds = np.ones(load.tip_pos.shape[0], bool)
         return place_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring)  # type: ignore[arg-type]
+
+    @property
+    def placed_kinds(self) -> tuple[str, ...]:
+        """Names of the loads and rods."""
+        return (self.name, f"{self.name}_link")
+
+    def shape(self) -> Shape:
+        """Return the shape of a load."""
+        return shape_of(self.size)
+
+    def body(self, data: SimData) -> LoadBody:
+        """Return the loads, with the hooks that hold them; of one drone or of one world."""
+        load = self.read(data)
+        up = upward(data, load, load.tip_pos)
+        return LoadBody(load.pos - self.ring * up, turned_z(up), load.vel, load.mass + self._held(load, load.hook_mass))
+
+    def with_vel(self, data: SimData, vel: Array) -> SimData:
+        """Return the data with other velocities of loads and of hooks that hold them. (..., 3)"""
+        load = self.read(data)
+        return self.write(data, load.replace(vel=vel, tip_vel=jnp.where(load.attached[..., None], vel, load.tip_vel)))
+
+    def joined(self, data: SimData) -> Array:
+        """Return True where a load is on the hook of a drone; of one world. (n_drones, n_drones)"""
+        return np.eye(data.states.pos.shape[0], dtype=bool) & self.read(data).attached
+
+    @staticmethod
+    def _held(load: HookData, mass: Array) -> Array:
+        """Return a mass where the load is on the hook, else zero. (..., 1)"""
+        return jnp.where(load.attached[..., None], mass, jnp.zeros_like(mass))
 
     def _link(self, load: HookData) -> Link:
         mass = load.hook_mass + jnp.where(load.attached, load.mass, jnp.zeros_like(load.mass))

@@ -15,10 +15,11 @@ from crazysim.core.integration import euler
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
+from crazysim.geometry import Shape
 from crazysim.geometry.linear import solve
+from crazysim.payloads.body import Colliding, LoadBody, rest_height, shape_of
 from crazysim.payloads.core import CABLE_SEGMENTS, add_to_scene, on_floor, pieces, placed, turned_z
 from crazysim.payloads.link import BAND, PULL, Pull, acceleration_at, relative
-from crazysim.payloads.slung import rest_height
 from crazysim.pytree import PyTree, leaf
 
 SOFT = 1e-6
@@ -48,7 +49,7 @@ class SharedLoadData(PyTree):
     """Height of the load above the floor where it rests, m. (1,)"""
 
 
-class SharedLoad(Plugin):
+class SharedLoad(Colliding, Plugin):
     """One load, a point mass, on rods or cables from all drones of a world.
 
     The tensions follow from one system of equations of all drones. It needs an integrator that moves positions with new
@@ -184,6 +185,29 @@ class SharedLoad(Plugin):
         up = jnp.asarray([[0.0, 0.0, 1.0]], load.pos.dtype)
         rows = {self.name: (load.pos[None], turned_z(up)), f"{self.name}_link": links}
         return placed(data.objects, rows)  # type: ignore[arg-type]
+
+    @property
+    def placed_kinds(self) -> tuple[str, ...]:
+        """Names of the load and the links."""
+        return (self.name, f"{self.name}_link")
+
+    def shape(self) -> Shape:
+        """Return the shape of the load."""
+        return shape_of(self.size)
+
+    def body(self, data: SimData) -> LoadBody:
+        """Return the load; of one world."""
+        load = self.read(data)
+        upright = jnp.asarray([[0.0, 0.0, 0.0, 1.0]], load.pos.dtype)
+        return LoadBody(load.pos[None], upright, load.vel[None], load.mass[None])
+
+    def with_vel(self, data: SimData, vel: Array) -> SimData:
+        """Return the data with another velocity of the load; of one world. (1, 3)"""
+        return self.write(data, self.read(data).replace(vel=vel[0]))
+
+    def joined(self, data: SimData) -> Array:
+        """Return True for drones that a rod joins to the load; of one world. (1, n_drones)"""
+        return self.read(data).attached[None] & (not self.cable)
 
 
 def _tensions(matrix: Array, rhs: Array, acts: Array, one_sided: bool) -> Array:

@@ -14,7 +14,8 @@ from crazysim.core.integration import rk4
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import Stage
 from crazysim.effects.core import zeros
-from crazysim.errors import ConfigError
+from crazysim.geometry import Shape
+from crazysim.payloads.body import Colliding, LoadBody, rest_height, shape_of
 from crazysim.payloads.core import (
     CABLE_SEGMENTS,
     LoadData,
@@ -30,7 +31,7 @@ from crazysim.payloads.link import Link, couple, end_relative_motion, relative
 from crazysim.pytree import select_worlds
 
 
-class SlungLoad(Plugin):
+class SlungLoad(Colliding, Plugin):
     """A load on a rod or a cable, a point mass that hangs from each drone.
 
     Load and drone are integrated together. A cable is slack while the load is nearer than its length, and pulls as soon
@@ -129,12 +130,44 @@ class SlungLoad(Plugin):
         load = self.read(data)
         return place_loads(data, self.name, load, load.pos, load.attached, CABLE_SEGMENTS if self.cable else 1)
 
+    @property
+    def placed_kinds(self) -> tuple[str, ...]:
+        """Names of the loads and links."""
+        return (self.name, f"{self.name}_link")
+
+    def shape(self) -> Shape:
+        """Return the shape of a load."""
+        return shape_of(self.size)
+
+    def body(self, data: SimData) -> LoadBody:
+        """Return the loads; of one drone or of one world."""
+        load = self.read(data)
+        mass = jnp.broadcast_to(load.mass, (*load.pos.shape[:-1], 1))
+        return LoadBody(load.pos, turned_z(upward(data, load, load.pos)), load.vel, mass)
+
+    def with_vel(self, data: SimData, vel: Array) -> SimData:
+        """Return the data with other velocities of the loads; of one drone or of one world. (..., 3)"""
+        return self.write(data, self.read(data).replace(vel=vel))
+
+    def joined(self, data: SimData) -> Array:
+        """Return True where a rod joins a load to a drone; of one world. (n_drones, n_drones)"""
+        n = data.states.pos.shape[0]
+        return np.eye(n, dtype=bool) & self.read(data).attached & (not self.cable)
+
     def _link(self, load: LoadData) -> Link:
         return Link(load.attach, load.length, load.mass, load.damping, load.restitution, load.attached, self.cable)
 
 
-def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float) -> LoadData:
-    """Return the record of loads at rest below their drones, from the settings of a plugin, which are checked."""
+def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, ring: float | None = None) -> LoadData:
+    """Return the record of loads at rest below their drones, from the settings of a plugin, which are checked.
+
+    Args:
+        plugin: The plugin.
+        sim: Simulation.
+        is_cable: True for cables.
+        clearance: Height of a load's position above the floor where it rests, m.
+        ring: Height of the ring above the middle of the load, m, by which a hook holds it; None without a hook.
+    """
 
     def check(name: str, core: tuple[int, ...] = (1,), **limits: Any) -> Array:
         return check_parameter(sim, name, getattr(plugin, name), core, **limits)
@@ -149,7 +182,7 @@ def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float) 
     if plugin.in_scene:
         add_to_scene(
             sim, plugin.name, plugin.size, plugin.rgba, float(jnp.max(length)), sim.n_drones,
-            CABLE_SEGMENTS if is_cable else 1,
+            CABLE_SEGMENTS if is_cable else 1, ring,
         )  # fmt: skip
     states = sim.data.states
     pos, vel = hanging(states, attach, length, rest, is_cable)
@@ -185,20 +218,20 @@ def place_loads(
     """
     r = relative(data.states, tip, load.vel, load.attach)
     offset = jnp.where(holds[..., None], r.offset, -load.length * r.rot[..., 2])
-    up = jnp.where(load.attached[..., None], -r.direction, jnp.asarray([0.0, 0.0, 1.0], tip.dtype))
+    up = upward(data, load, tip)
     top = data.states.pos if r.arm is None else data.states.pos + r.arm
     links = pieces(top, offset, load.length, n_pieces)
     rows = {name: (load.pos - ring * up, turned_z(up)), f"{name}_link": links}
     return placed(data.objects, rows)  # type: ignore[arg-type]
 
 
-def rest_height(size: Any) -> float:
-    """Return the height of the middle of a ball or box above the floor on which it stands, m.
+def upward(data: SimData, load: LoadData, tip: Array) -> Array:
+    """Return the axis of the loads' shapes: along the link where a load hangs, else vertical. (..., 3)
 
-    Raises:
-        ConfigError: If the size is neither a radius nor three lengths.
+    Args:
+        data: One drone or one world.
+        load: Record of the loads.
+        tip: Ends of the links, world frame, m. (..., 3)
     """
-    shape = np.shape(size)
-    if shape not in ((), (3,)) or not np.all(np.asarray(size) > 0):
-        raise ConfigError(f"expected size as a positive radius, or as three positive lengths of a box, m, got {size!r}")
-    return float(size) if shape == () else float(size[2]) / 2
+    direction = relative(data.states, tip, load.vel, load.attach).direction
+    return jnp.where(load.attached[..., None], -direction, jnp.asarray([0.0, 0.0, 1.0], tip.dtype))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
@@ -13,6 +14,7 @@ from crazysim.core.stage import Stage, StageScope
 from crazysim.deprecation import renamed, warn_renamed
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, static
+from crazysim.scene.placement import placed_by
 from crazysim.scene.report import ContactReport, Objects, choose
 
 
@@ -65,16 +67,18 @@ class ContactLog(Plugin):
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return a stage of one drone for floor and objects, and a stage of one world for the other drones.
+        """Return a stage of one drone for floor and objects, and one of one world for other drones and for loads.
 
         Two, because a stage of one world computes everything for all its drones.
         """
         names, found = self._names(sim), []
-        if names or self.floor:
-            alone = self._stage(sim.scene.contact_fn(names, self.floor, drones=False), "drone")
+        placed = placed_by(sim.scene.plugins(), names)
+        others = [name for name in names if name not in placed]
+        if others or self.floor:
+            alone = self._stage(sim.scene.contact_fn(others, self.floor, drones=False), "drone")
             found.append(Placement(alone, before="increment_steps"))
-        if self.drones:
-            together = self._stage(sim.scene.contact_fn((), floor=False), "world")
+        if placed or self.drones:
+            together = self._stage(sim.scene.contact_fn(list(placed), floor=False, drones=self.drones), "world")
             found.append(Placement(together, before="increment_steps", name=f"{self.name}_of_drones"))
         return found
 
@@ -86,7 +90,7 @@ class ContactLog(Plugin):
             log, report = self.read(data), contacts(data)
             new = log.replace(
                 floor=_or(log.floor, report.floor),
-                objects=_or(log.objects, report.objects),
+                objects=_with_objects(log, report),
                 drones=_or(log.drones, report.drones),
                 first=jnp.where((log.first < 0) & report.any, data.core.steps + 1, log.first),
             )
@@ -99,6 +103,14 @@ def latch_contacts(sim: Simulation, objects: Objects = None, floor: bool = True,
     """Log contacts. Deprecated: use ``sim.add(ContactLog(...))``."""
     warn_renamed("scene.contact_log.latch_contacts(sim, ...)", "sim.add(ContactLog(...))")
     sim.add(ContactLog(objects, floor, drones))
+
+
+def _with_objects(log: ContactLogData, report: ContactReport) -> Array:
+    """Return the log's objects with those of a report, which may be some of them. (..., n_objects)"""
+    if report.objects is None or report.object_names == log.object_names:
+        return _or(log.objects, report.objects)
+    columns = np.array([log.object_names.index(name) for name in report.object_names])
+    return log.objects | jnp.zeros_like(log.objects).at[..., columns].set(report.objects)
 
 
 def _or(before: Array, now: Array | None) -> Array:

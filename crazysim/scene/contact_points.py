@@ -5,7 +5,7 @@ They are the corners of the box, and the points of its upper and lower plate tha
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from itertools import product
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
 from crazysim.geometry import Shape, distance, point_distance
+from crazysim.payloads.body import LoadBody
 from crazysim.scene.collision import CollisionGeom
 from crazysim.scene.report import Objects, choose
 
@@ -36,24 +37,30 @@ class Surface(NamedTuple):
     """Row of the movable object that carries it in ``data.objects``; None for a fixed one."""
 
 
-def surfaces_of(sim: Simulation, objects: Objects) -> list[Surface]:
-    """Return the surfaces of the floor and of some objects."""
+def surfaces_of(sim: Simulation, objects: Objects, loads: Collection[str] = ()) -> list[Surface]:
+    """Return the surfaces of the floor and of some objects, without those that are loads."""
     model = sim.scene.collision_model
     found = [Surface(geom, None) for geom in model.floor]
     for body in choose(model, objects):
-        found += [Surface(geom, body.row) for geom in body.geoms]
+        found += [Surface(geom, body.row) for geom in body.geoms if body.name not in loads]
     return found
 
 
+def is_ground(surface: Surface) -> bool:
+    """Return True for the plane z = 0, at which every load stops without a contact response."""
+    geom = surface.geom
+    return surface.row is None and geom.shape.kind == "plane" and geom.rot is None and geom.pos[2] == 0
+
+
 class ContactPoints(NamedTuple):
-    """Points that are or may come into contact, in the drone's body frame."""
+    """Points that are or may come into contact, in the body frame of a drone, or for loads in the world frame."""
 
     gap: Array
     """Distance to the surface, m. (..., n)"""
     normal: Array
     """Outward normal of the surface. (..., n, 3)"""
-    point: Array
-    """Position on the drone, from its centre of mass, m. (..., n, 3)"""
+    point: Array | None
+    """Position on the drone, from its centre of mass, m; None for a load, which is a point mass. (..., n, 3)"""
     vel: Array
     """Velocity of the surface, m/s. (..., n, 3)"""
 
@@ -85,6 +92,30 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
             found += [_nearest(data, geom, into, plate, middle, still[..., :1, :]) for middle in middles]
     joined = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True)))
     return ContactPoints(*joined)
+
+
+def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surface]) -> ContactPoints:
+    """Return the points of loads that are nearest to each surface.
+
+    Args:
+        data: One drone or one world.
+        body: Its loads.
+        shape: Their shape.
+        surfaces: At least one surface.
+    """
+    pos, quat = body.pos[..., None, :], body.quat[..., None, :]
+    axes = [rotation.rotate(quat, jnp.eye(3, dtype=pos.dtype)[k]) for k in range(3)]
+    gaps, normals, vels = [], [], []
+    for geom, row in surfaces:
+        into, _, vel = _frame(data, geom, row)
+        rot = jnp.stack([into(axis, False) for axis in axes], axis=-1)
+        gap, pull = jax.vjp(lambda x, s=geom.shape, f=into, r=rot: distance(shape, s, f(x, True), r), pos)
+        gaps.append(gap)
+        normals.append(pull(jnp.ones_like(gap))[0])
+        vels.append(jnp.zeros_like(pos) if vel is None else jnp.broadcast_to(vel[..., None, :], pos.shape))
+    return ContactPoints(
+        jnp.concatenate(gaps, axis=-1), jnp.concatenate(normals, axis=-2), None, jnp.concatenate(vels, axis=-2)
+    )
 
 
 def _nearest(

@@ -7,6 +7,7 @@ import mujoco
 from crazysim.scene import collision, depth, report
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.objects import SceneObjects
+from crazysim.scene.placement import Placing
 
 
 class PureQueries:
@@ -14,6 +15,8 @@ class PureQueries:
 
     added: SceneObjects
     """Objects that were added with ``add``."""
+    plugins: Placing
+    """Returns the plugins of the simulation, some of which place objects."""
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -53,7 +56,8 @@ class PureQueries:
         ``drones=False``. Fields that were not requested are None and are not computed.
 
         Bodies that were attached to ``spec`` and are moved through ``mjx_data`` are not part of the data: for those
-        pass ``mocap=mjx_data``, or the pair ``(mocap_pos, mocap_quat)`` as ``mjx_data`` has them.
+        pass ``mocap=mjx_data``, or the pair ``(mocap_pos, mocap_quat)`` as ``mjx_data`` has them. Objects of plugins,
+        such as loads, are where the plugins' records in ``data`` have them; they need the data of a world.
 
         Args:
             objects: Handles, or names of bodies; None for all, () for none.
@@ -63,7 +67,7 @@ class PureQueries:
         Raises:
             ConfigError: If nothing is requested, or an object does not exist.
         """
-        return report.build(self.collision_model, objects, floor, drones)
+        return report.build(self.collision_model, objects, floor, drones, self.plugins)
 
     def depth_fn(
         self,

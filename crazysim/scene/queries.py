@@ -73,10 +73,11 @@ class SceneQueries:
 
     def _contacts(self, objects: Objects, floor: bool, drones: bool) -> Callable[..., ContactReport]:
         """Return the contacts of all worlds as a function of data and mocap poses, by one kernel where possible."""
-        by_xla, platform = self._scene.contact_fn(objects, floor, drones), self._platform
+        # The data come with the objects of plugins at their poses.
+        model, platform = self._scene.collision_model, self._platform
+        by_xla = report.build(model, objects, floor, drones)
         if platform is None:
             return by_xla
-        model = self._scene.collision_model
         # Their poses become part of the data before the kernel runs, which is for data alone.
         in_data = model.without_mocap_bodies()
         queries: list[Query] = []

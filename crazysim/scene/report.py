@@ -24,6 +24,7 @@ from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionBody, CollisionGeom, CollisionModel
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.objects import Handle
+from crazysim.scene.placement import Placing, place, placed_by
 
 CHUNK = 64
 """Drones whose distances to all others of their world are computed at a time."""
@@ -76,7 +77,9 @@ ContactFn = Callable[..., ContactReport]
 """``contacts(data, mocap=None) -> ContactReport``."""
 
 
-def build(model: CollisionModel, objects: Objects = None, floor: bool = True, drones: bool = True) -> ContactFn:
+def build(
+    model: CollisionModel, objects: Objects = None, floor: bool = True, drones: bool = True, plugins: Placing = tuple
+) -> ContactFn:
     """Return ``contacts(data, mocap=None) -> ContactReport``, pure: for all worlds, one world, or one drone.
 
     Args:
@@ -84,6 +87,7 @@ def build(model: CollisionModel, objects: Objects = None, floor: bool = True, dr
         objects: Handles or names of the objects to report; None for all, () for none.
         floor: True to report the floor.
         drones: True to report other drones; a stage of one drone has no access to them.
+        plugins: Returns the plugins of the simulation, whose objects are put at their poses first.
 
     Raises:
         ConfigError: If nothing is requested, or an object does not exist.
@@ -96,6 +100,7 @@ def build(model: CollisionModel, objects: Objects = None, floor: bool = True, dr
 
     def contacts(data: SimData, mocap: MocapPoses = None) -> ContactReport:
         require_poses(model, names, mocap)
+        data = place(data, placed_by(plugins(), names))
         data = with_mocap_bodies(model, data, mocap)
         pos, quat = data.states.pos, data.states.quat
         drone_rot = rotation.matrix(quat) if any(g.shape.kind != "sphere" for g in model.drone_geoms) else None

@@ -73,6 +73,7 @@ class Scene(PureQueries):
         self.renderer = SceneRenderer(device)
         self.spec = build.build_spec(xml_path, airframe, n_drones, freq, self.max_geom_pairs)
         self.added = SceneObjects(n_worlds)
+        self.plugins = tuple
         self.revision = 0
         self.compile()
 

@@ -1,13 +1,17 @@
-"""The commands of a simulation, one method for each level."""
+"""The commands of a simulation: one method for each level, their rate, and when they take effect."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from jax import Array
+
 from crazysim.core import functional as F
 
 if TYPE_CHECKING:
+    from crazysim.core.data import SimData
     from crazysim.engine import Stepper
+    from crazysim.sim.configuration import Configuration
 
 
 class Commands:
@@ -16,7 +20,21 @@ class Commands:
     Arguments and errors of all methods are those of ``crazysim.core.functional.state_control``.
     """
 
+    data: SimData
+    """Everything that changes."""
+    configuration: Configuration
+    """Validated settings."""
     _stepper: Stepper
+
+    @property
+    def control_freq(self) -> int:
+        """Rate at which staged commands take effect, Hz; with rotor commands that is every step."""
+        return self.configuration.control_freqs.get(self.configuration.control, self.configuration.freq)
+
+    @property
+    def controllable(self) -> Array:
+        """True in worlds where a staged command takes effect at the next step. (n_worlds, 1)"""
+        return F.controllable(self.data)
 
     def state_control(self, controls: Any, check_finite: bool = False, *, feedforward: Any = None) -> None:
         """Stage a full-state setpoint. (n_worlds, n_drones, 16)"""

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import find_controller
-from crazysim.core.data import require_controller, require_pair
+from crazysim.core.controls import require_controller, require_pair
 from crazysim.core.integration import Integrator
 from crazysim.core.settings import control_freqs, controller_at_rates, find_device, member, physics_freq, positive
 from crazysim.drones import Airframe, load_airframe
@@ -84,7 +84,7 @@ class Configuration:
             require_controller(dynamics, control, controller)
             controller = controller_at_rates(controller, control, freq, dict(rates))
             with_outer = control == Control.state and controller.has_outer
-            freqs |= {control: controller.outer_freq if with_outer else controller.freq}
+            freqs = {**freqs, control: controller.outer_freq if with_outer else controller.freq}
         return Configuration(
             n_worlds,
             n_drones,

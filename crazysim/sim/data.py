@@ -1,17 +1,13 @@
 """Records of a simulation, under the path that Crazyflow uses."""
 
-from crazysim.core.data import (
+from crazysim.core.controls import (
     AttitudeControlData,
     BodyRateControlData,
     ForceTorqueControlData,
     SimControls,
-    SimCore,
-    SimData,
-    SimParams,
-    SimState,
-    SimStateDeriv,
     StateControlData,
 )
+from crazysim.core.data import SimCore, SimData, SimParams, SimState, SimStateDeriv
 
 ControlData = StateControlData | AttitudeControlData | BodyRateControlData | ForceTorqueControlData
 """Records of controllers."""

@@ -141,6 +141,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self._queries = self._new_queries()
         self._seed = as_key(rng_key)
         self.plugins = PluginRegistry(self)  # type: ignore[arg-type]  # properties serve as attributes
+        self._scene.plugins = self.plugins.values
         self.build_data()
         self.build_default_data()
 
@@ -192,16 +193,6 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
     def time(self) -> Array:
         """Time since each world's last reset, s. (n_worlds, 1)"""
         return F.time(self.data)
-
-    @property
-    def control_freq(self) -> int:
-        """Rate at which staged commands take effect, Hz; with rotor commands that is every step."""
-        return self.configuration.control_freqs.get(self.control, self.freq)
-
-    @property
-    def controllable(self) -> Array:
-        """True in worlds where a staged command takes effect at the next step. (n_worlds, 1)"""
-        return F.controllable(self.data)
 
     def build_data(self) -> SimData:
         """Return new data at rest, as at construction, with a new record of every plugin; make it the simulation's."""

@@ -59,7 +59,7 @@ RECIPES: dict[str, Recipe] = {
         config={"iterations": 150, "entropy": 0.01, "init_std": 0.7},
         practice={"practice": True},
     ),
-    "transport": Recipe(n_worlds=4096, config={"iterations": 200, "discount": 0.99}),
+    "transport": Recipe(n_worlds=4096, config={"iterations": 400, "discount": 0.99}),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
 }
 """Recipes by task; the default of other tasks is ``Recipe()``."""

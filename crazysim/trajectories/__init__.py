@@ -1,7 +1,17 @@
 """Trajectories: a record of piecewise polynomials, its constructors and checks, and the plugin that follows them."""
 
 from crazysim.trajectories.approaches import Approach
-from crazysim.trajectories.files import Lights, Show, load_csv, load_show, save_csv, save_show
+from crazysim.trajectories.files import (
+    Cue,
+    Lights,
+    Show,
+    load_csv,
+    load_show,
+    pack_compressed,
+    save_csv,
+    save_samples,
+    save_show,
+)
 from crazysim.trajectories.follow import Follow, FollowData
 from crazysim.trajectories.limits import Limits, Report, Violation, check
 from crazysim.trajectories.shapes import circle, figure_eight, helix, hover, line, lissajous
@@ -12,6 +22,7 @@ from crazysim.trajectories.waypoints import minimum_jerk, minimum_snap
 
 __all__ = [
     "Approach",
+    "Cue",
     "Follow",
     "FollowData",
     "Lights",
@@ -32,7 +43,9 @@ __all__ = [
     "minimum_jerk",
     "minimum_snap",
     "of_bezier",
+    "pack_compressed",
     "save_csv",
+    "save_samples",
     "save_show",
     "smoothest",
     "spline",

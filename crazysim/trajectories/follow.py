@@ -17,7 +17,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter,
 from crazysim.core.stage import stage
 from crazysim.core.stages import tick
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, static
 from crazysim.trajectories.trajectory import Trajectory
 
 DEGREE = 7
@@ -45,6 +45,8 @@ class FollowData(PyTree):
     """Time of the world at which a drone starts, s. (1,)"""
     rate: Array = leaf("parameter", 1, (1,))
     """Speed at which a drone goes through its trajectory, 1: at 2 it takes half the time. (1,)"""
+    degrees: tuple[int, ...] = static()
+    """Largest degrees of x, y, z and yaw in the slots, -1 for zero; no trajectory in them may exceed them. (4,)"""
 
     @property
     def trajectories(self) -> Trajectory:
@@ -54,15 +56,7 @@ class FollowData(PyTree):
     def setpoint(self, t: Array) -> Setpoint:
         """Return the setpoint of one drone at a time of its world, s. ()"""
         rate = self.rate[0]
-        s = self.trajectories.evaluate_one(self.index[0], (t - self.start[0]) * rate)
-        return s.replace(
-            vel=rate * s.vel,
-            acc=rate**2 * s.acc,
-            jerk=rate**3 * s.jerk,
-            snap=rate**4 * s.snap,
-            yaw_rate=rate * s.yaw_rate,
-            yaw_acc=rate**2 * s.yaw_acc,
-        )
+        return self.trajectories.evaluate_at_rate(self.index[0], (t - self.start[0]) * rate, rate, self.degrees)
 
 
 class Follow(Plugin):
@@ -113,6 +107,7 @@ class Follow(Plugin):
             index=_checked(sim, "index", index, n_slots),
             start=_checked(sim, "start", self.start, n_slots),
             rate=_checked(sim, "rate", self.rate, n_slots),
+            degrees=(slots.degree,) * 4 if has_room else slots.degrees(),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
@@ -156,6 +151,12 @@ class Follow(Plugin):
             raise ConfigError(
                 f"expected one trajectory of at most {n_pieces} pieces and degree {n_coefficients - 1}, got ends of "
                 f"shape {trajectory.ends.shape} and degree {trajectory.degree}. Use Follow(..., max_pieces=...)."
+            )
+        degrees = trajectory.degrees()
+        if any(degree > most for degree, most in zip(degrees, record.degrees, strict=True)):
+            raise ConfigError(
+                f"expected degrees of x, y, z and yaw up to {record.degrees}, those of the first trajectories, got "
+                f"{degrees}. Use Follow(..., n_slots=...) to keep room for others."
             )
         leaves = jax.tree.leaves(trajectory.padded(n_pieces, n_coefficients - 1))
         old = [record.ends, record.coefficients, record.repeats]

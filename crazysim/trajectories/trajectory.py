@@ -15,6 +15,8 @@ from crazysim.control.setpoint import Setpoint
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, floating, leaf
 
+COUNTED = 16
+"""Most pieces of which that of a time is found by counting; otherwise it is found by bisection."""
 N_DERIVATIVES = 4
 """Highest derivative of a setpoint: snap."""
 
@@ -103,6 +105,18 @@ class Trajectory(PyTree):
                 index. ()
             t: Time since the start of the trajectory, s. ()
         """
+        return self.evaluate_at_rate(index, t, 1.0)
+
+    def evaluate_at_rate(self, index: Any, t: Any, rate: Any, degrees: Sequence[int] | None = None) -> Setpoint:
+        """Return the setpoint of one of several trajectories that is flown faster or slower.
+
+        Args:
+            index: Index along the one leading axis, as for ``evaluate_one``. ()
+            t: Time since the start of the trajectory, at its own speed, s. ()
+            rate: Time of the trajectory that passes in one second, s. ()
+            degrees: Degrees of x, y, z and yaw in all pieces if they are known, -1 for zero: whatever is above them is
+                not read; None for the largest. (4,)
+        """
         ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
         end, repeats = _at(ends, index, ends.shape[1] - 1), _at(jnp.asarray(self.repeats), index)
         t = jnp.asarray(t, ends.dtype)
@@ -112,17 +126,36 @@ class Trajectory(PyTree):
         local = jnp.where(local > end, end, jnp.where(local < 0, 0.0, local))
         inside = (t >= 0) & (repeats | (t <= end))
         piece = _piece(ends, index, local)
-        begin = jnp.where(piece > 0, _at(ends, index, jnp.maximum(piece - 1, 0)), 0.0)
+        begin = jnp.where(piece > 0, _at(ends, index, piece - 1), 0.0)
         length = _at(ends, index, piece) - begin
         inverse = 1 / jnp.where(length > 0, length, 1.0)  # padding has no length
-        values = _derivatives(_at(coefficients, index, piece), (local - begin) * inverse, N_DERIVATIVES)
-        rate = jnp.where(inside, inverse, 0.0)
-        pos = values[0]
-        vel, acc, jerk, snap = (value * rate**k for k, value in enumerate(values[1:], start=1))
+        u, of_piece = (local - begin) * inverse, _at(coefficients, index, piece)
+        degrees = [self.degree] * 4 if degrees is None else degrees
+        rows: dict[int, list[Array]] = {}
+        for degree in sorted(set(degrees)):
+            axes = [k for k, d in enumerate(degrees) if d == degree]
+            derivatives = _derivatives(of_piece[np.array(axes), : degree + 1], u, N_DERIVATIVES)
+            rows.update((axis, [x[k] for x in derivatives]) for k, axis in enumerate(axes))
+        values = [jnp.stack([rows[axis][k] for axis in range(4)]) for k in range(N_DERIVATIVES + 1)]
+        rate = factor = jnp.where(inside, inverse * rate, 0.0)
+        for k in range(1, N_DERIVATIVES + 1):
+            values[k], factor = values[k] * factor, factor * rate
+        pos, vel, acc, jerk, snap = values
         return Setpoint(
             pos=pos[:3], vel=vel[:3], acc=acc[:3], jerk=jerk[:3], snap=snap[:3],
             yaw=pos[3:], yaw_rate=vel[3:], yaw_acc=acc[3:],
         )  # fmt: skip
+
+    def degrees(self) -> tuple[int, ...]:
+        """Return the largest degrees of x, y, z and yaw with a coefficient that is not zero, -1 for zero, on the host.
+
+        With coefficients that are not known yet, as under ``jax.jit``, it is the largest degree for all.
+        """
+        if isinstance(self.coefficients, jax.core.Tracer):
+            return (self.degree,) * 4
+        c = np.asarray(self.coefficients)
+        used = np.any(c.reshape(-1, *c.shape[-2:]) != 0, axis=0)
+        return tuple([int(np.max(np.flatnonzero(row), initial=-1)) for row in used])
 
     @staticmethod
     def stack(trajectories: Sequence[Trajectory]) -> Trajectory:
@@ -196,12 +229,14 @@ def _module(tree: Any) -> Any:
 
 def _at(x: Array, *index: Any) -> Array:
     """Return an entry of an array; an index that is too large or too small means the last or first one."""
-    return x.at[index].get(mode="clip")
+    return x.at[index].get(mode="clip", wrap_negative_indices=False)
 
 
 def _piece(ends: Array, index: Any, t: Array) -> Array:
-    """Return the number of ends of a trajectory up to a time, at most that of its last piece, by bisection. ()"""
+    """Return the number of ends of a trajectory up to a time, at most that of its last piece. ()"""
     n = ends.shape[1]
+    if len(ends) == 1 and n <= COUNTED:
+        return jnp.sum(ends[0, :-1] <= t, dtype=jnp.int32)
     low = jnp.zeros(jnp.shape(t), jnp.int32)
     for k in reversed(range((n - 1).bit_length())):
         middle = jnp.minimum(low + 2**k, n - 1)
@@ -220,6 +255,8 @@ def _derivatives(coefficients: Array, u: Array, order: int) -> list[Array]:
         order: Highest derivative.
     """
     columns = [coefficients[..., k] for k in reversed(range(coefficients.shape[-1]))]
+    if not columns:
+        return [jnp.zeros(coefficients.shape[:-1], coefficients.dtype)] * (order + 1)
     taylor = columns[:1]
     for column in columns[1:]:
         raised = [taylor[0] * u + column]

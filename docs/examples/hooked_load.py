@@ -3,7 +3,7 @@
 import numpy as np
 
 from crazysim import Hook, Sim
-from crazysim.control.load_lqr import LoadLQR
+from crazysim.control import LoadLQR
 
 
 def main(n_worlds=1):

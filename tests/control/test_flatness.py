@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import vectors
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from crazysim.control.flatness import attitude_of_thrust
@@ -31,6 +31,7 @@ def of_motion(f, yaw):
     return at
 
 
+@example(f=(np.array([3.0, -2, 1]), np.array([4.0, 5, 6]), np.array([7.0, -8, 9])), yaw=(0.5, 1.0, -2.0), up=1.0)
 @given(
     f=st.tuples(vectors(3, 8.0), vectors(3, 20.0), vectors(3, 50.0)),
     yaw=st.tuples(angles, angles, angles),

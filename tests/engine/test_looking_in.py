@@ -87,7 +87,8 @@ def test_a_dump_has_the_jaxprs_and_the_program_after_each_pass(data, tmp_path, m
     names = [
         file.name.split("-", 2)[2] for file in sorted((tmp_path / "out").iterdir(), key=lambda f: f.name.split("-")[1])
     ]
-    assert names == ["sway.jaxpr", "program.lowered", "program.fuse", "program.hoist", "program.pack_shared"]
+    passes = ["lowered", "fuse", "join_ticks", "hoist", "pack_shared"]
+    assert names == ["sway.jaxpr", *(f"program.{name}" for name in passes)]
     jaxpr = next((tmp_path / "out").glob("*sway.jaxpr")).read_text()
     assert "sin" in jaxpr
 

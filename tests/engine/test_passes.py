@@ -18,6 +18,7 @@ from crazysim.engine.program import Leaf, Program, Segment
 from crazysim.engine.verify import VerificationError, verify
 
 N_WORLDS = 5
+F32 = np.float32
 
 
 def flat(program, leaves):
@@ -158,6 +159,48 @@ def test_what_one_stage_writes_the_next_reads_as_a_value():
     assert set(fused.writes) == {Y, Z}
     assert [x.name for x in fused.block.operations] == ["exp", "barrier", "neg", "barrier"]
     assert [x.stage for x in fused.block.operations][::2] == ["a", "b"]
+
+
+def guarded(name, reads, write, fn):
+    """Return a segment that writes a number where x is positive."""
+    b = Builder(stage=name)
+    x, old, *rest = [b.input(np.float32) for _ in [X, write, *reads]]
+    inner = Builder(b)
+    block = inner.finish([fn(inner, *rest)])
+    mask = b.add("gt", (x, np.float32(0)), bool)
+    new = b.add_many("when", (mask, old), (np.float32,), (), (block,))
+    return Segment("drone", (name,), "each", b.finish(new), (X, write, *reads), (write,))
+
+
+@pytest.mark.parametrize("last", [Y, Z])
+def test_stages_of_the_same_ticks_are_joined(last):
+    """The second reads what the first wrote, and may write it again; the numbers where nothing ticks stay."""
+    half = guarded("half", [SHARED], Y, lambda b, x: b.add("mul", (x, np.float32(0.5)), np.float32))
+    sine = guarded("sine", [Y, SHARED], last, lambda b, y, x: b.add("add", (b.add("sin", (y,), F32), x), F32))
+    fused = passes.fuse(Program(LEAVES, 1, (half, sine)))
+    joined = verify(passes.join_ticks(fused))
+    assert [op.name for op in fused.segments[0].block.operations].count("when") == 2
+    assert [op.name for op in joined.segments[0].block.operations].count("when") == 1
+    x = np.array([-1, 1, 0, 2, -3], np.float32)
+    numbers = {X: x, Y: x + 10, Z: x + 20, SHARED: np.float32(3)}
+    expected, found = run(fused, numbers, 2), run(joined, numbers, 2)
+    assert all((found[slot] == expected[slot]).all() for slot in (X, Y, Z))
+    assert (found[last] == np.where(x > 0, np.sin(np.float32(1.5)) + np.float32(3), numbers[last])).all()
+
+
+def test_constants_pass_from_stage_to_stage_of_the_same_ticks():
+    zero = guarded("zero", [], Y, lambda b: np.float32(0))
+    cosine = guarded("cosine", [Y], Z, lambda b, y: b.add("cos", (y,), F32))
+    joined = passes.join_ticks(passes.fuse(Program(LEAVES, 1, (zero, cosine))))
+    assert "cos" not in {op.name for op in joined.segments[0].block.walk()}
+
+
+def test_stages_of_other_ticks_are_not_joined():
+    first = guarded("first", [], Y, lambda b: np.float32(1))
+    between = segment("between", [Y], [X], op("neg"))
+    second = guarded("second", [Y], Z, lambda b, y: b.add("sin", (y,), F32))
+    joined = passes.join_ticks(passes.fuse(Program(LEAVES, 1, (first, between, second))))
+    assert [op.name for op in joined.segments[0].block.operations].count("when") == 2
 
 
 def test_phases_and_scopes_are_not_joined():

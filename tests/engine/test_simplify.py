@@ -61,6 +61,14 @@ def test_only_floats_have_known_zeros():
     assert build("mul", ..., np.int32(0), dtype=np.int32)[0] == 0  # no integer is NaN
 
 
+def test_angles_of_zero_are_exact():
+    wanted = {"sin": 0.0, "cos": 1.0}
+    assert {name: simplify(name, (F(0),), np.dtype(F), ()) for name in wanted} == wanted
+    assert simplify("atan2", (F(0), F(2)), np.dtype(F), ()) == 0
+    assert simplify("atan2", (F(0), F(-2)), np.dtype(F), ()) is None
+    assert simplify("sin", (F(1),), np.dtype(F), ()) is None
+
+
 def test_logic_with_a_constant():
     b = Builder()
     x = b.input(bool)

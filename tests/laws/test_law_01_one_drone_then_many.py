@@ -1,6 +1,7 @@
 """Law 1: physics and control are written for one drone, and accept any leading axes: ``f(batch)[i] == f(batch[i])``."""
 
 import ast
+import importlib
 import inspect
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import pytest
 from cases import FITTED
 
 import crazysim
-from crazysim import Dynamics, load_airframe
+from crazysim import Dynamics, Sim, load_airframe
 from crazysim.control import AllocationParams, AttitudeParams, StateParams, allocation, attitude, state
+from crazysim.control.controllers import CONTROLLERS
 from crazysim.dynamics import drag, first_principles, fitted, rigid_body, rotor
 
 BATCH = (3, 2)
@@ -108,12 +110,53 @@ def test_a_batch_is_its_drones(module, function, model, per_drone, x64, rng):
             np.testing.assert_allclose(many[i], one, rtol=1e-12, atol=scale)
 
 
+@pytest.mark.parametrize("name", [name for name in CONTROLLERS if name not in ("load_lqr", "tracking_lqr")])
+def test_drones_of_a_controller_fly_as_each_does_alone(name, rng):
+    """Law 1: worlds of drones with random states and setpoints, and each drone by itself.
+
+    Controllers that need a load or a trajectory of their own are compared in tests/control.
+    """
+
+    def fly(n_worlds, n_drones, drawn):
+        sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="state", controller=name, engine="plain")
+        states = sim.data.states.replace(**{key: jnp.asarray(x, jnp.float32) for key, x in drawn.items()})
+        sim.data = sim.data.replace(states=states)
+        setpoint = np.zeros((n_worlds, n_drones, 16))
+        setpoint[..., :3], setpoint[..., 15] = drawn["pos"] + drawn["vel"], 1.0
+        setpoint[..., 12:14] = [0.6, 0.8]  # a yaw
+        sim.state_control(setpoint)
+        sim.step(25)
+        return sim.data.states
+
+    quat = np.array([0, 0, 0, 1.0]) + 0.2 * rng.normal(size=(*BATCH, 4))
+    drawn = {
+        "pos": rng.uniform(0.5, 1.5, (*BATCH, 3)),
+        "quat": quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+        "vel": 0.3 * rng.normal(size=(*BATCH, 3)),
+        "ang_vel": 0.5 * rng.normal(size=(*BATCH, 3)),
+        "rotor_vel": rng.uniform(1.2e4, 1.6e4, (*BATCH, 4)),
+    }
+    many = jax.tree.leaves(fly(*BATCH, drawn))
+    for i in [(0, 0), (2, 1)]:
+        alone = jax.tree.leaves(fly(1, 1, {key: x[i][None, None] for key, x in drawn.items()}))
+        for x, y in zip(many, alone, strict=True):
+            # float32 rounding, which 25 steps of feedback with gains of PWM amplify
+            np.testing.assert_allclose(x[i], y[0, 0], rtol=1e-3, atol=1e-4 * max(1.0, float(np.abs(y).max())))
+
+
 def test_the_cases_cover_dynamics_and_control():
-    """No module of physics or control that computes arrays is missing above; ``parameters`` only loads them."""
+    """No module of physics or control that computes arrays is missing: ``parameters`` only loads them.
+
+    Laws of controllers are covered by the controllers that use them.
+    """
     covered = {m.__name__ for m in MODULES}
+    for place in CONTROLLERS.values():
+        module = importlib.import_module(place.partition(":")[0])
+        covered |= {module.__name__} | {getattr(x, "__module__", "") for x in vars(module).values()}
+    names = ("__init__", "core", "parameters", "protocol", "controllers", "setpoint", "switch")
     for path in sources():
         name = "crazysim." + ".".join(path.relative_to(Path(crazysim.__file__).parent).with_suffix("").parts)
-        assert name in covered or path.stem in ("__init__", "core", "parameters"), name
+        assert name in covered or path.stem in names, name
     assert len(CASES) >= 17
 
 
@@ -126,9 +169,13 @@ def sources():
 
 
 def test_physics_and_control_contain_no_batching():
-    """Law 1: they contain no vmap, no loop of JAX, and no batch index."""
-    forbidden = {"vmap", "pmap", "shard_map", "scan", "fori_loop", "while_loop", "n_worlds", "n_drones"}
+    """Law 1: they contain no vmap, no loop of JAX, and no batch index.
+
+    Riccati equations have loops over doublings, and gains along a trajectory over its setpoints.
+    """
+    batching = {"vmap", "pmap", "shard_map", "scan", "fori_loop", "while_loop", "n_worlds", "n_drones"}
     for path in sources():
+        forbidden = batching - {"scan", "vmap"} if path.stem in ("riccati", "tracking_lqr") else batching
         for node in ast.walk(ast.parse(path.read_text())):
             names = {getattr(node, key, None) for key in ("id", "attr", "arg", "name")}
             assert not names & forbidden, f"{path.name}:{node.lineno} uses {names & forbidden}"

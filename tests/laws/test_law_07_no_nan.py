@@ -52,8 +52,12 @@ def tilted(data):
     return command
 
 
-ENGINES = [(*pair, "plain") for pair in PAIRS] + [("first_principles", "state", "auto")]
-"""Every pair on the engine that compiles fastest, and the longest pipeline on the one that users get."""
+ENGINES = [
+    pytest.param(*case, marks=pytest.mark.xdist_group(f"law 7 {' '.join(case)}"))
+    for case in [*((*pair, "plain") for pair in PAIRS), ("first_principles", "state", "auto")]
+]
+"""Every pair on the engine that compiles fastest, and the longest pipeline on the one that users get; tests of one
+case share its flight, so one worker runs them."""
 
 
 @functools.cache

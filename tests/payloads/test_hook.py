@@ -98,3 +98,28 @@ def test_a_load_on_the_floor_waits(x64):
     np.testing.assert_allclose(record.pos[0, 0], [1.0, 0.5, 0.04 + 0.1275])
     np.testing.assert_allclose(record.vel, 0, atol=1e-12)
     assert jnp.isfinite(record.tip_pos).all()
+
+
+@pytest.mark.parametrize("size", [(0.14, 0.14, 0.08), 0.05])
+def test_hook_and_load_are_drawn_where_they_meet(size):
+    """The wires of the load end in its ring, and the bend of the hook is there while it carries."""
+    sim, _ = hooked(2.0, in_scene=True, size=size)
+    sim.sync(0)
+    model, data = sim.mj_model, sim.mj_data
+
+    def ends(body):
+        """Return both ends of all rods of a body, world frame, m."""
+        geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies_of(body) and model.geom_type[g] == 3]
+        half = np.array([data.geom_xmat[g].reshape(3, 3)[:, 2] * model.geom_size[g, 1] for g in geoms])
+        return np.concatenate([data.geom_xpos[geoms] + half, data.geom_xpos[geoms] - half])
+
+    def bodies_of(name):
+        return {b for b in range(model.nbody) if model.body_rootid[b] == model.body(name).id}
+
+    ring = np.array([0.0, 0.0, 2.0 - 0.4])
+    for body in ("load:0", "load_link:0"):
+        assert np.linalg.norm(ends(body) - ring, axis=-1).min() < 4e-3, body
+    box = next(
+        g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies_of("load:0") and model.geom_conaffinity[g]
+    )
+    np.testing.assert_allclose(data.geom_xpos[box], ring - [0, 0, 0.1275], atol=1e-5)

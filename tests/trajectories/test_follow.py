@@ -110,6 +110,28 @@ def test_uploads_are_flown_and_nothing_is_compiled_again():
     )  # fmt: skip
 
 
+def test_coefficients_that_are_zero_in_all_trajectories_are_not_read():
+    level = Trajectory(EIGHT.ends, EIGHT.coefficients * (np.arange(4) < 2)[:, None] * np.ones(8), EIGHT.repeats)
+    lookups = {}
+    for name, one, settings in (("level", level, {}), ("room", level, {"n_slots": 1}), ("turned", UP, {})):
+        sim = build()
+        plugin = sim.add(Follow(one, **settings))
+        lookups[name] = _lookups(sim)
+        sim.step(20)
+        expected = jax.jit(Trajectory.evaluate)(one, 15 / 500).command()
+        np.testing.assert_allclose(sim.data.controls.state.cmd[0, 0], expected, rtol=1e-5, atol=2e-5)
+        if name == "level":
+            assert plugin.read(sim.data).degrees == (7, 7, -1, -1)
+            with pytest.raises(ConfigError, match="degrees of x, y, z and yaw"):
+                plugin.upload(sim, 0, hover([0, 0, 1]))
+    assert lookups["level"] <= lookups["room"] - 16
+
+
+def _lookups(sim):
+    blocks = [s.block for s in sim.step_fn.plan(sim.data).program.segments]
+    return sum(op.name == "lookup" for block in blocks for op in block.walk())
+
+
 def _compiled(sim):
     return sim.step_fn.plan(sim.data).dynamic._cache_size()
 

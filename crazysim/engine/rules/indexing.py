@@ -113,7 +113,7 @@ def _gather(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
     if table is not None:
         zeros = np.zeros(indices.shape, np.int32)
         offsets = move_many(eqn, [table.offsets.astype(object)], [zeros])[0].reshape(-1)
-        bases = [table.base_at(row, limits) for row in rows]
+        bases = [table.base_at(list(row), limits) for row in rows]
         result = list(table.look_up(offsets, [bases[k] for k in row_of]))
     else:
         result = _select_windows(ctx, eqn, x, indices.shape, rows, row_of, limits)

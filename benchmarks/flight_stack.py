@@ -1,0 +1,134 @@
+"""Cost of trajectories, controllers and loads: physics steps per second of each, and its ratio, one JSON line each.
+
+    python benchmarks/flight_stack.py [--device gpu] [--worlds 1024] [--cases state follow rod ...] [--operations]
+
+Drones hover, in calls of 100 steps; all cases alternate. ``ratio`` is the time over that of the reference: constant
+state commands for trajectories and controllers, the bare drone with rotor commands for loads.
+
+- state: the default cascade, a constant command; follow: a figure eight for all; starts: with a start per world
+- slots: 16 trajectories of 60 pieces, index and start per world
+- geometric: geometric control at 100 Hz along a figure eight
+- pid, mellinger: the firmware's controllers, a constant command
+- rotor: rotor commands; rod, cable: with a load at the centre of mass; offset: a rod below it, with damping
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from measure import Flight, digits, engine_of, medians, report
+
+from crazysim import Sim, SlungLoad
+from crazysim.engine.program import Segment
+from crazysim.trajectories import Follow, Trajectory, figure_eight
+
+N_STEPS = 100
+"""Steps per call."""
+EIGHT = (0.4, 0.2)
+"""Size of the figure eight that drones follow, m; its period is 5 s."""
+N_SLOTS, N_PIECES = 16, 60
+"""Trajectories and pieces of each in the case ``slots``."""
+LOAD = {"mass": 0.0005, "length": 0.3, "in_scene": False}
+"""Settings of loads, kg and m: so light that the rotor command of a bare drone holds them up for a while."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--worlds", type=int, default=1024)
+    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--operations", action="store_true", help="report the operations of each step's program too")
+    args = parser.parse_args()
+    references = [name for name in REFERENCES if any(CASES[case][0] == name for case in args.cases)]
+    cases = dict.fromkeys([*references, *args.cases])
+    flights = {name: fly(args, name) for name in cases}
+    taken = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
+    for name, flight in flights.items():
+        flight.require_flying()
+        line: dict[str, Any] = {"operations": operations(flight.sim)} if args.operations else {}
+        report(
+            args.device,
+            benchmark="flight_stack",
+            case=name,
+            engine=engine_of(flight.sim),
+            n_worlds=args.worlds,
+            call_s=digits(taken[name]),
+            steps_per_s=digits(args.worlds * N_STEPS / taken[name]),
+            reference=CASES[name][0],
+            ratio=digits(taken[name] / taken[CASES[name][0]]),
+            **line,
+        )
+
+
+def fly(args: argparse.Namespace, name: str) -> Flight:
+    """Return the compiled flight of a case."""
+    reference, settings, add = CASES[name]
+    sim = Sim(args.worlds, device=args.device, engine=args.engine, **settings)
+    if add is not None:
+        add(sim)
+    return Flight(sim, "rotor_vel" if reference == "rotor" else "state", N_STEPS, args.device)
+
+
+def follow(sim: Sim) -> None:
+    """Let all drones follow one trajectory."""
+    sim.add(Follow(figure_eight(*EIGHT), visible=False))
+
+
+def follow_from_own_starts(sim: Sim) -> None:
+    """Let all drones follow one trajectory, each from its own time on."""
+    sim.add(Follow(figure_eight(*EIGHT), start=own_starts(sim), visible=False))
+
+
+def follow_slots(sim: Sim) -> None:
+    """Let the drones follow 16 trajectories of 60 pieces, each from its own time on."""
+    coefficients = np.random.default_rng(0).normal(0.0, 0.01, (N_PIECES, 4, 8))
+    coefficients[:, 2, 0] = 1.0
+    pieces = Trajectory.of_pieces(np.full(N_PIECES, 0.1), coefficients)
+    index = np.arange(sim.n_worlds)[:, None] % N_SLOTS
+    sim.add(Follow([pieces] * N_SLOTS, index=index, start=own_starts(sim), visible=False))
+
+
+def own_starts(sim: Sim) -> np.ndarray:
+    """Return times at which the drones start, s. (n_worlds, 1)"""
+    return np.linspace(-1.0, 0.0, sim.n_worlds)[:, None]
+
+
+def load(**settings: Any) -> Callable[[Sim], Any]:
+    """Return the function that adds a load with these settings."""
+    return lambda sim: sim.add(SlungLoad(**(LOAD | settings)))
+
+
+STATE: dict[str, Any] = {"control": "state"}
+ROTOR: dict[str, Any] = {"control": "rotor_vel"}
+REFERENCES = ("state", "rotor")
+CASES: dict[str, tuple[str, dict[str, Any], Callable[[Sim], Any] | None]] = {
+    "state": ("state", STATE, None),
+    "follow": ("state", STATE, follow),
+    "starts": ("state", STATE, follow_from_own_starts),
+    "slots": ("state", STATE, follow_slots),
+    "geometric": ("state", STATE | {"controller": "geometric", "state_freq": 100}, follow),
+    "pid": ("state", STATE | {"controller": "pid"}, None),
+    "mellinger": ("state", STATE | {"controller": "mellinger"}, None),
+    "rotor": ("rotor", ROTOR, None),
+    "rod": ("rotor", ROTOR, load()),
+    "cable": ("rotor", ROTOR, load(cable=True)),
+    "offset": ("rotor", ROTOR, load(attach=[0.0, 0.0, -0.02], damping=1e-5)),
+}
+"""Reference, settings of ``Sim``, and what is added, of each case."""
+
+
+def operations(sim: Sim) -> dict[str, int]:
+    """Return the number of operations of each kind in the program of a step, or none if the step has no program."""
+    program = sim.build_step_fn().plan(sim.data).program
+    blocks = [segment.block for segment in program.segments if isinstance(segment, Segment)] if program else []
+    return dict(Counter(operation.name for block in blocks for operation in block.walk()).most_common())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,240 @@
+"""Records of the controllers: commands in force and staged, memory, gains and rates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from crazysim.control import AllocationParams, AttitudeParams, Control, Controller, StateParams
+from crazysim.drones import Airframe
+from crazysim.dynamics import Dynamics
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, floating, leaf, of_host, scopes, static
+
+
+class StateControlData(PyTree):
+    """Command and internal state of the state controller."""
+
+    cmd: Array = leaf("drone", 1)
+    """Setpoint in force: position, velocity, acceleration, quaternion, body rates. (n_worlds, n_drones, 16)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Setpoint that takes effect at the next tick. (n_worlds, n_drones, 16)"""
+    freq: int = static()
+    """Rate of the controller, Hz."""
+    pos_err_i: Array | None = leaf("drone", 1)
+    """Integral of the position error, m s; None with another controller. (n_worlds, n_drones, 3)"""
+    params: StateParams | None
+    """Gains and constants; None with another controller."""
+    feedforward: Array | None = leaf("drone", 1)
+    """Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, and yaw acceleration, rad/s^2, of the setpoint in force; None in
+    Crazyflow's cascade. (n_worlds, n_drones, 8)"""
+    staged_feedforward: Array | None = leaf("drone", 1)
+    """The same of the staged setpoint; None in Crazyflow's cascade. (n_worlds, n_drones, 8)"""
+
+
+class AttitudeControlData(PyTree):
+    """Command and internal state of the attitude controller."""
+
+    cmd: Array = leaf("drone", 1)
+    """Command in force: roll, pitch, yaw, rad, and collective thrust, N. (n_worlds, n_drones, 4)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
+    freq: int = static()
+    """Rate of the controller, Hz."""
+    ang_vel_des: Array | None = leaf("drone", 1)
+    """Desired body rates in force, rad/s; None in fitted dynamics and with another controller.
+    (n_worlds, n_drones, 3)"""
+    staged_ang_vel_des: Array | None = leaf("drone", 1)
+    """Desired body rates that take effect at the next tick, rad/s; None likewise. (n_worlds, n_drones, 3)"""
+    r_int_error: Array | None = leaf("drone", 1)
+    """Integral of the rotation error, rad s; None likewise. (n_worlds, n_drones, 3)"""
+    prev_ang_vel: Array | None = leaf("drone", 1)
+    """Angular velocity at the previous tick, rad/s; None likewise. (n_worlds, n_drones, 3)"""
+    params: Any
+    """Gains and constants, ``AttitudeParams``; None in fitted dynamics, which contain the controller, and with another
+    controller."""
+
+
+class BodyRateControlData(PyTree):
+    """Command and internal state of the body-rate controller."""
+
+    cmd: Array = leaf("drone", 1)
+    """Command in force: body rates, rad/s, and collective thrust, N. (n_worlds, n_drones, 4)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
+    freq: int = static()
+    """Rate of the controller, Hz."""
+    r_int_error: Array | None = leaf("drone", 1)
+    """Integral of the rotation error, rad s; None with another controller. (n_worlds, n_drones, 3)"""
+    prev_ang_vel: Array | None = leaf("drone", 1)
+    """Angular velocity at the previous tick, rad/s; None with another controller. (n_worlds, n_drones, 3)"""
+    params: AttitudeParams | None
+    """Gains and constants; None with another controller."""
+
+
+class ForceTorqueControlData(PyTree):
+    """Command of the allocation."""
+
+    cmd: Array = leaf("drone", 1)
+    """Command in force: collective thrust, N, and body torque, N m. (n_worlds, n_drones, 4)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
+    freq: int = static()
+    """Rate of the allocation, Hz."""
+    params: AllocationParams
+    """Limits and constants."""
+
+
+class ControllerData(PyTree):
+    """Memory and parameters of the controller that ``Sim(controller=...)`` names."""
+
+    memory: Any
+    """Memory of the drones, a record of the controller's own, or None."""
+    params: Any
+    """Gains and constants, a record of the controller's own, or None."""
+    freq: int = static()
+    """Rate of the controller, Hz; an outer loop has that of the command."""
+
+    @staticmethod
+    def create(n_worlds: int, n_drones: int, controller: Controller, airframe: Airframe) -> ControllerData:
+        """Return a controller at rest, with the airframe's gains.
+
+        Raises:
+            ConfigError: If the airframe lacks a number, or a record has leaves of another scope.
+        """
+        memory, params = controller.memory(airframe), controller.params(airframe)
+        for record, kinds in ((memory, ("drone",)), (params, ("shared", "drone"))):
+            others = set(jax.tree.leaves(scopes(record))) - set(kinds)
+            if others:
+                raise ConfigError(
+                    f"expected leaves of scope {' or '.join(kinds)} in {type(record).__name__} of controller "
+                    f"{controller.name!r}, got {sorted(others)}. Declare them with leaf(...)."
+                )
+
+        def of_all(x: Any) -> Any:
+            dtype = floating() if np.issubdtype(np.asarray(x).dtype, np.floating) else np.asarray(x).dtype
+            return of_host(x, n_worlds, n_drones, *np.shape(x), dtype=dtype)
+
+        return ControllerData(jax.tree.map(of_all, memory), params, controller.freq)
+
+
+class SimControls(PyTree):
+    """Controllers of a simulation; those not in use are None."""
+
+    mode: Control = static()
+    """Command level."""
+    state: StateControlData | None
+    """State controller."""
+    attitude: AttitudeControlData | None
+    """Attitude controller."""
+    body_rate: BodyRateControlData | None
+    """Body-rate controller."""
+    force_torque: ForceTorqueControlData | None
+    """Allocation."""
+    rotor_vel: Array | None = leaf("drone", 1)
+    """Commanded rotor speeds, rpm; None in fitted dynamics. (n_worlds, n_drones, n_rotors)"""
+    controller: ControllerData | None = None
+    """Controller in place of Crazyflow's cascade; None with the cascade."""
+
+    @staticmethod
+    def create(
+        n_worlds: int,
+        n_drones: int,
+        control: Control,
+        dynamics: Dynamics,
+        airframe: Airframe,
+        freqs: dict[Control, int],
+        controller: Controller | None = None,
+    ) -> SimControls:
+        """Return controllers at rest, with the airframe's gains; ``controller`` None is Crazyflow's cascade.
+
+        Raises:
+            ConfigError: If the dynamics do not support the command level.
+        """
+        shape = (n_worlds, n_drones)
+        with_rotors = dynamics == Dynamics.first_principles
+        require_pair(dynamics, control)
+        require_controller(dynamics, control, controller)
+
+        def zeros(n: int) -> Any:
+            return of_host(0.0, *shape, n)
+
+        cascade = with_rotors and controller is None
+
+        state = attitude = body_rate = force_torque = rotor_vel = None
+        if control == Control.state:
+            cmd = of_host(np.eye(16)[12], *shape, 16)
+            # A copy, because two leaves that share a buffer cannot both be donated.
+            state = StateControlData(
+                cmd,
+                cmd.copy(),
+                freqs[Control.state],
+                pos_err_i=zeros(3) if controller is None else None,
+                params=StateParams.create(airframe) if controller is None else None,
+                feedforward=None if controller is None else zeros(8),
+                staged_feedforward=None if controller is None else zeros(8),
+            )
+        if control == Control.attitude or (control == Control.state and controller is None):
+            attitude = AttitudeControlData(
+                cmd=zeros(4),
+                staged_cmd=zeros(4),
+                freq=freqs[Control.attitude],
+                ang_vel_des=zeros(3) if cascade else None,
+                staged_ang_vel_des=zeros(3) if cascade else None,
+                r_int_error=zeros(3) if cascade else None,
+                prev_ang_vel=zeros(3) if cascade else None,
+                params=AttitudeParams.create(airframe) if cascade else None,
+            )
+        if control == Control.body_rate:
+            body_rate = BodyRateControlData(
+                zeros(4),
+                zeros(4),
+                freqs[control],
+                r_int_error=zeros(3) if cascade else None,
+                prev_ang_vel=zeros(3) if cascade else None,
+                params=AttitudeParams.create(airframe) if cascade else None,
+            )
+        if with_rotors:
+            rotor_vel = zeros(airframe.n_rotors)
+        if with_rotors and Control.rotor_vel not in (control, controller and controller.output):
+            params = AllocationParams.create(airframe)
+            force_torque = ForceTorqueControlData(zeros(4), zeros(4), freqs[Control.force_torque], params)
+        data = None if controller is None else ControllerData.create(*shape, controller, airframe)
+        return SimControls(control, state, attitude, body_rate, force_torque, rotor_vel, data)
+
+
+def require_pair(dynamics: Dynamics, control: Control) -> None:
+    """Check that a dynamics model supports a command level.
+
+    Raises:
+        ConfigError: If it does not.
+    """
+    if dynamics != Dynamics.first_principles and control not in (Control.state, Control.attitude):
+        raise ConfigError(
+            f"control {control.value!r} needs rotors, which dynamics {dynamics.value!r} does not have. Use "
+            f"dynamics='first_principles', or control 'state' or 'attitude'."
+        )
+
+
+def require_controller(dynamics: Dynamics, control: Control, controller: Controller | None) -> None:
+    """Check that a controller follows a command level and has rotors to command; None is Crazyflow's cascade.
+
+    Raises:
+        ConfigError: If it does not.
+    """
+    if controller is None:
+        return
+    for member in controller.members:
+        if control not in member.levels:
+            raise ConfigError(
+                f"expected a command level that controller {member.name!r} follows, {' or '.join(member.levels)}, got "
+                f"control={control.value!r}. Use another level, or controller='crazyflow', which follows all."
+            )
+    if dynamics != Dynamics.first_principles:
+        raise ConfigError(
+            f"expected dynamics with rotors for controller {controller.name!r}, got {dynamics.value!r}, which contains "
+            f"a controller of its own. Use dynamics='first_principles'."
+        )

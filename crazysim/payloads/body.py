@@ -1,0 +1,71 @@
+"""Loads as bodies that collide: point masses with a shape."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.errors import ConfigError
+from crazysim.geometry import Shape
+
+
+class LoadBody(NamedTuple):
+    """State of loads with the poses of their shapes, world frame. Leading axes: () for one drone, else (n_loads,)."""
+
+    pos: Array
+    """Centre of the shape, m. (..., 3)"""
+    quat: Array
+    """Attitude of the shape, xyzw. (..., 4)"""
+    vel: Array
+    """Velocity of the point mass, m/s. (..., 3)"""
+    mass: Array
+    """Mass, kg. (..., 1)"""
+
+
+class Colliding:
+    """Interface of plugins whose loads collide; mixed into a ``Plugin``."""
+
+    coupling: Any
+    """``"drone"`` for loads of one drone each, ``"world"`` for loads of a world."""
+    name: Any
+    """Name of the plugin, and of its loads in the scene: ``name:0``, ..."""
+
+    def shape(self) -> Shape:
+        """Return the shape of a load."""
+        raise NotImplementedError
+
+    def body(self, data: SimData) -> LoadBody:
+        """Return the loads; of one drone or of one world."""
+        raise NotImplementedError
+
+    def with_vel(self, data: SimData, vel: Array) -> SimData:
+        """Return the data with other velocities of the loads; of one drone or of one world. (..., 3)"""
+        raise NotImplementedError
+
+    def joined(self, data: SimData) -> Array:
+        """Return True where a rigid rod joins a load to a drone, and the two cannot touch. (n_loads, n_drones)"""
+        raise NotImplementedError
+
+
+def shape_of(size: Any) -> Shape:
+    """Return a ball of a radius, or a box of three full lengths, m.
+
+    Raises:
+        ConfigError: If the size is neither.
+    """
+    dims = np.shape(size)
+    if dims not in ((), (3,)) or not np.all(np.asarray(size) > 0):
+        raise ConfigError(f"expected size as a positive radius, or as three positive lengths of a box, m, got {size!r}")
+    return Shape("sphere", (float(size),)) if dims == () else Shape("box", tuple(float(x) / 2 for x in size))
+
+
+def rest_height(size: Any) -> float:
+    """Return the height of the middle of a ball or box above the floor on which it stands, m.
+
+    Raises:
+        ConfigError: If the size is neither a radius nor three lengths.
+    """
+    return shape_of(size).size[-1]

@@ -1,0 +1,310 @@
+"""Loads that collide with obstacles and drones: bounces, momentum, energy, contact logs, and engines."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import with_states
+
+from crazysim import ConfigError, ContactLog, ContactResponse, Hook, SharedLoad, Sim, SlungLoad, rotation
+from crazysim.engine import Step
+
+RADIUS = 0.03
+LENGTH = 0.4
+
+
+def flying(n_worlds=1, n_drones=1, height=3.0, **kwargs):
+    """Return drones at a height, without drag and with motors off."""
+    options = {"drone": "bumblebee", "control": "rotor_vel", "engine": "lanes"} | kwargs
+    sim = Sim(n_worlds, n_drones, **options)
+    params = sim.data.params
+    sim.data = sim.data.replace(params=params.replace(drag_matrix=0 * params.drag_matrix))
+    sim.data = with_states(sim.data, pos=np.asarray(sim.data.states.pos) + [0, 0, height])
+    return sim
+
+
+def weightless(sim):
+    params = sim.data.params
+    sim.data = sim.data.replace(params=params.replace(gravity_vec=0 * params.gravity_vec))
+    return sim
+
+
+def heavy(sim):
+    """Make the drones so heavy that loads do not move them, and hold them up."""
+    params = sim.data.params
+    sim.data = sim.data.replace(params=params.replace(mass=jnp.full(1, 1e9)))
+    sim.data = with_states(sim.data, force=np.array([0, 0, 9.81e9]))
+
+
+def with_load(load, data, **changes):
+    record = load.read(data)
+    new = {k: jnp.broadcast_to(jnp.asarray(v, record.vel.dtype), getattr(record, k).shape) for k, v in changes.items()}
+    return load.write(data, record.replace(**new))
+
+
+def of_load(load, sim):
+    record = load.read(sim.data)
+    return np.asarray(record.pos[..., 0, :]), np.asarray(record.vel[..., 0, :])
+
+
+@pytest.mark.parametrize("kind", ["wall", "pole", "sphere"])
+def test_a_swing_ends_at_an_obstacle_with_the_restitution(kind):
+    """Below a heavy drone, released from the side, into an obstacle at the lowest point, where it moves level."""
+    options = {
+        "wall": {"thickness": 0.1, "height": 2.7}, "pole": {"radius": 0.05, "height": 2.7}, "sphere": {"radius": 0.05},
+    }[kind]  # fmt: skip
+    sim = flying(3)
+    heavy(sim)
+    load = sim.add(SlungLoad(mass=0.1, length=LENGTH, size=RADIUS))
+    sim.scene.add(kind, pos=[0.05 + RADIUS, 0, 2.6 if kind == "sphere" else 0.0], **options)
+    response = sim.add(ContactResponse(friction=0.0))
+    restitution = np.array([0.0, 0.5, 0.8])
+    record = response.read(sim.data).replace(restitution=jnp.asarray(restitution, jnp.float32)[:, None, None])
+    angle = 0.5
+    sim.data = response.write(sim.data, record)
+    sim.data = with_load(load, sim.data, pos=[-LENGTH * np.sin(angle), 0, 3 - LENGTH * np.cos(angle)])
+    fall = np.sqrt(2 * 9.81 * LENGTH * (1 - np.cos(angle)))
+    seen = []
+    for _ in range(200):
+        sim.step()
+        seen.append(np.concatenate(of_load(load, sim), axis=-1))
+    x, v = np.array(seen)[..., 0], np.array(seen)[..., 3]
+    hit = np.argmax(v[:, 0]) + 1
+    np.testing.assert_allclose(v[hit - 1], fall, rtol=0.02)
+    np.testing.assert_allclose(v[hit], -restitution * fall, atol=0.02 * fall)
+    assert (x.max(axis=0) < fall / 500 + 1e-3).all()  # one step beyond
+    assert abs(x[-1, 0]) < 2e-3, "it rests at the obstacle"
+    assert x[-1, 1] < -0.02
+
+
+def test_without_a_response_it_swings_through():
+    sim = flying()
+    heavy(sim)
+    load = sim.add(SlungLoad(mass=0.1, length=LENGTH, size=RADIUS))
+    sim.scene.add("wall", pos=[0.05 + RADIUS, 0, 0], thickness=0.1, height=2.7)
+    sim.data = with_load(load, sim.data, vel=[1.5, 0, 0])
+    sim.step(60)
+    assert of_load(load, sim)[0][0, 0] > 0.1
+
+
+def test_a_free_load_slides_on_a_pad_as_friction_has_it():
+    """A load that was cut loose on a pad: over v^2 / (2 mu g)."""
+    sim = flying()
+    load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
+    sim.scene.add("box", pos=[0, 0, 0.5], size=(3.0, 3.0, 0.2), mocap=False)
+    sim.add(ContactResponse(friction=0.4))
+    sim.data = with_load(load, load.release(sim.data), pos=[0, 0, 0.63], vel=[1.0, 0, 0])
+    sim.step(250)
+    pos, vel = of_load(load, sim)
+    np.testing.assert_allclose(pos[0], [1 / (2 * 0.4 * 9.81), 0, 0.63], atol=0.006)
+    assert np.abs(vel[0, :2]).max() < 1e-3
+    assert abs(vel[0, 2]) < 9.81 / 500 + 1e-3, "what gravity takes in the next step"
+
+
+def test_a_moving_object_pushes_a_load():
+    sim = weightless(flying())
+    load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
+    ball = sim.scene.add("sphere", radius=0.1)
+    sim.add(ContactResponse(restitution=0.0, friction=0.0))
+    at = of_load(load, sim)[0] - [0.129, 0, 0]
+    sim.data = ball.set_pose(load.release(sim.data), at, vel=[0.5, 0, 0])
+    sim.step()
+    np.testing.assert_allclose(of_load(load, sim)[1][0], [0.5, 0, 0], atol=5e-3)
+
+
+def momentum(load, sim, mass):
+    """Return momentum and angular momentum of a world about the origin. (3,) each"""
+    s, r, m = sim.data.states, load.read(sim.data), np.asarray(sim.data.params.mass)
+    pos, vel = np.asarray(r.pos[0]).reshape(-1, 3), np.asarray(r.vel[0]).reshape(-1, 3)
+    spin = rotation.rotate(s.quat[0], rotation.matvec(sim.data.params.J, s.ang_vel[0]))
+    linear = m * np.asarray(s.vel[0]).sum(0) + mass * vel.sum(0)
+    angular = m * np.cross(s.pos[0], s.vel[0]).sum(0) + np.asarray(spin).sum(0) + mass * np.cross(pos, vel).sum(0)
+    return linear, angular
+
+
+def energy(load, sim, mass):
+    s, r, m = sim.data.states, load.read(sim.data), float(sim.data.params.mass[0])
+    turning = np.einsum("ni,ij,nj", s.ang_vel[0], np.asarray(sim.data.params.J), s.ang_vel[0])
+    return 0.5 * (m * np.sum(np.square(s.vel[0])) + turning + mass * np.sum(np.square(r.vel[0])))
+
+
+@pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
+def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, x64, rng):
+    """Loose loads against two drones, from all sides: of the contact stage alone, momentum exactly, energy no more."""
+    sim = weightless(flying(n_drones=2, engine="plain"))
+    load = sim.add(SlungLoad(mass=0.2, size=size))
+    sim.add(ContactResponse(restitution=0.7, friction=0.5))
+    sim.data = load.release(sim.data)
+    stage = sim.step_pipeline["contact_response_of_load_and_drones"]
+    step, hits = Step({"hit": stage}, "plain"), 0
+    start = sim.data
+    quat = rng.normal(size=(60, 2, 4))
+    for k in range(60):
+        at = np.asarray(start.states.pos) + rng.uniform(-0.12, 0.12, (1, 2, 3))
+        sim.data = with_states(
+            start, vel=rng.normal(size=(1, 2, 3)), ang_vel=3 * rng.normal(size=(1, 2, 3)),
+            quat=(quat[k] / np.linalg.norm(quat[k], axis=-1, keepdims=True))[None],
+        )  # fmt: skip
+        sim.data = with_load(load, sim.data, pos=at, vel=2 * rng.normal(size=(1, 2, 3)))
+        before, had = momentum(load, sim, 0.2), energy(load, sim, 0.2)
+        sim.data = step(sim.data, jnp.int32(1))
+        after, has = momentum(load, sim, 0.2), energy(load, sim, 0.2)
+        np.testing.assert_allclose(after[0], before[0], atol=1e-12)
+        np.testing.assert_allclose(after[1], before[1], atol=1e-12)
+        assert has < had + 0.5 * (0.2 + 0.605) * 0.25**2
+        impulse = sim.data.plugins["contact_response"].impulse
+        hits += bool(np.abs(impulse).max() > 1e-3)
+    assert hits > 20
+
+
+def test_a_load_hits_a_drone_head_on(x64):
+    """From below along the centre line: the speeds of two bodies with restitution, by hand."""
+    sim = weightless(flying(n_drones=2))
+    load = sim.add(SlungLoad(mass=0.2, size=RADIUS))
+    sim.add(ContactResponse(restitution=0.5, friction=0.0))
+    below = np.asarray(sim.data.states.pos)[:, ::-1] + [0, 0, -0.2]  # each below the other's drone
+    sim.data = with_load(load, load.release(sim.data), pos=below, vel=[0, 0, 2.0])
+    sim.step(100)
+    mass = float(sim.data.params.mass[0])
+    drone = 2.0 * 0.2 * 1.5 / (mass + 0.2)
+    np.testing.assert_allclose(sim.data.states.vel[0, :, 2], drone, rtol=1e-6)
+    np.testing.assert_allclose(load.read(sim.data).vel[0, :, 2], drone - 1.0, rtol=1e-6)
+
+
+def test_a_wall_that_stops_a_load_holds_back_the_drone(x64):
+    """Through the taut rod, in the next step: the drone flies on towards the wall only until the load is there."""
+    sim = weightless(flying())
+    load = sim.add(SlungLoad(mass=0.2, size=RADIUS))
+    sim.scene.add("box", pos=[0.4 + RADIUS + 0.05 + 0.01, 0, 3], size=(0.1, 1.0, 1.0))
+    sim.add(ContactResponse(restitution=0.0))
+    start = np.asarray(sim.data.states.pos)
+    sim.data = with_load(load, with_states(sim.data, vel=[0.5, 0, 0]), pos=start + [LENGTH, 0, 0], vel=[0.5, 0, 0])
+    sim.step(100)
+    assert np.abs(sim.data.states.vel[0, 0, 0]) < 0.27  # an overlap is pushed out at 0.25 m/s at most
+    assert float(sim.data.states.pos[0, 0, 0] - start[0, 0, 0]) < 0.015
+
+
+def test_shared_loads_and_hooks_collide():
+    sim = weightless(flying(n_drones=2, integrator="symplectic_euler"))
+    load = sim.add(SharedLoad(mass=0.2, length=3.0, size=RADIUS))
+    at = np.asarray(load.read(sim.data).pos)
+    sim.scene.add("sphere", pos=at[0, 0] + [0.2, 0, 0], radius=0.1)
+    sim.add(ContactResponse(restitution=0.5, friction=0.0))
+    sim.data = with_load(load, load.release(sim.data), vel=[1.0, 0, 0])
+    sim.step(80)
+    np.testing.assert_allclose(load.read(sim.data).vel[0, 0], [-0.5, 0, 0], atol=0.01)
+
+    sim = weightless(flying())
+    hook = sim.add(Hook(mass=0.2, damping=0.0, size=RADIUS, ring=0.05))
+    record = hook.read(sim.data)
+    sim.scene.add("sphere", pos=np.asarray(record.pos)[0, 0] + [0.2, 0, -0.05], radius=0.1)
+    sim.add(ContactResponse(restitution=0.5, friction=0.0))
+    sim.data = hook.write(sim.data, record.replace(vel=record.vel + jnp.array([1.0, 0, 0]), tip_vel=record.vel + 1.0))
+    sim.data = with_load(hook, sim.data, tip_vel=[1.0, 0, 0])
+    sim.step(60)
+    record = hook.read(sim.data)
+    assert record.vel[0, 0, 0] < -0.2
+    np.testing.assert_array_equal(record.tip_vel, record.vel)
+
+
+def test_the_log_has_the_step_in_which_a_load_touches():
+    """A load without weight moves past drones at a known speed: each is logged in the step of the first overlap."""
+    sim = weightless(flying(2, 2))
+    load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
+    pole = sim.scene.add("sphere", pos=[0, 0, 9], radius=0.1)
+    log = sim.add(ContactLog(floor=False, drones=False))
+    (drone,) = sim.scene.collision_model.drone_geoms
+    reach = drone.shape.size[0] + RADIUS
+    start = np.asarray(sim.data.states.pos)[:, ::-1] + np.array(drone.pos) + [0, 0, -0.5]
+    sim.data = with_load(load, load.release(sim.data), pos=start, vel=[0, 0, 1.0])
+    sim.data = pole.set_pose(sim.data, [0, 0, 9])
+    sim.step(400)
+    record = log.read(sim.data)
+    first = int(np.ceil((0.5 - reach) * 500))
+    assert record.object_names == ("load:0", "load:1", "sphere:0")
+    np.testing.assert_array_equal(np.asarray(record.objects)[0], [[False, True, False], [True, False, False]])
+    assert np.abs(np.asarray(record.first) - first).max() <= 1
+    sim.data = pole.set_pose(sim.data, sim.data.states.pos[:, :1])
+    sim.step()
+    assert bool(log.read(sim.data).objects[0, 0, 2])
+
+
+def test_a_report_in_a_stage_needs_a_world():
+    sim = flying()
+    load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
+    sim.data = with_load(load, sim.data, pos=sim.data.states.pos)
+    contacts = sim.scene.contact_fn(floor=False, drones=False)
+    assert bool(jax.jit(contacts)(sim.data).objects[0, 0, 0])
+    with pytest.raises(ConfigError, match="expected the data of a world, got those of one drone"):
+        contacts(jax.tree.map(lambda x: x, sim.data.replace(states=jax.tree.map(lambda x: x[0, 0], sim.data.states))))
+
+
+def test_law_01_all_engines_agree():
+    ends = {}
+    for engine in ("plain", "lanes", "fused"):
+        sim = flying(2, 2, height=1.0, engine=engine, strict=True)
+        load = sim.add(SlungLoad(mass=0.2, cable=True, size=RADIUS))
+        sim.scene.add("wall", pos=[0.3, 0, 0], height=3.0)
+        sim.scene.add("pole", pos=[-0.3, 0.1, 0], height=3.0, mocap=False)
+        sim.add(ContactResponse(restitution=0.4))
+        log = sim.add(ContactLog())
+        vel = np.array([[[2.0, 0, 0], [-1.5, 0.2, 0]], [[0, 3.0, 0.5], [1.0, 1.0, 4.0]]])
+        sim.data = with_load(load, sim.data, vel=vel)
+        sim.rotor_vel_control(np.full((2, 2, 4), 13000.0))
+        sim.step(60)
+        assert "not fused" not in sim.explain()
+        ends[engine] = np.concatenate([sim.data.states.pos, load.read(sim.data).pos, load.read(sim.data).vel], axis=-1)
+        ends[engine, "log"] = np.asarray(log.read(sim.data).objects)
+    for engine in ("lanes", "fused"):
+        np.testing.assert_allclose(ends[engine], ends["plain"], atol=2e-3)
+        np.testing.assert_array_equal(ends[engine, "log"], ends["plain", "log"])
+
+
+def test_law_07_no_nan(rng):
+    """Loads in drones, in obstacles, in the floor, without mass, at any speed."""
+    n = 12
+    sim = flying(n, 2, height=0.3)
+    load = sim.add(SlungLoad(mass=np.linspace(0, 0.3, 2 * n).reshape(n, 2), cable=True, size=(0.06, 0.06, 0.06)))
+    sim.scene.add("box", pos=[0.3, 0, 0.2], size=(0.2, 0.2, 0.4))
+    sim.add(ContactResponse())
+    pos = np.asarray(sim.data.states.pos) + rng.uniform(-0.3, 0.3, (n, 2, 3))
+    pos[0], pos[1, :] = np.asarray(sim.data.states.pos)[0], [0.3, 0, 0.2]
+    sim.data = with_load(load, sim.data, pos=pos, vel=5 * rng.normal(size=(n, 2, 3)))
+    for _ in range(4):
+        sim.step(300)
+        for x in jax.tree.leaves((sim.data.states, load.read(sim.data))):
+            assert np.isfinite(x).all()
+
+
+def test_the_bounce_has_gradients(x64):
+    """Of the load's speed after a bounce by its speed before, and of the drone's after a hit; no NaN anywhere."""
+    sim = weightless(flying(n_drones=2, engine="plain"))
+    load = sim.add(SlungLoad(mass=0.2, size=RADIUS))
+    sim.scene.add("sphere", pos=[5, 0, 3], radius=0.1)
+    sim.add(ContactResponse(restitution=0.5, friction=0.3))
+    below = np.asarray(sim.data.states.pos)[:, ::-1] + [0.01, 0, -0.06]
+    data = with_load(load, load.release(sim.data), pos=below, vel=[0, 0, 1.0])
+
+    @jax.jit
+    def lifted(speed):
+        moved = with_load(load, data, vel=jnp.array([0.1, 0, 1.0]) * speed)
+        return sim.step_fn(moved, 20).states.vel[0, 0, 2]
+
+    slope = jax.jit(jax.grad(lifted))(2.0)
+    difference = (lifted(2.001) - lifted(1.999)) / 0.002
+    np.testing.assert_allclose(slope, difference, rtol=1e-4)
+    assert slope > 0.1
+    gradient = jax.grad(lambda d: jnp.sum(sim.step_fn(d, 20).states.vel), allow_int=True)(data)
+    for x in jax.tree.leaves((gradient.states, gradient.plugins["load"])):
+        assert x.dtype == jax.dtypes.float0 or np.isfinite(x).all()
+
+
+def test_removing_the_load_leaves_the_response():
+    sim = flying(height=1.0)
+    load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
+    sim.scene.add("sphere", pos=[5, 0, 3], radius=0.1)
+    sim.add(ContactResponse())
+    sim.add(ContactLog())
+    sim.remove(load)
+    sim.step(10)
+    assert np.isfinite(sim.data.states.pos).all()
