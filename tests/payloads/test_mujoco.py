@@ -63,7 +63,7 @@ def of_mujoco(dof, attach, damping, angles, ang_vel, law):
 
 
 def of_crazysim(dof, attach, damping, start, ang_vel, law, integrator):
-    sim = Sim(drone="bumblebee", control="rotor_vel", integrator=integrator, freq=FREQ, engine="lanes")
+    sim = Sim(drone="bumblebee", control="rotor_vel", integrator=integrator, freq=FREQ, engine="fused", strict=True)
     s = sim.data.states
     sim.data = sim.data.replace(
         states=s.replace(pos=s.pos * 0 + START, ang_vel=s.ang_vel + np.asarray(ang_vel)),
@@ -76,16 +76,15 @@ def of_crazysim(dof, attach, damping, start, ang_vel, law, integrator):
     found = []
     for k in range(FREQ * SECONDS):
         s = sim.data.states
-        pos, vel, quat, w = (np.asarray(x[0, 0]) for x in (s.pos, s.vel, s.quat, s.ang_vel))
+        pos, vel, quat, w = (np.asarray(x)[0, 0] for x in (s.pos, s.vel, s.quat, s.ang_vel))
         force, torque = law(pos, vel, quat, w)
         rot = np.zeros(9)
         mujoco.mju_quat2Mat(rot, np.roll(quat, 1))
         force, torque = rot.reshape(3, 3) @ force, rot.reshape(3, 3) @ torque
-        states = s.replace(force=jnp.asarray(force)[None, None], torque=jnp.asarray(torque)[None, None])
-        sim.data = sim.data.replace(states=states)
+        sim.data = sim.data.replace(states=s.replace(force=force[None, None], torque=torque[None, None]))
         sim.step()
         if k % 10 == 9:
-            found.append([np.asarray(sim.data.states.pos[0, 0]), np.asarray(hook.read(sim.data).tip_pos[0, 0])])
+            found.append([np.asarray(sim.data.states.pos)[0, 0], np.asarray(hook.read(sim.data).tip_pos)[0, 0]])
     return np.array(found)
 
 

@@ -8,7 +8,7 @@ from cases import with_states
 from crazysim import ConfigError, Sim
 from crazysim.payloads import SharedLoad, SlungLoad
 
-SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "lanes"}
+SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "strict": True}
 CORNERS = np.array([[0.3, 0.3, 5.0], [-0.3, 0.3, 5.0], [-0.3, -0.3, 5.0], [0.3, -0.3, 5.0]])
 
 
