@@ -20,11 +20,15 @@ from crazysim.control.protocol import Controller
 from crazysim.control.riccati import gain_discrete
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
+from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
 Target = Literal["load", "drone"]
 """Body that a setpoint describes."""
+
+ROD_JERK_MAX = 500.0
+"""Largest third derivative of the direction of the rod that is fed forward, 1/s^3: a swing of 0.5 rad at 10 rad/s."""
 
 
 class LoadLQRParams(PyTree):
@@ -64,8 +68,14 @@ class LoadLQRParams(PyTree):
             R: Weights of collective thrust and torque (4,) or (4, 4); None for ``default_load_weights``.
 
         Raises:
-            ConfigError: If the airframe lacks a value, a weight has another shape, or no gain stabilises the drone.
+            ConfigError: If the airframe lacks a value, mass or length is negative or not finite, a weight has another
+                shape, or no gain stabilises the drone.
         """
+        if not (0 <= load_mass < np.inf and 0 < length < np.inf):
+            raise ConfigError(
+                f"expected load_mass of at least 0 kg and a positive length, m, got {load_mass!r} and {length!r}. Use "
+                f"LoadLQR(load_mass=0.05, length=0.4)."
+            )
         mass, inertia, drag = airframe.value("rigid_body.mass"), airframe.inertia, airframe.value("drag.coefficients")
         weights = default_load_weights(airframe, freq, load_mass, length)
         Q = as_weights("Q", weights[0] if Q is None else Q, 16)
@@ -230,7 +240,7 @@ def load_lqr_control(
 
 
 class LoadLQRMemory(PyTree):
-    """Memory of the LQR with load: the setpoint of the last tick, of which a difference gives one more derivative."""
+    """Memory of the LQR with load: a derivative at the last tick, whose difference gives the next one."""
 
     rod_acc: Array = leaf("drone", 1)
     """Second derivative of the direction of the rod at the last tick, 1/s^2. (n_worlds, n_drones, 3)"""
@@ -238,12 +248,11 @@ class LoadLQRMemory(PyTree):
     """One after the first tick, zero before. (n_worlds, n_drones, 1)"""
 
 
-ROD_JERK_MAX = 500.0
-"""Largest third derivative of the direction of the rod that is fed forward, 1/s^3: a swing of 0.5 rad at 10 rad/s."""
-
-
 class LoadLQR(Controller):
-    """Linear quadratic regulator of a drone with a load (``load_lqr_control``) for setpoints of load or drone."""
+    """Linear quadratic regulator of a drone with a load (``load_lqr_control``) for setpoints of load or drone.
+
+    The rod is assumed to be attached at the drone's centre of mass.
+    """
 
     name: ClassVar[str] = "load_lqr"
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
@@ -272,10 +281,25 @@ class LoadLQR(Controller):
         """Return the memory before the first tick."""
         return LoadLQRMemory(as_parameter(np.zeros(3)), as_parameter(0.0))
 
+    def take_over(
+        self, data: Any, command: Any, memory: LoadLQRMemory, params: LoadLQRParams, rotor_vel: Array
+    ) -> LoadLQRMemory:
+        """Return a memory that starts anew: its derivative is not that of the last tick."""
+        return memory.replace(started=jnp.zeros_like(memory.started))
+
     def update(
         self, data: Any, command: Any, memory: LoadLQRMemory, params: LoadLQRParams
     ) -> tuple[Array, LoadLQRMemory]:
-        """Return the wrench."""
+        """Return the wrench.
+
+        Raises:
+            ConfigError: If the simulation has no such load.
+        """
+        if self.load not in data.plugins:
+            raise ConfigError(
+                f"expected a load {self.load!r} for controller {self.name!r}, got plugins {list(data.plugins)}. Use "
+                f"sim.add(SlungLoad(...)), or LoadLQR(load=...) with its name."
+            )
         s, load = data.states, data.plugins[self.load]
         # An empty hook swings too, and its load stands elsewhere.
         tip_pos, tip_vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)

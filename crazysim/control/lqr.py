@@ -181,7 +181,8 @@ def state_error(
         vel: Velocity, world frame, m/s. (..., 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         reference: Reference.
-        yaw: Heading in whose frame position and velocity are given, rad; None for the world frame. (..., 1)
+        yaw: Heading in whose frame the errors of position and velocity are returned, rad; None for the world frame.
+            (..., 1)
     """
     matrix = rotation.matrix(quat)
     relative = [[dot(reference.matrix[..., i], matrix[..., j])[..., 0] for j in range(3)] for i in range(3)]  # R_d^T R

@@ -214,11 +214,12 @@ class TrackingLQR(Controller):
         Raises:
             ConfigError: If the setpoints are missing or too many, or no gain stabilises the drone.
         """
-        n = np.shape(self.setpoints.pos)[0] if isinstance(self.setpoints, Setpoint) else 0
-        if not 2 <= n <= MAX_KNOTS or self.dt <= 0:
+        shape = np.shape(self.setpoints.pos) if isinstance(self.setpoints, Setpoint) else ()
+        n = shape[0] if len(shape) == 2 else 0
+        if not 2 <= n <= MAX_KNOTS or not 0 < self.dt < math.inf:
             raise ConfigError(
                 f"expected setpoints of one drone with a leading axis of 2 to {MAX_KNOTS}, and a positive dt, got "
-                f"{n} and {self.dt}. Use jax.vmap(trajectory.evaluate)(times) with a larger dt."
+                f"positions of shape {shape} and {self.dt}. Use jax.vmap(trajectory.evaluate)(times) with a larger dt."
             )
         hover = LQRParams.create(airframe, self.freq, self.Q, self.R)
         weights = default_weights(airframe, self.freq)

@@ -141,8 +141,8 @@ class MPPI:
         self.substeps, self.knots = positive("substeps", substeps), positive("knots", knots)
         if not 2 <= self.knots <= MAX_KNOTS or self.horizon < 2:
             raise ConfigError(f"expected 2 to {MAX_KNOTS} knots and a horizon from 2 on, got {knots} and {horizon}")
-        if not temperature > 0:
-            raise ConfigError(f"expected a positive temperature, got {temperature!r}")
+        if not 0 < temperature < np.inf:
+            raise ConfigError(f"expected a positive, finite temperature, got {temperature!r}. Use 0.05.")
         self.temperature, self.cost, self._key = temperature, cost, jax.random.key(seed)
         freq = c.freq if freq is None else positive("freq", freq)
         self._sim = Sim(
@@ -155,8 +155,8 @@ class MPPI:
         """Time from one command to the next, s."""
         self.hover, self.low, self.high, default = _command_range(sim)
         self.noise = default if noise is None else np.asarray(noise, floating())
-        if self.noise.shape != self.hover.shape or not np.all(self.noise >= 0):
-            raise ConfigError(f"expected noise as {len(self.hover)} numbers from zero on, got {noise!r}")
+        if self.noise.shape != self.hover.shape or not np.all((self.noise >= 0) & np.isfinite(self.noise)):
+            raise ConfigError(f"expected noise as {len(self.hover)} finite numbers of at least zero, got {noise!r}")
         pipeline = {
             "mppi_command": Stage(self._command_stage, "drone", self._control_tick),
             **self._sim.step_pipeline,
@@ -239,6 +239,11 @@ class MPPI:
     def _rollouts(self, data: SimData, record: RolloutRecord) -> SimData:
         """Return the data of the rollouts: that of the simulation, once for every sample, at step 0."""
         template = self._sim.data
+        if data.plugins.keys() != template.plugins.keys():
+            raise ConfigError(
+                f"expected data with the plugins that the simulation had when MPPI was built, "
+                f"{list(template.plugins)}, got {list(data.plugins)}. Build MPPI after adding them."
+            )
 
         def of_rollouts(scope: str, own: Any, x: Any) -> Any:
             return self._repeat(x) if scope in ("drone", "world") else own if scope != "shared" else x
