@@ -17,6 +17,7 @@ from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
@@ -73,7 +74,7 @@ class GeometricParams(PyTree):
             }
         return GeometricParams(
             mass=as_parameter(mass),
-            gravity_vec=as_parameter([0.0, 0.0, -9.81]),
+            gravity_vec=as_parameter(GRAVITY),
             J=as_parameter(airframe.inertia),
             drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
             **{key: as_parameter(np.broadcast_to(value, (3,))) for key, value in table.items()},

@@ -233,7 +233,7 @@ class INDI(Controller):
     def take_over(
         self, data: Any, command: Any, memory: INDIMemory, params: INDIParams, rotor_vel: Array
     ) -> INDIMemory:
-        """Return a memory that starts anew: velocities of when it was last active are not those of the last tick."""
+        """Return the memory before the first tick, since the remembered velocities are not those of the last tick."""
         return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(self, data: Any, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:

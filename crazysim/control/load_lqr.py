@@ -14,12 +14,13 @@ from crazysim.control.bandwidth import bandwidth
 from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust, direction_of
 from crazysim.control.linear import linearize, load_derivative, rod_angles
-from crazysim.control.lqr import GRAVITY_VEC, Reference, as_weights, into_heading, on_host, state_error
+from crazysim.control.lqr import Reference, as_weights, into_heading, on_host, state_error
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.riccati import gain_discrete
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
@@ -85,7 +86,7 @@ class LoadLQRParams(PyTree):
             mass=as_parameter(mass),
             load_mass=as_parameter(load_mass),
             length=as_parameter(length),
-            gravity_vec=as_parameter(GRAVITY_VEC),
+            gravity_vec=as_parameter(GRAVITY),
             J=as_parameter(inertia),
             drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
             gain=as_parameter(gain),
@@ -101,7 +102,7 @@ def default_load_weights(
     As ``crazysim.control.lqr.default_weights``, for drone and load together. The angle of the rod counts as a shift of
     the load: 1 m of position is 1 / length rad, and its rate as the natural frequency times that.
     """
-    rates, g = bandwidth(airframe, freq), 9.81
+    rates, g = bandwidth(airframe, freq), -GRAVITY[2]
     w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
     tilt = w**2 / g
     angle = [1 / length, 1 / length, w / length, w / length]
@@ -128,12 +129,12 @@ def load_gain(mass: Array, J: Array, load_mass: Array, length: Array, dt: Array,
         Gain K of ``u = -K x``. (4, 16)
     """
     mass, load_mass = jnp.reshape(mass, (1,)), jnp.reshape(load_mass, (1,))
-    gravity = jnp.asarray(GRAVITY_VEC, J.dtype)
+    gravity = jnp.asarray(GRAVITY, J.dtype)
 
     def model(x: Array, u: Array) -> Array:
         return load_derivative(x, u, mass, J, gravity, load_mass, jnp.reshape(length, (1,)))
 
-    x, u = jnp.zeros(16, J.dtype), jnp.concatenate([9.81 * (mass + load_mass), jnp.zeros(3, J.dtype)])
+    x, u = jnp.zeros(16, J.dtype), jnp.concatenate([-GRAVITY[2] * (mass + load_mass), jnp.zeros(3, J.dtype)])
     A, B = linearize(model, x, u)
     return gain_discrete(jnp.eye(16, dtype=J.dtype) + dt * A, dt * B, Q, R)
 
@@ -284,7 +285,7 @@ class LoadLQR(Controller):
     def take_over(
         self, data: Any, command: Any, memory: LoadLQRMemory, params: LoadLQRParams, rotor_vel: Array
     ) -> LoadLQRMemory:
-        """Return a memory that starts anew: its derivative is not that of the last tick."""
+        """Return the memory before the first tick, since the remembered derivative is not that of the last tick."""
         return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(

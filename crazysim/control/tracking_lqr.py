@@ -28,6 +28,7 @@ from crazysim.control.protocol import Controller
 from crazysim.control.riccati import gain_continuous, solve_lyapunov
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, matvec
@@ -116,7 +117,7 @@ def tracking_gains(
         (n, 4, 12)
     """
     mass = jnp.reshape(mass, (1,))
-    params = _Model(mass, jnp.asarray([0.0, 0.0, -9.81], J.dtype), J, drag_matrix)
+    params = _Model(mass, jnp.asarray(GRAVITY, J.dtype), J, drag_matrix)
 
     def matrices(setpoint: Setpoint) -> tuple[Array, Array]:
         reference = reference_of(setpoint, params)

@@ -15,6 +15,7 @@ from crazysim.control import Control, Setpoint
 from crazysim.core.data import SimData, SimState
 from crazysim.core.settings import positive
 from crazysim.core.stage import Stage
+from crazysim.dynamics.core import GRAVITY
 from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.engine import Step
 from crazysim.errors import ConfigError
@@ -305,7 +306,7 @@ def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     mass = float(airframe.value("rigid_body.mass", ()))
     low = airframe.n_rotors * float(airframe.value("rotors.thrust_min", ()))
     high = airframe.n_rotors * float(airframe.value("rotors.thrust_max", ()))
-    weight = mass * 9.81
+    weight = -GRAVITY[2] * mass
     thrust, spread = (weight, low, high), 0.2 * (high - low)
     if level == Control.rotor_vel:
         least, most = rotor_vel_limits(sim.dynamics, airframe)
