@@ -10,7 +10,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.allocation import AllocationParams
-from crazysim.control.bandwidth import bandwidth
+from crazysim.control.bandwidth import Bandwidth, bandwidth
 from crazysim.control.core import Control
 from crazysim.control.flatness import Attitude, attitude_of_thrust
 from crazysim.control.priority import prioritized_wrench
@@ -65,13 +65,7 @@ class GeometricParams(PyTree):
         if gains == "airframe":
             table = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
         else:
-            rates, moments = bandwidth(airframe, freq), np.diag(airframe.inertia)
-            table = {
-                "kr": mass * rates.position**2,
-                "kv": mass * 2 * rates.position,
-                "kR": moments * rates.stiffness,
-                "kw": moments * rates.damping,
-            }
+            table = gains_of(airframe, bandwidth(airframe, freq))
         return GeometricParams(
             mass=as_parameter(mass),
             gravity_vec=as_parameter(GRAVITY),
@@ -80,6 +74,17 @@ class GeometricParams(PyTree):
             **{key: as_parameter(np.broadcast_to(value, (3,))) for key, value in table.items()},
             allocation=AllocationParams.create(airframe),
         )
+
+
+def gains_of(airframe: Airframe, rates: Bandwidth) -> dict[str, Any]:
+    """Return the gains ``kr``, ``kv``, ``kR`` and ``kw`` that give an airframe the rates of a bandwidth."""
+    mass, moments = airframe.value("rigid_body.mass", ()), np.diag(airframe.inertia)
+    return {
+        "kr": mass * rates.position**2,
+        "kv": mass * 2 * rates.position,
+        "kR": moments * rates.stiffness,
+        "kw": moments * rates.damping,
+    }
 
 
 def geometric_control(

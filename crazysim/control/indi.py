@@ -14,7 +14,7 @@ from crazysim.control.allocation import force_torque2rotor_vel
 from crazysim.control.bandwidth import bandwidth, rotor_rate
 from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust
-from crazysim.control.geometric import GeometricParams, attitude_errors
+from crazysim.control.geometric import GeometricParams, attitude_errors, gains_of
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
@@ -62,14 +62,7 @@ class INDIParams(PyTree):
         if not 0 < cutoff < math.inf:
             raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
         params = GeometricParams.create(airframe, freq)
-        moments, mass = np.diag(airframe.inertia), float(airframe.value("rigid_body.mass", ()))
-        rates = bandwidth(airframe, freq, LEAD * rotor_rate(airframe))
-        gains = {
-            "kr": mass * rates.position**2,
-            "kv": mass * 2 * rates.position,
-            "kR": moments * rates.stiffness,
-            "kw": moments * rates.damping,
-        }
+        gains = gains_of(airframe, bandwidth(airframe, freq, LEAD * rotor_rate(airframe)))
         arms = np.array([airframe.arm, airframe.arm, float(airframe.value("controller.thrust2torque", ()))])
         mixing = np.vstack([np.ones(airframe.n_rotors), arms[:, None] * airframe.mixing_matrix])
         return INDIParams(
