@@ -24,7 +24,11 @@ CONTROLLERS = {
 
 
 def find_controller(controller: Any, switch: Any = None) -> Controller | None:
-    """Return a controller by its name, or as it is given, or several with a switch; None for Crazyflow's cascade.
+    """Return the controller of a simulation; None for Crazyflow's cascade.
+
+    Args:
+        controller: Name, ``Controller``, or a list of them, which ``switch`` chooses from.
+        switch: Function or indices, as for ``Switch``; None for a single controller.
 
     Raises:
         UnknownNameError: If there is no controller of that name.

@@ -10,13 +10,14 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.allocation import AllocationParams
-from crazysim.control.bandwidth import bandwidth
+from crazysim.control.bandwidth import Bandwidth, bandwidth
 from crazysim.control.core import Control
 from crazysim.control.flatness import Attitude, attitude_of_thrust
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
@@ -64,21 +65,26 @@ class GeometricParams(PyTree):
         if gains == "airframe":
             table = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
         else:
-            rates, moments = bandwidth(airframe, freq), np.diag(airframe.inertia)
-            table = {
-                "kr": mass * rates.position**2,
-                "kv": mass * 2 * rates.position,
-                "kR": moments * rates.stiffness,
-                "kw": moments * rates.damping,
-            }
+            table = gains_of(airframe, bandwidth(airframe, freq))
         return GeometricParams(
             mass=as_parameter(mass),
-            gravity_vec=as_parameter([0.0, 0.0, -9.81]),
+            gravity_vec=as_parameter(GRAVITY),
             J=as_parameter(airframe.inertia),
             drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
             **{key: as_parameter(np.broadcast_to(value, (3,))) for key, value in table.items()},
             allocation=AllocationParams.create(airframe),
         )
+
+
+def gains_of(airframe: Airframe, rates: Bandwidth) -> dict[str, Any]:
+    """Return the gains ``kr``, ``kv``, ``kR`` and ``kw`` that give an airframe the rates of a bandwidth."""
+    mass, moments = airframe.value("rigid_body.mass", ()), np.diag(airframe.inertia)
+    return {
+        "kr": mass * rates.position**2,
+        "kv": mass * 2 * rates.position,
+        "kR": moments * rates.stiffness,
+        "kw": moments * rates.damping,
+    }
 
 
 def geometric_control(

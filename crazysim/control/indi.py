@@ -14,12 +14,13 @@ from crazysim.control.allocation import force_torque2rotor_vel
 from crazysim.control.bandwidth import bandwidth, rotor_rate
 from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust
-from crazysim.control.geometric import GeometricParams, attitude_errors
+from crazysim.control.geometric import GeometricParams, attitude_errors, gains_of
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
+from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
@@ -56,17 +57,12 @@ class INDIParams(PyTree):
             cutoff: Cutoff frequency of the filter, Hz.
 
         Raises:
-            ConfigError: If the airframe lacks a value.
+            ConfigError: If the airframe lacks a value, or the cutoff is not positive.
         """
+        if not 0 < cutoff < math.inf:
+            raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
         params = GeometricParams.create(airframe, freq)
-        moments, mass = np.diag(airframe.inertia), float(airframe.value("rigid_body.mass", ()))
-        rates = bandwidth(airframe, freq, LEAD * rotor_rate(airframe))
-        gains = {
-            "kr": mass * rates.position**2,
-            "kv": mass * 2 * rates.position,
-            "kR": moments * rates.stiffness,
-            "kw": moments * rates.damping,
-        }
+        gains = gains_of(airframe, bandwidth(airframe, freq, LEAD * rotor_rate(airframe)))
         arms = np.array([airframe.arm, airframe.arm, float(airframe.value("controller.thrust2torque", ()))])
         mixing = np.vstack([np.ones(airframe.n_rotors), arms[:, None] * airframe.mixing_matrix])
         return INDIParams(
@@ -101,7 +97,7 @@ def butterworth(cutoff: float, freq: float) -> np.ndarray:
     By the bilinear transform with its frequency warped, so that the gain at the cutoff is 1/sqrt(2).
 
     Args:
-        cutoff: Cutoff frequency, Hz.
+        cutoff: Cutoff frequency, Hz; at most 0.45 of the sampling rate is used.
         freq: Sampling rate, Hz.
     """
     k = math.tan(math.pi * min(cutoff / freq, 0.45))
@@ -151,7 +147,7 @@ def indi_control(
         f = f_rotors + m (a_desired - a),   tau = tau_rotors + J (w'_desired - w')
 
     The disturbances ``m a - f_rotors - m g`` and ``J w' - tau_rotors`` are limited (``DISTURBANCE_MAX``,
-    ``TORQUE_MAX``): the floor under a drone that stands is none that the rotors should push against.
+    ``TORQUE_MAX``), so that the rotors do not push against the floor under a drone that stands.
 
     Acceleration a and angular acceleration w' are differences of the velocities over one tick. They and the force and
     torque of the rotors, from their measured speeds, pass through the same low-pass filter, so that their delays
@@ -226,6 +222,12 @@ class INDI(Controller):
     def memory(self, airframe: Airframe) -> INDIMemory:
         """Return the memory before the first tick."""
         return INDIMemory.at_rest()
+
+    def take_over(
+        self, data: Any, command: Any, memory: INDIMemory, params: INDIParams, rotor_vel: Array
+    ) -> INDIMemory:
+        """Return the memory before the first tick, since the remembered velocities are not those of the last tick."""
+        return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(self, data: Any, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:
         """Return the rotor speeds."""

@@ -14,17 +14,22 @@ from crazysim.control.bandwidth import bandwidth
 from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust, direction_of
 from crazysim.control.linear import linearize, load_derivative, rod_angles
-from crazysim.control.lqr import GRAVITY_VEC, Reference, as_weights, into_heading, on_host, state_error
+from crazysim.control.lqr import Reference, as_weights, into_heading, on_host, state_error
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.riccati import gain_discrete
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY
+from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
 Target = Literal["load", "drone"]
 """Body that a setpoint describes."""
+
+ROD_JERK_MAX = 500.0
+"""Largest third derivative of the direction of the rod that is fed forward, 1/s^3: a swing of 0.5 rad at 10 rad/s."""
 
 
 class LoadLQRParams(PyTree):
@@ -64,8 +69,14 @@ class LoadLQRParams(PyTree):
             R: Weights of collective thrust and torque (4,) or (4, 4); None for ``default_load_weights``.
 
         Raises:
-            ConfigError: If the airframe lacks a value, a weight has another shape, or no gain stabilises the drone.
+            ConfigError: If the airframe lacks a value, mass or length is negative or not finite, a weight has another
+                shape, or no gain stabilises the drone.
         """
+        if not (0 <= load_mass < np.inf and 0 < length < np.inf):
+            raise ConfigError(
+                f"expected load_mass of at least 0 kg and a positive length, m, got {load_mass!r} and {length!r}. Use "
+                f"LoadLQR(load_mass=0.05, length=0.4)."
+            )
         mass, inertia, drag = airframe.value("rigid_body.mass"), airframe.inertia, airframe.value("drag.coefficients")
         weights = default_load_weights(airframe, freq, load_mass, length)
         Q = as_weights("Q", weights[0] if Q is None else Q, 16)
@@ -75,7 +86,7 @@ class LoadLQRParams(PyTree):
             mass=as_parameter(mass),
             load_mass=as_parameter(load_mass),
             length=as_parameter(length),
-            gravity_vec=as_parameter(GRAVITY_VEC),
+            gravity_vec=as_parameter(GRAVITY),
             J=as_parameter(inertia),
             drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
             gain=as_parameter(gain),
@@ -91,7 +102,7 @@ def default_load_weights(
     As ``crazysim.control.lqr.default_weights``, for drone and load together. The angle of the rod counts as a shift of
     the load: 1 m of position is 1 / length rad, and its rate as the natural frequency times that.
     """
-    rates, g = bandwidth(airframe, freq), 9.81
+    rates, g = bandwidth(airframe, freq), -GRAVITY[2]
     w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
     tilt = w**2 / g
     angle = [1 / length, 1 / length, w / length, w / length]
@@ -118,12 +129,12 @@ def load_gain(mass: Array, J: Array, load_mass: Array, length: Array, dt: Array,
         Gain K of ``u = -K x``. (4, 16)
     """
     mass, load_mass = jnp.reshape(mass, (1,)), jnp.reshape(load_mass, (1,))
-    gravity = jnp.asarray(GRAVITY_VEC, J.dtype)
+    gravity = jnp.asarray(GRAVITY, J.dtype)
 
     def model(x: Array, u: Array) -> Array:
         return load_derivative(x, u, mass, J, gravity, load_mass, jnp.reshape(length, (1,)))
 
-    x, u = jnp.zeros(16, J.dtype), jnp.concatenate([9.81 * (mass + load_mass), jnp.zeros(3, J.dtype)])
+    x, u = jnp.zeros(16, J.dtype), jnp.concatenate([-GRAVITY[2] * (mass + load_mass), jnp.zeros(3, J.dtype)])
     A, B = linearize(model, x, u)
     return gain_discrete(jnp.eye(16, dtype=J.dtype) + dt * A, dt * B, Q, R)
 
@@ -230,7 +241,7 @@ def load_lqr_control(
 
 
 class LoadLQRMemory(PyTree):
-    """Memory of the LQR with load: the setpoint of the last tick, of which a difference gives one more derivative."""
+    """Memory of the LQR with load: a derivative at the last tick, whose difference gives the next one."""
 
     rod_acc: Array = leaf("drone", 1)
     """Second derivative of the direction of the rod at the last tick, 1/s^2. (n_worlds, n_drones, 3)"""
@@ -238,12 +249,11 @@ class LoadLQRMemory(PyTree):
     """One after the first tick, zero before. (n_worlds, n_drones, 1)"""
 
 
-ROD_JERK_MAX = 500.0
-"""Largest third derivative of the direction of the rod that is fed forward, 1/s^3: a swing of 0.5 rad at 10 rad/s."""
-
-
 class LoadLQR(Controller):
-    """Linear quadratic regulator of a drone with a load (``load_lqr_control``) for setpoints of load or drone."""
+    """Linear quadratic regulator of a drone with a load (``load_lqr_control``) for setpoints of load or drone.
+
+    The rod is assumed to be attached at the drone's centre of mass.
+    """
 
     name: ClassVar[str] = "load_lqr"
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
@@ -272,10 +282,25 @@ class LoadLQR(Controller):
         """Return the memory before the first tick."""
         return LoadLQRMemory(as_parameter(np.zeros(3)), as_parameter(0.0))
 
+    def take_over(
+        self, data: Any, command: Any, memory: LoadLQRMemory, params: LoadLQRParams, rotor_vel: Array
+    ) -> LoadLQRMemory:
+        """Return the memory before the first tick, since the remembered derivative is not that of the last tick."""
+        return memory.replace(started=jnp.zeros_like(memory.started))
+
     def update(
         self, data: Any, command: Any, memory: LoadLQRMemory, params: LoadLQRParams
     ) -> tuple[Array, LoadLQRMemory]:
-        """Return the wrench."""
+        """Return the wrench.
+
+        Raises:
+            ConfigError: If the simulation has no such load.
+        """
+        if self.load not in data.plugins:
+            raise ConfigError(
+                f"expected a load {self.load!r} for controller {self.name!r}, got plugins {list(data.plugins)}. Use "
+                f"sim.add(SlungLoad(...)), or LoadLQR(load=...) with its name."
+            )
         s, load = data.states, data.plugins[self.load]
         # An empty hook swings too, and its load stands elsewhere.
         tip_pos, tip_vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)

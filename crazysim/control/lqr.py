@@ -20,11 +20,10 @@ from crazysim.control.protocol import Controller
 from crazysim.control.riccati import check_gain, gain_continuous
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
-
-GRAVITY_VEC = np.array([0.0, 0.0, -9.81])
 
 
 class LQRParams(PyTree):
@@ -63,7 +62,7 @@ class LQRParams(PyTree):
         R = as_weights("R", weights[1] if R is None else R, 4)
         return LQRParams(
             mass=as_parameter(mass),
-            gravity_vec=as_parameter(GRAVITY_VEC),
+            gravity_vec=as_parameter(GRAVITY),
             J=as_parameter(inertia),
             drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
             gain=as_parameter(on_host(hover_gain, mass, inertia, Q, R)),
@@ -79,7 +78,7 @@ def default_weights(airframe: Airframe, freq: int) -> tuple[np.ndarray, np.ndarr
     ``crazysim.control.bandwidth`` would give it: w, w^2 / g, w^3 / g, m w^2 and J k w^2 / g, with the natural frequency
     w of the position and the attitude stiffness k. Yaw counts as roll and pitch.
     """
-    rates, g = bandwidth(airframe, freq), 9.81
+    rates, g = bandwidth(airframe, freq), -GRAVITY[2]
     w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
     tilt = w**2 / g
     errors = np.concatenate([np.ones(3), np.full(3, w), np.full(3, tilt), np.full(3, tilt * w)])
@@ -126,13 +125,13 @@ def hover_gain(mass: Array, J: Array, Q: Array, R: Array) -> Array:
     Returns:
         Gain K of ``u = -K x``. (4, 12)
     """
-    gravity = jnp.asarray(GRAVITY_VEC, J.dtype)
+    gravity = jnp.asarray(GRAVITY, J.dtype)
     mass = jnp.reshape(mass, (1,))
 
     def model(x: Array, u: Array) -> Array:
         return drone_derivative(x, u, mass, J, gravity)
 
-    x, u = jnp.zeros(12, J.dtype), jnp.concatenate([9.81 * mass, jnp.zeros(3, J.dtype)])
+    x, u = jnp.zeros(12, J.dtype), jnp.concatenate([-GRAVITY[2] * mass, jnp.zeros(3, J.dtype)])
     return gain_continuous(*linearize(model, x, u), Q, R)
 
 
@@ -181,7 +180,8 @@ def state_error(
         vel: Velocity, world frame, m/s. (..., 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         reference: Reference.
-        yaw: Heading in whose frame position and velocity are given, rad; None for the world frame. (..., 1)
+        yaw: Heading in whose frame the errors of position and velocity are returned, rad; None for the world frame.
+            (..., 1)
     """
     matrix = rotation.matrix(quat)
     relative = [[dot(reference.matrix[..., i], matrix[..., j])[..., 0] for j in range(3)] for i in range(3)]  # R_d^T R

@@ -58,7 +58,7 @@ class Switch(Controller):
     """Function ``(state, setpoint, time) -> index`` of one drone, or indices of all drones, () or (n_worlds, n_drones).
 
     ``state`` is the ``SimState`` of the drone, ``setpoint`` its ``Setpoint`` (the command at other levels), ``time``
-    that since the last reset, s. An index beyond the last controller means the last one."""
+    that since the last reset, s. A negative index means the first controller, one beyond the last means the last."""
     freq: int = 500
     """Rate at which the switch is evaluated, Hz; in a simulation, one that all the controllers' rates divide."""
 

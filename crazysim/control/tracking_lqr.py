@@ -28,6 +28,7 @@ from crazysim.control.protocol import Controller
 from crazysim.control.riccati import gain_continuous, solve_lyapunov
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, matvec
@@ -116,7 +117,7 @@ def tracking_gains(
         (n, 4, 12)
     """
     mass = jnp.reshape(mass, (1,))
-    params = _Model(mass, jnp.asarray([0.0, 0.0, -9.81], J.dtype), J, drag_matrix)
+    params = _Model(mass, jnp.asarray(GRAVITY, J.dtype), J, drag_matrix)
 
     def matrices(setpoint: Setpoint) -> tuple[Array, Array]:
         reference = reference_of(setpoint, params)
@@ -214,11 +215,12 @@ class TrackingLQR(Controller):
         Raises:
             ConfigError: If the setpoints are missing or too many, or no gain stabilises the drone.
         """
-        n = np.shape(self.setpoints.pos)[0] if isinstance(self.setpoints, Setpoint) else 0
-        if not 2 <= n <= MAX_KNOTS or self.dt <= 0:
+        shape = np.shape(self.setpoints.pos) if isinstance(self.setpoints, Setpoint) else ()
+        n = shape[0] if len(shape) == 2 else 0
+        if not 2 <= n <= MAX_KNOTS or not 0 < self.dt < math.inf:
             raise ConfigError(
                 f"expected setpoints of one drone with a leading axis of 2 to {MAX_KNOTS}, and a positive dt, got "
-                f"{n} and {self.dt}. Use jax.vmap(trajectory.evaluate)(times) with a larger dt."
+                f"positions of shape {shape} and {self.dt}. Use jax.vmap(trajectory.evaluate)(times) with a larger dt."
             )
         hover = LQRParams.create(airframe, self.freq, self.Q, self.R)
         weights = default_weights(airframe, self.freq)

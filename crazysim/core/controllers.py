@@ -15,8 +15,8 @@ from crazysim.core.stage import Stage, tick
 def controller_stages(controller: Controller, control: Control) -> Pipeline:
     """Return the stages of a controller, in order.
 
-    One stage takes over the staged command and commands the rotors or the allocation. With an outer loop there are
-    two: the first takes over the setpoint at the rate of the outer loop, the second commands at that of the controller.
+    One stage puts the staged command in force and commands the rotors or the allocation. With an outer loop there are
+    two: the first puts the setpoint in force at the rate of the outer loop, the second commands at the controller's.
     """
     level = control.value
 
@@ -27,7 +27,7 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
         return tick(data, data.controls.controller.freq)
 
     def outer(data: SimData) -> SimData:
-        data = taken_over(data)
+        data = with_staged_command(data)
         own = data.controls.controller
         setpoint: Any = command_in_force(data)
         memory = controller.outer(data, setpoint, own.memory, own.params)
@@ -42,8 +42,8 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
             controls = controls.replace(force_torque=controls.force_torque.replace(staged_cmd=command))
         return data.replace(controls=controls.replace(controller=own.replace(memory=memory)))
 
-    def whole(data: SimData) -> SimData:
-        return inner(taken_over(data))
+    def both(data: SimData) -> SimData:
+        return inner(with_staged_command(data))
 
     name = f"{level}_controller"
     if control == Control.state and controller.has_outer:
@@ -51,10 +51,10 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
             name: Stage(outer, "drone", command_ticks, name=name),
             "attitude_controller": Stage(inner, "drone", controller_ticks, name="attitude_controller"),
         }
-    return {name: Stage(whole, "drone", controller_ticks, name=name)}
+    return {name: Stage(both, "drone", controller_ticks, name=name)}
 
 
-def taken_over(data: SimData) -> SimData:
+def with_staged_command(data: SimData) -> SimData:
     """Return the data of one drone with the staged command in force."""
     controls: Any = data.controls
     ctrl = getattr(controls, controls.mode.value)

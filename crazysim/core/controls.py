@@ -103,7 +103,7 @@ class ControllerData(PyTree):
         """Return a controller at rest, with the airframe's gains.
 
         Raises:
-            ConfigError: If the airframe lacks a number, or a record has leaves of another scope.
+            ConfigError: If the airframe lacks a number, or a record has leaves of another scope or of other counts.
         """
         memory, params = controller.memory(airframe), controller.params(airframe)
         for record, kinds in ((memory, ("drone",)), (params, ("shared", "drone"))):
@@ -111,7 +111,16 @@ class ControllerData(PyTree):
             if others:
                 raise ConfigError(
                     f"expected leaves of scope {' or '.join(kinds)} in {type(record).__name__} of controller "
-                    f"{controller.name!r}, got {sorted(others)}. Declare them with leaf(...)."
+                    f"{controller.name!r}, got {sorted(others)}. Declare memory with leaf('drone', ...), and "
+                    f"parameters with leaf('parameter', ...)."
+                )
+
+        counts = (n_worlds, n_drones)
+        for x, scope in zip(jax.tree.leaves(params), jax.tree.leaves(scopes(params)), strict=True):
+            if scope == "drone" and np.shape(x)[:2] != counts:
+                raise ConfigError(
+                    f"expected parameters of controller {controller.name!r} for all drones or for each, with the "
+                    f"leading axes (n_worlds, n_drones) = {counts}, got shape {np.shape(x)}. Use np.broadcast_to."
                 )
 
         def of_all(x: Any) -> Any:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 from crazysim.live.commands import Command, Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
 from crazysim.sim.sim import Sim
-from crazysim.trajectories import Follow, Trajectory
+from crazysim.trajectories import Follow, Trajectory, hover, line
 
 SPEED = 0.5
 """Mean speed of take-off and landing, m/s."""
@@ -56,7 +56,7 @@ class Fleet:
             sim: Simulation of one world with state commands.
             ids: Drone of each ID that is in use; None for none.
             max_pieces: Most pieces of a trajectory.
-            teleport: True to move a drone to the begin of the first trajectory that it receives before any other
+            teleport: True to move a drone to the start of the first trajectory that it receives before any other
                 command, as the lab's simulator does.
             name: Name of the plugin that follows the trajectories.
 
@@ -99,7 +99,7 @@ class Fleet:
         return n
 
     def setpoint(self, drone: int) -> NDArray:
-        """Return the position, m, and yaw, rad, that a drone has to be at now. (4,)"""
+        """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
         return _at(self._active[drone], self._now() - self._starts[drone])
 
     def _now(self) -> float:
@@ -145,9 +145,9 @@ class Fleet:
         elif isinstance(command, Hover):
             self._fly(drone, _hover(here))
         elif isinstance(command, TakeOff):
-            self._fly(drone, _move(here, np.array([here[0], here[1], command.height, here[3]])))
+            self._fly(drone, _move(here, command.height))
         elif isinstance(command, Land):
-            self._fly(drone, _move(here, np.array([here[0], here[1], 0.0, here[3]])))
+            self._fly(drone, _move(here, 0.0))
 
     def _drones(self, identity: int | None) -> list[int]:
         """Return the drones of an ID; a new one gets the next free drone."""
@@ -200,19 +200,13 @@ class Fleet:
 
 def _hover(point: NDArray) -> Trajectory:
     """Return the trajectory that stays at a position, m, and yaw, rad. (4,)"""
-    return Trajectory.of_pieces([1.0], point[None, :, None])
+    return hover(point[:3], float(point[3]))
 
 
-def _move(begin: NDArray, end: NDArray) -> Trajectory:
-    """Return the straight move between two points, at rest up to the third derivative at both ends.
-
-    Its polynomial of degree 7, ``35 u^4 - 84 u^5 + 70 u^6 - 20 u^7``, is the one with these eight conditions.
-    """
-    seconds = max(float(np.linalg.norm(end[:3] - begin[:3])) / SPEED, MIN_TIME)
-    c = np.zeros((1, 4, 8))
-    c[0, :, 0] = begin
-    c[0, :, 4:] = (end - begin)[:, None] * np.array([35.0, -84.0, 70.0, -20.0])
-    return Trajectory.of_pieces([seconds], c / seconds ** np.arange(8))
+def _move(point: NDArray, height: float) -> Trajectory:
+    """Return the vertical move from a position, m, and yaw, rad, to a height, m, at rest at both ends."""
+    seconds = max(abs(height - float(point[2])) / SPEED, MIN_TIME)
+    return line(point[:3], [point[0], point[1], height], seconds, yaw=float(point[3]))
 
 
 def _at(trajectory: Trajectory, t: float) -> NDArray:

@@ -64,7 +64,8 @@ class Frames:
     """Buffer of a stream.
 
     frames = Frames()
-    for message in frames.feed(received): ...
+    for message in frames.feed(received):
+        ...
     """
 
     def __init__(self) -> None:
@@ -79,7 +80,7 @@ class Frames:
 
     @property
     def pending(self) -> bool:
-        """True where the buffer holds the begin of a message."""
+        """True where the buffer holds the start of a message."""
         return bool(self._buffer)
 
     def feed(self, received: bytes) -> Iterator[Message | Request | ShowFile]:
@@ -120,7 +121,7 @@ class Frames:
         return None
 
     def _may_begin(self, front: bytes) -> bool:
-        """Return True where these bytes may be the begin of a message."""
+        """Return True where these bytes may be the start of a message."""
         if any(start.startswith(front[: len(start)]) for start in STARTS) and len(front) <= MAX_TEXT:
             rest = front[len(b"CMDSTART_") :]
             return not front.startswith(b"CMDSTART_") or bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", rest))

@@ -53,7 +53,9 @@ class CommandQueue:
         try:
             self._queue.put_nowait(command)
         except queue.Full:
-            raise ConfigError(f"expected at most {MAX_QUEUE} waiting commands, got one more") from None
+            raise ConfigError(
+                f"expected at most {MAX_QUEUE} waiting commands, got one more. Call commands() more often."
+            ) from None
 
 
 class CommandServer(CommandQueue):

@@ -66,13 +66,11 @@ def flat_states(
         gravity_vec: Gravitational acceleration, world frame, m/s^2. (3,)
     """
     if path.ndim > 2:
-        one = lambda p, y: flat_states(p, y, mass, load_mass, length, inertia, gravity_vec)  # noqa: E731
-        return jax.vmap(one)(path, yaw)
+        return jax.vmap(lambda p, y: flat_states(p, y, mass, load_mass, length, inertia, gravity_vec))(path, yaw)
 
     def derivatives(order: int, t: Array) -> Array:
         """Return a derivative of the path as a function of the time from now."""
-        terms, factor = path[ORDER], 1.0
-        total = jnp.zeros_like(terms)
+        total, factor = jnp.zeros_like(path[0]), 1.0
         for k in range(ORDER - order + 1):
             factor = factor / k if k else factor
             total = total + path[order + k] * factor * t**k
@@ -116,25 +114,10 @@ def flat_states(
         acc=acceleration(now),
         direction=offset / length,
         direction_rate=(path[1] - velocity(now)) / length,
-        quat=_quaternion(rot),
+        quat=rotation.quat_from_axes(rot[:, 0], rot[:, 1], rot[:, 2]),
         ang_vel=w,
         ang_acc=w_rate,
         tension=tension,
         thrust=jnp.linalg.norm(force(now))[None],
         torque=torque,
     )
-
-
-def _quaternion(rot: Array) -> Array:
-    """Return the quaternion of a rotation matrix, xyzw, by the largest of its four components. (4,)"""
-    xx, yy, zz = rot[0, 0], rot[1, 1], rot[2, 2]
-    d = [rot[2, 1] - rot[1, 2], rot[0, 2] - rot[2, 0], rot[1, 0] - rot[0, 1]]
-    s = [rot[1, 0] + rot[0, 1], rot[2, 0] + rot[0, 2], rot[2, 1] + rot[1, 2]]
-    rows = jnp.stack([
-        jnp.stack([1 + xx - yy - zz, s[0], s[1], d[0]]),
-        jnp.stack([s[0], 1 - xx + yy - zz, s[2], d[1]]),
-        jnp.stack([s[1], s[2], 1 - xx - yy + zz, d[2]]),
-        jnp.stack([d[0], d[1], d[2], 1 + xx + yy + zz]),
-    ])  # fmt: skip
-    row = rows[jnp.argmax(jnp.diagonal(rows))]
-    return row / jnp.linalg.norm(row)

@@ -193,7 +193,9 @@ class Hook(Colliding, Plugin):
         return self.write(data, load.replace(grip=jnp.broadcast_to(jnp.asarray(grip, bool), load.grip.shape)))
 
     def hang(self, data: SimData, mask: Any = None) -> SimData:
-        """Return the data with hooks at rest below their drones, for drones that were moved; of all worlds.
+        """Return the data with hooks, and the loads on them, at rest below their drones; of all worlds.
+
+        Use it after moving drones.
 
         Args:
             data: Simulation.

@@ -98,7 +98,9 @@ class SlungLoad(Colliding, Plugin):
         return self.write(data.replace(states=states), load.replace(vel=vel))
 
     def hang(self, data: SimData, mask: Any = None) -> SimData:
-        """Return the data with attached loads at rest below their drones, for drones that were moved; of all worlds.
+        """Return the data with every load attached, and at rest below its drone; of all worlds.
+
+        Use it after moving drones.
 
         Args:
             data: Simulation.

@@ -15,6 +15,7 @@ from crazysim.control import Control, Setpoint
 from crazysim.core.data import SimData, SimState
 from crazysim.core.settings import positive
 from crazysim.core.stage import Stage
+from crazysim.dynamics.core import GRAVITY
 from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.engine import Step
 from crazysim.errors import ConfigError
@@ -141,8 +142,8 @@ class MPPI:
         self.substeps, self.knots = positive("substeps", substeps), positive("knots", knots)
         if not 2 <= self.knots <= MAX_KNOTS or self.horizon < 2:
             raise ConfigError(f"expected 2 to {MAX_KNOTS} knots and a horizon from 2 on, got {knots} and {horizon}")
-        if not temperature > 0:
-            raise ConfigError(f"expected a positive temperature, got {temperature!r}")
+        if not 0 < temperature < np.inf:
+            raise ConfigError(f"expected a positive, finite temperature, got {temperature!r}. Use 0.05.")
         self.temperature, self.cost, self._key = temperature, cost, jax.random.key(seed)
         freq = c.freq if freq is None else positive("freq", freq)
         self._sim = Sim(
@@ -155,8 +156,8 @@ class MPPI:
         """Time from one command to the next, s."""
         self.hover, self.low, self.high, default = _command_range(sim)
         self.noise = default if noise is None else np.asarray(noise, floating())
-        if self.noise.shape != self.hover.shape or not np.all(self.noise >= 0):
-            raise ConfigError(f"expected noise as {len(self.hover)} numbers from zero on, got {noise!r}")
+        if self.noise.shape != self.hover.shape or not np.all((self.noise >= 0) & np.isfinite(self.noise)):
+            raise ConfigError(f"expected noise as {len(self.hover)} finite numbers of at least zero, got {noise!r}")
         pipeline = {
             "mppi_command": Stage(self._command_stage, "drone", self._control_tick),
             **self._sim.step_pipeline,
@@ -239,6 +240,11 @@ class MPPI:
     def _rollouts(self, data: SimData, record: RolloutRecord) -> SimData:
         """Return the data of the rollouts: that of the simulation, once for every sample, at step 0."""
         template = self._sim.data
+        if data.plugins.keys() != template.plugins.keys():
+            raise ConfigError(
+                f"expected data with the plugins that the simulation had when MPPI was built, "
+                f"{list(template.plugins)}, got {list(data.plugins)}. Build MPPI after adding them."
+            )
 
         def of_rollouts(scope: str, own: Any, x: Any) -> Any:
             return self._repeat(x) if scope in ("drone", "world") else own if scope != "shared" else x
@@ -300,7 +306,7 @@ def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     mass = float(airframe.value("rigid_body.mass", ()))
     low = airframe.n_rotors * float(airframe.value("rotors.thrust_min", ()))
     high = airframe.n_rotors * float(airframe.value("rotors.thrust_max", ()))
-    weight = mass * 9.81
+    weight = -GRAVITY[2] * mass
     thrust, spread = (weight, low, high), 0.2 * (high - low)
     if level == Control.rotor_vel:
         least, most = rotor_vel_limits(sim.dynamics, airframe)

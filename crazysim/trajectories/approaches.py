@@ -16,7 +16,7 @@ SPLIT = 4
 BATCH = 500_000
 """Number of cells, of all pairs, that are examined at once, which bounds the memory."""
 TABLE = 4_000_000
-"""Number of cells, of all drones, up to which the motion of every drone is worked out once and looked up."""
+"""Largest number of cells, of all drones, for which the motion of every drone is computed once and looked up."""
 SHORTEST = 1e-6
 """Length below which a cell is not split, s: only a jump of a position leads there."""
 
@@ -91,7 +91,7 @@ class _Motion:
         return self.in_cells(np.arange(self.fleet.n_drones)[:, None], np.arange(n_cells), dt, None)
 
     def in_cells(self, drone: Ints, cell: Ints, dt: float, table: tuple[Floats, ...] | None) -> tuple[Floats, ...]:
-        """Return positions at begin and end, acceleration and jerk in the middle (..., 3) and bound (...) of each cell.
+        """Return positions at start and end, acceleration and jerk in the middle (..., 3) and bound (...) of each cell.
 
         The bound is that of the deviation from the chord, less the part of the derivatives in the middle.
         """

@@ -88,7 +88,7 @@ def _maxima(paths: Floats, waypoints: Floats, radii: Floats) -> tuple[np.ndarray
     piece, at = np.nonzero(is_peak)
     around = np.clip(samples[at][:, None] + (2 * samples - 1) / (N_SAMPLES - 1), 0.0, 1.0)
     distance = _deviation(paths[piece], waypoints[piece], waypoints[piece + 1], around)[2]
-    return piece, around[np.arange(len(piece)), np.argmax(distance, axis=-1)] if len(piece) else np.zeros(0)
+    return piece, around[np.arange(len(piece)), np.argmax(distance, axis=-1)]
 
 
 class _Program:

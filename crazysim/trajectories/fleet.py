@@ -27,9 +27,9 @@ class Fleet:
     drone: Ints
     """Drone of each piece. (n_pieces,)"""
     begin: Floats
-    """Begin of each piece, s. (n_pieces,)"""
+    """Start of each piece, s. (n_pieces,)"""
     length: Floats
-    """Length of each piece, s. (n_pieces,)"""
+    """Duration of each piece, s. (n_pieces,)"""
     coefficients: Floats
     """Coefficients of x, y, z, m, and yaw, rad, of a piece's time divided by its length. (n_pieces, 4, degree + 1)"""
 
@@ -103,7 +103,7 @@ class Fleet:
 
         Args:
             piece: Numbers of pieces. (...)
-            u: Time since the begin of the piece over its length. (...)
+            u: Time since the start of the piece over its duration. (...)
             order: Order of the derivative.
 
         Returns:

@@ -230,8 +230,11 @@ def _checked(sim: Simulation, name: str, value: Any, n_slots: int) -> Array:
 
 
 def _count(name: str, value: Any, least: int) -> int:
+    """Return a setting, checked to be an integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise ConfigError(f"expected {name} to be a whole number from {least} on, which is given, got {value!r}")
+        raise ConfigError(
+            f"expected {name} as an integer of at least {least}, which the trajectories need, got {value!r}"
+        )
     return int(value)
 
 

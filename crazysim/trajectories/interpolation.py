@@ -83,9 +83,9 @@ def cost_matrices(durations: Floats, order: int) -> Floats:
 def fill(nodes: Floats, durations: Floats) -> Floats:
     """Return the derivatives at all waypoints that minimise the integral of the squared k-th derivative.
 
-    The positions of a single axis are solved for at a time, since other derivatives may be free in other axes. Times
-    are scaled by the mean duration; a Cholesky factorisation needs no further scaling, as its error does not depend on
-    that of rows and columns (Higham, *Accuracy and Stability of Numerical Algorithms*, section 10.1).
+    Each axis is solved on its own, since different derivatives may be free in each. Times are scaled by the mean
+    duration; a Cholesky factorisation needs no further scaling, as its error does not depend on that of rows and
+    columns (Higham, *Accuracy and Stability of Numerical Algorithms*, section 10.1).
 
     Args:
         nodes: Derivatives 0 to k - 1 at each waypoint, NaN where free. (n_pieces + 1, k, n_axes)

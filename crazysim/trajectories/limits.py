@@ -178,15 +178,16 @@ def check(
         tolerance: Largest error of a distance, m.
 
     Raises:
-        ConfigError: If there is no trajectory, or the number of names or starts differs from that of the trajectories.
+        ConfigError: If there is no trajectory, or the number of names or starts differs from that of the trajectories,
+            or the tolerance is not positive.
     """
     several = _unstacked(trajectories) if isinstance(trajectories, Trajectory) else list(trajectories)
     fleet = Fleet.of(several, starts, duration)
     labels = tuple(names) if names is not None else tuple(f"drone {k}" for k in range(len(several)))
     if len(labels) != len(several):
         raise ConfigError(f"expected {len(several)} names, one for each drone, got {len(labels)}")
-    if tolerance <= 0:
-        raise ConfigError(f"expected a positive tolerance, m, got {tolerance!r}")
+    if not 0 < tolerance < np.inf:
+        raise ConfigError(f"expected a positive, finite tolerance, m, got {tolerance!r}. Use 1e-3.")
     allowed = (limits if airframe is None else limits.of_airframe(airframe)).given()
     found, closest = peaks(fleet, tuple(QUANTITIES)), tuple(closest_approaches(fleet, tolerance))
     violations = []

@@ -19,7 +19,7 @@ from crazysim.trajectories.trajectory import Trajectory
 TOLERANCE = 5e-6
 """Largest error of the position of a fitted curve, m; float32 adds its rounding, 6e-8 of a coordinate."""
 PERIOD = 5.0
-"""Period without another, s."""
+"""Default period, s."""
 
 Curve = Callable[[np.ndarray, int], np.ndarray]
 """Times, s (n,), and the order of a derivative to x, y, z, m, and yaw, rad, differentiated as often. (n, 4)"""

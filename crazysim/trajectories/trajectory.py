@@ -16,7 +16,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, floating, leaf
 
 COUNTED = 16
-"""Most pieces of which that of a time is found by counting; otherwise it is found by bisection."""
+"""Largest number of pieces for which the piece at a time is found by counting; above it, by bisection."""
 N_DERIVATIVES = 4
 """Highest derivative of a setpoint: snap."""
 

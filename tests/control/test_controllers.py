@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Latency, Sim, make
-from crazysim.control import PID, Control, Controller, Mellinger, Setpoint
+from crazysim.control import INDI, PID, Control, Controller, LoadLQR, Mellinger, Setpoint
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
 from crazysim.pytree import PyTree, as_parameter, leaf
@@ -189,6 +189,13 @@ def test_rates_of_the_simulation_replace_those_of_the_controller():
         ({"controller": ["crazyflow"], "switch": 0}, r"other than 'crazyflow'"),
         ({"controller": ["pid"], "switch": 1}, r"expected switch as a function or as integers from 0 to 0"),
         ({"controller": ["pid"], "switch": lambda state, setpoint, time: time}, r"expected one integer"),
+        (
+            {"controller": ["pid"], "switch": np.zeros((3, 4), int)},
+            r"\(n_worlds, n_drones\) = \(1, 1\), got shape \(3, 4, 1\)",
+        ),
+        ({"controller": "load_lqr", "drone": "bumblebee"}, r"expected a load 'load' for controller 'load_lqr'"),
+        ({"controller": LoadLQR(length=0.0), "drone": "bumblebee"}, r"positive length, m, got 0\.05 and 0\.0"),
+        ({"controller": INDI(cutoff=-1.0)}, r"expected a positive, finite cutoff, Hz, got -1"),
     ],
 )
 def test_wrong_settings_are_refused(settings, message):

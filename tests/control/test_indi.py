@@ -1,17 +1,18 @@
 """Incremental nonlinear dynamic inversion: its filter, its start, and what it compensates."""
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
-from flights import figure_eight, fly, hover, rms, simulation, start_at
+from flights import figure_eight, fly, hover, rms, setpoint_of, simulation, start_at
 
 from crazysim import Sim, load_airframe
 from crazysim.control.geometric import GeometricParams, geometric_control
-from crazysim.control.indi import INDIMemory, INDIParams, butterworth, filtered, indi_control, steady
+from crazysim.control.indi import INDI, INDIMemory, INDIParams, butterworth, filtered, indi_control, steady
 
 
 def test_the_filter_is_that_of_scipy():
@@ -46,6 +47,19 @@ def law(drone):
 
 def memory():
     return jax.tree.map(jnp.asarray, INDIMemory.at_rest())
+
+
+def test_a_return_to_the_controller_starts_its_filter_anew():
+    controller, airframe = INDI(), load_airframe("bumblebee")
+    params, setpoint = controller.params(airframe), setpoint_of(hover, jnp.float32(0))
+    rotor_vel = jnp.full(4, 8000.0)
+    state = {"pos": jnp.zeros(3), "quat": jnp.eye(4)[3], "vel": jnp.array([1.0, 0.0, 0.0]), "ang_vel": jnp.zeros(3)}
+    data = SimpleNamespace(states=SimpleNamespace(**state, rotor_vel=rotor_vel))
+    stale = INDIMemory(jnp.array([-2.0, 0.0, 0.0]), jnp.ones(3), jnp.full(24, 9.0), jnp.ones(1))
+    back = controller.take_over(data, setpoint, stale, params, rotor_vel)
+    first, _ = controller.update(data, setpoint, memory(), params)
+    np.testing.assert_array_equal(controller.update(data, setpoint, back, params)[0], first)
+    assert np.max(np.abs(controller.update(data, setpoint, stale, params)[0] - first)) > 100
 
 
 def test_figure_eight_of_two_metres_at_two_metres_per_second():

@@ -99,6 +99,15 @@ def test_a_trajectory_is_needed_along_a_trajectory():
         Sim(control="state", controller="tracking_lqr")
 
 
+@pytest.mark.parametrize(
+    "shape, dt, got", [((), 0.1, r"shape \(3,\) and 0.1"), ((4,), np.nan, r"shape \(4, 3\) and nan")]
+)
+def test_a_trajectory_has_one_leading_axis_and_a_time(shape, dt, got):
+    setpoints = jax.tree.map(lambda x: np.broadcast_to(x, (*shape, *x.shape)), setpoint_of(figure_eight, 0.0))
+    with pytest.raises(ConfigError, match=f"got positions of {got}"):
+        TrackingLQR(setpoints=setpoints, dt=dt).params(load_airframe("bumblebee"))
+
+
 # Along a trajectory -------------------------------------------------------------------------------------------------
 
 

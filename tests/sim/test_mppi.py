@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import Sim
+from crazysim import Sim, Wind
 from crazysim.control import Setpoint
 from crazysim.errors import ConfigError
 from crazysim.sim.mppi import MPPI, setpoint_after, tracking_cost
@@ -118,7 +118,9 @@ WRONG = {
     "horizon": (lambda sim: MPPI(sim, horizon=1), "horizon"),
     "samples": (lambda sim: MPPI(sim, samples=0), "samples"),
     "temperature": (lambda sim: MPPI(sim, temperature=0.0), "temperature"),
+    "endless temperature": (lambda sim: MPPI(sim, temperature=np.inf), "temperature"),
     "noise": (lambda sim: MPPI(sim, noise=[1.0, 2.0]), "noise"),
+    "endless noise": (lambda sim: MPPI(sim, noise=[np.inf] * 4), "noise"),
 }
 
 
@@ -127,3 +129,11 @@ def test_wrong_settings(sim, case):
     make, message = WRONG[case]
     with pytest.raises(ConfigError, match=message):
         make(sim)
+
+
+def test_data_with_other_plugins_is_refused():
+    sim = Sim(control="attitude")
+    mppi = MPPI(sim, samples=2, freq=125, horizon=2)
+    sim.add(Wind())
+    with pytest.raises(ConfigError, match="Build MPPI after adding them"):
+        mppi.command(sim.data, point())

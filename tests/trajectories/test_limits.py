@@ -136,6 +136,7 @@ def test_a_stack_is_a_fleet():
         (lambda: check([], Limits()), "at least one"),
         (lambda: check(straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), names=["a", "b"]), "1 names"),
         (lambda: check(straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), tolerance=0.0), "tolerance"),
+        (lambda: check(straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), tolerance=np.nan), "tolerance"),
     ],
 )
 def test_law_09_bad_limits_are_errors(make, message):

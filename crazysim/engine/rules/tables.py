@@ -18,14 +18,21 @@ ZERO = constant(0, np.int32)
 
 
 class Table:
-    """An array of elements as a table: all indices of its entries share a computed base, and differ by constants."""
+    """An array whose elements are entries of a table in memory, each at a computed base plus a constant offset."""
 
     def __init__(self, ctx: Lowering, entry: Entry, offsets: np.ndarray, strides: dict[int, int]):
-        """Hold the table and base, the index of each element less the base, and the steps of the index along axes."""
+        """Describe where the elements stand.
+
+        Args:
+            ctx: The lowering.
+            entry: First element, with its table and base.
+            offsets: Index of each element in the table, less the base.
+            strides: Growth of the index along each axis that is indexed.
+        """
         self.ctx, self.table, self.base, self.offsets, self.strides = ctx, entry.table, entry.base, offsets, strides
         self.aligned = entry.aligned and all(stride % 4 == 0 for stride in strides.values())
         self.same: dict[int, Element] = {}
-        """Entries that are the same constant at all places, by the offset of the first."""
+        """Constants that are equal along the indexed axes, by the offset of the first; they are not looked up."""
 
     def base_at(self, index: Sequence[Element], limits: Sequence[int]) -> Element:
         """Return the base of the elements at an index along the axes, each clamped to 0 and its limit."""

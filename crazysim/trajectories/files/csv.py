@@ -21,7 +21,7 @@ def load_csv(path: str | Path) -> Trajectory:
     """Return the trajectory in a CSV file, of one of two kinds that differ in the number of columns.
 
     - 33 or 25: Crazyswarm's polynomials. Duration, s, and eight coefficients, constant term first, of the time since
-      the begin of the piece, s, for each of x, y, z, m, and, with 33 columns, yaw, rad.
+      the start of the piece, s, for each of x, y, z, m, and, with 33 columns, yaw, rad.
     - 4 or 5: samples. Time, s, x, y, z, m, and, with 5 columns, yaw, rad. Times count from the first row. Between the
       samples the trajectory is cubic, with velocities by central differences, and at rest at both ends.
 

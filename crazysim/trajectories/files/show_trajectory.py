@@ -19,7 +19,7 @@ TOLERANCE = 1e-6
 
 
 def parse_trajectory(value: Any, place: str, yaw_control: Any = None) -> tuple[Trajectory, str]:
-    """Return the trajectory in a ``trajectory.json``, from the begin of the show on, and its encoding.
+    """Return the trajectory in a ``trajectory.json``, from the start of the show on, and its encoding.
 
     Each point is ``[t, [x, y, z], [control points]]``: the end of a Bezier curve that begins at the previous point,
     with up to six inner control points. Times count from ``takeoffTime``; until the first point the vehicle rests
