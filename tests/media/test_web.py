@@ -180,7 +180,10 @@ def pixel(browser, flight, point, world):
 def test_a_served_flight_is_scrubbed_in_a_browser(viser, browser, flight, tmp_path):
     """Wherever the bar is clicked, forwards and backwards, the drone is shown where it was at that time."""
     flight.save(tmp_path / "flight.npz")
-    command = [sys.executable, "-m", "crazysim", "replay", "flight.npz", "--world", "1", "--port", "0"]
+    # Programs that a shell started in the background ignore SIGINT, and so would this one.
+    start = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    start += "from crazysim.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", start, "replay", "flight.npz", "--world", "1", "--port", "0"]
     program = subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": ":".join(sys.path)}
     )
