@@ -14,6 +14,7 @@ from jax import Array
 
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
+from crazysim.demos.common import FPS, frames_of
 from crazysim.dynamics import first_principles
 from crazysim.errors import RenderError
 from crazysim.media import Film, Flight, Recorder, View
@@ -22,8 +23,6 @@ from crazysim.progress import progress
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material
 
-FPS = 25
-"""Rate of frames and of contact checks, Hz."""
 PERIOD = 5.0
 """Period of the figure eight, s."""
 SETTLED = 2.0
@@ -55,11 +54,9 @@ def run(
     Raises:
         ValueError: If the flight is shorter than one frame.
     """
-    if seconds < 1 / FPS:
-        raise ValueError(f"expected --seconds of at least {1 / FPS}, got {seconds}; use a longer flight")
+    n_frames = frames_of(seconds)
     sim = build(n_worlds, n_drones, device)
     fly_frame = build_fly_frame(sim)
-    n_frames = round(seconds * FPS)
     engine = sim.explain().splitlines()[0]
     print(f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from crazysim.control import LoadLQR
-from crazysim.errors import RenderError
-from crazysim.media import Film, View
+from crazysim.demos.common import FPS, FilmedFlight, frames_of
+from crazysim.media import View
 from crazysim.payloads import Hook
 from crazysim.sim.sim import Sim
 
-FPS = 25
-"""Rate of frames, Hz."""
 MASS, LENGTH, HEIGHT = 0.2, 0.4, 1.2
 """Mass of the load, kg, length of the rod, m, and height of the drone, m."""
 PUSH = 1.0
@@ -43,36 +39,23 @@ def run(
     Raises:
         ValueError: If the flight is shorter than one frame.
     """
-    if seconds < 1 / FPS:
-        raise ValueError(f"expected --seconds of at least {1 / FPS}, got {seconds}; use a longer flight")
+    n_frames = frames_of(seconds)
     sim = build(n_worlds, n_drones, device)
     goal = np.asarray(sim.data.plugins["load"].pos)
     print(f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}")
     view = View(width=960, height=544, trail=1.0, cam_config={"lookat": [0, 0, 0.9], "distance": 2.6, "elevation": -12})
     out.mkdir(parents=True, exist_ok=True)
-    recorder = Film(out / "load.mp4", view, fps=FPS) if film else None
-    step_s = 0.0
-    for k in range(round(seconds * FPS)):
-        begin = time.perf_counter()
-        sim.step(sim.freq // FPS)
-        jax.block_until_ready(sim.data.states.pos)
-        step_s += time.perf_counter() - begin if k else 0.0
-        if recorder is not None:
-            try:
-                recorder.add(sim)
-            except (ImportError, RenderError) as error:
-                print(f"no film: {error}")
-                recorder = None
+    flight = FilmedFlight(sim, out / "load.mp4", view, film)
+    for k in range(n_frames):
+        flight.fly_frame()
+        flight.film_frame()
         if k % FPS == FPS - 1:
             error = np.linalg.norm(np.asarray(sim.data.plugins["load"].pos) - goal, axis=-1)
             mean, most = 100 * error.mean(), 100 * error.max()
             print(f"{(k + 1) / FPS:4.0f} s   load {mean:5.1f} cm from its goal, {most:.1f} cm at most")
-    if recorder is not None:
-        recorder.close()
-        print(f"wrote {out / 'load.mp4'}")
+    flight.close_film()
     sim.close()
-    rate = n_worlds * n_drones * (round(seconds * FPS) - 1) * (sim.freq // FPS) / max(step_s, 1e-9)
-    print(f"steps per second  {rate / 1e6:.2f} M")
+    flight.print_rate()
 
 
 def build(n_worlds: int, n_drones: int, device: str) -> Sim:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import jax
@@ -13,14 +12,12 @@ from jax import Array
 from crazysim.control.load_lqr import LoadLQR
 from crazysim.control.setpoint import Setpoint
 from crazysim.core.data import SimState
-from crazysim.errors import RenderError
-from crazysim.media import Film, Recorder, View
+from crazysim.demos.common import FPS, FilmedFlight, frames_of
+from crazysim.media import Recorder, View
 from crazysim.payloads import Hook
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Follow, Trajectory, figure_eight, hover, line, minimum_snap
 
-FPS = 25
-"""Rate of frames, Hz."""
 MASS, HOOK_MASS, LENGTH, RING = 0.2, 0.0203, 0.4, 0.1675
 """Masses of load and hook, kg, length of the rod, m, and height of a standing load's ring, m."""
 START, FROM, TO, END = (np.array([x, y, 0.0]) for x, y in ((-1.2, 1.2), (-1.2, -1.2), (1.2, 1.2), (1.2, -1.2)))
@@ -60,42 +57,30 @@ def run(
     Raises:
         ValueError: If the flight is shorter than one frame.
     """
-    if seconds < 1 / FPS:
-        raise ValueError(f"expected --seconds of at least {1 / FPS}, got {seconds}; use a longer flight")
+    n_frames = frames_of(seconds)
     sim, hook, plans = build(n_worlds, n_drones, device)
     engine = sim.explain().splitlines()[0]
     print(f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
     view = View(width=960, height=544, follow=0, trail=1.5, cam_config={"distance": 1.7, "elevation": -20})
     out.mkdir(parents=True, exist_ok=True)
-    recorder, movie = Recorder(sim, worlds=[0]), Film(out / "pick.mp4", view, fps=FPS) if film else None
+    recorder, flight = Recorder(sim, worlds=[0]), FilmedFlight(sim, out / "pick.mp4", view, film)
     setpoints = jax.jit(lambda t: jax.vmap(lambda plan: plan.evaluate(t).pos)(plans).reshape(n_worlds, n_drones, 3))
-    errors, held, step_s = [], np.zeros((n_worlds, n_drones), bool), 0.0
-    for k in range(round(seconds * FPS)):
+    errors, held = [], np.zeros((n_worlds, n_drones), bool)
+    for k in range(n_frames):
         if k in (GRIP * FPS, RELEASE * FPS):
             sim.data = hook.command(sim.data, k == GRIP * FPS)
-        begin = time.perf_counter()
-        sim.step(sim.freq // FPS)
-        jax.block_until_ready(sim.data.states.pos)
-        step_s += time.perf_counter() - begin if k else 0.0
+        flight.fly_frame()
         recorder.add()
-        if movie is not None:
-            try:
-                movie.add(sim)
-            except (ImportError, RenderError) as error:
-                print(f"no film: {error}")
-                movie = None
+        flight.film_frame()
         load, now = hook.read(sim.data), (k + 1) / FPS
         held |= np.asarray(load.attached)
         if GRIP + 1 < now <= RELEASE - 1:
             errors.append(np.linalg.norm(np.asarray(load.pos - setpoints(now)), axis=-1))
     report(sim, hook, held, np.array(errors))
-    rate = n_worlds * n_drones * (round(seconds * FPS) - 1) * (sim.freq // FPS) / max(step_s, 1e-9)
-    print(f"steps per second  {rate / 1e6:.2f} M")
+    flight.print_rate()
     recorder.flight().save(out / "flight.npz")
     print(f"wrote {out / 'flight.npz'}")
-    if movie is not None:
-        movie.close()
-        print(f"wrote {out / 'pick.mp4'}")
+    flight.close_film()
     sim.close()
 
 

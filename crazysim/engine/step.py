@@ -116,6 +116,11 @@ class Step:
         step = flat.plan.static if isinstance(n_steps, int) else flat.plan.dynamic
         return step.lower(flat.inputs(), n_steps)
 
+    @property
+    def engines(self) -> list[str]:
+        """Engines that have run it so far, each once."""
+        return sorted({plan.engine for plan in self._plans.values()})
+
     def _cache_size(self) -> int:
         """Return the number of compiled programs, as for a jitted function; the tests of law 6 count them."""
         count = jaxcompat.n_compilations

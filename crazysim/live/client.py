@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from crazysim.errors import ConfigError
+from crazysim.live.closing import Closing
 from crazysim.live.server import DRONE_PORT, STREAM_PORT, connect
 from crazysim.trajectories import Trajectory
 from crazysim.trajectories.files.show_trajectory import format_trajectory
 
 
-class _Client:
+class _Client(Closing):
     """A connection that sends messages and waits for their answers."""
 
     def __init__(self, host: str, port: int, timeout: float):
@@ -49,14 +48,6 @@ class _Client:
     def close(self) -> None:
         """Disconnect."""
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 class DroneClient(_Client):

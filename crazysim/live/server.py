@@ -13,10 +13,10 @@ import socketserver
 import threading
 import time
 from collections.abc import Sequence
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from crazysim.errors import ConfigError
+from crazysim.live.closing import Closing
 from crazysim.live.commands import Command, command_of
 from crazysim.live.framing import Frames, FramingError, Message, Request, ShowFile
 
@@ -34,7 +34,7 @@ POLL = 0.2
 log = logging.getLogger(__name__)
 
 
-class CommandQueue:
+class CommandQueue(Closing):
     """Commands that wait for the simulation."""
 
     def __init__(self) -> None:
@@ -171,14 +171,6 @@ class CommandServer(CommandQueue):
             return
         peer.sendall(b"ACK")
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
 
 class StreamListener(CommandQueue):
     """Client of a server's stream of commands, such as port 7002 of the lab's test server, in a thread of its own.
@@ -226,14 +218,6 @@ class StreamListener(CommandQueue):
                     self._peer.sendall(b"ACK")
                 except ConfigError as error:
                     log.warning("%s: command refused: %s", name, error)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def connect(host: str, port: int, timeout: float) -> socket.socket:

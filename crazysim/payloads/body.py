@@ -32,10 +32,17 @@ class Colliding:
     """``"drone"`` for loads of one drone each, ``"world"`` for loads of a world."""
     name: Any
     """Name of the plugin, and of its loads in the scene: ``name:0``, ..."""
+    size: Any
+    """Radius of a ball, or full lengths of a box, m: () or (3,)."""
+
+    @property
+    def placed_kinds(self) -> tuple[str, ...]:
+        """Names of the loads and their links in the scene."""
+        return (self.name, f"{self.name}_link")
 
     def shape(self) -> Shape:
         """Return the shape of a load."""
-        raise NotImplementedError
+        return shape_of(self.size)
 
     def body(self, data: SimData) -> LoadBody:
         """Return the loads; of one drone or of one world."""

@@ -14,6 +14,7 @@ from crazysim.core.data import Objects, SimData, SimState
 from crazysim.core.plugin import Simulation
 from crazysim.effects.core import Exposed
 from crazysim.effects.wind import wind_at
+from crazysim.payloads.body import Colliding
 from crazysim.payloads.link import TINY, relative
 from crazysim.pytree import leaf
 
@@ -52,6 +53,36 @@ class LoadData(Exposed):
     """Coulomb's coefficient between load and floor, 1. (1,)"""
     clearance: Array = leaf("parameter", 1, (1,))
     """Height of the load's position above the floor where it rests, m. (1,)"""
+
+
+class PointLoad(Colliding):
+    """A load that is one point mass on links that can be cut; mixed into a ``Plugin``."""
+
+    read: Any
+    """``Plugin.read``."""
+    write: Any
+    """``Plugin.write``."""
+
+    def stop_at_floor(self, data: SimData) -> SimData:
+        """Stop the load at the floor; of one drone or of one world."""
+        load = self.read(data)
+        pos, vel = on_floor(load.pos, load.vel, load.clearance, load.friction)
+        return self.write(data, load.replace(pos=pos, vel=vel))
+
+    def release(self, data: SimData, mask: Any = True) -> SimData:
+        """Return the data with links of loads cut.
+
+        Args:
+            data: Simulation.
+            mask: True for drones that let go. (n_worlds, n_drones), or broadcast to that
+        """
+        load = self.read(data)
+        return self.write(data, load.replace(attached=load.attached & ~jnp.asarray(mask, bool)))
+
+
+def integrator_of(sim: Simulation) -> Any:
+    """Return the function of the integrator, such as ``core.integration.rk4``, or None if the stage is not built in."""
+    return getattr(getattr(sim.step_pipeline.get("integration"), "fn", None), "method", None)
 
 
 def air_and_gravity(data: SimData, load: LoadData, vel: Array) -> Array:

@@ -13,8 +13,7 @@ from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
-from crazysim.geometry import Shape
-from crazysim.payloads.body import Colliding, LoadBody, rest_height, shape_of
+from crazysim.payloads.body import Colliding, LoadBody, rest_height
 from crazysim.payloads.core import LoadData, air_and_gravity, hanging, on_floor, turned_z
 from crazysim.payloads.link import TINY, Link, couple, end_relative_motion
 from crazysim.payloads.slung import load_record, place_loads, upward
@@ -221,15 +220,6 @@ class Hook(Colliding, Plugin):
         load = self.read(data)
         holds = np.ones(load.tip_pos.shape[0], bool)
         return place_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring)  # type: ignore[arg-type]
-
-    @property
-    def placed_kinds(self) -> tuple[str, ...]:
-        """Names of the loads and rods."""
-        return (self.name, f"{self.name}_link")
-
-    def shape(self) -> Shape:
-        """Return the shape of a load."""
-        return shape_of(self.size)
 
     def body(self, data: SimData) -> LoadBody:
         """Return the loads, with the hooks that hold them; of one drone or of one world."""

@@ -15,10 +15,9 @@ from crazysim.core.integration import euler
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
-from crazysim.geometry import Shape
 from crazysim.geometry.linear import solve
-from crazysim.payloads.body import Colliding, LoadBody, rest_height, shape_of
-from crazysim.payloads.core import CABLE_SEGMENTS, add_to_scene, on_floor, pieces, placed, turned_z
+from crazysim.payloads.body import LoadBody, rest_height
+from crazysim.payloads.core import CABLE_SEGMENTS, PointLoad, add_to_scene, integrator_of, pieces, placed, turned_z
 from crazysim.payloads.link import BAND, PULL, Pull, acceleration_at, relative
 from crazysim.pytree import PyTree, leaf
 
@@ -49,7 +48,7 @@ class SharedLoadData(PyTree):
     """Height of the load above the floor where it rests, m. (1,)"""
 
 
-class SharedLoad(Colliding, Plugin):
+class SharedLoad(PointLoad, Plugin):
     """One load, a point mass, on rods or cables from all drones of a world.
 
     The tensions follow from one system of equations of all drones. It needs an integrator that moves positions with new
@@ -77,7 +76,7 @@ class SharedLoad(Colliding, Plugin):
 
     def record(self, sim: Simulation) -> SharedLoadData:
         """Return a load at rest below the drones."""
-        method = getattr(getattr(sim.step_pipeline.get("integration"), "fn", None), "method", None)
+        method = integrator_of(sim)
         if method is euler:
             raise ConfigError(
                 "expected an integrator that moves positions with new velocities, which a load between several drones "
@@ -157,22 +156,6 @@ class SharedLoad(Colliding, Plugin):
         rates = {"pos": rate, "vel": tip_acc}
         return deriv.replace(**changes, plugins=deriv.plugins | {self.name: rates})
 
-    def stop_at_floor(self, data: SimData) -> SimData:
-        """Stop the load at the floor; of one world."""
-        load = self.read(data)
-        pos, vel = on_floor(load.pos, load.vel, load.clearance, load.friction)
-        return self.write(data, load.replace(pos=pos, vel=vel))
-
-    def release(self, data: SimData, mask: Any = True) -> SimData:
-        """Return the data with the links of some drones cut.
-
-        Args:
-            data: Simulation.
-            mask: True for drones that let go. (n_worlds, n_drones), or broadcast to that
-        """
-        load = self.read(data)
-        return self.write(data, load.replace(attached=load.attached & ~jnp.asarray(mask, bool)))
-
     def place(self, data: SimData) -> Objects:
         """Return the scene's objects with load and links at their poses; of one world."""
         if not self.in_scene:
@@ -185,15 +168,6 @@ class SharedLoad(Colliding, Plugin):
         up = jnp.asarray([[0.0, 0.0, 1.0]], load.pos.dtype)
         rows = {self.name: (load.pos[None], turned_z(up)), f"{self.name}_link": links}
         return placed(data.objects, rows)  # type: ignore[arg-type]
-
-    @property
-    def placed_kinds(self) -> tuple[str, ...]:
-        """Names of the load and the links."""
-        return (self.name, f"{self.name}_link")
-
-    def shape(self) -> Shape:
-        """Return the shape of the load."""
-        return shape_of(self.size)
 
     def body(self, data: SimData) -> LoadBody:
         """Return the load; of one world."""

@@ -14,15 +14,15 @@ from crazysim.core.integration import rk4
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import Stage
 from crazysim.effects.core import zeros
-from crazysim.geometry import Shape
-from crazysim.payloads.body import Colliding, LoadBody, rest_height, shape_of
+from crazysim.payloads.body import LoadBody, rest_height
 from crazysim.payloads.core import (
     CABLE_SEGMENTS,
     LoadData,
+    PointLoad,
     add_to_scene,
     air_and_gravity,
     hanging,
-    on_floor,
+    integrator_of,
     pieces,
     placed,
     turned_z,
@@ -31,7 +31,7 @@ from crazysim.payloads.link import Link, couple, end_relative_motion, relative
 from crazysim.pytree import select_worlds
 
 
-class SlungLoad(Colliding, Plugin):
+class SlungLoad(PointLoad, Plugin):
     """A load on a rod or a cable, a point mass that hangs from each drone.
 
     Load and drone are integrated together. A cable is slack while the load is nearer than its length, and pulls as soon
@@ -70,7 +70,7 @@ class SlungLoad(Colliding, Plugin):
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage of the floor, and for cables in schemes of higher order that of becoming taut."""
         found = [Placement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor")]
-        method = getattr(getattr(sim.step_pipeline.get("integration"), "fn", None), "method", None)
+        method = integrator_of(sim)
         if self.cable and method is rk4:
             found.append(Placement(Stage(self.become_taut, "drone"), "integration", name=f"{self.name}_taut"))
         return found
@@ -84,12 +84,6 @@ class SlungLoad(Colliding, Plugin):
         )
         rates = {"pos": linked.rate, "vel": linked.acc}
         return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
-
-    def stop_at_floor(self, data: SimData) -> SimData:
-        """Stop the load at the floor; of one drone."""
-        load = self.read(data)
-        pos, vel = on_floor(load.pos, load.vel, load.clearance, load.friction)
-        return self.write(data, load.replace(pos=pos, vel=vel))
 
     def become_taut(self, data: SimData) -> SimData:
         """Apply the impulse of a cable that is taut while the load moves outwards; of one drone."""
@@ -115,31 +109,12 @@ class SlungLoad(Colliding, Plugin):
         )
         return self.write(data, new)
 
-    def release(self, data: SimData, mask: Any = True) -> SimData:
-        """Return the data with loads cut loose; they fall freely.
-
-        Args:
-            data: Simulation.
-            mask: True for drones that let go. (n_worlds, n_drones), or broadcast to that
-        """
-        load = self.read(data)
-        return self.write(data, load.replace(attached=load.attached & ~jnp.asarray(mask, bool)))
-
     def place(self, data: SimData) -> Objects:
         """Return the scene's objects with loads and links at their poses; of one world."""
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
         return place_loads(data, self.name, load, load.pos, load.attached, CABLE_SEGMENTS if self.cable else 1)
-
-    @property
-    def placed_kinds(self) -> tuple[str, ...]:
-        """Names of the loads and links."""
-        return (self.name, f"{self.name}_link")
-
-    def shape(self) -> Shape:
-        """Return the shape of a load."""
-        return shape_of(self.size)
 
     def body(self, data: SimData) -> LoadBody:
         """Return the loads; of one drone or of one world."""

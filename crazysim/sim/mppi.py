@@ -176,7 +176,7 @@ class MPPI:
     @property
     def engine(self) -> str:
         """Engine of the rollouts; empty before the first command."""
-        return ", ".join({plan.engine for plan in self._step._plans.values()})
+        return ", ".join(self._step.engines)
 
     def reset(self) -> None:
         """Forget the plans of ``command``."""

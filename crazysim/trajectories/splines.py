@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation
+from crazysim.trajectories.bezier import power_of
 from crazysim.trajectories.trajectory import Trajectory
 
 SPLINE_ORDERS = {3: 2, 5: 3, 7: 4}
@@ -84,22 +84,8 @@ def of_bezier(ends: Any, control_points: Sequence[Any], repeats: bool = False) -
             f"expected finite, positive, ascending ends, got {at.tolist()}. Remove curves without length."
         )
     degree = max(len(curve) for curve in curves) - 1
-    pieces = [
-        interpolation.pad_degree((_power_basis(len(curve) - 1) @ finite(curve, "control points")).T, degree)
-        for curve in curves
-    ]
+    pieces = [interpolation.pad_degree(power_of(finite(curve, "control points")), degree) for curve in curves]
     return of_unit_pieces(durations, np.stack(pieces), repeats)
-
-
-def _power_basis(degree: int) -> NDArray[np.float64]:
-    """Return the matrix from control points to coefficients, constant term first. (degree + 1, degree + 1)"""
-    return np.array(
-        [
-            [math.comb(degree, k) * (-1) ** (k - i) * math.comb(k, i) if i <= k else 0 for i in range(degree + 1)]
-            for k in range(degree + 1)
-        ],
-        float,
-    )
 
 
 def of_unit_pieces(durations: Any, coefficients: Any, repeats: bool = False) -> Trajectory:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.trajectories.files.bezier import restricted
+from crazysim.trajectories.bezier import restricted
 from crazysim.trajectories.trajectory import Trajectory
 
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from crazysim.errors import ConfigError
+from crazysim.trajectories.bezier import control_points, power_of, significant_degree
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.bezier import control_points, power_of, significant_degree
 from crazysim.trajectories.files.pieces import pieces_of, split, trajectory_of
 from crazysim.trajectories.trajectory import Trajectory
 
