@@ -52,6 +52,28 @@ def test_load_along_a_figure_eight(freq):
     assert np.sqrt(np.mean(errors**2)) < 0.01
 
 
+@pytest.mark.parametrize("target", ["load", "drone"])
+def test_a_load_that_hangs_off_the_centre(target):
+    """5 cm ahead of and below the centre of mass: load or drone come to rest at the setpoint, which a gain without the
+    offset misses, since the load's weight turns the drone."""
+    attach, at = (0.05, -0.02, -0.03), np.array([0.3, 0.2, 1.5])
+    flown = {}
+    for assumed in (attach, (0.0, 0.0, 0.0)):
+        controller = LoadLQR(load_mass=LOAD, length=LENGTH, attach=assumed, target=target)
+        sim = Sim(drone="bumblebee", control="state", controller=controller)
+        sim.data = with_states(sim.data, pos=np.array([0.0, 0.0, 1.8]))
+        load = sim.add(SlungLoad(mass=LOAD, length=LENGTH, attach=attach, in_scene=False))
+        command = np.zeros((1, 1, 16))
+        command[..., :3], command[..., 12] = at, 1.0
+        sim.state_control(command)
+        sim.step(3000)
+        body = load.read(sim.data) if target == "load" else sim.data.states
+        flown[assumed] = np.linalg.norm(body.pos[0, 0] - at)
+        assert np.abs(body.vel).max() < 0.01
+    assert flown[attach] < 2e-3
+    assert flown[0.0, 0.0, 0.0] > 0.02
+
+
 def test_an_empty_hook_is_the_load():
     """Its load stands elsewhere: the tip of the hook goes to the setpoint, and its swing is damped."""
     sim = Sim(drone="bumblebee", control="state", controller=LoadLQR(load_mass=0.0203, length=LENGTH))

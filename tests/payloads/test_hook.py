@@ -117,7 +117,7 @@ def test_hook_and_load_are_drawn_where_they_meet(size):
         return {b for b in range(model.nbody) if model.body_rootid[b] == model.body(name).id}
 
     ring = np.array([0.0, 0.0, 2.0 - 0.4])
-    for body in ("load:0", "load_link:0"):
+    for body in ("load:0", "load_hook:0"):
         assert np.linalg.norm(ends(body) - ring, axis=-1).min() < 4e-3, body
     box = next(
         g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies_of("load:0") and model.geom_conaffinity[g]
