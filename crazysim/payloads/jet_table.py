@@ -45,7 +45,9 @@ class JetTable(NamedTuple):
         if speeds.ndim != 1 or not len(speeds) or np.any(speeds <= 0) or np.any(np.diff(speeds) <= 0):
             raise ConfigError(f"expected positive rotor speeds in ascending order, rad/s, got {self.speeds!r}")
         if self.pressure is None and self.velocity is None:
-            raise ConfigError("expected a table of pressure or velocity, got neither. Use pressure=, velocity= or both.")
+            raise ConfigError(
+                "expected a table of pressure or velocity, got neither. Use pressure=, velocity= or both."
+            )
         found: dict[str, Any] = {}
         for name, core in (("pressure", ()), ("velocity", (3,))):
             value = getattr(self, name)

@@ -32,7 +32,8 @@ def test_law_08_gradients_are_the_slopes_of_the_cell_and_zero_outside(x64, rng):
     for point in rng.uniform(0.1, 0.9, size=(5, 3)) + rng.integers(0, 3, size=(5, 3)):
         h = 1e-6
         central = [
-            (interpolate(values, jnp.asarray(point + h * e)) - interpolate(values, jnp.asarray(point - h * e))) / (2 * h)
+            (interpolate(values, jnp.asarray(point + h * e)) - interpolate(values, jnp.asarray(point - h * e)))
+            / (2 * h)
             for e in np.eye(3)
         ]
         np.testing.assert_allclose(slope(jnp.asarray(point)), central, rtol=1e-7, atol=1e-8)

@@ -167,7 +167,10 @@ def test_profiles_by_hand():
     found = wind.log_profile(jnp.asarray([[3.048], [6.096], [0.04572], [0.01], [-1.0]]), 6.096 * one, 0.04572 * one)
     np.testing.assert_allclose(found[:, 0], [0.85834, 1, 0, 0, 0], atol=1e-5)
     np.testing.assert_allclose(wind.power_profile(10 * one, 80 * one, 0.2 * one), 0.65975, atol=1e-5)
-    for slope in (jax.grad(lambda z: wind.log_profile(z, 6.0, 0.05).sum()), jax.grad(lambda z: wind.power_profile(z, 6.0, 0.2).sum())):
+    for slope in (
+        jax.grad(lambda z: wind.log_profile(z, 6.0, 0.05).sum()),
+        jax.grad(lambda z: wind.power_profile(z, 6.0, 0.2).sum()),
+    ):
         assert np.isfinite(slope(jnp.asarray([-1.0, 0.0, 0.01, 0.05, 1.0]))).all()
 
 

@@ -22,7 +22,8 @@ DEPTH = 0.5
 def test_panels_close_a_surface(shape, area):
     """The areas add up, area times normal adds up to nothing, and position times normal to three volumes."""
     panels = panels_of(shape, 0.03)
-    assert panels.pos.shape == panels.normal.shape and len(panels.area) == len(panels.pos) >= 24
+    assert panels.pos.shape == panels.normal.shape
+    assert len(panels.area) == len(panels.pos) >= 24
     np.testing.assert_allclose(panels.area.sum(), area, rtol=1e-4)
     # a spiral of n points on a ball balances to one part in n
     np.testing.assert_allclose((panels.area * panels.normal).sum(axis=0), 0, atol=area / len(panels.pos))
@@ -57,17 +58,19 @@ def test_a_pressure_that_grows_upwards_pushes_down_by_its_gradient_times_the_vol
 
 @pytest.mark.parametrize("speed, share", [(250.0, 20.0), (500.0, 40.0), (1000.0, 100.0), (2000.0, 160.0)])
 def test_tables_are_linear_in_the_speed_and_fall_to_zero_below_the_smallest(speed, share):
-    sim, plugin = build(rotor_vel=speed, table=pressure_table())
+    sim, _plugin = build(rotor_vel=speed, table=pressure_table())
     stage = sim.step_pipeline["rotor_jet"]
     force = stage(sim.data).plugins["rotor_jet"].force
-    np.testing.assert_allclose(force[..., 2], -share * 0.2 * 0.1 * 0.04, rtol=2e-3)  # float32: a sum of cancelling terms
+    np.testing.assert_allclose(
+        force[..., 2], -share * 0.2 * 0.1 * 0.04, rtol=2e-3
+    )  # float32: a sum of cancelling terms
 
 
 def test_a_velocity_gives_its_momentum_to_the_upper_side():
     """Air of (1, 0, -5) m/s: rho v (v.(-n)) A on the upper side and on the side that faces it, none in the lee."""
     velocity = np.broadcast_to([1.0, 0.0, -5.0], (1, 5, 5, 11, 3))
     table = JetTable([1000.0], None, velocity, (-0.2, -0.2, -1.0), 0.1)
-    sim, plugin = build(table=table, air_density=1.2)
+    sim, _plugin = build(table=table, air_density=1.2)
     force = sim.step_pipeline["rotor_jet"](sim.data).plugins["rotor_jet"]
     expected = 1.2 * np.array([1.0, 0, -5.0]) * (5.0 * 0.2 * 0.1 + 1.0 * 0.1 * 0.04)
     np.testing.assert_allclose(force.force[1, 0], expected, rtol=1e-5, atol=1e-7)
@@ -79,13 +82,13 @@ def test_a_velocity_gives_its_momentum_to_the_upper_side():
 
 def test_outside_the_box_of_the_table_there_is_no_jet():
     table = pressure_table()._replace(origin=(-0.2, -0.2, -0.4))  # from -0.4 to 0.6 m: the load hangs below
-    sim, plugin = build(table=table)
+    sim, _plugin = build(table=table)
     assert not np.asarray(sim.step_pipeline["rotor_jet"](sim.data).plugins["rotor_jet"].force).any()
 
 
 def test_the_analytic_jet_is_that_of_downwash():
     """One panel for the whole top: rho u^2 A at its centre, DEPTH - 0.02 below the drone, in the middle of the jet."""
-    sim, plugin = build(panel=1.0)
+    sim, _plugin = build(panel=1.0)
     force = sim.step_pipeline["rotor_jet"](sim.data).plugins["rotor_jet"].force
     radius = float(sim.airframe.value("shape.propeller_radius", ()))
     thrust = 4 * 9.3945e-7 * 1000**2  # N, of the lab's coefficient
@@ -126,7 +129,7 @@ def test_the_force_moves_the_load():
 
 def test_jets_of_all_drones():
     """A drone above another's load: the load gets both jets, its own drone's load none of the lower one's."""
-    sim, plugin = build(n_drones=2, n_worlds=1, all_drones=True)
+    sim, _plugin = build(n_drones=2, n_worlds=1, all_drones=True)
     sim.data = with_states(sim.data, pos=np.array([[[0, 0, 2.0], [0.0, 0, 3.0]]]))
     load = sim.plugins["load"]
     sim.data = load.hang(sim.data)
@@ -178,7 +181,8 @@ def test_files_of_the_lab_are_read_in_their_order(tmp_path, rng):
     np.testing.assert_array_equal(table.speeds, [500, 1500])
     np.testing.assert_allclose(table.pressure[1, 0, 1, 2], tables[1, 0 * 9 + 1 * 3 + 2])
     np.testing.assert_allclose(table.origin, [-0.015, -0.015, -0.03])
-    assert table.velocity is None and table.shape == (2, 3, 3, 3)
+    assert table.velocity is None
+    assert table.shape == (2, 3, 3, 3)
     np.savetxt(tmp_path / "velocity_0500.txt", np.ones((27, 3)))
     np.savetxt(tmp_path / "velocity_1500.txt", np.ones((27, 3)))
     assert load_jet_table(tmp_path).velocity.shape == (2, 3, 3, 3, 3)
@@ -187,7 +191,7 @@ def test_files_of_the_lab_are_read_in_their_order(tmp_path, rng):
     write_tables(flat, (700,), rng.uniform(size=(1, 81 * 81 * 2)))
     assert load_jet_table(flat).shape == (1, 81, 81, 2)
     write_tables(flat, (700,), rng.uniform(size=(1, 24)))
-    assert np.asarray(load_jet_table(flat, shape=(4, 3, 2), origin=(0, 0, -1)).origin ).tolist() == [0, 0, -1]
+    assert np.asarray(load_jet_table(flat, shape=(4, 3, 2), origin=(0, 0, -1)).origin).tolist() == [0, 0, -1]
 
 
 @pytest.mark.parametrize("files, message", [
@@ -226,7 +230,7 @@ def test_law_09_wrong_tables(table, message):
 
 def test_law_09_wrong_settings():
     sim = Sim(n_drones=2, drone="bumblebee", control="rotor_vel", integrator="symplectic_euler")
-    with pytest.raises(ConfigError, match="Use sim.add"):
+    with pytest.raises(ConfigError, match=r"Use sim\.add"):
         sim.add(RotorJet())
     sim.add(SharedLoad(0.1, in_scene=False), name="shared")
     with pytest.raises(ConfigError, match="'shared'"):
