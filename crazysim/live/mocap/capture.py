@@ -15,6 +15,7 @@ import threading
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -68,9 +69,9 @@ class MotionCaptureSource(ThreadSource):
 
     def stream(self, stopped: threading.Event) -> Iterator[Frame]:
         """Yield the frames that the worker prints."""
-        assert self._worker.stdout is not None
+        output: Any = self._worker.stdout
         while not stopped.is_set():
-            line = self._worker.stdout.readline(LINE)
+            line = output.readline(LINE)
             if not line:
                 raise ConnectionError(f"the worker ended with code {self._worker.wait()}")
             message = json.loads(line)

@@ -54,7 +54,7 @@ class MocapRecorder(Closing):
         new = [name for frame in poll.frames for name in frame.names if name not in self._ids]
         if new:
             new = list(dict.fromkeys(new))
-            self._ids.update((name, len(self._ids) + k) for k, name in enumerate(new))
+            self._ids.update({name: k for k, name in enumerate(new, start=len(self._ids))})
             self._chunk(b"N" + json.dumps(new).encode())
         parts = [b"P", POLL.pack(poll.now, len(poll.frames), poll.lost)]
         for frame in poll.frames:

@@ -14,6 +14,8 @@ from crazysim.live.mocap.reports import Reports
 
 N_INTERVALS = 32
 """Number of intervals between frames whose median is the period of the source."""
+FARTHEST = 1e6
+"""Coordinates from here on are invalid, m."""
 CLOCK = 10.0
 """Age of the least delay, s, after which it is forgotten: clocks drift."""
 
@@ -49,7 +51,7 @@ class Tracker:
     | time not finite | frame refused | `invalid` |
     | gap of more than 1.5 periods | accepted; the number of missing frames is counted | `dropped` |
     | delayed by more than `late` | accepted | `late` |
-    | pose not finite, quaternion zero | body keeps its pose | `invalid` |
+    | pose not finite or beyond 1000 km, quaternion zero | body keeps its pose | `invalid` |
     | body faster than `max_speed` | body keeps its pose until `confirm` frames agree | `jumped`, `relocated` |
     | name that is not known | ignored; once for each name | `unknown` |
     | name twice in a frame | body keeps its pose | `duplicate` |
@@ -123,7 +125,8 @@ class Tracker:
         self._watch_delay(now, frame.received - now)
         self._stamp = now
         self.n_frames += 1
-        self._take_bodies(frame, now)
+        with np.errstate(over="ignore", invalid="ignore"):  # of numbers that are refused below
+            self._take_bodies(frame, now)
         missing = self.seen & ~self._lost & (now - self._stamps > rules.lost) & np.isfinite(self._stamps)
         for k in np.flatnonzero(missing):
             self._lost[k], self.vel[k] = True, 0.0
@@ -195,7 +198,7 @@ class Tracker:
         entries, rows = self._rows(frame.names, now)
         pos, quat = frame.pos[entries], frame.quat[entries]
         norm = np.sqrt((quat * quat).sum(-1))
-        valid = np.isfinite(pos).all(-1) & np.isfinite(norm) & (norm > 1e-3)
+        valid = (np.abs(pos) < FARTHEST).all(-1) & (norm > 1e-3) & np.isfinite(norm)
         if not valid.all():
             for k in rows[~valid]:
                 self._report("invalid", self.names[k], now, "pose not finite, or quaternion zero; it keeps its pose")
@@ -214,7 +217,8 @@ class Tracker:
             self._report("found", self.names[k], now, "valid pose again")
         rows, pos, quat, norm, dt, moved = rows[ok], pos[ok], quat[ok], norm[ok], dt[ok], moved[ok]
         still = ~known[ok] | relocated[ok] | self._lost[rows]
-        self.vel[rows] = np.where(still[:, None], 0.0, moved / np.where(still, 1.0, dt)[:, None])
+        dt = np.where(still, np.inf, np.maximum(dt, far[ok] / self.rules.max_speed))
+        self.vel[rows] = moved / np.where(dt > 0, dt, np.inf)[:, None]
         self.pos[rows], self.quat[rows] = pos, quat / norm[:, None]
         self._stamps[rows], self.seen[rows], self._lost[rows] = now, True, False
 
