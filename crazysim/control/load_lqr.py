@@ -9,7 +9,6 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.allocation import AllocationParams
 from crazysim.control.bandwidth import bandwidth
 from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust, direction_of
@@ -18,6 +17,7 @@ from crazysim.control.lqr import Reference, as_weights, into_heading, on_host, s
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.riccati import gain_discrete
+from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.core import GRAVITY
@@ -32,28 +32,18 @@ ROD_JERK_MAX = 500.0
 """Largest third derivative of the direction of the rod that is fed forward, 1/s^3: a swing of 0.5 rad at 10 rad/s."""
 
 
-class LoadLQRParams(PyTree):
+class LoadLQRParams(RigidBodyParams):
     """Gain and parameters of the LQR with load, each shared or one per drone."""
 
-    mass: Array = leaf("parameter", 1, (1,))
-    """Mass of the drone that the controller assumes, kg. (1,)"""
     load_mass: Array = leaf("parameter", 1, (1,))
     """Mass of the load that the controller assumes, kg. (1,)"""
     length: Array = leaf("parameter", 1, (1,))
     """Length of the rod that the controller assumes, m. (1,)"""
-    gravity_vec: Array = leaf("parameter", 1)
-    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
-    J: Array = leaf("parameter", 2)
-    """Inertia that the controller assumes, body frame, kg m^2. (3, 3)"""
-    drag_matrix: Array = leaf("parameter", 2)
-    """Linear drag coefficients that the controller compensates, body frame, N s/m. (3, 3)"""
     gain: Array = leaf("parameter", 2)
     """Gain K from the errors of position, velocity, rotation, body rates, rod angles and their rates to the wrench.
     (4, 16)"""
     attach: Array | None = leaf("parameter", 1, (3,))
     """Joint of the rod, from the centre of mass, body frame, m; None for the centre of mass. (3,)"""
-    allocation: AllocationParams
-    """Limits of the rotors."""
 
     @staticmethod
     def create(
@@ -91,22 +81,18 @@ class LoadLQRParams(PyTree):
             raise ConfigError(
                 f"expected attach as three finite numbers, m, got {attach!r}. Use LoadLQR(attach=(0.0, 0.0, -0.02))."
             )
-        mass, inertia, drag = airframe.value("rigid_body.mass"), airframe.inertia, airframe.value("drag.coefficients")
+        mass, inertia = airframe.value("rigid_body.mass"), airframe.inertia
         weights = default_load_weights(airframe, freq, load_mass, length)
         Q = as_weights("Q", weights[0] if Q is None else Q, 16)
         R = as_weights("R", weights[1] if R is None else R, 4)
         off_centre = [joint] if np.any(joint) else []
         gain = on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R, *off_centre)
         return LoadLQRParams(
-            mass=as_parameter(mass),
+            **rigid_body(airframe),
             load_mass=as_parameter(load_mass),
             length=as_parameter(length),
-            gravity_vec=as_parameter(GRAVITY),
-            J=as_parameter(inertia),
-            drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
             gain=as_parameter(gain),
             attach=as_parameter(joint) if off_centre else None,
-            allocation=AllocationParams.create(airframe),
         )
 
 

@@ -69,6 +69,7 @@ class PID(Controller):
     def outer(self, data: Any, command: Setpoint, memory: PIDMemory, params: PIDParams) -> PIDMemory:
         """Return the memory after position and velocity loop, with the desired roll, pitch and thrust."""
         s, heading = data.states, heading_of(data.states.quat)
+        # In world axes, as in the firmware (positionControllerResetAllPID), whose derivative gain here is zero.
         position = memory.position.started_at(s.pos, memory.started)
         vel_des, position = velocity_of_position(
             s.pos, heading, command.pos, position, self.outer_freq, loop=params.position

@@ -94,7 +94,10 @@ def shape_of(size: Any) -> Shape:
     """
     dims = np.shape(size)
     if dims not in ((), (3,)) or not np.all(np.asarray(size) > 0):
-        raise ConfigError(f"expected size as a positive radius, or as three positive lengths of a box, m, got {size!r}")
+        raise ConfigError(
+            f"expected size as a positive radius, or as three positive lengths of a box, m, got {size!r}. Use "
+            "size=0.05 or size=(0.1, 0.1, 0.05)."
+        )
     return Shape("sphere", (float(size),)) if dims == () else Shape("box", tuple(float(x) / 2 for x in size))
 
 

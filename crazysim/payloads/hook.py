@@ -107,7 +107,7 @@ class Hook(Colliding, Plugin):
     def record(self, sim: Simulation) -> HookData:
         """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
         if self.dof not in (1, 2):
-            raise ConfigError(f"expected dof as 1 or 2, got {self.dof!r}")
+            raise ConfigError(f"expected dof as 1 or 2, got {self.dof!r}. Use Hook(mass, dof=2).")
         load = load_record(self, sim, False, rest_height(self.size) + self.ring, self.ring)
 
         def check(name: str) -> Array:
@@ -134,7 +134,7 @@ class Hook(Colliding, Plugin):
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages of picking up and letting go, and of the floor."""
         return [
-            Placement(Stage(self.grip, "drone"), "integration", name=f"{self.name}_grip"),
+            Placement(Stage(self.pick_up_and_release, "drone"), "integration", name=f"{self.name}_grip"),
             Placement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor"),
         ]
 
@@ -158,7 +158,7 @@ class Hook(Colliding, Plugin):
         }
         return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
 
-    def grip(self, data: SimData) -> SimData:
+    def pick_up_and_release(self, data: SimData) -> SimData:
         """Pick up a load that is near and slow, or let go, as ``grip`` of the record commands; of one drone.
 
         Hook and ring stay together after an impact that keeps momentum: the mean of their velocities by mass, then the

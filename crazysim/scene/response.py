@@ -104,12 +104,12 @@ class ContactResponse(Plugin):
     def _load_stages(
         self, plugin: Any, obstacles: list[Surface], box: np.ndarray | None, n_drones: int
     ) -> list[Placement]:
-        """Return the stages of a plugin's loads: with obstacles, and with drones and each other, unless ``box`` is None.
+        """Return the stages of a plugin's loads: with obstacles, with drones and with each other.
 
         Args:
             plugin: Plugin with the loads.
             obstacles: Surfaces of objects.
-            box: Centre and half extents of the drones' collision box, body frame, m; None for no collisions. (6,)
+            box: Centre and half extents of the drones' collision box, body frame, m; None for obstacles only. (6,)
             n_drones: Number of drones in a world.
         """
         colliders = plugin.colliders()

@@ -9,7 +9,7 @@ from cases import with_states
 from crazysim import Hook, Sim, SlungLoad
 from crazysim.control.load_lqr import LoadLQR
 from crazysim.dynamics.first_principles import rotor_vel_of_thrust
-from crazysim.payloads import flat_states
+from crazysim.payloads import load_flat_state
 from crazysim.trajectories import Follow, figure_eight
 
 LOAD, LENGTH = 0.2, 0.4
@@ -25,7 +25,7 @@ def at_the_start(sim):
         path[order, :2] = SIZE * (np.array([1, 2]) * w) ** order * np.sin(order * np.pi / 2)
     path[0, 2] = 1.0
     p = sim.data.params
-    state = flat_states(jnp.asarray(path), jnp.zeros(3), p.mass[0], LOAD, LENGTH, p.J, p.gravity_vec)
+    state = load_flat_state(jnp.asarray(path), jnp.zeros(3), p.mass[0], LOAD, LENGTH, p.J, p.gravity_vec)
     return state, path
 
 

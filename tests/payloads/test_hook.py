@@ -28,7 +28,7 @@ def test_picking_up_keeps_momentum(integrator, x64):
     sim.data = hook.write(
         sim.data, record.replace(vel=record.vel + u, tip_vel=record.tip_vel + np.array([0.1, 0.0, 0.0]))
     )
-    after = hook.grip(sim.data.replace(
+    after = hook.pick_up_and_release(sim.data.replace(
         states=type(sim.data.states)(**{k: v[0, 0] for k, v in vars(sim.data.states).items()}),
         plugins={"load": type(record)(**{
             k: v[0, 0] if v is not None and v.ndim > 1 else v for k, v in vars(hook.read(sim.data)).items()

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from crazysim.__main__ import main
 from crazysim.errors import ConfigError
-from crazysim.shows import closest_approaches, collisions, film, fly, page, report, summary, tracking_rms
+from crazysim.shows import collisions, film, fly, page, report, sampled_approaches, summary, tracking_rms
 from crazysim.trajectories import Trajectory
 from crazysim.trajectories.files import Lights, Show, save_show
 
@@ -48,7 +48,7 @@ def test_closest_approach_of_straight_lines():
     t = np.arange(0.0, 3.0, 0.1)
     x = t - 1.234
     pos = np.stack([np.stack([x, 0 * x, 0 * x], -1), np.stack([-x, 0 * x + 0.3, 0 * x], -1)], axis=1)
-    distance, when = closest_approaches(t, pos)
+    distance, when = sampled_approaches(t, pos)
     assert distance[0, 1] == distance[1, 0] == pytest.approx(0.3, abs=1e-6)
     assert when[0, 1] == pytest.approx(1.234, abs=1e-6)
     assert np.all(np.isinf(np.diag(distance)))
@@ -57,7 +57,7 @@ def test_closest_approach_of_straight_lines():
 @given(st.integers(0, 10**6), st.integers(1, 12), st.integers(2, 5))
 def test_closest_approach_is_at_most_the_closest_sample(seed, n, n_drones):
     pos = np.random.default_rng(seed).normal(size=(n, n_drones, 3)).cumsum(axis=0)
-    distance, when = closest_approaches(0.5 * np.arange(n), pos)
+    distance, when = sampled_approaches(0.5 * np.arange(n), pos)
     between = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1).min(0)
     off = ~np.eye(n_drones, dtype=bool)
     assert np.all(distance[off] <= between[off] + 1e-12)

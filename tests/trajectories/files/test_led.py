@@ -96,7 +96,7 @@ def test_not_base64_and_too_long():
         decode_lights("?")
     with pytest.raises(ConfigError, match="at most 1048576 bytes"):
         decode_lights(bytes(2**20 + 1))
-    assert np.array_equal(decode_lights(base64.b64encode(bytes([7, 0])).decode()).begins[-1], WHITE)
+    assert np.array_equal(decode_lights(base64.b64encode(bytes([7, 0])).decode()).starts[-1], WHITE)
 
 
 @given(st.binary(max_size=60))
@@ -106,7 +106,7 @@ def test_any_program_is_decoded_or_refused(program):
     except ConfigError:
         return
     assert np.all(np.diff(lights.times) >= 0)
-    assert np.all((lights.begins >= 0) & (lights.ends <= 1))
+    assert np.all((lights.starts >= 0) & (lights.ends <= 1))
 
 
 pieces = st.lists(
