@@ -1,11 +1,16 @@
 """Flying shows: closest approaches, collisions and tracking errors by hand, films, pages, the command."""
 
 import json
+import os
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from screens import screen_pixels, virtual_screen
 
 from crazysim.__main__ import main
 from crazysim.errors import ConfigError
@@ -14,11 +19,11 @@ from crazysim.trajectories import Trajectory
 from crazysim.trajectories.files import Lights, Show, save_show
 
 
-def line(begin, end, seconds=2.0):
+def line(start, end, seconds=2.0):
     """A straight move at rest at both ends."""
     c = np.zeros((1, 4, 8))
-    c[0, :3, 0] = begin
-    c[0, :3, 4:] = np.subtract(end, begin)[:, None] * np.array([35.0, -84.0, 70.0, -20.0])
+    c[0, :3, 0] = start
+    c[0, :3, 4:] = np.subtract(end, start)[:, None] * np.array([35.0, -84.0, 70.0, -20.0])
     return Trajectory.of_pieces([seconds], c / seconds ** np.arange(8))
 
 
@@ -62,6 +67,61 @@ def test_closest_approach_is_at_most_the_closest_sample(seed, n, n_drones):
     off = ~np.eye(n_drones, dtype=bool)
     assert np.all(distance[off] <= between[off] + 1e-12)
     assert np.all((when >= 0) & (when <= 0.5 * (n - 1)))
+
+
+@pytest.fixture(scope="module")
+def screen(tmp_path_factory):
+    yield from virtual_screen(tmp_path_factory.mktemp("screen"))
+
+
+def in_window(screen, *arguments):
+    """Start Python in a process whose windows open on the screen."""
+    environment = os.environ | {"DISPLAY": screen[0], "MUJOCO_GL": "glfw"}
+    return subprocess.Popen([sys.executable, *arguments], stdout=subprocess.PIPE, env=environment, text=True)
+
+
+def test_the_window_plays_the_show_from_its_start(screen, tmp_path, opengl):
+    """A drone is lit red, then blue: both are seen, although opening the window takes as long as the show."""
+    slow = Trajectory.stack([line((0, 0, 1), (1, 0, 1), 4.0)])
+    lights = Lights.stack([Lights.of_pieces([0.0, 1.5], [(1, 0, 0), (0, 0, 1)])])
+    save_show(Show(names=("a",), trajectories=slow, lights=lights), tmp_path / "show.skyc")
+    program, seen = in_window(screen, "-m", "crazysim", "show", str(tmp_path / "show.skyc"), "--window"), []
+    deadline = time.monotonic() + 120
+    while program.poll() is None and time.monotonic() < deadline:
+        picture = screen_pixels(screen[1], wait=False).astype(int)
+        red = np.all(picture[..., :1] > picture[..., 1:] + 180, axis=-1).sum()
+        blue = np.all(picture[..., 2:] > picture[..., :2] + 180, axis=-1).sum()
+        seen += [name for name, n in (("red", red), ("blue", blue)) if n > 50 and name not in seen]
+        time.sleep(0.05)
+    assert " 4.0 s, computed in" in program.communicate(timeout=10)[0]
+    assert program.returncode == 0
+    assert seen == ["red", "blue"]
+
+
+CLOSED = """
+import sys
+from crazysim.shows import fly
+from crazysim.shows.view import play
+from crazysim.trajectories.files import load_show
+
+frames = []
+
+def close(sim, world):
+    frames.append(sim.time)
+    if len(frames) == 3:
+        window = sim.viewer._windows[0]
+        window._glfw.set_window_should_close(window._window, True)
+
+play(fly(load_show(sys.argv[1])), speed=0.001, draw=close, width=64, height=48)
+print(len(frames))
+"""
+
+
+def test_closing_the_window_ends_the_play(screen, tmp_path, opengl):
+    """It would take 2,000 s."""
+    save_show(SHOW, tmp_path / "show.skyc")
+    program = in_window(screen, "-c", CLOSED, str(tmp_path / "show.skyc"))
+    assert program.communicate(timeout=120)[0] == "3\n"
 
 
 def test_planned_is_the_show(flight):
