@@ -76,7 +76,7 @@ WRONG = {
     "missing argument": ([4, 1, 2], "argument"),
     "endless number": ([2, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x00], "at most 268435455"),
     "large number": ([2, 0xFF, 0xFF, 0xFF, 0xFF, 0x0F], "at most 268435455"),
-    "end of no loop": ([13], "begin of a loop"),
+    "end of no loop": ([13], "start of a loop"),
     "deep loops": ([12, 2] * 5, "at most 4 deep"),
     "endless loop in no time": ([12, 0, 13], "at most"),
     "jump in no time": ([18, 0], "at most"),
