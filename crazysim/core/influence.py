@@ -62,7 +62,7 @@ def own_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
         ConfigError: If a rate is not that of a state in the plugin's record, or has another shape or type.
     """
     where = f"derivative of plugin {plugin.name!r} ({type(plugin).__name__})"
-    rates = _called(where, plugin.derivative, data)
+    rates = _called(where, plugin.derivative, data, plugin.scope)
     if not isinstance(rates, Mapping):
         raise ConfigError(
             f"expected {where} to return a dict of fields of its record to rates, got {type(rates).__name__}. Use "
@@ -70,13 +70,13 @@ def own_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
         )
     record = data.plugins.get(plugin.name)
     kinds: dict[str, Any] = {} if record is None else vars(scopes(record))
-    states = [name for name, kind in kinds.items() if kind == "drone"]
+    states = [name for name, kind in kinds.items() if kind == plugin.scope]
     for field, rate in rates.items():
         if field not in states:
             raise ConfigError(
-                f"expected {where} to return rates of leaves of drones in its record, which are "
-                f"{', '.join(map(repr, states)) or 'none'}, got one of {field!r}. Declare such a state with "
-                f"leaf('drone', ...)."
+                f"expected {where} to return rates of leaves of {'drones' if plugin.scope == 'drone' else 'members'} in "
+                f"its record, which are {', '.join(map(repr, states)) or 'none'}, got one of {field!r}. Declare such a "
+                f"state with leaf({'drone' if plugin.scope == 'drone' else 'member'!r}, ...)."
             )
         x = getattr(record, field)
         same_type = jnp.issubdtype(x.dtype, jnp.floating) and jnp.result_type(x, rate) == x.dtype
