@@ -129,7 +129,12 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
         of_drones = members is None or scope == "drone"
         each = (n_worlds, n_drones) if of_drones else (n_worlds, members.n_members)
         kind = "drones" if of_drones else members.population
-        shape, batch, core_ndim, core = jnp.shape(x), batches.get(scope, each), metadata[CORE_NDIM_KEY], metadata["core"]
+        shape, batch, core_ndim, core = (
+            jnp.shape(x),
+            batches.get(scope, each),
+            metadata[CORE_NDIM_KEY],
+            metadata["core"],
+        )
         has_axes = shape[: len(batch)] == batch and len(shape) == len(batch) + core_ndim
         if not has_axes or core not in (None, shape[len(batch) :]):
             is_parameter = metadata["scope"] == "parameter"

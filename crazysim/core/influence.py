@@ -69,14 +69,16 @@ def own_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
             f"'return {{}}' for none."
         )
     record = data.plugins.get(plugin.name)
-    kinds: dict[str, Any] = {} if record is None else vars(scopes(record))
-    states = [name for name, kind in kinds.items() if kind == plugin.scope]
+    kinds = None if record is None else scopes(record)
+    fields = [] if record is None else [f.name for f in dataclasses.fields(record) if not f.metadata.get("static")]
+    states = [name for name in fields if getattr(kinds, name) == plugin.scope]
     for field, rate in rates.items():
         if field not in states:
+            own = "drone" if plugin.scope == "drone" else "member"
             raise ConfigError(
-                f"expected {where} to return rates of leaves of {'drones' if plugin.scope == 'drone' else 'members'} in "
-                f"its record, which are {', '.join(map(repr, states)) or 'none'}, got one of {field!r}. Declare such a "
-                f"state with leaf({'drone' if plugin.scope == 'drone' else 'member'!r}, ...)."
+                f"expected {where} to return rates of leaves of {own}s in its record, which are "
+                f"{', '.join(map(repr, states)) or 'none'}, got one of {field!r}. Declare such a state with "
+                f"leaf({own!r}, ...)."
             )
         x = getattr(record, field)
         same_type = jnp.issubdtype(x.dtype, jnp.floating) and jnp.result_type(x, rate) == x.dtype

@@ -56,10 +56,25 @@ class Population(Plugin):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the members, in order."""
-        if isinstance(self.members, (int, np.integer)) and not isinstance(self.members, bool):
-            return tuple([f"{self.prefix}_{k}" for k in range(self.members)])
-        return tuple(self.members)
+        """Names of the members, in order.
+
+        Raises:
+            ConfigError: If the members are neither a positive number nor distinct names.
+        """
+        members, kind = self.members, type(self).__name__
+        if isinstance(members, (int, np.integer)) and not isinstance(members, bool):
+            names = tuple([f"{self.prefix}_{k}" for k in range(members)])
+        else:
+            names = tuple(members) if isinstance(members, Sequence) and not isinstance(members, str) else ()
+        if not names or not all(isinstance(name, str) and name for name in names):
+            raise ConfigError(
+                f"expected members of {kind} as a positive number or a list of names, got {members!r}. Use {kind}(2) "
+                f"or {kind}(['{self.prefix}_0'])."
+            )
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ConfigError(f"expected distinct names of members, got {twice!r} twice. Rename one.")
+        return names
 
     @property
     def n_members(self) -> int:
@@ -99,25 +114,13 @@ class Population(Plugin):
         return kind(population=self.name, n_members=self.n_members, member_id=ids, **values)  # type: ignore[call-arg]
 
     def check(self, sim: Simulation) -> None:
-        """Check the names of population and members, and the rate of its controller.
+        """Check the name of the population and the rate of its controller.
 
         Raises:
             ConfigError: If one is invalid.
         """
-        kind = type(self).__name__
         if self.name in (*RESERVED, "drone", "world"):
             raise ConfigError(f"expected a name of a population, got {self.name!r}, a scope of stages. Use name=.")
-        is_number = isinstance(self.members, (int, np.integer)) and not isinstance(self.members, bool)
-        is_names = not isinstance(self.members, str) and isinstance(self.members, Sequence)
-        names = self.names if is_number or is_names else ()
-        if not names or not all(isinstance(name, str) and name for name in names):
-            raise ConfigError(
-                f"expected members of {kind} as a positive number or a list of names, got {self.members!r}. Use "
-                f"{kind}(2) or {kind}(['{self.prefix}_0'])."
-            )
-        twice = [name for name in names if names.count(name) > 1] if is_names else []
-        if twice:
-            raise ConfigError(f"expected distinct names of members, got {twice[0]!r} twice. Rename one.")
         if self.control_freq is None:
             return
         freq, rate = sim.data.core.freq, positive(f"control_freq of {self.name!r}", self.control_freq)
@@ -154,7 +157,7 @@ class Population(Plugin):
             found.append(Placement(Stage(self._controlled, self.name, when, name=name), name=name))
         if cls.derivative is not Population.derivative:
             name = f"{self.name}_integration"
-            step = functools.partial(self._integrated, SCHEMES[sim.integrator])
+            step = functools.partial(self._integrated, scheme_of(sim.integrator, self.positions))
             found.append(Placement(Stage(step, self.name, name=name), before="increment_steps", name=name))
         return found
 
@@ -181,7 +184,7 @@ class Population(Plugin):
         def rates(record: Members) -> dict[str, Array]:
             return own_rates(self, self.write(data, record))
 
-        moved = scheme(self.read(data), rates, 1 / data.core.freq, self.positions)
+        moved = scheme(self.read(data), rates, 1 / data.core.freq)
         return self.write(data, self.finish(moved))
 
 
@@ -194,7 +197,7 @@ def along(record: R, rates: Mapping[str, Array], dt: float) -> R:
     return record.replace(**{field: getattr(record, field) + dt * rate for field, rate in rates.items()})
 
 
-def euler(record: R, rates: Rates, dt: float, positions: Sequence[str]) -> R:
+def euler(record: R, rates: Rates, dt: float) -> R:
     """Return a record one explicit Euler step later."""
     return along(record, rates(record), dt)
 
@@ -205,7 +208,7 @@ def symplectic_euler(record: R, rates: Rates, dt: float, positions: Sequence[str
     return along(others, {k: rate for k, rate in rates(others).items() if k in positions}, dt)
 
 
-def rk4(record: R, rates: Rates, dt: float, positions: Sequence[str]) -> R:
+def rk4(record: R, rates: Rates, dt: float) -> R:
     """Return a record one step of the classical Runge-Kutta method of order 4 later."""
     k1 = rates(record)
     k2 = rates(along(record, k1, dt / 2))
@@ -214,11 +217,14 @@ def rk4(record: R, rates: Rates, dt: float, positions: Sequence[str]) -> R:
     return along(record, jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4), dt)
 
 
-SCHEMES: dict[Integrator, Callable[..., Any]] = {
-    Integrator.euler: euler,
-    Integrator.symplectic_euler: symplectic_euler,
-    Integrator.rk4: rk4,
-}
+def scheme_of(integrator: Integrator, positions: Sequence[str]) -> Callable[..., Any]:
+    """Return the function ``(record, rates, dt) -> record`` of an integration scheme."""
+    semi_implicit = functools.partial(symplectic_euler, positions=positions)
+    return {
+        Integrator.euler: euler,
+        Integrator.symplectic_euler: semi_implicit,
+        Integrator.rk4: rk4,
+    }[integrator]
 
 
 def populations(data: SimData) -> dict[str, Members]:
@@ -251,7 +257,9 @@ def _of_members(name: str, value: Any, metadata: Mapping[str, Any], counts: tupl
         ConfigError: If its shape does not allow that.
     """
     array = np.asarray(value)
-    is_integer = array.dtype.kind in "iu" and hasattr(value, "dtype")  # numbers of Python may be written without a point
+    is_integer = array.dtype.kind in "iu" and hasattr(
+        value, "dtype"
+    )  # numbers of Python may be written without a point
     dtype = np.int32 if is_integer else floating() if array.dtype.kind in "iuf" else array.dtype
     n_core = metadata["core_ndim"]
     core = array.shape[max(array.ndim - n_core, 0) :] if array.ndim >= n_core else None

@@ -61,7 +61,7 @@ def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
 
 
 def placement(data: SimData, mesh: Mesh) -> SimData:
-    """Return the sharding of every leaf: leaves of drones, populations and worlds are split, shared leaves are replicated.
+    """Return the sharding of every leaf: leaves of members and worlds are split, shared leaves are replicated.
 
     Raises:
         ConfigError: If the mesh has no axis of worlds, or the worlds cannot be split evenly.

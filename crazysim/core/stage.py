@@ -61,9 +61,7 @@ class Stage:
         return f"<stage {self.__name__} of one {self.scope}>"
 
 
-def stage(
-    scope: StageScope, when: Callable[..., Array | None] | None = None
-) -> Callable[[Callable[..., Any]], Stage]:
+def stage(scope: StageScope, when: Callable[..., Array | None] | None = None) -> Callable[[Callable[..., Any]], Stage]:
     """Declare the scope of a stage, so that an engine can fuse it with its neighbours.
 
     A stage without a declared scope receives the full batch.

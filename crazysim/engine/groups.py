@@ -58,8 +58,7 @@ def independent(stages: Sequence[Stage], data: Any) -> list[Group]:
     if not parts or "drone" not in parts[0][1]:
         parts.insert(0, (set(), frozenset({"drone"})))
     parts = [(_with_clocks(some, clocks, access), populations) for some, populations in parts]
-    unread = set(clocks).difference(*(some for some, _ in parts))
-    parts[0] = (_with_clocks(parts[0][0] | unread, clocks, access), parts[0][1])
+    parts[0] = (parts[0][0] | clocks, parts[0][1])  # the drones' program is what it is without other populations
     groups, taken = [], frozenset()
     for some, populations in parts:
         written = frozenset().union(*(access[k].written for k in some))

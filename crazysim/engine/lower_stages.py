@@ -68,7 +68,9 @@ def lower_stages(
     ids, places = {id(x) for x in watched(data)}, [id(x) for x in jax.tree.leaves(data)]
     own = [i for i, scope in enumerate(axes.scopes) if scope == "drone"]
     checked = [i for i in sorted({*own, *(axes.views & set(program.written))}) if places[i] in ids]
-    return dataclasses.replace(program, check=_finite_check(axes, leaves, places.index(id(data.core.nonfinite)), checked))
+    return dataclasses.replace(
+        program, check=_finite_check(axes, leaves, places.index(id(data.core.nonfinite)), checked)
+    )
 
 
 def _lower_stage(

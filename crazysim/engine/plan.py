@@ -250,7 +250,9 @@ def _jitted(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[.
     return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
 
-def _together(groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Steps]) -> tuple[Steps, tuple[int, ...]]:
+def _together(
+    groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Steps]
+) -> tuple[Steps, tuple[int, ...]]:
     """Return one function that runs independent programs, and the leaves that it writes."""
     runs = [on_data(program, run) for program, run in zip(programs, runs, strict=True)]
     if len(runs) == 1:

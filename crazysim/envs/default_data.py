@@ -11,7 +11,6 @@ import numpy as np
 from crazysim.core.data import SimData
 from crazysim.pytree import has_members, map_batched, scopes
 
-
 _AXES = {"drone": (0, 1), "world": (0,)}
 """Axes of worlds and drones by scope; members of other populations are stored one by one."""
 
