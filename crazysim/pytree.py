@@ -126,9 +126,10 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
                     f"batch axes it would have {metadata[CORE_NDIM_KEY]} dimensions, as its field declares."
                 )
             return
-        of_drones = members is None or scope == "drone"
-        each = (n_worlds, n_drones) if of_drones else (n_worlds, members.n_members)
-        kind = "drones" if of_drones else members.population
+        n, kind, kinds = n_drones, "drone", "drones"
+        if members is not None and scope != "drone":
+            n, kind, kinds = members.n_members, "member", members.population
+        each = (n_worlds, n)
         shape, batch, core_ndim, core = (
             jnp.shape(x),
             batches.get(scope, each),
@@ -139,12 +140,12 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
         if not has_axes or core not in (None, shape[len(batch) :]):
             is_parameter = metadata["scope"] == "parameter"
             batch = each if is_parameter else batch
-            or_shared = f", or {core_ndim} if all {kind} share it" if is_parameter else ""
+            or_shared = f", or {core_ndim} if all {kinds} share it" if is_parameter else ""
             ending = "" if core is None else f" and end with {core}"
             raise ConfigError(
                 f"{name} has shape {shape}; needed are {len(batch) + core_ndim} dimensions that begin with {batch}"
-                f"{ending}, for {n_worlds} worlds of {each[1]} {kind}{or_shared}. For one value per world, repeat it "
-                f"for every {'drone' if of_drones else 'member'} with jnp.broadcast_to."
+                f"{ending}, for {n_worlds} worlds of {n} {kinds}{or_shared}. For one value per world, repeat it "
+                f"for every {kind} with jnp.broadcast_to."
             )
 
     _map_declared(check, tree, {}, "data", None)
