@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.geometry.heightfield import surface
+from crazysim.geometry.heightfield import FAR, surface
 from crazysim.pytree import PyTree, leaf, static
 
 
@@ -49,12 +49,12 @@ class TerrainData(PyTree):
             point: Position, world frame, m. (..., 3)
 
         Returns:
-            Distance, m, infinite beyond the border of a terrain that a flat floor surrounds (...), and unit normal
+            Distance, m, ``FAR`` beyond the border of a terrain that a flat floor surrounds (...), and unit normal
             (..., 3).
         """
         height, normal, inside = surface(self.heights, self.half, point - self.middle)
         gap = (point[..., 2] - self.middle[2] - height) * normal[..., 2]
-        return jnp.where(inside, gap, jnp.inf) if self.floor else gap, normal
+        return jnp.where(inside, gap, FAR) if self.floor else gap, normal
 
 
 def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:

@@ -1,8 +1,7 @@
 """Signed distances to a height field: the solid below triangles over a grid, with walls and a bottom.
 
-Only the triangles of the cells near a point are examined, independent of the size of the grid. Their indices depend on
-the data. The fused engine supports such indexing for grids of up to 64 heights; with larger grids the stage runs as
-plain XLA.
+Only the triangles of the cells near a point are examined, independent of the size of the grid; their indices depend on
+the data.
 """
 
 from __future__ import annotations
@@ -18,6 +17,10 @@ from crazysim.geometry.segments import segment_to_box
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.vector import Vector, vector
 from crazysim.rotation import safe_clip, safe_sqrt
+
+
+FAR = 1e3
+"""Distance of places beyond the border of a field, m: without contact, and finite, as solvers need it."""
 
 
 def spacing(shape: Shape) -> tuple[float, float]:
@@ -177,12 +180,12 @@ def field_gap(shape: Shape, point: Array) -> tuple[Array, Array]:
     """Return the distance of a point to the plane of the triangle below it, m (...), and the plane's normal (..., 3).
 
     That is the signed distance to the ground near a surface without sharp edges, for a small part of the cost of
-    ``field_distance``. Beyond the border, and below the ground's bottom, it is infinite.
+    ``field_distance``. Beyond the border, and below the ground's bottom, it is ``FAR``.
     """
     half = jnp.asarray(shape.size[:2], point.dtype)
     height, normal, inside = surface(jnp.asarray(shape.array("heights"), point.dtype), half, point)
     inside = inside & (point[..., 2] > -shape.size[3])
-    return jnp.where(inside, (point[..., 2] - height) * normal[..., 2], jnp.inf), normal
+    return jnp.where(inside, (point[..., 2] - height) * normal[..., 2], FAR), normal
 
 
 def triangle_at(heights: Array, u: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:

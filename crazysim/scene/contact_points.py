@@ -129,9 +129,7 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
     )
 
 
-def _above(
-    data: SimData, geom: CollisionGeom, points: Array, into: Callable, back: Callable
-) -> tuple[Array, Array]:
+def _above(data: SimData, geom: CollisionGeom, points: Array, into: Callable, back: Callable) -> tuple[Array, Array]:
     """Return the distance of points to the plane below them of a height field, m, and its normal, world frame."""
     terrain = data.plugins.get(geom.name)
     if isinstance(terrain, TerrainData):

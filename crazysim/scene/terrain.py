@@ -35,9 +35,9 @@ class Terrain(Plugin):
 
     heights: Any = parameter()
     """Heights, m, rows along y and columns along x (n_rows, n_columns); or the path of a PNG image, whose brightness is
-    the height and whose upper edge lies at the largest y."""
+    the height, from its darkest to its brightest pixel, and whose upper edge lies at the largest y."""
     size: Any
-    """Full lengths along x and y, m (2,); with an image also the height of white over black (3,)."""
+    """Full lengths along x and y, m (2,); with an image also the height of the brightest pixel over the darkest (3,)."""
     pos: Any = (0.0, 0.0, 0.0)
     """Middle of the terrain at height zero, world frame, m. (3,)"""
     floor: bool = True
@@ -87,7 +87,7 @@ class Terrain(Plugin):
         n = 3 if is_image else 2
         if size.shape != (n,) or not np.all(np.isfinite(size)) or not np.all(size > 0):
             raise ConfigError(
-                f"expected size as {n} positive lengths, m, {'x, y and height of white' if is_image else 'x and y'}, "
+                f"expected size as {n} positive lengths, m, {'along x, y and z' if is_image else 'along x and y'}, "
                 f"got {self.size!r}"
             )
         if pos.shape != (3,) or not np.all(np.isfinite(pos)):
@@ -111,7 +111,7 @@ class Terrain(Plugin):
 
 
 def read_image(path: str | Path) -> np.ndarray:
-    """Return the brightness of a PNG image, 0 to 1, its lowest row first. (n_rows, n_columns)
+    """Return the brightness of a PNG image, its lowest row first, from 0 at the darkest pixel to 1. (n_rows, n_columns)
 
     MuJoCo reads it, with 8 bits per pixel.
 
@@ -127,7 +127,6 @@ def read_image(path: str | Path) -> np.ndarray:
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise ConfigError(f"expected a PNG image of heights, got {str(path)!r}: {error}") from error
-    # The compiler stretches brightness to the range from 0 to 1.
     return np.asarray(model.hfield_data, np.float64).reshape(int(model.hfield_nrow[0]), int(model.hfield_ncol[0]))
 
 
@@ -141,9 +140,7 @@ def _put(scene: Any, plugin: Terrain, heights: np.ndarray, size: np.ndarray, pos
         raise ConfigError(f"expected a new name, got {plugin.name!r}, which the scene has. Use name=.")
     if field is None:
         field = spec.add_hfield(name=plugin.name)
-        geom = spec.worldbody.add_geom(
-            name=plugin.name, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=plugin.name
-        )
+        geom = spec.worldbody.add_geom(name=plugin.name, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=plugin.name)
     field.size = [*(size / 2), rise, DEPTH]
     field.nrow, field.ncol = heights.shape
     field.userdata = shares.ravel()
