@@ -18,7 +18,6 @@ from crazysim.geometry.shapes import Shape
 from crazysim.geometry.vector import Vector, vector
 from crazysim.rotation import safe_clip, safe_sqrt
 
-
 FAR = 1e3
 """Distance of places beyond the border of a field, m: without contact, and finite, as solvers need it."""
 

@@ -118,12 +118,14 @@ def read_image(path: str | Path) -> np.ndarray:
     Raises:
         ConfigError: If it is no image that MuJoCo can read.
     """
+    if not Path(path).is_file():
+        raise ConfigError(
+            f"expected a PNG image of heights, got {str(path)!r}, which is no file. Use an existing path."
+        )
     spec = mujoco.MjSpec()
     spec.add_hfield(name="image", file=str(path), size=[1, 1, 1, 1])
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="image")
     try:
-        if not Path(path).is_file():
-            raise ValueError("no such file")
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise ConfigError(f"expected a PNG image of heights, got {str(path)!r}: {error}") from error

@@ -15,7 +15,7 @@ LOBES = [(5.0, 1.3, 1.0, 0.0), (3.0, 2.5, 0.6, 0.3), (4.0, 0.0, 1.0, 0.0), (4.0,
 @pytest.mark.parametrize("lobe", LOBES)
 def test_the_outline_is_where_the_margin_changes_sign(lobe, x64):
     """The parametric curve of the drawing bounds the closed form of the test."""
-    size, _, height, tilt = lobe
+    size, _, _height, tilt = lobe
     outline = lobe_curves(*lobe)[0]
     middle = np.array([size * np.cos(tilt), 0.0, size * np.sin(tilt)])  # on the axis of the lobe
     for share, inside in ((0.98, True), (1.02, False)):
@@ -37,7 +37,8 @@ def test_law_07_margin_and_gradient_are_finite_everywhere():
     points = jnp.asarray([[0, 0, 0], [10, 0, 0], [0, 0, 3.0], [1e6, 0, 1e6], [1e-9, 0, 0], [5, 0, 0]])
     for e in (0.0, 1.3):
         value, slope = jax.vmap(jax.value_and_grad(lambda p: lobe_margin(p, 5.0, e, 1.0, 0.2)))(points)  # noqa: B023
-        assert np.isfinite(value).all() and np.isfinite(slope).all()
+        assert np.isfinite(value).all()
+        assert np.isfinite(slope).all()
 
 
 def test_detection_counts_time_and_is_reset():

@@ -6,13 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 from cases import with_states
+from scene.test_objects import _png
 
 from crazysim import ConfigError, ContactResponse, GroundEffect, Hook, RangeFinder, Sim, SlungLoad, Terrain, Wind
 from crazysim.core.stages import FLOOR
 from crazysim.effects.ground import ground_at, ground_height
 from crazysim.engine import Step
 from crazysim.scene import terrain as terrain_module
-from scene.test_objects import _png
 
 SIZE = (4.0, 3.0)
 
@@ -199,7 +199,7 @@ def test_images_lie_with_their_upper_edge_at_the_largest_y(tmp_path):
 
 
 def test_other_heights_replace_it():
-    sim, plugin = build(np.full((3, 3), 0.5))
+    sim, _plugin = build(np.full((3, 3), 0.5))
     sim.step()
     sim.replace(Terrain(np.full((3, 3), 0.7), SIZE))
     np.testing.assert_allclose(ground_height(sim.data, sim.data.states.pos), 0.7)
