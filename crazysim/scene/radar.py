@@ -153,7 +153,7 @@ def lobe_margin(offset: Array, size: Array, exponent: Array, height_scale: Array
 
 
 def lobe_curves(size: float, exponent: float, height_scale: float, tilt: float) -> list[np.ndarray]:
-    """Return outlines of a lobe relative to its radar, m: teardrops in vertical planes, and its widest circles. (n, 3)"""
+    """Return outlines of a lobe relative to its radar, m: teardrops in vertical planes, and circles. (n, 3) each"""
     t = np.linspace(0.0, math.pi, N_POINTS)
     along, across = size * (1 - np.cos(t)), height_scale * size * np.sin(t) * np.sin(t / 2) ** exponent
     along, across = np.concatenate([along, along[::-1]]), np.concatenate([across, -across[::-1]])
