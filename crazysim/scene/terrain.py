@@ -37,7 +37,7 @@ class Terrain(Plugin):
     """Heights, m, rows along y and columns along x (n_rows, n_columns); or the path of a PNG image, whose brightness is
     the height, from its darkest to its brightest pixel, and whose upper edge lies at the largest y."""
     size: Any
-    """Full lengths along x and y, m (2,); with an image also the height of the brightest over the darkest pixel (3,)."""
+    """Full lengths along x and y, m (2,); with an image also the height of the brightest over the darkest (3,)."""
     pos: Any = (0.0, 0.0, 0.0)
     """Middle of the terrain at height zero, world frame, m. (3,)"""
     floor: bool = True
