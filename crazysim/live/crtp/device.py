@@ -111,10 +111,10 @@ class CrtpDevice:
                 return []
             try:
                 return [bytes([p << 4 | 0x0C | c]) + d for p, c, d in handler(channel, data)]
-            except (struct.error, IndexError, UnicodeDecodeError):
-                self._report(f"packet of a wrong form to port {port}, channel {channel}: {data.hex()}")
             except ConfigError as error:
                 self._report(str(error))
+            except (struct.error, IndexError, ValueError):
+                self._report(f"packet of a wrong form to port {port}, channel {channel}: {data.hex()}")
             return []
 
     def due(self) -> list[bytes]:

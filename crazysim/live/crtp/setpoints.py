@@ -108,7 +108,8 @@ def _uncompressed(memory: bytes, offset: int, n: int) -> Path:
     """Return the trajectory of polynomials in memory."""
     if not n or offset + PIECE * n > len(memory):
         raise ConfigError(f"expected 1 or more pieces within {len(memory)} bytes, got {n} from {offset} on")
-    numbers = np.frombuffer(memory, "<f4", 33 * n, offset).astype(float).reshape(n, 33)
+    with np.errstate(invalid="ignore"):  # of NaN, which is refused below
+        numbers = np.frombuffer(memory, "<f4", 33 * n, offset).astype(float).reshape(n, 33)
     durations, c = numbers[:, 32], numbers[:, :32].reshape(n, 4, 8)
     _require_durations(durations)
     with np.errstate(over="ignore", invalid="ignore"):

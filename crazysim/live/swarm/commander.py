@@ -22,8 +22,8 @@ STABILIZE, SHUTDOWN = 0.5, 2.0
 """Time without a streamed setpoint after which the drone stays in its place, and after which its motors stop, s."""
 FARTHEST = 1e3
 """Largest coordinate of a command, m, and largest number of any command."""
-LONGEST = 1e4
-"""Longest duration of a command, s."""
+SHORTEST, LONGEST = 1e-3, 1e4
+"""Limits of durations, s, and of factors of durations, 1."""
 N_TRAJECTORIES = 256
 """Number of trajectories that a drone holds; their IDs are one byte."""
 
@@ -130,14 +130,14 @@ class Commander:
             relative_yaw: True to begin at the present yaw too.
 
         Raises:
-            ConfigError: If there is none, or the factor is not positive.
+            ConfigError: If there is none, or the factor is out of range.
         """
         if identity not in self.trajectories:
             raise ConfigError(
                 f"expected one of the trajectories {sorted(self.trajectories)}, got {identity}. Upload it."
             )
-        if not 0 < timescale < FARTHEST:
-            raise ConfigError(f"expected a positive timescale below {FARTHEST:g}, got {timescale}")
+        if not SHORTEST <= timescale <= LONGEST:
+            raise ConfigError(f"expected a timescale from {SHORTEST:g} to {LONGEST:g}, got {timescale}")
         self._require(Control.state)
         plan = Plan(self.trajectories[identity], self.now, timescale, bool(reversed))
         begin, first = self.goal()[0], plan.at(self.now)[0]
@@ -310,8 +310,8 @@ def _numbers(name: str, values: Any, n: int, limit: float = FARTHEST) -> NDArray
 
 def _duration(value: float) -> float:
     (value,) = _numbers("duration", [value], 1, LONGEST)
-    if value <= 0:
-        raise ConfigError(f"expected a positive duration, got {value} s")
+    if value < SHORTEST:
+        raise ConfigError(f"expected a positive duration of at least {SHORTEST:g} s, got {value} s")
     return value
 
 
