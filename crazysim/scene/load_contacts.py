@@ -150,7 +150,7 @@ def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Mater
     groups = list(combinations_with_replacement(range(len(colliders)), 2))
     material = Material(*(x.reshape(-1)[:1] for x in material))
     found = {(a, b): _pairs(data, colliders[a], colliders[b], material, same=a == b) for a, b in groups}
-    n_touches = [
+    n_touches: list[Any] = [
         sum(pairs.touches.sum(axis=1) for (a, _), pairs in found.items() if a == k)
         + sum(pairs.touches.sum(axis=0) for (_, b), pairs in found.items() if b == k)
         for k in range(len(colliders))
