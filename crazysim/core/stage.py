@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.core.others import AXIS
 from crazysim.errors import ConfigError
 from crazysim.pytree import PER_WORLD, PyTree, scopes
 
@@ -65,7 +66,7 @@ def stage(
     A stage without a declared scope receives the full batch.
 
     ``@stage("drone")``: the data of one drone. Leaves of drones and worlds come without batch axes: ``pos`` is (3,),
-    ``steps`` (). The stage writes leaves of drones.
+    ``steps`` (). The stage writes leaves of drones, and reads those of other drones by ``reduce_over_others``.
 
     ``@stage("world")``: the data of one world. Leaves of drones come as (n_drones, ...), leaves of worlds without
     batch axes. The stage writes leaves of drones or worlds.
@@ -221,7 +222,7 @@ def over_drones(fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def of_world(data: Any) -> Any:
         leaves, treedef = jax.tree.flatten(data)
         axes = [0 if scope == "drone" else None for scope in jax.tree.leaves(scopes(data))]
-        return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,))(leaves)
+        return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,), axis_name=AXIS)(leaves)
 
     return of_world
 
@@ -250,7 +251,7 @@ def _over_worlds(stage: Stage, data: Any) -> Any:
             return [new[i] for i in written]
 
         over_drones = [0 if s == "drone" else None for s in axes.scopes]
-        out = jax.vmap(one, (over_drones,))(leaves) if stage.scope == "drone" else one(leaves)
+        out = jax.vmap(one, (over_drones,), axis_name=AXIS)(leaves) if stage.scope == "drone" else one(leaves)
         return axes.treedef.unflatten(with_leaves(leaves, written, out))
 
     return over_worlds(of_world, ("drone", "world"))(data)
