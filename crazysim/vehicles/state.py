@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.pytree import PyTree, leaf
 
 
-class CarState(PyTree):
+class CarState(NamedTuple):
     """State of one vehicle on level ground, with any leading axes."""
 
-    pos: Array = leaf("drone", 1)
+    pos: Array
     """Position of the centre of mass, world frame, m. (..., 3)"""
-    yaw: Array = leaf("drone", 1)
+    yaw: Array
     """Heading, rad, not wrapped. (..., 1)"""
-    body_vel: Array = leaf("drone", 1)
+    body_vel: Array
     """Forward and left velocity of the centre of mass, body frame, m/s. (..., 2)"""
-    yaw_rate: Array = leaf("drone", 1)
+    yaw_rate: Array
     """Rate of the heading, rad/s. (..., 1)"""
-    steer: Array = leaf("drone", 1)
+    steer: Array
     """Steering angle of a wheel in the middle of the front axle, rad, positive to the left. (..., 1)"""
-    distance: Array = leaf("drone", 1)
+    distance: Array
     """Distance that the wheels rolled, m; backwards it decreases. (..., 1)"""
-    joints: Array | None = leaf("drone", 1)
+    joints: Array | None = None
     """Headings of drawbar and trailer, rad, not wrapped; None without a trailer. (..., 2)"""
 
     @staticmethod
