@@ -28,6 +28,7 @@ class Simulation(Protocol):
     default_data: SimData
     step_pipeline: Pipeline
     airframe: Airframe
+    integrator: Any
     n_worlds: int
     n_drones: int
 
@@ -156,6 +157,11 @@ class Plugin:
     def constrains(self) -> bool:
         """True if the plugin couples bodies of its own to the drones by ``constrain``."""
         return type(self).constrain is not Plugin.constrain
+
+    @property
+    def scope(self) -> str:
+        """Scope of the plugin's own states, and of the data that ``derivative`` is written for."""
+        return "drone"
 
     def record(self, sim: Simulation) -> PyTree | None:
         """Return the plugin's record for all worlds, or None if it has none; check settings and simulation.

@@ -17,7 +17,7 @@ from crazysim.core.pipeline import Pipeline, insert_fn_before
 from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.stage import Axes, over_drones, over_worlds
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.pytree import PyTree
+from crazysim.pytree import PyTree, n_batch_axes
 
 P = TypeVar("P", bound=Plugin)
 
@@ -139,7 +139,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             return {f"{p.name}.{key}": x for p in self.values() for key, x in p.observations(one).items()}
 
         leaves, axes = jax.tree.leaves(data), Axes(data)
-        worlds = [0 if scope in ("drone", "world") else None for scope in axes.scopes]
+        worlds = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]
         of_drones = over_drones(of_one)
         of_world = [x[:, 0] if scope == "world" else x for scope, x in zip(axes.scopes, leaves, strict=True)]
         return jax.vmap(lambda values: of_drones(axes.treedef.unflatten(values)), (worlds,))(of_world)

@@ -146,6 +146,10 @@ class Program:
     """Leaves that only carry numbers from one stage to another: what is written there is not kept."""
     packed: tuple[int, ...] = ()
     """Shared leaves whose numbers are also those of one leaf, one after the other."""
+    population: str = "drone"
+    """Population whose members it computes side by side; here they are called drones, with scope ``drone``."""
+    views: frozenset[int] = frozenset()
+    """Leaves of other populations, viewed as leaves of the world (``relative``)."""
 
     @functools.cached_property
     def fused(self) -> bool:
