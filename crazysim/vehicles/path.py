@@ -255,6 +255,18 @@ class Path(PyTree):
         k = int(np.argmin(np.sum((at - np.asarray(pos, float)[:2]) ** 2, axis=1)))
         return k / 8 * float(self.spacing[index])
 
+    def at_time(self, index: int, start: float) -> tuple[Floats, float, float]:
+        """Return position, m (2,), heading of the vehicle, rad, and arc length, m, at time zero, on the host.
+
+        Args:
+            index: Number of the path.
+            start: Time at which the vehicle is at the start of the path, s.
+        """
+        arc, _ = self.time_reference(index, jnp.asarray(-start, floating()))
+        point = self.at(index, arc[0])
+        x, y = np.asarray(point.tangent, float) * (-1 if self.speeds[index, 0] < 0 else 1)
+        return np.asarray(point.pos, float), float(np.arctan2(y, x)), float(arc[0])
+
     def _locate(self, index: Any, s: Array) -> tuple[Array, Array]:
         """Return the piece at an arc length, and the share of its length."""
         length, spacing = _take(self.length, index), _take(self.spacing, index)

@@ -12,7 +12,7 @@ WHEELS = {"fl": (1, 1), "fr": (1, -1), "rl": (-1, 1), "rr": (-1, -1)}
 def articulated_car(vehicle: VehicleModel, trailer: bool = False) -> str:
     """Return MJCF of the car, and of its trailer."""
     number = vehicle.number
-    radius, half = number("wheels.radius"), number("wheels.width") / 2
+    radius = number("wheels.radius")
     spin = f'armature="{number("wheels.armature")}" damping="{number("wheels.damping")}"'
     spin += f' frictionloss="{number("wheels.friction_loss")}"'
     wheels, motors = "", ""
@@ -23,13 +23,13 @@ def articulated_car(vehicle: VehicleModel, trailer: bool = False) -> str:
         hinge = f'<joint name="steer_{name}" axis="0 0 1" damping="4" armature="0.001"/>'
         wheels += f"""<body pos="{x} {y} 0">{hinge if ahead > 0 else ""}
             <joint name="{name}" axis="0 1 0" {spin}/>
-            <geom type="cylinder" size="{radius} {half}" zaxis="0 1 0" mass="{number("wheels.mass")}" condim="3"
+            <geom type="sphere" size="{radius}" mass="{number("wheels.mass")}" condim="3"
              friction="{number("tyres.friction")}" priority="1"/></body>"""
         motors += f'<motor name="{name}" joint="{name}"/>'
         if ahead > 0:
             motors += f'<position name="steer_{name}" joint="steer_{name}" kp="300"/>'
     inertia = number("rigid_body.yaw_inertia")
-    return f"""<mujoco><option timestep="{TIMESTEP}" integrator="implicitfast" cone="elliptic" impratio="100"/>
+    return f"""<mujoco><option timestep="{TIMESTEP}" integrator="implicitfast" cone="elliptic" impratio="1000"/>
       <worldbody><geom type="plane" size="100 100 1"/>
         <body name="car" pos="0 0 {radius}"><freejoint/>
           <inertial pos="0 0 0" mass="{number("rigid_body.mass")}" diaginertia="0.05 0.05 {inertia}"/>
@@ -46,7 +46,7 @@ def _trailer(vehicle: VehicleModel) -> str:
     def axle(x: float) -> str:
         return "".join(
             f"""<body pos="{x} {side * track / 2} {-drop}"><joint axis="0 1 0" armature="5e-5"/>
-            <geom type="cylinder" size="{radius} 0.005" zaxis="0 1 0" mass="0.1" condim="3" priority="1"
+            <geom type="sphere" size="{radius}" mass="0.1" condim="3" priority="1"
              friction="{number("tyres.friction")}"/></body>"""
             for side in (1, -1)
         )
