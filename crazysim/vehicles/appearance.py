@@ -158,7 +158,7 @@ def _wheel(radius: float, width: float) -> str:
     tyre = _geom("cylinder", (radius, width / 2), (0, 0, 0), (0.16, 0.16, 0.16, 1.0), TOUCHES, axis)
     spokes = "".join(
         _geom("box", (0.29 * radius, width / 2 + 0.0016, 0.06 * radius),
-              (0.29 * radius * np.cos(a), 0, -0.29 * radius * np.sin(a)), STEEL, GHOST, f'axisangle="0 1 0 {a:.6g}"')
+              (0.29 * radius * np.cos(a), 0, -0.29 * radius * np.sin(a)), STEEL, GHOST, f'quat="{np.cos(a / 2):.6g} 0 {np.sin(a / 2):.6g} 0"')
         for a in np.arange(SPOKES) * 2 * np.pi / SPOKES
     )  # fmt: skip
     return tyre + rim + spokes

@@ -90,6 +90,7 @@ def test_single_track_tends_to_the_gym_at_small_angles(seed):
             stiffness=gym.friction * gym.stiffness * loads, grip=jnp.full(2, jnp.inf), drive=jnp.array([1.0, 0, 0]),
             drive_max=jnp.array([jnp.inf]), front_share=jnp.zeros(1), rolling=jnp.zeros(2), towed_mass=jnp.zeros(1),
             steer_max=jnp.ones(1), steer_rate_max=jnp.ones(1), steer_bandwidth=jnp.ones(1), slip_speed=jnp.zeros(1),
+            trailer=None,
         )  # fmt: skip
         slip, steer, yaw_rate = np.random.default_rng(seed).uniform(-1, 1, 3)
         speed, sizes, errors = 4.0, 0.1 * 0.5 ** np.arange(4), []
