@@ -15,8 +15,9 @@ from crazysim.vehicles.model import VehicleModel, load_vehicle
 from crazysim.vehicles.state import ackermann, heading_quat, to_world
 from crazysim.vehicles.trailer import trailer_axles
 
-BODY, DARK, STEEL, WOOD = (0.1, 0.35, 0.75, 1.0), (0.08, 0.08, 0.08, 1.0), (0.6, 0.6, 0.65, 1.0), (0.7, 0.6, 0.35, 1.0)
-"""Colours of bodies, tyres, rims and decks."""
+BODY, DARK, STEEL = (0.1, 0.35, 0.75, 1.0), (0.08, 0.08, 0.08, 1.0), (0.6, 0.6, 0.65, 1.0)
+RUBBER, WOOD = (0.16, 0.16, 0.16, 1.0), (0.7, 0.6, 0.35, 1.0)
+"""Colours of bodies, rims, spokes, tyres and decks."""
 TOUCHES, GHOST = 'contype="0" conaffinity="2"', 'contype="0" conaffinity="0"'
 """Attributes of geoms that drones touch, and of others."""
 SPOKES = 5
@@ -111,7 +112,9 @@ def _trailers(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]
     pos, quat = [], []
     for at, heading in ((at_front, bar), (at_rear, deck)):
         for side in (half, -half):
-            offset = to_world(heading, jnp.concatenate([jnp.zeros_like(heading), jnp.full_like(heading, side)], axis=-1))
+            offset = to_world(
+                heading, jnp.concatenate([jnp.zeros_like(heading), jnp.full_like(heading, side)], axis=-1)
+            )
             pos.append(at + jnp.concatenate([offset, jnp.zeros_like(heading)], axis=-1))
             quat.append(rotation.multiply(heading_quat(heading), _rolled(turn[:, 0])))
     wheels = jnp.stack(pos, axis=1).reshape(-1, 3), jnp.stack(quat, axis=1).reshape(-1, 4)
@@ -153,15 +156,14 @@ def _body(vehicle: VehicleModel, rgba: Any) -> str:
 
 def _wheel(radius: float, width: float) -> str:
     """Return geoms of a wheel whose axis is y: a tyre, a rim and spokes."""
-    axis = 'zaxis="0 1 0"'
+    axis, reach = 'zaxis="0 1 0"', 0.29 * radius
     rim = _geom("cylinder", (0.6 * radius, width / 2 + 0.0008), (0, 0, 0), DARK, GHOST, axis)
-    tyre = _geom("cylinder", (radius, width / 2), (0, 0, 0), (0.16, 0.16, 0.16, 1.0), TOUCHES, axis)
-    spokes = "".join(
-        _geom("box", (0.29 * radius, width / 2 + 0.0016, 0.06 * radius),
-              (0.29 * radius * np.cos(a), 0, -0.29 * radius * np.sin(a)), STEEL, GHOST, f'quat="{np.cos(a / 2):.6g} 0 {np.sin(a / 2):.6g} 0"')
-        for a in np.arange(SPOKES) * 2 * np.pi / SPOKES
-    )  # fmt: skip
-    return tyre + rim + spokes
+    spokes = ""
+    for angle in np.arange(SPOKES) * 2 * np.pi / SPOKES:
+        at, turn = (reach * np.cos(angle), 0, -reach * np.sin(angle)), (np.cos(angle / 2), np.sin(angle / 2))
+        quat = f'quat="{turn[0]:.6g} 0 {turn[1]:.6g} 0"'
+        spokes += _geom("box", (reach, width / 2 + 0.0016, 0.06 * radius), at, STEEL, GHOST, quat)
+    return _geom("cylinder", (radius, width / 2), (0, 0, 0), RUBBER, TOUCHES, axis) + rim + spokes
 
 
 def _drawbar(length: float, track: float) -> str:

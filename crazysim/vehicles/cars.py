@@ -133,12 +133,12 @@ class Cars(Population):
     controller: PathController | None = None
     """Controller that follows paths; None for ``PurePursuit()``."""
     reference: Literal["time", "arc"] = "time"
-    """``time``: be where the timing of the path asks at each time; ``arc``: drive at the speed of where the car is."""
+    """``time``: be where the timing of the path has the car at each time; ``arc``: drive at the speed of where the car is."""
     index: Any = parameter(default=None)
     """Number of the path of each car; None for car i path i modulo their number. () or (n_worlds, n_members)"""
     start: Any = parameter(default=None)
-    """Time at which a car is at the start of its path, s; None for zero, and on closed paths for the cars of one path at
-    equal intervals. () or (n_worlds, n_members)"""
+    """Time at which a car is at the start of its path, s; None for zero, and at equal intervals for the cars of one
+    closed path. () or (n_worlds, n_members)"""
     trailer: bool = False
     """True for cars that tow a trailer."""
     rate: int | None = None
@@ -292,8 +292,10 @@ class Cars(Population):
             return None
         given = [self.path] if isinstance(self.path, (Path, Trajectory)) else self.path
         if not isinstance(given, Sequence) or not all(isinstance(x, (Path, Trajectory)) for x in given):
-            raise ConfigError(f"expected a Path, a Trajectory or a sequence of them, got {self.path!r}. Use "
-                              f"Path.of_points([(0, 0), (1, 0), (2, 1)]).")  # fmt: skip
+            raise ConfigError(
+                f"expected a Path, a Trajectory or a sequence of them, got {self.path!r}. Use "
+                f"Path.of_points([(0, 0), (1, 0), (2, 1)])."
+            )
         return Path.stack([Path.of_trajectory(x) if isinstance(x, Trajectory) else x for x in given])
 
     def _indices(self, paths: Path) -> Any:
@@ -344,8 +346,8 @@ def _numbers(name: str, value: Any, counts: tuple[int, int], n: int | None = Non
     if array.shape not in ((), counts[1:], counts) or array.dtype.kind not in "iuf" or not whole:
         what = "a number" if n is None else f"a whole number from 0 to {n - 1}"
         raise ConfigError(
-            f"expected {name} as {what} for all cars, or for each, {counts[1:]} or {counts} = (n_worlds, n_members), got "
-            f"{value!r}"
+            f"expected {name} as {what} for all cars, or for each, {counts[1:]} or {counts} = (n_worlds, n_members), "
+            f"got {value!r}"
         )
     if not np.all(np.isfinite(array)):
         raise ConfigError(f"expected {name} to be finite, got {value!r}")
@@ -356,7 +358,7 @@ def _numbers(name: str, value: Any, counts: tuple[int, int], n: int | None = Non
 def _on_path(
     paths: Path, index: NDArray[Any], start: NDArray[Any], counts: tuple[int, int]
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return position (..., 2), heading (..., 1) and arc length (..., 1) of cars where their paths ask them to be."""
+    """Return position (..., 2), heading (..., 1) and arc length (..., 1) of cars where their paths have them at time zero."""
     index, start = (np.broadcast_to(x, (*counts, 1)) for x in (index, start))
     pos, yaw, arc = np.zeros((*counts, 2)), np.zeros((*counts, 1)), np.zeros((*counts, 1))
     found: dict[tuple[int, float], tuple[Any, ...]] = {}
@@ -385,7 +387,7 @@ def _for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTree | Non
 
 
 class Bicycles(Cars):
-    """Bicycles of AIMotionLab-Virtual: their motor reference is the torque of the rear wheel, N m; they do not steer."""
+    """Bicycles of AIMotionLab-Virtual, whose motor reference is the torque of the rear wheel, N m; they do not steer."""
 
     vehicle: Any = "bicycle"
     name: str = "bicycles"

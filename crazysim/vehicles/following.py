@@ -20,8 +20,8 @@ from crazysim.vehicles.state import CarState, to_world
 class PathState(NamedTuple):
     """A vehicle relative to its path at one instant.
 
-    Offset, heading error and curvature are those of the path as it is seen in the direction in which the vehicle
-    points: of a path that is driven backwards, against its direction.
+    Offset, heading error and curvature are those of the path along the direction in which the vehicle points:
+    of a path that is driven backwards, against its direction.
     """
 
     path: Path
@@ -129,8 +129,9 @@ class PathController:
         """
         name = type(self).__name__
         if path.goes_backwards and not self.backwards:
-            raise ConfigError(f"expected a path that {name} can drive forwards, got negative speeds. Use PurePursuit() or "
-                              f"PathLQR().")  # fmt: skip
+            raise ConfigError(
+                f"expected a path that {name} can drive forwards, got negative speeds. Use PurePursuit() or PathLQR()."
+            )
         if not vehicle.number("steering.angle_max") > 0:
             raise ConfigError(f"expected a vehicle that steers for {name}, got {vehicle.name!r}, which cannot")
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
@@ -169,7 +170,7 @@ class PathController:
         raise NotImplementedError(f"{type(self).__name__} does not define steering")
 
     def driving(self, state: CarState, at: PathState, gains: Any, car: CarParams) -> Array:
-        """Return the motor reference that follows the reference speed and, of a reference by time, the position. (1,)"""
+        """Return the motor reference that follows the reference speed, and the position of one by time. (1,)"""
         acc = self.position_gain * at.lag + self.speed_gain * (at.speed - state.body_vel[:1])
         return motor_reference(at.speed, acc, car)
 
@@ -212,8 +213,8 @@ class PurePursuit(PathController):
 class Stanley(PathController):
     """Stanley's law: the front wheels point along the path, and to it in proportion to the front axle's offset.
 
-    ``d = -heading_error - arctan(k offset / (v_0 + v))`` (Hoffmann, Tomlin, Montemerlo and Thrun, "Autonomous Automobile
-    Trajectory Tracking for Off-Road Driving", 2007, equations 5 and 10). Forwards only.
+    ``d = -heading_error - arctan(k offset / (v_0 + v))`` (Hoffmann, Tomlin, Montemerlo and Thrun, "Autonomous
+    Automobile Trajectory Tracking for Off-Road Driving", 2007). Forwards only.
     """
 
     backwards: ClassVar[bool] = False

@@ -61,8 +61,8 @@ class LPV(PathController):
     Along the path, with ``p = |cos(heading_error + slip) / cos(slip) / (1 - curvature offset)|`` and the lag l behind a
     reference by time, the motor reference is that of speed ``v_ref / p``, plus ``kl1(p) l + kl2(p) (v_ref / p - v)``.
 
-    Gains and feed-forward f are published (``LATERAL``, ``LONGITUDINAL``). The lab's curvature has no sign, which steers
-    the wrong way in one direction of turning; here it has. Forwards only, for the F1TENTH cars.
+    Gains and feed-forward f are published (``LATERAL``, ``LONGITUDINAL``). The lab's curvature has no sign, which
+    steers the wrong way in one direction of turning; here it has. Forwards only, for the F1TENTH cars.
     """
 
     backwards: ClassVar[bool] = False

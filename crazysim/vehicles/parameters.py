@@ -76,7 +76,7 @@ class CarParams(PyTree):
         kinematic = vehicle.dynamics == "kinematic"
         stiffness = [0.0, 0.0] if kinematic else [number("tyres.front"), number("tyres.rear")]
         moments = front**2 * stiffness[0] + rear**2 * stiffness[1]
-        # The fastest rate of the lateral motion is at most this over the speed; its product with the step stays below 1.
+        # The fastest rate of lateral motion is at most this over the speed; times the step it stays below 1.
         rate = max(sum(stiffness) / mass, moments / yaw_inertia)
         drive, drive_max = drive_constants(vehicle)
         return CarParams(
@@ -89,7 +89,9 @@ class CarParams(PyTree):
             drive=as_parameter(drive),
             drive_max=as_parameter(drive_max),
             front_share=as_parameter(vehicle.value("drive.front_share")),
-            rolling=as_parameter([n * number("wheels.damping") / radius**2, n * number("wheels.friction_loss") / radius]),
+            rolling=as_parameter(
+                [n * number("wheels.damping") / radius**2, n * number("wheels.friction_loss") / radius]
+            ),
             towed_mass=as_parameter(n * spin / radius**2 + (number("trailer.mass") if trailer else 0.0)),
             steer_max=as_parameter(vehicle.value("steering.angle_max")),
             steer_rate_max=as_parameter(vehicle.value("steering.rate_max")),

@@ -174,7 +174,7 @@ class Path(PyTree):
         return bool(np.any(np.asarray(self.speeds) < 0))
 
     def at(self, index: Any, s: Array) -> PathPoint:
-        """Return a path at an arc length; a closed one goes on from its start, an open one stays at its ends.
+        """Return a path at an arc length; a closed one continues from its start, an open one stays at its ends.
 
         Args:
             index: Number of the path. ()
@@ -193,7 +193,7 @@ class Path(PyTree):
     def time_reference(self, index: Any, t: Array) -> tuple[Array, Array]:
         """Return the arc length, m, and the speed, m/s, at a time; before the start and after the end at rest.
 
-        On a closed path the arc length increases with every round, and the motion goes on.
+        On a closed path the arc length increases with every round, and the motion continues.
 
         Args:
             index: Number of the path. ()
@@ -303,8 +303,7 @@ def _of_curve(
     if len(moving) != moving[-1] - moving[0] + 1:
         stop = times[moving[0] + np.argmax(np.diff(moving) > 1)]
         raise ConfigError(
-            f"expected a path that stops only at its ends, got one that stops at {stop:.3g} s, where it has no tangent. "
-            f"Split it there."
+            f"expected a path that stops only at its ends, got one without a tangent at {stop:.3g} s. Split it there."
         )
     n = max(4, int(np.ceil(arc[-1] / SPACING)))
     nodes = np.interp(np.linspace(0.0, arc[-1], n + 1), arc, times)

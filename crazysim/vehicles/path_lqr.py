@@ -38,7 +38,7 @@ class PathLQRGains(PyTree):
 class PathLQR(PathController):
     """Linear quadratic regulator of a vehicle about its path, forwards and backwards.
 
-    ``steer = f curvature - K (offset, sideways velocity, heading error, yaw rate)``. At each speed the vehicle's model is
+    ``steer = f curvature - K (offset, sideways velocity, heading error, yaw rate)``. At each speed the model is
     linearised about straight driving and K minimises the weighted squares; f gives the steering angle and the sideways
     velocity of steady cornering, at which the offset is zero.
     """

@@ -34,8 +34,8 @@ def drive_force(reference: Array, speed: Array, params: CarParams) -> Array:
 def tyre_force(drive: Array, vel: Array, stiffness: Array, grip: Array, slip_speed: Array) -> tuple[Array, Array]:
     """Return the force of the tyres of an axle along and across its wheels, N. (..., 1) each
 
-    The force across is the cornering stiffness times the lateral slip ``-v_across / |v_along|``, the tangent of the slip
-    angle; ``|v|`` is ``sqrt(v^2 + slip_speed^2)``, so that the tyre of a slow wheel is a damper that makes it roll
+    The force across is the cornering stiffness times the lateral slip ``-v_across / |v_along|``, the tangent of the
+    slip angle; ``|v|`` is ``sqrt(v^2 + slip_speed^2)``, so that the tyre of a slow wheel is a damper that makes it roll
     without slip. Both forces together are ``f / sqrt(1 + |f|^2 / grip^2)`` of the forces f without a limit: equal to f
     where they are small, and never larger than the grip (a friction circle).
 

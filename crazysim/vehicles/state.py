@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax import Array
 
 
-
 class CarState(NamedTuple):
     """State of one vehicle on level ground, with any leading axes."""
 

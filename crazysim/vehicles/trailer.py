@@ -20,7 +20,9 @@ def trailer_rates(state: CarState, params: CarParams) -> Array:
         ConfigError: If the parameters have no trailer.
     """
     if params.trailer is None or state.joints is None:
-        raise ConfigError("expected parameters of a trailer, got none. Use CarParams.create(vehicle, freq, trailer=True).")
+        raise ConfigError(
+            "expected parameters of a trailer, got none. Use CarParams.create(vehicle, freq, trailer=True)."
+        )
     hitch, drawbar, axles = (params.trailer[..., k : k + 1] for k in range(3))
     vx, vy = state.body_vel[..., :1], state.body_vel[..., 1:] - hitch * state.yaw_rate
     to_bar = state.yaw - state.joints[..., :1]

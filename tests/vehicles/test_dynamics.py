@@ -173,7 +173,9 @@ def test_rest_stays_at_rest_with_finite_gradients(model, name):
 def test_values_and_gradients_are_finite(speed, side, turn, steer, d, command):
     s, car = state(speed, side, turn, steer), params()
     rate = single_track(s, jnp.array([d, command]), car)
-    slope = jax.grad(lambda s: sum(jnp.sum(x) for x in jax.tree.leaves(single_track(s, jnp.array([d, command]), car))))(s)
+    slope = jax.grad(lambda s: sum(jnp.sum(x) for x in jax.tree.leaves(single_track(s, jnp.array([d, command]), car))))(
+        s
+    )
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((rate, slope)))
 
 
@@ -198,7 +200,9 @@ def test_gradients_equal_central_differences(model):
         slope = jax.grad(end)(command)
         for k in range(2):
             step = jnp.zeros(2).at[k].set(h)
-            assert float(slope[k]) == pytest.approx(float(end(command + step) - end(command - step)) / (2 * h), rel=1e-6)
+            assert float(slope[k]) == pytest.approx(
+                float(end(command + step) - end(command - step)) / (2 * h), rel=1e-6
+            )
 
 
 def test_drive_holds_the_speed_of_its_balance():

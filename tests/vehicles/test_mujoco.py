@@ -99,7 +99,7 @@ def test_braking_with_the_motors(torque):
 
 
 def test_braking_with_locked_wheels():
-    """Sliding on ground of friction 0.3, distances agree within 2%: ``v^2 / (2 friction g)``, and the lock takes 20 ms."""
+    """On ground of friction 0.3 distances agree within 2%: ``v^2 / (2 friction g)``, and the lock takes 20 ms."""
     slippery = vehicle(friction=0.3, armature=1e-4)
     car = Articulated(slippery)
     while car.body_vel[0] < 2.0:
@@ -108,7 +108,7 @@ def test_braking_with_locked_wheels():
     speed, start = car.body_vel[0], car.pos[0]
     car.torque(0.0)
     for name in WHEELS:
-        car.model.joint(name).damping[0] = 10.0  # brakes that lock the wheels
+        car.model.joint(name).damping[0] = 0.05  # holds the wheels far below the speed at which they would roll
     while car.body_vel[0] > 0.3:
         car.step()
     params = CarParams.create(slippery, 1000)
