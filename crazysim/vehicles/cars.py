@@ -133,7 +133,7 @@ class Cars(Population):
     controller: PathController | None = None
     """Controller that follows paths; None for ``PurePursuit()``."""
     reference: Literal["time", "arc"] = "time"
-    """``time``: be where the timing of the path has the car at each time; ``arc``: drive at the speed of where the car is."""
+    """``time`` to keep to the timing of the path; ``arc`` to drive at the speed of the place where the car is."""
     index: Any = parameter(default=None)
     """Number of the path of each car; None for car i path i modulo their number. () or (n_worlds, n_members)"""
     start: Any = parameter(default=None)
@@ -358,7 +358,7 @@ def _numbers(name: str, value: Any, counts: tuple[int, int], n: int | None = Non
 def _on_path(
     paths: Path, index: NDArray[Any], start: NDArray[Any], counts: tuple[int, int]
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return position (..., 2), heading (..., 1) and arc length (..., 1) of cars where their paths have them at time zero."""
+    """Return positions (..., 2), headings (..., 1) and arc lengths (..., 1) of cars on their paths at time zero."""
     index, start = (np.broadcast_to(x, (*counts, 1)) for x in (index, start))
     pos, yaw, arc = np.zeros((*counts, 2)), np.zeros((*counts, 1)), np.zeros((*counts, 1))
     found: dict[tuple[int, float], tuple[Any, ...]] = {}
@@ -387,7 +387,7 @@ def _for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTree | Non
 
 
 class Bicycles(Cars):
-    """Bicycles of AIMotionLab-Virtual, whose motor reference is the torque of the rear wheel, N m; they do not steer."""
+    """Bicycles of AIMotionLab-Virtual: the motor reference is the torque of the rear wheel, N m; no steering."""
 
     vehicle: Any = "bicycle"
     name: str = "bicycles"
