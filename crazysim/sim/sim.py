@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from jax.sharding import Mesh
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import CASCADE
 from crazysim.core import functional as F
+from crazysim.core.airframes import airframe_of
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
 from crazysim.core.random import seed_sim
@@ -31,7 +32,7 @@ from crazysim.scene.queries import SceneQueries
 from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim.commands import Commands
-from crazysim.sim.configuration import Configuration
+from crazysim.sim.configuration import AirframeSource, Configuration
 from crazysim.sim.pipelines import Pipelines
 from crazysim.sim.plugins import PluginMethods
 from crazysim.sim.scene_shell import SceneShell, use_box_collision
@@ -59,7 +60,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self,
         n_worlds: int = 1,
         n_drones: int = 1,
-        drone: str | Path | Mapping[str, Any] | Airframe = Drone.cf21B_500,
+        drone: AirframeSource | Sequence[AirframeSource] = Drone.cf21B_500,
         dynamics: Dynamics | str = Dynamics.default,
         control: Control | str = Control.default,
         integrator: Integrator | str = Integrator.default,
@@ -83,7 +84,8 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         Args:
             n_worlds: Number of worlds.
             n_drones: Number of drones in each.
-            drone: Name of a built-in airframe, path of a TOML file, dict, or airframe.
+            drone: Name of a built-in airframe, path of a TOML file, dict, or airframe; or a list of these, one for each
+                drone, whose length is then ``n_drones``.
             dynamics: Dynamics model.
             control: Command level.
             integrator: Integration scheme.
@@ -132,10 +134,10 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         )
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
         self.dynamics, self.control, self.integrator = c.dynamics, c.control, c.integrator
-        self.airframe, self.drone = c.airframe, c.airframe.name
+        self.airframes = c.airframes
         self.device, self.mesh, self.engine = c.device, mesh, engine
 
-        self._scene = Scene(xml_path, self.airframe, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
+        self._scene = Scene(xml_path, self.airframes, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
         self._revision = self._scene.revision
         self._stepper = Stepper(self.device, mesh, engine, strict)
         self._queries = self._new_queries()
@@ -149,6 +151,24 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self.reset_pipeline = {"reset": reset}
         self.build_step_fn()
         self.build_reset_fn()
+
+    @property
+    def airframe(self) -> Airframe:
+        """Airframe of all drones.
+
+        Raises:
+            ConfigError: If the drones have several.
+        """
+        return airframe_of(self.airframes)
+
+    @property
+    def drone(self) -> str:
+        """Name of the airframe of all drones.
+
+        Raises:
+            ConfigError: If the drones have several airframes.
+        """
+        return self.airframe.name
 
     # Data ---------------------------------------------------------------------------------------------------
 
@@ -201,7 +221,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
             self.n_drones,
             self.dynamics,
             self.control,
-            self.airframe,
+            self.airframes,
             self.freq,
             dict(self.configuration.control_freqs),
             self._scene.drone_mocap_ids,
