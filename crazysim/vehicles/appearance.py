@@ -12,7 +12,7 @@ from crazysim import rotation
 from crazysim.core.data import Objects
 from crazysim.core.plugin import Simulation
 from crazysim.vehicles.model import VehicleModel, load_vehicle
-from crazysim.vehicles.state import ackermann, heading_quat, to_world
+from crazysim.vehicles.state import ackermann, heading_quat, tilted
 from crazysim.vehicles.trailer import trailer_axles
 
 BODY, DARK, STEEL = (0.1, 0.35, 0.75, 1.0), (0.08, 0.08, 0.08, 1.0), (0.6, 0.6, 0.65, 1.0)
@@ -70,8 +70,7 @@ def placed(objects: Objects, cars: Any, car: Any) -> Objects:
         car: Its record, for one world. Leaves (n_members, ...)
     """
     vehicle = load_vehicle(cars.vehicle)
-    quat = heading_quat(car.yaw)
-    rows = {"body": (car.pos, quat), "wheel": _wheels(vehicle, car)}
+    rows = {"body": (car.pos, car.quat), "wheel": _wheels(vehicle, car)}
     if cars.trailer:
         rows |= _trailers(vehicle, car)
     pos, turned = objects.pos, objects.quat
@@ -85,44 +84,38 @@ def placed(objects: Objects, cars: Any, car: Any) -> Objects:
 def _wheels(vehicle: VehicleModel, car: Any) -> tuple[Array, Array]:
     """Return positions, m, and attitudes of all wheels; a wheel's axis is its y axis. (n_members n_wheels, ...)"""
     places = wheel_places(vehicle)
-    n, n_wheels = car.pos.shape[0], len(places)
-    yaw = jnp.broadcast_to(car.yaw[:, None], (n, n_wheels, 1))
-    offset = to_world(yaw, jnp.broadcast_to(jnp.asarray(places, car.pos.dtype), (n, n_wheels, 2)))
-    pos = car.pos[:, None] + jnp.concatenate([offset, jnp.zeros_like(yaw)], axis=-1)
-    pos = pos.at[..., 2].set(car.pos[:, None, 2])
-    if n_wheels == 4:
-        front = ackermann(car.steer, vehicle.wheelbase, vehicle.number("axles.track"))
-        steer = jnp.concatenate([front, jnp.zeros_like(front)], axis=-1)[..., None]
-    else:
-        steer = jnp.stack([car.steer, jnp.zeros_like(car.steer)], axis=1)
-    rolled = car.distance / vehicle.number("wheels.radius")
-    quat = rotation.multiply(heading_quat(yaw + steer), _rolled(jnp.broadcast_to(rolled[:, None], yaw.shape)))
+    shape = (car.pos.shape[0], len(places))
+    body = jnp.broadcast_to(car.quat[:, None], (*shape, 4))
+    pos = car.pos[:, None] + rotation.rotate(body, jnp.asarray(np.pad(places, ((0, 0), (0, 1))), car.pos.dtype))
+    front = ackermann(car.steer, vehicle.wheelbase, vehicle.number("axles.track"))[:, : len(places) // 2]
+    steer = jnp.concatenate([front, jnp.zeros_like(front)], axis=-1)[..., None]
+    rolled = _rolled(jnp.broadcast_to((car.distance / vehicle.number("wheels.radius"))[:, None], steer.shape))
+    quat = rotation.multiply(body, rotation.multiply(heading_quat(steer), rolled))
     return pos.reshape(-1, 3), quat.reshape(-1, 4)
 
 
 def _trailers(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]:
-    """Return positions, m, and attitudes of drawbars, decks and wheels of trailers."""
+    """Return positions, m, and attitudes of drawbars, decks and wheels of trailers, on the plane below their cars."""
     number = vehicle.number
-    front, rear = trailer_axles(car.state, car.params)
-    height = jnp.full((front.shape[0], 1), number("trailer.wheel_radius"), front.dtype)
-    bar, deck = car.joints[:, :1], car.joints[:, 1:]
-    at_front, at_rear = (jnp.concatenate([x, height], axis=-1) for x in (front, rear))
-    half = number("trailer.track") / 2
-    turn = (car.distance / number("trailer.wheel_radius"))[:, None]
-    pos, quat = [], []
-    for at, heading in ((at_front, bar), (at_rear, deck)):
+    radius, half = number("trailer.wheel_radius"), number("trailer.track") / 2
+    bar, deck = (tilted(car.joints[:, k : k + 1], car.normal) for k in range(2))
+    front, rear = (_above_plane(x, car, radius - number("wheels.radius")) for x in trailer_axles(car.state, car.params))
+    turn = _rolled(car.distance / radius)
+    wheels = []
+    for at, attitude in ((front, bar), (rear, deck)):
         for side in (half, -half):
-            offset = to_world(
-                heading, jnp.concatenate([jnp.zeros_like(heading), jnp.full_like(heading, side)], axis=-1)
-            )
-            pos.append(at + jnp.concatenate([offset, jnp.zeros_like(heading)], axis=-1))
-            quat.append(rotation.multiply(heading_quat(heading), _rolled(turn[:, 0])))
-    wheels = jnp.stack(pos, axis=1).reshape(-1, 3), jnp.stack(quat, axis=1).reshape(-1, 4)
-    return {
-        "drawbar": (at_front, heading_quat(bar)),
-        "trailer": (at_front, heading_quat(deck)),
-        "trailer_wheel": wheels,
-    }
+            offset = rotation.rotate(attitude, jnp.asarray([0.0, side, 0.0], at.dtype))
+            wheels.append((at + offset, rotation.multiply(attitude, turn)))
+    pos, quat = (jnp.stack(x, axis=1) for x in zip(*wheels, strict=True))
+    wheel = (pos.reshape(-1, 3), quat.reshape(-1, 4))
+    return {"drawbar": (front, bar), "trailer": (front, deck), "trailer_wheel": wheel}
+
+
+def _above_plane(at: Array, car: Any, height: float) -> Array:
+    """Return places, (n, 2), at a height above the plane through the cars' centres of mass, m. (n, 3)"""
+    off, normal = at - car.pos[:, :2], car.normal
+    rise = -(normal[:, :1] * off[:, :1] + normal[:, 1:2] * off[:, 1:]) / normal[:, 2:]
+    return jnp.concatenate([at, car.pos[:, 2:] + rise + height], axis=-1)
 
 
 def _rolled(angle: Array) -> Array:

@@ -16,6 +16,8 @@ from crazysim.core.data import Objects, SimData
 from crazysim.core.plugin import Placement, Simulation, parameter
 from crazysim.core.population import Population
 from crazysim.core.stage import Stage, tick
+from crazysim.dynamics.core import GRAVITY
+from crazysim.effects.ground import TerrainData, ground_at
 from crazysim.errors import ConfigError
 from crazysim.pytree import Members, PyTree, floating, leaf
 from crazysim.trajectories import Trajectory
@@ -26,12 +28,14 @@ from crazysim.vehicles.model import VehicleModel, load_vehicle
 from crazysim.vehicles.parameters import CarParams
 from crazysim.vehicles.path import Path
 from crazysim.vehicles.single_track import single_track
-from crazysim.vehicles.state import CarState, heading_quat, to_body, to_world
+from crazysim.vehicles.state import CarState, tilted, to_body, to_world
 
 CONTROL_FREQ = 50
 """Default rate of the controllers, Hz, lowered to the next divisor of the simulation's rate."""
 SPEED_GAIN = 4.0
 """Acceleration over the error of speed at the command level ``speed``, 1/s."""
+SETTLING = 0.02
+"""Time in which height and tilt of a car follow the ground, s: that of stiff springs."""
 GAP = 1.0
 """Distance of neighbours that start in a row, m."""
 
@@ -47,6 +51,9 @@ class CarData(Members):
     """Forward and left velocity of the centre of mass, body frame, m/s. (n_worlds, n_members, 2)"""
     yaw_rate: Array = leaf("member", 1)
     """Rate of the heading, rad/s. (n_worlds, n_members, 1)"""
+    normal: Array = leaf("member", 1)
+    """Unit normal of the ground below, upwards, world frame; it follows terrain within ``SETTLING``.
+    (n_worlds, n_members, 3)"""
     steer: Array = leaf("member", 1)
     """Steering angle in the middle of the front axle, rad, positive to the left. (n_worlds, n_members, 1)"""
     distance: Array = leaf("member", 1)
@@ -86,7 +93,7 @@ class CarData(Members):
     @property
     def quat(self) -> Array:
         """Attitude, body to world, xyzw. (n_worlds, n_members, 4)"""
-        return heading_quat(self.yaw)
+        return tilted(self.yaw, self.normal)
 
     @property
     def vel(self) -> Array:
@@ -111,10 +118,11 @@ class CarData(Members):
 
 
 class Cars(Population):
-    """Cars on level ground, driven by commands, or along paths by a controller.
+    """Cars, driven by commands, or along paths by a controller, on level ground or on terrain.
 
     Commands are held until they change: at the level ``drive`` the motor reference and the steering angle, at ``speed``
-    the speed and the steering angle. With a path the cars need no commands.
+    the speed and the steering angle. With a path the cars need no commands. On terrain the dynamics are those of level
+    ground with the pull of the slope; height and tilt follow the ground. Wheels do not leave it.
     """
 
     members: int | Sequence[str] = 1
@@ -197,7 +205,8 @@ class Cars(Population):
         pos, yaw = (np.broadcast_to(x, (*counts, x.shape[-1])) for x in (pos, yaw))
         if arc is not None and self.pos is not None:
             arc = _projected(paths, index, pos, arc)
-        z = np.full((*counts, 1), vehicle.number("wheels.radius"))
+        height, normal = ground_at(sim.data, jnp.asarray(np.concatenate([pos, pos[..., :1]], axis=-1), floating()))
+        z = np.asarray(height) + vehicle.number("wheels.radius")
         zero = np.zeros((*counts, 1))
         two, three = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)
         if self.in_scene:
@@ -210,6 +219,7 @@ class Cars(Population):
             yaw=yaw,
             body_vel=two,
             yaw_rate=zero,
+            normal=np.asarray(normal),
             steer=zero,
             distance=zero,
             joints=np.concatenate([yaw, yaw], axis=-1) if self.trailer else None,
@@ -252,9 +262,21 @@ class Cars(Population):
         car = self.read(data)
         model = kinematic if self.model.dynamics == "kinematic" else single_track
         command = car.command if car.applied is None else car.applied
-        push = jnp.concatenate([to_body(car.yaw, car.force[:2]), car.torque[2:]])
-        rates = model(car.state, command, car.params, push)._asdict()
+        force, settling = car.force[:2], {}
+        if any(isinstance(record, TerrainData) for record in data.plugins.values()):
+            force = force - GRAVITY[2] * car.params.mass * car.normal[2:] * car.normal[:2]
+            settling = self._settling(data, car)
+        push = jnp.concatenate([to_body(car.yaw, force), car.torque[2:]])
+        rates = model(car.state, command, car.params, push)._asdict() | settling
         return {name: rate for name, rate in rates.items() if rate is not None}
+
+    def _settling(self, data: SimData, car: CarData) -> dict[str, Array]:
+        """Return the rates of position and normal of one car that follows terrain."""
+        height, normal = ground_at(data, car.pos)
+        vel, rate = car.vel, 1 / max(SETTLING, 2 / data.core.freq)
+        climb = -(normal[:1] * vel[:1] + normal[1:2] * vel[1:2]) / normal[2:]
+        sink = rate * (height + self.model.number("wheels.radius") - car.pos[2:])
+        return {"pos": jnp.concatenate([vel[:2], climb + sink]), "normal": rate * (normal - car.normal)}
 
     def place(self, data: SimData) -> Objects:
         """Return the objects of a world with the cars' bodies, wheels and trailers at their poses."""

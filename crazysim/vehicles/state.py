@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
+
+from crazysim import rotation
 
 
 class CarState(NamedTuple):
@@ -51,6 +53,19 @@ def heading_quat(yaw: Array) -> Array:
     """Return the rotation about z by an angle, (..., 1), as a quaternion, xyzw. (..., 4)"""
     zero = jnp.zeros_like(yaw)
     return jnp.concatenate([zero, zero, jnp.sin(yaw / 2), jnp.cos(yaw / 2)], axis=-1)
+
+
+def tilted(yaw: Array, normal: Array) -> Array:
+    """Return the attitude of a vehicle on a slope: turned by its heading, then by the tilt of the ground. (..., 4)
+
+    Args:
+        yaw: Heading, rad. (..., 1)
+        normal: Unit normal of the ground, upwards. (..., 3)
+    """
+    x, y, z = normal[..., :1], normal[..., 1:2], normal[..., 2:]
+    tilt = jnp.concatenate([-y, x, jnp.zeros_like(x), 1 + z], axis=-1)
+    tilt = tilt * lax.rsqrt(jnp.sum(tilt * tilt, axis=-1, keepdims=True))
+    return rotation.multiply(tilt, heading_quat(yaw))
 
 
 def to_world(yaw: Array, vector: Array) -> Array:
