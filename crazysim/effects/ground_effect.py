@@ -12,6 +12,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, check_parameter, parameter
 from crazysim.deprecation import warn_renamed
 from crazysim.effects.core import require_rotors
+from crazysim.effects.ground import ground_below
 from crazysim.pytree import PyTree, leaf
 
 
@@ -25,7 +26,7 @@ class GroundEffectData(PyTree):
 
 
 class GroundEffect(Plugin):
-    """Thrust of every rotor that grows near the floor, at z = 0; needs rotors."""
+    """Thrust of every rotor that grows near the ground, flat floor or terrain; needs rotors."""
 
     propeller_radius: Any = parameter(default=None)
     """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
@@ -43,7 +44,7 @@ class GroundEffect(Plugin):
     def influence(self, data: SimData) -> SimData:
         """Return the data with the thrust curves at the height of each rotor."""
         record, s, p = self.read(data), data.states, data.params
-        height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], record.rotor_pos)[..., 2]
+        height = s.pos[..., 2:] - ground_below(data) + rotation.rotate(s.quat[..., None, :], record.rotor_pos)[..., 2]
         upright = rotation.z_axis(s.quat)[..., 2:]
         gain = thrust_gain(height, upright, record.propeller_radius)
         return data.replace(params=p.replace(rpm2thrust=gain[..., None] * p.rpm2thrust))

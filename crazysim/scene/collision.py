@@ -33,6 +33,8 @@ class CollisionGeom:
     """Origin of the shape's frame, m."""
     rot: Matrix | None
     """Rows of the rotation matrix from the shape's frame; None for the identity."""
+    name: str = dataclasses.field(default="", compare=False)
+    """Name of the geom; empty if it has none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,7 +164,7 @@ def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | Non
     # The compiler stores attitudes as quaternions, whose rounding would turn axis-aligned boxes.
     rot = np.where(np.abs(np.abs(rot) - 1) < 1e-9, np.sign(rot), rot)
     rows = None if np.allclose(rot, np.eye(3), rtol=0, atol=1e-9) else tuple(tuple(map(float, row)) for row in rot)
-    return CollisionGeom(_shape(model, geom), tuple(map(float, pos)), rows)  # type: ignore[arg-type]
+    return CollisionGeom(_shape(model, geom), tuple(map(float, pos)), rows, model.geom(geom).name)  # type: ignore[arg-type]
 
 
 def _shape(model: mujoco.MjModel, geom: int) -> Shape:
