@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -20,14 +22,18 @@ class Keyboard:
 
     def __init__(self) -> None:
         """Begin with all keys released and without functions."""
-        self._held: dict[str, bool] = {}
+        self._held: dict[str, float] = {}
         self._pressed: deque[str] = deque(maxlen=100)
         self._calls: dict[str, Callable[[Live], Any]] = {}
 
     def press(self, key: str) -> None:
         """Note that a key is pressed."""
-        self._held[key] = True
+        self._held[key] = math.inf
         self._pressed.append(key)
+
+    def hold(self, key: str, seconds: float) -> None:
+        """Hold a key for a while, s, for viewers that do not report when it is released; calls nothing."""
+        self._held[key] = time.monotonic() + seconds
 
     def release(self, key: str) -> None:
         """Note that a key is released."""
@@ -39,7 +45,7 @@ class Keyboard:
 
     def is_held(self, key: str) -> bool:
         """Return True while a key is held."""
-        return key in self._held
+        return self._held.get(key, 0.0) > time.monotonic()
 
     def axis(self, positive: str, negative: str) -> float:
         """Return 1, -1 or 0 for two opposite keys."""

@@ -60,8 +60,14 @@ class Live(Closing):
     """Buttons and sliders that viewers show."""
     selected: tuple[int, int] | None
     """World and drone that are followed, plotted and piloted; None for none."""
+    quantities: dict[str, Callable[[Live], Any]]
+    """Further quantities that viewers can plot: by name, functions of the loop that return numbers. (k,)"""
+    on_click: Callable[[Live, int, NDArray], Any] | None
+    """Function that is called with the loop, a world and a point of its ground, m, that was clicked in a viewer."""
     step: int
     """Control steps since the last reset."""
+    flown: int
+    """Control steps since the beginning, which resets do not set back."""
 
     def __init__(
         self,
@@ -93,8 +99,8 @@ class Live(Closing):
                 raise ConfigError(f"expected a positive {name}, got {value!r}")
         self.sim, self.control_freq = sim, control_freq
         self.n_substeps = sim.freq // control_freq
-        self.keyboard, self.controls = Keyboard(), []
-        self.selected = (0, 0)
+        self.keyboard, self.controls, self.quantities = Keyboard(), [], {}
+        self.selected, self.on_click = (0, 0), None
         self.step = round(float(sim.time[0, 0]) * control_freq)
         self.flown = 0
         self._dt, self._fps = 1.0 / control_freq, float(fps)
@@ -251,6 +257,16 @@ class Live(Closing):
             )
         self.selected = (int(world), int(drone))
 
+    def click(self, world: int, point: NDArray) -> None:
+        """Call ``on_click``, if it is set, as viewers do for a click on the ground.
+
+        Args:
+            world: Index of the world.
+            point: Point, world frame, m. (3,)
+        """
+        if self.on_click is not None:
+            self.on_click(self, world, point)
+
     def post(self, call: Callable[[Live], Any]) -> None:
         """Let the loop call a function between two steps; may be called from any thread."""
         self._posted.append(call)
@@ -275,6 +291,11 @@ class Live(Closing):
         self._recording, self._path = LiveRecording(self.sim, path, period), Path(path)
         self._recording.add(self)
         return self._recording.path
+
+    @property
+    def is_recording(self) -> bool:
+        """True while a recording is being written."""
+        return self._recording is not None
 
     def stop_recording(self) -> None:
         """Finish the recording, if there is one."""
@@ -332,7 +353,7 @@ class Live(Closing):
             factor = (self.flown - flown) * self._dt / (now - then)
             self._factor = (now, self.flown, factor)
         marks = [f"{self.time:.2f} s", f"{factor:.2f} x real time"]
-        marks += ["paused"] * self._paused + ["recording"] * (self._recording is not None)
+        marks += ["paused"] * self._paused + ["recording"] * self.is_recording
         return ", ".join(marks)
 
     def _turn(self) -> float:
@@ -403,9 +424,13 @@ class Live(Closing):
         self._pictures += bool(self._viewers)
 
     def _run_posted(self) -> None:
-        self.keyboard.run(self)
-        while self._posted:
-            self._posted.popleft()(self)
+        try:
+            self.keyboard.run(self)
+            while self._posted:
+                self._posted.popleft()(self)
+        except ConfigError as error:
+            self._failures += 1
+            log.warning("refused at %.2f s: %s", self.time, error)
 
     def _between_steps(self, call: Callable[[Live], Any]) -> None:
         """Call a function now, or after the control step that is under way."""

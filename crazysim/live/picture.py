@@ -83,7 +83,8 @@ class PictureSource:
         touching = np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drones.shape[:2], bool)
         values = np.zeros(0)
         if plot and live.selected is not None:
-            values = quantity(data, plot)(*live.selected)
+            own = live.quantities.get(plot)
+            values = quantity(data, plot)(*live.selected) if own is None else np.ravel(np.asarray(own(live), float))
         return Picture(
             worlds, live.time, live.status, pos, quat, drones, setpoint, touching, air, live.selected, values
         )

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from crazysim.control import Control
 from crazysim.sim.sim import Sim
 
+UNSET = np.eye(16)[12]
+"""State command of a drone that has had none: the origin, level. (16,)"""
+
 
 class StagedCommands:
     """The command of every drone, as the simulation's command level has it; staged while it is in use."""
@@ -52,6 +55,6 @@ def _present(sim: Sim) -> NDArray:
         return np.array(controls.rotor_vel, float)
     command = np.array(getattr(controls, sim.control.value).staged_cmd, float)
     if sim.control == Control.state:
-        unset = ~command[..., 9:13].any(-1)
-        command[unset, :3], command[unset, 12] = np.asarray(sim.data.states.pos, float)[unset], 1.0
+        unset = (command == UNSET).all(-1)
+        command[unset, :3] = np.asarray(sim.data.states.pos, float)[unset]
     return command
