@@ -9,7 +9,7 @@ from crazysim.core.plugin import Placement, Plugin, parameter
 from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
-from crazysim.effects import Battery, Downwash, GroundEffect, Latency, MotorFailure, Wind
+from crazysim.effects import Battery, Downwash, GroundEffect, Latency, MotorFailure, Wind, WindField
 from crazysim.errors import ConfigError
 from crazysim.lazy import lazy
 from crazysim.pytree import PyTree, leaf, static
@@ -19,7 +19,7 @@ from crazysim.version import __version__
 if TYPE_CHECKING:
     from crazysim.core import functional as functional
     from crazysim.envs import make
-    from crazysim.payloads import Hook, SharedLoad, SlungLoad
+    from crazysim.payloads import Hook, RotorJet, SharedLoad, SlungLoad
     from crazysim.scene.contact_log import ContactLog
     from crazysim.scene.range_finder import RangeFinder
     from crazysim.scene.response import ContactResponse
@@ -48,11 +48,13 @@ __all__ = [
     "Plugin",
     "PyTree",
     "RangeFinder",
+    "RotorJet",
     "SharedLoad",
     "Sim",
     "SimData",
     "SlungLoad",
     "Wind",
+    "WindField",
     "__version__",
     "leaf",
     "load_airframe",
@@ -70,6 +72,7 @@ __getattr__ = lazy(
         "Follow": "crazysim.trajectories",
         "Hook": "crazysim.payloads",
         "MPPI": "crazysim.sim.mppi",
+        "RotorJet": "crazysim.payloads",
         "SharedLoad": "crazysim.payloads",
         "SlungLoad": "crazysim.payloads",
         "RangeFinder": "crazysim.scene.range_finder",

@@ -217,6 +217,13 @@ def test_mppi_prints_the_rate_of_commands(run):
     assert (line["samples"], line["horizon"], line["engine"]) == (16, 5, "fused")
 
 
+def test_mocap_takes_less_than_a_millisecond_a_frame(run):
+    (line,) = run("mocap.py", "--objects", "50", "--freq", "240", "--seconds", "1")
+    assert line["frames"] > 100
+    assert line["lost"] == 0
+    assert line["frame_ms"] < 1
+
+
 def test_controllers_are_compared_on_the_same_flights(run):
     lines = run("controllers.py", "--controllers", "geometric", "--worlds", "4", "--repeats", "1")
     assert [line["controller"] for line in lines] == ["geometric"]

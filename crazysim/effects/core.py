@@ -27,6 +27,9 @@ class Exposed(PyTree):
     air_vel: Array | None = leaf("drone", 1)
     """Velocity of the air at the body from the jets of all drones, world frame, m/s; None without drag.
     (n_worlds, n_drones, 3)"""
+    wind_vel: Array | None = leaf("drone", 1)
+    """Velocity of the air at the body from all wind fields, world frame, m/s; None without drag.
+    (n_worlds, n_drones, 3)"""
 
 
 def with_moving_air(data: SimData, air_vel: Array) -> SimData:

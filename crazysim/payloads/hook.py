@@ -131,7 +131,7 @@ class Hook(Colliding, Plugin):
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
         """Return the derivative with the pull of hook and load, and their rates; of one drone."""
         load, p = self.read(data), data.params
-        falling = air_and_gravity(data, load, load.vel)
+        falling = air_and_gravity(data, load, self.name)
         link = self._link(load)
         free = jnp.where(
             load.attached,
