@@ -9,8 +9,10 @@ from crazysim.live.keyboard import Keyboard
 from crazysim.live.loop import Live
 from crazysim.live.pace import LiveReport
 from crazysim.live.piloting import Pilot, keyboard_sticks
+from crazysim.live.remote import RemoteCommands
 from crazysim.live.server import CommandServer, StreamListener
 from crazysim.live.viewer import Viewer
+from crazysim.live.window import Window
 
 __all__ = [
     "Browser",
@@ -25,6 +27,7 @@ __all__ = [
     "LiveReport",
     "LoadShow",
     "Pilot",
+    "RemoteCommands",
     "SetParameter",
     "Start",
     "StartShow",
@@ -33,5 +36,6 @@ __all__ = [
     "TakeOff",
     "Upload",
     "Viewer",
+    "Window",
     "keyboard_sticks",
 ]

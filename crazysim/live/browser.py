@@ -146,13 +146,14 @@ class Browser(Viewer):
         self._picture = picture = self._source.take(live, self._panel.plot)
         with self._server.atomic():
             self._scene.update(picture, self._panel.follow)
-        self._panel.update(live, picture, time.perf_counter())
+        self._panel.update(picture, time.perf_counter())
 
     def close(self) -> None:
         """Stop the server."""
         if self._server is not None:
             server, self._server = self._server, None
-            server.stop()
+            with contextlib.redirect_stdout(io.StringIO()):  # viser says so
+                server.stop()
 
 
 def _require_free(host: str, port: int) -> int:

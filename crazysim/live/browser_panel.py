@@ -83,19 +83,16 @@ class BrowserPanel:
             def _(_: Any) -> None:
                 self.plot = choice.value
 
-    def update(self, live: Live, picture: Picture, now: float) -> None:
+    def update(self, picture: Picture, now: float) -> None:
         """Show text and plot, at rates of their own.
 
         Args:
-            live: Loop.
             picture: Picture that is shown.
             now: Present time, s.
         """
         if now - self._text_at >= TEXT_PERIOD:
             self._text_at = now
             self._text.content = f"**{picture.status}**"
-            self._pause.label = "Resume" if live.paused else "Pause"
-            self._record.label = "Stop recording" if live.is_recording else "Record"
             if picture.selected is not None and self._drone.value != picture.selected[1]:
                 self._drone.value = picture.selected[1]
         plotted = (self.plot, picture.selected, len(picture.plot))
@@ -118,9 +115,7 @@ class BrowserPanel:
         if self._chart is not None:
             self._chart.data = data
             return
-        lines = [
-            {"label": str(k), "stroke": COLORS[k % len(COLORS)], "width": 1.5} for k in range(values.shape[1])
-        ]
+        lines = [{"label": str(k), "stroke": COLORS[k % len(COLORS)], "width": 1.5} for k in range(values.shape[1])]
         with self._plots:
             self._chart = self._gui.add_uplot(
                 data, ({"label": "s"}, *lines), title=self.plot, scales={"x": {"time": False}}, aspect=1.3
@@ -132,10 +127,14 @@ class BrowserPanel:
             self._chart = None
 
     def _add_time(self, gui: Any, live: Live) -> None:
-        self._pause = gui.add_button("Pause")
-        _post(self._pause, live, lambda live: setattr(live, "paused", not live.paused))
-        _post(gui.add_button("Single step"), live, lambda live: live.advance())
-        _post(gui.add_button("Reset"), live, lambda live: live.reset())
+        calls = {
+            "pause": lambda live: setattr(live, "paused", not live.paused),
+            "step": lambda live: live.advance(),
+            "reset": lambda live: live.reset(),
+            "record": lambda live: live.toggle_recording(),
+        }
+        buttons = gui.add_button_group("", tuple(calls))
+        buttons.on_click(lambda _: live.post(calls[buttons.value]))
         speed = gui.add_dropdown("speed", SPEEDS, initial_value=_nearest(live.speed))
 
         @speed.on_update
@@ -145,8 +144,6 @@ class BrowserPanel:
 
         to = gui.add_number("go to, s", 0.0, min=0.0, step=0.1)
         _post(gui.add_button("Go"), live, lambda live: live.go_to(float(to.value)))
-        self._record = gui.add_button("Record")
-        _post(self._record, live, lambda live: live.toggle_recording())
 
     def _add_drone(self, gui: Any, live: Live) -> None:
         sim = live.sim

@@ -21,6 +21,8 @@ MARK_RADIUS = 0.12
 """Radius of the sphere around a drone that touches something or is selected, m."""
 WIND_SCALE = 0.1
 """Length of a wind arrow per speed, s."""
+FLOOR_GREY = 0.8
+"""Grey that trails fade to, 0 to 1."""
 CONTACT_COLOR, SELECTED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
 """Colours of marks, rgb, 0 to 255."""
 
@@ -198,8 +200,8 @@ class Trails:
         self._samples: deque[NDArray] = deque(maxlen=self._length)
         self._last = -np.inf
         pos = _finite(pos)
-        fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]  # towards white, as lines are opaque
-        shades = np.round(255 * (1 - fade * (1 - colors))).astype(np.uint8)
+        fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]  # towards the floor, as lines are opaque
+        shades = np.round(255 * (FLOOR_GREY - fade * (FLOOR_GREY - colors))).astype(np.uint8)
         self._handle = scene.add_line_segments(
             "/world/trails", self._segments(pos), np.repeat(shades.reshape(-1, 1, 3), 2, axis=1), thickness=2.0,
             thickness_units="screen",

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import logging
-import sys
 import time
-from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,19 +18,17 @@ from crazysim.core.settings import positive
 from crazysim.errors import ConfigError
 from crazysim.live.closing import Closing
 from crazysim.live.history import History, Snapshot
-from crazysim.live.keyboard import Keyboard
-from crazysim.live.pace import LiveReport, Pace, Speed
+from crazysim.live.interaction import Interaction
+from crazysim.live.pace import LiveReport, Pace, Speed, undisturbed
 from crazysim.live.process import Event, OnError, Process, RateLimit, period_of
 from crazysim.live.recording import LiveRecording
 from crazysim.live.report import make_report
 from crazysim.live.staging import StagedCommands
-from crazysim.live.viewer import Button, Control, Slider, Viewer
+from crazysim.live.viewer import Viewer
 from crazysim.sim.sim import Sim
 
 SLICE = 0.01
 """Longest sleep, s: the time after which a click or a key is noticed."""
-SWITCH_INTERVAL = 5e-4
-"""Time after which a thread of Python gives way to the loop, s."""
 ALARM = 0.02
 """Lateness of a control step that is logged, s."""
 
@@ -40,7 +36,7 @@ V = TypeVar("V", bound=Viewer)
 log = logging.getLogger(__name__)
 
 
-class Live(Closing):
+class Live(Interaction, Closing):
     """A simulation that advances in real time, or at any other speed, and can be watched and commanded.
 
         with Live(sim, control_freq=100) as live:
@@ -52,18 +48,6 @@ class Live(Closing):
     that they may read and write ``live.sim``. Other threads use ``post``.
     """
 
-    sim: Sim
-    """The simulation."""
-    keyboard: Keyboard
-    """Keys that are held in a viewer."""
-    controls: list[Control]
-    """Buttons and sliders that viewers show."""
-    selected: tuple[int, int] | None
-    """World and drone that are followed, plotted and piloted; None for none."""
-    quantities: dict[str, Callable[[Live], Any]]
-    """Further quantities that viewers can plot: by name, functions of the loop that return numbers. (k,)"""
-    on_click: Callable[[Live, int, NDArray], Any] | None
-    """Function that is called with the loop, a world and a point of its ground, m, that was clicked in a viewer."""
     step: int
     """Control steps since the last reset."""
     flown: int
@@ -97,10 +81,9 @@ class Live(Closing):
         for name, value in (("fps", fps), ("snapshot_s", snapshot_s)):
             if not np.isfinite(value) or value <= 0:
                 raise ConfigError(f"expected a positive {name}, got {value!r}")
-        self.sim, self.control_freq = sim, control_freq
+        super().__init__(sim)
+        self.control_freq = control_freq
         self.n_substeps = sim.freq // control_freq
-        self.keyboard, self.controls, self.quantities = Keyboard(), [], {}
-        self.selected, self.on_click = (0, 0), None
         self.step = round(float(sim.time[0, 0]) * control_freq)
         self.flown = 0
         self._dt, self._fps = 1.0 / control_freq, float(fps)
@@ -110,7 +93,6 @@ class Live(Closing):
         self._snapshot_steps = max(round(snapshot_s * control_freq), 1)
         self._processes: list[Process] = []
         self._events: dict[int, list[Event]] = defaultdict(list)
-        self._posted: deque[Callable[[Live], Any]] = deque()
         self._viewers: list[Viewer] = []
         self._recording: LiveRecording | None = None
         self._path: Path | None = None
@@ -119,8 +101,6 @@ class Live(Closing):
         self._next_picture = 0.0
         self._factor = (time.perf_counter(), 0, 0.0)
         self._may_warn = RateLimit()
-        for key, call in self._bindings().items():
-            self.keyboard.bind(key, call)
 
     # Time -----------------------------------------------------------------------------------------------------------
 
@@ -218,22 +198,6 @@ class Live(Closing):
             raise ConfigError(f"expected a time of {self.time:g} s or later, got {time!r}")
         self._events[step].append(Event(step, call, name or getattr(call, "__name__", "event")))
 
-    def button(self, name: str, call: Callable[[Live], Any], key: str | None = None) -> None:
-        """Add a button to viewers that are shown from now on, and a key that does the same."""
-        self.controls.append(Button(name, call))
-        if key is not None:
-            self.keyboard.bind(key, call)
-
-    def slider(self, name: str, low: float, high: float, value: float, call: Callable[[Live, float], Any]) -> None:
-        """Add a slider to viewers that are shown from now on; the function is called with the loop and the value.
-
-        Raises:
-            ConfigError: If the limits are not ``low <= value <= high`` with ``low < high``.
-        """
-        if not (np.isfinite([low, high]).all() and low < high and low <= value <= high):
-            raise ConfigError(f"expected low <= value <= high of slider {name!r}, got {low!r}, {value!r}, {high!r}")
-        self.controls.append(Slider(name, low, high, value, call))
-
     def show(self, viewer: V) -> V:
         """Show the simulation in a viewer, and return that; ``run`` ends when all viewers have been closed.
 
@@ -243,33 +207,6 @@ class Live(Closing):
         viewer.open(self)
         self._viewers.append(viewer)
         return viewer
-
-    def select(self, world: int, drone: int) -> None:
-        """Select a drone to follow, plot and pilot.
-
-        Raises:
-            ConfigError: If it does not exist.
-        """
-        if world not in range(self.sim.n_worlds) or drone not in range(self.sim.n_drones):
-            raise ConfigError(
-                f"expected a world below {self.sim.n_worlds} and a drone below {self.sim.n_drones}, got "
-                f"{world!r} and {drone!r}"
-            )
-        self.selected = (int(world), int(drone))
-
-    def click(self, world: int, point: NDArray) -> None:
-        """Call ``on_click``, if it is set, as viewers do for a click on the ground.
-
-        Args:
-            world: Index of the world.
-            point: Point, world frame, m. (3,)
-        """
-        if self.on_click is not None:
-            self.on_click(self, world, point)
-
-    def post(self, call: Callable[[Live], Any]) -> None:
-        """Let the loop call a function between two steps; may be called from any thread."""
-        self._posted.append(call)
 
     # Recording ------------------------------------------------------------------------------------------------------
 
@@ -328,15 +265,13 @@ class Live(Closing):
         self._warm_up()
         self._pace = Pace(self._dt, self._pace.speed)
         first, pictures, paused_s, begin = self.flown, self._pictures, 0.0, time.perf_counter()
-        with _undisturbed(), contextlib.suppress(KeyboardInterrupt):
+        with undisturbed(), contextlib.suppress(KeyboardInterrupt):
             while not self._stopped and (end is None or self.flown < end):
                 paused_s += self._turn()
         jax.block_until_ready(self.sim.data.states.pos)
         wall = time.perf_counter() - begin - paused_s
         simulated = (self.flown - first) * self._dt
-        return make_report(
-            self._pace, self._processes, simulated, wall, self._pictures - pictures, self._failures
-        )
+        return make_report(self._pace, self._processes, simulated, wall, self._pictures - pictures, self._failures)
 
     def close(self) -> None:
         """Finish the recording and close the viewers."""
@@ -475,43 +410,3 @@ class Live(Closing):
         self.sim.data = data
         self._update_viewers()
         self._next_picture = time.perf_counter()
-
-    def _bindings(self) -> dict[str, Callable[[Live], Any]]:
-        """Return the keys that every live simulation has."""
-
-        def scale(factor: float) -> Callable[[Live], None]:
-            def call(live: Live) -> None:
-                live.speed = factor * (1.0 if live.speed == "max" else live.speed)
-
-            return call
-
-        def toggle(live: Live) -> None:
-            live.paused = not live.paused
-
-        def select_next(live: Live) -> None:
-            world, drone = live.selected or (0, -1)
-            live.select(world, (drone + 1) % live.sim.n_drones)
-
-        return {
-            "space": toggle,
-            ".": lambda live: live.advance(),
-            "backspace": lambda live: live.reset(),
-            "tab": select_next,
-            "+": scale(2.0),
-            "-": scale(0.5),
-            "r": lambda live: live.toggle_recording(),
-            "escape": lambda live: live.stop(),
-        }
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Keep other threads of Python and the garbage collector from delaying the loop."""
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(SWITCH_INTERVAL)
-    gc.freeze()  # the objects of JAX and MuJoCo are not examined again: that takes 0.1 s and more
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-        sys.setswitchinterval(interval)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +22,8 @@ MAX_LAG = 0.25
 """Lag from which the lost time is given up instead of caught up, s."""
 BIN = 1e-4
 """Resolution of the statistics of lateness, s."""
+SWITCH_INTERVAL = 5e-4
+"""Time after which another thread of Python gives way to the loop, s."""
 N_BINS = 5000
 """Number of their bins; the last one holds everything above."""
 
@@ -160,3 +165,16 @@ class Pace:
             return 0.0
         k = int(np.searchsorted(np.cumsum(self._counts), part * total))
         return min((k + 1) * BIN, self.worst) if k < N_BINS - 1 else self.worst
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Keep other threads of Python and the garbage collector from delaying the loop."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    gc.freeze()  # the objects of JAX and MuJoCo are not examined again: that takes 0.1 s and more
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        sys.setswitchinterval(interval)

@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.core.data import SimData
 from crazysim.core.stage import over_drones, over_worlds
-from crazysim.effects.wind import WindData, wind_at
+from crazysim.effects.wind import WindData
+from crazysim.effects.wind_field import WindFieldData
 from crazysim.media.poses import mocap_poses
 from crazysim.sim.sim import Sim
 
@@ -61,7 +64,7 @@ class PictureSource:
         """
         self._sim, self._worlds = sim, np.asarray(worlds)
         self._contacts, self._wind = contacts, wind
-        self._wind_fn = jax.jit(over_worlds(over_drones(wind_at)))
+        self._wind_fn = jax.jit(over_worlds(over_drones(_air)))
 
     def take(self, live: Live, plot: str = "") -> Picture:
         """Return a picture of the simulation as it is now.
@@ -78,7 +81,7 @@ class PictureSource:
         state, setpoint, air = data.controls.state, none, none
         if state is not None:
             setpoint = np.asarray(state.staged_cmd, float)[worlds, :, :3]
-        if self._wind and any(isinstance(record, WindData) for record in data.plugins.values()):
+        if self._wind and _winds(data):
             air = np.asarray(self._wind_fn(data), float)[worlds]
         touching = np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drones.shape[:2], bool)
         values = np.zeros(0)
@@ -88,6 +91,16 @@ class PictureSource:
         return Picture(
             worlds, live.time, live.status, pos, quat, drones, setpoint, touching, air, live.selected, values
         )
+
+
+def _winds(data: SimData) -> list[WindData | WindFieldData]:
+    """Return the records of all winds."""
+    return [record for record in data.plugins.values() if isinstance(record, (WindData, WindFieldData))]
+
+
+def _air(data: SimData) -> jax.Array:
+    """Return the velocity of the air at a drone, world frame, m/s; of one drone. (3,)"""
+    return sum((record.velocity_at(data.states.pos) for record in _winds(data)), jnp.zeros_like(data.states.pos))
 
 
 def quantities(sim: Sim) -> list[str]:

@@ -117,9 +117,7 @@ class Program:
             if np.isfinite(point).all():
                 self.window.look_at(point)
         n, settings = len(picture.worlds), self._settings
-        self.window.draw_tiles(
-            n, lambda k: self._tile(picture, k), self._camera, settings["width"], settings["height"]
-        )
+        self.window.draw_tiles(n, lambda k: self._tile(picture, k), self._camera, settings["width"], settings["height"])
         if self.window.is_open and self._double_clicked():
             self._report(picture, self.window.pick(n, lambda k: self._tile(picture, k)))
 

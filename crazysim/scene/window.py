@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from crazysim.errors import RenderError
 from crazysim.scene.overlays import Overlays
 
-
 KEYS = {
     "UP": "up", "DOWN": "down", "LEFT": "left", "RIGHT": "right", "SPACE": "space", "TAB": "tab", "ENTER": "enter",
     "BACKSPACE": "backspace", "ESCAPE": "escape", "EQUAL": "+", "KP_ADD": "+", "MINUS": "-", "KP_SUBTRACT": "-",
