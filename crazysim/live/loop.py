@@ -294,6 +294,8 @@ class Live(Interaction, Closing):
     def _turn(self) -> float:
         """Do what is due, or sleep; return the time spent in a pause, s."""
         self._run_posted()
+        if self._stopped:
+            return 0.0
         if self._paused:
             begin = time.perf_counter()
             self._draw(self._next_picture)
@@ -403,8 +405,8 @@ class Live(Interaction, Closing):
 
     def _warm_up(self) -> None:
         """Compile what a control step needs, before time begins to run."""
-        data = self.sim.data
         self._commands.stage()
+        data = self.sim.data
         self.sim.step(self.n_substeps)
         jax.block_until_ready(self.sim.data.states.pos)
         self.sim.data = data

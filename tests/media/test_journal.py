@@ -99,7 +99,7 @@ KILLED = textwrap.dedent("""
     from crazysim.media import Film, View
     film = Film(sys.argv[1], View(width=64, height=48), fps=10)
     for k in range(int(sys.argv[2])):
-        film.write(np.full((48, 64, 3), k, np.uint8))
+        film.write(np.full((48, 64, 3), k % 256, np.uint8))
     os.kill(film._ffmpeg.pid if sys.argv[3] == "ffmpeg" else os.getpid(), signal.SIGKILL)
     os.waitpid(film._ffmpeg.pid, 0)
 """)
