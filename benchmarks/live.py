@@ -69,8 +69,8 @@ def measure(case: str, n_drones: int, seconds: float) -> None:
 
 def read(url: str) -> Any:
     """Read what the server of a page sends, as a browser does, and discard it."""
-    from websockets.sync.client import connect
     from viser import __version__
+    from websockets.sync.client import connect
 
     with (
         contextlib.suppress(Exception),

@@ -20,10 +20,13 @@ from crazysim.media.worlds import require_world
 from crazysim.sim.sim import Sim
 
 ENCODERS = {
-    # Fragments of a second keep what has been encoded readable if the encoder is killed.
-    ".mp4": ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "22", "-movflags", "+frag_keyframe+empty_moov"],
+    # Fragments of a second, each written at once, keep what has been encoded readable if the encoder is killed.
+    ".mp4": [
+        "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "22", "-movflags", "+frag_keyframe+empty_moov",
+        "-flush_packets", "1",
+    ],
     ".gif": ["-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse"],
-}
+}  # fmt: skip
 """Arguments of ffmpeg for each suffix."""
 
 
