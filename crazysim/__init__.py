@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from crazysim.envs import make
     from crazysim.payloads import Hook, RotorJet, SharedLoad, SlungLoad
     from crazysim.scene.contact_log import ContactLog
+    from crazysim.scene.radar import Radar
     from crazysim.scene.range_finder import RangeFinder
     from crazysim.scene.response import ContactResponse
+    from crazysim.scene.terrain import Terrain
     from crazysim.sim.mppi import MPPI
     from crazysim.trajectories import Follow
 
@@ -48,12 +50,14 @@ __all__ = [
     "Placement",
     "Plugin",
     "PyTree",
+    "Radar",
     "RangeFinder",
     "RotorJet",
     "SharedLoad",
     "Sim",
     "SimData",
     "SlungLoad",
+    "Terrain",
     "Wind",
     "WindField",
     "__version__",
@@ -77,7 +81,9 @@ __getattr__ = lazy(
         "RotorJet": "crazysim.payloads",
         "SharedLoad": "crazysim.payloads",
         "SlungLoad": "crazysim.payloads",
+        "Radar": "crazysim.scene.radar",
         "RangeFinder": "crazysim.scene.range_finder",
+        "Terrain": "crazysim.scene.terrain",
         "functional": "crazysim.core",
         "make": "crazysim.envs",
     },

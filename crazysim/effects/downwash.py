@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.others import reduce_over_others
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter
 from crazysim.core.stage import stage
 from crazysim.deprecation import warn_renamed
 from crazysim.dynamics import first_principles
@@ -52,11 +53,11 @@ class Downwash(Plugin):
         require_drag(sim, "downwash")
         radius = self.propeller_radius
         if radius is None:
-            radius = sim.airframe.value("shape.propeller_radius", ())
+            radius = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
         radius = check_parameter(sim, "propeller_radius", radius, positive=True)
         density = check_parameter(sim, "air_density", self.air_density, positive=True)
         # Far below a rotor the cross-section of its stream is half the rotor's disc (momentum theory).
-        return DownwashData(math.sqrt(2 * sim.airframe.n_rotors) * radius, density, zeros(sim, 3))
+        return DownwashData(stream_diameter(sim, radius), density, zeros(sim, 3))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that computes the air velocity."""
@@ -91,6 +92,13 @@ def add(sim: Simulation, propeller_radius: Any = None, air_density: Any = AIR_DE
     """Add downwash. Deprecated: use ``sim.add(Downwash(...))``."""
     warn_renamed("effects.downwash.add(sim, ...)", "sim.add(Downwash(...))")
     sim.add(Downwash(propeller_radius, air_density))
+
+
+def stream_diameter(sim: Simulation, radius: Array) -> Array:
+    """Return the diameter of the contracted stream of drones with propellers of a radius, m. (1,) or one per drone"""
+    factor = np.sqrt(2 * of_airframes(sim, lambda airframe: airframe.n_rotors))
+    factor = factor[..., None] if factor.ndim else factor
+    return jnp.asarray(factor * radius, radius.dtype)
 
 
 def jet(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density: Array) -> Array:
