@@ -77,13 +77,9 @@ class Touching:
             jnp.concatenate([x[:, 0], jnp.zeros(size - n_free, x.dtype)]) for x in (record.friction, record.restitution)
         )
         contacts = joined(found, friction, restitution)
-        after, impulse = solve_contacts(
-            bodies, contacts, 1 / data.core.freq, plugin.softness, plugin.iterations
-        )
+        after, impulse = solve_contacts(bodies, contacts, 1 / data.core.freq, plugin.softness, plugin.iterations)
         ang_vel = rotation.rotate_inverse(record.quat, after.ang_vel[:n_free])
-        data = plugin.write(
-            data, record.replace(vel=after.vel[:n_free], ang_vel=ang_vel, impulse=impulse[:n_free])
-        )
+        data = plugin.write(data, record.replace(vel=after.vel[:n_free], ang_vel=ang_vel, impulse=impulse[:n_free]))
         if n_drones:
             own = slice(n_free, first_carrier)
             ang_vel = rotation.rotate_inverse(s.quat, after.ang_vel[own])

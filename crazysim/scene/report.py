@@ -239,8 +239,8 @@ def _to_others(own: Own, drone_rot: Array | None) -> Array:
         turned = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
         gaps = []
         for mine, at in own:
-            for (geom, _), place in zip(own, places, strict=True):
-                inside = at - place if inverse is None else rotation.matvec(inverse, at - place)
+            for (geom, _), there in zip(own, places, strict=True):
+                inside = at - there if inverse is None else rotation.matvec(inverse, at - there)
                 gaps.append(distance(mine.shape, geom.shape, inside, turned))
         return jnp.where(is_self, jnp.inf, _smallest(gaps, own[0][1]))
 
