@@ -53,7 +53,7 @@ class ContactReport(PyTree):
     drone_distance: Array | None
     """Distance to the nearest other drone, m; infinite for a single drone. (n_worlds, n_drones)"""
     nearest_drone: Array | None
-    """Index of that drone; the drone's own for a single drone. (n_worlds, n_drones)"""
+    """Index of that drone; the drone's own for a single drone. None in a stage of one drone. (n_worlds, n_drones)"""
     object_names: tuple[str, ...] = static()
     """Names of the objects' bodies."""
 
