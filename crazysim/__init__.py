@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from crazysim.control import Control, Controller
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
+from crazysim.core.others import reduce_over_others
 from crazysim.core.plugin import Placement, Plugin, parameter
 from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
@@ -21,8 +22,10 @@ if TYPE_CHECKING:
     from crazysim.envs import make
     from crazysim.payloads import Hook, RotorJet, SharedLoad, SlungLoad
     from crazysim.scene.contact_log import ContactLog
+    from crazysim.scene.radar import Radar
     from crazysim.scene.range_finder import RangeFinder
     from crazysim.scene.response import ContactResponse
+    from crazysim.scene.terrain import Terrain
     from crazysim.sim.mppi import MPPI
     from crazysim.trajectories import Follow
 
@@ -47,12 +50,14 @@ __all__ = [
     "Placement",
     "Plugin",
     "PyTree",
+    "Radar",
     "RangeFinder",
     "RotorJet",
     "SharedLoad",
     "Sim",
     "SimData",
     "SlungLoad",
+    "Terrain",
     "Wind",
     "WindField",
     "__version__",
@@ -60,6 +65,7 @@ __all__ = [
     "load_airframe",
     "make",
     "parameter",
+    "reduce_over_others",
     "stage",
     "static",
 ]
@@ -75,7 +81,9 @@ __getattr__ = lazy(
         "RotorJet": "crazysim.payloads",
         "SharedLoad": "crazysim.payloads",
         "SlungLoad": "crazysim.payloads",
+        "Radar": "crazysim.scene.radar",
         "RangeFinder": "crazysim.scene.range_finder",
+        "Terrain": "crazysim.scene.terrain",
         "functional": "crazysim.core",
         "make": "crazysim.envs",
     },

@@ -16,6 +16,7 @@ from crazysim.core.random import drone_key
 from crazysim.core.stage import stage
 from crazysim.deprecation import warn_renamed
 from crazysim.effects.core import require_drag, with_moving_air, zeros
+from crazysim.effects.ground import ground_below
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import dot, safe_clip, safe_normalize
@@ -49,18 +50,18 @@ class WindData(PyTree):
     gust: Array | None = leaf("drone", 1)
     """Gust, world frame, m/s; None without gusts. (n_worlds, n_drones, 3)"""
 
-    def mean_at(self, pos: Array) -> Array:
-        """Return the mean wind at a place, world frame, m/s. (..., 3)"""
+    def mean_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
+        """Return the mean wind at a place, above ground of some height, m (..., 1), world frame, m/s. (..., 3)"""
         if self.reference_height is None:
             return self.velocity
-        height = pos[..., 2:]
+        height = pos[..., 2:] - ground
         if self.roughness is not None:
             return log_profile(height, self.reference_height, self.roughness) * self.velocity
         return power_profile(height, self.reference_height, self.exponent) * self.velocity  # type: ignore[arg-type]
 
-    def velocity_at(self, pos: Array) -> Array:
+    def velocity_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
         """Return the velocity of the air at a place, with the drone's gust, world frame, m/s. (..., 3)"""
-        mean = self.mean_at(pos)
+        mean = self.mean_at(pos, ground)
         return mean if self.gust is None else mean + self.gust
 
 
@@ -125,13 +126,14 @@ class Wind(Plugin):
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the force that the wind adds to the drag."""
-        return with_moving_air(data, self.read(data).velocity_at(data.states.pos))
+        return with_moving_air(data, self.read(data).velocity_at(data.states.pos, ground_below(data)))
 
     def advance_gust(self, data: SimData) -> SimData:
         """Advance the gust at one drone by a step."""
         wind, s = self.read(data), data.states
-        mean = wind.mean_at(s.pos)
-        length, deviation = low_altitude(s.pos[..., 2:], wind.speed_20ft)
+        ground = ground_below(data)
+        mean = wind.mean_at(s.pos, ground)
+        length, deviation = low_altitude(s.pos[..., 2:] - ground, wind.speed_20ft)
         relative = s.vel - mean
         airspeed = jnp.sqrt(dot(relative, relative) + MIN_AIRSPEED**2)
         step = airspeed / (data.core.freq * length)
@@ -155,7 +157,7 @@ def wind_at(data: SimData, pos: Array) -> Array:
     total = jnp.zeros_like(pos)
     for record in data.plugins.values():
         if isinstance(record, WindData):
-            total = total + record.velocity_at(pos)
+            total = total + record.velocity_at(pos, ground_below(data))
     return total
 
 

@@ -13,6 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import Objects, SimData, SimState
 from crazysim.core.plugin import Simulation
 from crazysim.effects.core import Exposed
+from crazysim.effects.ground import ground_height
 from crazysim.effects.wind import wind_at
 from crazysim.effects.wind_field import WindFieldData
 from crazysim.payloads.body import Colliding
@@ -68,7 +69,8 @@ class PointLoad(Colliding):
     def stop_at_floor(self, data: SimData) -> SimData:
         """Stop the load at the floor; of one drone or of one world."""
         load = self.read(data)
-        pos, vel = on_floor(load.pos, load.vel, load.clearance, load.friction)
+        clearance = load.clearance + ground_height(data, load.pos)
+        pos, vel = on_floor(load.pos, load.vel, clearance, load.friction)
         return self.write(data, load.replace(pos=pos, vel=vel))
 
     def release(self, data: SimData, mask: Any = True) -> SimData:

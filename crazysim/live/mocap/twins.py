@@ -138,6 +138,10 @@ class Twins(Closing):
         """Reports of the source and its bodies."""
         return self.tracker.reports
 
+    def __call__(self, live: Any) -> None:
+        """Update the simulation of a loop such as ``Live``, which has it as ``live.sim``."""
+        self.update(live.sim)
+
     def update(self, sim: Sim) -> None:
         """Read the frames that have arrived, and write all poses; it never waits for the source."""
         poll = self.source.poll(int(sim.data.core.steps[0, 0]), sim.freq)
