@@ -1,4 +1,4 @@
-"""What people do to a live simulation: keys, buttons, sliders, clicks and the selection of a drone."""
+"""Interaction with a live simulation: keys, buttons, sliders, clicks and the selection of a drone."""
 
 from __future__ import annotations
 

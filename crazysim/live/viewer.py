@@ -1,4 +1,4 @@
-"""What the loop needs of a viewer, and the controls that viewers show."""
+"""Base class of viewers, and the controls that viewers show."""
 
 from __future__ import annotations
 

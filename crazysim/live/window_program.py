@@ -141,7 +141,9 @@ class Program:
             if air.any():
                 overlays.capsule(pos, pos + WIND_SCALE * air, 0.006, AIR, cylinder=True)
         if picture.selected is not None and picture.selected[0] == picture.worlds[k]:
-            overlays.points(drones[picture.selected[1]][None], SELECTED, MARK_RADIUS)
+            place = drones[picture.selected[1]]
+            overlays.points(place[None], SELECTED, MARK_RADIUS)
+            overlays.label(picture.name, place + [0.0, 0.0, MARK_RADIUS])
         text = picture.status if k == 0 else ""
         if len(picture.worlds) > 1:
             text = f"world {picture.worlds[k]}\n{text}".strip()
