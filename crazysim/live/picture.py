@@ -48,6 +48,8 @@ class Picture:
     """Selected world and drone; None for none."""
     name: str
     """Name of the selected drone; empty for none."""
+    controls: tuple[str, ...]
+    """Buttons and sliders of the loop, for viewers without a panel."""
     plot: NDArray
     """Values of the plotted quantity of the selected drone. (k,)"""
 
@@ -92,7 +94,19 @@ class PictureSource:
             values = quantity(data, plot)(*live.selected) if own is None else np.ravel(np.asarray(own(live), float))
         name = "" if live.selected is None else sim.drone_names[live.selected[1]]
         return Picture(
-            worlds, live.time, live.status, pos, quat, drones, setpoint, touching, air, live.selected, name, values
+            worlds,
+            live.time,
+            live.status,
+            pos,
+            quat,
+            drones,
+            setpoint,
+            touching,
+            air,
+            live.selected,
+            name,
+            live.control_lines,
+            values,
         )
 
 

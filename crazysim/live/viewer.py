@@ -18,6 +18,8 @@ class Button:
     """Text on the button."""
     call: Callable[[Live], None]
     """Function of the loop."""
+    key: str | None = None
+    """Key that does the same; None for none."""
 
 
 @dataclass(frozen=True)
