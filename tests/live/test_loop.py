@@ -329,9 +329,17 @@ def test_other_command_levels(live):
 
 
 def test_memory_stays_where_it_is(live):
-    """An hour of control steps, in short: nothing grows but the snapshots, which are bounded."""
+    """Nothing grows with time but the snapshots, which are bounded; the first is kept, and jumps add none."""
     live.run(70.0)
     assert len(live._history._latest) == 60
+    live.go_to(65.0)
+    live.go_to(65.0)
+    live.advance()
+    assert [snapshot.step for snapshot in live._history._latest][-2:] == [6400, 6500]
+    with pytest.raises(ConfigError, match="time that was flown"):
+        Live(live.sim).go_to(1.0)
+    live.go_to(5.0)
+    assert live.time == pytest.approx(5.0)
     assert live._pace._counts.shape == (5000,)
 
 
