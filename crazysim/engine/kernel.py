@@ -108,7 +108,9 @@ def write(program: Program, target: str) -> Kernel:
     for segment in each:
         outs = writer.block(segment.hoisted, [names[slot] for slot in segment.hoisted_reads], depth)
         kinds = [type_name(x.dtype) for x in segment.hoisted.outputs]
-        hoisted.append([exchange.keep(writer, writer.new("h"), kind, x, depth) for kind, x in zip(kinds, outs, strict=True)])
+        hoisted.append(
+            [exchange.keep(writer, writer.new("h"), kind, x, depth) for kind, x in zip(kinds, outs, strict=True)]
+        )
     exchange.end(writer, 1)
     writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
     exchange.begin(writer, 2)

@@ -163,7 +163,9 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
         i, some = xs
         mine = dict(zip(own, some, strict=True))
         outs = run(block, [*rows, jnp.arange(n)[None] == i], (n_worlds, n), fixed | mine)
-        return [REDUCE[name](_lanes(x, (n_worlds, n)), axis=1) for name, x in zip(op.param("reduce"), outs, strict=True)]
+        return [
+            REDUCE[name](_lanes(x, (n_worlds, n)), axis=1) for name, x in zip(op.param("reduce"), outs, strict=True)
+        ]
 
     numbers = jnp.arange(n)
     if n_worlds * n * n <= MAX_PAIRS:
@@ -174,7 +176,13 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
     return [x.T.reshape(shape) for x in found]
 
 
-REDUCE: dict[str, Callable[..., Array]] = {"add": jnp.sum, "min": jnp.min, "max": jnp.max, "or": jnp.any, "and": jnp.all}
+REDUCE: dict[str, Callable[..., Array]] = {
+    "add": jnp.sum,
+    "min": jnp.min,
+    "max": jnp.max,
+    "or": jnp.any,
+    "and": jnp.all,
+}
 """Reductions of an axis by the names of operations."""
 
 MAX_PAIRS = 2**24

@@ -44,7 +44,13 @@ def _over_others(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements
 
 def _replaced(x: Elements, new: dict[Value, Value]) -> Elements:
     def of(item: Any) -> Any:
-        return tuple(map(of, item)) if isinstance(item, tuple) else new.get(item, item) if isinstance(item, Value) else item
+        return (
+            tuple(map(of, item))
+            if isinstance(item, tuple)
+            else new.get(item, item)
+            if isinstance(item, Value)
+            else item
+        )
 
     return as_elements([of(item) for item in x.reshape(-1)], x.shape)
 
