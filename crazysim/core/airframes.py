@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -15,6 +16,8 @@ from crazysim.pytree import PyTree
 
 T = TypeVar("T")
 
+PREFIXES = {"Crazyflie": ("cf", "crazyflie"), "Bumblebee": ("bumblebee",)}
+"""Names of drones of some airframes, by the beginnings of the names of these, as AIMotionLab-Virtual has them."""
 MASK = "rotors"
 """Name of fields that are True for the rotors that a drone has; None where all drones have equally many."""
 PER_ROTOR = ("L", "prop_inertia", "rpm2thrust", "rpm2torque", "rotor_dyn_coef")
@@ -46,6 +49,26 @@ def airframe_of(airframes: Airframes) -> Airframe:
 def n_rotors_of(airframes: Airframes) -> int:
     """Return the largest number of rotors."""
     return max(airframe.n_rotors for airframe in as_airframes(airframes))
+
+
+def prefix_of(airframe: Airframe) -> str:
+    """Return the beginning of the names of drones of an airframe: ``Crazyflie``, ``Bumblebee``, or its own name."""
+    name = airframe.name.lower()
+    for prefix, beginnings in PREFIXES.items():
+        if name.startswith(beginnings):
+            return prefix
+    words = re.findall("[A-Za-z0-9]+", airframe.name)
+    return "".join(word[0].upper() + word[1:] for word in words) or "Drone"
+
+
+def drone_names(airframes: Sequence[Airframe]) -> tuple[str, ...]:
+    """Return the names of drones, numbered for each prefix: ``Crazyflie_0``, ``Bumblebee_0``, ``Crazyflie_1``."""
+    counts: dict[str, int] = {}
+    names = []
+    for prefix in map(prefix_of, airframes):
+        counts[prefix] = counts.get(prefix, -1) + 1
+        names.append(f"{prefix}_{counts[prefix]}")
+    return tuple(names)
 
 
 def for_drones(airframes: Airframes, create: Callable[[Airframe], T], n_worlds: int) -> T:

@@ -14,6 +14,7 @@ from jax import Array
 from crazysim.control import Control, Controller, command_size
 from crazysim.core.airframes import Airframes, as_airframes, for_drones, n_rotors_of
 from crazysim.core.controls import SimControls
+from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, of_host, static

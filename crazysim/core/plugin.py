@@ -33,6 +33,11 @@ class Simulation(Protocol):
     n_drones: int
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all drones and members of populations."""
+        ...
+
+    @property
     def scene(self) -> Any:
         """The MuJoCo scene, a ``crazysim.scene.scene.Scene``."""
         ...

@@ -24,12 +24,12 @@ CHUNK = 128
 
 
 def build_spec(
-    xml_path: str | Path | None, airframes: Sequence[Airframe], freq: int, max_geom_pairs: int
+    xml_path: str | Path | mujoco.MjSpec | None, airframes: Sequence[Airframe], freq: int, max_geom_pairs: int
 ) -> mujoco.MjSpec:
     """Return the scene as an editable spec, with the drones ``drone:0``, ``drone:1``, ... in it.
 
     Args:
-        xml_path: MJCF scene without drones; None for the package's own floor, light and sky.
+        xml_path: MJCF scene without drones, or its spec; None for the package's own floor, light and sky.
         airframes: Airframe of each drone. (n_drones,)
         freq: Physics steps per second, Hz.
         max_geom_pairs: Most pairs that MJX checks per kind of collision; -1 for all.
@@ -37,21 +37,13 @@ def build_spec(
     Raises:
         ConfigError: If the file does not exist, cannot be read, or has names that are reserved for drones.
     """
-    if xml_path is not None and not isinstance(xml_path, (str, Path)):
-        raise ConfigError(f"expected the path of an MJCF file or None as xml_path, got {xml_path!r}")
-    path = SCENE if xml_path is None else Path(xml_path)
-    if not path.is_file():
-        raise ConfigError(f"expected an existing MJCF file as xml_path, got {str(path)!r}")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ConfigError(f"expected a scene that MuJoCo can read, got {str(path)!r}: {error}") from error
+    spec = xml_path if isinstance(xml_path, mujoco.MjSpec) else read_spec(xml_path)
     spec.option.timestep = 1 / freq
     spec.add_numeric(name="max_geom_pairs", data=[max_geom_pairs])
     taken = [body.name for body in spec.bodies if body.name.startswith("drone:")]
     if taken:
         raise ConfigError(
-            f"expected no bodies named 'drone:...', which are reserved for the drones, got {taken} in {str(path)!r}"
+            f"expected no bodies named 'drone:...', which are reserved for the drones, got {taken} in {str(xml_path)!r}"
         )
     _add_drones(spec, airframes)
     # mjx.kinematics refuses a model without any degree of freedom, and mocap bodies have none.
@@ -60,6 +52,23 @@ def build_spec(
     # So that one body of a user's spec can be attached several times.
     spec.copy_during_attach = True
     return spec
+
+
+def read_spec(xml_path: str | Path | None) -> mujoco.MjSpec:
+    """Return the spec of an MJCF file; None for the package's own floor, light and sky.
+
+    Raises:
+        ConfigError: If the file does not exist or cannot be read.
+    """
+    if xml_path is not None and not isinstance(xml_path, (str, Path)):
+        raise ConfigError(f"expected the path of an MJCF file or None as xml_path, got {xml_path!r}")
+    path = SCENE if xml_path is None else Path(xml_path)
+    if not path.is_file():
+        raise ConfigError(f"expected an existing MJCF file as xml_path, got {str(path)!r}")
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"expected a scene that MuJoCo can read, got {str(path)!r}: {error}") from error
 
 
 def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:

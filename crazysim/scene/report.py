@@ -172,8 +172,7 @@ def _group_key(body: CollisionBody) -> tuple[bool, tuple[CollisionGeom, ...] | s
 
 
 Own = Sequence[tuple[CollisionGeom, Array, Array | None]]
-"""Geoms of the drone with their positions, world frame, m (..., 3), and True for the drones that have them (...), or None
-if all have."""
+"""Geoms of the drone, their positions, world frame, m (..., 3), and True for drones that have them (...) or None."""
 
 
 def _of(present: Array | None, gap: Array) -> Array:
