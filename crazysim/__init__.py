@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from crazysim.control import Control, Controller
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
+from crazysim.core.others import reduce_over_others
 from crazysim.core.plugin import Placement, Plugin, parameter
 from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
@@ -27,11 +28,14 @@ if TYPE_CHECKING:
     from crazysim.scene.terrain import Terrain
     from crazysim.sim.mppi import MPPI
     from crazysim.trajectories import Follow
+    from crazysim.vehicles import Bicycles, Cars
 
 __all__ = [
     "MPPI",
     "Airframe",
     "Battery",
+    "Bicycles",
+    "Cars",
     "ConfigError",
     "ContactLog",
     "ContactResponse",
@@ -64,6 +68,7 @@ __all__ = [
     "load_airframe",
     "make",
     "parameter",
+    "reduce_over_others",
     "stage",
     "static",
 ]
@@ -71,6 +76,8 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
+        "Bicycles": "crazysim.vehicles",
+        "Cars": "crazysim.vehicles",
         "ContactLog": "crazysim.scene.contact_log",
         "ContactResponse": "crazysim.scene.response",
         "Follow": "crazysim.trajectories",

@@ -70,7 +70,7 @@ class SimLink:
             self.swarm.commanders[self.drone].stop()
 
 
-def fly(
+def fly_policy(
     link: Link,
     policy: Callable[[DroneState], ArrayLike],
     seconds: float,
@@ -104,10 +104,10 @@ def fly(
 
 
 class TrainedPolicy:
-    """A trained policy as a function of the state of a drone, for ``fly``.
+    """A trained policy as a function of the state of a drone, for ``fly_policy``.
 
     policy, _, meta = load_policy("out/hover")            # of crazysim.train
-    fly(link, TrainedPolicy(policy, meta, goal=[0, 0, 1]), 5.0, 50, meta["actions"]["level"])
+    fly_policy(link, TrainedPolicy(policy, meta, goal=[0, 0, 1]), 5.0, 50, meta["actions"]["level"])
     """
 
     def __init__(self, policy: Callable[[dict[str, Any]], Any], meta: Mapping[str, Any], goal: ArrayLike = (0, 0, 1)):

@@ -91,7 +91,7 @@ class RosBridge:
             frame: Name of the world frame.
 
         Raises:
-            ConfigError: If there is no ROS, an object does not exist, or the rate is not positive.
+            ConfigError: If ROS is missing, an object does not exist, or the rate is not positive.
         """
         if not 0 < freq < math.inf:
             raise ConfigError(f"expected a positive rate of messages, got {freq} Hz")

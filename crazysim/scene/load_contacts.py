@@ -17,6 +17,7 @@ from crazysim.core.plugin import Simulation
 from crazysim.geometry import Shape, distance
 from crazysim.payloads.body import Collider, Colliding
 from crazysim.scene.contact_points import Surface, load_points
+from crazysim.scene.drone_boxes import Boxes, of_kind
 from crazysim.scene.impulse import FASTEST_PUSH, SLOW, STICKING, Material, after_contact, inertia_matrix
 
 FAR = 1e3
@@ -52,7 +53,7 @@ def stop_loads(
     return collider.with_vel(data, vel)
 
 
-def hit_drones(data: SimData, collider: Collider, material: Material, box: np.ndarray) -> tuple[SimData, Any]:
+def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Boxes) -> tuple[SimData, Any]:
     """Return one world after the impulses between loads or hooks and drones, and the impulses on the drones, N s.
 
     The impulse acts at the load's centre, on both: momentum and angular momentum are kept. First the normal impulse,
@@ -64,7 +65,7 @@ def hit_drones(data: SimData, collider: Collider, material: Material, box: np.nd
         data: One world.
         collider: The loads, or the hooks.
         material: Parameters of the contacts.
-        box: Centre and half extents of the drones' collision box, body frame, m. (6,)
+        boxes: Collision boxes of the drones.
     """
     body, s, p = collider.body(data), data.states, data.params
     mass, quat = body.mass[:, None], s.quat[None]
@@ -72,9 +73,15 @@ def hit_drones(data: SimData, collider: Collider, material: Material, box: np.nd
     lever = rotation.rotate_inverse(quat, body.pos[:, None] - s.pos)
     eye = jnp.eye(3, dtype=lever.dtype)
     axes = [rotation.rotate_inverse(quat, rotation.rotate(body.quat[:, None], eye[k])) for k in range(3)]
-    shape, target, rot = collider.shape, Shape("box", tuple(map(float, box[3:]))), jnp.stack(axes, axis=-1)
-    gap, pull = jax.vjp(lambda x: distance(shape, target, x - jnp.asarray(box[:3], x.dtype), rot), lever)
-    normal = pull(jnp.ones_like(gap))[0]
+    shape, rot = collider.shape, jnp.stack(axes, axis=-1)
+
+    def to_box(box: np.ndarray) -> tuple[Array, Array]:
+        target = Shape("box", tuple(map(float, box[3:])))
+        gap, pull = jax.vjp(lambda x: distance(shape, target, x - jnp.asarray(box[:3], x.dtype), rot), lever)
+        return gap[..., None], pull(jnp.ones_like(gap))[0]
+
+    gap, normal = of_kind([(kind, to_box(box)) for kind, box in boxes], data.core.drone_id)
+    gap = gap[..., 0]
     touches = (gap < 0) & ~collider.joined(data)
     touches = touches if body.exists is None else touches & body.exists[:, None]
 

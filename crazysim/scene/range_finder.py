@@ -85,7 +85,7 @@ class RangeFinder(Plugin):
         touched = {body.name for body in solid.objects}
         objects = tuple(body for body in visual.objects if body.name in touched or body.name not in placed)
         # The outline of a drone is enough for a few rays.
-        model = dataclasses.replace(visual, objects=objects, drone_geoms=solid.drone_geoms)
+        model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
         placed = {name: plugin for name, plugin in placed.items() if name in touched}
         scope = "world" if self.drones or placed else "drone"
         period = self._period(sim)

@@ -23,6 +23,7 @@ from crazysim.deprecation import warn_renamed
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 from crazysim.scene.contact_points import Surface, contact_points, is_ground, surfaces_of
+from crazysim.scene.drone_boxes import Boxes, boxes_of, of_kind
 from crazysim.scene.impulse import Material, after_contact, inertia_matrix
 from crazysim.scene.load_contacts import hit_drones, hit_each_other, loads_of, names_of, stop_loads
 from crazysim.scene.report import Objects, choose
@@ -85,31 +86,30 @@ class ContactResponse(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that applies the impulses."""
-        box = np.asarray(sim.airframe.value("shape.collision_box"), np.float64)
+        boxes = boxes_of(sim)
         plugins = loads_of(sim)
         names = names_of(sim, plugins)
         surfaces = surfaces_of(sim, self.objects, names)
 
         def respond(data: SimData) -> SimData:
-            states, record = _respond(data, self.read(data), surfaces, box, self.iterations)
+            found = [(kind, _respond(data, self.read(data), surfaces, box, self.iterations)) for kind, box in boxes]
+            states, record = of_kind(found, data.core.drone_id)
             return self.write(data.replace(states=states), record)
 
         found = [Placement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
         obstacles = [surface for surface in surfaces if not is_ground(surface)]
         hits = any(body.name in names for body in choose(sim.scene.collision_model, self.objects))
         for plugin in plugins:
-            found += self._load_stages(plugin, obstacles, box if hits else None, sim.n_drones)
+            found += self._load_stages(plugin, obstacles, boxes if hits else [], sim.n_drones)
         return found
 
-    def _load_stages(
-        self, plugin: Any, obstacles: list[Surface], box: np.ndarray | None, n_drones: int
-    ) -> list[Placement]:
+    def _load_stages(self, plugin: Any, obstacles: list[Surface], boxes: Boxes, n_drones: int) -> list[Placement]:
         """Return the stages of a plugin's loads: with obstacles, with drones and with each other.
 
         Args:
             plugin: Plugin with the loads.
             obstacles: Surfaces of objects.
-            box: Centre and half extents of the drones' collision box, body frame, m; None for obstacles only. (6,)
+            boxes: Collision boxes of the drones; empty for obstacles only.
             n_drones: Number of drones in a world.
         """
         colliders = plugin.colliders()
@@ -128,7 +128,7 @@ class ContactResponse(Plugin):
             record = self.read(data)
             impulse = record.impulse
             for collider in colliders:
-                data, part = hit_drones(data, collider, record.material, box)  # type: ignore[arg-type]
+                data, part = hit_drones(data, collider, record.material, boxes)
                 impulse = impulse + part
             return self.write(data, record.replace(impulse=impulse))
 
@@ -140,7 +140,7 @@ class ContactResponse(Plugin):
         found = []
         if obstacles:
             found.append((Stage(stop, plugin.coupling), f"{self.name}_of_{plugin.name}"))
-        if box is not None:
+        if boxes:
             found.append((Stage(hit, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
             if meet:
                 found.append((Stage(hit_others, "world"), f"{self.name}_between_{plugin.name}"))

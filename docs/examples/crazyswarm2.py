@@ -3,8 +3,8 @@
 import numpy as np
 
 from crazysim import Sim
+from crazysim.live import Swarm
 from crazysim.live.crazyflie_py import Crazyswarm, use  # was: from crazyflie_py import Crazyswarm
-from crazysim.live.swarm import Swarm
 
 HEIGHT, RADIUS, TURN = 1.0, 0.6, 6.0
 

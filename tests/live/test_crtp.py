@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from crazysim import Sim
 from crazysim.errors import ConfigError
-from crazysim.live.crtp import CrtpDevice, CrtpServer, register, unregister
+from crazysim.live.crtp import CrtpDevice, CrtpServer, add_cflib_driver, remove_cflib_driver
 from crazysim.live.crtp.setpoints import unpack_quat
 from crazysim.live.crtp.tables import LOG_TYPES, Table, Variable, pack
 from crazysim.live.swarm import Swarm
@@ -40,8 +40,8 @@ def running(swarm):
 
 @pytest.fixture
 def uri(running):
-    yield register(running)[0]
-    unregister(running)
+    yield add_cflib_driver(running)[0]
+    remove_cflib_driver(running)
 
 
 def rest(seconds):

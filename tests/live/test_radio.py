@@ -2,16 +2,19 @@
 
 import socket
 
+import jax
 import numpy as np
 import pytest
 
 from crazysim import Sim
+from crazysim.envs import make
 from crazysim.errors import ConfigError
-from crazysim.live.crtp import register, unregister
-from crazysim.live.link import SimLink, TrainedPolicy, fly
+from crazysim.live.crtp import add_cflib_driver, remove_cflib_driver
+from crazysim.live.link import SimLink, TrainedPolicy, fly_policy
 from crazysim.live.mocap import Frame
 from crazysim.live.radio import Radio
-from crazysim.live.swarm import Swarm
+from crazysim.live.swarm import DroneState, Swarm
+from crazysim.train.export import describe
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:cflib", "ignore::DeprecationWarning:usb")
 
@@ -28,7 +31,7 @@ class Recorded:
 
     def __init__(self, control):
         self.swarm = swarm_of(control)
-        self.uri = register(self.swarm)[0]
+        self.uri = add_cflib_driver(self.swarm)[0]
         self.packets = []
 
     def __enter__(self):
@@ -40,7 +43,7 @@ class Recorded:
         return self
 
     def __exit__(self, *_):
-        unregister(self.swarm)
+        remove_cflib_driver(self.swarm)
         self.swarm.close()
 
     def commands(self):
@@ -66,7 +69,7 @@ def test_nothing_is_sent_without_arming(monkeypatch):
             with pytest.raises(ConfigError, match="arm=True"):
                 link.send_pose(Frame.of(0.0, {"cf1": ((0, 0, 1), (0, 0, 0, 1))}), "cf1")
             with pytest.raises(ConfigError, match="arm=True"):
-                fly(link, lambda state: np.zeros(4), 1.0, 50)
+                fly_policy(link, lambda state: np.zeros(4), 1.0, 50)
             link.stop()
     assert radio.packets == []
 
@@ -127,14 +130,14 @@ def hover(state):
 
 def test_a_policy_flies_a_simulated_and_a_radio_link():
     simulated = SimLink(swarm_of("attitude"))
-    states = fly(simulated, hover, 2.0, 100)
+    states = fly_policy(simulated, hover, 2.0, 100)
     np.testing.assert_allclose(states[-1].pos, [0, 0, 1], atol=0.05)
     with Recorded("attitude") as radio:
         radio.swarm.close()  # started again below, in real time
         radio.swarm.start(1.0)
         with Radio(radio.uri, arm=True, crazyflie=radio.crazyflie) as link:
             radio.swarm.sim.reset()
-            fly(link, hover, 1.5, 100)
+            fly_policy(link, hover, 1.5, 100)
             there = link.state()
     np.testing.assert_allclose(there.pos, [0, 0, 1], atol=0.3)
 
@@ -148,7 +151,7 @@ def test_a_failing_policy_stops_the_motors():
         return hover(state)
 
     with pytest.raises(RuntimeError, match="lost"):
-        fly(link, policy, 1.0, 100)
+        fly_policy(link, policy, 1.0, 100)
     assert not link.swarm["cf1"].motors_on
 
 
@@ -170,3 +173,20 @@ def test_trained_policies_get_their_observations():
     np.testing.assert_allclose(asked["rot"], np.eye(3).reshape(9))
     with pytest.raises(ConfigError, match="got gates"):
         TrainedPolicy(policy, meta | {"observations": {"gates": 3}})
+
+
+def test_observations_over_a_link_equal_those_of_the_task():
+    env = make("hover", 1)
+    step = env.reset(jax.random.key(3))
+    states, seen = step.data.states, {}
+    values = [np.asarray(x[0, 0], float) for x in (states.pos, states.quat, states.vel, states.ang_vel)]
+    goal = values[0] + np.asarray(step.obs["difference_to_goal"])[0, 0]
+
+    def policy(observations):
+        seen.update(observations)
+        return np.zeros(4)
+
+    TrainedPolicy(policy, describe(env), goal)(DroneState(0.0, *values, np.zeros(3)))
+    assert sorted(seen) == sorted(step.obs)
+    for name, value in seen.items():
+        np.testing.assert_allclose(value, np.asarray(step.obs[name])[0, 0], atol=1e-5)

@@ -13,7 +13,7 @@ from crazysim.live.swarm import Swarm
 _drivers: dict[int, type] = {}
 
 
-def register(swarm: Swarm) -> list[str]:
+def add_cflib_driver(swarm: Swarm) -> list[str]:
     """Let ``cflib`` connect to the drones of a swarm in this process, and return their URIs, ``sim://cf1`` and so on.
 
     It may be called before or after ``cflib.crtp.init_drivers()``. A later swarm hides an earlier one with its names.
@@ -25,13 +25,13 @@ def register(swarm: Swarm) -> list[str]:
         import cflib.crtp
     except ImportError as error:
         raise ConfigError("expected cflib, got none. Install it with pip install crazysim[radio].") from error
-    unregister(swarm)
+    remove_cflib_driver(swarm)
     _drivers[id(swarm)] = _driver(swarm)
     cflib.crtp.CLASSES.insert(0, _drivers[id(swarm)])
     return [f"sim://{name}" for name in swarm.names]
 
 
-def unregister(swarm: Swarm) -> None:
+def remove_cflib_driver(swarm: Swarm) -> None:
     """Remove a swarm from ``cflib``."""
     import cflib.crtp
 
