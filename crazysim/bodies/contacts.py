@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from collections.abc import Collection
+from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -10,13 +11,14 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.bodies.pairs import Found, Solids, between, joined, on_ground, on_surface
-from crazysim.bodies.solver import Bodies, solve_contacts
+from crazysim.bodies.pairs import CORNERS, Found, Solids, between, joined, on_ground, on_surface
+from crazysim.bodies.solver import Bodies, Impulses, solve_contacts
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
 from crazysim.core.population import populations
 from crazysim.core.stage import over_worlds
 from crazysim.effects.ground import TerrainData
+from crazysim.geometry.manifold import N_OF_BOXES
 from crazysim.scene.collision import CollisionGeom
 from crazysim.scene.report import choose
 
@@ -56,6 +58,23 @@ class Touching:
             elif kind not in kinds:
                 self.carriers.append(Carrier(None, body.row, body.geoms))
 
+    def n_contacts(self, terrains: Collection[str]) -> int:
+        """Return the number of contact points, of which most are out of contact.
+
+        Args:
+            terrains: Names of the plugins whose height fields are terrain.
+        """
+        balls = [shape.kind == "sphere" for shape in self.shapes]
+        geoms = [geom for carrier in self.carriers for geom in carrier.geoms]
+        others = [False] * self.n_drones + [g.shape.kind == "sphere" for g in geoms if g.shape.kind in EXACT]
+        pairs = [*combinations(balls, 2), *product(balls, others)]
+        n = sum(1 if any(pair) else N_OF_BOXES for pair in pairs)
+        for geom in geoms:
+            if geom.shape.kind not in EXACT:
+                only_corners = geom.shape.kind == "plane" or geom.name in terrains
+                n += sum(1 if ball else len(CORNERS) + (not only_corners) for ball in balls)
+        return n
+
     def respond(self, data: SimData) -> SimData:
         """Return the data of all worlds with the velocities after contact."""
         return over_worlds(self.of_world)(data)
@@ -77,12 +96,16 @@ class Touching:
             jnp.concatenate([x[:, 0], jnp.zeros(size - n_free, x.dtype)]) for x in (record.friction, record.restitution)
         )
         contacts = joined(found, friction, restitution)
-        after, impulse = solve_contacts(
-            bodies, contacts, 1 / data.core.freq, plugin.softness, plugin.iterations
+        before = Impulses(record.press, record.drag)
+        after, at, impulse = solve_contacts(
+            bodies, contacts, before, 1 / data.core.freq, plugin.softness, plugin.iterations
         )
         ang_vel = rotation.rotate_inverse(record.quat, after.ang_vel[:n_free])
         data = plugin.write(
-            data, record.replace(vel=after.vel[:n_free], ang_vel=ang_vel, impulse=impulse[:n_free])
+            data,
+            record.replace(
+                vel=after.vel[:n_free], ang_vel=ang_vel, impulse=impulse[:n_free], press=at.press, drag=at.drag
+            ),
         )
         if n_drones:
             own = slice(n_free, first_carrier)

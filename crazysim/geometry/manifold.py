@@ -14,6 +14,8 @@ from jax import Array, lax
 from crazysim import rotation
 from crazysim.geometry.heightfield import FAR
 
+N_OF_BOXES = 13
+"""Number of points of two boxes."""
 PARALLEL = 1e-3
 """Sine of the angle of two edges below which they span no separating axis."""
 EDGE_SHARE, EDGE_BIAS = 0.95, 0.01
