@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from crazysim.control import Control, Controller
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
+from crazysim.core.others import reduce_over_others
 from crazysim.core.plugin import Placement, Plugin, parameter
 from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
@@ -64,6 +65,7 @@ __all__ = [
     "load_airframe",
     "make",
     "parameter",
+    "reduce_over_others",
     "stage",
     "static",
 ]

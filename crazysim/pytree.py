@@ -23,7 +23,9 @@ CORE_NDIM_KEY = "core_ndim"
 T = TypeVar("T")
 
 
-def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None) -> Any:
+def leaf(
+    scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None, *, default: Any = dataclasses.MISSING
+) -> Any:
     """Declare an array field, or a dict of such arrays.
 
     Args:
@@ -34,8 +36,9 @@ def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None) 
         core_ndim: Number of dimensions of the core shape.
         core: The core shape, if it is fixed. It keeps one mass for each of three worlds from passing for one along
             each of three axes.
+        default: Value of the field where none is given.
     """
-    return dataclasses.field(metadata={"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core})
+    return dataclasses.field(default=default, metadata={"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core})
 
 
 def static(**kwargs: Any) -> Any:

@@ -27,14 +27,24 @@ class Simulation(Protocol):
     data: SimData
     default_data: SimData
     step_pipeline: Pipeline
-    airframe: Airframe
+    airframes: tuple[Airframe, ...]
     integrator: Any
     n_worlds: int
     n_drones: int
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all drones and members of populations."""
+        ...
+
+    @property
     def scene(self) -> Any:
         """The MuJoCo scene, a ``crazysim.scene.scene.Scene``."""
+        ...
+
+    @property
+    def airframe(self) -> Airframe:
+        """Airframe of all drones; an error where they have several."""
         ...
 
     def add(self, plugin: Any, name: str | None = None) -> Any:
@@ -67,6 +77,25 @@ def parameter(*, default: Any = dataclasses.MISSING) -> Any:
     ``derivative`` must read the number from the record, never from the field.
     """
     return dataclasses.field(default=default, metadata={"parameter": True})
+
+
+def of_airframes(sim: Simulation, number: Callable[[Airframe], Any]) -> Any:
+    """Return a number of the airframe, as ``check_parameter`` takes it: one for all drones, or one for each.
+
+    Args:
+        sim: The simulation.
+        number: From an airframe to a number or array. (*core)
+
+    Returns:
+        (*core), or (n_worlds, n_drones, *core) where the drones have several airframes
+    """
+    kinds = {id(airframe): airframe for airframe in sim.airframes}
+    values = {key: np.asarray(number(airframe)) for key, airframe in kinds.items()}
+    first = next(iter(values.values()))
+    if len(kinds) == 1:
+        return first
+    each = np.stack([values[id(airframe)] for airframe in sim.airframes])
+    return np.broadcast_to(each, (sim.n_worlds, *each.shape))
 
 
 def check_parameter(

@@ -6,6 +6,7 @@ masks, seeds, sharding, engines and gradients treat members as they treat drones
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
@@ -161,6 +162,16 @@ class Population(Plugin):
             found.append(Placement(Stage(step, self.name, name=name), before="increment_steps", name=name))
         return found
 
+    def with_poses(self, record: R, pos: Array, quat: Array) -> R:
+        """Return a record of all worlds with other poses; by default in its fields ``pos`` and ``quat``, if it has them.
+
+        Args:
+            record: The record.
+            pos: Positions, world frame, m. (n_worlds, n_members, 3)
+            quat: Attitudes, body to world, xyzw. (n_worlds, n_members, 4)
+        """
+        return record.replace(**{k: x for k, x in (("pos", pos), ("quat", quat)) if k in _fields(record)})
+
     def commanded(self, data: SimData, command: Any) -> SimData:
         """Return the data of all worlds with a command for every member. (n_worlds, n_members, k)
 
@@ -230,6 +241,10 @@ def scheme_of(integrator: Integrator, positions: Sequence[str]) -> Callable[...,
 def populations(data: SimData) -> dict[str, Members]:
     """Return the records of the populations beside the drones, by name."""
     return {name: x for name, x in data.plugins.items() if isinstance(x, Members) and x.population == name}
+
+
+def _fields(record: Members) -> set[str]:
+    return {f.name for f in dataclasses.fields(record)}  # type: ignore[arg-type]
 
 
 def check_command(name: str, shape: tuple[int, ...], command: Any, dtype: Any) -> Array | np.ndarray:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.core.others import AXIS
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, has_members, n_batch_axes, n_world_axes, scopes
 
@@ -67,7 +68,8 @@ def stage(scope: StageScope, when: Callable[..., Array | None] | None = None) ->
     A stage without a declared scope receives the full batch.
 
     ``@stage("drone")``: the data of one drone. Leaves of drones and worlds come without batch axes: ``pos`` is (3,),
-    ``steps`` (). Leaves of other populations come as (n_members, ...). The stage writes leaves of drones.
+    ``steps`` (). Leaves of other populations come as (n_members, ...). The stage writes leaves of drones, and reads
+    those of other drones by ``reduce_over_others``.
 
     ``@stage("cars")``: the data of one member of the population of that name, likewise. Leaves of drones come as
     (n_drones, ...). The stage writes leaves of the population.
@@ -256,7 +258,7 @@ def over_members(fn: Callable[[Any], Any], population: str) -> Callable[[Any], A
     def of_world(data: Any) -> Any:
         leaves, treedef = jax.tree.flatten(data)
         axes = [0 if scope == population else None for scope in jax.tree.leaves(scopes(data))]
-        return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,))(leaves)
+        return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,), axis_name=AXIS)(leaves)
 
     return of_world
 
@@ -289,7 +291,7 @@ def of_world(stage: Stage, axes: Axes) -> Callable[[Any], Any]:
             return [new[i] for i in written]
 
         own = [0 if s == stage.scope else None for s in axes.scopes]
-        out = one(leaves) if stage.scope == "world" else jax.vmap(one, (own,))(leaves)
+        out = one(leaves) if stage.scope == "world" else jax.vmap(one, (own,), axis_name=AXIS)(leaves)
         return axes.treedef.unflatten(with_leaves(leaves, written, out))
 
     return of_one_world

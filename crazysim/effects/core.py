@@ -56,7 +56,7 @@ def require_drag(sim: Simulation, effect: str) -> None:
     drag = getattr(sim.data.params, "drag_matrix", None)
     if drag is None or not np.any(np.asarray(drag)):
         raise ConfigError(
-            f"{effect} acts through drag, and drone {sim.airframe.name!r} has none in this model. Use "
+            f"{effect} acts through drag, and drone {sim.airframes[0].name!r} has none in this model. Use "
             f"dynamics='first_principles' or 'so_rpy_rotor_drag' and an airframe with drag coefficients."
         )
 

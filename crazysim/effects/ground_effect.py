@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Plugin, Simulation, check_parameter, of_airframes, parameter
 from crazysim.deprecation import warn_renamed
+from crazysim.drones import Airframe
 from crazysim.effects.core import require_rotors
 from crazysim.effects.ground import ground_below
 from crazysim.pytree import PyTree, leaf
@@ -37,9 +39,15 @@ class GroundEffect(Plugin):
         require_rotors(sim, "ground effect")
         radius = self.propeller_radius
         if radius is None:
-            radius = sim.airframe.value("shape.propeller_radius", ())
+            radius = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
         radius = check_parameter(sim, "propeller_radius", radius, positive=True)
-        return GroundEffectData(radius, jnp.asarray(sim.airframe.value("rotors.position"), radius.dtype))
+        n_rotors = sim.data.states.rotor_vel.shape[-1]
+
+        def places(airframe: Airframe) -> np.ndarray:
+            own = airframe.value("rotors.position")
+            return np.pad(own, [(0, n_rotors - len(own)), (0, 0)])  # missing rotors have no thrust
+
+        return GroundEffectData(radius, jnp.asarray(of_airframes(sim, places), radius.dtype))
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the thrust curves at the height of each rotor."""

@@ -10,10 +10,11 @@ import jax
 import numpy as np
 
 import crazysim.engine.rules  # noqa: F401  (fills the table of rules)
+from crazysim.core.others import reduce_over_others_p
 from crazysim.core.stage import Axes, Stage
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir import Builder, Element, Value, constant, prune
-from crazysim.engine.jaxcompat import is_key
+from crazysim.engine.jaxcompat import equations, is_key
 from crazysim.engine.lower import Elements, Entry, Lowering, as_elements, inputs, scalars
 from crazysim.engine.program import TABLE, Leaf, Phase, Program, Segment, Slot, UnfusedStage
 from crazysim.engine.relative import RelativeAxes, viewed
@@ -89,7 +90,7 @@ def _lower_stage(
         if max(others, default=0) > MAX_UNROLLED_DRONES:
             raise LimitError(f"other populations are unrolled for at most {MAX_UNROLLED_DRONES} members")
         shared = [i for i in traced.used if axes.scopes[i] == "shared" and not is_key(traced.avals[i])]
-        return _segment(stage, scope, phase, traced, zeros, shared)
+        return _segment(stage, scope, phase, traced, zeros, shared, n_drones if scope == "drone" else 0)
     except UnsupportedError as error:
         traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)
         why = error.located(stage=stage.__name__)
@@ -103,10 +104,12 @@ def _segment(
     traced: TracedStage,
     zeros: Zeros,
     shared: Sequence[int],
+    n_members: int,
 ) -> Segment:
-    lowering = Lowering(Builder(stage=stage.__name__))
+    lowering = Lowering(Builder(stage=stage.__name__), n_members=n_members)
     before = {i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.used}
     tables = {_table(lowering, before[i]): (i, TABLE) for i in shared if i in before and before[i].size > 1}
+    lowering.shared.update(x for i in shared for x in scalars(before[i]) if isinstance(x, Value))
     args = [before[i] for i in traced.used]
     if traced.when is None:
         after = lowering.lower(traced.fn, args)
@@ -137,10 +140,18 @@ def _table(lowering: Lowering, elements: Elements) -> Value:
 def _guarded(
     lowering: Lowering, mask: Element, traced: TracedStage, args: list[Elements], old: list[Elements]
 ) -> list[Elements]:
-    """Return what the written leaves become of a stage that acts where a mask is true."""
-    inner = lowering.inner()
+    """Return what the written leaves become of a stage that acts where a mask is true.
+
+    Drones whose stages act at different steps still publish values for each other, so that such a stage is computed
+    at every step, and selected.
+    """
+    together = any(eqn.primitive is reduce_over_others_p for eqn in equations(traced.fn))
+    inner = lowering if together else lowering.inner()
     new = inner.lower(traced.fn, args)
     pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(scalars(x), scalars(y), strict=True)]
+    if together:
+        results = iter([a if a is b else lowering.scalar("select_n", mask, a, b) for a, b in pairs])
+        return [_with_scalars(x, [next(results) for _ in scalars(x)]) for x in old]
     changed = [(a, b) for a, b in pairs if a is not b]
     block = inner.builder.finish([b for _, b in changed])
     before = [a for a, _ in changed]

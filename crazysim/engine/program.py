@@ -91,6 +91,11 @@ class Segment:
         """Leaves that it reads."""
         return {leaf for leaf, _ in (*self.reads, *self.hoisted_reads)}
 
+    @functools.cached_property
+    def couples(self) -> bool:
+        """True if drones of a world read each other's numbers."""
+        return self.scope == "world" or any(op.name == "over_others" for op in self.block.operations)
+
     @property
     def n_operations(self) -> int:
         """Number of operations of a step."""
@@ -189,8 +194,8 @@ class Program:
 
     @functools.cached_property
     def group(self) -> int:
-        """Number of drones whose scalars are computed together: those of a world, if a segment has that scope."""
-        return self.n_drones if any(s.scope == "world" for s in self.fused_segments) else 1
+        """Number of drones that read each other's numbers: those of a world, if a segment needs that; otherwise 1."""
+        return self.n_drones if any(s.couples for s in self.fused_segments) else 1
 
     def of(self, phase: Phase) -> list[Any]:
         """Return the segments that run in a phase."""

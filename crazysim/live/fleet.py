@@ -99,6 +99,13 @@ class Fleet:
                 log.warning("%s refused: %s", type(command).__name__, error)
         return n
 
+    def reset(self) -> None:
+        """Let every drone hover where it is again, as after ``sim.reset()``; trajectories that it received stay."""
+        self._untouched = [True] * self.sim.n_drones
+        for drone, pos in enumerate(np.asarray(self.sim.data.states.pos[0], float)):
+            self._fly(drone, _hover(np.append(pos, 0.0)))
+            self._untouched[drone] = self._uploaded[drone] is None
+
     def setpoint(self, drone: int) -> NDArray:
         """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
         return Path.of(self._active[drone]).at(self._now() - self._starts[drone])

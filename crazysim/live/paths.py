@@ -39,7 +39,7 @@ class Path(NamedTuple):
 
     def derivatives(self, t: float, n: int) -> NDArray:
         """Return position and yaw and their first n derivatives at a time since the start, s. (n + 1, 4)"""
-        inside = t > 0 and (self.repeats or t < self.ends[-1])
+        inside = t >= 0 and (self.repeats or t <= self.ends[-1])
         t = t % self.ends[-1] if self.repeats and t > 0 else min(max(t, 0.0), float(self.ends[-1]))
         k = min(int(np.searchsorted(self.ends, t, side="right")), len(self.ends) - 1)
         begin = float(self.ends[k - 1]) if k else 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,11 +11,11 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter
 from crazysim.core.stage import Stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.effects.core import require_rotors, zeros
-from crazysim.effects.downwash import AIR_DENSITY, collective_thrust, jet
+from crazysim.effects.downwash import AIR_DENSITY, collective_thrust, jet, stream_diameter
 from crazysim.effects.grid import LARGEST_FUSED, interpolate, is_inside
 from crazysim.errors import ConfigError
 from crazysim.payloads.body import Colliding
@@ -89,7 +88,7 @@ class RotorJet(Plugin):
         table = None if self.table is None else self.table.checked()
         radius = self.propeller_radius
         if radius is None:
-            radius = sim.airframe.value("shape.propeller_radius", ())
+            radius = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
         radius = check_parameter(sim, "propeller_radius", radius, positive=True)
         dtype = radius.dtype
 
@@ -100,7 +99,7 @@ class RotorJet(Plugin):
         return RotorJetData(
             force=zeros(sim, 3),
             torque=zeros(sim, 3),
-            diameter=math.sqrt(2 * sim.airframe.n_rotors) * radius,
+            diameter=stream_diameter(sim, radius),
             air_density=check_parameter(sim, "air_density", self.air_density, positive=True),
             speeds=shared("speeds"),
             pressure=shared("pressure"),

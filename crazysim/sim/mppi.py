@@ -147,7 +147,7 @@ class MPPI:
         self.temperature, self.cost, self._key = temperature, cost, jax.random.key(seed)
         freq = c.freq if freq is None else positive("freq", freq)
         self._sim = Sim(
-            sim.n_worlds * self.samples, sim.n_drones, c.airframe, c.dynamics, c.control, c.integrator, freq,
+            sim.n_worlds * self.samples, sim.n_drones, c.airframes, c.dynamics, c.control, c.integrator, freq,
             device=c.device, engine=c.engine, controller="crazyflow" if c.controller is None else c.controller,
         )  # fmt: skip
         for plugin in sim.plugins.values():

@@ -2,6 +2,7 @@
 
 from crazysim.live.mocap.capture import SYSTEMS, MotionCaptureSource
 from crazysim.live.mocap.frames import Convention, Frame
+from crazysim.live.mocap.playback import Playback
 from crazysim.live.mocap.recording import MocapRecorder, ReplaySource, read_polls
 from crazysim.live.mocap.reports import Report, Reports
 from crazysim.live.mocap.source import FunctionSource, MocapSource, Poll, RealTimeSource, ThreadSource, show_source
@@ -16,6 +17,7 @@ __all__ = [
     "MocapRecorder",
     "MocapSource",
     "MotionCaptureSource",
+    "Playback",
     "Poll",
     "RealTimeSource",
     "ReplaySource",

@@ -184,7 +184,8 @@ class ThreadSource(MocapSource):
             self._ended = "the stream ended"
         except Exception as error:
             self._ended = f"{type(error).__name__}: {error}"
-            log.warning("%s ended: %s", self.name, self._ended)
+            if not self._stopped.is_set():
+                log.warning("%s ended: %s", self.name, self._ended)
 
 
 class RealTimeSource(ThreadSource):

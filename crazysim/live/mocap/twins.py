@@ -17,6 +17,7 @@ from crazysim.drones import load_airframe
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.live.closing import Closing
 from crazysim.live.mocap.frames import from_rpy, multiply, rotate, to_rpy
+from crazysim.live.mocap.playback import Playback
 from crazysim.live.mocap.recording import MocapRecorder
 from crazysim.live.mocap.reports import Reports
 from crazysim.live.mocap.source import MocapSource
@@ -138,6 +139,10 @@ class Twins(Closing):
         """Reports of the source and its bodies."""
         return self.tracker.reports
 
+    def __call__(self, live: Any) -> None:
+        """Update the simulation of a loop such as ``Live``, which has it as ``live.sim``."""
+        self.update(live.sim)
+
     def update(self, sim: Sim) -> None:
         """Read the frames that have arrived, and write all poses; it never waits for the source."""
         poll = self.source.poll(int(sim.data.core.steps[0, 0]), sim.freq)
@@ -166,6 +171,39 @@ class Twins(Closing):
         """Return position, m (3,), attitude, xyzw (4,), and velocity, m/s (3,), of the object of a body."""
         k = self._indices([name])[0]
         return tuple(x[k].copy() for x in self._poses)  # type: ignore[return-value]
+
+    def playback(
+        self, source: MocapSource, seconds: float, freq: int = 100, start: Any = 0.0, name: str = "playback"
+    ) -> Playback:
+        """Return a plugin that moves the objects within the compiled step, in every world, for ``sim.add``.
+
+        Args:
+            source: Source in simulated time, such as ``ReplaySource(path, by="time")``. Rules, offsets and skeletons
+                are applied to its frames.
+            seconds: Time to take from it, s.
+            freq: Samples per second, Hz; poses between them are interpolated.
+            start: Time of the recording at the reset of a world, s. () or (n_worlds,)
+            name: Name of the plugin.
+
+        Raises:
+            ConfigError: If the time is shorter than two samples.
+        """
+        if not 2 <= seconds * freq <= 1e7:
+            raise ConfigError(f"expected a time of at least two samples, {2 / freq} s, got {seconds} s")
+        kept = self.tracker, self._poses
+        self.tracker = Tracker(self.names, self.tracker.rules, source.name)
+        samples = []
+        try:
+            for k in range(round(seconds * freq)):
+                poll = source.poll(k, freq)
+                for frame in poll.frames:
+                    self.tracker.accept(frame)
+                self._compute()
+                samples.append(self._poses[:2])
+        finally:
+            self.tracker, self._poses = kept
+        pos, quat = (np.stack(x) for x in zip(*samples, strict=True))
+        return Playback(list(self.handles.values()), pos, quat, float(freq), start, name)
 
     def close(self) -> None:
         """Close the source and the recording."""

@@ -1,5 +1,7 @@
 """Twins: objects at measured poses, which simulated drones measure, avoid and hit."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -247,3 +249,44 @@ def test_a_recorded_stream_gives_the_same_run_bit_for_bit(tmp_path):
             np.testing.assert_array_equal(x, y)
     assert np.ptp([x[0][0, 0, 0] for x in live]) > 1e-4
     assert np.isfinite(rotate(live[-1][1], np.ones(3))).all()
+
+
+def test_playback_moves_objects_in_the_compiled_step():
+    """Every world replays the stream from a start of its own; drones measure the objects within the step."""
+    sim = Sim(n_worlds=3, n_drones=1, control="state")
+    sim.scene.add("box", "fixed_by_handle", pos=[0.0, -5.0, 0.0])
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0)))
+
+    def bodies(t):
+        return {"cf1": ((1.0 + t, 0, 1), from_rpy([0, 0, 3 * t])), "cf2": ((0, 2, 1), LEVEL)}
+
+    source = FunctionSource(bodies, 50.0)
+    twins = Twins(sim, source, {"cf": BOX}, ["cf1", "cf2"])
+    playback = sim.add(twins.playback(source, 2.0, freq=50, start=[0.0, 0.5, 10.0]))
+    rays = sim.add(RangeFinder(directions=[(1, 0, 0)]))
+    command = np.zeros((3, 1, 16))
+    command[..., 2] = 1.0
+    sim.state_control(command)
+    sim.step(101)  # the last step began at 0.2 s
+    pos, quat = twins.handles["cf1"].pose(sim.data)
+    np.testing.assert_allclose(pos[:, 0], [[1.2, 0, 1], [1.7, 0, 1], [2.98, 0, 1]], atol=1e-5)
+    np.testing.assert_allclose(np.abs(quat[1, 0] @ from_rpy([0, 0, 2.1])), 1, atol=1e-5)
+    np.testing.assert_allclose(sim.data.objects.vel[:, 0, 1, 0], [1, 1, 0], atol=1e-3)
+    np.testing.assert_allclose(sim.data.objects.pos[:, 0, 0, 1], -5)
+    assert np.all(np.asarray(rays.read(sim.data).distance)[0] < 1.15)
+    sim.reset()
+    sim.step()
+    np.testing.assert_allclose(twins.handles["cf1"].pose(sim.data)[0][0, 0], [1, 0, 1], atol=1e-5)
+    assert playback.read(sim.data).start.shape == (3, 1)
+
+
+def test_wrong_playbacks(sim):
+    source = FunctionSource(lambda t: {"a": ((t, 0, 1), LEVEL)}, 50.0)
+    twins = Twins(sim, source, {"a": BOX}, ["a"])
+    with pytest.raises(ConfigError, match="at least two samples"):
+        twins.playback(source, 0.0)
+    good = twins.playback(source, 1.0)
+    for wrong in ({"pos": good.pos[:1]}, {"start": [0.0] * 5}, {"freq": 0.0}, {"quat": np.nan * good.quat}):
+        with pytest.raises(ConfigError, match="expected"):
+            sim.add(dataclasses.replace(good, **wrong))
