@@ -18,6 +18,7 @@ from crazysim.sim.sim import Sim
 from crazysim.version import __version__
 
 if TYPE_CHECKING:
+    from crazysim.bodies import FreeBodies
     from crazysim.core import functional as functional
     from crazysim.envs import make
     from crazysim.payloads import Hook, RotorJet, SharedLoad, SlungLoad
@@ -42,6 +43,7 @@ __all__ = [
     "Drone",
     "Dynamics",
     "Follow",
+    "FreeBodies",
     "GroundEffect",
     "Hook",
     "Integrator",
@@ -76,6 +78,7 @@ __getattr__ = lazy(
         "ContactLog": "crazysim.scene.contact_log",
         "ContactResponse": "crazysim.scene.response",
         "Follow": "crazysim.trajectories",
+        "FreeBodies": "crazysim.bodies",
         "Hook": "crazysim.payloads",
         "MPPI": "crazysim.sim.mppi",
         "RotorJet": "crazysim.payloads",

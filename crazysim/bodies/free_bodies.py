@@ -88,7 +88,7 @@ class FreeBodies(Population):
     """Ratio of the speeds after and before a bounce, 0 to 1; of two bodies the larger counts. (), (n_members,) or
     (n_worlds, n_members)"""
     objects: ObjectNames = None
-    """Handles, or names of objects that the bodies touch; None for all at the time of adding, () for the ground alone."""
+    """Handles, or names of objects that the bodies touch; None for all at the time of adding, () for the ground."""
     drones: bool = True
     """True for contact with drones."""
     softness: float = 0.03
@@ -112,6 +112,11 @@ class FreeBodies(Population):
         if listed and len(size) != n:
             raise ConfigError(f"expected one size for all {n} bodies or a list of {n}, got a list of {len(size)}")
         return tuple(shape_of(tuple(s) if np.ndim(s) else s) for s in (size if listed else [size] * n))
+
+    @property
+    def pushes_drones(self) -> bool:
+        """True if the contacts of this plugin are those with drones, so that ``ContactResponse`` leaves them out."""
+        return self.drones
 
     @property
     def placed_kinds(self) -> tuple[str, ...]:

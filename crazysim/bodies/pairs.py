@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,10 @@ from crazysim.geometry import Shape, distance, point_distance
 from crazysim.geometry.manifold import Manifold, ball_on_box, balls, boxes
 from crazysim.scene.collision import CollisionGeom
 
+GapFn = Callable[[Array], tuple[Array, Array]]
+"""From points (n, 3) to gaps (n,) and normals (n, 3)."""
 CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+"""Corners of a box of half lengths one. (8, 3)"""
 
 
 class Solids(NamedTuple):
@@ -97,7 +101,7 @@ def on_surface(solids: Solids, number: int, geom: CollisionGeom, carrier: int, p
     return Found(np.full(n, solids.body[number]), np.full(n, carrier), found)
 
 
-def on_ground(solids: Solids, number: int, carrier: int, gap_at) -> Found:  # noqa: ANN001
+def on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> Found:
     """Return the contact points of a solid with terrain, of which ``gap_at(points)`` gives gaps and normals."""
     pos, rot = solids.pos[number], solids.rot[number]
     if solids.is_ball[number]:

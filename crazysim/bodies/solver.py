@@ -121,7 +121,7 @@ def solve_contacts(
         across = across + parts[numbers] * (trace - of_normal)
     along, across = COUPLED * along, COUPLED * across
 
-    def turn_once(count: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
+    def turn_once(_: int, carry: tuple[Array, ...]) -> tuple[Array, ...]:
         press, drag, old_press, old_drag, age = carry
         ahead = age / (age + 3)
         y, z = press + ahead * (press - old_press), drag + ahead * (drag - old_drag)

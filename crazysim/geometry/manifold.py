@@ -1,7 +1,7 @@
 """Contact manifolds: the points at which two balls or boxes touch, with normals and gaps.
 
-For one pair, on small arrays; ``jax.vmap`` takes many. The number of points is that of the kinds of the pair, and points
-that do not exist have a large gap.
+For one pair, on small arrays; ``jax.vmap`` takes many. The number of points depends on the kinds of the pair only, and
+points that do not exist have a large gap.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def _clipped(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> 
     normal = side * rot[:, 0]
     against = rotation.matvec(other[2].T, normal)
     turned = jnp.argmax(lax.stop_gradient(jnp.abs(against)))
-    half_o, pos_o, rot_o = _rolled(other, turned)
+    half_o, _, rot_o = _rolled(other, turned)
     # The other's nearest face: its middle and its half edges, in the plane of the face (u, v) and along its normal (s).
     sign = jnp.where(against[turned] > 0, -1.0, 1.0)
     frame = jnp.stack([rot[:, 1], rot[:, 2], normal])
