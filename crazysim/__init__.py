@@ -18,7 +18,7 @@ from crazysim.sim.sim import Sim
 from crazysim.version import __version__
 
 if TYPE_CHECKING:
-    from crazysim.bodies import FreeBodies
+    from crazysim.bodies import DroneCollisions, FreeBodies
     from crazysim.core import functional as functional
     from crazysim.envs import make
     from crazysim.payloads import Hook, RotorJet, SharedLoad, SlungLoad
@@ -41,6 +41,7 @@ __all__ = [
     "Controller",
     "Downwash",
     "Drone",
+    "DroneCollisions",
     "Dynamics",
     "Follow",
     "FreeBodies",
@@ -77,6 +78,7 @@ __getattr__ = lazy(
     {
         "ContactLog": "crazysim.scene.contact_log",
         "ContactResponse": "crazysim.scene.response",
+        "DroneCollisions": "crazysim.bodies",
         "Follow": "crazysim.trajectories",
         "FreeBodies": "crazysim.bodies",
         "Hook": "crazysim.payloads",

@@ -115,14 +115,11 @@ class Touching:
 
     def _bodies(self, data: SimData, record: Any) -> Bodies:
         """Return the bodies: free ones, drones, then those that are not pushed."""
-        s, p, dtype = data.states, data.params, record.pos.dtype
+        dtype = record.pos.dtype
         rows = [(record.pos, record.vel, rotation.rotate(record.quat, record.ang_vel), 1 / record.mass[:, 0],
                  _turned(record.quat, 1 / record.inertia))]  # fmt: skip
         if self.n_drones:
-            rot, inverse = rotation.matrix(s.quat), jnp.broadcast_to(p.J_inv, (self.n_drones, 3, 3))
-            inverse = _product(_product(rot, inverse), jnp.swapaxes(rot, -1, -2))
-            inv_mass = jnp.broadcast_to(1 / p.mass, (self.n_drones, 1))[:, 0]
-            rows.append((s.pos, s.vel, rotation.rotate(s.quat, s.ang_vel), inv_mass, inverse))
+            rows.append(drones_as_bodies(data))
         for carrier in self.carriers:
             pos, quat, vel, ang_vel = _motion(data, carrier)
             spin = rotation.rotate(quat, ang_vel)
@@ -131,7 +128,7 @@ class Touching:
 
     def _solids(self, data: SimData, record: Any) -> Solids:
         """Return the shapes of free bodies and drones, and the balls and boxes of objects, at their poses."""
-        n_free, s = record.pos.shape[0], data.states
+        n_free = record.pos.shape[0]
         dtype = record.pos.dtype
         owners, balls, sizes = list(range(n_free)), [x.kind == "sphere" for x in self.shapes], []
         sizes = [np.resize(x.size, 3) for x in self.shapes]
@@ -140,8 +137,8 @@ class Touching:
             owners += range(n_free, n_free + self.n_drones)
             balls += [False] * self.n_drones
             sizes += [self.box[3:]] * self.n_drones
-            pos.append(s.pos + rotation.rotate(s.quat, jnp.asarray(self.box[:3], dtype)))
-            rot.append(rotation.matrix(s.quat))
+            for whole, part in zip((pos, rot), drones_as_boxes(data, self.box), strict=True):
+                whole.append(part)
         for k, carrier in enumerate(self.carriers):
             for geom in carrier.geoms:
                 if geom.shape.kind in EXACT:
@@ -169,6 +166,26 @@ class Touching:
                 else:
                     found.append(on_surface(solids, k, geom, number, _pose(data, carrier, geom, solids.pos.dtype)))
         return found
+
+
+def drones_as_bodies(data: SimData) -> Bodies:
+    """Return the drones of one world as bodies."""
+    s, p, n = data.states, data.params, data.states.pos.shape[0]
+    rot, inverse = rotation.matrix(s.quat), jnp.broadcast_to(p.J_inv, (n, 3, 3))
+    inverse = _product(_product(rot, inverse), jnp.swapaxes(rot, -1, -2))
+    inv_mass = jnp.broadcast_to(1 / p.mass, (n, 1))[:, 0]
+    return Bodies(s.pos, s.vel, rotation.rotate(s.quat, s.ang_vel), inv_mass, inverse)
+
+
+def drones_as_boxes(data: SimData, box: np.ndarray) -> tuple[Array, Array]:
+    """Return positions, m (n, 3), and attitudes (n, 3, 3) of the drones' collision boxes; of one world.
+
+    Args:
+        data: One world.
+        box: Centre and half extents of the box, body frame, m. (6,)
+    """
+    s = data.states
+    return s.pos + rotation.rotate(s.quat, jnp.asarray(box[:3], s.pos.dtype)), rotation.matrix(s.quat)
 
 
 def _motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Array, Array]:

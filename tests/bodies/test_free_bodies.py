@@ -13,11 +13,11 @@ from crazysim.core.stage import stage
 FREQ = 500
 
 
-def build(*args, n_worlds=1, n_drones=1, drone_pos=(-3.0, 0.0, 1.0), **kwargs):
+def build(members=1, size=(0.2, 0.2, 0.2), mass=0.1, n_worlds=1, n_drones=1, drone_pos=(-3.0, 0.0, 1.0), **kwargs):
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", freq=FREQ)
     sim.data = with_states(sim.data, pos=drone_pos)
     sim.build_default_data()
-    return sim, sim.add(FreeBodies(*args, **kwargs))
+    return sim, sim.add(FreeBodies(members, size=size, mass=mass, **kwargs))
 
 
 def mujoco_track(bodies, seconds, friction=0.6, record=5):
@@ -202,7 +202,7 @@ def test_drones_and_bodies_push_each_other():
 def test_an_object_moved_by_the_user_pushes_a_body():
     sim = Sim(control="rotor_vel")
     pusher = sim.scene.add("box", "pusher", size=(0.2, 0.2, 0.2), pos=(0, 0, 0.1))
-    plugin = sim.add(FreeBodies(1, (0.2, 0.2, 0.2), pos=(0.25, 0, 0.1)))
+    plugin = sim.add(FreeBodies(1, size=(0.2, 0.2, 0.2), pos=(0.25, 0, 0.1)))
     for k in range(100):
         sim.data = pusher.set_pose(sim.data, [0.002 * (k + 1), 0, 0.1], vel=[0.2, 0, 0])
         sim.step(5)
@@ -215,7 +215,9 @@ def test_objects_of_any_kind_carry_bodies():
     sim = Sim(control="rotor_vel")
     sim.scene.add("landing_pad", pos=(0, 0, 0.3), radius=0.4, mocap=False)
     sim.scene.add("sphere", pos=(3, 0, 0.2), radius=0.2, mocap=False)
-    plugin = sim.add(FreeBodies(3, [(0.2, 0.2, 0.2), 0.1, 0.1], pos=[[0, 0, 0.45], [0.25, 0, 0.45], [3.0, 0, 0.55]]))
+    plugin = sim.add(
+        FreeBodies(3, size=[(0.2, 0.2, 0.2), 0.1, 0.1], pos=[[0, 0, 0.45], [0.25, 0, 0.45], [3.0, 0, 0.55]])
+    )
     sim.step(1000)
     z = np.asarray(plugin.read(sim.data).pos)[0, :, 2]
     np.testing.assert_allclose(z, [0.4, 0.4, 0.5], atol=1e-3)
@@ -226,7 +228,7 @@ def test_bodies_rest_on_terrain():
     heights = np.concatenate([np.full((4, 3), 0.4), 0.4 + 0.3 * np.tile(np.arange(1.0, 4.0), (4, 1))], axis=1)
     sim = Sim(control="rotor_vel")
     sim.add(Terrain(heights, (5.0, 3.0)))
-    plugin = sim.add(FreeBodies(2, (0.2, 0.2, 0.1), pos=[[-1.5, 0, 0.5], [1.5, 0.1, 0.95]]))
+    plugin = sim.add(FreeBodies(2, size=(0.2, 0.2, 0.1), pos=[[-1.5, 0, 0.5], [1.5, 0.1, 0.95]]))
     sim.step(1000)
     body = plugin.read(sim.data)
     np.testing.assert_allclose(body.pos[0, 0], [-1.5, 0, 0.45], atol=1e-3)
@@ -301,9 +303,9 @@ def test_stages_see_the_bodies():
 
 @pytest.mark.parametrize("args, kwargs, message", [
     ((0,), {}, "expected members"),
-    ((2, [0.1]), {}, "a list of 2"),
-    ((1, (0.1, 0.2)), {}, "expected size"),
-    ((1, -0.1), {}, "expected size"),
+    ((2,), {"size": [0.1]}, "a list of 2"),
+    ((1,), {"size": (0.1, 0.2)}, "expected size"),
+    ((1,), {"size": -0.1}, "expected size"),
     ((1,), {"mass": 0.0}, "expected mass to be finite and positive"),
     ((1,), {"friction": -1.0}, "expected friction"),
     ((1,), {"restitution": 1.5}, "expected restitution"),
@@ -323,4 +325,4 @@ def test_law_09_wrong_settings_leave_the_simulation_as_it_was(args, kwargs, mess
 def test_law_09_one_plugin_holds_all():
     sim, _ = build(1)
     with pytest.raises(ConfigError, match="expected one FreeBodies"):
-        sim.add(FreeBodies(1), name="more")
+        sim.add(FreeBodies(["Ball_0"], name="more"))
