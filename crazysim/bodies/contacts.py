@@ -18,6 +18,7 @@ from crazysim.core.plugin import Simulation
 from crazysim.core.population import populations
 from crazysim.core.stage import over_worlds
 from crazysim.effects.ground import TerrainData
+from crazysim.geometry.linear import apply, matmul
 from crazysim.geometry.manifold import N_OF_BOXES
 from crazysim.scene.collision import CollisionGeom
 from crazysim.scene.report import choose
@@ -172,7 +173,7 @@ def drones_as_bodies(data: SimData) -> Bodies:
     """Return the drones of one world as bodies."""
     s, p, n = data.states, data.params, data.states.pos.shape[0]
     rot, inverse = rotation.matrix(s.quat), jnp.broadcast_to(p.J_inv, (n, 3, 3))
-    inverse = _product(_product(rot, inverse), jnp.swapaxes(rot, -1, -2))
+    inverse = matmul(matmul(rot, inverse), jnp.swapaxes(rot, -1, -2))
     inv_mass = jnp.broadcast_to(1 / p.mass, (n, 1))[:, 0]
     return Bodies(s.pos, s.vel, rotation.rotate(s.quat, s.ang_vel), inv_mass, inverse)
 
@@ -205,16 +206,11 @@ def _pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: Any) -> t
     """Return position and rotation matrix of a geom, world frame."""
     pos, quat, _, _ = _motion(data, carrier)
     rot = rotation.matrix(quat)
-    at = pos + rotation.matvec(rot, jnp.asarray(geom.pos, dtype))
-    return at, rot if geom.rot is None else _product(rot, jnp.asarray(geom.rot, dtype))
+    at = pos + apply(rot, jnp.asarray(geom.pos, dtype))
+    return at, rot if geom.rot is None else matmul(rot, jnp.asarray(geom.rot, dtype))
 
 
 def _turned(quat: Array, diagonal: Array) -> Array:
     """Return the matrices ``R diag(d) R^T``. (n, 3, 3)"""
     rot = rotation.matrix(quat)
-    return _product(rot * diagonal[:, None, :], jnp.swapaxes(rot, -1, -2))
-
-
-def _product(a: Array, b: Array) -> Array:
-    """Return ``a @ b`` by components: a GPU may round matrix products to 10 bits. (..., 3, 3)"""
-    return jnp.stack([rotation.matvec(a, b[..., k]) for k in range(3)], axis=-1)
+    return matmul(rot * diagonal[:, None, :], jnp.swapaxes(rot, -1, -2))

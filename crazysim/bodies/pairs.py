@@ -13,6 +13,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.bodies.solver import Contacts
 from crazysim.geometry import Shape, distance, point_distance
+from crazysim.geometry.linear import apply
 from crazysim.geometry.manifold import Manifold, ball_on_box, balls, boxes
 from crazysim.scene.collision import CollisionGeom
 
@@ -87,13 +88,13 @@ def on_surface(solids: Solids, number: int, geom: CollisionGeom, carrier: int, p
     shape = geom.shape
     if is_ball:
         radius = float(solids.size[number, 0])
-        gap, normal = _height(shape, rotation.matvec(turn.T, pos - at))
-        normal, gap = rotation.matvec(turn, normal), gap - radius
+        gap, normal = _height(shape, apply(turn.T, pos - at))
+        normal, gap = apply(turn, normal), gap - radius
         found = Manifold(gap[None], normal[None], (pos - normal * (radius + 0.5 * gap))[None])
     else:
-        corners = pos + rotation.matvec(rot, jnp.asarray(CORNERS * solids.size[number], dtype))
-        gap, normal = _height(shape, rotation.matvec(turn.T, corners - at))
-        found = Manifold(gap, rotation.matvec(turn, normal), corners)
+        corners = pos + apply(rot, jnp.asarray(CORNERS * solids.size[number], dtype))
+        gap, normal = _height(shape, apply(turn.T, corners - at))
+        found = Manifold(gap, apply(turn, normal), corners)
         if shape.kind != "plane":
             nearest = _nearest(Shape("box", tuple(map(float, solids.size[number]))), pos, rot, shape, at, turn)
             found = Manifold(*(jnp.concatenate(x) for x in zip(found, nearest, strict=True)))
@@ -110,7 +111,7 @@ def on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> Found
         gap = gap - radius
         found = Manifold(gap, normal, pos - normal * (radius + 0.5 * gap[:, None]))
     else:
-        corners = pos + rotation.matvec(rot, jnp.asarray(CORNERS * solids.size[number], pos.dtype))
+        corners = pos + apply(rot, jnp.asarray(CORNERS * solids.size[number], pos.dtype))
         found = Manifold(*gap_at(corners), corners)
     n = found.gap.shape[0]
     return Found(np.full(n, solids.body[number]), np.full(n, carrier), found)
@@ -141,13 +142,13 @@ def _nearest(box: Shape, pos: Array, rot: Array, shape: Shape, at: Array, turn: 
 
     def gap_at(move: Array, turned: Array) -> Array:
         spun = rot + jnp.stack([rotation.cross(turned, rot[:, k]) for k in range(3)], axis=-1)
-        columns = [rotation.matvec(turn.T, spun[:, k]) for k in range(3)]
-        return distance(box, shape, rotation.matvec(turn.T, pos + move - at), jnp.stack(columns, axis=-1))
+        columns = [apply(turn.T, spun[:, k]) for k in range(3)]
+        return distance(box, shape, apply(turn.T, pos + move - at), jnp.stack(columns, axis=-1))
 
     gap, pull = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
     normal, torque = pull(jnp.ones_like(gap))
     half = jnp.asarray(box.size, pos.dtype)
-    reach = jnp.sum(jnp.abs(rotation.matvec(rot.T, normal)) * half)
+    reach = jnp.sum(jnp.abs(apply(rot.T, normal)) * half)
     point = pos + rotation.cross(normal, torque) - reach * normal
     return Manifold(gap[None], normal[None], point[None])
 

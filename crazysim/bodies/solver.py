@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.geometry.linear import apply
 from crazysim.scene.impulse import FASTEST_PUSH, SLOW
 
 NEAR = 1e-3
@@ -99,7 +100,7 @@ def solve_contacts(
         """Return the velocities after impulses on the first bodies, and against the second."""
         force = _gather(sums[0], impulse) - _gather(sums[1], impulse)
         torque = _gather(sums[0], rotation.cross(arm_a, impulse)) - _gather(sums[1], rotation.cross(arm_b, impulse))
-        turned = rotation.matvec(bodies.inv_inertia, torque)
+        turned = apply(bodies.inv_inertia, torque)
         return bodies.vel + bodies.inv_mass[:, None] * force, bodies.ang_vel + turned
 
     out = rotation.dot(slip(bodies.vel, bodies.ang_vel), normal)[:, 0]
@@ -114,9 +115,9 @@ def solve_contacts(
     for numbers, arm in ((a, arm_a), (b, arm_b)):
         inverse, inv_mass = bodies.inv_inertia[numbers], bodies.inv_mass[numbers]
         turn = rotation.cross(arm, normal)
-        of_normal = inv_mass + rotation.dot(turn, rotation.matvec(inverse, turn))[:, 0]
+        of_normal = inv_mass + rotation.dot(turn, apply(inverse, turn))[:, 0]
         trace = jnp.trace(inverse, axis1=-2, axis2=-1) * rotation.dot(arm, arm)[:, 0]
-        trace = trace - rotation.dot(arm, rotation.matvec(inverse, arm))[:, 0] + 3 * inv_mass
+        trace = trace - rotation.dot(arm, apply(inverse, arm))[:, 0] + 3 * inv_mass
         along = along + parts[numbers] * of_normal
         across = across + parts[numbers] * (trace - of_normal)
     along, across = COUPLED * along, COUPLED * across

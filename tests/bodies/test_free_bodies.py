@@ -208,7 +208,8 @@ def test_an_object_moved_by_the_user_pushes_a_body():
         sim.step(5)
     body = plugin.read(sim.data)
     np.testing.assert_allclose(body.pos[0, 0], [0.4, 0, 0.1], atol=3e-3)
-    np.testing.assert_allclose(body.vel[0, 0, 0], 0.2, atol=0.02)
+    # between two poses of the object friction may brake for five steps
+    np.testing.assert_allclose(body.vel[0, 0, 0], 0.2, atol=5 * 0.6 * 9.81 / FREQ)
 
 
 def test_objects_of_any_kind_carry_bodies():
