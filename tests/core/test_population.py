@@ -207,7 +207,8 @@ def test_an_independent_population_costs_the_drones_nothing():
     for target in ("cuda", "host"):
         assert _source(programs[0], target) == _source(plan.program, target)
         assert _source(programs[1], target) != _source(plan.program, target)
-    assert len(plan.programs) == programs[1].group == 1
+    assert len(plan.programs) == 1
+    assert programs[1].group == 1
     assert "fused, for one member of 'springs': springs_control, springs_integration" in beside.explain()
 
 
