@@ -42,7 +42,8 @@ class Touching:
         """Collect the solids of the scene as they are now."""
         self.plugin, self.shapes = plugin, plugin.shapes
         self.n_drones = sim.n_drones if plugin.drones else 0
-        self.box = np.asarray(sim.airframe.value("shape.collision_box"), np.float64)
+        boxes = [airframe.value("shape.collision_box") for airframe in sim.airframes]
+        self.boxes = np.asarray(boxes, np.float64)
         model = sim.scene.collision_model
         self.carriers = [Carrier(None, None, tuple(model.floor))] if model.floor else []
         kinds = {kind: p for p in sim.scene.plugins() for kind in p.placed_kinds or ()}
@@ -112,8 +113,8 @@ class Touching:
         if self.n_drones:
             owners += range(n_free, n_free + self.n_drones)
             balls += [False] * self.n_drones
-            sizes += [self.box[3:]] * self.n_drones
-            pos.append(s.pos + rotation.rotate(s.quat, jnp.asarray(self.box[:3], dtype)))
+            sizes += list(self.boxes[:, 3:])
+            pos.append(s.pos + rotation.rotate(s.quat, jnp.asarray(self.boxes[:, :3], dtype)))
             rot.append(rotation.matrix(s.quat))
         for k, carrier in enumerate(self.carriers):
             for geom in carrier.geoms:
