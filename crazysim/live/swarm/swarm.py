@@ -84,7 +84,7 @@ class Swarm(Closing):
         self.colors, self.reports = np.zeros((len(names), 3)), Reports()
         self.listeners: list[Callable[[], Any]] = []
         self._period = sim.freq // sim.control_freq
-        self._size = {Control.state: 16, Control.rotor_vel: sim.airframe.n_rotors}.get(sim.control, 4)
+        self._size = {Control.state: 16, Control.rotor_vel: sim.data.controls.rotor_vel.shape[-1]}.get(sim.control, 4)
         self._motors = self._add_motors()
         self._on = np.ones(len(names), bool)
         self._states: list[DroneState] = []
