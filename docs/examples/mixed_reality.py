@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from crazysim import Cars, SharedLoad, Sim
+from crazysim import Cars, SharedLoad, Sim, vehicles
 from crazysim.live import FunctionSource, Live, ReplaySource, Twin, Twins
 from crazysim.trajectories import figure_eight
-from crazysim.vehicles import PathLQR
 
 SECONDS = 8.0
 
@@ -42,7 +41,7 @@ def build():
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[0].set(ring)))
     sim.build_default_data()
     load = sim.add(SharedLoad(mass=0.15, length=1.0))
-    cars = sim.add(Cars(2, path=figure_eight(6.0, 2.0, period=14.0), controller=PathLQR()))
+    cars = sim.add(Cars(2, path=figure_eight(6.0, 2.0, period=14.0), controller=vehicles.PathLQR()))
     return sim, ring, load, cars
 
 
