@@ -18,6 +18,7 @@ from crazysim.sim.sim import Sim
 from crazysim.version import __version__
 
 if TYPE_CHECKING:
+    from crazysim.bodies import DroneCollisions, FreeBodies
     from crazysim.core import functional as functional
     from crazysim.envs import make
     from crazysim.payloads import Hook, RotorJet, SharedLoad, SlungLoad
@@ -43,8 +44,10 @@ __all__ = [
     "Controller",
     "Downwash",
     "Drone",
+    "DroneCollisions",
     "Dynamics",
     "Follow",
+    "FreeBodies",
     "GroundEffect",
     "Hook",
     "Integrator",
@@ -80,7 +83,9 @@ __getattr__ = lazy(
         "Cars": "crazysim.vehicles",
         "ContactLog": "crazysim.scene.contact_log",
         "ContactResponse": "crazysim.scene.response",
+        "DroneCollisions": "crazysim.bodies",
         "Follow": "crazysim.trajectories",
+        "FreeBodies": "crazysim.bodies",
         "Hook": "crazysim.payloads",
         "MPPI": "crazysim.sim.mppi",
         "RotorJet": "crazysim.payloads",
