@@ -233,19 +233,19 @@ def _smallest(gaps: list[Array], pos: Array) -> Array:
 def _to_others(own: Own, drone_rot: Array | None) -> Array:
     """Return the distance of one drone to the nearest other of its world, m. ()"""
 
-    def between(other: tuple[list[tuple[Array, Array | None]], Array | None], is_self: Array) -> Array:
-        theirs, rot = other
+    def between(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
+        places, theirs, rot = other
         inverse = None if rot is None else rot.T
         turned = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
         gaps = []
         for mine, at, has in own:
-            for (geom, _, _), (there, other_has) in zip(own, theirs, strict=True):
-                both = None if has is None or other_has is None else has & other_has
+            for (geom, *_), there, other_has in zip(own, places, theirs, strict=True):
                 inside = at - there if inverse is None else rotation.matvec(inverse, at - there)
+                both = None if has is None or other_has is None else has & other_has
                 gaps.append(_of(both, distance(mine.shape, geom.shape, inside, turned)))
         return jnp.where(is_self, jnp.inf, _smallest(gaps, own[0][1]))
 
-    return reduce_over_others(between, ([(at, has) for _, at, has in own], drone_rot), "min")
+    return reduce_over_others(between, ([at for _, at, _ in own], [has for *_, has in own], drone_rot), "min")
 
 
 def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:

@@ -185,21 +185,6 @@ def test_an_inner_vmap_and_an_influence_may_reduce():
             np.testing.assert_allclose(found.vel, expected.vel, rtol=1e-5, atol=1e-6, err_msg=engine)
 
 
-@pytest.mark.parametrize("n_drones", [3, 9])
-def test_law_08_gradients_are_those_of_plain(n_drones):
-    sim = simulation(2, n_drones)
-    sim.add(Downwash())
-
-    def loss(step, pos):
-        data = step(sim.data.replace(states=sim.data.states.replace(pos=pos)), 3)
-        return jnp.sum(data.states.vel**2) + jnp.sum(data.plugins["downwash"].air_vel ** 2)
-
-    expected = jax.grad(lambda pos: loss(Step(sim.step_pipeline, "plain"), pos))(sim.data.states.pos)
-    for engine in set(ENGINES) - {"interpret"}:
-        found = jax.grad(lambda pos, e=engine: loss(Step(sim.step_pipeline, e), pos))(sim.data.states.pos)
-        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
-
-
 def test_law_09_wrong_uses_are_errors():
     with pytest.raises(ConfigError, match="expected reduce_over_others in a function of one drone"):
         reduce_over_others(lambda other, me: other, jnp.ones(3))
