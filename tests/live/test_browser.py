@@ -33,7 +33,7 @@ def sim(plain_scene):
 
 @pytest.fixture(scope="module")
 def chromium(tmp_path_factory):
-    browser = start_browser(tmp_path_factory.mktemp("browser"), width=1400, height=700)
+    browser = start_browser(tmp_path_factory.mktemp("browser"), width=1100, height=500)
     yield browser
     browser.close()
 
