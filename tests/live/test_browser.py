@@ -16,6 +16,7 @@ from crazysim.live.browser_scene import grid_offsets
 from crazysim.live.picture import PictureSource, quantities, quantity
 from crazysim.media.web import FOV
 from crazysim.sim import Sim
+from crazysim.vehicles import Cars
 
 MAGENTA = (1, 0, 1)
 
@@ -202,7 +203,18 @@ def test_a_picture_has_what_is_drawn():
     np.testing.assert_allclose(source.take(live, "double").plot, [2.0])
     assert "0.00 s" in picture.status
     assert picture.name == sim.drone_names[0]
-    assert {"states.pos", "states.rotor_vel", "controls.state.cmd"} <= set(quantities(sim))
-    assert "core.steps" not in quantities(sim)
+    assert {"states.pos", "states.rotor_vel", "controls.state.cmd", "core.steps"} <= set(quantities(sim))
+    np.testing.assert_allclose(quantity(sim.data, "states.pos", 2, 1)[2], 5.0)
     with pytest.raises(KeyError):
-        quantity(sim.data, "states.nothing")
+        quantity(sim.data, "states.nothing", 0, 0)
+
+
+def test_quantities_of_members():
+    """Two cars beside two drones: scopes, not counts, say which numbers are whose."""
+    sim = Sim(n_drones=2, control="state")
+    sim.add(Cars(["Fleet1Tenth_0", "Fleet1Tenth_1"]))
+    names = quantities(sim)
+    assert "plugins.cars.pos[1]" in names
+    assert "plugins.cars.pos" not in names
+    pos = np.asarray(sim.data.plugins["cars"].pos)[0, 1]
+    np.testing.assert_allclose(quantity(sim.data, "plugins.cars.pos[1]", 0, 0), pos)
