@@ -156,7 +156,7 @@ def _leaves(data: SimData) -> list[tuple[str, str, jax.Array]]:
     """Return path, scope and value of every leaf that holds numbers."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(data)
     named = zip(leaves, jax.tree.leaves(scopes(data)), strict=True)
-    return [(_path(path), scope, x) for (path, x), scope in named if getattr(x.dtype, "kind", "") in ("f", "i", "u", "b")]
+    return [(_path(path), scope, x) for (path, x), scope in named if getattr(x.dtype, "kind", "O") in "fiub"]
 
 
 def _path(path: Any) -> str:
