@@ -28,11 +28,14 @@ if TYPE_CHECKING:
     from crazysim.scene.terrain import Terrain
     from crazysim.sim.mppi import MPPI
     from crazysim.trajectories import Follow
+    from crazysim.vehicles import Bicycles, Cars
 
 __all__ = [
     "MPPI",
     "Airframe",
     "Battery",
+    "Bicycles",
+    "Cars",
     "ConfigError",
     "ContactLog",
     "ContactResponse",
@@ -73,6 +76,8 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
+        "Bicycles": "crazysim.vehicles",
+        "Cars": "crazysim.vehicles",
         "ContactLog": "crazysim.scene.contact_log",
         "ContactResponse": "crazysim.scene.response",
         "Follow": "crazysim.trajectories",

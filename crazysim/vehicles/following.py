@@ -72,7 +72,7 @@ def path_state(state: CarState, path: Path, index: Array, guess: Array, ahead: A
         speed, lag = path.speed_at(index, arc), jnp.zeros_like(guess)
     else:
         reference, speed = path.time_reference(index, time)
-        lag = sign * (reference - arc)
+        lag = sign * (reference - arc) + ahead  # of the centre of mass
     return PathState(
         path=path,
         index=index,

@@ -172,7 +172,7 @@ def test_wheels_roll_and_steer_in_the_scene():
 
 
 def test_contacts_of_drones_name_the_car():
-    sim, cars = build(2, pos=(0, 0))
+    sim, _ = build(2, pos=(0, 0))
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[1, 0].set(jnp.array([0.0, 0.0, 0.1]))))
     report = sim.contact_report()

@@ -11,6 +11,7 @@ from crazysim import ConfigError
 from crazysim.trajectories import circle, figure_eight, hover, line, spline
 from crazysim.vehicles import Path
 
+STRAIGHT = spline([0, 1], [(0, 0, 0), (1, 0, 0)])
 SQUARE = [(0, 0), (2, 0), (2, 2), (0, 2)]
 
 
@@ -128,11 +129,11 @@ def test_slots_hold_paths_of_any_length():
         (lambda: Path.of_trajectory(hover((0, 0, 1), 2.0)), "of some length"),
         (lambda: Path.stack([]), "at least one path"),
         (
-            lambda: Path.of_trajectory(spline([0, 1], [(0, 0, 0), (1, 0, 0)]).then(spline([0, 1], [(1, 0, 0), (0, 1, 0)]))),
+            lambda: Path.of_trajectory(STRAIGHT.then(spline([0, 1], [(1, 0, 0), (0, 1, 0)]))),
             "without a tangent",
         ),
         (
-            lambda: Path.of_trajectory(spline([0, 1], [(0, 0, 0), (1, 0, 0)]).replace(repeats=np.bool_(True))),
+            lambda: Path.of_trajectory(STRAIGHT.replace(repeats=np.bool_(True))),
             "a gap of 1 m",
         ),
     ],
