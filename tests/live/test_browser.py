@@ -43,7 +43,7 @@ def chromium(tmp_path_factory):
 def live(sim):
     """A running loop, paused, with a page."""
     sim.reset()
-    live = Live(sim)
+    live = Live(sim, fps=10)  # the browser of the tests draws without a GPU
     live.command[..., 2] = 1.0
     live.selected = None
     live.paused = True
