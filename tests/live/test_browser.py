@@ -147,7 +147,7 @@ def test_a_page_is_watched_and_used(viser, chromium, live):
         live.post(lambda live: live.advance(5))
         wait_for(lambda: live.step == press_again + 5)
         chromium.call("Page.navigate", url=page.url)
-        wait_for(lambda: page.n_clients == 1 and len(chromium.mask(MAGENTA)[0]) > 40)
+        wait_for(lambda: page.n_clients == 1 and len(chromium.mask(MAGENTA)[0]) > 40, 120)
     assert not page.is_open
 
 
