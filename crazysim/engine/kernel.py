@@ -34,6 +34,8 @@ class Kernel:
     """Leaves of rows that it updates in place: input and output of each must be the same memory."""
     group: int = 1
     """Neighbouring drones that must be in one warp or vector, because they read each other's numbers."""
+    samples: tuple[int, ...] = ()
+    """Leaves of which it also writes samples, behind all other outputs."""
 
     def aliases(self) -> dict[int, int]:
         """Return the result that each operand in place is, by number; two numbers precede the operands."""
@@ -58,8 +60,16 @@ def epilogue(target: str) -> str:
     return resources.files("crazysim.engine").joinpath("targets", "host_call.h").read_text()
 
 
-def write(program: Program, target: str) -> Kernel:
+def write(program: Program, target: str, samples: Sequence[int] = ()) -> Kernel:
     """Return the source of a program for ``cuda`` or ``host``.
+
+    A kernel takes the number of steps as an array of one number. One that writes samples takes a second number, and
+    repeats the steps that often: after each repetition it writes the sampled leaves.
+
+    Args:
+        program: The program.
+        target: ``"cuda"`` or ``"host"``.
+        samples: Leaves of drones or worlds to sample, which the program writes.
 
     Raises:
         UnsupportedError: If there is no source for an operation or a type; the error names the stage.
@@ -92,10 +102,19 @@ def write(program: Program, target: str) -> Kernel:
             writer.line(f"const auto {names[slot]} = {access};", 1)
     _write_phase(writer, program, "first", names, 1)
     hoisted = [writer.block(s.hoisted, [names[slot] for slot in s.hoisted_reads], 1) for s in each]
+    if samples:
+        writer.line("for (int sample = 0; sample < n_samples; ++sample) {", 1)
     writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
     for segment, constants in zip(each, hoisted, strict=True):
         _write_segment(writer, program, segment, names, constants, 2)
     writer.line("}", 1)
+    for leaf in samples:
+        kind, size, n_drones = _type(program, leaf), program.leaves[leaf].size, _drones(program, leaf)
+        writer.line(f"{kind}* const r{leaf} = s{leaf} + sample * (n_lanes / {n_drones} * {size}ll);", 1)
+        for k in range(size):
+            writer.line(f"STORE({size}, {n_drones}, r{leaf}, {k}, {kind}_lanes({names[leaf, k]}))", 1)
+    if samples:
+        writer.line("}", 1)
     if check is not None:
         (flagged,) = writer.block(check.block, [names[slot] for slot in checked], 1)
         writer.line(f"STORE(1, 1, flagged, 0, b1_lanes({flagged}))", 1)
@@ -106,13 +125,16 @@ def write(program: Program, target: str) -> Kernel:
     pointers = [f"const {_type(program, i)}* __restrict__ p{i}" for i in inputs]
     pointers += [f"{_type(program, i)}* __restrict__ q{i}" for i in outputs]
     pointers += ["b1* __restrict__ flagged"] if check is not None else []
+    pointers += [f"{_type(program, i)}* __restrict__ s{i}" for i in samples]
     frame = {"cuda": _cuda, "host": _host}[target]
     widest = 8 if any(_type(program, i) == "f64" for i in (*inputs, *outputs)) else 4
-    defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n"
+    n_operations = sum(s.n_operations for s in each)
+    defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n#define OPERATIONS {n_operations}\n"
+    defines += f"#define SAMPLES {'count[1]' if samples else 1}\n"
     tables = "".join(f"{line}\n" for line in writer.tables)
     text = defines + preamble(target) + tables + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
     in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
-    return Kernel(text, inputs, outputs, in_place, program.group)
+    return Kernel(text, inputs, outputs, in_place, program.group, tuple(samples))
 
 
 def _require(program: Program) -> None:
@@ -250,7 +272,7 @@ def _cuda(pointers: Sequence[str], body: str) -> str:
     arguments = ", ".join([*scalars, *pointers])
     return f"""
 extern "C" __global__ void __launch_bounds__({BLOCK}, {UNBOUNDED}) advance({arguments}) {{
-  const int n_lanes = sizes[0], n_steps = count[0];
+  const int n_lanes = sizes[0], n_steps = count[0], n_samples = SAMPLES;
   const int thread = blockIdx.x * {BLOCK} + threadIdx.x;
   const int wanted = thread / 32 * LANES + thread % 32;
   const bool active = thread % 32 < LANES && wanted < n_lanes;
@@ -268,7 +290,7 @@ def _host(pointers: Sequence[str], body: str) -> str:
     buffers = [f"({kind}*)in[{k + 2}]->data" if k < n_in else f"({kind}*)out[{k - n_in}]->data"
                for k, kind in enumerate(kinds)]  # fmt: skip
     return f"""
-static void advance_block(int64_t first, int64_t n_lanes, int n_steps, {arguments}) {{
+static void advance_block(int64_t first, int64_t n_lanes, int n_steps, int n_samples, {arguments}) {{
   const int n_active = n_lanes - first < LANES ? int(n_lanes - first) : LANES;
   const i32v own = numbers() % GROUP;
 {body}
@@ -276,11 +298,12 @@ static void advance_block(int64_t first, int64_t n_lanes, int n_steps, {argument
 
 static void advance(XLA_FFI_Buffer** in, XLA_FFI_Buffer** out) {{
   const int64_t n_lanes = *(int*)in[0]->data;
-  const int n_steps = *(int*)in[1]->data;
+  const int* count = (int*)in[1]->data;
+  const int n_steps = count[0], n_samples = SAMPLES;
   const auto run = [=](int64_t begin, int64_t end) {{
     for (int64_t first = begin; first < end; first += LANES)
-      advance_block(first, n_lanes, n_steps, {", ".join(buffers)});
+      advance_block(first, n_lanes, n_steps, n_samples, {", ".join(buffers)});
   }};
-  in_parallel(n_lanes, n_steps, run);
+  in_parallel(n_lanes, int64_t(n_steps) * n_samples, run);
 }}
 """

@@ -329,7 +329,7 @@ template <class F> static void* work(void* share) {
   (*s->run)(s->from, s->to);
   return nullptr;
 }
-template <class F> static void in_parallel(int64_t n_lanes, int n_steps, const F& run) {
+template <class F> static void in_parallel(int64_t n_lanes, int64_t n_steps, const F& run) {
   const int most = 256;
   const int64_t n_blocks = (n_lanes + LANES - 1) / LANES, worth = n_blocks * (n_steps + 1) / 512;
   const int64_t n_threads = worth < 2 ? 1 : least(least(n_cores(), most), worth);
