@@ -322,6 +322,10 @@ static int64_t n_cores() {  // that this process may use
 #endif
   return sysconf(_SC_NPROCESSORS_ONLN);
 }
+// Operations on a block that are worth a thread: some 50 us, as a sleeping core takes up to 100 us to wake. Loading and
+// storing a block takes as long as some steps.
+#define WORTH_A_THREAD (1 << 19)
+#define IO_STEPS 8
 static int64_t least(int64_t a, int64_t b) { return b < a ? b : a; }
 template <class F> struct Share { const F* run; int64_t from, to; pthread_t thread; bool begun; };
 template <class F> static void* work(void* share) {
@@ -331,7 +335,8 @@ template <class F> static void* work(void* share) {
 }
 template <class F> static void in_parallel(int64_t n_lanes, int64_t n_steps, const F& run) {
   const int most = 256;
-  const int64_t n_blocks = (n_lanes + LANES - 1) / LANES, worth = n_blocks * (n_steps + 1) / 512;
+  const int64_t n_blocks = (n_lanes + LANES - 1) / LANES;
+  const int64_t worth = n_blocks * (n_steps + IO_STEPS) * OPERATIONS / WORTH_A_THREAD;
   const int64_t n_threads = worth < 2 ? 1 : least(least(n_cores(), most), worth);
   const auto bound = [=](int64_t k) { return least(n_lanes, n_blocks * k / n_threads * LANES); };
   Share<F> shares[most];
