@@ -119,9 +119,7 @@ def chosen_anew(jaxpr, least):
         for v in jaxpr.jaxpr.outvars:
             count[v] = count.get(v, 0.0) + v.aval.size
         for node in reversed(nodes):
-            n_results = sum(
-                count.get(v, 0.0) if node.fused and v not in found else v.aval.size for v in node.results
-            )
+            n_results = sum(count.get(v, 0.0) if node.fused and v not in found else v.aval.size for v in node.results)
             for v, n in node.operands:
                 count[v] = count.get(v, 0.0) + n_results * n
         best, most = None, 0.0
