@@ -23,7 +23,7 @@ CORE_NDIM_KEY = "core_ndim"
 T = TypeVar("T")
 
 
-def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None) -> Any:
+def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None, *, sparse: bool = False) -> Any:
     """Declare an array field, or a dict of such arrays.
 
     Args:
@@ -33,8 +33,10 @@ def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None) 
         core_ndim: Number of dimensions of the core shape.
         core: The core shape, if it is fixed. It keeps one mass for each of three worlds from passing for one along
             each of three axes.
+        sparse: True for a parameter whose zeros are terms that are absent, as an offset along one axis has. While it is
+            shared, a step is compiled without them, and again after one of them changes.
     """
-    return dataclasses.field(metadata={"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core})
+    return dataclasses.field(metadata={"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse})
 
 
 def static(**kwargs: Any) -> Any:
@@ -74,6 +76,11 @@ def scopes(tree: Any) -> Any:
     its first axis is over worlds, and stages receive it like an opaque leaf.
     """
     return _map_declared(lambda x, metadata, _: _scope(x, metadata), tree, {}, "")
+
+
+def sparse_leaves(tree: Any) -> Any:
+    """Return the same tree with True in the place of every leaf that is declared sparse, and False elsewhere."""
+    return _map_declared(lambda x, metadata, _: bool(metadata.get("sparse")), tree, {}, "")
 
 
 def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:

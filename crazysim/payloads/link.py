@@ -150,8 +150,8 @@ def couple(
     r, m = relative(s, pos, vel, link.attach), link.mass
     out = dot(r.direction, r.vel)
     attach_acc = acceleration_at(s, deriv, r.rot, link.attach, 1.0 if dt is None else 0.5)
-    damped = None if link.damping is None else _damping(s, r, link, freq)
-    rel_acc = free_acc - attach_acc if damped is None else free_acc + damped - attach_acc
+    damped = None if link.damping is None else _damping(s, r, out, link, freq)
+    rel_acc = free_acc - attach_acc
 
     first = Pull.create(r.direction, r.rot, J_inv, link.attach)
     # Of equal directions: their product is 1 but for rounding.
@@ -212,11 +212,14 @@ def _swing(s: SimState, r: Relative) -> tuple[Array, Array]:
     return ang_vel, r.vel - cross(ang_vel, r.offset)
 
 
-def _damping(s: SimState, r: Relative, link: Link, freq: int) -> Array:
-    """Return the acceleration of the tip by the damped joint; implicit in time, so that it cannot reverse a motion."""
+def _damping(s: SimState, r: Relative, out: Array, link: Link, freq: int) -> Array:
+    """Return the acceleration of the tip by the damped joint; implicit in time, so that it cannot reverse a motion.
+
+    It is across the link: a turn of the body moves the tip across it too, so that ``out`` is the speed along it.
+    """
     swing = _swing(s, r)[1]
     stiff = link.damping / (link.length * link.length)  # type: ignore[operator]
-    return -stiff / (link.mass + stiff / freq + TINY) * (swing - dot(r.direction, swing) * r.direction)
+    return -stiff / (link.mass + stiff / freq + TINY) * (swing - out * r.direction)
 
 
 def _radial(r: Relative, out: Array, free: Array, link: Link, dt: float | None, freq: int) -> Array:

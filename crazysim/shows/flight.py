@@ -139,5 +139,5 @@ def _pose(data: SimData) -> tuple[Array, Array]:
 @jax.jit
 def _planned(trajectories: Trajectory, times: Array) -> Array:
     """Return planned positions, m. (n, n_drones, 3)"""
-    of_all = jax.vmap(lambda trajectory, t: trajectory.evaluate(t).pos, in_axes=(0, None))
+    of_all = jax.vmap(lambda trajectory, t: trajectory.derivatives(t, 0)[0][:3], in_axes=(0, None))
     return jax.vmap(of_all, in_axes=(None, 0))(trajectories, times)
