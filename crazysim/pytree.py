@@ -80,7 +80,7 @@ def scopes(tree: Any) -> Any:
 
 def sparse_leaves(tree: Any) -> Any:
     """Return the same tree with True in the place of every leaf that is declared sparse, and False elsewhere."""
-    return _map_declared(lambda x, metadata, _: bool(metadata.get("sparse")), tree, {}, "")
+    return _map_declared(lambda _, metadata, __: bool(metadata.get("sparse")), tree, {}, "")
 
 
 def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
