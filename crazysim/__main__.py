@@ -33,12 +33,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="play a recorded flight in a browser",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    replay.add_argument("flight", type=Path, help="flight saved by crazysim.media.Flight, an .npz file")
+    replay.add_argument("flight", type=Path, help="flight saved by crazysim.media.Flight or recorded live")
     replay.add_argument("--world", type=int, help="world to show; by default the first that was recorded")
     replay.add_argument("--port", type=int, default=8080, help="port of the server; 0 for any free port")
     replay.add_argument("--host", default="127.0.0.1", help="address of the server; 0.0.0.0 to accept other machines")
     replay.add_argument("--export", type=Path, metavar="FILE", help="write the page to an .html file instead")
     _add_show(commands)
+    _add_live(commands)
     _add_training(commands)
     options = parser.parse_args(arguments)
     if options.command is None:
@@ -74,6 +75,34 @@ def _add_show(commands: Any) -> None:
     show.add_argument("--drone", help="airframe; by default that of Sim")
     show.add_argument("--controller", help="controller that follows the trajectories; by default that of Sim")
     show.add_argument("--device", default="cpu", help="device: cpu, gpu")
+
+
+def _add_live(commands: Any) -> None:
+    """Add the command that flies live."""
+    live = commands.add_parser(
+        "live",
+        help="fly in real time: watch, pilot, command and record; print the factor of real time",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    live.add_argument("--drones", type=int, default=4, help="drones in each world")
+    live.add_argument("--worlds", type=int, default=1, help="number of worlds")
+    live.add_argument("--seconds", type=float, help="simulated time, s; by default until the viewer is closed")
+    live.add_argument("--speed", default="1", help="simulated seconds per second, or max for as fast as possible")
+    live.add_argument("--window", action="store_true", help="show a window; the default where there is a screen")
+    live.add_argument("--browser", action="store_true", help="show a page; the default without a screen")
+    live.add_argument("--headless", action="store_true", help="show nothing")
+    live.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any free port")
+    live.add_argument("--host", default="127.0.0.1", help="address of the page; 0.0.0.0 to accept other machines")
+    live.add_argument("--fps", type=float, default=50.0, help="pictures per second")
+    live.add_argument("--control-freq", type=int, default=100, help="control steps per simulated second")
+    live.add_argument("--freq", type=int, default=500, help="physics steps per simulated second")
+    live.add_argument("--record", type=Path, metavar="FILE", help="file to record to, for crazysim replay")
+    live.add_argument("--pilot", action="store_true", help="pilot the first drone: arrow keys, W, S, A, D, clicks")
+    live.add_argument("--gamepad", action="store_true", help="pilot the first drone by gamepad and keyboard")
+    live.add_argument("--commands", action="store_true", help="listen for commands over TCP, at ports 7000 and 7002")
+    live.add_argument("--drone", help="airframe; by default that of Sim")
+    live.add_argument("--controller", help="controller of the setpoints; by default that of Sim")
+    live.add_argument("--device", help="device: cpu, gpu; by default cpu")
 
 
 def _listed(names: Mapping[str, str]) -> str:
@@ -173,6 +202,12 @@ def _show(options: argparse.Namespace) -> None:
             serve_page(html, options.port, options.host)
 
 
+def _live(options: argparse.Namespace) -> None:
+    from crazysim.live.program import run
+
+    run(options)
+
+
 def _pairs(texts: Sequence[str]) -> dict[str, Any]:
     """Return NAME=VALUE pairs as a dict; a value that is not JSON is a string."""
     pairs = {}
@@ -257,6 +292,7 @@ COMMANDS = {
     "demo": _demo,
     "replay": _replay,
     "show": _show,
+    "live": _live,
     "train": _train,
     "evaluate": _evaluate,
     "export": _export,

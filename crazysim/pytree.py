@@ -13,30 +13,40 @@ from jax import Array
 
 from crazysim.errors import ConfigError
 
-Scope = Literal["drone", "world", "batched", "shared", "opaque", "parameter"]
+Scope = Literal["drone", "member", "world", "batched", "shared", "opaque", "parameter"]
 
-PER_WORLD = ("drone", "world", "batched")
-"""Scopes of leaves that have a first axis over worlds, as ``scopes`` returns them."""
+WITHOUT_MEMBERS = ("world", "batched", "shared", "opaque")
+"""Scopes that ``scopes`` returns for leaves of no population; any other is ``drone`` or the name of a population."""
 CORE_NDIM_KEY = "core_ndim"
 """Key under which the metadata of a field give the number of dimensions without batch axes; Crazyflow's key too."""
 
 T = TypeVar("T")
 
 
-def leaf(scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None, *, sparse: bool = False) -> Any:
+def leaf(
+    scope: Scope,
+    core_ndim: int = 0,
+    core: tuple[int, ...] | None = None,
+    *,
+    sparse: bool = False,
+    default: Any = dataclasses.MISSING,
+) -> Any:
     """Declare an array field, or a dict of such arrays.
 
     Args:
-        scope: Batch axes of the array. ``drone``: (n_worlds, n_drones, *core). ``world``: (n_worlds, 1, *core).
-            ``batched``: (n_worlds, ...), with any further axes. ``shared``: core. ``parameter``: shared or drone, by
-            its number of dimensions. ``opaque``: undeclared; masked resets and sharding do not change it.
+        scope: Batch axes of the array. ``drone``: (n_worlds, n_drones, *core). ``member``, in a record of a population
+            (``Members``): (n_worlds, n_members, *core). ``world``: (n_worlds, 1, *core). ``batched``: (n_worlds, ...),
+            with any further axes. ``shared``: core. ``parameter``: shared, or one per drone (or member), by its number
+            of dimensions. ``opaque``: undeclared; masked resets and sharding do not change it.
         core_ndim: Number of dimensions of the core shape.
         core: The core shape, if it is fixed. It keeps one mass for each of three worlds from passing for one along
             each of three axes.
         sparse: True for a parameter whose zeros are terms that are absent, as an offset along one axis has. While it is
             shared, a step is compiled without them, and again after one of them changes.
+        default: Value of the field where none is given.
     """
-    return dataclasses.field(metadata={"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse})
+    metadata = {"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 def static(**kwargs: Any) -> Any:
@@ -68,19 +78,49 @@ class PyTree:
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
 
 
+class Members(PyTree):
+    """Base class of records of a population: all things of one kind in a world, such as cars.
+
+    The name of the population is the scope of its leaves, those of records within it included.
+    """
+
+    population: str = static()
+    """Name of the population."""
+    n_members: int = static()
+    """Number of members in each world."""
+    member_id: Array = leaf("member")
+    """Index of the member in its world; enters its random numbers. (n_worlds, n_members)"""
+
+
+def has_members(scope: str) -> bool:
+    """Return True for the scope of leaves with axes (n_worlds, n_members): ``drone``, or the name of a population."""
+    return scope not in WITHOUT_MEMBERS
+
+
+def n_batch_axes(scope: str) -> int:
+    """Return the number of batch axes of a leaf, by its scope as ``scopes`` returns it."""
+    return {"batched": 1, "shared": 0, "opaque": 0}.get(scope, 2)
+
+
+def n_world_axes(scope: str) -> int:
+    """Return the number of batch axes that functions of one world receive a leaf without."""
+    return 1 if has_members(scope) else n_batch_axes(scope)
+
+
 def scopes(tree: Any) -> Any:
     """Return the same tree with the scope of every leaf in its place.
 
-    A parameter is returned as ``shared`` or ``drone``. Leaves without a declaration are ``opaque``. A leaf of another
-    dataclass whose field has ``CORE_NDIM_KEY`` in its metadata is ``batched`` if it has more dimensions than that:
-    its first axis is over worlds, and stages receive it like an opaque leaf.
+    A leaf of members has the name of its population. A parameter is returned as ``shared``, ``drone`` or the name of a
+    population. Leaves without a declaration are ``opaque``. A leaf of another dataclass whose field has
+    ``CORE_NDIM_KEY`` in its metadata is ``batched`` if it has more dimensions than that: its first axis is over worlds,
+    and stages receive it like an opaque leaf.
     """
-    return _map_declared(lambda x, metadata, _: _scope(x, metadata), tree, {}, "")
+    return _map_declared(lambda x, metadata, _, members: _scope(x, metadata, members), tree, {}, "", None)
 
 
 def sparse_leaves(tree: Any) -> Any:
     """Return the same tree with True in the place of every leaf that is declared sparse, and False elsewhere."""
-    return _map_declared(lambda _, metadata, __: bool(metadata.get("sparse")), tree, {}, "")
+    return _map_declared(lambda _, metadata, *__: bool(metadata.get("sparse")), tree, {}, "", None)
 
 
 def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
@@ -89,10 +129,10 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
     Raises:
         ConfigError: If a leaf has others, with its name and the shapes it may have.
     """
-    batches = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1), "shared": ()}
+    batches = {"world": (n_worlds, 1), "shared": ()}
 
-    def check(x: Any, metadata: Any, name: str) -> None:
-        scope = _scope(x, metadata)
+    def check(x: Any, metadata: Any, name: str, members: Members | None) -> None:
+        scope = _scope(x, metadata, members)
         if scope == "opaque":
             return
         if scope == "batched":
@@ -102,43 +142,57 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
                     f"batch axes it would have {metadata[CORE_NDIM_KEY]} dimensions, as its field declares."
                 )
             return
-        shape, batch, core_ndim, core = jnp.shape(x), batches[scope], metadata[CORE_NDIM_KEY], metadata["core"]
+        n, kind, kinds = n_drones, "drone", "drones"
+        if members is not None and scope != "drone":
+            n, kind, kinds = members.n_members, "member", members.population
+        each = (n_worlds, n)
+        shape, batch, core_ndim, core = (
+            jnp.shape(x),
+            batches.get(scope, each),
+            metadata[CORE_NDIM_KEY],
+            metadata["core"],
+        )
         has_axes = shape[: len(batch)] == batch and len(shape) == len(batch) + core_ndim
         if not has_axes or core not in (None, shape[len(batch) :]):
             is_parameter = metadata["scope"] == "parameter"
-            batch = batches["drone"] if is_parameter else batch
-            or_shared = f", or {core_ndim} if all drones share it" if is_parameter else ""
+            batch = each if is_parameter else batch
+            or_shared = f", or {core_ndim} if all {kinds} share it" if is_parameter else ""
             ending = "" if core is None else f" and end with {core}"
             raise ConfigError(
                 f"{name} has shape {shape}; needed are {len(batch) + core_ndim} dimensions that begin with {batch}"
-                f"{ending}, for {n_worlds} worlds of {n_drones} drones{or_shared}. For one value per world, repeat it "
-                f"for every drone with jnp.broadcast_to."
+                f"{ending}, for {n_worlds} worlds of {n} {kinds}{or_shared}. For one value per world, repeat it "
+                f"for every {kind} with jnp.broadcast_to."
             )
 
-    _map_declared(check, tree, {}, "data")
+    _map_declared(check, tree, {}, "data", None)
 
 
-def _map_declared(fn: Callable[[Any, Any, str], Any], node: Any, metadata: Any, name: str) -> Any:
-    """Return the tree with ``fn(leaf, metadata of its field, its name)`` in place of every leaf."""
+def _map_declared(
+    fn: Callable[[Any, Any, str, Members | None], Any], node: Any, metadata: Any, name: str, members: Members | None
+) -> Any:
+    """Return the tree with ``fn(leaf, metadata of its field, its name, record of its population)`` for every leaf."""
     if isinstance(node, PyTree):
+        members = node if isinstance(node, Members) else members
         changes = {
-            f.name: _map_declared(fn, getattr(node, f.name), f.metadata, f"{name}.{f.name}")
+            f.name: _map_declared(fn, getattr(node, f.name), f.metadata, f"{name}.{f.name}", members)
             for f in dataclasses.fields(node)  # type: ignore[arg-type]
             if not f.metadata.get("static")
         }
         return node.replace(**changes)
     if isinstance(node, dict):
-        return {k: _map_declared(fn, v, metadata, f"{name}[{k!r}]") for k, v in node.items()}
+        return {k: _map_declared(fn, v, metadata, f"{name}[{k!r}]", members) for k, v in node.items()}
     if _is_foreign_record(node):
-        return _map_foreign(fn, node, name)
+        return _map_foreign(fn, node, name, members)
     return jax.tree.map(
-        lambda x: _map_declared(fn, x, metadata, name) if _is_record(x) else fn(x, metadata, name),
+        lambda x: _map_declared(fn, x, metadata, name, members) if _is_record(x) else fn(x, metadata, name, members),
         node,
         is_leaf=_is_record,
     )
 
 
-def _map_foreign(fn: Callable[[Any, Any, str], Any], record: Any, name: str) -> Any:
+def _map_foreign(
+    fn: Callable[[Any, Any, str, Members | None], Any], record: Any, name: str, members: Members | None
+) -> Any:
     """Return a record of another library, such as ``flax.struct``, mapped like ``_map_declared``."""
     children, treedef = jax.tree_util.tree_flatten_with_path(record, is_leaf=lambda x: x is not record)
     metadata = {field.name: field.metadata for field in dataclasses.fields(record)}
@@ -151,7 +205,7 @@ def _map_foreign(fn: Callable[[Any, Any, str], Any], record: Any, name: str) -> 
                 f"expected an array in {child_name}, whose metadata have {CORE_NDIM_KEY!r}, got a "
                 f"{type(child).__name__}. Give the metadata to the fields of that record."
             )
-        mapped.append(_map_declared(fn, child, declared, child_name))
+        mapped.append(_map_declared(fn, child, declared, child_name, members))
     return treedef.unflatten(mapped)
 
 
@@ -165,19 +219,24 @@ def _is_foreign_record(node: Any) -> bool:
     return is_instance and not jax.tree_util.all_leaves([node])
 
 
-def _scope(x: Any, metadata: Any) -> str:
+def _scope(x: Any, metadata: Any, members: Members | None) -> str:
     if "scope" not in metadata:
         core_ndim = metadata.get(CORE_NDIM_KEY)
         return "opaque" if core_ndim is None or jnp.ndim(x) <= core_ndim else "batched"
-    if metadata["scope"] != "parameter":
-        return metadata["scope"]
-    return "shared" if jnp.ndim(x) == metadata[CORE_NDIM_KEY] else "drone"
+    scope = metadata["scope"]
+    if scope == "member":
+        return scope if members is None else members.population
+    if scope != "parameter":
+        return scope
+    if jnp.ndim(x) == metadata[CORE_NDIM_KEY]:
+        return "shared"
+    return "drone" if members is None else members.population
 
 
 def map_batched(fn: Callable[..., Any], tree: T, *others: T) -> T:
-    """Apply ``fn`` to the leaves that have an axis over worlds (``PER_WORLD``), and keep the rest."""
+    """Apply ``fn`` to the leaves that have an axis over worlds, and keep the rest."""
     return jax.tree.map(
-        lambda scope, x, *rest: fn(x, *rest) if scope in PER_WORLD else x,
+        lambda scope, x, *rest: fn(x, *rest) if n_batch_axes(scope) else x,
         scopes(tree),
         tree,
         *others,

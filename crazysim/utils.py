@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import grid_2d
-from crazysim.pytree import CORE_NDIM_KEY, PER_WORLD, PyTree, scopes, select_worlds
+from crazysim.pytree import CORE_NDIM_KEY, PyTree, n_batch_axes, scopes, select_worlds
 
 __all__ = ["CORE_NDIM_KEY", "enable_cache", "grid_2d", "leaf_replace", "pytree_replace", "world_mask"]
 
@@ -31,7 +31,7 @@ def leaf_replace(record: Record, mask: Array | None = None, **changes: Array) ->
 
 def world_mask(tree: Tree) -> Tree:
     """Return the tree with True in place of every leaf that has an axis over worlds, False in place of others."""
-    return jax.tree.map(lambda scope: scope in PER_WORLD, scopes(tree))
+    return jax.tree.map(lambda scope: n_batch_axes(scope) > 0, scopes(tree))
 
 
 def pytree_replace(tree: Tree, new_tree: Tree, batched: Any, mask: Array | None = None) -> Tree:

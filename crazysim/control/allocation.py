@@ -25,6 +25,8 @@ class AllocationParams(PyTree):
     """Thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
     allocation_matrix: Array = leaf("parameter", 2)
     """Allocation matrix, wrench over the arms to rotor thrusts, 1. (n_rotors, 4)"""
+    rotors: Array | None = leaf("parameter", 1, default=None)
+    """True for the rotors that the drone has; None where all drones have equally many. (n_rotors,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> AllocationParams:

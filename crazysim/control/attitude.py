@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.core import allocation_matrix
+from crazysim.control.core import allocation_matrix, number_of, where_present
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import matvec
@@ -39,6 +39,8 @@ class AttitudeParams(PyTree):
     """Mixing matrix, rotor thrusts to torque over the arms, 1. (3, n_rotors)"""
     torque_allocation: Array = leaf("parameter", 2)
     """Torque commands to PWM of each rotor, with the firmware's factor 1/2 for roll and pitch, 1. (n_rotors, 3)"""
+    rotors: Array | None = leaf("parameter", 1, default=None)
+    """True for the rotors that the drone has; None where all drones have equally many. (n_rotors,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> AttitudeParams:
@@ -112,10 +114,11 @@ def attitude2force_torque(
     torque_pwm = rotation.safe_clip(torque_pwm, -p.torque_pwm_max, p.torque_pwm_max)
 
     thrust = cmd[..., 3:4]
-    n_rotors = p.mixing_matrix.shape[-1]
+    n_rotors = number_of(p.rotors, p.mixing_matrix.shape[-1])
     newton_per_pwm = p.thrust_max / p.pwm_max
     pwm = thrust / (n_rotors * newton_per_pwm) + matvec(p.torque_allocation, torque_pwm)
     thrusts = rotation.safe_clip(pwm, p.pwm_min, p.pwm_max) * jnp.where(thrust <= 0, 0.0, newton_per_pwm)
+    thrusts = where_present(p.rotors, thrusts, 0.0)
     torque = p.arms * matvec(p.mixing_matrix, thrusts)
     return jnp.concatenate([jnp.sum(thrusts, axis=-1, keepdims=True), torque], axis=-1), r_int_error
 

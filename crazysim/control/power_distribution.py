@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.control.core import allocation_matrix
+from crazysim.control.core import allocation_matrix, number_of, where_present
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
@@ -28,6 +28,8 @@ class PowerDistributionParams(PyTree):
     """Torque commands to PWM of each rotor, with the firmware's factor 1/2 for roll and pitch, 1. (n_rotors, 3)"""
     torque_of_pwm: Array = leaf("parameter", 2)
     """Inverse of the allocation, PWM of each rotor to torque commands, 1. (3, n_rotors)"""
+    rotors: Array | None = leaf("parameter", 1, default=None)
+    """True for the rotors that the drone has; None where all drones have equally many. (n_rotors,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> PowerDistributionParams:
@@ -96,7 +98,7 @@ def rotor_vel_of_pwm(pwm: Array, *, params: PowerDistributionParams) -> Array:
 def pwm_of_thrust(thrust: Array, *, params: PowerDistributionParams) -> Array:
     """Return the PWM of each motor at which all together give a collective thrust, N. (..., 1)"""
     p = params
-    n_rotors = p.torque_allocation.shape[-2]
+    n_rotors = number_of(p.rotors, p.torque_allocation.shape[-2])
     return thrust * (p.pwm_max / (n_rotors * p.thrust_max))
 
 
@@ -109,4 +111,7 @@ def command_of_rotor_vel(rotor_vel: Array, *, params: PowerDistributionParams) -
     """
     p = params
     pwm = jnp.where(rotor_vel > 0, curve(rotor_vel, p.rpm2thrust), 0.0) * (p.pwm_max / p.thrust_max)
-    return jnp.mean(pwm, axis=-1, keepdims=True), matvec(p.torque_of_pwm, pwm)
+    if p.rotors is None:
+        return jnp.mean(pwm, axis=-1, keepdims=True), matvec(p.torque_of_pwm, pwm)
+    pwm = where_present(p.rotors, pwm, 0.0)
+    return jnp.sum(pwm, axis=-1, keepdims=True) / number_of(p.rotors, 0), matvec(p.torque_of_pwm, pwm)

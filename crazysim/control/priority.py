@@ -6,7 +6,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.control.allocation import AllocationParams
+from crazysim.control.core import where_present
 from crazysim.rotation import matvec, safe_clip
+
+BOUNDLESS = 1e9
+"""Collective thrust beyond any rotor's limit, N."""
 
 
 def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
@@ -32,13 +36,16 @@ def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
     turn = p.allocation_matrix[..., 3] * (wrench[..., 3:] / p.arms[..., 2:])
 
     # Rotor i needs low <= lift_i F + s tilt_i <= high. Two rotors agree on F if s is at most their room over the need.
+    # Rotors that a drone lacks have no limits.
+    lift = where_present(p.rotors, lift, 1.0)
+    most, least = where_present(p.rotors, high / lift, BOUNDLESS), where_present(p.rotors, low / lift, -BOUNDLESS)
     ratio = tilt / lift
     need = ratio[..., :, None] - ratio[..., None, :]
-    room = (high / lift)[..., :, None] - (low / lift)[..., None, :]
+    room = most[..., :, None] - least[..., None, :]
     scale = jnp.min(jnp.where(need > room, room / jnp.where(need > room, need, 1.0), 1.0), axis=(-2, -1))[..., None]
     tilt = scale * tilt
-    least = jnp.max((low - tilt) / lift, axis=-1, keepdims=True)
-    most = jnp.min((high - tilt) / lift, axis=-1, keepdims=True)
+    least = jnp.max(where_present(p.rotors, (low - tilt) / lift, -BOUNDLESS), axis=-1, keepdims=True)
+    most = jnp.min(where_present(p.rotors, (high - tilt) / lift, BOUNDLESS), axis=-1, keepdims=True)
     force = safe_clip(wrench[..., :1], least, jnp.maximum(most, least))
 
     thrusts = lift * force + tilt

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.control import AllocationParams, AttitudeParams, Control, Controller, StateParams
+from crazysim.core.airframes import Airframes, as_airframes, for_drones, n_rotors_of
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
@@ -99,13 +101,14 @@ class ControllerData(PyTree):
     """Rate of the controller, Hz; an outer loop has that of the command."""
 
     @staticmethod
-    def create(n_worlds: int, n_drones: int, controller: Controller, airframe: Airframe) -> ControllerData:
-        """Return a controller at rest, with the airframe's gains.
+    def create(n_worlds: int, n_drones: int, controller: Controller, airframes: Airframes) -> ControllerData:
+        """Return a controller at rest, with the gains of each drone's airframe.
 
         Raises:
-            ConfigError: If the airframe lacks a number, or a record has leaves of another scope or of other counts.
+            ConfigError: If an airframe lacks a number, or a record has leaves of another scope or of other counts.
         """
-        memory, params = controller.memory(airframe), controller.params(airframe)
+        params = for_drones(airframes, controller.params, n_worlds)
+        memory, one = for_drones(airframes, controller.memory, n_worlds), controller.memory(as_airframes(airframes)[0])
         for record, kinds in ((memory, ("drone",)), (params, ("shared", "drone"))):
             others = set(jax.tree.leaves(scopes(record))) - set(kinds)
             if others:
@@ -123,11 +126,12 @@ class ControllerData(PyTree):
                     f"leading axes (n_worlds, n_drones) = {counts}, got shape {np.shape(x)}. Use np.broadcast_to."
                 )
 
-        def of_all(x: Any) -> Any:
+        def of_all(x: Any, like: Any) -> Any:
             dtype = floating() if np.issubdtype(np.asarray(x).dtype, np.floating) else np.asarray(x).dtype
-            return of_host(x, n_worlds, n_drones, *np.shape(x), dtype=dtype)
+            core = np.shape(x)[np.ndim(x) - np.ndim(like) :]  # it may have rows of drones, and more rotors
+            return of_host(x, n_worlds, n_drones, *core, dtype=dtype)
 
-        return ControllerData(jax.tree.map(of_all, memory), params, controller.freq)
+        return ControllerData(jax.tree.map(of_all, memory, one), params, controller.freq)
 
 
 class SimControls(PyTree):
@@ -154,11 +158,11 @@ class SimControls(PyTree):
         n_drones: int,
         control: Control,
         dynamics: Dynamics,
-        airframe: Airframe,
+        airframes: Airframes,
         freqs: dict[Control, int],
         controller: Controller | None = None,
     ) -> SimControls:
-        """Return controllers at rest, with the airframe's gains; ``controller`` None is Crazyflow's cascade.
+        """Return controllers at rest, with the gains of each drone's airframe; ``controller`` None is the cascade.
 
         Raises:
             ConfigError: If the dynamics do not support the command level.
@@ -171,6 +175,9 @@ class SimControls(PyTree):
         def zeros(n: int) -> Any:
             return of_host(0.0, *shape, n)
 
+        def gains(create: Callable[[Airframe], Any]) -> Any:
+            return for_drones(airframes, create, n_worlds)
+
         cascade = with_rotors and controller is None
 
         state = attitude = body_rate = force_torque = rotor_vel = None
@@ -182,7 +189,7 @@ class SimControls(PyTree):
                 cmd.copy(),
                 freqs[Control.state],
                 pos_err_i=zeros(3) if controller is None else None,
-                params=StateParams.create(airframe) if controller is None else None,
+                params=gains(StateParams.create) if controller is None else None,
                 feedforward=None if controller is None else zeros(8),
                 staged_feedforward=None if controller is None else zeros(8),
             )
@@ -195,7 +202,7 @@ class SimControls(PyTree):
                 staged_ang_vel_des=zeros(3) if cascade else None,
                 r_int_error=zeros(3) if cascade else None,
                 prev_ang_vel=zeros(3) if cascade else None,
-                params=AttitudeParams.create(airframe) if cascade else None,
+                params=gains(AttitudeParams.create) if cascade else None,
             )
         if control == Control.body_rate:
             body_rate = BodyRateControlData(
@@ -204,14 +211,14 @@ class SimControls(PyTree):
                 freqs[control],
                 r_int_error=zeros(3) if cascade else None,
                 prev_ang_vel=zeros(3) if cascade else None,
-                params=AttitudeParams.create(airframe) if cascade else None,
+                params=gains(AttitudeParams.create) if cascade else None,
             )
         if with_rotors:
-            rotor_vel = zeros(airframe.n_rotors)
+            rotor_vel = zeros(n_rotors_of(airframes))
         if with_rotors and Control.rotor_vel not in (control, controller and controller.output):
-            params = AllocationParams.create(airframe)
+            params = gains(AllocationParams.create)
             force_torque = ForceTorqueControlData(zeros(4), zeros(4), freqs[Control.force_torque], params)
-        data = None if controller is None else ControllerData.create(*shape, controller, airframe)
+        data = None if controller is None else ControllerData.create(*shape, controller, airframes)
         return SimControls(control, state, attitude, body_rate, force_torque, rotor_vel, data)
 
 

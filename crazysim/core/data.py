@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.control import Control, Controller, command_size
+from crazysim.core.airframes import Airframes, as_airframes, for_drones, n_rotors_of
 from crazysim.core.controls import SimControls
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted
@@ -170,7 +171,7 @@ class SimData(PyTree):
         n_drones: int,
         dynamics: Dynamics,
         control: Control,
-        airframe: Airframe,
+        airframe: Airframes,
         freq: int,
         freqs: dict[Control, int],
         drone_mocap_ids: Any,
@@ -179,30 +180,42 @@ class SimData(PyTree):
     ) -> SimData:
         """Return data of drones at rest, without plugins.
 
-        ``freqs`` are the rates of the controllers, Hz; ``controller`` None is Crazyflow's cascade.
+        ``airframe`` is that of all drones, or a list of those of each; ``freqs`` are the rates of the controllers, Hz;
+        ``controller`` None is Crazyflow's cascade.
         """
+        airframes = as_airframes(airframe, n_drones)
         return SimData(
-            states=SimState.create(n_worlds, n_drones, n_rotor_states(dynamics, airframe)),
-            controls=SimControls.create(n_worlds, n_drones, control, dynamics, airframe, freqs, controller),
-            params=create_params(dynamics, airframe),
+            states=SimState.create(n_worlds, n_drones, n_rotor_states(dynamics, airframes)),
+            controls=SimControls.create(n_worlds, n_drones, control, dynamics, airframes, freqs, controller),
+            params=create_params(dynamics, airframes, n_worlds),
             core=SimCore.create(freq, n_worlds, n_drones, drone_mocap_ids, rng_key),
         )
 
 
-def create_params(dynamics: Dynamics, airframe: Airframe) -> SimParams:
-    """Return the shared parameters of an airframe for a dynamics model.
+def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) -> SimParams:
+    """Return the parameters of drones for a dynamics model: shared, or one per drone where airframes differ.
+
+    Args:
+        dynamics: Dynamics model.
+        airframe: Airframe of all drones, or of each.
+        n_worlds: Number of worlds.
 
     Raises:
-        ConfigError: If the airframe has no parameters for the model.
+        ConfigError: If an airframe has no parameters for the model.
     """
-    if dynamics == Dynamics.first_principles:
-        return first_principles.Params.create(airframe)
-    return fitted.Params.create(airframe, dynamics)
+    n_rotors = n_rotors_of(airframe)
+
+    def create(one: Airframe) -> SimParams:
+        if dynamics == Dynamics.first_principles:
+            return first_principles.with_rotors(first_principles.Params.create(one), n_rotors)
+        return fitted.Params.create(one, dynamics)
+
+    return for_drones(airframe, create, n_worlds)
 
 
-def n_rotor_states(dynamics: Dynamics, airframe: Airframe) -> int:
-    """Return the length of ``states.rotor_vel``: one per rotor, or four for a fitted model, as in Crazyflow."""
-    return airframe.n_rotors if dynamics == Dynamics.first_principles else 4
+def n_rotor_states(dynamics: Dynamics, airframes: Airframes) -> int:
+    """Return the length of ``states.rotor_vel``: the most rotors, or four for a fitted model, as in Crazyflow."""
+    return n_rotors_of(airframes) if dynamics == Dynamics.first_principles else 4
 
 
 def command_shape(data: SimData, control: Control) -> tuple[int, int, int]:

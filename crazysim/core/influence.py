@@ -62,21 +62,23 @@ def own_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
         ConfigError: If a rate is not that of a state in the plugin's record, or has another shape or type.
     """
     where = f"derivative of plugin {plugin.name!r} ({type(plugin).__name__})"
-    rates = _called(where, plugin.derivative, data)
+    rates = _called(where, plugin.derivative, data, plugin.scope)
     if not isinstance(rates, Mapping):
         raise ConfigError(
             f"expected {where} to return a dict of fields of its record to rates, got {type(rates).__name__}. Use "
             f"'return {{}}' for none."
         )
     record = data.plugins.get(plugin.name)
-    kinds: dict[str, Any] = {} if record is None else vars(scopes(record))
-    states = [name for name, kind in kinds.items() if kind == "drone"]
+    kinds = None if record is None else scopes(record)
+    fields = [] if record is None else [f.name for f in dataclasses.fields(record) if not f.metadata.get("static")]
+    states = [name for name in fields if getattr(kinds, name) == plugin.scope]
     for field, rate in rates.items():
         if field not in states:
+            own = "drone" if plugin.scope == "drone" else "member"
             raise ConfigError(
-                f"expected {where} to return rates of leaves of drones in its record, which are "
+                f"expected {where} to return rates of leaves of {own}s in its record, which are "
                 f"{', '.join(map(repr, states)) or 'none'}, got one of {field!r}. Declare such a state with "
-                f"leaf('drone', ...)."
+                f"leaf({own!r}, ...)."
             )
         x = getattr(record, field)
         same_type = jnp.issubdtype(x.dtype, jnp.floating) and jnp.result_type(x, rate) == x.dtype

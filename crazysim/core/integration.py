@@ -154,7 +154,8 @@ class Integration:
         for plugin in self.plugins:
             data = influenced(plugin, data)
         deriv = self.deriv_fn(data)
-        own = {plugin.name: rates for plugin in self.plugins if (rates := own_rates(plugin, data))}
+        of_drones = [plugin for plugin in self.plugins if plugin.scope == "drone"]
+        own = {plugin.name: rates for plugin in of_drones if (rates := own_rates(plugin, data))}
         return data, deriv.replace(plugins=own) if own else deriv
 
     def stage(self) -> Stage:

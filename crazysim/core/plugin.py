@@ -27,13 +27,24 @@ class Simulation(Protocol):
     data: SimData
     default_data: SimData
     step_pipeline: Pipeline
-    airframe: Airframe
+    airframes: tuple[Airframe, ...]
+    integrator: Any
     n_worlds: int
     n_drones: int
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all drones and members of populations."""
+        ...
+
+    @property
     def scene(self) -> Any:
         """The MuJoCo scene, a ``crazysim.scene.scene.Scene``."""
+        ...
+
+    @property
+    def airframe(self) -> Airframe:
+        """Airframe of all drones; an error where they have several."""
         ...
 
     def add(self, plugin: Any, name: str | None = None) -> Any:
@@ -66,6 +77,25 @@ def parameter(*, default: Any = dataclasses.MISSING) -> Any:
     ``derivative`` must read the number from the record, never from the field.
     """
     return dataclasses.field(default=default, metadata={"parameter": True})
+
+
+def of_airframes(sim: Simulation, number: Callable[[Airframe], Any]) -> Any:
+    """Return a number of the airframe, as ``check_parameter`` takes it: one for all drones, or one for each.
+
+    Args:
+        sim: The simulation.
+        number: From an airframe to a number or array. (*core)
+
+    Returns:
+        (*core), or (n_worlds, n_drones, *core) where the drones have several airframes
+    """
+    kinds = {id(airframe): airframe for airframe in sim.airframes}
+    values = {key: np.asarray(number(airframe)) for key, airframe in kinds.items()}
+    first = next(iter(values.values()))
+    if len(kinds) == 1:
+        return first
+    each = np.stack([values[id(airframe)] for airframe in sim.airframes])
+    return np.broadcast_to(each, (sim.n_worlds, *each.shape))
 
 
 def check_parameter(
@@ -156,6 +186,11 @@ class Plugin:
     def constrains(self) -> bool:
         """True if the plugin couples bodies of its own to the drones by ``constrain``."""
         return type(self).constrain is not Plugin.constrain
+
+    @property
+    def scope(self) -> str:
+        """Scope of the plugin's own states, and of the data that ``derivative`` is written for."""
+        return "drone"
 
     def record(self, sim: Simulation) -> PyTree | None:
         """Return the plugin's record for all worlds, or None if it has none; check settings and simulation.

@@ -48,6 +48,11 @@ def drone_key(data: SimData, name: str) -> Array:
     return jax.random.fold_in(world_key(data, name), data.core.drone_id)
 
 
+def member_key(data: SimData, population: str, name: str) -> Array:
+    """Return the random key of one member of a population, for stages declared for one member; see ``world_key``. ()"""
+    return jax.random.fold_in(world_key(data, f"{population} {name}"), data.plugins[population].member_id)
+
+
 def world_keys(data: SimData, name: str) -> Array:
     """Return the random keys of all worlds, equal to ``world_key`` of each.
 

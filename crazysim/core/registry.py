@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -15,9 +15,10 @@ from crazysim.core.data import SimData
 from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, insert_fn_before
 from crazysim.core.plugin import Placement, Plugin, Simulation
+from crazysim.core.population import Population
 from crazysim.core.stage import Axes, over_drones, over_worlds
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.pytree import PyTree
+from crazysim.pytree import PyTree, n_batch_axes
 
 P = TypeVar("P", bound=Plugin)
 
@@ -83,6 +84,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             )
         if name in self._sim.data.plugins:
             raise ConfigError(f"data.plugins already has a record {name!r}. Use sim.add(..., name=...).")
+        self._require_names(plugin, self._sim.names)
         record, default = plugin.record(self._sim), plugin.default_record(self._sim)
         pipeline, installed = _with(dict(self._sim.step_pipeline), plugin, plugin.stages(self._sim))
         pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
@@ -110,6 +112,7 @@ class PluginRegistry(Mapping[str, Plugin]):
                 f"sim.remove({plugin.name!r}) first, or another name=."
             )
         sim, name = self._sim, plugin.name
+        self._require_names(plugin, [other for other in sim.names if other not in self.members_of(before)])
         present, record, default = sim.data.plugins.get(name), plugin.record(sim), plugin.default_record(sim)
         if _same_code(before, plugin) and jax.tree.structure(present) == jax.tree.structure(record):
             self._put(name, _continued(record, present), default)
@@ -127,6 +130,30 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._build(pipeline)
         return plugin
 
+    @staticmethod
+    def members_of(plugin: Plugin) -> tuple[str, ...]:
+        """Return the names of the members of a population; none of another plugin."""
+        return plugin.names if isinstance(plugin, Population) else ()
+
+    @property
+    def members(self) -> tuple[str, ...]:
+        """Names of the members of all populations."""
+        return tuple([name for plugin in self.values() for name in self.members_of(plugin)])
+
+    def _require_names(self, plugin: Plugin, taken: Collection[str]) -> None:
+        """Check that the members of a population have names of their own.
+
+        Raises:
+            ConfigError: If another has one of these names.
+        """
+        taken = set(taken)
+        twice = [name for name in self.members_of(plugin) if name in taken]
+        if twice:
+            raise ConfigError(
+                f"expected names that nothing else has, got {twice[0]!r} again. Use "
+                f"{type(plugin).__name__}([...]) with other names."
+            )
+
     def build_records(self) -> None:
         """Put a new record of every plugin into the simulation's data."""
         for name, plugin in self.items():
@@ -139,7 +166,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             return {f"{p.name}.{key}": x for p in self.values() for key, x in p.observations(one).items()}
 
         leaves, axes = jax.tree.leaves(data), Axes(data)
-        worlds = [0 if scope in ("drone", "world") else None for scope in axes.scopes]
+        worlds = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]
         of_drones = over_drones(of_one)
         of_world = [x[:, 0] if scope == "world" else x for scope, x in zip(axes.scopes, leaves, strict=True)]
         return jax.vmap(lambda values: of_drones(axes.treedef.unflatten(values)), (worlds,))(of_world)

@@ -10,7 +10,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDev
 
 from crazysim.core.data import SimData
 from crazysim.errors import ConfigError
-from crazysim.pytree import PER_WORLD, scopes
+from crazysim.pytree import n_batch_axes, scopes
 
 WORLD_AXIS = "worlds"
 """Name of the mesh axis over which worlds are distributed."""
@@ -61,7 +61,7 @@ def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
 
 
 def placement(data: SimData, mesh: Mesh) -> SimData:
-    """Return the sharding of every leaf: leaves of drones and worlds are split, shared leaves are replicated.
+    """Return the sharding of every leaf: leaves of members and worlds are split, shared leaves are replicated.
 
     Raises:
         ConfigError: If the mesh has no axis of worlds, or the worlds cannot be split evenly.
@@ -80,7 +80,7 @@ def placement(data: SimData, mesh: Mesh) -> SimData:
         )
     split = NamedSharding(mesh, PartitionSpec(WORLD_AXIS))
     copied = NamedSharding(mesh, PartitionSpec())
-    return jax.tree.map(lambda scope: split if scope in PER_WORLD else copied, scopes(data))
+    return jax.tree.map(lambda scope: split if n_batch_axes(scope) else copied, scopes(data))
 
 
 def shard(data: SimData, mesh: Mesh) -> SimData:

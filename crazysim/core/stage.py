@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.core.others import AXIS
 from crazysim.errors import ConfigError
-from crazysim.pytree import PER_WORLD, PyTree, scopes
+from crazysim.pytree import PyTree, has_members, n_batch_axes, n_world_axes, scopes
 
-StageScope = Literal["drone", "world", "batch"]
+StageScope = str
+"""``"drone"``, ``"world"``, ``"batch"`` for all worlds, or the name of a population."""
+
+RESERVED = ("batch", "batched", "shared", "opaque", "parameter", "member")
+"""Names of other scopes, which neither a stage is declared for nor a population is named."""
 
 
 class Stage:
@@ -57,30 +62,33 @@ class Stage:
         return f"<stage {self.__name__} of one {self.scope}>"
 
 
-def stage(
-    scope: Literal["drone", "world"], when: Callable[..., Array | None] | None = None
-) -> Callable[[Callable[..., Any]], Stage]:
+def stage(scope: StageScope, when: Callable[..., Array | None] | None = None) -> Callable[[Callable[..., Any]], Stage]:
     """Declare the scope of a stage, so that an engine can fuse it with its neighbours.
 
     A stage without a declared scope receives the full batch.
 
     ``@stage("drone")``: the data of one drone. Leaves of drones and worlds come without batch axes: ``pos`` is (3,),
-    ``steps`` (). The stage writes leaves of drones.
+    ``steps`` (). Leaves of other populations come as (n_members, ...). The stage writes leaves of drones, and reads
+    those of other drones by ``reduce_over_others``.
 
-    ``@stage("world")``: the data of one world. Leaves of drones come as (n_drones, ...), leaves of worlds without
-    batch axes. The stage writes leaves of drones or worlds.
+    ``@stage("cars")``: the data of one member of the population of that name, likewise. Leaves of drones come as
+    (n_drones, ...). The stage writes leaves of the population.
+
+    ``@stage("world")``: the data of one world. Leaves of drones come as (n_drones, ...), those of other populations as
+    (n_members, ...), leaves of worlds without batch axes. The stage writes leaves of any of these.
 
     Args:
-        scope: ``"drone"`` or ``"world"``.
+        scope: ``"drone"``, ``"world"`` or the name of a population.
         when: ``when(data)``: true if the stage acts at this step, (); None for always. An engine skips a stage at
             steps where it acts nowhere.
 
     Raises:
-        ConfigError: If the scope is neither.
+        ConfigError: If the scope is none of these. A population is looked up when the stage is applied.
     """
-    if scope not in ("drone", "world"):
+    if not isinstance(scope, str) or not scope or scope in RESERVED:
         raise ConfigError(
-            f"expected scope 'drone' or 'world', got {scope!r}. A stage of the full batch is left undeclared."
+            f"expected scope 'drone', 'world' or the name of a population, got {scope!r}. A stage of the full batch is "
+            f"left undeclared."
         )
     return lambda fn: Stage(fn, scope, when)
 
@@ -122,7 +130,7 @@ class Axes:
                 f"put everything in place before the step, with sim.data = sim.data.replace(...)"
             )
         written = [i for i, (x, y) in enumerate(zip(before, new, strict=True)) if x is not y]
-        own = {"drone": ("drone",), "world": ("drone", "world")}.get(stage.scope)
+        own = self.writable(stage)
         for i in written:
             x, y = before[i], new[i]
             if jnp.shape(x) != jnp.shape(y) or jnp.result_type(x) != jnp.result_type(y):
@@ -138,14 +146,36 @@ class Axes:
                 )
         return written
 
+    def writable(self, stage: Stage) -> list[str] | None:
+        """Return the scopes of the leaves that a stage may write; None for all.
+
+        Raises:
+            ConfigError: If the stage is declared for a population that does not exist.
+        """
+        if stage.scope == "batch":
+            return None
+        populations = list(dict.fromkeys(scope for scope in self.scopes if has_members(scope)))
+        if stage.scope == "world":
+            return [*populations, "world"]
+        if stage.scope not in (*populations, "drone"):
+            others = ", ".join(repr(name) for name in populations if name != "drone")
+            raise ConfigError(
+                f"stage {stage.__name__!r} is declared for one {stage.scope!r}, and there is no population of that "
+                f"name; there {'are ' + others if others else 'is none'}. Add it with sim.add first, or declare the "
+                f"stage for 'drone' or 'world'."
+            )
+        return [stage.scope]
+
     def of_one(self, leaves: list[Any], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
         """Return what a stage is given, for each leaf of all worlds: its shape and type for one drone or world."""
         return [self.one_of(i, x, scope) for i, x in enumerate(leaves)]
 
     def one_of(self, i: int, x: Any, scope: StageScope) -> jax.ShapeDtypeStruct:
         """Return the same for the leaf with number ``i``."""
-        taken = {"drone": 2 if scope == "drone" else 1, "world": 2} if scope != "batch" else {}
-        return jax.ShapeDtypeStruct(jnp.shape(x)[taken.get(self.scopes[i], 0) :], x.dtype)
+        own, taken = self.scopes[i], 0
+        if scope != "batch" and own != "batched":
+            taken = n_batch_axes(own) if own == scope else n_world_axes(own)
+        return jax.ShapeDtypeStruct(jnp.shape(x)[taken:], x.dtype)
 
 
 def with_leaves(leaves: Sequence[Any], numbers: Sequence[int], values: Sequence[Any]) -> list[Any]:
@@ -156,16 +186,16 @@ def with_leaves(leaves: Sequence[Any], numbers: Sequence[int], values: Sequence[
     return out
 
 
-def over_worlds(fn: Callable[..., Any], split: Sequence[str] = PER_WORLD) -> Callable[..., Any]:
+def over_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
     """Return a function of one world as a function of all worlds.
 
-    In records the batch axes are the declared ones: the function receives leaves of drones as (n_drones, ...), leaves
-    of worlds and batched leaves without batch axes, and all others as they are, which it must return unchanged. An
-    array outside of a record has worlds as its first axis.
+    In records the batch axes are the declared ones: the function receives leaves of drones as (n_drones, ...), those of
+    other populations as (n_members, ...), leaves of worlds and batched leaves without batch axes, and all others as
+    they are, which it must return unchanged. An array outside of a record has worlds as its first axis.
 
     Args:
         fn: The function of one world: from any trees of arrays to one.
-        split: Scopes of the leaves that are divided among worlds.
+        least: Number of batch axes from which a leaf is divided among worlds: 2 excludes batched leaves.
 
     Raises:
         ConfigError: When the function is called, if it changes a leaf that all worlds share.
@@ -175,6 +205,7 @@ def over_worlds(fn: Callable[..., Any], split: Sequence[str] = PER_WORLD) -> Cal
         leaves, treedef = jax.tree.flatten(args)
         kinds = _kinds(args)
         rows = [x[:, 0] if kind == "world" else x for kind, x in zip(kinds, leaves, strict=True)]
+        split = [n_batch_axes(kind) >= least for kind in kinds]
         returned: dict[str, Any] = {}
 
         def one(values: list[Any]) -> list[Any]:
@@ -184,13 +215,13 @@ def over_worlds(fn: Callable[..., Any], split: Sequence[str] = PER_WORLD) -> Cal
             numbers = {id(x): i for i, x in enumerate(values)}
             unchanged = [numbers.get(id(x)) for _, x in paths]
             for k, number in enumerate(unchanged):
-                if number is not None and kinds[number] not in split and after[k] in split:
+                if number is not None and not split[number] and n_batch_axes(after[k]) >= least:
                     unchanged[k] = None  # shared, and now an array of every world
-                elif number is not None and after[k] not in split:
+                elif number is not None and n_batch_axes(after[k]) < least:
                     after[k] = kinds[number]  # without its axis of worlds the scope of a foreign record is not known
             returned["unchanged"] = unchanged
             for (path, _), kind, number in zip(paths, after, unchanged, strict=True):
-                if kind not in split and number is None:
+                if n_batch_axes(kind) < least and number is None:
                     name = jax.tree_util.keystr(path).lstrip(".")
                     raise ConfigError(
                         f"{getattr(fn, '__name__', fn)!r} is written for one world and changes {name}, which all "
@@ -198,7 +229,7 @@ def over_worlds(fn: Callable[..., Any], split: Sequence[str] = PER_WORLD) -> Cal
                     )
             return [x for (_, x), number in zip(paths, unchanged, strict=True) if number is None]
 
-        changed = iter(jax.vmap(one, ([0 if kind in split else None for kind in kinds],))(rows))
+        changed = iter(jax.vmap(one, ([0 if divided else None for divided in split],))(rows))
         out = []
         for kind, number in zip(returned["kinds"], returned["unchanged"], strict=True):
             if number is not None and kinds[number] == kind:
@@ -212,16 +243,22 @@ def over_worlds(fn: Callable[..., Any], split: Sequence[str] = PER_WORLD) -> Cal
 
 
 def over_drones(fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a function of the data of one drone as a function of the data of one world.
+    """Return a function of the data of one drone as a function of the data of one world; see ``over_members``."""
+    return over_members(fn, "drone")
+
+
+def over_members(fn: Callable[[Any], Any], population: str) -> Callable[[Any], Any]:
+    """Return a function of the data of one member of a population as a function of the data of one world.
 
     Args:
-        fn: From the data of one drone to any tree of arrays, each of which gets a first axis over drones.
+        fn: From the data of one member to any tree of arrays, each of which gets a first axis over members.
+        population: Name of the population, or ``"drone"``.
     """
 
     def of_world(data: Any) -> Any:
         leaves, treedef = jax.tree.flatten(data)
-        axes = [0 if scope == "drone" else None for scope in jax.tree.leaves(scopes(data))]
-        return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,))(leaves)
+        axes = [0 if scope == population else None for scope in jax.tree.leaves(scopes(data))]
+        return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,), axis_name=AXIS)(leaves)
 
     return of_world
 
@@ -236,10 +273,14 @@ def _kinds(tree: Any) -> list[str]:
 
 
 def _over_worlds(stage: Stage, data: Any) -> Any:
-    """Return the data after ``stage.one`` in every world, and for every drone if the stage is of one drone."""
-    axes = Axes(data)
+    """Return the data after ``stage.one`` in every world, and for every drone or member that it is declared for."""
+    return over_worlds(of_world(stage, Axes(data)), 2)(data)
 
-    def of_world(world: Any) -> Any:
+
+def of_world(stage: Stage, axes: Axes) -> Callable[[Any], Any]:
+    """Return a stage as a function of the data of one world, with a condition that selects its results."""
+
+    def of_one_world(world: Any) -> Any:
         leaves = jax.tree.leaves(world)
         written: list[int] = []
 
@@ -249,8 +290,8 @@ def _over_worlds(stage: Stage, data: Any) -> Any:
             new = jax.tree.leaves(after)
             return [new[i] for i in written]
 
-        over_drones = [0 if s == "drone" else None for s in axes.scopes]
-        out = jax.vmap(one, (over_drones,))(leaves) if stage.scope == "drone" else one(leaves)
+        own = [0 if s == stage.scope else None for s in axes.scopes]
+        out = one(leaves) if stage.scope == "world" else jax.vmap(one, (own,), axis_name=AXIS)(leaves)
         return axes.treedef.unflatten(with_leaves(leaves, written, out))
 
-    return over_worlds(of_world, ("drone", "world"))(data)
+    return of_one_world

@@ -24,7 +24,7 @@ from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integra
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.stage import Stage, StageScope, tick
 from crazysim.dynamics import Dynamics, first_principles, fitted
-from crazysim.pytree import PER_WORLD, scopes, select_worlds
+from crazysim.pytree import Members, has_members, n_batch_axes, scopes, select_worlds
 
 FLOOR = -0.001
 """Height below which no drone falls, m: a little under zero, so that a negative height marks a landing."""
@@ -237,11 +237,17 @@ def increment_steps(data: SimData) -> SimData:
     return data.replace(core=data.core.replace(steps=data.core.steps + 1))
 
 
+def watched(data: SimData) -> Any:
+    """Return the records whose NaN and infinities flag a world: states and commands of drones, other populations."""
+    populations = [record for record in data.plugins.values() if isinstance(record, Members)]
+    return data.states, data.controls, populations
+
+
 def finite(data: SimData) -> Array:
     """Return in which worlds no state and no command is NaN or infinite. (n_worlds, 1)"""
-    watched = (data.states, data.controls)
-    pairs = zip(jax.tree.leaves(scopes(watched)), jax.tree.leaves(watched), strict=True)
-    leaves = [x for scope, x in pairs if scope == "drone"]
+    records = watched(data)
+    pairs = zip(jax.tree.leaves(scopes(records)), jax.tree.leaves(records), strict=True)
+    leaves = [x for scope, x in pairs if has_members(scope)]
     each = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in leaves])
     return jnp.all(each, axis=0)[:, None]
 
@@ -262,7 +268,7 @@ def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> Si
     plugins = {name: default_data.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
 
     def restore(scope: str, x: Any, default: Any) -> Any:
-        if scope in PER_WORLD:
+        if n_batch_axes(scope):
             return select_worlds(mask, default, x)
         return default if mask is None else x
 

@@ -6,5 +6,6 @@ from crazysim.effects.ground_effect import GroundEffect
 from crazysim.effects.latency import Latency
 from crazysim.effects.motors import MotorFailure
 from crazysim.effects.wind import Wind
+from crazysim.effects.wind_field import WindField
 
-__all__ = ["Battery", "Downwash", "GroundEffect", "Latency", "MotorFailure", "Wind"]
+__all__ = ["Battery", "Downwash", "GroundEffect", "Latency", "MotorFailure", "Wind", "WindField"]

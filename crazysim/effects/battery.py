@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter
 from crazysim.core.stage import stage
 from crazysim.deprecation import warn_renamed
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
@@ -77,7 +77,7 @@ class Battery(Plugin):
         cells = int(check_parameter(sim, "n_cells", self.n_cells, (1,), 1, dtype=jnp.int32).item())
         full_speed_voltage = self.full_speed_voltage
         if full_speed_voltage is None:
-            full_speed_voltage = sim.airframe.full_thrust_voltage or NOMINAL_VOLTAGE * cells
+            full_speed_voltage = of_airframes(sim, lambda a: a.full_thrust_voltage or NOMINAL_VOLTAGE * cells)
         charge = per_drone(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0))
         return BatteryData(
             charge=charge,

@@ -27,6 +27,9 @@ class Exposed(PyTree):
     air_vel: Array | None = leaf("drone", 1)
     """Velocity of the air at the body from the jets of all drones, world frame, m/s; None without drag.
     (n_worlds, n_drones, 3)"""
+    wind_vel: Array | None = leaf("drone", 1)
+    """Velocity of the air at the body from all wind fields, world frame, m/s; None without drag.
+    (n_worlds, n_drones, 3)"""
 
 
 def with_moving_air(data: SimData, air_vel: Array) -> SimData:
@@ -53,7 +56,7 @@ def require_drag(sim: Simulation, effect: str) -> None:
     drag = getattr(sim.data.params, "drag_matrix", None)
     if drag is None or not np.any(np.asarray(drag)):
         raise ConfigError(
-            f"{effect} acts through drag, and drone {sim.airframe.name!r} has none in this model. Use "
+            f"{effect} acts through drag, and drone {sim.airframes[0].name!r} has none in this model. Use "
             f"dynamics='first_principles' or 'so_rpy_rotor_drag' and an airframe with drag coefficients."
         )
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.others import reduce_over_others
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter
 from crazysim.core.stage import stage
 from crazysim.deprecation import warn_renamed
 from crazysim.dynamics import first_principles
@@ -51,42 +53,52 @@ class Downwash(Plugin):
         require_drag(sim, "downwash")
         radius = self.propeller_radius
         if radius is None:
-            radius = sim.airframe.value("shape.propeller_radius", ())
+            radius = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
         radius = check_parameter(sim, "propeller_radius", radius, positive=True)
         density = check_parameter(sim, "air_density", self.air_density, positive=True)
         # Far below a rotor the cross-section of its stream is half the rotor's disc (momentum theory).
-        return DownwashData(math.sqrt(2 * sim.airframe.n_rotors) * radius, density, zeros(sim, 3))
+        return DownwashData(stream_diameter(sim, radius), density, zeros(sim, 3))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that computes the air velocity, of one world."""
-        return [Placement(stage("world")(self.sum_jets))]
+        """Return the stage that computes the air velocity."""
+        return [Placement(stage("drone")(self.sum_jets))]
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the force that the air from other drones adds to the drag."""
         return with_moving_air(data, self.read(data).air_vel)
 
     def sum_jets(self, data: SimData) -> SimData:
-        """Add up the jets of the drones of one world at each of them; a jet does not act on its own drone.
+        """Add up the jets of all drones of the world at one drone; a jet does not act on its own drone.
 
-        They are added up at loads too, where the jet of the drone above counts.
+        They are added up at its load too, where the jet of the drone above counts.
         """
         record, s = self.read(data), data.states
-        axis, thrust = rotation.z_axis(s.quat), collective_thrust(data)
-
-        def air_at(pos: Array) -> Array:
-            speed = jet(pos[:, None] - s.pos[None], axis, thrust, record.diameter, record.air_density)
-            return jnp.sum(-speed * axis, axis=1)
-
         bodies = {name: x for name, x in data.plugins.items() if isinstance(x, Exposed) and x.air_vel is not None}
-        moved = {name: x.replace(air_vel=air_at(x.pos)) for name, x in bodies.items()}
+        places = {self.name: s.pos} | {name: x.pos for name, x in bodies.items()}
+        axis = rotation.z_axis(s.quat)
+        own = jet_source(collective_thrust(data), record.diameter, record.air_density)
+
+        def at_places(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
+            origin, axis, source = other
+            return {name: jet_speed(pos - origin, axis, source) * axis for name, pos in places.items()}
+
+        against = reduce_over_others(at_places, (s.pos, axis, own))
+        moved = {name: x.replace(air_vel=-against[name]) for name, x in bodies.items()}
         data = data.replace(plugins=data.plugins | moved)
-        return self.write(data, record.replace(air_vel=air_at(s.pos)))
+        return self.write(data, record.replace(air_vel=-against[self.name]))
 
 
 def add(sim: Simulation, propeller_radius: Any = None, air_density: Any = AIR_DENSITY) -> None:
     """Add downwash. Deprecated: use ``sim.add(Downwash(...))``."""
     warn_renamed("effects.downwash.add(sim, ...)", "sim.add(Downwash(...))")
     sim.add(Downwash(propeller_radius, air_density))
+
+
+def stream_diameter(sim: Simulation, radius: Array) -> Array:
+    """Return the diameter of the contracted stream of drones with propellers of a radius, m. (1,) or one per drone"""
+    factor = np.sqrt(2 * of_airframes(sim, lambda airframe: airframe.n_rotors))
+    factor = factor[..., None] if factor.ndim else factor
+    return jnp.asarray(factor * radius, radius.dtype)
 
 
 def jet(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density: Array) -> Array:
@@ -113,18 +125,43 @@ def jet(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density:
     Returns:
         Speed against the axis. (..., 1)
     """
+    return jet_speed(offset, axis, jet_source(thrust, diameter, air_density))
+
+
+class JetSource(NamedTuple):
+    """The part of a jet's speed that does not depend on the place."""
+
+    strength: Array
+    """``u_0 B d``, m^2/s; zero without thrust. (..., 1)"""
+    origin: Array
+    """Distance ``B d`` of the virtual origin above the rotors, m. (..., 1)"""
+    per_diameter: Array
+    """``1 / d``, 1/m. (..., 1)"""
+
+
+def jet_source(thrust: Array, diameter: Array, air_density: Array) -> JetSource:
+    """Return the source of a drone's jet; the arguments are those of ``jet``."""
+    pushes = thrust > 0
+    impulse = jnp.where(pushes, jnp.sqrt(jnp.where(pushes, thrust, 1.0) * 4 / (math.pi * air_density)), 0.0)
+    return JetSource(DECAY * impulse, DECAY * diameter, 1 / diameter)
+
+
+def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:
+    """Return the speed of the air in a jet, m/s. (..., 1)
+
+    The formula of ``jet`` with one division: for ``q = s + B d`` and ``w = q / (q^2 + (sqrt(2) - 1) (r / S)^2)`` the
+    speed is ``u_0 B d q w^2``.
+    """
     below = -rotation.dot(offset, axis)
     off_axis = offset + below * axis
-    pushes = thrust > 0
-    start = jnp.sqrt(jnp.where(pushes, thrust, 1.0) * 4 / (math.pi * air_density)) / diameter
     # Only below: above, the distance to the virtual origin would pass through zero.
-    down = jnp.where(below > 0, below, 0.0)
-    half_width = SPREAD * (down + DECAY * diameter)
-    profile = 1 + (math.sqrt(2) - 1) * rotation.dot(off_axis, off_axis) / (half_width * half_width)
-    x = rotation.safe_clip(below / diameter, 0.0, 1.0)
+    down = jnp.where(below < 0, 0.0, below)
+    q = down + source.origin
+    w = q / (q * q + (math.sqrt(2) - 1) / SPREAD**2 * rotation.dot(off_axis, off_axis))
+    x = down * source.per_diameter
+    x = jnp.where(x > 1, 1.0, x)
     begins = x * x * (3 - 2 * x)
-    speed = begins * start / ((1 + down / (DECAY * diameter)) * profile * profile)
-    return jnp.where(pushes, speed, 0.0)
+    return begins * source.strength * q * w * w
 
 
 def collective_thrust(data: SimData) -> Array:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Plugin, Simulation, check_parameter, of_airframes, parameter
 from crazysim.deprecation import warn_renamed
+from crazysim.drones import Airframe
 from crazysim.effects.core import require_rotors
+from crazysim.effects.ground import ground_below
 from crazysim.pytree import PyTree, leaf
 
 
@@ -25,7 +28,7 @@ class GroundEffectData(PyTree):
 
 
 class GroundEffect(Plugin):
-    """Thrust of every rotor that grows near the floor, at z = 0; needs rotors."""
+    """Thrust of every rotor that grows near the ground, flat floor or terrain; needs rotors."""
 
     propeller_radius: Any = parameter(default=None)
     """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
@@ -36,14 +39,20 @@ class GroundEffect(Plugin):
         require_rotors(sim, "ground effect")
         radius = self.propeller_radius
         if radius is None:
-            radius = sim.airframe.value("shape.propeller_radius", ())
+            radius = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
         radius = check_parameter(sim, "propeller_radius", radius, positive=True)
-        return GroundEffectData(radius, jnp.asarray(sim.airframe.value("rotors.position"), radius.dtype))
+        n_rotors = sim.data.states.rotor_vel.shape[-1]
+
+        def places(airframe: Airframe) -> np.ndarray:
+            own = airframe.value("rotors.position")
+            return np.pad(own, [(0, n_rotors - len(own)), (0, 0)])  # missing rotors have no thrust
+
+        return GroundEffectData(radius, jnp.asarray(of_airframes(sim, places), radius.dtype))
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the thrust curves at the height of each rotor."""
         record, s, p = self.read(data), data.states, data.params
-        height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], record.rotor_pos)[..., 2]
+        height = s.pos[..., 2:] - ground_below(data) + rotation.rotate(s.quat[..., None, :], record.rotor_pos)[..., 2]
         upright = rotation.z_axis(s.quat)[..., 2:]
         gain = thrust_gain(height, upright, record.propeller_radius)
         return data.replace(params=p.replace(rpm2thrust=gain[..., None] * p.rpm2thrust))

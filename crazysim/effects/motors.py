@@ -52,7 +52,7 @@ class MotorFailure(Plugin):
     def record(self, sim: Simulation) -> MotorFailureData:
         """Return the rotors at their initial effectiveness."""
         require_rotors(sim, "motor failure")
-        core, step, rate = (sim.airframe.n_rotors,), self.fail_step, self.rate
+        core, step, rate = (sim.data.states.rotor_vel.shape[-1],), self.fail_step, self.rate
         return MotorFailureData(
             effectiveness=per_drone(sim, check_parameter(sim, "effectiveness", self.effectiveness, core, 0.0, 1.0)),
             fail_step=None if step is None else check_parameter(sim, "fail_step", step, core, dtype=jnp.int32),

@@ -22,6 +22,8 @@ def build_program(
     last: Sequence[Stage] = (),
     scratch: Collection[int] = (),
     rows: Callable[[list[int]], list[int]] | None = None,
+    population: str = "drone",
+    pack: bool = True,
 ) -> Program:
     """Return the program of a step, ready for an engine.
 
@@ -34,9 +36,11 @@ def build_program(
         last: Stages that run once, after the last step.
         scratch: Leaves that only carry numbers from one stage to another; what is written there is not kept.
         rows: From the leaves that are written to those that are stored as rows of one number of all drones each.
+        population: Population whose members are computed side by side.
+        pack: True to read shared numbers from one leaf.
     """
-    program = lower_stages(stages, data, zeros, watched, first, last, scratch)
-    then: list[passes.Pass] = [passes.fuse, passes.join_ticks, passes.hoist, pack_shared]
+    program = lower_stages(stages, data, zeros, watched, first, last, scratch, population)
+    then: list[passes.Pass] = [passes.fuse, passes.join_ticks, passes.hoist, *([pack_shared] if pack else [])]
     if rows is not None:
         stored = functools.partial(as_rows, select=rows)
         then.append(functools.update_wrapper(stored, as_rows))

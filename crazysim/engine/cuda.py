@@ -22,7 +22,7 @@ from jax import Array
 
 from crazysim.engine import dump, jaxcompat
 from crazysim.engine.errors import KernelError
-from crazysim.engine.kernel import BLOCK, Kernel
+from crazysim.engine.kernel import Kernel
 from crazysim.engine.native import Launch
 
 TARGET = "__gpu$xla.gpu.ptx"
@@ -31,11 +31,8 @@ TARGET = "__gpu$xla.gpu.ptx"
 OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false", "--device-as-default-execution-space")
 """Division and square root to 2 and 1 units in the last place, as XLA has them; no other shortcut."""
 
-BLOCKS_AT_ONCE = (8, 6)
-"""Numbers of blocks of 64 threads to try, the most first: they leave 128 or 168 registers to each thread."""
-
-WARP = 32
-"""Threads that can read each other's registers."""
+THREADS_AT_ONCE = (512, 384)
+"""Numbers of threads of a multiprocessor to try, the most first: they leave 128 or 168 registers to each thread."""
 
 DEFAULT_ARCHITECTURE = "compute_90"
 """Architecture to compile for on a machine without a GPU."""
@@ -64,12 +61,10 @@ def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Lau
     device = weakest(devices)
     kernel = kernel if device is None else fitted(kernel, device)
     text = ptx(kernel, architecture(device))
-    # Groups that do not fit into a warp go to the next one.
-    of_block = BLOCK // WARP * (WARP // kernel.group * kernel.group)
 
     def launch(n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
-        grid = {"grid_x": -(-n_lanes // of_block), "grid_y": 1, "grid_z": 1}
-        block = {"block_x": BLOCK, "block_y": 1, "block_z": 1}
+        grid = {"grid_x": -(-n_lanes // kernel.lanes), "grid_y": 1, "grid_z": 1}
+        block = {"block_x": kernel.threads, "block_y": 1, "block_z": 1}
         run = jax.ffi.ffi_call(TARGET, list(outputs), input_output_aliases=kernel.aliases())
         return list(
             run(
@@ -113,7 +108,8 @@ def fitted(kernel: Kernel, device: jax.Device) -> Kernel:
 
     More blocks hide more latency, until registers that no longer fit cost more than that.
     """
-    candidates = [kernel, *(kernel.with_blocks(n) for n in BLOCKS_AT_ONCE)]
+    numbers = dict.fromkeys(n // kernel.threads for n in THREADS_AT_ONCE if n > kernel.threads)
+    candidates = [kernel, *(kernel.with_blocks(n) for n in numbers)]
     with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
         least, *found = pool.map(lambda c: resources(c, device), candidates)
     bearable = 16 if least.registers <= 224 else 256  # measured on an H200: docs/concepts/engine.md

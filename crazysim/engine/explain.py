@@ -26,17 +26,20 @@ def explain(step: Step, data: SimData, measure: bool = False) -> str:
     lines = [f"engine: {plan.engine}" + (f" ({plan.why})" if plan.why else "")]
     if plan.program is None:
         return "\n".join([*lines, f"stages: {', '.join(s.__name__ for s in step.stages)}"])
-    for segment in plan.program.segments:
-        if isinstance(segment, UnfusedStage):
-            lines.append(f"splits the step: {segment.unfused}")
-        else:
-            names = ", ".join(segment.stages)
-            lines.append(f"fused, for one {segment.scope}: {names} ({segment.n_operations} operations)")
-    split = [stage.name for stage in plan.program.unfused_stages]
+    for program in plan.programs:
+        for segment in program.segments:
+            if isinstance(segment, UnfusedStage):
+                lines.append(f"splits the step: {segment.unfused}")
+            else:
+                names, own = ", ".join(segment.stages), segment.scope == "drone"
+                one = f"member of {program.population!r}" if own and program.population != "drone" else segment.scope
+                lines.append(f"fused, for one {one}: {names} ({segment.n_operations} operations)")
+    split = [stage.name for program in plan.programs for stage in program.unfused_stages]
     if split and measure:
         lines.append(_cost_of_split(step, data, split))
     if plan.engine == "fused":
-        lines.append(fused.describe(plan.program, plan.location.platform, plan.location.devices))
+        described = [fused.describe(p, plan.location.platform, plan.location.devices) for p in plan.programs]
+        lines += dict.fromkeys(described)
     return "\n".join(lines)
 
 

@@ -118,7 +118,7 @@ def describe(program: Program, platform: str, devices: Sequence[jax.Device] | No
     if device is None:
         return f"kernel: compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"
     used = cuda.resources(cuda.fitted(source, device), device)
-    return f"kernel: {kernel.BLOCK} threads a block, {used.registers} registers, {used.spilled} bytes spilled"
+    return f"kernel: {source.threads} threads a block, {used.registers} registers, {used.spilled} bytes spilled"
 
 
 def _over_batches(program: Program, run: Run) -> Run:

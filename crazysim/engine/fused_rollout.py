@@ -12,6 +12,7 @@ from jax import Array
 from crazysim.core.stage import Stage, with_leaves
 from crazysim.engine import fused, kernel
 from crazysim.engine.build import build_program
+from crazysim.engine.relative import on_data, viewed
 
 
 class FusedRollout:
@@ -56,7 +57,7 @@ class FusedRollout:
         self.read = [i for i in kernel.needed(program) if i < self._n_leaves]
         """Leaves that are read as arrays of their own, neither as rows nor with the shared numbers."""
         self._n_steps = n_steps
-        self._run = fused.build(program, platform)
+        self._run = on_data(program, fused.build(program, platform))
 
     def __call__(self, leaves: Sequence[Any]) -> list[Any]:
         """Return the leaves after all stages."""
@@ -71,6 +72,7 @@ class FusedRollout:
     def pack(self, leaves: Sequence[Any]) -> list[Array]:
         """Return leaves as rows, each one number of all drones; one array for each type. (n_rows, n_lanes) each"""
         n_drones = self.program.n_drones
+        leaves = viewed(self.program.views, leaves)
 
         def row(x: Any) -> Array:
             x = jnp.broadcast_to(x, (x.shape[0], n_drones, *x.shape[2:]))
@@ -87,7 +89,8 @@ class FusedRollout:
                 like = program.leaves[i]
                 size = like.size
                 x = array[first : first + size].T.reshape(-1, program.n_drones, *like.shape[2:])
-                out[i] = x[:, :1] if like.scope == "world" else x
+                x = x[:, :1] if like.scope == "world" else x
+                out[i] = x.reshape(x.shape[0], *x.shape[2:]) if i in program.views else x
                 first += size
         return out
 

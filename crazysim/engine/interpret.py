@@ -78,6 +78,8 @@ def _apply(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: E
             while (mask := run(test, args, shape, env)[0]).any():
                 args = [np.where(mask, x, y) for x, y in zip(run(body, args, shape, env), args, strict=True)]
             return args
+        case "over_others":
+            return _over_others(op, args, shape, env)
         case "custom_jvp":
             return run(op.blocks[0], args, shape, env)
         case "table":
@@ -92,6 +94,19 @@ def _apply(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: E
     if numpy is None:
         raise RuntimeError(f"operation {op.name!r} has no NumPy function; give it one in ops.TABLE")
     return [np.asarray(numpy(*args, **params)).astype(op.dtype, copy=False)]
+
+
+def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: Env) -> list[np.ndarray]:
+    """Combine the results of a block for each drone of the world, one after the other."""
+    n = op.param("n_members")
+    own = np.arange(shape[0]) % n
+    combine = [ops.TABLE[name].numpy for name in op.param("reduce")]
+    found = [np.full(shape, ops.neutral(name, x.dtype)) for name, x in zip(op.param("reduce"), op.results, strict=True)]
+    for j in range(n):
+        other = [np.repeat(x.reshape(-1, n)[:, j], n) for x in args]
+        new = run(op.blocks[0], [*other, own == j], shape, env)
+        found = [fn(x, y) for fn, x, y in zip(combine, found, new, strict=True)]
+    return found
 
 
 ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))

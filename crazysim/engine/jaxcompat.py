@@ -37,6 +37,7 @@ __all__ = [
     "closed",
     "compute_capability",
     "custom_vmap",
+    "equations",
     "expanded",
     "ffi_include_folder",
     "is_key",
@@ -73,6 +74,16 @@ def with_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
     return ClosedJaxpr(
         Jaxpr(inner.constvars, invars, inner.outvars, inner.eqns, inner.effects, inner.debug_info), jaxpr.consts
     )
+
+
+def equations(jaxpr: ClosedJaxpr) -> Iterator[Any]:
+    """Iterate over the equations of a jaxpr, those of jaxprs among their parameters included."""
+    for eqn in jaxpr.jaxpr.eqns:
+        yield eqn
+        for value in eqn.params.values():
+            for inner in value if isinstance(value, list | tuple) else [value]:
+                if isinstance(inner, ClosedJaxpr | Jaxpr):
+                    yield from equations(closed(inner))
 
 
 class Parameters(dict):

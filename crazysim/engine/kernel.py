@@ -11,6 +11,8 @@ from collections.abc import Iterable, Sequence
 from importlib import resources
 
 from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.exchange import exchange_for, lanes_of_block
+from crazysim.engine.ir import Block
 from crazysim.engine.program import TABLE, Phase, Program, Segment, Slot
 from crazysim.engine.source import TYPES, Writer, require, type_name
 
@@ -32,8 +34,10 @@ class Kernel:
     """Leaves that it writes; behind them comes one bool per drone, whether its world is flagged, if that is checked."""
     in_place: tuple[int, ...] = ()
     """Leaves of rows that it updates in place: input and output of each must be the same memory."""
-    group: int = 1
-    """Neighbouring drones that must be in one warp or vector, because they read each other's numbers."""
+    threads: int = BLOCK
+    """Threads of a block on a GPU."""
+    lanes: int = BLOCK
+    """Threads of a block that are lanes: as many as make whole worlds, where drones read each other's numbers."""
     samples: tuple[int, ...] = ()
     """Leaves of which it also writes samples, behind all other outputs."""
 
@@ -75,7 +79,8 @@ def write(program: Program, target: str, samples: Sequence[int] = ()) -> Kernel:
         UnsupportedError: If there is no source for an operation or a type; the error names the stage.
     """
     _require(program)
-    writer = Writer()
+    exchange = exchange_for(target, program.group)
+    writer = Writer(exchange)
     check = program.check
     segments = program.fused_segments
     each = [s for s in segments if s.phase == "each"]
@@ -88,53 +93,83 @@ def write(program: Program, target: str, samples: Sequence[int] = ()) -> Kernel:
     inputs = needed(program)
 
     names = {slot: f"x{slot[0]}_{slot[1]}" for slot in slots}
-    for slot in slots:
-        kind, access = _type(program, slot[0]), _load(program, slot)
+    depth = 1 + exchange.depth
+    shared = [slot for slot in slots if program.leaves[slot[0]].scope not in ("drone", "world")]
+    for slot in shared:
         if slot[1] == TABLE:
             names[slot] = f"p{slot[0]}"
-        elif slot not in loaded:
-            writer.line(f"auto {names[slot]} = {kind}_lanes({kind}(0));", 1)
-        elif slot in written:
-            writer.line(f"auto {names[slot]} = {kind}_lanes({access});", 1)
+        elif slot in stored or not _is_deferred(program, slot):
+            writer.line(f"const auto {names[slot]} = {_load(program, slot)};", 1)
+        else:
+            names[slot] = _load(program, slot)
+    exchange.begin(writer, 1)
+    for slot in slots:
+        kind, access = _type(program, slot[0]), _load(program, slot)
+        if slot in shared:
+            continue
+        if slot in written:
+            start = access if slot in loaded else f"{kind}(0)"
+            names[slot] = exchange.variable(writer, names[slot], kind, f"{kind}_lanes({start})", depth)
         elif slot not in stored and _is_deferred(program, slot):
             names[slot] = access
         else:
-            writer.line(f"const auto {names[slot]} = {access};", 1)
-    _write_phase(writer, program, "first", names, 1)
-    hoisted = [writer.block(s.hoisted, [names[slot] for slot in s.hoisted_reads], 1) for s in each]
+            names[slot] = exchange.keep(writer, names[slot], kind, access, depth)
+    _write_phase(writer, program, "first", names, depth)
+    hoisted = []
+    for segment in each:
+        outs = writer.block(segment.hoisted, [names[slot] for slot in segment.hoisted_reads], depth)
+        kinds = [type_name(x.dtype) for x in segment.hoisted.outputs]
+        hoisted.append(
+            [exchange.keep(writer, writer.new("h"), kind, x, depth) for kind, x in zip(kinds, outs, strict=True)]
+        )
+    exchange.end(writer, 1)
     if samples:
         writer.line("for (int sample = 0; sample < n_samples; ++sample) {", 1)
     writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
+    exchange.begin(writer, 2)
     for segment, constants in zip(each, hoisted, strict=True):
-        _write_segment(writer, program, segment, names, constants, 2)
+        _write_segment(writer, program, segment, names, constants, 1 + depth)
+    exchange.end(writer, 2)
     writer.line("}", 1)
-    for leaf in samples:
-        kind, size, n_drones = _type(program, leaf), program.leaves[leaf].size, _drones(program, leaf)
-        writer.line(f"{kind}* const r{leaf} = s{leaf} + sample * (n_lanes / {n_drones} * {size}ll);", 1)
-        for k in range(size):
-            writer.line(f"STORE({size}, {n_drones}, r{leaf}, {k}, {kind}_lanes({names[leaf, k]}))", 1)
     if samples:
+        exchange.begin(writer, 2)
+        for leaf in samples:
+            kind, size, n_drones = _type(program, leaf), program.leaves[leaf].size, _drones(program, leaf)
+            writer.line(f"{kind}* const r{leaf} = s{leaf} + sample * (n_lanes / {n_drones} * {size}ll);", 2)
+            for k in range(size):
+                writer.line(f"STORE({size}, {n_drones}, r{leaf}, {k}, {kind}_lanes({names[leaf, k]}))", 2)
+        exchange.end(writer, 2)
         writer.line("}", 1)
+    exchange.begin(writer, 1)
     if check is not None:
-        (flagged,) = writer.block(check.block, [names[slot] for slot in checked], 1)
-        writer.line(f"STORE(1, 1, flagged, 0, b1_lanes({flagged}))", 1)
-    _write_phase(writer, program, "last", names, 1)
+        (flagged,) = writer.block(check.block, [names[slot] for slot in checked], depth)
+        writer.line(f"STORE(1, 1, flagged, 0, b1_lanes({flagged}))", depth)
+    _write_phase(writer, program, "last", names, depth)
     for slot in stored:
-        writer.line(_store(program, slot, f"{_type(program, slot[0])}_lanes({names[slot]})"), 1)
+        writer.line(_store(program, slot, f"{_type(program, slot[0])}_lanes({names[slot]})"), depth)
+    exchange.end(writer, 1)
 
     pointers = [f"const {_type(program, i)}* __restrict__ p{i}" for i in inputs]
     pointers += [f"{_type(program, i)}* __restrict__ q{i}" for i in outputs]
     pointers += ["b1* __restrict__ flagged"] if check is not None else []
     pointers += [f"{_type(program, i)}* __restrict__ s{i}" for i in samples]
-    frame = {"cuda": _cuda, "host": _host}[target]
+    threads, lanes = lanes_of_block(program.group)
+    body = "\n".join(writer.lines)
+    frame = _cuda(pointers, body, threads, lanes) if target == "cuda" else _host(pointers, body, exchange.depth > 0)
     widest = 8 if any(_type(program, i) == "f64" for i in (*inputs, *outputs)) else 4
-    n_operations = sum(s.n_operations for s in each)
-    defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n#define OPERATIONS {n_operations}\n"
+    defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n#define BLOCK_THREADS {threads}\n"
+    defines += f"#define OPERATIONS {sum(_n_operations(s.block) for s in each)}\n"
     defines += f"#define SAMPLES {'count[1]' if samples else 1}\n"
-    tables = "".join(f"{line}\n" for line in writer.tables)
-    text = defines + preamble(target) + tables + frame(pointers, "\n".join(writer.lines)) + epilogue(target)
+    declared = "".join(f"{line}\n" for line in (*writer.tables, *exchange.declarations))
+    text = defines + preamble(target) + declared + frame + epilogue(target)
     in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
-    return Kernel(text, inputs, outputs, in_place, program.group, tuple(samples))
+    return Kernel(text, inputs, outputs, in_place, threads, lanes, tuple(samples))
+
+
+def _n_operations(block: Block) -> int:
+    """Return the number of operations of a block, with those for each of the others of a world."""
+    inner = [dict(op.params).get("n_members", 1) * sum(map(_n_operations, op.blocks)) for op in block.operations]
+    return len(block.operations) + sum(inner)
 
 
 def _require(program: Program) -> None:
@@ -234,6 +269,7 @@ def _is_deferred(program: Program, slot: Slot) -> bool:
             return False
         block = segment.block
         now = {x for op in block.operations for x in op.args} | set(block.outputs)
+        now = now.union(*(x.uses() for op in block.operations if op.name == "over_others" for x in op.blocks))
         for x, read in zip(block.inputs, program.per_drone(segment, segment.reads), strict=False):
             if read == slot:
                 if segment.scope == "world" or x in now:
@@ -267,33 +303,44 @@ def _drones(program: Program, leaf: int) -> int:
     return program.n_drones if program.leaves[leaf].scope == "world" else 1
 
 
-def _cuda(pointers: Sequence[str], body: str) -> str:
+def _cuda(pointers: Sequence[str], body: str, threads: int, lanes: int) -> str:
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
     arguments = ", ".join([*scalars, *pointers])
     return f"""
-extern "C" __global__ void __launch_bounds__({BLOCK}, {UNBOUNDED}) advance({arguments}) {{
+extern "C" __global__ void __launch_bounds__({threads}, {UNBOUNDED}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0], n_samples = SAMPLES;
-  const int thread = blockIdx.x * {BLOCK} + threadIdx.x;
-  const int wanted = thread / 32 * LANES + thread % 32;
-  const bool active = thread % 32 < LANES && wanted < n_lanes;
+  const int thread = threadIdx.x % THREADS, place = threadIdx.x / THREADS * LANES + thread;
+  const int wanted = blockIdx.x * {lanes} + place;
+  const bool active = thread < LANES && wanted < n_lanes;
   const int lane = wanted < n_lanes ? wanted : n_lanes - 1;
   const int own = lane % GROUP;
+  const int world = active ? place / GROUP * GROUP : 0;
 {body}
 }}
 """
 
 
-def _host(pointers: Sequence[str], body: str) -> str:
+def _host(pointers: Sequence[str], body: str, in_memory: bool) -> str:
     arguments = ", ".join(pointers)
     kinds = [p.split("*")[0].removeprefix("const ") for p in pointers]
     n_in = sum(p.startswith("const") for p in pointers)
     buffers = [f"({kind}*)in[{k + 2}]->data" if k < n_in else f"({kind}*)out[{k - n_in}]->data"
                for k, kind in enumerate(kinds)]  # fmt: skip
-    return f"""
-static void advance_block(int64_t first, int64_t n_lanes, int n_steps, int n_samples, {arguments}) {{
+    call = f"n_lanes, n_steps, n_samples, {', '.join(buffers)}"
+    sizes = "int64_t n_lanes, int n_steps, int n_samples"
+    if in_memory:
+        block = f"static void advance_world(World& w, int64_t begin, {sizes}, {arguments}) {{\n"
+        each = f"""    World* const w = static_cast<World*>(std::aligned_alloc(64, (sizeof(World) + 63) / 64 * 64));
+    for (int64_t first = begin; first < end; first += GROUP) advance_world(*w, first, {call});
+    std::free(w);"""
+    else:
+        block = f"""static void advance_block(int64_t first, {sizes}, {arguments}) {{
   const int n_active = n_lanes - first < LANES ? int(n_lanes - first) : LANES;
   const i32v own = numbers() % GROUP;
-{body}
+"""
+        each = f"    for (int64_t first = begin; first < end; first += LANES) advance_block(first, {call});"
+    return f"""
+{block}{body}
 }}
 
 static void advance(XLA_FFI_Buffer** in, XLA_FFI_Buffer** out) {{
@@ -301,8 +348,7 @@ static void advance(XLA_FFI_Buffer** in, XLA_FFI_Buffer** out) {{
   const int* count = (int*)in[1]->data;
   const int n_steps = count[0], n_samples = SAMPLES;
   const auto run = [=](int64_t begin, int64_t end) {{
-    for (int64_t first = begin; first < end; first += LANES)
-      advance_block(first, n_lanes, n_steps, n_samples, {", ".join(buffers)});
+{each}
   }};
   in_parallel(n_lanes, int64_t(n_steps) * n_samples, run);
 }}

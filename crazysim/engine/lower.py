@@ -60,15 +60,18 @@ class Entry(NamedTuple):
 class Lowering:
     """Lowers jaxprs into a block of scalar operations."""
 
-    def __init__(self, builder: Builder | None = None, entries: dict[Value, Entry] | None = None):
+    def __init__(self, builder: Builder | None = None, entries: dict[Value, Entry] | None = None, n_members: int = 0):
         """Add operations to a block, to a new one if none is given.
 
         Args:
             builder: Builder of the block.
             entries: Numbers that can also be looked up in tables, to which others are added.
+            n_members: Number of drones of a world, for a function of one drone; 0 where it has no others.
         """
         self.builder = Builder() if builder is None else builder
         self.entries = {} if entries is None else entries
+        self.n_members = n_members
+        self.shared: set[Value] = set()
 
     def lower(self, jaxpr: ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
         """Return the results of a jaxpr for arrays of elements.
@@ -131,7 +134,7 @@ class Lowering:
 
     def inner(self) -> Lowering:
         """Return a lowering into a new block inside this one."""
-        return Lowering(Builder(self.builder), self.entries)
+        return Lowering(Builder(self.builder), self.entries, self.n_members)
 
     def lookup(self, table: Value, base: Element, offset: int, aligned: bool) -> Element:
         """Return a number of a table, whose base is a multiple of four if it is aligned."""

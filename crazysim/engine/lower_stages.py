@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Literal
 
@@ -9,12 +10,14 @@ import jax
 import numpy as np
 
 import crazysim.engine.rules  # noqa: F401  (fills the table of rules)
+from crazysim.core.others import reduce_over_others_p
 from crazysim.core.stage import Axes, Stage
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir import Builder, Element, Value, constant, prune
-from crazysim.engine.jaxcompat import is_key
+from crazysim.engine.jaxcompat import equations, is_key
 from crazysim.engine.lower import Elements, Entry, Lowering, as_elements, inputs, scalars
 from crazysim.engine.program import TABLE, Leaf, Phase, Program, Segment, Slot, UnfusedStage
+from crazysim.engine.relative import RelativeAxes, viewed
 from crazysim.engine.tracing import TracedStage
 
 MAX_UNROLLED_DRONES = 8
@@ -32,6 +35,7 @@ def lower_stages(
     first: Sequence[Stage] = (),
     last: Sequence[Stage] = (),
     scratch: Collection[int] = (),
+    population: str = "drone",
 ) -> Program:
     """Return the program of a step, each stage a segment of its own.
 
@@ -45,23 +49,33 @@ def lower_stages(
         first: Stages that run once, before the first step.
         last: Stages that run once, after the last step.
         scratch: Leaves that only carry numbers from one stage to another; what is written there is not kept.
+        population: Population whose members are computed side by side; below they are called drones.
     """
-    axes, leaves = Axes(data), jax.tree.leaves(data)
-    zeros, n_drones = zeros or {}, data.core.n_drones
+    axes = RelativeAxes(data, population)
+    leaves = viewed(axes.views, jax.tree.leaves(data))
+    zeros = zeros or {}
+    n_drones = next(x.shape[1] for x, scope in zip(leaves, axes.scopes, strict=True) if scope == "drone")
     segments = []
     phases: dict[Phase, Sequence[Stage]] = {"first": first, "each": stages, "last": last}
     for phase, some in phases.items():
-        segments += [_lower_stage(stage, phase, axes, leaves, zeros, n_drones) for stage in some]
+        segments += [_lower_stage(axes.stage(stage), phase, axes, leaves, zeros, n_drones) for stage in some]
     described = tuple([
         Leaf(name, scope, tuple(x.shape), x.dtype)
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
     ])  # fmt: skip
-    check = None if watched is None else _finite_check(axes, leaves, data.core.nonfinite, watched(data))
-    return Program(described, n_drones, tuple(segments), check, frozenset(scratch))
+    program = Program(described, n_drones, tuple(segments), None, frozenset(scratch), (), population, axes.views)
+    if watched is None:
+        return program
+    ids, places = {id(x) for x in watched(data)}, [id(x) for x in jax.tree.leaves(data)]
+    own = [i for i, scope in enumerate(axes.scopes) if scope == "drone"]
+    checked = [i for i in sorted({*own, *(axes.views & set(program.written))}) if places[i] in ids]
+    return dataclasses.replace(
+        program, check=_finite_check(axes, leaves, places.index(id(data.core.nonfinite)), checked)
+    )
 
 
 def _lower_stage(
-    stage: Stage, phase: Phase, axes: Axes, leaves: Sequence[Any], zeros: Zeros, n_drones: int
+    stage: Stage, phase: Phase, axes: RelativeAxes, leaves: Sequence[Any], zeros: Zeros, n_drones: int
 ) -> Segment | UnfusedStage:
     try:
         if stage.scope == "batch":
@@ -72,8 +86,11 @@ def _lower_stage(
         scope: Literal["drone", "world"] = "world" if stage.scope == "world" and of_drones else "drone"
         if scope == "world" and n_drones > MAX_UNROLLED_DRONES:
             raise LimitError(f"a stage of one world is unrolled for at most {MAX_UNROLLED_DRONES} drones")
+        others = [leaves[i].shape[2] for i in (*traced.used, *traced.written) if i in axes.views]
+        if max(others, default=0) > MAX_UNROLLED_DRONES:
+            raise LimitError(f"other populations are unrolled for at most {MAX_UNROLLED_DRONES} members")
         shared = [i for i in traced.used if axes.scopes[i] == "shared" and not is_key(traced.avals[i])]
-        return _segment(stage, scope, phase, traced, zeros, shared)
+        return _segment(stage, scope, phase, traced, zeros, shared, n_drones if scope == "drone" else 0)
     except UnsupportedError as error:
         traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)
         why = error.located(stage=stage.__name__)
@@ -87,10 +104,12 @@ def _segment(
     traced: TracedStage,
     zeros: Zeros,
     shared: Sequence[int],
+    n_members: int,
 ) -> Segment:
-    lowering = Lowering(Builder(stage=stage.__name__))
+    lowering = Lowering(Builder(stage=stage.__name__), n_members=n_members)
     before = {i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.used}
     tables = {_table(lowering, before[i]): (i, TABLE) for i in shared if i in before and before[i].size > 1}
+    lowering.shared.update(x for i in shared for x in scalars(before[i]) if isinstance(x, Value))
     args = [before[i] for i in traced.used]
     if traced.when is None:
         after = lowering.lower(traced.fn, args)
@@ -121,10 +140,18 @@ def _table(lowering: Lowering, elements: Elements) -> Value:
 def _guarded(
     lowering: Lowering, mask: Element, traced: TracedStage, args: list[Elements], old: list[Elements]
 ) -> list[Elements]:
-    """Return what the written leaves become of a stage that acts where a mask is true."""
-    inner = lowering.inner()
+    """Return what the written leaves become of a stage that acts where a mask is true.
+
+    Drones whose stages act at different steps still publish values for each other, so that such a stage is computed
+    at every step, and selected.
+    """
+    together = any(eqn.primitive is reduce_over_others_p for eqn in equations(traced.fn))
+    inner = lowering if together else lowering.inner()
     new = inner.lower(traced.fn, args)
     pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(scalars(x), scalars(y), strict=True)]
+    if together:
+        results = iter([a if a is b else lowering.scalar("select_n", mask, a, b) for a, b in pairs])
+        return [_with_scalars(x, [next(results) for _ in scalars(x)]) for x in old]
     changed = [(a, b) for a, b in pairs if a is not b]
     block = inner.builder.finish([b for _, b in changed])
     before = [a for a, _ in changed]
@@ -140,18 +167,17 @@ def _with_scalars(like: Elements, items: Sequence[Element]) -> Elements:
     return as_elements(pairs, like.shape)
 
 
-def _finite_check(axes: Axes, leaves: Sequence[Any], flag: Any, watched: Sequence[Any]) -> Segment:
+def _finite_check(axes: Axes, leaves: Sequence[Any], flag: int, watched: Sequence[int]) -> Segment:
     """Return a segment that flags a drone: its world was flagged, or a watched number is not finite."""
-    ids = {id(x) for x in watched}
     builder = Builder(stage="finite_check")
     reads: list[Slot] = []
     finite: Element = constant(True, bool)
     avals = axes.of_one(list(leaves), "drone")
-    for i, x in enumerate(leaves):
-        if id(x) in ids and axes.scopes[i] == "drone" and avals[i].dtype.kind == "f":
+    for i in watched:
+        if avals[i].dtype.kind == "f":
             for k, item in enumerate(scalars(inputs(builder, avals[i]))):
                 reads.append((i, k))
                 finite = builder.add("and", (finite, builder.add("is_finite", (item,), bool)), bool)
-    reads.append((next(i for i, x in enumerate(leaves) if x is flag), 0))
+    reads.append((flag, 0))
     flagged = builder.add("or", (builder.input(bool), builder.add("not", (finite,), bool)), bool)
     return Segment("drone", ("finite_check",), "last", builder.finish([flagged]), tuple(reads), ())

@@ -206,7 +206,7 @@ def _rows() -> list[Row]:
         Row(name="lookup", operands="**", results="*", structured=True),
         Row(name="threefry2x32", operands="uuuu", results="uu", cost=60, structured=True),
         *(Row(name=name, operands="...", results="...", cost=0, structured=True)
-          for name in ("when", "loop", "while", "custom_jvp")),
+          for name in ("when", "loop", "while", "custom_jvp", "over_others")),
     ]  # fmt: skip
     return [*arithmetic, *rounding, *functions, *comparisons, *bits, *structured]
 
@@ -223,7 +223,9 @@ TABLE: Mapping[str, Row] = {row.name: row for row in _rows()}
 ``barrier`` separates stages: what is used behind it is computed once. ``when(mask, *old)`` has the outputs of its block
 where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)`` runs its block that often;
 ``while(*carry)`` runs its second block as long as its first is true. ``custom_jvp(*args, slope=)`` runs its block, and
-has a derivative of its own. ``threefry2x32`` is the cipher of JAX's random numbers.
+has a derivative of its own. ``over_others(*published, reduce=, n_members=)`` runs its block for each drone of the
+world: the block's inputs are what that drone published, and whether it is the drone itself; ``reduce`` names the
+operation that combines its outputs. It stands in no inner block. ``threefry2x32`` is the cipher of JAX's random numbers.
 ``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=, aligned=)`` the entry at the sum of an
 int32, which is a multiple of four if that is aligned, and a constant; whoever makes one ensures that there is one.
 
@@ -231,6 +233,18 @@ Costs are counted with what decides them: comparisons with selections, signs wit
 hardware that approximates them and a step that refines take, or the shortest polynomial that is exact to float32;
 twenty rounds of add, rotate and xor make a random number. An operation that runs a block costs what that does.
 """
+
+REDUCTIONS: Mapping[str, str] = {"sum": "add", "min": "min", "max": "max"}
+"""Operations that combine the results of ``over_others``."""
+
+
+def neutral(name: str, dtype: np.dtype) -> np.generic:
+    """Return the number that an operation of ``REDUCTIONS`` begins with; ``or`` and ``and`` stand for max and min."""
+    if name in ("add", "or", "and"):
+        return dtype.type(name == "and")
+    limits = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    return dtype.type(limits[name == "min"])
+
 
 BOOLEAN_FORM: Mapping[str, tuple[str, int | None]] = {
     "lt": ("and", 0),

@@ -15,6 +15,7 @@ from crazysim.core.stage import Axes, Stage, with_leaves
 from crazysim.core.stages import finite
 from crazysim.engine import jaxcompat
 from crazysim.engine.barriers import compute_once
+from crazysim.pytree import has_members
 
 ResetFn = Callable[..., SimData]
 
@@ -82,7 +83,7 @@ def _finish_stage(axes: Axes, stage: Stage, before: SimData, after: SimData, by_
     written = axes.written(jax.tree.leaves(before), after, stage)
     new = jax.tree.leaves(after)
     for i, value in zip(written, jax.lax.optimization_barrier([new[i] for i in written]), strict=True):
-        new[i] = _stored(value, by_component and axes.scopes[i] == "drone")
+        new[i] = _stored(value, by_component and has_members(axes.scopes[i]))
     return axes.treedef.unflatten(new)
 
 

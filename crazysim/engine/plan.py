@@ -18,19 +18,23 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 from jax.sharding import PartitionSpec
 
 from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Stage, with_leaves
+from crazysim.core.stages import watched
 from crazysim.engine import fused, interpret, lanes, passes, plain
 from crazysim.engine.build import build_program
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.flat import Zeros
+from crazysim.engine.groups import Group, independent
 from crazysim.engine.program import Program
+from crazysim.engine.relative import on_data
 from crazysim.errors import ConfigError
-from crazysim.pytree import scopes
+from crazysim.pytree import n_batch_axes, scopes
 
 ENGINES = ("auto", "plain", "lanes", "fused", "interpret")
 """Values of ``engine=``. ``interpret`` runs the program in NumPy: slow, without derivatives, to find bugs with."""
@@ -46,8 +50,9 @@ class Plan(NamedTuple):
     """Engine that runs."""
     why: str
     """Reason why it is not a faster one."""
-    program: Program | None
-    """Program that it runs; None for ``plain``."""
+    programs: tuple[Program, ...]
+    """Programs that it runs, that of the drones first: one for each group of populations that depend on each other;
+    none for ``plain``."""
     location: Location
     """Devices that it runs on."""
     read: tuple[int, ...]
@@ -62,6 +67,11 @@ class Plan(NamedTuple):
     """The compiled step, for a number of steps that is an array."""
     static: Callable[..., Any]
     """The same for a number of steps that is a Python number, which can be differentiated in reverse."""
+
+    @property
+    def program(self) -> Program | None:
+        """Program of the drones; None for ``plain``."""
+        return self.programs[0] if self.programs else None
 
 
 class Planner(NamedTuple):
@@ -122,28 +132,33 @@ class Planner(NamedTuple):
         kinds = jax.tree.leaves(scopes(data))
         # Zeros that a caller found earlier may belong to a parameter that was shared then and is one per drone now.
         known = {i: some for i, some in zeros if kinds[i] == "shared"}
-        program = build_program(self.stages, data, known, _watched)
-        split = program.unfused_stages
+        groups = independent(self.stages, data)
+        programs = tuple([
+            build_program(group.stages, data, known, _watched, population=group.population, pack=k == 0)
+            for k, group in enumerate(groups)
+        ])  # fmt: skip
+        split = [stage for program in programs for stage in program.unfused_stages]
         problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
         if self.location.spread and split:
             return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}"), problems
-        on_lanes = passes.separate(program) if self.location.platform == "cpu" else program
-        engine, why, run = "lanes", "it was chosen", functools.partial(lanes.steps, on_lanes)
+        on_lanes = [passes.separate(p) if self.location.platform == "cpu" else p for p in programs]
+        engine, why, runs = "lanes", "it was chosen", [functools.partial(lanes.steps, p) for p in on_lanes]
         if self.engine == "interpret":
-            engine, run = "interpret", functools.partial(interpret.steps, program)
+            engine, runs = "interpret", [functools.partial(interpret.steps, p) for p in programs]
         elif self.engine != "lanes":
             why = fused.missing(self.location.platform) or ""
             if not why:
                 try:
-                    run = fused.build(program, self.location.platform, self.location.devices)
+                    runs = [fused.build(p, self.location.platform, self.location.devices) for p in programs]
                     engine = "fused"
                 except UnsupportedError as error:
                     why = str(error)
                     problems.append(self._without_kernel(error))
             if why and self.engine == "fused":
                 raise ConfigError(f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'.")
-        read = (*program.read, *_needed(program))
-        plan = self._wrap(engine, why, data, program, read, tuple(program.written), run, len(program.leaves))
+        read = tuple(i for program in programs for i in (*program.read, *_needed(program)))
+        run, written = _together(groups, programs, runs)
+        plan = self._wrap(engine, why, data, programs, read, written, run, len(programs[0].leaves))
         return plan, problems
 
     def _spread_limit(self, data: SimData) -> str:
@@ -160,14 +175,14 @@ class Planner(NamedTuple):
         run, written = plain.build(self.stages, data, by_component=not self.location.spread, barriers=on_cpu)
         everything = tuple(range(len(jax.tree.leaves(data))))
         # XLA spreads the arrays of ``plain`` over devices by itself.
-        return self._wrap("plain", why, data, None, everything, tuple(written), run, len(everything))
+        return self._wrap("plain", why, data, (), everything, tuple(written), run, len(everything))
 
     def _wrap(
         self,
         engine: str,
         why: str,
         data: SimData,
-        program: Program | None,
+        programs: tuple[Program, ...],
         read: tuple[int, ...],
         written: tuple[int, ...],
         run: Steps,
@@ -177,7 +192,7 @@ class Planner(NamedTuple):
         nonfinite, synced = numbers[id(data.core.nonfinite)], numbers[id(data.core.mjx_synced)]
         everything = tuple(sorted({*read, *written}))
         written = (*written, nonfinite)
-        packed = program.packed if program else ()
+        packed = programs[0].packed if programs else ()
         read = everything[:-1] if packed else everything  # the packed array is the last
 
         def advance(values: list[Any], n_steps: int | Array) -> list[Any]:
@@ -185,16 +200,17 @@ class Planner(NamedTuple):
             out, flagged = run(leaves, n_steps)
             return [*out, flagged]
 
-        if program is not None and self.location.mesh is not None:
-            advance = self._over_mesh(advance, program, everything, written)
-        return Plan(engine, why, program, self.location, read, packed, written, synced, *_jitted(advance))
+        if programs and self.location.mesh is not None:
+            advance = self._over_mesh(advance, data, everything, written)
+        return Plan(engine, why, programs, self.location, read, packed, written, synced, *_jitted(advance))
 
     def _over_mesh(
-        self, advance: Callable[..., Any], program: Program, inputs: Sequence[int], outputs: Sequence[int]
+        self, advance: Callable[..., Any], data: SimData, inputs: Sequence[int], outputs: Sequence[int]
     ) -> Callable[..., Any]:
         """Return a step in which every device advances its own worlds."""
         split, shared = PartitionSpec(self.location.axis), PartitionSpec()
-        specs = [split if leaf.scope in ("drone", "world") else shared for leaf in program.leaves]
+        specs = [split if n_batch_axes(scope) == 2 else shared for scope in jax.tree.leaves(scopes(data))]
+        specs.append(shared)  # the packed array
 
         def spread(values: list[Any], n_steps: int | Array) -> list[Any]:
             count = [] if isinstance(n_steps, int) else [n_steps]
@@ -234,9 +250,31 @@ def _jitted(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[.
     return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
 
+def _together(
+    groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Steps]
+) -> tuple[Steps, tuple[int, ...]]:
+    """Return one function that runs independent programs, and the leaves that it writes."""
+    runs = [on_data(program, run) for program, run in zip(programs, runs, strict=True)]
+    if len(runs) == 1:
+        return runs[0], tuple(programs[0].written)
+    owned = [group.owned for group in groups]
+    written = sorted({i for program in programs for i in program.written})
+
+    def run_all(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+        new: dict[int, Any] = {}
+        flags = []
+        for program, own, run in zip(programs, owned, runs, strict=True):
+            out, flagged = run(leaves[: len(program.leaves)], n_steps)
+            new |= {i: x for i, x in zip(program.written, out, strict=True) if own is None or i in own}
+            flags.append(flagged)
+        return [new[i] for i in written], functools.reduce(jnp.logical_or, flags)
+
+    return run_all, tuple(written)
+
+
 def _watched(data: SimData) -> list[Any]:
     """Return the leaves whose NaN and infinities flag a world: states and commands."""
-    return jax.tree.leaves((data.states, data.controls))
+    return jax.tree.leaves(watched(data))
 
 
 def _needed(program: Program) -> list[int]:

@@ -91,6 +91,11 @@ class Segment:
         """Leaves that it reads."""
         return {leaf for leaf, _ in (*self.reads, *self.hoisted_reads)}
 
+    @functools.cached_property
+    def couples(self) -> bool:
+        """True if drones of a world read each other's numbers."""
+        return self.scope == "world" or any(op.name == "over_others" for op in self.block.operations)
+
     @property
     def n_operations(self) -> int:
         """Number of operations of a step."""
@@ -146,6 +151,10 @@ class Program:
     """Leaves that only carry numbers from one stage to another: what is written there is not kept."""
     packed: tuple[int, ...] = ()
     """Shared leaves whose numbers are also those of one leaf, one after the other."""
+    population: str = "drone"
+    """Population whose members it computes side by side; here they are called drones, with scope ``drone``."""
+    views: frozenset[int] = frozenset()
+    """Leaves of other populations, viewed as leaves of the world (``relative``)."""
 
     @functools.cached_property
     def fused(self) -> bool:
@@ -185,8 +194,8 @@ class Program:
 
     @functools.cached_property
     def group(self) -> int:
-        """Number of drones whose scalars are computed together: those of a world, if a segment has that scope."""
-        return self.n_drones if any(s.scope == "world" for s in self.fused_segments) else 1
+        """Number of drones that read each other's numbers: those of a world, if a segment needs that; otherwise 1."""
+        return self.n_drones if any(s.couples for s in self.fused_segments) else 1
 
     def of(self, phase: Phase) -> list[Any]:
         """Return the segments that run in a phase."""

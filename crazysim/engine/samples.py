@@ -53,8 +53,10 @@ def _by_loop(step: Step, data: SimData, keep: Keep, n_samples: int, n_steps: int
 def _by_kernel(step: Step, data: SimData, keep: Keep, n_samples: int, n_steps: int) -> Sampler | None:
     """Return a sampler that is one kernel; None where there is none for this step or these samples."""
     plan, zeros = step.plan(data), step.zeros(data)
-    program, location = plan.program, plan.location
-    if plan.engine != "fused" or program is None or not program.fused or location.mesh is not None:
+    if plan.engine != "fused" or len(plan.programs) != 1 or plan.location.mesh is not None:
+        return None
+    program, location = plan.programs[0], plan.location
+    if program.views or not program.fused:
         return None
     numbers = {id(x): i for i, x in enumerate(jax.tree.leaves(data))}
     kept, tree = jax.tree.flatten(keep(data))

@@ -7,6 +7,7 @@ functions are defined by a preamble for each target (``targets/``); the source o
 from __future__ import annotations
 
 import collections
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from crazysim.engine import ops
 from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.exchange import Exchange, Registers
 from crazysim.engine.ir import Block, Element, Operation, Value, is_constant
 
 TYPES = {np.dtype(name): short for name, short in
@@ -42,8 +44,13 @@ INDENT = "  "
 class Writer:
     """Lines of source of blocks."""
 
-    def __init__(self) -> None:
-        """Begin without lines."""
+    def __init__(self, exchange: Exchange | None = None) -> None:
+        """Begin without lines.
+
+        Args:
+            exchange: How lanes read each other's numbers; None for registers.
+        """
+        self.exchange = Registers() if exchange is None else exchange
         self.lines: list[str] = []
         self.names: dict[Value, str] = {}
         self.pairs: dict[str, str] = {}
@@ -66,10 +73,17 @@ class Writer:
         self.names.update(zip(block.inputs, inputs, strict=True))
         outside = dict(self.pairs), self.fours  # what is computed inside a block is not defined outside
         self.fours = dict.fromkeys(_fours(block), "")
-        for op in block.operations:
-            self._operation(op, depth)
+        for position, op in enumerate(block.operations):
+            if op.name == "over_others":
+                self._over_others(op, depth, _live(block, position))
+            else:
+                self._operation(op, depth)
         self.pairs, self.fours = outside
         return [self.element(x) for x in block.outputs]
+
+    def forget(self) -> None:
+        """Forget shared intermediate results: their variables are not defined behind this place."""
+        self.pairs, self.fours = {}, dict.fromkeys(self.fours, "")
 
     def element(self, x: Element) -> str:
         """Return an element as an expression."""
@@ -159,6 +173,24 @@ class Writer:
         self._assign(name, outs, None, depth + 1)
         self.line("}", depth)
 
+    def _over_others(self, op: Operation, depth: int, live: Sequence[tuple[Value, str]]) -> None:
+        """Write a loop over the drones of the world, which reads what they published."""
+        (body,) = op.blocks
+        published = [(type_name(x.dtype), self.element(x)) for x in op.args]
+        reads = self.exchange.publish(self, published, live, depth)
+        first = [ops.neutral(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
+        name, turn = self._carry(op, [literal(x) for x in first], depth), self.new("j")
+        self.line(f"UNROLL for (int {turn} = 0; {turn} < GROUP; ++{turn}) {{", depth)
+        inputs = [self.new() for _ in body.inputs]
+        for variable, read in zip(inputs, reads, strict=False):
+            self.line(f"const auto {variable} = {read(turn)};", depth + 1)
+        self.line(f"const auto {inputs[-1]} = eq_(own, i32({turn}));", depth + 1)
+        outs = self.block(body, inputs, depth + 1)
+        for k, (combine, out) in enumerate(zip(op.param("reduce"), outs, strict=True)):
+            text = f"{name}_{k} + {out}" if combine == "add" else f"{combine}_({name}_{k}, {out})"
+            self.line(f"{name}_{k} = {text};", depth + 1)
+        self.line("}", depth)
+
     def _while(self, op: Operation, args: list[str], depth: int) -> None:
         test, body = op.blocks
         name = self._carry(op, args, depth)
@@ -183,6 +215,14 @@ class Writer:
             self.line(f"const auto {f} = {out if mask is None else f'select_n_({mask}, {name}_{k}, {out})'};", depth)
         for k, f in enumerate(fresh):
             self.line(f"{name}_{k} = {f};", depth)
+
+
+def _live(block: Block, position: int) -> list[tuple[Value, str]]:
+    """Return the values of a block that are computed before an operation, and used in its blocks or after it."""
+    before = [x for op in block.operations[:position] for x in op.results if not x.size]
+    used = dataclasses.replace(block, operations=block.operations[position + 1 :]).uses()
+    used = used.union(*(inner.uses() for inner in block.operations[position].blocks))
+    return [(x, type_name(x.dtype)) for x in before if x in used]
 
 
 def _four_of(op: Operation) -> tuple[Element, Element, int]:

@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 from crazysim.core.data import SimData
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS, Location, locate
-from crazysim.core.stage import as_stages, with_leaves
+from crazysim.core.stage import Axes, as_stages, with_leaves
 from crazysim.engine import fused, jaxcompat
 from crazysim.engine.flat import FlatData, PackCache, Zeros, ZerosCache
 from crazysim.engine.plan import ENGINES, Plan, Planner
@@ -148,6 +148,8 @@ class Step:
         plan = self._plans.get(key)
         if plan is None:
             check_axes(data, data.core.n_worlds, data.core.n_drones)
+            for stage in self.stages:
+                Axes(data).writable(stage)
             location = self.location if elsewhere is None else elsewhere
             planner = Planner(self.stages, self.engine, self.strict, location, self._reported)
 

@@ -137,6 +137,10 @@ def _verify_types(op: Operation) -> None:
             carried = [[x.dtype for x in some] for some in (body.inputs, body.outputs, *(t.inputs for t in test))]
             _require(all(x == dtypes == results for x in carried), text)
             _require(all([x.dtype for x in t.outputs] == [np.dtype(bool)] for t in test), text)
+        case "over_others":
+            (block,) = op.blocks
+            _require([x.dtype for x in block.inputs] == [*dtypes, np.dtype(bool)], text)
+            _require([x.dtype for x in block.outputs] == results and len(op.param("reduce")) == len(results), text)
         case "custom_jvp":
             (block,) = op.blocks
             _require([x.dtype for x in block.inputs] == dtypes, text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -133,6 +134,61 @@ def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
     return call(*(jnp.asarray(x) for x in args))
 
 
+MAX_UNROLLED = 8
+"""Most drones of a world whose pairs are written out one drone after the other; those of more have an axis."""
+
+
+def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    """Combine the results of a block for each drone of the world."""
+    (block,), n = op.blocks, op.param("n_members")
+    n_worlds = shape[0] // n
+    used = [v for v in block.uses() if v in env]
+    own = {v: env[v] for v in used if not v.size and np.ndim(env[v])}
+    fixed = {v: env[v] for v in used if v not in own}
+    rows = [jnp.reshape(x, (n_worlds, n)) if np.ndim(x) else x for x in args]
+    if n <= MAX_UNROLLED:
+        number = lax.broadcasted_iota(np.int32, (n_worlds, n), 1)
+        mine = {v: jnp.reshape(x, (n_worlds, n)) for v, x in own.items()}
+        turns = []
+        for j in range(n):
+            other = [x[:, j : j + 1] if np.ndim(x) else x for x in rows]
+            turns.append(run(block, [*other, number == j], (n_worlds, n), fixed | mine))
+        combine = [getattr(lax, ops.TABLE[name].xla or name) for name in op.param("reduce")]
+        found = [functools.reduce(fn, [_lanes(x, (n_worlds, n)) for x in some])
+                 for fn, some in zip(combine, zip(*turns, strict=True), strict=True)]  # fmt: skip
+        return [jnp.reshape(x, shape) for x in found]
+    columns = [jnp.reshape(x, (n_worlds, n)).T[..., None] for x in own.values()]  # (n, n_worlds, 1)
+
+    def of_one(xs: tuple[Array, list[Array]]) -> list[Array]:
+        i, some = xs
+        mine = dict(zip(own, some, strict=True))
+        outs = run(block, [*rows, jnp.arange(n)[None] == i], (n_worlds, n), fixed | mine)
+        return [
+            REDUCE[name](_lanes(x, (n_worlds, n)), axis=1) for name, x in zip(op.param("reduce"), outs, strict=True)
+        ]
+
+    numbers = jnp.arange(n)
+    if n_worlds * n * n <= MAX_PAIRS:
+        found = jax.vmap(of_one)((numbers, columns))
+    else:
+        at_once = max(1, MAX_PAIRS // (n_worlds * n))
+        found = lax.map(jax.checkpoint(of_one), (numbers, columns), batch_size=at_once)
+    return [x.T.reshape(shape) for x in found]
+
+
+REDUCE: dict[str, Callable[..., Array]] = {
+    "add": jnp.sum,
+    "min": jnp.min,
+    "max": jnp.max,
+    "or": jnp.any,
+    "and": jnp.all,
+}
+"""Reductions of an axis by the names of operations."""
+
+MAX_PAIRS = 2**24
+"""Pairs of drones of all worlds that are computed at once; the memory of a gradient grows with them."""
+
+
 def _table(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     return [jnp.asarray(op.param("numbers").array)]
 
@@ -151,6 +207,7 @@ STRUCTURE: dict[str, Callable[..., Any]] = {
     "while": _while,
     "when": _when,
     "custom_jvp": _custom_jvp,
+    "over_others": _over_others,
     "table": _table,
     "lookup": _lookup,
     "threefry2x32": _threefry,

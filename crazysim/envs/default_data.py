@@ -9,7 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim.core.data import SimData
-from crazysim.pytree import map_batched, scopes
+from crazysim.pytree import has_members, map_batched, scopes
+
+_AXES = {"drone": (0, 1), "world": (0,)}
+"""Axes of worlds and drones by scope; members of other populations are stored one by one."""
 
 
 def compact(data: SimData) -> SimData:
@@ -19,7 +22,7 @@ def compact(data: SimData) -> SimData:
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
             return x
         x = np.asarray(x)
-        for axis in range({"drone": 2, "world": 1}.get(scope, 0)):
+        for axis in _AXES.get(scope, (0,) if has_members(scope) else ()):
             first = x.take([0], axis)
             if np.array_equal(x, np.broadcast_to(first, x.shape)):
                 x = first
@@ -33,7 +36,7 @@ def spread(data: SimData, n_worlds: int, n_drones: int) -> SimData:
     shapes = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1)}
 
     def all_of(scope: str, x: Any) -> Any:
-        shape = shapes.get(scope, ())
+        shape = shapes.get(scope, (n_worlds,) if has_members(scope) else ())
         return jnp.broadcast_to(x, (*shape, *x.shape[len(shape) :])) if shape else x
 
     return jax.tree.map(all_of, scopes(data), data)

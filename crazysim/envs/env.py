@@ -24,7 +24,7 @@ from crazysim.envs.state import EnvState, validate_action
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_task, require_installed
 from crazysim.errors import ConfigError
-from crazysim.pytree import PER_WORLD, scopes, select_worlds
+from crazysim.pytree import n_batch_axes, n_world_axes, scopes, select_worlds
 from crazysim.sim.sim import Sim
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ class DroneEnv(Env):
         self._default = default = compact(sim.default_data)
         kinds = zip(jax.tree.leaves(scopes(default)), jax.tree.leaves(default), strict=True)
         self.default_varies = any(
-            kind in ("drone", "world") and x.shape[0] > 1 and x is not default.core.world_id for kind, x in kinds
+            n_batch_axes(kind) == 2 and x.shape[0] > 1 and x is not default.core.world_id for kind, x in kinds
         )
         """True if episodes begin from different data in different worlds."""
 
@@ -272,10 +272,9 @@ class DroneEnv(Env):
 
     def default_of_world(self, data: SimData) -> SimData:
         """Return the data of one world that an episode begins from, where worlds do not differ in that."""
-        taken = {"drone": 1, "world": 2}
 
         def one(scope: str, x: Any) -> Any:
-            return x[(0,) * taken[scope]] if scope in taken else x
+            return x[(0,) * n_world_axes(scope)] if n_batch_axes(scope) == 2 else x
 
         return with_own(jax.tree.map(one, scopes(self._default), self._default), data)
 
@@ -291,5 +290,5 @@ def select_states(mask: Array, new: EnvState, old: EnvState) -> EnvState:
     old = old.replace(reward=new.reward if old.reward is None else old.reward, info=new.info | old.info)
     kinds = jax.tree.leaves(scopes(new))
     pairs = zip(kinds, jax.tree.leaves(new), jax.tree.leaves(old), strict=True)
-    leaves = [select_worlds(mask, x, y) if kind in PER_WORLD else x for kind, x, y in pairs]
+    leaves = [select_worlds(mask, x, y) if n_batch_axes(kind) else x for kind, x, y in pairs]
     return jax.tree.structure(new).unflatten(leaves)

@@ -14,11 +14,12 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, Stage
+from crazysim.core.stages import watched
 from crazysim.engine.errors import LimitError
 from crazysim.engine.fused_rollout import FusedRollout
 from crazysim.envs.phases import act, begin, observe
 from crazysim.envs.state import EnvState
-from crazysim.pytree import PyTree, leaf, scopes
+from crazysim.pytree import PyTree, has_members, leaf, n_world_axes, scopes
 
 if TYPE_CHECKING:
     from crazysim.envs.env import Env
@@ -235,17 +236,16 @@ class _Layout:
 
 def _of_one_world(state: EnvState) -> EnvState:
     """Return shapes and types of a state in one world."""
-    taken = {"drone": 1, "world": 2, "batched": 1}
     return jax.tree.map(
-        lambda kind, x: jax.ShapeDtypeStruct(x.shape[taken.get(kind, 0) :], x.dtype), scopes(state), state
+        lambda kind, x: jax.ShapeDtypeStruct(x.shape[n_world_axes(kind) :], x.dtype), scopes(state), state
     )
 
 
 def _finite(data: SimData) -> Array:
     """Return true if all states and commands of a world are finite. ()"""
-    watched = (data.states, data.controls)
-    pairs = zip(jax.tree.leaves(scopes(watched)), jax.tree.leaves(watched), strict=True)
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for scope, x in pairs if scope == "drone"]))
+    records = watched(data)
+    pairs = zip(jax.tree.leaves(scopes(records)), jax.tree.leaves(records), strict=True)
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for scope, x in pairs if has_members(scope)]))
 
 
 def _leaves_of_rest(joined: SimData) -> dict[str, int]:

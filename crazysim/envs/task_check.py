@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from crazysim.core.data import SimData
 from crazysim.envs.task import NAME, Task
 from crazysim.errors import ConfigError
-from crazysim.pytree import scopes
+from crazysim.pytree import n_world_axes, scopes
 from crazysim.sim.sim import Sim
 
 GUIDE = "docs/guides/tasks.md"
@@ -94,7 +94,7 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
 
 def _of_world(scope: str, x: Any) -> jax.ShapeDtypeStruct:
     """Return shape and type of a leaf as functions of one world receive it."""
-    return jax.ShapeDtypeStruct(x.shape[{"drone": 1, "world": 2, "batched": 1}.get(scope, 0) :], x.dtype)
+    return jax.ShapeDtypeStruct(x.shape[n_world_axes(scope) :], x.dtype)
 
 
 def _described(x: Any) -> str:

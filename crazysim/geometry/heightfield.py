@@ -1,8 +1,7 @@
 """Signed distances to a height field: the solid below triangles over a grid, with walls and a bottom.
 
-Only the triangles of the cells near a point are examined, independent of the size of the grid. Their indices depend on
-the data. The fused engine supports such indexing for grids of up to 64 heights; with larger grids the stage runs as
-plain XLA.
+Only the triangles of the cells near a point are examined, independent of the size of the grid; their indices depend on
+the data.
 """
 
 from __future__ import annotations
@@ -18,6 +17,9 @@ from crazysim.geometry.segments import segment_to_box
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.vector import Vector, vector
 from crazysim.rotation import safe_clip, safe_sqrt
+
+FAR = 1e3
+"""Distance of places beyond the border of a field, m: without contact, and finite, as solvers need it."""
 
 
 def spacing(shape: Shape) -> tuple[float, float]:
@@ -145,7 +147,60 @@ def plane_at(shape: Shape, x: Array, y: Array, like: Vector) -> tuple[Array, Arr
     """Return the position in its cell (0 to 1, x and y), the rises of its triangle and the height of its origin, m."""
     heights = jnp.asarray(shape.array("heights"), like.x.dtype)
     side_x, side_y = spacing(shape)
-    u, v = (x + shape.size[0]) / side_x, (y + shape.size[1]) / side_y
+    return triangle_at(heights, (x + shape.size[0]) / side_x, (y + shape.size[1]) / side_y)
+
+
+def surface(heights: Array, half: Array, point: Array) -> tuple[Array, Array, Array]:
+    """Return height and normal of the surface at a place, and whether it lies on the field.
+
+    Beyond its border the field continues with the heights of the border.
+
+    Args:
+        heights: Heights of the nodes, rows along y and columns along x, m. (n_rows, n_columns)
+        half: Half extents along x and y, m. (2,)
+        point: Place in the frame of the field, whose z does not count, m. (..., 3)
+
+    Returns:
+        Height, m (...), unit normal, upwards (..., 3), and True on the field (...).
+    """
+    n_rows, n_columns = heights.shape
+    x, y = point[..., 0], point[..., 1]
+    inside = (jnp.abs(x) <= half[0]) & (jnp.abs(y) <= half[1])
+    side_x, side_y = 2 * half[0] / (n_columns - 1), 2 * half[1] / (n_rows - 1)
+    place_u = safe_clip((x + half[0]) / side_x, 0.0, float(n_columns - 1))
+    place_v = safe_clip((y + half[1]) / side_y, 0.0, float(n_rows - 1))
+    u, v, rise_x, rise_y, origin = triangle_at(heights, place_u, place_v)
+    slope_x, slope_y = rise_x / side_x, rise_y / side_y
+    up = 1 / jnp.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
+    return origin + rise_x * u + rise_y * v, jnp.stack([-slope_x * up, -slope_y * up, up], axis=-1), inside
+
+
+def field_gap(shape: Shape, point: Array) -> tuple[Array, Array]:
+    """Return the distance of a point to the plane of the triangle below it, m (...), and the plane's normal (..., 3).
+
+    That is the signed distance to the ground near a surface without sharp edges, for a small part of the cost of
+    ``field_distance``. Beyond the border, and below the ground's bottom, it is ``FAR``.
+    """
+    half = jnp.asarray(shape.size[:2], point.dtype)
+    height, normal, inside = surface(jnp.asarray(shape.array("heights"), point.dtype), half, point)
+    inside = inside & (point[..., 2] > -shape.size[3])
+    return jnp.where(inside, (point[..., 2] - height) * normal[..., 2], FAR), normal
+
+
+def triangle_at(heights: Array, u: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the triangle below a place: the position in its cell, its rises, and the height of the cell's origin.
+
+    A place outside the grid belongs to the plane of the nearest cell.
+
+    Args:
+        heights: Heights of the nodes, rows along y and columns along x, m. (n_rows, n_columns)
+        u: Place along x in units of cells. (...)
+        v: Place along y in units of cells. (...)
+
+    Returns:
+        Position in the cell along x and y, rises of the triangle over a cell along x and y, m, and height at the
+        cell's corner of smallest x and y, m. (...) each
+    """
     column = jnp.clip(jnp.floor(u), 0, heights.shape[1] - 2).astype(jnp.int32)
     row = jnp.clip(jnp.floor(v), 0, heights.shape[0] - 2).astype(jnp.int32)
     u, v = u - column.astype(u.dtype), v - row.astype(v.dtype)

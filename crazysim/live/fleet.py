@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.live.commands import Command, Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
+from crazysim.live.paths import Path
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Follow, Trajectory, hover, line
 
@@ -98,9 +99,16 @@ class Fleet:
                 log.warning("%s refused: %s", type(command).__name__, error)
         return n
 
+    def reset(self) -> None:
+        """Let every drone hover where it is again, as after ``sim.reset()``; trajectories that it received stay."""
+        self._untouched = [True] * self.sim.n_drones
+        for drone, pos in enumerate(np.asarray(self.sim.data.states.pos[0], float)):
+            self._fly(drone, _hover(np.append(pos, 0.0)))
+            self._untouched[drone] = self._uploaded[drone] is None
+
     def setpoint(self, drone: int) -> NDArray:
         """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
-        return _at(self._active[drone], self._now() - self._starts[drone])
+        return Path.of(self._active[drone]).at(self._now() - self._starts[drone])
 
     def _now(self) -> float:
         return float(self.sim.time[0, 0])
@@ -172,7 +180,7 @@ class Fleet:
     def _receive(self, drone: int, trajectory: Trajectory) -> None:
         self._uploaded[drone] = trajectory
         if self.teleport and self._untouched[drone]:
-            begin = _at(trajectory, 0.0)
+            begin = Path.of(trajectory).at(0.0)
             states = self.sim.data.states
             pos = states.pos.at[0, drone].set(jnp.asarray(begin[:3], states.pos.dtype))
             half = begin[3] / 2
@@ -186,7 +194,7 @@ class Fleet:
         if trajectory is None:
             raise ConfigError("expected a trajectory to start, got none. Upload one first.")
         if relative:
-            trajectory = trajectory.moved((self.setpoint(drone) - _at(trajectory, 0.0))[:3])
+            trajectory = trajectory.moved((self.setpoint(drone) - Path.of(trajectory).at(0.0))[:3])
         self._fly(drone, trajectory)
 
     def _fly(self, drone: int, trajectory: Trajectory) -> None:
@@ -207,17 +215,6 @@ def _move(point: NDArray, height: float) -> Trajectory:
     """Return the vertical move from a position, m, and yaw, rad, to a height, m, at rest at both ends."""
     seconds = max(abs(height - float(point[2])) / SPEED, MIN_TIME)
     return line(point[:3], [point[0], point[1], height], seconds, yaw=float(point[3]))
-
-
-def _at(trajectory: Trajectory, t: float) -> NDArray:
-    """Return position, m, and yaw, rad, of one trajectory at a time since its start, s. (4,)"""
-    ends = np.asarray(trajectory.ends, float)
-    t = t % ends[-1] if bool(trajectory.repeats) and t > 0 else min(max(t, 0.0), ends[-1])
-    k = min(int(np.searchsorted(ends, t, side="right")), len(ends) - 1)
-    begin = ends[k - 1] if k else 0.0
-    u = (t - begin) / (ends[k] - begin) if ends[k] > begin else 1.0
-    c = np.asarray(trajectory.coefficients, float)[k]
-    return (c * u ** np.arange(c.shape[1])).sum(-1)
 
 
 def _without_padding(trajectory: Trajectory) -> Trajectory:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import subprocess
 from pathlib import Path
 from types import TracebackType
@@ -19,9 +20,13 @@ from crazysim.media.worlds import require_world
 from crazysim.sim.sim import Sim
 
 ENCODERS = {
-    ".mp4": ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "22", "-movflags", "+faststart"],
+    # Fragments of a second, each written at once, keep what has been encoded readable if the encoder is killed.
+    ".mp4": [
+        "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "22", "-movflags", "+frag_keyframe+empty_moov",
+        "-flush_packets", "1",
+    ],
     ".gif": ["-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse"],
-}
+}  # fmt: skip
 """Arguments of ffmpeg for each suffix."""
 
 
@@ -186,7 +191,7 @@ class Film:
                 "expected imageio-ffmpeg, which films need, got none. Run pip install 'crazysim[demo]'."
             ) from error
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self.fps:g}", "-i", "-"]
-        encoder = ENCODERS[self.path.suffix.lower()]
+        encoder = [*ENCODERS[self.path.suffix.lower()], "-g", f"{math.ceil(self.fps)}"]  # a key frame every second
         return [get_ffmpeg_exe(), "-loglevel", "error", *raw, *encoder, "-y", str(self.path)]
 
     def __enter__(self) -> Film:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.media.journal import is_journal, pack_arrays, read_journal, unpack_arrays
 from crazysim.scene.visual_geoms import KINDS, VisualGeom
 
 FORMAT = 1
@@ -87,7 +88,7 @@ class Flight:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write the flight to an ``.npz`` file.
+        """Write the flight to a compressed ``.npz`` file.
 
         Raises:
             ConfigError: If the folder does not exist, or the name has another suffix.
@@ -97,19 +98,12 @@ class Flight:
             raise ConfigError(f"expected the name of a recording to end with .npz, got {str(path)!r}")
         if not path.parent.is_dir():
             raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
-        shapes = self.shapes
         arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shapes"}
-        arrays["shape_kind"] = np.array([KINDS.index(shape.kind) for shape in shapes], int)
-        for name in ("size", "rgba", "mocap", "pos", "quat"):
-            arrays[f"shape_{name}"] = np.array([getattr(shape, name) for shape in shapes]).reshape(len(shapes), -1)
-        for name in ("vertices", "faces"):  # of all meshes, concatenated
-            arrays[f"shape_{name}"] = np.concatenate([np.zeros((0, 3)), *(getattr(shape, name) for shape in shapes)])
-        arrays["shape_n"] = np.array([(len(shape.vertices), len(shape.faces)) for shape in shapes], int).reshape(-1, 2)
-        np.savez_compressed(path, format=FORMAT, **arrays)
+        np.savez_compressed(path, format=FORMAT, **arrays, **shape_arrays(self.shapes))
 
     @classmethod
     def load(cls, path: str | Path) -> Flight:
-        """Return the flight that ``save`` has written.
+        """Return the flight that ``save`` or a ``Recorder`` with a path has written, even one that crashed.
 
         Raises:
             ConfigError: If the file does not exist or is not a recorded flight.
@@ -118,25 +112,86 @@ class Flight:
         if not path.is_file():
             raise ConfigError(f"expected an existing file, got {str(path)!r}")
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = dict(file)
+            if is_journal(path):
+                arrays = _read_samples(path)
+            else:
+                with np.load(path, allow_pickle=False) as file:
+                    arrays = dict(file)
             if int(arrays["format"]) != FORMAT:
                 raise ConfigError(f"expected a recording of format {FORMAT}, got format {arrays['format']} in {path}")
-            n = arrays["shape_n"]
-            vertices = np.split(arrays["shape_vertices"], np.cumsum(n[:, 0])[:-1]) if len(n) else []
-            faces = np.split(arrays["shape_faces"].astype(int), np.cumsum(n[:, 1])[:-1]) if len(n) else []
-            shapes = [
-                VisualGeom(
-                    kind=KINDS[kind],
-                    **{name: arrays[f"shape_{name}"][k] for name in ("size", "rgba", "pos", "quat")},
-                    mocap=int(arrays["shape_mocap"][k, 0]),
-                    vertices=vertices[k],
-                    faces=faces[k],
-                )
-                for k, kind in enumerate(arrays["shape_kind"])
-            ]
-            return cls(**{f.name: arrays[f.name] for f in fields(cls) if f.name != "shapes"}, shapes=shapes)
+            return cls(**{f.name: arrays[f.name] for f in fields(cls) if f.name != "shapes"}, shapes=_shapes(arrays))
         except ConfigError:
             raise
         except (KeyError, ValueError, OSError, EOFError) as error:
             raise ConfigError(f"expected a recorded flight, got {str(path)!r}: {error}") from error
+
+
+def shape_arrays(shapes: Sequence[VisualGeom]) -> dict[str, NDArray]:
+    """Return geoms as arrays, for a file."""
+    arrays = {"shape_kind": np.array([KINDS.index(shape.kind) for shape in shapes], int)}
+    for name in ("size", "rgba", "mocap", "pos", "quat"):
+        arrays[f"shape_{name}"] = np.array([getattr(shape, name) for shape in shapes]).reshape(len(shapes), -1)
+    for name in ("vertices", "faces"):  # of all meshes, concatenated
+        arrays[f"shape_{name}"] = np.concatenate([np.zeros((0, 3)), *(getattr(shape, name) for shape in shapes)])
+    arrays["shape_n"] = np.array([(len(shape.vertices), len(shape.faces)) for shape in shapes], int).reshape(-1, 2)
+    return arrays
+
+
+def _shapes(arrays: dict[str, NDArray]) -> list[VisualGeom]:
+    """Return the geoms in the arrays of a file."""
+    n = arrays["shape_n"]
+    vertices = np.split(arrays["shape_vertices"], np.cumsum(n[:, 0])[:-1]) if len(n) else []
+    faces = np.split(arrays["shape_faces"].astype(int), np.cumsum(n[:, 1])[:-1]) if len(n) else []
+    return [
+        VisualGeom(
+            kind=KINDS[kind],
+            **{name: arrays[f"shape_{name}"][k] for name in ("size", "rgba", "pos", "quat")},
+            mocap=int(arrays["shape_mocap"][k, 0]),
+            vertices=vertices[k],
+            faces=faces[k],
+        )
+        for k, kind in enumerate(arrays["shape_kind"])
+    ]
+
+
+SCENE, SAMPLE = b"SCEN", b"SAMP"
+"""Kinds of chunks of a flight: what does not change, and one sample."""
+SAMPLED = ("time", "pos", "quat", "body_pos", "body_quat", "setpoint")
+"""Fields of a sample, in their order in a chunk."""
+
+
+def pack_scene(scene: dict[str, Any]) -> bytes:
+    """Return the fields of a flight that do not change with time as a chunk of a journal."""
+    others = {name: x for name, x in scene.items() if name != "shapes"}
+    return pack_arrays(format=np.array(FORMAT), **others, **shape_arrays(scene["shapes"]))
+
+
+def pack_sample(sample: dict[str, Any]) -> bytes:
+    """Return a sample as a chunk of a journal: float64 in the order of ``SAMPLED``; sizes follow from the scene."""
+    return np.concatenate([np.ravel(sample[name]) for name in SAMPLED]).astype("<f8").tobytes()
+
+
+def _read_samples(path: Path) -> dict[str, NDArray]:
+    """Return the arrays of a flight in a journal.
+
+    Raises:
+        ConfigError: If it holds no sample.
+    """
+    scene: dict[str, NDArray] = {}
+    samples: list[NDArray] = []
+    for kind, content in read_journal(path):
+        if kind == SCENE:
+            scene = unpack_arrays(content)
+        elif kind == SAMPLE:
+            samples.append(np.frombuffer(content, "<f8"))
+    if not samples or not scene:
+        raise ConfigError(f"expected a recorded flight with at least one sample, got none in {str(path)!r}")
+    n_worlds, n_drones, n_bodies = (len(scene[name]) for name in ("worlds", "drone_ids", "body_ids"))
+    values = np.stack(samples)
+    sizes = [(), (n_worlds, n_drones, 3), (n_worlds, n_drones, 4), (n_worlds, n_bodies, 3), (n_worlds, n_bodies, 4)]
+    ends = np.cumsum([int(np.prod(size)) for size in sizes])
+    parts = np.split(values, ends, axis=1)
+    shapes = [*sizes, (n_worlds, parts[-1].shape[1] // (3 * n_worlds), 3)]
+    return scene | {
+        name: part.reshape(len(values), *shape) for name, part, shape in zip(SAMPLED, parts, shapes, strict=True)
+    }

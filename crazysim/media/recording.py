@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.media.flight import Flight
+from crazysim.media.flight import SAMPLE, SCENE, Flight, pack_sample, pack_scene
+from crazysim.media.journal import Journal
+from crazysim.media.poses import mocap_poses
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
 from crazysim.sim.sim import Sim
@@ -32,55 +35,80 @@ class Clock:
 
 
 class Recorder:
-    """Recorder of poses.
+    """Recorder of poses, in memory or in a file.
 
-    recorder = Recorder(sim, worlds=[0, 1])
-    for _ in range(100):
-        sim.step(10)
-        recorder.add()
-    recorder.flight().save("flight.npz")
+        recorder = Recorder(sim, worlds=[0, 1])
+        for _ in range(100):
+            sim.step(10)
+            recorder.add()
+        recorder.flight().save("flight.npz")
+
+    With a path every sample is appended to that file as it is added, and none is kept in memory: the process may crash
+    at any moment, and ``Flight.load`` returns the flight up to there.
     """
 
-    def __init__(self, sim: Sim, worlds: Sequence[int] | None = None):
+    def __init__(self, sim: Sim, worlds: Sequence[int] | None = None, path: str | Path | None = None):
         """Prepare to record; ``add`` records the first sample.
 
         Args:
             sim: Simulation.
             worlds: Indices of the worlds to record; None for all.
+            path: New file; None to record in memory.
 
         Raises:
-            ConfigError: If a world does not exist.
+            ConfigError: If a world does not exist, or the file exists or cannot be created.
         """
         self._sim = sim
         self._worlds = world_indices(sim, worlds)
         self._scene = _scene(sim, self._worlds)
         self._clock = Clock()
         self._samples: list[dict[str, Any]] = []
+        self._n, self._last = 0, -np.inf
+        self._journal = None if path is None else Journal(path)
+        if self._journal is not None:
+            self._journal.append(SCENE, pack_scene(self._scene))
 
     def __len__(self) -> int:
         """Return the number of samples."""
-        return len(self._samples)
+        return self._n
 
-    def add(self) -> None:
-        """Record the poses as they are now; a second sample at the same time replaces the first."""
+    def add(self, time: float | None = None) -> None:
+        """Record the poses as they are now.
+
+        A second sample at the same time replaces the first, or in a file is left out.
+
+        Args:
+            time: Time since the start of the recording, s; None for that of the first recorded world, which resets of
+                the world do not set back.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
         sim, worlds = self._sim, self._worlds
-        time = self._clock.at(float(sim.time[self._worlds[0], 0]))
-        if self._samples and self._samples[-1]["time"] == time:
+        if time is None:
+            time = self._clock.at(float(sim.time[self._worlds[0], 0]))
+        if self._n and self._last == time:
+            if self._journal is not None:
+                return
             self._samples.pop()
+            self._n -= 1
         states, state = sim.data.states, sim.data.controls.state
         body_pos, body_quat = _bodies(sim, self._worlds)
-        self._samples.append(
-            {
-                "time": time,
-                "pos": np.asarray(states.pos[worlds], float),
-                "quat": np.asarray(states.quat[worlds], float),
-                "body_pos": body_pos,
-                "body_quat": body_quat,
-                "setpoint": np.zeros((len(worlds), 0, 3))
-                if state is None
-                else np.asarray(state.staged_cmd[worlds, :, :3], float),
-            }
-        )
+        sample = {
+            "time": time,
+            "pos": np.asarray(states.pos, float)[worlds],
+            "quat": np.asarray(states.quat, float)[worlds],
+            "body_pos": body_pos,
+            "body_quat": body_quat,
+            "setpoint": np.zeros((len(worlds), 0, 3))
+            if state is None
+            else np.asarray(state.staged_cmd, float)[worlds, :, :3],
+        }
+        if self._journal is None:
+            self._samples.append(sample)
+        else:
+            self._journal.append(SAMPLE, pack_sample(sample))
+        self._n, self._last = self._n + 1, time
 
     def flight(self) -> Flight:
         """Return the flight up to the last sample.
@@ -88,11 +116,18 @@ class Recorder:
         Raises:
             ConfigError: If there is no sample.
         """
-        if not self._samples:
+        if not self._n:
             raise ConfigError("expected at least one sample, got none. Call recorder.add() between steps.")
+        if self._journal is not None:
+            return Flight.load(self._journal.path)
         return Flight(
             **{name: np.stack([sample[name] for sample in self._samples]) for name in self._samples[0]}, **self._scene
         )
+
+    def close(self) -> None:
+        """Close the file, if there is one; samples in memory stay."""
+        if self._journal is not None:
+            self._journal.close()
 
 
 def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = None) -> Flight:
@@ -196,8 +231,5 @@ def _scene(sim: Sim, worlds: NDArray) -> dict[str, Any]:
 def _bodies(sim: Sim, worlds: NDArray) -> tuple[NDArray, NDArray]:
     """Return poses of bodies other than drones. (n_worlds, n_bodies, 3) and (n_worlds, n_bodies, 4), xyzw"""
     ids = _body_ids(sim)
-    pos, quat = np.zeros((len(worlds), len(ids), 3)), np.zeros((len(worlds), len(ids), 4))
-    for k, world in enumerate(worlds if len(ids) else []):
-        sim.sync(world)
-        pos[k], quat[k] = sim.mj_data.mocap_pos[ids], np.roll(sim.mj_data.mocap_quat[ids], -1, axis=-1)
-    return pos, quat
+    pos, quat = mocap_poses(sim, worlds)
+    return pos[:, ids], quat[:, ids]

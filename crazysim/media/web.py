@@ -47,11 +47,11 @@ def page(flight: Flight, world: int | None = None, lights: NDArray | None = None
     needed = (len(flight.time), flight.n_drones, 3)
     if lights is not None and np.shape(lights) != needed:
         raise ConfigError(f"expected lights of shape {needed} = (n, n_drones, 3), got {np.shape(lights)}")
-    viser = _viser()
+    viser = import_viser()
     with contextlib.redirect_stdout(
         io.StringIO()
     ):  # viser prints the address of its server, which runs for this call only
-        server = viser.ViserServer(host="127.0.0.1", port=_free_port(), verbose=False)
+        server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
         try:
             return _record(server, flight, k, lights).as_html()
         finally:
@@ -151,7 +151,7 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
         by_color[shape.mocap, tuple(np.round(shape.rgba, 3))].append(shape)
     for i, ((mocap, rgba), shapes) in enumerate(by_color.items()):
         parent = f"/bodies/{mocap}" if mocap in frames else "/scene"
-        _add(scene, f"{parent}/{i}", shapes, rgba)
+        add_static(scene, f"{parent}/{i}", shapes, rgba)
 
     colors = colors_of(flight.n_drones, None)
     for drone in range(flight.n_drones):
@@ -160,15 +160,15 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
         if len(path) > 1:
             segments = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
             scene.add_line_segments(
-                f"/trails/{drone}", segments, _rgb(colors[drone]), thickness=1.5, thickness_units="screen"
+                f"/trails/{drone}", segments, rgb(colors[drone]), thickness=1.5, thickness_units="screen"
             )
     balls = [
-        scene.add_icosphere(f"/setpoints/{drone}", radius=0.02, color=_rgb(colors[drone]))
+        scene.add_icosphere(f"/setpoints/{drone}", radius=0.02, color=rgb(colors[drone]))
         for drone in range(flight.setpoint.shape[2])
     ]
 
     bulbs = [
-        scene.add_icosphere(f"/bodies/{mocap}/light", radius=LIGHT_RADIUS, color=_rgb(color), opacity=0.8)
+        scene.add_icosphere(f"/bodies/{mocap}/light", radius=LIGHT_RADIUS, color=rgb(color), opacity=0.8)
         for mocap, color in zip(flight.drone_ids, [] if lights is None else lights[0], strict=False)
     ]
 
@@ -202,42 +202,48 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
         if lights is not None:
             colors = lights[min(int(np.searchsorted(flight.time, time)), len(lights) - 1)]
             for bulb, color in zip(bulbs, colors, strict=True):
-                if (rgb := _rgb(color)) != lit.get(bulb.name):
-                    lit[bulb.name] = bulb.color = rgb
+                if (value := rgb(color)) != lit.get(bulb.name):
+                    lit[bulb.name] = bulb.color = value
     return recording
 
 
-def _add(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> None:
-    """Add geoms of one body and one colour: planes one by one, all others as one mesh."""
-    import trimesh
-
-    meshes = []
-    for i, shape in enumerate(shapes):
-        if shape.kind == "plane":
-            width, height = (2 * PLANE_SIZE if size == 0 else 2 * float(size) for size in shape.size[:2])
-            scene.add_grid(
-                f"{name}/plane{i}", width, height, cell_size=1.0, cell_color=_rgb(rgba, 0.9), section_size=5.0,
-                section_color=_rgb(rgba, 0.8), plane_color=_rgb(rgba), plane_opacity=float(rgba[3]),
-                infinite_grid=not shape.size[:2].any(), fade_distance=2 * PLANE_SIZE,
-                position=shape.pos, wxyz=np.roll(shape.quat, 1),
-            )  # fmt: skip
-            continue
-        mesh = _mesh(shape)
-        pose = np.eye(4)
-        pose[:3, :3] = trimesh.transformations.quaternion_matrix(np.roll(shape.quat, 1))[:3, :3]
-        pose[:3, 3] = shape.pos
-        meshes.append(mesh.apply_transform(pose))
-    if meshes:
-        mesh = trimesh.util.concatenate(meshes)
+def add_static(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> None:
+    """Add geoms of one body and one colour to a scene of viser: planes one by one, all others as one mesh."""
+    solid = [shape for shape in shapes if shape.kind != "plane"]
+    for i, shape in enumerate(shape for shape in shapes if shape.kind == "plane"):
+        width, height = (2 * PLANE_SIZE if size == 0 else 2 * float(size) for size in shape.size[:2])
+        scene.add_grid(
+            f"{name}/plane{i}", width, height, cell_size=1.0, cell_color=rgb(rgba, 0.9), section_size=5.0,
+            section_color=rgb(rgba, 0.8), plane_color=rgb(rgba), plane_opacity=float(rgba[3]),
+            infinite_grid=not shape.size[:2].any(), fade_distance=2 * PLANE_SIZE,
+            position=shape.pos, wxyz=np.roll(shape.quat, 1),
+        )  # fmt: skip
+    if solid:
+        mesh = mesh_of(solid)
         scene.add_mesh_simple(
             name,
             np.asarray(mesh.vertices, np.float32),
             np.asarray(mesh.faces, np.uint32),
-            color=_rgb(rgba),
+            color=rgb(rgba),
             opacity=None if rgba[3] >= 1 else float(rgba[3]),
             flat_shading=True,
             side="double",
         )
+
+
+def mesh_of(shapes: list[VisualGeom]) -> Any:
+    """Return geoms of one body as one mesh of trimesh, in the body's frame; planes are left out."""
+    import trimesh
+
+    meshes = []
+    for shape in shapes:
+        if shape.kind == "plane":
+            continue
+        pose = np.eye(4)
+        pose[:3, :3] = trimesh.transformations.quaternion_matrix(np.roll(shape.quat, 1))[:3, :3]
+        pose[:3, 3] = shape.pos
+        meshes.append(_mesh(shape).apply_transform(pose))
+    return trimesh.util.concatenate(meshes)
 
 
 def _mesh(shape: VisualGeom) -> Any:
@@ -257,12 +263,18 @@ def _mesh(shape: VisualGeom) -> Any:
     return mesh.apply_scale(shape.size if shape.kind == "ellipsoid" else radius)
 
 
-def _rgb(rgba: Any, darker: float = 1.0) -> tuple[int, int, int]:
+def rgb(rgba: Any, darker: float = 1.0) -> tuple[int, int, int]:
+    """Return a colour, 0 to 1, as red, green and blue from 0 to 255."""
     r, g, b = (round(255 * darker * float(np.clip(channel, 0, 1))) for channel in rgba[:3])
     return r, g, b
 
 
-def _viser() -> Any:
+def import_viser() -> Any:
+    """Return viser.
+
+    Raises:
+        ImportError: If it is not installed.
+    """
     try:
         import viser
     except ImportError as error:
@@ -270,7 +282,8 @@ def _viser() -> Any:
     return viser
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """Return the number of a free port of this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]

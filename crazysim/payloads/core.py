@@ -13,9 +13,12 @@ from crazysim import rotation
 from crazysim.core.data import Objects, SimData, SimState
 from crazysim.core.plugin import Simulation
 from crazysim.effects.core import Exposed
+from crazysim.effects.ground import ground_height
 from crazysim.effects.wind import wind_at
+from crazysim.effects.wind_field import WindFieldData
 from crazysim.payloads.body import Colliding
 from crazysim.payloads.link import TINY, relative
+from crazysim.payloads.rotor_jet import jet_force
 from crazysim.pytree import leaf
 
 CABLE_SEGMENTS = 8
@@ -66,7 +69,8 @@ class PointLoad(Colliding):
     def stop_at_floor(self, data: SimData) -> SimData:
         """Stop the load at the floor; of one drone or of one world."""
         load = self.read(data)
-        pos, vel = on_floor(load.pos, load.vel, load.clearance, load.friction)
+        clearance = load.clearance + ground_height(data, load.pos)
+        pos, vel = on_floor(load.pos, load.vel, clearance, load.friction)
         return self.write(data, load.replace(pos=pos, vel=vel))
 
     def release(self, data: SimData, mask: Any = True) -> SimData:
@@ -85,16 +89,26 @@ def integrator_of(sim: Simulation) -> Any:
     return getattr(getattr(sim.step_pipeline.get("integration"), "fn", None), "method", None)
 
 
-def air_and_gravity(data: SimData, load: LoadData, vel: Array) -> Array:
-    """Return the acceleration of a free load under gravity and drag, m/s^2; of one drone. (3,)
+def air_and_gravity(data: SimData, load: LoadData, name: str) -> Array:
+    """Return the acceleration of a free load under gravity, drag and jets of rotors, m/s^2; of one drone. (3,)
 
     Drag is implicit in time, so that it cannot reverse a motion, and a load without mass moves with the air.
+
+    Args:
+        data: Simulation.
+        load: Record of the load.
+        name: Name of the load's plugin.
     """
-    gravity = data.params.gravity_vec
+    acc = data.params.gravity_vec
+    jet = jet_force(data, name)
+    if jet is not None:
+        acc = acc + jnp.where(load.mass > 0, jet / jnp.where(load.mass > 0, load.mass, 1.0), 0.0)
     if load.air_vel is None or load.drag is None:
-        return gravity
-    air = wind_at(data) + load.air_vel
-    return gravity + load.drag / (load.mass + load.drag / data.core.freq + TINY) * (air - vel)
+        return acc
+    air = wind_at(data, load.pos) + load.air_vel
+    if any(isinstance(record, WindFieldData) for record in data.plugins.values()):
+        air = air + load.wind_vel
+    return acc + load.drag / (load.mass + load.drag / data.core.freq + TINY) * (air - load.vel)
 
 
 def on_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from jax import Array
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import Stage
+from crazysim.effects.ground import ground_height
 from crazysim.errors import ConfigError
 from crazysim.payloads.body import Colliding, LoadBody, rest_height
 from crazysim.payloads.core import LoadData, air_and_gravity, hanging, on_floor, turned_z
@@ -131,7 +132,7 @@ class Hook(Colliding, Plugin):
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
         """Return the derivative with the pull of hook and load, and their rates; of one drone."""
         load, p = self.read(data), data.params
-        falling = air_and_gravity(data, load, load.vel)
+        falling = air_and_gravity(data, load, self.name)
         link = self._link(load)
         free = jnp.where(
             load.attached,
@@ -175,8 +176,9 @@ class Hook(Colliding, Plugin):
         """Stop hook and load at the floor; of one drone."""
         load = self.read(data)
         height = jnp.where(load.attached, load.clearance, jnp.zeros_like(load.clearance))
+        height = height + ground_height(data, load.tip_pos)
         tip_pos, tip_vel = on_floor(load.tip_pos, load.tip_vel, height, load.friction)
-        pos, vel = on_floor(load.pos, load.vel, load.clearance, load.friction)
+        pos, vel = on_floor(load.pos, load.vel, load.clearance + ground_height(data, load.pos), load.friction)
         pos, vel = jnp.where(load.attached, tip_pos, pos), jnp.where(load.attached, tip_vel, vel)
         return self.write(data, load.replace(pos=pos, vel=vel, tip_pos=tip_pos, tip_vel=tip_vel))
 

@@ -78,7 +78,7 @@ class SlungLoad(PointLoad, Plugin):
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
         """Return the derivative with the pull of the load, and the load's rates; of one drone."""
         load, p = self.read(data), data.params
-        free = air_and_gravity(data, load, load.vel)
+        free = air_and_gravity(data, load, self.name)
         linked = couple(
             data.states, deriv, p.mass, p.J_inv, self._link(load), load.pos, load.vel, free, dt, data.core.freq
         )
@@ -167,6 +167,7 @@ def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, 
         pos=pos,
         vel=vel + jnp.zeros_like(states.vel),
         air_vel=None if drag is None else zeros(sim, 3),
+        wind_vel=None if drag is None else zeros(sim, 3),
         attached=jnp.ones(states.pos.shape[:2], bool),
         mass=check("mass", low=0.0),
         length=length,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -24,37 +24,28 @@ CHUNK = 128
 
 
 def build_spec(
-    xml_path: str | Path | None, airframe: Airframe, n_drones: int, freq: int, max_geom_pairs: int
+    xml_path: str | Path | mujoco.MjSpec | None, airframes: Sequence[Airframe], freq: int, max_geom_pairs: int
 ) -> mujoco.MjSpec:
-    """Return the scene as an editable spec, with the drones ``drone:0`` to ``drone:{n_drones - 1}`` in it.
+    """Return the scene as an editable spec, with the drones ``drone:0``, ``drone:1``, ... in it.
 
     Args:
-        xml_path: MJCF scene without drones; None for the package's own floor, light and sky.
-        airframe: Airframe of the drones.
-        n_drones: Number of drones.
+        xml_path: MJCF scene without drones, or its spec; None for the package's own floor, light and sky.
+        airframes: Airframe of each drone. (n_drones,)
         freq: Physics steps per second, Hz.
         max_geom_pairs: Most pairs that MJX checks per kind of collision; -1 for all.
 
     Raises:
         ConfigError: If the file does not exist, cannot be read, or has names that are reserved for drones.
     """
-    if xml_path is not None and not isinstance(xml_path, (str, Path)):
-        raise ConfigError(f"expected the path of an MJCF file or None as xml_path, got {xml_path!r}")
-    path = SCENE if xml_path is None else Path(xml_path)
-    if not path.is_file():
-        raise ConfigError(f"expected an existing MJCF file as xml_path, got {str(path)!r}")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ConfigError(f"expected a scene that MuJoCo can read, got {str(path)!r}: {error}") from error
+    spec = xml_path if isinstance(xml_path, mujoco.MjSpec) else read_spec(xml_path)
     spec.option.timestep = 1 / freq
     spec.add_numeric(name="max_geom_pairs", data=[max_geom_pairs])
     taken = [body.name for body in spec.bodies if body.name.startswith("drone:")]
     if taken:
         raise ConfigError(
-            f"expected no bodies named 'drone:...', which are reserved for the drones, got {taken} in {str(path)!r}"
+            f"expected no bodies named 'drone:...', which are reserved for the drones, got {taken} in {str(xml_path)!r}"
         )
-    _add_drones(spec, airframe, n_drones)
+    _add_drones(spec, airframes)
     # mjx.kinematics refuses a model without any degree of freedom, and mocap bodies have none.
     dummy = spec.worldbody.add_body(name="_dummy", mass=1e-6, inertia=[1e-9] * 3)
     dummy.add_joint(name="_dummy_joint", type=mujoco.mjtJoint.mjJNT_SLIDE)
@@ -63,24 +54,42 @@ def build_spec(
     return spec
 
 
-def _add_drones(spec: mujoco.MjSpec, airframe: Airframe, n_drones: int) -> None:
+def read_spec(xml_path: str | Path | None) -> mujoco.MjSpec:
+    """Return the spec of an MJCF file; None for the package's own floor, light and sky.
+
+    Raises:
+        ConfigError: If the file does not exist or cannot be read.
+    """
+    if xml_path is not None and not isinstance(xml_path, (str, Path)):
+        raise ConfigError(f"expected the path of an MJCF file or None as xml_path, got {xml_path!r}")
+    path = SCENE if xml_path is None else Path(xml_path)
+    if not path.is_file():
+        raise ConfigError(f"expected an existing MJCF file as xml_path, got {str(path)!r}")
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"expected a scene that MuJoCo can read, got {str(path)!r}: {error}") from error
+
+
+def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
     """Add the drones' bodies element by element, large swarms in chunks.
 
     MuJoCo goes through the whole spec for every geom that is added and every body that is attached: 4,096 drones
     take 30 s one by one, 2 s in chunks that are filled alone.
     """
+    n_drones = len(airframes)
     for name, rgba in MATERIALS.items():
         spec.add_material(name=name, rgba=rgba)
     for i in range(n_drones):
         for led in LED_MATERIALS:
             spec.add_material(name=f"{led}:{i}", rgba=(1, 1, 1, 0.15))
     if n_drones <= CHUNK:
-        _add_bodies(spec, airframe, range(n_drones))
+        _add_bodies(spec, airframes, range(n_drones))
         return
     with _no_warnings():
         for first in range(0, n_drones, CHUNK):
             chunk = mujoco.MjSpec()
-            _add_bodies(chunk, airframe, range(first, min(first + CHUNK, n_drones)))
+            _add_bodies(chunk, airframes, range(first, min(first + CHUNK, n_drones)))
             spec.attach(chunk, prefix="", frame=spec.worldbody.add_frame())
 
 
@@ -95,9 +104,11 @@ def _no_warnings() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def _add_bodies(spec: mujoco.MjSpec, airframe: Airframe, drones: range) -> None:
-    geoms, cameras = body_geoms(airframe), body_cameras(airframe)
+def _add_bodies(spec: mujoco.MjSpec, airframes: Sequence[Airframe], drones: range) -> None:
+    kinds = {id(airframe): airframe for airframe in airframes}
+    bodies = {key: (body_geoms(airframe), body_cameras(airframe)) for key, airframe in kinds.items()}
     for i in drones:
+        geoms, cameras = bodies[id(airframes[i])]
         body = spec.worldbody.add_body(name=f"drone:{i}", mocap=True)
         for geom in geoms:
             _add_geom(body, geom, i)

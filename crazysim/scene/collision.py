@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax import Array
 
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape, hfield, hull
@@ -20,6 +23,8 @@ VISIBLE_GROUPS = range(3)
 OPAQUE = 0.5
 """Least alpha of geoms that rays hit."""
 
+Kinds = Sequence[tuple[int, ...] | None]
+"""Indices of the drones of each airframe; None for all drones."""
 Matrix = tuple[tuple[float, float, float], ...]
 
 
@@ -33,6 +38,8 @@ class CollisionGeom:
     """Origin of the shape's frame, m."""
     rot: Matrix | None
     """Rows of the rotation matrix from the shape's frame; None for the identity."""
+    name: str = dataclasses.field(default="", compare=False)
+    """Name of the geom; empty if it has none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +55,33 @@ class CollisionBody:
 
 
 @dataclasses.dataclass(frozen=True)
+class DroneGeoms:
+    """Geoms of drones of one airframe."""
+
+    geoms: tuple[CollisionGeom, ...]
+    """Geoms of each, in its body frame."""
+    drones: tuple[int, ...] | None = None
+    """Indices of the drones; None for all."""
+
+    def present(self, drone_id: Array) -> Array | None:
+        """Return True for the drones, by index; None if they are all. (...)"""
+        if self.drones is None:
+            return None
+        return functools.reduce(jnp.logical_or, [(drone_id >= a) & (drone_id <= b) for a, b in _runs(self.drones)])
+
+
+def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """Return first and last of each run of consecutive numbers."""
+    runs: list[tuple[int, int]] = []
+    for k in sorted(numbers):
+        if runs and runs[-1][1] == k - 1:
+            runs[-1] = (runs[-1][0], k)
+        else:
+            runs.append((k, k))
+    return runs
+
+
+@dataclasses.dataclass(frozen=True)
 class CollisionModel:
     """Geoms of a scene that drones touch, or that cameras see."""
 
@@ -55,8 +89,8 @@ class CollisionModel:
     """Planes and height fields of the world body."""
     objects: tuple[CollisionBody, ...]
     """Objects with at least one geom; other geoms of the world body are an object ``world``."""
-    drone_geoms: tuple[CollisionGeom, ...]
-    """Geoms of a drone, in its body frame."""
+    drones: tuple[DroneGeoms, ...]
+    """Geoms of the drones, of each airframe."""
     mocap_bodies: tuple[str, ...]
     """Mocap bodies without a handle, whose poses are in ``mjx_data`` only; they follow the rows of ``data.objects``."""
     mocap_ids: tuple[int, ...]
@@ -67,12 +101,13 @@ class CollisionModel:
         return dataclasses.replace(self, mocap_bodies=(), mocap_ids=())
 
 
-def collision_model(model: mujoco.MjModel, handles: Sequence[str]) -> CollisionModel:
+def collision_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds = (None,)) -> CollisionModel:
     """Return the geoms that drones touch.
 
     Args:
         model: Compiled scene.
         handles: Bodies with handles, in the order of ``data.objects``.
+        kinds: Drones of each airframe.
 
     Raises:
         ConfigError: If a geom has an unsupported type.
@@ -84,15 +119,16 @@ def collision_model(model: mujoco.MjModel, handles: Sequence[str]) -> CollisionM
     def touches_of_drone(geom: int) -> bool:
         return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
 
-    return _model(model, handles, touches, touches_of_drone)
+    return _model(model, handles, kinds, touches, touches_of_drone)
 
 
-def visual_model(model: mujoco.MjModel, handles: Sequence[str]) -> CollisionModel:
+def visual_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds = (None,)) -> CollisionModel:
     """Return the geoms that cameras see: meshes as convex hulls, without geoms that are more than half transparent.
 
     Args:
         model: Compiled scene.
         handles: Bodies with handles, in the order of ``data.objects``.
+        kinds: Drones of each airframe.
 
     Raises:
         ConfigError: If a geom has an unsupported type.
@@ -103,23 +139,28 @@ def visual_model(model: mujoco.MjModel, handles: Sequence[str]) -> CollisionMode
         alpha = model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3]
         return model.geom_group[geom] in VISIBLE_GROUPS and alpha >= OPAQUE
 
-    return _model(model, handles, is_seen, is_seen)
+    return _model(model, handles, kinds, is_seen, is_seen)
 
 
 def _model(
-    model: mujoco.MjModel, handles: Sequence[str], is_taken: Callable[[int], bool], of_drone: Callable[[int], bool]
+    model: mujoco.MjModel,
+    handles: Sequence[str],
+    kinds: Kinds,
+    is_taken: Callable[[int], bool],
+    of_drone: Callable[[int], bool],
 ) -> CollisionModel:
-    """Return the geoms of the scene and of the first drone for which the predicates hold."""
+    """Return the geoms of the scene, and of the first drone of each kind, for which the predicates hold."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    floor, drone_geoms = [], []
+    floor = []
+    drone_geoms: dict[str, list[CollisionGeom]] = {f"drone:{kind[0] if kind else 0}": [] for kind in kinds}
     geoms_of = dict[int, list[int]]()
     for geom in range(model.ngeom):
         root = int(model.body_rootid[model.geom_bodyid[geom]])
         name = body_name(model, root)
         if name.startswith("drone:"):
-            if name == "drone:0" and of_drone(geom):
-                drone_geoms.append(_geom(model, data, geom, root))
+            if name in drone_geoms and of_drone(geom):
+                drone_geoms[name].append(_geom(model, data, geom, root))
             continue
         if not is_taken(geom):
             continue
@@ -144,7 +185,8 @@ def _model(
         row = rows.get(body_name(model, root))
         frame = None if row is None else root
         objects.append(CollisionBody(body_name(model, root), row, tuple(_geom(model, data, g, frame) for g in geoms)))
-    return CollisionModel(tuple(floor), tuple(objects), tuple(drone_geoms), tuple(mocap), tuple(mocap.values()))
+    drones = tuple([DroneGeoms(tuple(geoms), kind) for geoms, kind in zip(drone_geoms.values(), kinds, strict=True)])
+    return CollisionModel(tuple(floor), tuple(objects), drones, tuple(mocap), tuple(mocap.values()))
 
 
 def body_name(model: mujoco.MjModel, body: int) -> str:
@@ -162,7 +204,7 @@ def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | Non
     # The compiler stores attitudes as quaternions, whose rounding would turn axis-aligned boxes.
     rot = np.where(np.abs(np.abs(rot) - 1) < 1e-9, np.sign(rot), rot)
     rows = None if np.allclose(rot, np.eye(3), rtol=0, atol=1e-9) else tuple(tuple(map(float, row)) for row in rot)
-    return CollisionGeom(_shape(model, geom), tuple(map(float, pos)), rows)  # type: ignore[arg-type]
+    return CollisionGeom(_shape(model, geom), tuple(map(float, pos)), rows, model.geom(geom).name)  # type: ignore[arg-type]
 
 
 def _shape(model: mujoco.MjModel, geom: int) -> Shape:

@@ -17,12 +17,14 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
+from crazysim.effects.ground import TerrainData
 from crazysim.geometry import Shape, distance, point_distance
+from crazysim.geometry.heightfield import field_gap
 from crazysim.payloads.body import LoadBody
 from crazysim.scene.collision import CollisionGeom
 from crazysim.scene.report import Objects, choose
 
-FLAT = ("plane", "box", "cylinder", "hfield")
+FLAT = ("plane", "box", "cylinder")
 """Kinds with faces, on which a drone stands by its corners."""
 THIN = 0.05
 """Height of the upper and lower plate of a drone's box, as a share of the box; both touch an object along its side."""
@@ -84,6 +86,10 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
     for geom, row in surfaces:
         into, back, vel = _frame(data, geom, row)
         still = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(turn, vel[..., None, :])
+        if geom.shape.kind == "hfield":
+            gap, normal = _above(data, geom, in_world, into, back)
+            normal = rotation.rotate_inverse(turn, normal)
+            found.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
         if geom.shape.kind in FLAT:
             gap, pull = jax.vjp(lambda p, s=geom.shape: point_distance(s, p), into(in_world, True))
             normal = rotation.rotate_inverse(turn, back(pull(jnp.ones_like(gap))[0]))
@@ -107,15 +113,36 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
     axes = [rotation.rotate(quat, jnp.eye(3, dtype=pos.dtype)[k]) for k in range(3)]
     gaps, normals, vels = [], [], []
     for geom, row in surfaces:
-        into, _, vel = _frame(data, geom, row)
-        rot = jnp.stack([into(axis, False) for axis in axes], axis=-1)
-        gap, pull = jax.vjp(lambda x, s=geom.shape, f=into, r=rot: distance(shape, s, f(x, True), r), pos)
+        into, back, vel = _frame(data, geom, row)
+        if geom.shape.kind == "hfield":
+            gap, normal = _above(data, geom, pos, into, back)
+            gap = gap - _reach(shape, jnp.stack([rotation.dot(axis, normal)[..., 0] for axis in axes], axis=-1))
+        else:
+            rot = jnp.stack([into(axis, False) for axis in axes], axis=-1)
+            gap, pull = jax.vjp(lambda x, s=geom.shape, f=into, r=rot: distance(shape, s, f(x, True), r), pos)
+            normal = pull(jnp.ones_like(gap))[0]
         gaps.append(gap)
-        normals.append(pull(jnp.ones_like(gap))[0])
+        normals.append(normal)
         vels.append(jnp.zeros_like(pos) if vel is None else jnp.broadcast_to(vel[..., None, :], pos.shape))
     return ContactPoints(
         jnp.concatenate(gaps, axis=-1), jnp.concatenate(normals, axis=-2), None, jnp.concatenate(vels, axis=-2)
     )
+
+
+def _above(data: SimData, geom: CollisionGeom, points: Array, into: Callable, back: Callable) -> tuple[Array, Array]:
+    """Return the distance of points to the plane below them of a height field, m, and its normal, world frame."""
+    terrain = data.plugins.get(geom.name)
+    if isinstance(terrain, TerrainData):
+        return terrain.gap_at(points)
+    gap, normal = field_gap(geom.shape, into(points, True))
+    return gap, back(normal)
+
+
+def _reach(shape: Shape, direction: Array) -> Array:
+    """Return the distance of the outermost point of a ball or box along a direction in its frame, m. (...)"""
+    if shape.kind == "sphere":
+        return jnp.full(direction.shape[:-1], shape.size[0], direction.dtype)
+    return jnp.sum(jnp.abs(direction) * jnp.asarray(shape.size, direction.dtype), axis=-1)
 
 
 def _nearest(

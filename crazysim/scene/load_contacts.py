@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
@@ -15,6 +16,7 @@ from crazysim.core.plugin import Simulation
 from crazysim.geometry import Shape, distance
 from crazysim.payloads.body import Colliding
 from crazysim.scene.contact_points import Surface, load_points
+from crazysim.scene.drone_boxes import Boxes, of_kind
 from crazysim.scene.impulse import FASTEST_PUSH, SLOW, STICKING, Material, after_contact, inertia_matrix
 
 
@@ -44,7 +46,7 @@ def stop_loads(data: SimData, plugin: Any, surfaces: list[Surface], material: Ma
     return plugin.with_vel(data, vel)
 
 
-def hit_drones(data: SimData, plugin: Any, material: Material, box: np.ndarray) -> tuple[SimData, Any]:
+def hit_drones(data: SimData, plugin: Any, material: Material, boxes: Boxes) -> tuple[SimData, Any]:
     """Return one world after the impulses between loads and drones, and the impulses on the drones, N s.
 
     The impulse acts at the load's centre, on both: momentum and angular momentum are kept. First the normal impulse,
@@ -56,7 +58,7 @@ def hit_drones(data: SimData, plugin: Any, material: Material, box: np.ndarray) 
         data: One world.
         plugin: Plugin with the loads.
         material: Parameters of the contacts.
-        box: Centre and half extents of the drones' collision box, body frame, m. (6,)
+        boxes: Collision boxes of the drones.
     """
     body, s, p = plugin.body(data), data.states, data.params
     mass, quat = body.mass[:, None], s.quat[None]
@@ -64,9 +66,15 @@ def hit_drones(data: SimData, plugin: Any, material: Material, box: np.ndarray) 
     lever = rotation.rotate_inverse(quat, body.pos[:, None] - s.pos)
     eye = jnp.eye(3, dtype=lever.dtype)
     axes = [rotation.rotate_inverse(quat, rotation.rotate(body.quat[:, None], eye[k])) for k in range(3)]
-    shape, target, rot = plugin.shape(), Shape("box", tuple(map(float, box[3:]))), jnp.stack(axes, axis=-1)
-    gap, pull = jax.vjp(lambda x: distance(shape, target, x - jnp.asarray(box[:3], x.dtype), rot), lever)
-    normal = pull(jnp.ones_like(gap))[0]
+    shape, rot = plugin.shape(), jnp.stack(axes, axis=-1)
+
+    def to_box(box: np.ndarray) -> tuple[Array, Array]:
+        target = Shape("box", tuple(map(float, box[3:])))
+        gap, pull = jax.vjp(lambda x: distance(shape, target, x - jnp.asarray(box[:3], x.dtype), rot), lever)
+        return gap[..., None], pull(jnp.ones_like(gap))[0]
+
+    gap, normal = of_kind([(kind, to_box(box)) for kind, box in boxes], data.core.drone_id)
+    gap = gap[..., 0]
     touches = (gap < 0) & ~plugin.joined(data)
 
     def response(change: Any) -> Any:

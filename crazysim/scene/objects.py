@@ -200,11 +200,12 @@ class SceneObjects:
 def add_bodies(
     spec: mujoco.MjSpec, what: Any, names: list[str], pos: np.ndarray, quat: np.ndarray, mocap: bool, options: dict
 ) -> None:
-    """Add equal bodies to a spec.
+    """Add bodies to a spec.
 
     Args:
         spec: Scene.
-        what: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec.
+        what: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec; or a list of one of the last
+            four for each body.
         names: Names of the bodies.
         pos: Positions, m. (n, 3)
         quat: Attitudes, xyzw. (n, 4)
@@ -225,8 +226,8 @@ def add_bodies(
         return
     if options:
         raise ConfigError(f"expected no settings, which only {', '.join(PRIMITIVES)} have, got {', '.join(options)}")
-    for name, pose in zip(names, poses, strict=True):
-        source = _source(what)
+    for k, (name, pose) in enumerate(zip(names, poses, strict=True)):
+        source = _source(what[k] if isinstance(what, list) else what)
         body = spec.worldbody.add_body(name=name, mocap=mocap, **pose)
         frame, prefix = body.add_frame(), f"{name}/"
         if isinstance(source, mujoco.MjSpec):

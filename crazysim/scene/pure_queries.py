@@ -33,7 +33,7 @@ class PureQueries:
         """Geoms that drones touch; read again after a compilation."""
         model = self.mj_model  # compiles an edited scene
         if self._collision_model is None:
-            self._collision_model = collision.collision_model(model, self.added.movable)
+            self._collision_model = collision.collision_model(model, self.added.movable, self.kinds)
         return self._collision_model
 
     @property
@@ -41,7 +41,7 @@ class PureQueries:
         """Geoms that cameras see; read again after a compilation."""
         model = self.mj_model  # compiles an edited scene
         if self._visual_model is None:
-            self._visual_model = collision.visual_model(model, self.added.movable)
+            self._visual_model = collision.visual_model(model, self.added.movable, self.kinds)
         return self._visual_model
 
     @property

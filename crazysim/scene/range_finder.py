@@ -79,7 +79,7 @@ class RangeFinder(Plugin):
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that measures, of one drone, or of one world if drones are to be measured."""
         # The outline of a drone is enough for a few rays.
-        model = dataclasses.replace(sim.scene.visual_model, drone_geoms=sim.scene.collision_model.drone_geoms)
+        model = dataclasses.replace(sim.scene.visual_model, drones=sim.scene.collision_model.drones)
         period = self._period(sim)
         when = None if period == 1 else lambda data: data.core.steps % period == 0
         measure = Stage(lambda data: self._measure(model, data), "world" if self.drones else "drone", when)

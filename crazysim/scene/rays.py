@@ -85,8 +85,10 @@ def cast(
             best = _met_by(best, geoms, pos, quat, np.array(group), origin, direction, None)
     if drones:
         pos, quat = data.states.pos, data.states.quat
-        group = np.stack([np.arange(data.core.n_drones)] * 2, axis=-1) + [0, 1 + len(model.objects)]
-        best = _met_by(best, model.drone_geoms, pos, quat, group, origin, direction, own)
+        for kind in model.drones:
+            rows = np.arange(data.core.n_drones) if kind.drones is None else np.asarray(kind.drones)
+            group = np.stack([rows, rows + 1 + len(model.objects)], axis=-1)
+            best = _met_by(best, kind.geoms, pos, quat, group, origin, direction, own)
     return best
 
 

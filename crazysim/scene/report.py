@@ -18,6 +18,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.others import reduce_over_others
 from crazysim.errors import ConfigError
 from crazysim.geometry import distance
 from crazysim.pytree import PyTree, static
@@ -52,7 +53,7 @@ class ContactReport(PyTree):
     drone_distance: Array | None
     """Distance to the nearest other drone, m; infinite for a single drone. (n_worlds, n_drones)"""
     nearest_drone: Array | None
-    """Index of that drone; the drone's own for a single drone. (n_worlds, n_drones)"""
+    """Index of that drone; the drone's own for a single drone. None in a stage of one drone. (n_worlds, n_drones)"""
     object_names: tuple[str, ...] = static()
     """Names of the objects' bodies."""
 
@@ -86,7 +87,7 @@ def build(
         model: Collision model of the scene.
         objects: Handles or names of the objects to report; None for all, () for none.
         floor: True to report the floor.
-        drones: True to report other drones; a stage of one drone has no access to them.
+        drones: True to report other drones. For one drone this needs a stage, and ``nearest_drone`` is None there.
         plugins: Returns the plugins of the simulation, whose objects are put at their poses first.
 
     Raises:
@@ -103,25 +104,27 @@ def build(
         data = place(data, placed_by(plugins(), names))
         data = with_mocap_bodies(model, data, mocap)
         pos, quat = data.states.pos, data.states.quat
-        drone_rot = rotation.matrix(quat) if any(g.shape.kind != "sphere" for g in model.drone_geoms) else None
-        own = [(geom, pos + rotation.rotate(quat, jnp.asarray(geom.pos, pos.dtype))) for geom in model.drone_geoms]
+        all_geoms = [geom for kind in model.drones for geom in kind.geoms]
+        drone_rot = rotation.matrix(quat) if any(geom.shape.kind != "sphere" for geom in all_geoms) else None
+        own = [
+            (geom, pos + rotation.rotate(quat, jnp.asarray(geom.pos, pos.dtype)), present)
+            for kind in model.drones
+            for present in (kind.present(data.core.drone_id),)
+            for geom in kind.geoms
+        ]
         found: dict[str, Array | None] = dict.fromkeys(
             ("floor", "floor_distance", "objects", "object_distance", "nearest_object", "drones", "drone_distance",
              "nearest_drone")
         )  # fmt: skip
         if floor:
-            gap = _smallest([_gap(mine, at, drone_rot, geom) for mine, at in own for geom in model.floor], pos)
+            gaps = [_of(has, _gap(mine, at, drone_rot, geom)) for mine, at, has in own for geom in model.floor]
+            gap = _smallest(gaps, pos)
             found |= {"floor": gap < 0, "floor_distance": gap}
         if chosen:
             gap = jnp.concatenate([_to_group(own, drone_rot, group, data) for group in groups], axis=-1)
             found |= {"objects": gap < 0, "object_distance": gap, "nearest_object": jnp.argmin(gap, axis=-1)}
         if drones:
-            if pos.ndim == 1:
-                raise ConfigError(
-                    "expected the data of a world, got those of one drone, which do not contain the other drones. "
-                    "Declare the stage @stage('world'), or build the contacts with drones=False."
-                )
-            gap, nearest = _to_drones(own, drone_rot)
+            gap, nearest = (_to_others(own, drone_rot), None) if pos.ndim == 1 else _to_drones(own, drone_rot)
             found |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": nearest}
         return ContactReport(**found, object_names=names)
 
@@ -164,15 +167,21 @@ def _group_key(body: CollisionBody) -> tuple[bool, tuple[CollisionGeom, ...] | s
     return (True, body.geoms) if body.row is not None else (False, body.name)
 
 
-Own = Sequence[tuple[CollisionGeom, Array]]
-"""Geoms of the drone with their positions, world frame, m. (..., 3)"""
+Own = Sequence[tuple[CollisionGeom, Array, Array | None]]
+"""Geoms of the drone, their positions, world frame, m (..., 3), and True for drones that have them (...) or None."""
+
+
+def _of(present: Array | None, gap: Array) -> Array:
+    """Return distances, infinite for geoms that a drone does not have. (...)"""
+    return gap if present is None else jnp.where(present, gap, jnp.inf)
 
 
 def _to_group(own: Own, drone_rot: Array | None, group: list[CollisionBody], data: SimData) -> Array:
     """Return the distances to objects with equal geoms, m. (..., n)"""
     geoms = group[0].geoms
     if group[0].row is None:
-        return _smallest([_gap(mine, at, drone_rot, geom) for mine, at in own for geom in geoms], own[0][1])[..., None]
+        gaps = [_of(has, _gap(mine, at, drone_rot, geom)) for mine, at, has in own for geom in geoms]
+        return _smallest(gaps, own[0][1])[..., None]
     objects = data.objects
     rows = [body.row for body in group if body.row is not None]
     run = slice(rows[0], rows[-1] + 1) if rows == list(range(rows[0], rows[-1] + 1)) else np.array(rows)
@@ -181,9 +190,10 @@ def _to_group(own: Own, drone_rot: Array | None, group: list[CollisionBody], dat
     if drone_rot is not None:
         rot = _product(jnp.swapaxes(rotation.matrix(quat), -1, -2), drone_rot[..., None, :, :])
     gaps = []
-    for mine, at in own:
+    for mine, at, has in own:
         inside = rotation.rotate_inverse(quat, at[..., None, :] - pos)
-        gaps += [_gap(mine, inside, rot, geom) for geom in geoms]
+        of_each = None if has is None else has[..., None]
+        gaps += [_of(of_each, _gap(mine, inside, rot, geom)) for geom in geoms]
     return _smallest(gaps, own[0][1])
 
 
@@ -220,6 +230,23 @@ def _smallest(gaps: list[Array], pos: Array) -> Array:
     return functools.reduce(lambda a, b: jnp.where(b < a, b, a), gaps)
 
 
+def _to_others(own: Own, drone_rot: Array | None) -> Array:
+    """Return the distance of one drone to the nearest other of its world, m. ()"""
+
+    def between(other: tuple[list[Array], Array | None], is_self: Array) -> Array:
+        places, rot = other
+        inverse = None if rot is None else rot.T
+        turned = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
+        gaps = []
+        for mine, at in own:
+            for (geom, _), there in zip(own, places, strict=True):
+                inside = at - there if inverse is None else rotation.matvec(inverse, at - there)
+                gaps.append(distance(mine.shape, geom.shape, inside, turned))
+        return jnp.where(is_self, jnp.inf, _smallest(gaps, own[0][1]))
+
+    return reduce_over_others(between, ([at for _, at in own], drone_rot), "min")
+
+
 def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:
     """Return the distance to the nearest other drone, m, and its index. (..., n_drones)
 
@@ -231,17 +258,18 @@ def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:
 
     def of_chunk(chunk: Array) -> tuple[Array, Array]:
         gaps = []
-        for mine, at in own:
+        for mine, at, has in own:
             here = jnp.take(at, chunk, axis=-2)[..., :, None, :]
-            for geom, other in own:
+            for geom, other, other_has in own:
+                both = None if has is None else jnp.take(has, chunk, axis=-1)[..., :, None] & other_has[..., None, :]
                 offset = here - other[..., None, :, :]
                 if drone_rot is None:
-                    gaps.append(distance(mine.shape, geom.shape, offset, jnp.eye(3)))
+                    gaps.append(_of(both, distance(mine.shape, geom.shape, offset, jnp.eye(3))))
                     continue
                 inverse = jnp.swapaxes(drone_rot, -1, -2)[..., None, :, :, :]
                 inside = rotation.matvec(inverse, offset)
                 rot = _product(inverse, jnp.take(drone_rot, chunk, axis=-3)[..., :, None, :, :])
-                gaps.append(distance(mine.shape, geom.shape, inside, rot))
+                gaps.append(_of(both, distance(mine.shape, geom.shape, inside, rot)))
         gap = jnp.where(chunk[:, None] == indices, jnp.inf, _smallest(gaps, own[0][1]))
         return jnp.min(gap, axis=-1), jnp.argmin(gap, axis=-1)
 

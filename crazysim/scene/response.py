@@ -23,6 +23,7 @@ from crazysim.deprecation import warn_renamed
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 from crazysim.scene.contact_points import Surface, contact_points, is_ground, surfaces_of
+from crazysim.scene.drone_boxes import Boxes, boxes_of, of_kind
 from crazysim.scene.impulse import Material, after_contact, inertia_matrix
 from crazysim.scene.load_contacts import hit_drones, loads_of, names_of, stop_loads
 from crazysim.scene.report import Objects, choose
@@ -84,24 +85,25 @@ class ContactResponse(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that applies the impulses."""
-        box = np.asarray(sim.airframe.value("shape.collision_box"), np.float64)
+        boxes = boxes_of(sim)
         plugins = loads_of(sim)
         names = names_of(sim, plugins)
         surfaces = surfaces_of(sim, self.objects, names)
 
         def respond(data: SimData) -> SimData:
-            states, record = _respond(data, self.read(data), surfaces, box, self.iterations)
+            found = [(kind, _respond(data, self.read(data), surfaces, box, self.iterations)) for kind, box in boxes]
+            states, record = of_kind(found, data.core.drone_id)
             return self.write(data.replace(states=states), record)
 
         found = [Placement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
         obstacles = [surface for surface in surfaces if not is_ground(surface)]
         hits = any(body.name in names for body in choose(sim.scene.collision_model, self.objects))
         for plugin in plugins:
-            found += self._load_stages(plugin, obstacles, box if hits else None)
+            found += self._load_stages(plugin, obstacles, boxes if hits else [])
         return found
 
-    def _load_stages(self, plugin: Any, obstacles: list[Surface], box: np.ndarray | None) -> list[Placement]:
-        """Return the stages of a plugin's loads: with obstacles, and with drones unless ``box`` is None."""
+    def _load_stages(self, plugin: Any, obstacles: list[Surface], boxes: Boxes) -> list[Placement]:
+        """Return the stages of a plugin's loads: with obstacles, and with drones if there are boxes of these."""
 
         def stop(data: SimData) -> SimData:
             if plugin.name not in data.plugins:
@@ -112,13 +114,13 @@ class ContactResponse(Plugin):
             if plugin.name not in data.plugins:
                 return data
             record = self.read(data)
-            data, impulse = hit_drones(data, plugin, record.material, box)  # type: ignore[arg-type]
+            data, impulse = hit_drones(data, plugin, record.material, boxes)
             return self.write(data, record.replace(impulse=record.impulse + impulse))
 
         found = []
         if obstacles:
             found.append((Stage(stop, plugin.coupling), f"{self.name}_of_{plugin.name}"))
-        if box is not None:
+        if boxes:
             found.append((Stage(hit, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
         return [Placement(stage, before="increment_steps", name=name) for stage, name in found]
 

@@ -47,7 +47,7 @@ class Scene(PureQueries):
     def __init__(
         self,
         xml_path: str | Path | None,
-        airframe: Airframe,
+        airframes: Sequence[Airframe],
         n_worlds: int,
         n_drones: int,
         freq: int,
@@ -58,7 +58,7 @@ class Scene(PureQueries):
 
         Args:
             xml_path: MJCF scene without drones; None for floor, light and sky.
-            airframe: Airframe of the drones.
+            airframes: Airframe of each drone. (n_drones,)
             n_worlds: Number of worlds.
             n_drones: Number of drones per world.
             freq: Physics steps per second, Hz.
@@ -69,9 +69,10 @@ class Scene(PureQueries):
             ConfigError: If the scene cannot be read or compiled.
         """
         self.n_worlds, self.n_drones, self.device, self.mesh = n_worlds, n_drones, device, mesh
+        self.kinds = _kinds(airframes)
         self.max_geom_pairs = -1 if n_drones < LARGE_SWARM else 2 * n_drones
         self.renderer = SceneRenderer(device)
-        self.spec = build.build_spec(xml_path, airframe, n_drones, freq, self.max_geom_pairs)
+        self.spec = build.build_spec(xml_path, airframes, freq, self.max_geom_pairs)
         self.added = SceneObjects(n_worlds)
         self.plugins = tuple
         self.revision = 0
@@ -261,3 +262,11 @@ class Scene(PureQueries):
     def close(self) -> None:
         """Close the window and free the renderers; the next image makes new ones."""
         self.renderer.close()
+
+
+def _kinds(airframes: Sequence[Airframe]) -> tuple[tuple[int, ...] | None, ...]:
+    """Return the indices of the drones of each airframe; None for all."""
+    found: dict[int, list[int]] = {}
+    for k, airframe in enumerate(airframes):
+        found.setdefault(id(airframe), []).append(k)
+    return (None,) if len(found) == 1 else tuple([tuple(drones) for drones in found.values()])

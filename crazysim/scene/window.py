@@ -5,16 +5,28 @@ from __future__ import annotations
 import os
 import sys
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
 from crazysim.errors import RenderError
 from crazysim.scene.overlays import Overlays
 
+KEYS = {
+    "UP": "up", "DOWN": "down", "LEFT": "left", "RIGHT": "right", "SPACE": "space", "TAB": "tab", "ENTER": "enter",
+    "BACKSPACE": "backspace", "ESCAPE": "escape", "EQUAL": "+", "KP_ADD": "+", "MINUS": "-", "KP_SUBTRACT": "-",
+}  # fmt: skip
+"""Names of keys that are not named by their character, by GLFW's names."""
+
+Tile = tuple[mujoco.MjData, Overlays]
+"""State of one world, with its kinematics up to date, and what is drawn over it."""
+
 
 class Window:
-    """A window that shows one model.
+    """A window that shows one model, in one or several states.
 
     MuJoCo's passive viewer draws in a thread of its own, and sometimes crashes the process when it is closed.
     """
@@ -46,6 +58,12 @@ class Window:
         self._settings: Any = None
         self._size = (width, height)
         self._cursor = (0.0, 0.0)
+        self.on_key: Callable[[str, bool], None] | None = None
+        """Function that is called with the name of a key, and True when it is pressed, False when it is released."""
+        self.on_drawn: Callable[[mujoco.MjrRect, mujoco.MjrContext], None] | None = None
+        """Function that draws over the finished image, with its rectangle, pixels."""
+        self._names = {getattr(glfw, f"KEY_{key}"): name for key, name in KEYS.items()}
+        glfw.set_key_callback(self._window, self._on_key)
         glfw.set_cursor_pos_callback(self._window, self._on_move)
         glfw.set_scroll_callback(self._window, self._on_scroll)
 
@@ -56,6 +74,20 @@ class Window:
 
     def draw(self, data: mujoco.MjData, camera: mujoco.MjvCamera, overlays: Overlays, width: int, height: int) -> None:
         """Show ``data``. A camera or size that differs from the last call replaces the view that the mouse has set."""
+        self.draw_tiles(1, lambda _: (data, overlays), camera, width, height)
+
+    def draw_tiles(
+        self, n: int, tile: Callable[[int], Tile], camera: mujoco.MjvCamera, width: int, height: int
+    ) -> None:
+        """Show several states in a grid, all from one camera.
+
+        Args:
+            n: Number of tiles.
+            tile: Returns the k-th tile; called right before it is drawn, so that all may share one ``MjData``.
+            camera: Camera; one that differs from the last call replaces the view that the mouse has set.
+            width: Width of the window, pixels; likewise.
+            height: Height of the window, pixels.
+        """
         glfw = self._glfw
         if self._window is not None and glfw.window_should_close(self._window):
             self.close()
@@ -68,15 +100,69 @@ class Window:
             self._size = (width, height)
             glfw.set_window_size(self._window, width, height)
         glfw.poll_events()
+        glfw.make_context_current(self._window)
+        for k, pixels in enumerate(self._tiles(n)):
+            data, overlays = tile(k)
+            self._update_scene(data)
+            overlays.write(self._scene)
+            mujoco.mjr_render(pixels, self._scene, self._context)
+            overlays.write_text(pixels, self._context)
+        if self.on_drawn is not None:
+            self.on_drawn(mujoco.MjrRect(0, 0, *glfw.get_framebuffer_size(self._window)), self._context)
+        glfw.swap_buffers(self._window)
+
+    def look_at(self, point: NDArray) -> None:
+        """Let the free camera look at a point from now on, m, from where the mouse has put it. (3,)"""
+        self._camera.lookat[:] = point
+
+    @property
+    def cursor(self) -> tuple[float, float]:
+        """Position of the cursor, from the left and from the top, 0 to 1."""
+        width, height = self._glfw.get_window_size(self._window)
+        return self._cursor[0] / max(width, 1), self._cursor[1] / max(height, 1)
+
+    def is_pressed(self, button: str) -> bool:
+        """Return True while a button of the mouse, ``"left"`` or ``"right"``, is pressed."""
+        glfw = self._glfw
+        number = {"left": glfw.MOUSE_BUTTON_LEFT, "right": glfw.MOUSE_BUTTON_RIGHT}[button]
+        return glfw.get_mouse_button(self._window, number) == glfw.PRESS
+
+    def pick(self, n: int, tile: Callable[[int], Tile]) -> tuple[int, int, NDArray] | None:
+        """Return tile, geom and point, world frame, m, below the cursor; None if there is nothing.
+
+        Args:
+            n: Number of tiles.
+            tile: Returns the k-th tile.
+        """
+        size = self._glfw.get_framebuffer_size(self._window)
+        x, y = self.cursor[0] * size[0], (1 - self.cursor[1]) * size[1]
+        for k, r in enumerate(self._tiles(n)):
+            inside = (x - r.left) / max(r.width, 1), (y - r.bottom) / max(r.height, 1)
+            if not all(0 <= part < 1 for part in inside):
+                continue
+            data, _ = tile(k)
+            self._update_scene(data)
+            point, geom = np.zeros(3), np.full((1, 1), -1, np.int32)
+            ids = np.full((1, 1), -1, np.int32)
+            mujoco.mjv_select(
+                self._model, data, self._option, r.width / max(r.height, 1), *inside, self._scene, point, geom, ids,
+                ids.copy(),
+            )  # fmt: skip
+            return None if geom[0, 0] < 0 else (k, int(geom[0, 0]), point)
+        return None
+
+    def _update_scene(self, data: mujoco.MjData) -> None:
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
-        overlays.write(self._scene)
-        glfw.make_context_current(self._window)
-        pixels = mujoco.MjrRect(0, 0, *glfw.get_framebuffer_size(self._window))
-        mujoco.mjr_render(pixels, self._scene, self._context)
-        overlays.write_text(pixels, self._context)
-        glfw.swap_buffers(self._window)
+
+    def _tiles(self, n: int) -> list[mujoco.MjrRect]:
+        """Return the rectangles of n tiles, row by row from the top left, pixels."""
+        width, height = self._glfw.get_framebuffer_size(self._window)
+        columns = int(np.ceil(np.sqrt(n)))
+        rows = -(-n // columns)
+        w, h = width // columns, height // rows
+        return [mujoco.MjrRect(k % columns * w, height - (k // columns + 1) * h, w, h) for k in range(n)]
 
     def close(self) -> None:
         """Close the window and free its context."""
@@ -86,6 +172,11 @@ class Window:
         self._context.free()
         self._glfw.destroy_window(self._window)
         self._window = None
+
+    def _on_key(self, _window: Any, key: int, _code: int, action: int, _mods: int) -> None:
+        name = self._names.get(key) or (chr(key).lower() if 32 < key < 127 else None)
+        if self.on_key is not None and name is not None and action != self._glfw.REPEAT:
+            self.on_key(name, action == self._glfw.PRESS)
 
     def _on_move(self, window: Any, x: float, y: float) -> None:
         glfw, mouse = self._glfw, mujoco.mjtMouse
@@ -107,12 +198,21 @@ class Window:
         mujoco.mjv_moveCamera(self._model, action, dx, dy, self._camera)
 
 
-def _glfw() -> Any:
+def require_screen() -> None:
+    """Check that there is a screen, as far as the environment says.
+
+    Raises:
+        RenderError: If there is none.
+    """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise RenderError(
             "expected a screen for render('human'), got neither DISPLAY nor WAYLAND_DISPLAY. Use mode='rgb_array' "
             "without a screen."
         )
+
+
+def _glfw() -> Any:
+    require_screen()
     import glfw  # comes with mujoco; images in memory do not need it
 
     with warnings.catch_warnings(action="ignore"):

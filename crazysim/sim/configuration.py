@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,35 @@ from crazysim.core.settings import control_freqs, controller_at_rates, find_devi
 from crazysim.drones import Airframe, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.core import require_support
+from crazysim.errors import ConfigError
+
+AirframeSource = str | Path | Mapping[str, Any] | Airframe
+"""Name of a built-in airframe, path of a TOML file, dict, or airframe."""
+
+
+def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: int) -> tuple[Airframe, ...]:
+    """Return the airframe of each drone; drones of the same source have the same one. (n_drones,)
+
+    Raises:
+        UnknownNameError: If an airframe does not exist.
+        ConfigError: If an airframe is invalid, or a list has another length than there are drones.
+    """
+    if not _is_list(drone):
+        return (load_airframe(drone),) * n_drones
+    if len(drone) != n_drones:
+        raise ConfigError(
+            f"expected {n_drones} airframes, one for each drone, got {len(drone)}. Use Sim(n_drones={len(drone)}), or "
+            f"one airframe for all."
+        )
+    loaded: dict[Any, Airframe] = {}
+    for source in drone:
+        key = str(source) if isinstance(source, (str, Path)) else id(source)
+        loaded[key] = loaded[key] if key in loaded else load_airframe(source)
+    return tuple([loaded[str(source) if isinstance(source, (str, Path)) else id(source)] for source in drone])
+
+
+def _is_list(drone: Any) -> bool:
+    return isinstance(drone, Sequence) and not isinstance(drone, str)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,8 +57,8 @@ class Configuration:
     """Number of worlds."""
     n_drones: int
     """Number of drones in each world."""
-    airframe: Airframe
-    """Airframe of every drone."""
+    airframes: tuple[Airframe, ...]
+    """Airframe of each drone. (n_drones,)"""
     dynamics: Dynamics
     """Dynamics model."""
     control: Control
@@ -55,7 +84,7 @@ class Configuration:
     def create(
         n_worlds: Any,
         n_drones: Any,
-        drone: str | Path | Mapping[str, Any] | Airframe,
+        drone: AirframeSource | Sequence[AirframeSource],
         dynamics: Any,
         control: Any,
         integrator: Any,
@@ -74,11 +103,13 @@ class Configuration:
             ValueError: For an argument that is invalid or contradicts another, with what was expected.
         """
         n_worlds, n_drones, freq = positive("n_worlds", n_worlds), positive("n_drones", n_drones), physics_freq(freq)
+        n_drones = len(drone) if n_drones == 1 and _is_list(drone) and len(drone) else n_drones
         dynamics, control = member(Dynamics, "dynamics", dynamics), member(Control, "control", control)
         integrator = member(Integrator, "integrator", integrator)
         require_pair(dynamics, control)
-        airframe = load_airframe(drone)
-        require_support(airframe, dynamics)
+        airframes = load_airframes(drone, n_drones)
+        for airframe in airframes:
+            require_support(airframe, dynamics)
         freqs, controller = control_freqs(control, freq, dict(rates)), find_controller(controller, switch)
         if controller is not None:
             require_controller(dynamics, control, controller)
@@ -88,7 +119,7 @@ class Configuration:
         return Configuration(
             n_worlds,
             n_drones,
-            airframe,
+            airframes,
             dynamics,
             control,
             integrator,

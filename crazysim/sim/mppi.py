@@ -19,7 +19,7 @@ from crazysim.dynamics.core import GRAVITY
 from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.engine import Step
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, floating, leaf, scopes
+from crazysim.pytree import PyTree, floating, leaf, n_batch_axes, scopes
 from crazysim.sim.sim import Sim
 
 Cost = Callable[[SimState, Setpoint, Array], Array]
@@ -147,7 +147,7 @@ class MPPI:
         self.temperature, self.cost, self._key = temperature, cost, jax.random.key(seed)
         freq = c.freq if freq is None else positive("freq", freq)
         self._sim = Sim(
-            sim.n_worlds * self.samples, sim.n_drones, c.airframe, c.dynamics, c.control, c.integrator, freq,
+            sim.n_worlds * self.samples, sim.n_drones, c.airframes, c.dynamics, c.control, c.integrator, freq,
             device=c.device, engine=c.engine, controller="crazyflow" if c.controller is None else c.controller,
         )  # fmt: skip
         for plugin in sim.plugins.values():
@@ -247,7 +247,7 @@ class MPPI:
             )
 
         def of_rollouts(scope: str, own: Any, x: Any) -> Any:
-            return self._repeat(x) if scope in ("drone", "world") else own if scope != "shared" else x
+            return self._repeat(x) if n_batch_axes(scope) == 2 else own if scope != "shared" else x
 
         leaves = [
             of_rollouts(*pair)

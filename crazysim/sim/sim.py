@@ -14,6 +14,7 @@ from jax.sharding import Mesh
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import CASCADE
 from crazysim.core import functional as F
+from crazysim.core.airframes import airframe_of, drone_names
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
 from crazysim.core.random import seed_sim
@@ -30,8 +31,10 @@ from crazysim.engine.rollout import run as run_rollout
 from crazysim.scene.queries import SceneQueries
 from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
+from crazysim.sim.adopt import adopt
 from crazysim.sim.commands import Commands
-from crazysim.sim.configuration import Configuration
+from crazysim.sim.configuration import AirframeSource, Configuration
+from crazysim.sim.members import Member, find_member
 from crazysim.sim.pipelines import Pipelines
 from crazysim.sim.plugins import PluginMethods
 from crazysim.sim.scene_shell import SceneShell, use_box_collision
@@ -59,7 +62,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self,
         n_worlds: int = 1,
         n_drones: int = 1,
-        drone: str | Path | Mapping[str, Any] | Airframe = Drone.cf21B_500,
+        drone: AirframeSource | Sequence[AirframeSource] = Drone.cf21B_500,
         dynamics: Dynamics | str = Dynamics.default,
         control: Control | str = Control.default,
         integrator: Integrator | str = Integrator.default,
@@ -83,7 +86,8 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         Args:
             n_worlds: Number of worlds.
             n_drones: Number of drones in each.
-            drone: Name of a built-in airframe, path of a TOML file, dict, or airframe.
+            drone: Name of a built-in airframe, path of a TOML file, dict, or airframe; or a list of these, one for each
+                drone, whose length is then ``n_drones``.
             dynamics: Dynamics model.
             control: Command level.
             integrator: Integration scheme.
@@ -132,10 +136,11 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         )
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
         self.dynamics, self.control, self.integrator = c.dynamics, c.control, c.integrator
-        self.airframe, self.drone = c.airframe, c.airframe.name
+        self.airframes = c.airframes
+        self.drone_names = drone_names(c.airframes)
         self.device, self.mesh, self.engine = c.device, mesh, engine
 
-        self._scene = Scene(xml_path, self.airframe, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
+        self._scene = Scene(xml_path, self.airframes, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
         self._revision = self._scene.revision
         self._stepper = Stepper(self.device, mesh, engine, strict)
         self._queries = self._new_queries()
@@ -149,6 +154,61 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self.reset_pipeline = {"reset": reset}
         self.build_step_fn()
         self.build_reset_fn()
+
+    @classmethod
+    def from_mjcf(
+        cls, xml_path: str | Path, n_worlds: int = 1, *, kinds: Mapping[str, Any] | None = None, **settings: Any
+    ) -> Sim:
+        """Return a simulation with the vehicles of an MJCF, at their poses; everything else there is the scene.
+
+        Vehicles are the children of the world with a joint, or mocap bodies, whose names are a prefix and a number:
+        ``Crazyflie_0``, ``Bumblebee_2``. They keep their names. Their bodies are replaced by those of the airframes.
+
+        Args:
+            xml_path: MJCF file.
+            n_worlds: Number of worlds.
+            kinds: Airframes, or subclasses of ``Population``, by further prefixes; ``crazysim.sim.adopt.KINDS`` has
+                those that are known.
+            **settings: Further arguments of ``Sim``.
+
+        Raises:
+            UnknownNameError: If a prefix is unknown, with those that are known.
+            ConfigError: If the file cannot be read, two bodies have the same name, or there is no drone.
+        """
+        return adopt(cls, xml_path, n_worlds, kinds, settings)
+
+    @property
+    def airframe(self) -> Airframe:
+        """Airframe of all drones.
+
+        Raises:
+            ConfigError: If the drones have several.
+        """
+        return airframe_of(self.airframes)
+
+    @property
+    def drone(self) -> str:
+        """Name of the airframe of all drones.
+
+        Raises:
+            ConfigError: If the drones have several airframes.
+        """
+        return self.airframe.name
+
+    # Names --------------------------------------------------------------------------------------------------
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all drones, then of the members of all populations."""
+        return (*self.drone_names, *self.plugins.members)
+
+    def __getitem__(self, name: str) -> Member:
+        """Return a view of a drone or member by its name, to read and to command: ``sim["Crazyflie_0"].pos``.
+
+        Raises:
+            UnknownNameError: If there is none of that name.
+        """
+        return find_member(self, name)
 
     # Data ---------------------------------------------------------------------------------------------------
 
@@ -201,7 +261,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
             self.n_drones,
             self.dynamics,
             self.control,
-            self.airframe,
+            self.airframes,
             self.freq,
             dict(self.configuration.control_freqs),
             self._scene.drone_mocap_ids,

@@ -24,7 +24,21 @@ def races(result):
     assert not hit.any()
 
 
-CHECKS = {"fit_flight": fits, "race": races}
+def repeats(result):
+    """Check that the twin was never touched, and that its replay gave the same flight."""
+    closest, same = result
+    assert closest > 0.05
+    assert same
+
+
+def lands(result):
+    """Check that the drones followed their circle, and stand on the floor."""
+    error, heights = result
+    assert error < 0.25
+    assert max(heights) < 0.01
+
+
+CHECKS = {"crazyswarm2": lands, "fit_flight": fits, "race": races, "replayed_twin": repeats}
 """Further checks of the values that ``main`` of an example returns."""
 
 

@@ -21,10 +21,12 @@ from crazysim import (
     MotorFailure,
     Sim,
     Wind,
+    WindField,
     effects,
     load_airframe,
 )
 from crazysim.core.pipeline import replace_fn
+from crazysim.effects.grid import Grid
 from crazysim.engine import Step
 from crazysim.pytree import PyTree, leaf, scopes
 
@@ -34,7 +36,11 @@ ON = {
     GroundEffect: {},
     Latency: {"delay": 2},
     MotorFailure: {"effectiveness": 0.9, "fail_step": [-1, -1, -1, 30], "rate": 0.1},
-    Wind: {"velocity": (2.0, 1.0, 0.0), "speed_20ft": 7.7},
+    Wind: {"velocity": (2.0, 1.0, 0.0), "speed_20ft": 7.7, "roughness": 0.05},
+    WindField: {
+        "field": Grid(np.arange(54).reshape(3, 3, 2, 3) % 7 - 3.0, (-1.0, -1.0, 0.0), (1.0, 1.0, 4.0)),
+        "spread": (0.5, 0.5, 0.0),
+    },
 }
 """Every effect, with settings that do something."""
 IDLE = {Battery: {"capacity": 1e6, "resistance": 1e-6}, Latency: {"delay": 0}, MotorFailure: {}, Wind: {}}
@@ -128,7 +134,7 @@ def test_float64_stays_float64(x64):
     assert signature(after) == signature(sim.data)
 
 
-STAGES = ("battery", "downwash", "latency", "motors", "wind", "integration")
+STAGES = ("battery", "downwash", "latency", "motors", "wind", "wind_field", "integration")
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +175,7 @@ def test_stages_are_straight_line(every, flown, name):
 
 
 def test_docstrings_tell_the_shapes(every):
-    sizes = {"n_worlds": 3, "n_drones": 2, "n_rotors": 4, "n_rows": 3, "k": 4}
+    sizes = {"n_worlds": 3, "n_drones": 2, "n_rotors": 4, "n_rows": 3, "k": 4, "n_x": 3, "n_y": 3, "n_z": 2}
     for name, record in every.data.plugins.items():
         body = ast.parse(inspect.getsource(type(record))).body[0].body
         for field, text in itertools.pairwise(body):

@@ -4,11 +4,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import Battery, Downwash, GroundEffect, Latency, MotorFailure, Sim, Wind
+from crazysim import Battery, Downwash, GroundEffect, Latency, MotorFailure, Sim, Wind, WindField
+from crazysim.effects.grid import Grid
 from crazysim.engine import Step, native
 
 EFFECTS = [
-    Wind(velocity=[2.0, 0.5, 0.0], speed_20ft=5.0),
+    Wind(velocity=[2.0, 0.5, 0.0], speed_20ft=5.0, exponent=0.2),
+    WindField(Grid(np.linspace(-1, 1, 300).reshape(5, 5, 4, 3), (-1, -1, 0), 0.5), spread=(0.3, 0.3, 0.0)),
     Downwash(),
     Battery(capacity=0.25, resistance=0.05),
     MotorFailure(rate=0.5),
@@ -35,8 +37,8 @@ def test_every_effect_is_fused(sim):
     assert program.unfused_stages == ()
     segments = program.fused_segments
     fused = {name for s in segments for name in s.stages}
-    assert {"wind", "downwash", "battery", "motors"} <= fused
-    assert [s.scope for s in segments] == ["drone", "world", "drone"]
+    assert {"wind", "wind_field", "wind_field_displacement", "downwash", "battery", "motors"} <= fused
+    assert [s.scope for s in segments] == ["drone"]
 
 
 def test_effects_mean_the_same_on_every_engine(sim):

@@ -159,3 +159,40 @@ def test_law_09_wind_that_cannot_be_is_told(dynamics, drone, velocity, message):
         sim.add(Wind(velocity))
     assert sim.step_pipeline == stages
     assert not sim.data.plugins
+
+
+def test_profiles_by_hand():
+    """ln(3.048 / 0.04572) / ln(6.096 / 0.04572) at 10 ft, Category C; (10 / 80)^0.2 of a turbine's hub."""
+    one = jnp.ones(1)
+    found = wind.log_profile(jnp.asarray([[3.048], [6.096], [0.04572], [0.01], [-1.0]]), 6.096 * one, 0.04572 * one)
+    np.testing.assert_allclose(found[:, 0], [0.85834, 1, 0, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(wind.power_profile(10 * one, 80 * one, 0.2 * one), 0.65975, atol=1e-5)
+    for slope in (
+        jax.grad(lambda z: wind.log_profile(z, 6.0, 0.05).sum()),
+        jax.grad(lambda z: wind.power_profile(z, 6.0, 0.2).sum()),
+    ):
+        assert np.isfinite(slope(jnp.asarray([-1.0, 0.0, 0.01, 0.05, 1.0]))).all()
+
+
+@pytest.mark.parametrize("profile, share", [({"roughness": 0.05}, np.log(2 / 0.05) / np.log(6.096 / 0.05)),
+                                            ({"exponent": 0.3}, (2 / 6.096) ** 0.3)])  # fmt: skip
+def test_the_mean_grows_with_height(profile, share):
+    sim = build((6.0, 0, 0), **profile)
+    sim.data = with_states(sim.data, pos=[0, 0, 2.0])
+    sim.step()
+    expected = build((6.0 * share, 0, 0))
+    expected.step()
+    np.testing.assert_allclose(sim.data.states.vel, expected.data.states.vel, rtol=1e-5)
+    assert share < 0.8
+
+
+@pytest.mark.parametrize("profile, message", [
+    ({"roughness": 0.05, "exponent": 0.2}, "got both"),
+    ({"roughness": 0.0}, "positive"),
+    ({"roughness": 7.0}, "a roughness below the reference height"),
+    ({"exponent": -0.1}, "exponent"),
+    ({"exponent": 0.1, "reference_height": 0.0}, "reference_height"),
+])  # fmt: skip
+def test_law_09_wrong_profiles(profile, message):
+    with pytest.raises(ConfigError, match=message):
+        build((1.0, 0, 0), **profile)

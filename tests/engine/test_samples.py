@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from crazysim import Sim
+from crazysim.effects import Downwash
 from crazysim.engine import fused
 from crazysim.engine.samples import compile_sampler
 
@@ -55,6 +56,14 @@ def test_samples_are_those_of_steps_in_turn(engine):
     same(samples, expected)
     assert samples["pos"].shape == (N_SAMPLES, N_WORLDS, N_DRONES, 3)
     np.testing.assert_array_equal(samples["steps"][:, 0, 0], N_STEPS * np.arange(1, N_SAMPLES + 1))
+
+
+def test_drones_that_see_each_other_are_sampled():
+    sim = Sim(n_worlds=2, n_drones=12, control="attitude", engine="fused")
+    sim.add(Downwash())
+    (data, samples), (data_after, expected) = taken(sim), in_turns(sim)
+    same(data, data_after)
+    same(samples, expected)
 
 
 def test_one_kernel_takes_all_samples(monkeypatch):

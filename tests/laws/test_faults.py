@@ -25,7 +25,7 @@ from cases import (
 
 from crazysim import ConfigError, PyTree, Sim, leaf
 from crazysim.core.stages import FLOOR
-from crazysim.pytree import PER_WORLD, scopes
+from crazysim.pytree import n_batch_axes, scopes
 
 
 @functools.cache
@@ -274,7 +274,7 @@ def test_fault_16_a_full_reset_is_that_of_all_worlds_and_of_what_they_share(dirt
     default, used, reset = dirty
     full, masked = reset(used, default), reset(used, default, jnp.ones(3, bool))
     assert jax.tree.structure(full) == jax.tree.structure(masked)
-    per_world = dict(zip(named_leaves(full), (s in PER_WORLD for s in jax.tree.leaves(scopes(full))), strict=True))
+    per_world = dict(zip(named_leaves(full), (n_batch_axes(s) > 0 for s in jax.tree.leaves(scopes(full))), strict=True))
     masked, full, start, before = (named_leaves(x) for x in (masked, full, default, used))
     assert len(full) > 40
     shared = 0

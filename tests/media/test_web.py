@@ -1,34 +1,27 @@
 """A recorded flight is opened in a real browser, scrubbed with its mouse, and looked at."""
 
-import base64
-import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
-import urllib.request
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from imageio_ffmpeg import get_ffmpeg_exe
+from browsing import NEAR, Browser, start_browser, wait_for
 
 from crazysim.__main__ import main
 from crazysim.media import Recorder
 from crazysim.media.web import FOV, camera_of, page
 from crazysim.sim import Sim
 
-WIDTH, HEIGHT = 640, 480
 START, END = np.array([-0.5, 0.0, 0.8]), np.array([0.5, 0.0, 1.2])
 """Where the drone of world 1 begins and ends, m."""
 BOX = np.array([0.25, 0.0, 0.05])
 """Where the obstacle of world 0 is, m; it stands on edge in the model, and lies along x in that world."""
 MAGENTA, GREEN = (1, 0, 1), (0, 1, 0)
-NEAR = 12
-"""Pixels between where something is seen and where it is; the drone flies 10 from one of the page's moments on."""
 
 
 @pytest.fixture(scope="module")
@@ -54,49 +47,8 @@ def flight(plain_scene):
     return recorder.flight()
 
 
-class Browser:
-    """A browser without a screen, spoken to over its debugging protocol."""
-
-    def __init__(self, program, folder):
-        from websockets.sync.client import connect
-
-        options = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader"]
-        options += ["--enable-unsafe-swiftshader", "--remote-debugging-port=0", f"--user-data-dir={folder}"]
-        self._process = subprocess.Popen(
-            [program, *options, f"--window-size={WIDTH},{HEIGHT}", "about:blank"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        ready = folder / "DevToolsActivePort"
-        try:
-            wait_for(lambda: ready.exists() and ready.read_text().count("\n") > 0)
-        except AssertionError:
-            self._process.kill()
-            raise
-        with urllib.request.urlopen(f"http://127.0.0.1:{ready.read_text().split()[0]}/json") as answer:
-            tabs = json.load(answer)
-        tab = next(tab for tab in tabs if tab["type"] == "page")
-        self._socket = connect(tab["webSocketDebuggerUrl"], max_size=None)
-        self._n = 0
-
-    def call(self, method, **params):
-        self._n += 1
-        self._socket.send(json.dumps({"id": self._n, "method": method, "params": params}))
-        while True:
-            answer = json.loads(self._socket.recv(60))
-            if answer.get("id") == self._n:
-                assert "error" not in answer, answer
-                return answer["result"]
-
-    def value(self, expression):
-        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
-
-    def box(self, selector):
-        """Return left, top, width and height of an element, or None while it is not there."""
-        return self.value(
-            f"(() => {{ const e = document.querySelector('{selector}'); if (!e) return null;"
-            f" const b = e.getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; }})()"
-        )
+class FlightBrowser(Browser):
+    """A browser of pages with flights."""
 
     def open(self, url):
         """Open a page with a flight, and wait until its bar and its image are there."""
@@ -120,48 +72,10 @@ class Browser:
 
         wait_for(shown)
 
-    def picture(self):
-        """Return the window's pixels. (height, width, 3)"""
-        png = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        size = self.value("[window.innerWidth, window.innerHeight]")
-        decode = [get_ffmpeg_exe(), "-loglevel", "error", "-f", "png_pipe", "-i", "-"]
-        decode += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-        pixels = subprocess.run(decode, input=png, capture_output=True, check=True).stdout
-        return np.frombuffer(pixels, np.uint8).reshape(size[1], size[0], 3).astype(int)
-
-    def mask(self, rgb):
-        """Return rows and columns of what has a hue."""
-        picture, on = self.picture(), np.asarray(rgb) > 0
-        return np.nonzero(picture[..., on].min(-1) > picture[..., ~on].max(-1) + 60)
-
-    def find(self, rgb, near):
-        """Return column and row of the middle of what has a hue, once that is near a place or half a minute is over."""
-        place, deadline = np.full(2, np.inf), time.monotonic() + 30
-        while time.monotonic() < deadline and not np.allclose(place, near, atol=NEAR):
-            rows, columns = self.mask(rgb)
-            if len(rows) > 20:
-                place = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
-        return place
-
-    def close(self):
-        self._socket.close()
-        self._process.terminate()
-        self._process.wait(20)
-
-
-def wait_for(condition, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come to be"
-        time.sleep(0.1)
-
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    program = shutil.which("chromium") or shutil.which("google-chrome")
-    if program is None:
-        pytest.skip("no chromium")
-    browser = Browser(program, tmp_path_factory.mktemp("browser"))
+    browser = start_browser(tmp_path_factory.mktemp("browser"), FlightBrowser)
     yield browser
     browser.close()
 

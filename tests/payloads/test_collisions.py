@@ -213,7 +213,7 @@ def test_the_log_has_the_step_in_which_a_load_touches():
     load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
     pole = sim.scene.add("sphere", pos=[0, 0, 9], radius=0.1)
     log = sim.add(ContactLog(floor=False, drones=False))
-    (drone,) = sim.scene.collision_model.drone_geoms
+    ((drone,),) = (kind.geoms for kind in sim.scene.collision_model.drones)
     reach = drone.shape.size[0] + RADIUS
     start = np.asarray(sim.data.states.pos)[:, ::-1] + np.array(drone.pos) + [0, 0, -0.5]
     sim.data = with_load(load, load.release(sim.data), pos=start, vel=[0, 0, 1.0])

@@ -99,7 +99,7 @@ def test_drones_are_mocap_bodies_that_weigh_nothing(sim):
 def test_every_airframe_has_a_body(name):
     """Each built-in airframe gives a body of primitives: a disc over each rotor, two LEDs, cameras, shapes to touch."""
     airframe = load_airframe(name)
-    model = compile_spec(build_spec(None, airframe, 1, 500, -1))
+    model = compile_spec(build_spec(None, [airframe], 500, -1))
     of_drone = model.geom_bodyid == model.body("drone:0").id
     assert not np.isin(model.geom_type[of_drone], [mujoco.mjtGeom.mjGEOM_MESH]).any()
     discs = of_drone & (model.geom_matid == model.material("drone_propeller").id)
@@ -115,7 +115,7 @@ def test_every_airframe_has_a_body(name):
 
 def test_the_tracking_camera_looks_at_its_drone():
     """It stands behind and above, its view goes through the drone, and up is up."""
-    model = compile_spec(build_spec(None, load_airframe("cf21B_500"), 1, 500, -1))
+    model = compile_spec(build_spec(None, [load_airframe("cf21B_500")], 500, -1))
     data = mujoco.MjData(model)
     data.mocap_pos[0], data.mocap_quat[0] = [1, 2, 3], [np.cos(0.4), 0, np.sin(0.4), 0]
     mujoco.mj_kinematics(model, data)
@@ -134,16 +134,16 @@ def test_the_tracking_camera_looks_at_its_drone():
 
 def test_a_swarm_of_thousands_builds():
     """MuJoCo goes through the whole spec for every geom it is given: built one by one, this would take minutes."""
-    model = compile_spec(build_spec(None, load_airframe("cf21B_500"), 4096, 500, 8192))
+    model = compile_spec(build_spec(None, [load_airframe("cf21B_500")] * 4096, 500, 8192))
     assert model.nmocap == 4096
 
 
 def test_a_swarm_built_in_chunks_is_the_swarm_built_one_by_one(monkeypatch):
     """How bodies come into the spec leaves no trace in the model: every array of it is the same."""
     airframe = load_airframe("cf21B_500")
-    whole = compile_spec(build_spec(None, airframe, 7, 500, -1))
+    whole = compile_spec(build_spec(None, [airframe] * 7, 500, -1))
     monkeypatch.setattr(build, "CHUNK", 3)
-    parts = compile_spec(build_spec(None, airframe, 7, 500, -1))
+    parts = compile_spec(build_spec(None, [airframe] * 7, 500, -1))
     arrays = [name for name in dir(whole) if isinstance(getattr(whole, name), np.ndarray)]
     assert len(arrays) > 100
     for name in arrays:

@@ -1,5 +1,13 @@
-// A lane is a thread; of a warp's, as many are used as make whole groups.
+// A lane is a thread. Drones of a world that read each other's numbers are in one warp, or from 33 on in one block.
+// Of the threads of a warp or block, as many are lanes as make whole groups.
+#if GROUP <= 32
+#define THREADS 32
 #define LANES (32 / GROUP * GROUP)
+#else
+#define THREADS BLOCK_THREADS
+#define LANES (THREADS / GROUP * GROUP)
+#endif
+#define UNROLL _Pragma("unroll 4")
 #define FN static __device__ __forceinline__
 #define RSQRTF(x) rsqrtf(x)
 #define BITS_F32(x) __uint_as_float(x)

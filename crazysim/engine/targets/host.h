@@ -5,6 +5,7 @@
 
 #include <cmath>
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
 #include <type_traits>
 
@@ -25,10 +26,25 @@ static inline unsigned bits_of_float(float x) { unsigned y; std::memcpy(&y, &x, 
 #else
 #define BYTES 16
 #endif
-// Lanes of a block: as many as the widest numbers leave room for in a vector register, but at least one group; of
-// them, as many are used as make whole groups.
+// Lanes of a vector: as many as the widest numbers leave room for in a register, but at least one group; of them, as
+// many are used as make whole groups. A group of more than 8 has several vectors.
+#if GROUP <= 8
 #define W (BYTES / WIDEST > GROUP ? BYTES / WIDEST : GROUP <= 2 ? 2 : GROUP <= 4 ? 4 : 8)
 #define LANES (W / GROUP * GROUP)
+#define VECTORS 1
+#else
+#define W (BYTES / WIDEST)
+#define LANES W
+#define VECTORS ((GROUP + W - 1) / W)
+#endif
+#define LANES_OF_BLOCK (VECTORS == 1 && GROUP <= 8 ? LANES : GROUP)
+#define UNROLL _Pragma("GCC unroll 8")
+// What is computed for one vector of a world after the other.
+#define SWEEP \
+  for (int v = 0; v < VECTORS; ++v) \
+    if (const int64_t first = begin + v * W; true) \
+      if (const int n_active = GROUP - v * W < W ? GROUP - v * W : W; true) \
+        if (const i32v own = numbers() + v * W; true)
 
 template <class T> struct vec { typedef T type __attribute__((vector_size(sizeof(T) * W))); };
 typedef vec<f32>::type f32v;
@@ -74,6 +90,10 @@ template <class V> FN V of_drone(V x, int d) {
 #endif
 }
 FN b1v of_drone(b1v x, int d) { return {of_drone(x.m, d)}; }
+
+// A number of the drone with number d of a world of several vectors.
+template <class V> FN auto of_place(const V* x, int d) { return x[d / W][d % W]; }
+FN b1 of_place(const b1v* x, int d) { return x[d / W].m[d % W] != 0; }
 
 FN b1v mask(i32v m) { return {m}; }
 FN b1v mask(i64v m) { return {__builtin_convertvector(m, i32v)}; }
@@ -335,10 +355,10 @@ template <class F> static void* work(void* share) {
 }
 template <class F> static void in_parallel(int64_t n_lanes, int64_t n_steps, const F& run) {
   const int most = 256;
-  const int64_t n_blocks = (n_lanes + LANES - 1) / LANES;
-  const int64_t worth = n_blocks * (n_steps + IO_STEPS) * OPERATIONS / WORTH_A_THREAD;
+  const int64_t n_blocks = (n_lanes + LANES_OF_BLOCK - 1) / LANES_OF_BLOCK;
+  const int64_t worth = n_blocks * VECTORS * (n_steps + IO_STEPS) * OPERATIONS / WORTH_A_THREAD;
   const int64_t n_threads = worth < 2 ? 1 : least(least(n_cores(), most), worth);
-  const auto bound = [=](int64_t k) { return least(n_lanes, n_blocks * k / n_threads * LANES); };
+  const auto bound = [=](int64_t k) { return least(n_lanes, n_blocks * k / n_threads * LANES_OF_BLOCK); };
   Share<F> shares[most];
   for (int64_t k = 1; k < n_threads; ++k) {
     shares[k] = {&run, bound(k), bound(k + 1), pthread_t(), false};

@@ -1,0 +1,69 @@
+"""Steps per second of worlds whose drones act on each other, beside the same worlds without that.
+
+One JSON line for each number of drones a world, the total being constant. ``downwash`` adds up the jets of all drones
+of a world at each of them; ``uncoupled`` is the same simulation without an effect. The two are measured in turns.
+
+    python benchmarks/coupled.py [--device gpu] [--total 262144] [--drones 4 8 16 64 256] [--check]
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from measure import Flight, digits, engine_of, medians, report
+
+from crazysim import Downwash, Sim, __version__
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--control", default="attitude")
+    parser.add_argument("--integrator", default="euler")
+    parser.add_argument("--total", type=int, default=262144, help="drones of all worlds")
+    parser.add_argument("--drones", nargs="+", type=int, default=[4, 8, 16, 64, 256], help="drones of a world")
+    parser.add_argument("--steps", type=int, default=20, help="physics steps per call")
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--check", action="store_true", help="compare with engine 'plain' instead of measuring")
+    args = parser.parse_args()
+    for n_drones in args.drones:
+        n_worlds = max(args.total // n_drones, 1)
+        case = {"control": args.control, "integrator": args.integrator, "n_worlds": n_worlds, "n_drones": n_drones}
+        line = check(case, args) if args.check else measure(case, args)
+        report(args.device, benchmark="coupled", **case, n_steps=args.steps, crazysim=__version__, **line)
+
+
+def measure(case: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+    """Return the steps per second with and without downwash."""
+    sims = {name: Sim(**case, device=args.device) for name in ("uncoupled", "downwash")}
+    sims["downwash"].add(Downwash())
+    flights = {name: Flight(sim, args.control, args.steps, args.device) for name, sim in sims.items()}
+    taken = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
+    n_steps = case["n_worlds"] * case["n_drones"] * args.steps
+    rates = {name: digits(n_steps / seconds) for name, seconds in taken.items()}
+    return {"engine": engine_of(sims["downwash"]), "steps_per_s": rates}
+
+
+def check(case: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+    """Return the largest differences of velocities between the fastest engine and ``plain``, m/s."""
+    case = case | {"n_worlds": min(case["n_worlds"], 100)}
+    pos = np.random.default_rng(0).uniform(-1, 1, (case["n_worlds"], case["n_drones"], 3))
+    vels, engines = [], []
+    for engine in ("auto", "plain"):
+        sim = Sim(**case, device=args.device, engine=engine)
+        sim.add(Downwash())
+        states = sim.data.states
+        hover = jnp.full_like(states.rotor_vel, 15864.0)
+        sim.data = sim.data.replace(states=states.replace(pos=jnp.asarray(pos, states.pos.dtype) + 2, rotor_vel=hover))
+        sim.step(args.steps)
+        vels.append(np.asarray(sim.data.states.vel))
+        engines.append(engine_of(sim))
+    return {"engine": engines[0], "difference": float(np.abs(vels[0] - vels[1]).max()),
+            "largest": float(np.abs(vels[1]).max())}  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""The live loop measured: factor of real time, lateness of control steps, cost of pictures and recordings.
+
+    python benchmarks/live.py [--seconds 20] [--drones 30] [--only max recorded pictures jitter]
+
+- max: as fast as possible, setpoints of all drones renewed at every control step; simulated seconds per second
+- recorded: the same, with 50 samples per simulated second written to a file
+- pictures: in real time, with a page in a server that one client reads, and 50 pictures a second
+- jitter: in real time without viewers; lateness of control steps, which 99.9% keep below lateness_999, ms
+
+One world, control at 100 Hz, physics at 500 Hz. For the stated figure of jitter use --seconds 600 on an idle machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+from measure import digits, report
+
+from crazysim import Sim
+from crazysim.live import Browser, Live
+from crazysim.live.program import Circles
+
+CASES = ("max", "recorded", "pictures", "jitter")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=20.0, help="simulated time of each case, s")
+    parser.add_argument("--drones", type=int, default=30)
+    parser.add_argument("--only", nargs="+", choices=CASES, default=CASES)
+    args = parser.parse_args()
+    for case in args.only:
+        measure(case, args.drones, args.seconds)
+
+
+def measure(case: str, n_drones: int, seconds: float) -> None:
+    """Print the line of one case."""
+    sim = Sim(n_drones=n_drones, control="state", freq=500)
+    speed = 1.0 if case in ("pictures", "jitter") else "max"
+    with contextlib.ExitStack() as stack:
+        live = stack.enter_context(Live(sim, control_freq=100, speed=speed))
+        live.add(Circles(live, piloted=False), name="circles")
+        if case == "recorded":
+            live.record(Path(stack.enter_context(tempfile.TemporaryDirectory())) / "flight.journal")
+        if case == "pictures":
+            page = live.show(Browser(port=0))
+            client = threading.Thread(target=read, args=(page.url,), daemon=True)
+            client.start()
+        live.run(1.0)
+        result = live.run(seconds)
+    report(
+        "cpu",
+        benchmark="live",
+        case=case,
+        n_drones=n_drones,
+        seconds=seconds,
+        factor=digits(result.factor),
+        pictures_per_s=digits(result.pictures / result.wall_s),
+        late=result.late,
+        lateness_999_ms=digits(1e3 * result.lateness_999),
+        worst_ms=digits(1e3 * result.worst),
+    )
+
+
+def read(url: str) -> Any:
+    """Read what the server of a page sends, as a browser does, and discard it."""
+    from viser import __version__
+    from websockets.sync.client import connect
+
+    with (
+        contextlib.suppress(Exception),
+        connect(url.replace("http", "ws"), subprotocols=[f"viser-v{__version__}"], max_size=None) as socket,
+    ):
+        while True:
+            socket.recv()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""Motion capture: time of one frame of many objects, from its arrival to the poses in the data.
+
+    python benchmarks/mocap.py --objects 50 --freq 240 --seconds 10
+
+A thread sends frames in real time, and the simulation takes them between control steps, as a live one does. One JSON
+line has the time of the rules for a frame, and of an update of the scene, each as median and 99th percentile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import jax
+import numpy as np
+from measure import digits, report
+
+from crazysim import Sim
+from crazysim.live.mocap import FunctionSource, RealTimeSource, Twin, Twins
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--objects", type=int, default=50, help="number of tracked objects")
+    parser.add_argument("--freq", type=float, default=240.0, help="frames per second, Hz")
+    parser.add_argument("--seconds", type=float, default=10.0, help="real time to measure, s")
+    args = parser.parse_args()
+    measure(args.objects, args.freq, args.seconds)
+
+
+def measure(n_objects: int, freq: float, seconds: float) -> None:
+    phases = np.arange(n_objects)
+
+    def bodies(t: float) -> dict:
+        xy = np.stack([phases % 10 + 0.2 * np.cos(t + phases), phases // 10 + 0.2 * np.sin(t + phases)], axis=-1)
+        half = 0.5 * np.sin(t)
+        quat = (0.0, 0.0, np.sin(half), np.cos(half))
+        return {f"cf{k}": ((*p, 1.0), quat) for k, p in enumerate(xy.tolist())}
+
+    sim = Sim(n_drones=4, control="state")
+    source = RealTimeSource(FunctionSource(bodies, freq))
+    twins = Twins(sim, source, {"cf": Twin.drone()}, [f"cf{k}" for k in range(n_objects)])
+    twins.update(sim)
+    sim.step(5)
+    twins.update(sim)
+
+    source.start()
+    updates, n_steps, begin = [], 0, time.monotonic()
+    while time.monotonic() - begin < seconds:
+        sim.step(5)
+        jax.block_until_ready(sim.data.states.pos)
+        start = time.perf_counter()
+        twins.update(sim)
+        jax.block_until_ready(sim.data.objects.pos)  # type: ignore[union-attr]
+        updates.append(time.perf_counter() - start)
+        n_steps += 1
+        time.sleep(max(begin + n_steps / 100 - time.monotonic(), 0.0))
+    twins.close()
+
+    frames = [FunctionSource(bodies, freq).frame(100 + k / freq) for k in range(500)]
+    rules = []
+    for frame in frames:
+        start = time.perf_counter()
+        twins.tracker.accept(frame)
+        rules.append(time.perf_counter() - start)
+    report(
+        "cpu",
+        benchmark="mocap",
+        n_objects=n_objects,
+        freq=freq,
+        frames=twins.tracker.n_frames - len(frames),
+        lost=twins.reports.count("overrun"),
+        frame_ms=digits(1e3 * float(np.median(rules))),
+        frame_p99_ms=digits(1e3 * float(np.percentile(rules, 99))),
+        update_ms=digits(1e3 * float(np.median(updates))),
+        update_p99_ms=digits(1e3 * float(np.percentile(updates, 99))),
+    )
+
+
+if __name__ == "__main__":
+    main()

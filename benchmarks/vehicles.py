@@ -1,0 +1,89 @@
+"""Steps of cars per second: under commands, along paths, with trailers, and beside a drone.
+
+    python benchmarks/vehicles.py [--device gpu] [--worlds 1048576] [--cases drive kinematic path] [--steps 20]
+
+``alone`` in a line means that the stages of the drones are not in the pipeline. Cars drive on circles all the time; a
+case whose cars stop or leave their circle is an error.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+from measure import digits, engine_of, medians, report, seconds
+
+from crazysim import Sim
+from crazysim.trajectories import circle
+from crazysim.vehicles import Cars, PathLQR, PurePursuit, Stanley
+
+WORLDS = {"cpu": 16384, "gpu": 1048576}
+CASES: dict[str, dict[str, Any]] = {
+    "drive": {},
+    "speed": {"level": "speed"},
+    "kinematic": {"vehicle": {"base": "f1tenth_ros", "model": "kinematic"}},
+    "trailer": {"trailer": True},
+    "path": {"path": circle(2.0, speed=1.5, height=0.0), "controller": PurePursuit()},
+    "stanley": {"path": circle(2.0, speed=1.5, height=0.0), "controller": Stanley()},
+    "lqr": {"path": circle(2.0, speed=1.5, height=0.0), "controller": PathLQR()},
+    "beside_drone": {},
+}
+"""Settings of the cars in each case."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--worlds", type=int)
+    parser.add_argument("--cars", type=int, default=1, help="cars in each world")
+    parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--steps", type=int, default=100, help="physics steps of a call")
+    parser.add_argument("--repeats", type=int, default=20)
+    args = parser.parse_args()
+    for case in args.cases:
+        measure(case, args)
+
+
+def measure(case: str, args: argparse.Namespace) -> None:
+    """Print the rate of one case."""
+    n_worlds = args.worlds or WORLDS["cpu" if args.device == "cpu" else "gpu"]
+    sim = Sim(n_worlds, control="rotor_vel", device=args.device, engine=args.engine)
+    cars = sim.add(Cars(args.cars, in_scene=False, **CASES[case]))
+    if cars.path is None:
+        command = [1.5 if cars.level == "speed" else 0.08, 0.2]
+        sim.data = cars.commanded(sim.data, np.tile(np.float32(command), (n_worlds, args.cars, 1)))
+    if case != "beside_drone":
+        of_cars = {k: fn for k, fn in sim.step_pipeline.items() if k.startswith("cars") or k == "increment_steps"}
+        sim.step_pipeline = type(sim.step_pipeline)(of_cars)
+        sim.build_step_fn()
+
+    def step() -> Any:
+        sim.step(args.steps)
+        return sim.data.plugins["cars"].pos
+
+    compile_s = seconds(step)
+    for _ in range(10):
+        step()
+    found = medians({"step": lambda: seconds(step)}, args.repeats)["step"]
+    record = cars.read(sim.data)
+    speed, turn = np.asarray(record.body_vel[..., 0]), np.asarray(record.yaw_rate)
+    if not (speed.min() > 0.5 and speed.max() < 3.0 and np.abs(turn).min() > 0.2):
+        raise SystemExit(f"{case}: expected cars on circles, got speeds from {speed.min()} to {speed.max()} m/s")
+    report(
+        args.device,
+        benchmark="vehicles",
+        case=case,
+        alone=case != "beside_drone",
+        engine=engine_of(sim),
+        n_worlds=n_worlds,
+        n_cars=args.cars,
+        n_steps=args.steps,
+        compile_s=round(compile_s, 2),
+        steps_per_s=digits(n_worlds * args.cars * args.steps / found),
+    )
+
+
+if __name__ == "__main__":
+    main()

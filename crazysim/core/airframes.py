@@ -1,0 +1,144 @@
+"""Drones of several airframes: what differs between them becomes one value per drone."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from crazysim.drones import Airframe
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree
+
+T = TypeVar("T")
+
+PREFIXES = {"Crazyflie": ("cf", "crazyflie"), "Bumblebee": ("bumblebee",)}
+"""Names of drones of some airframes, by the beginnings of the names of these, as AIMotionLab-Virtual has them."""
+MASK = "rotors"
+"""Name of fields that are True for the rotors that a drone has; None where all drones have equally many."""
+PER_ROTOR = ("L", "prop_inertia", "rpm2thrust", "rpm2torque", "rotor_dyn_coef")
+"""Fields that missing rotors have like the last one; all others are zero for missing rotors."""
+
+
+Airframes = Airframe | Sequence[Airframe]
+"""Airframe of all drones, or of each."""
+
+
+def as_airframes(airframes: Airframes, n_drones: int = 1) -> tuple[Airframe, ...]:
+    """Return the airframe of each drone. (n_drones,)"""
+    return (airframes,) * n_drones if isinstance(airframes, Airframe) else tuple(airframes)
+
+
+def airframe_of(airframes: Airframes) -> Airframe:
+    """Return the airframe of all drones.
+
+    Raises:
+        ConfigError: If they have several.
+    """
+    first, *others = as_airframes(airframes)
+    if any(other is not first for other in others):
+        names = ", ".join(dict.fromkeys(repr(airframe.name) for airframe in (first, *others)))
+        raise ConfigError(f"expected one airframe for all drones, got {names}. Use sim.airframes, one for each drone.")
+    return first
+
+
+def n_rotors_of(airframes: Airframes) -> int:
+    """Return the largest number of rotors."""
+    return max(airframe.n_rotors for airframe in as_airframes(airframes))
+
+
+def prefix_of(airframe: Airframe) -> str:
+    """Return the beginning of the names of drones of an airframe: ``Crazyflie``, ``Bumblebee``, or its own name."""
+    name = airframe.name.lower()
+    for prefix, beginnings in PREFIXES.items():
+        if name.startswith(beginnings):
+            return prefix
+    words = re.findall("[A-Za-z0-9]+", airframe.name)
+    return "".join(word[0].upper() + word[1:] for word in words) or "Drone"
+
+
+def drone_names(airframes: Sequence[Airframe]) -> tuple[str, ...]:
+    """Return the names of drones, numbered for each prefix: ``Crazyflie_0``, ``Bumblebee_0``, ``Crazyflie_1``."""
+    counts: dict[str, int] = {}
+    names = []
+    for prefix in map(prefix_of, airframes):
+        counts[prefix] = counts.get(prefix, -1) + 1
+        names.append(f"{prefix}_{counts[prefix]}")
+    return tuple(names)
+
+
+def for_drones(airframes: Airframes, create: Callable[[Airframe], T], n_worlds: int) -> T:
+    """Return the record of parameters of all drones: shared where their airframes are alike, one per drone elsewhere.
+
+    Axes over rotors are as long as the largest number of rotors. The others do not exist: their thrust, their part in
+    the mixing matrix and their largest speed are zero.
+
+    Args:
+        airframes: Airframe of each drone.
+        create: From an airframe to its record, shared by all drones of it.
+        n_worlds: Number of worlds.
+
+    Raises:
+        ConfigError: If the records have different fields.
+    """
+    airframes = as_airframes(airframes)
+    kinds = list({id(airframe): airframe for airframe in airframes}.values())
+    records = [create(kind) for kind in kinds]
+    if len(kinds) == 1:
+        return records[0]
+    counts = [kind.n_rotors for kind in kinds]
+    if len(set(counts)) > 1:
+        records = [_with_mask(record, n) for record, n in zip(records, counts, strict=True)]
+    structures = [jax.tree.structure(record) for record in records]
+    for kind, structure in zip(kinds, structures, strict=True):
+        if structure != structures[0]:
+            raise ConfigError(
+                f"expected airframes with the same numbers for {type(records[0]).__name__}, got {kinds[0].name!r} and "
+                f"{kind.name!r}, of which one lacks some. Add them, with the key 'base', or use another controller."
+            )
+    numbers = [kinds.index(airframe) for airframe in airframes]
+
+    def joined(path: Any, *values: Any) -> Any:
+        name = jax.tree_util.keystr(path[-1:]).strip("[].'\"")
+        arrays = _of_one_shape([np.asarray(x) for x in values], name)
+        if all(np.array_equal(x, arrays[0]) for x in arrays):
+            return arrays[0]
+        each = np.stack([arrays[k] for k in numbers])
+        return np.array(np.broadcast_to(each, (n_worlds, *each.shape)))
+
+    return jax.tree_util.tree_map_with_path(joined, *records)
+
+
+def _of_one_shape(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
+    """Return arrays with their axes over rotors, along which their lengths differ, as long as the longest."""
+    shape = tuple(np.max([x.shape for x in arrays], axis=0)) if arrays[0].ndim else ()
+    out = []
+    for x in arrays:
+        missing = [(0, n - own) for n, own in zip(shape, x.shape, strict=True)]
+        alike = [own == 1 and n > 1 for n, own in zip(shape, x.shape, strict=True)]
+        if any(alike):
+            x = np.broadcast_to(x, [n if one else own for n, own, one in zip(shape, x.shape, alike, strict=True)])
+            missing = [(0, n - own) for n, own in zip(shape, x.shape, strict=True)]
+        out.append(np.pad(x, missing, mode="edge" if name in PER_ROTOR else "constant"))
+    return out
+
+
+def _with_mask(record: Any, n_rotors: int) -> Any:
+    """Return a record with the masks over rotors that it and the records within it declare."""
+    if not isinstance(record, PyTree):
+        return record
+    changes = {}
+    for f in dataclasses.fields(record):  # type: ignore[arg-type]
+        value = getattr(record, f.name)
+        if f.name == MASK and value is None:
+            changes[f.name] = np.ones(n_rotors, bool)
+        elif isinstance(value, (PyTree, tuple, list)):
+            of_parts = isinstance(value, (tuple, list))
+            changes[f.name] = (
+                type(value)(_with_mask(x, n_rotors) for x in value) if of_parts else _with_mask(value, n_rotors)
+            )
+    return record.replace(**changes) if changes else record

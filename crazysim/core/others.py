@@ -1,0 +1,144 @@
+"""Reductions over the drones of a world, for functions that are written for one drone.
+
+A drone publishes some of its values, and a function of one pair says what the values of another drone mean for it. No
+array has an axis of pairs there: ``plain`` forms one, kernels loop over the drones of a world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import batching, mlir
+
+from crazysim.errors import ConfigError
+
+AXIS = "members"
+"""Name of the axis of ``vmap`` over the drones of a world, or over the members of another population."""
+
+Reduction = Literal["sum", "min", "max"]
+
+REDUCTIONS: dict[str, Callable[..., Array]] = {"sum": jnp.sum, "min": jnp.min, "max": jnp.max}
+
+MAX_PAIRS = 2**20
+"""Pairs of a world that are computed at once; those of a larger swarm follow in turns, which bounds the memory."""
+
+
+def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Reduction = "sum") -> Any:
+    """Return the reduction of a function of pairs over all drones of the world, for use in functions of one drone.
+
+    ``fn`` also runs for the pair of the drone with itself, where ``is_self`` is true. Values of the drone itself are
+    those that ``fn`` closes over. What depends on the other drone alone belongs into ``values``: it is computed once
+    for each drone, and ``fn`` once for each pair.
+
+        gap = reduce_over_others(
+            lambda other, is_self: jnp.where(is_self, jnp.inf, rotation.norm(pos - other)), pos, "min"
+        )
+
+    Args:
+        fn: ``fn(other, is_self)`` returns any tree of arrays for one pair: ``other`` are the ``values`` of the other
+            drone, ``is_self`` is true where it is the drone itself, ().
+        values: Values of this drone that are passed to all drones of its world, any tree of small arrays.
+        reduce: ``"sum"``, ``"min"`` or ``"max"`` over the other drones; of bools ``"max"`` is true where any is true.
+
+    Returns:
+        The tree of ``fn``, reduced.
+
+    Raises:
+        ConfigError: If the reduction does not exist or does not fit the type, or outside of a stage or an influence of
+            one drone.
+    """
+    if reduce not in REDUCTIONS:
+        raise ConfigError(f"expected reduce as 'sum', 'min' or 'max', got {reduce!r}")
+    leaves, treedef = jax.tree.flatten(jax.tree.map(jnp.asarray, values))
+    structure: Any = None
+
+    def pair(*args: Any) -> list[Array]:
+        nonlocal structure
+        *other, is_self = args
+        found, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, fn(treedef.unflatten(other), is_self)))
+        return found
+
+    avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+    traced = jax.make_jaxpr(pair)(*avals, jax.ShapeDtypeStruct((), bool))
+    if reduce == "sum" and any(x.dtype == bool for x in traced.out_avals):
+        raise ConfigError("expected numbers to sum over the other drones, got bools. Use reduce='max' for any of them.")
+    found = reduce_over_others_p.bind(
+        *traced.consts, *leaves, jaxpr=_without_constants(traced), n_own=len(traced.consts), reduce=reduce
+    )
+    return structure.unflatten(found)
+
+
+reduce_over_others_p = Primitive("reduce_over_others")
+"""The reduction as a primitive: operands are the values that the function closes over, then those that are published.
+``jaxpr`` maps them and ``is_self`` to results, for one pair; ``n_own`` is the number of the first."""
+reduce_over_others_p.multiple_results = True
+
+
+def _without_constants(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """Return a jaxpr that takes what it closes over as its first inputs."""
+    x = closed.jaxpr
+    return ClosedJaxpr(Jaxpr((), [*x.constvars, *x.invars], x.outvars, x.eqns, x.effects, x.debug_info), ())
+
+
+def _outside(*args: Any, **params: Any) -> Any:
+    raise ConfigError(
+        "expected reduce_over_others in a function of one drone that a stage applies to all drones of a world, got a "
+        "call outside of one. Use it in stage('drone') or in the influence of a plugin."
+    )
+
+
+def _results(*args: Any, jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> list[Any]:
+    return [x.update(weak_type=False) for x in jaxpr.out_avals]
+
+
+def _batched(axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> Any:
+    """Return the reduction under ``vmap``: over drones it is computed, over any other axis it stays one."""
+    mapped = [None if d is None else 0 for d in dims]
+    rows = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
+    if axis.name == AXIS:
+        out = _of_all(axis.size, rows[:n_own], mapped[:n_own], rows[n_own:], mapped[n_own:], jaxpr, reduce)
+    else:
+        of_many = jax.vmap(jaxpr_as_fun(jaxpr), in_axes=(*mapped, None), axis_size=axis.size)
+        pair = jax.make_jaxpr(of_many)(*rows, jax.ShapeDtypeStruct((), bool))
+        out = reduce_over_others_p.bind(*rows, jaxpr=pair, n_own=n_own, reduce=reduce)
+    return out, [0] * len(out)
+
+
+def _of_all(
+    n: int,
+    own: Sequence[Array],
+    own_axes: Sequence[int | None],
+    other: Sequence[Array],
+    other_axes: Sequence[int | None],
+    jaxpr: ClosedJaxpr,
+    reduce: str,
+) -> list[Array]:
+    """Return the reduction for each drone of a world. (n, ...) each"""
+    pair, numbers = jaxpr_as_fun(jaxpr), jnp.arange(n)
+    each = [x for x, axis in zip(own, own_axes, strict=True) if axis is not None]
+
+    def of_one(i: Array, some: Sequence[Array]) -> list[Array]:
+        rest = iter(some)
+        mine = [x if axis is None else next(rest) for x, axis in zip(own, own_axes, strict=True)]
+
+        def of_pair(j: Array, values: Sequence[Array]) -> list[Array]:
+            return pair(*mine, *values, i == j)
+
+        found = jax.vmap(of_pair, (0, list(other_axes)))(numbers, list(other))
+        return [REDUCTIONS[reduce](x, axis=0).astype(x.dtype) for x in found]
+
+    if n * n <= MAX_PAIRS:
+        return jax.vmap(of_one)(numbers, each)
+    in_turn = jax.checkpoint(lambda xs: of_one(*xs))
+    return jax.lax.map(in_turn, (numbers, each), batch_size=max(1, MAX_PAIRS // n))
+
+
+reduce_over_others_p.def_impl(_outside)
+reduce_over_others_p.def_abstract_eval(_results)
+batching.fancy_primitive_batchers[reduce_over_others_p] = _batched
+mlir.register_lowering(reduce_over_others_p, _outside)

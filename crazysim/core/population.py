@@ -1,0 +1,287 @@
+"""Populations: things of one kind beside the drones of a world, such as cars, loads or free bodies.
+
+A population is a plugin whose record has one row for each member. Its methods are written for one member; scopes,
+masks, seeds, sharding, engines and gradients treat members as they treat drones.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.influence import own_rates
+from crazysim.core.integration import Integrator
+from crazysim.core.plugin import Placement, Plugin, Simulation
+from crazysim.core.settings import positive
+from crazysim.core.stage import RESERVED, Stage, tick
+from crazysim.errors import ConfigError
+from crazysim.pytree import Members, PyTree, floating
+
+R = TypeVar("R", bound=Members)
+
+
+class Population(Plugin):
+    """Base class of populations, which ``sim.add`` adds.
+
+    A subclass overrides ``record``, ``derivative`` and what else it needs. The methods that take ``data`` are written
+    for one member: leaves of the population and of worlds come without batch axes, leaves of other populations, drones
+    included, as (n_members, ...), to be read only. ``self.read(data)`` is the record of the member.
+
+    The stages of a population are its controller, before the integration of the drones, and its integration, behind
+    that of the drones. Both carry its name as scope.
+    """
+
+    members: int | Sequence[str] = 1
+    """Number of members in each world, or their names, such as ``("Fleet1Tenth_0", "Fleet1Tenth_7")``."""
+    name: str = "population"
+    """Name of the population: key of its record in ``data.plugins``, and scope of its leaves and stages."""
+    prefix: ClassVar[str] = "Member"
+    """Beginning of the names of members that are given by number: ``Member_0``."""
+    positions: ClassVar[tuple[str, ...]] = ("pos",)
+    """States that the scheme ``symplectic_euler`` moves with the new values of the others."""
+    command_field: ClassVar[str | None] = None
+    """Field of the record that ``command`` writes; None for a population without commands."""
+
+    @property
+    def scope(self) -> str:
+        """Scope of its states and stages: its name."""
+        return self.name
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the members, in order.
+
+        Raises:
+            ConfigError: If the members are neither a positive number nor distinct names.
+        """
+        members, kind = self.members, type(self).__name__
+        if isinstance(members, (int, np.integer)) and not isinstance(members, bool):
+            names = tuple([f"{self.prefix}_{k}" for k in range(members)])
+        else:
+            names = tuple(members) if isinstance(members, Sequence) and not isinstance(members, str) else ()
+        if not names or not all(isinstance(name, str) and name for name in names):
+            raise ConfigError(
+                f"expected members of {kind} as a positive number or a list of names, got {members!r}. Use {kind}(2) "
+                f"or {kind}(['{self.prefix}_0'])."
+            )
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ConfigError(f"expected distinct names of members, got {twice!r} twice. Rename one.")
+        return names
+
+    @property
+    def n_members(self) -> int:
+        """Number of members in each world."""
+        return len(self.names)
+
+    @property
+    def control_freq(self) -> int | None:
+        """Rate of ``control``, Hz, a divisor of the rate of physics steps; None for that rate."""
+        return None
+
+    @property
+    def is_dynamic(self) -> bool:
+        """True if the drones' integration must call ``influence``; populations integrate their own states."""
+        return type(self).influence is not Plugin.influence or self.constrains
+
+    def create(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
+        """Return a record for all worlds, each number repeated for every member that it is not given for.
+
+        Args:
+            sim: The simulation.
+            kind: Class of the record.
+            fields: Values of its fields: for a leaf of members of shape (), (*core), (n_members, *core) or
+                (n_worlds, n_members, *core); other leaves and records within it as they are.
+
+        Raises:
+            ConfigError: If the members are invalid, or a value has another shape.
+        """
+        self.check(sim)
+        counts = sim.n_worlds, self.n_members
+        values = {}
+        for name, value in fields.items():
+            metadata = kind.__dataclass_fields__[name].metadata  # type: ignore[attr-defined]
+            of_members = metadata.get("scope") == "member" and value is not None and not isinstance(value, PyTree)
+            values[name] = _of_members(name, value, metadata, counts) if of_members else value
+        ids = np.array(np.broadcast_to(np.arange(self.n_members, dtype=np.int32), counts))
+        return kind(population=self.name, n_members=self.n_members, member_id=ids, **values)  # type: ignore[call-arg]
+
+    def check(self, sim: Simulation) -> None:
+        """Check the name of the population and the rate of its controller.
+
+        Raises:
+            ConfigError: If one is invalid.
+        """
+        if self.name in (*RESERVED, "drone", "world"):
+            raise ConfigError(f"expected a name of a population, got {self.name!r}, a scope of stages. Use name=.")
+        if self.control_freq is None:
+            return
+        freq, rate = sim.data.core.freq, positive(f"control_freq of {self.name!r}", self.control_freq)
+        if freq % rate:
+            nearest = next(f for f in range(min(rate, freq), 0, -1) if freq % f == 0)
+            raise ConfigError(
+                f"expected control_freq of {self.name!r} to divide freq = {freq} Hz, got {rate} Hz. Use the nearest "
+                f"rate below, {nearest} Hz."
+            )
+
+    def control(self, data: SimData) -> Members:
+        """Return the record of one member with what its controller computes, at ``control_freq``."""
+        return self.read(data)
+
+    def derivative(self, data: SimData) -> Mapping[str, Array]:
+        """Return the time derivatives of the states of one member by field of its record, per second.
+
+        The integration advances them in the scheme of the simulation. The rate of a unit quaternion is the derivative
+        of its four numbers; ``finish`` restores its length.
+        """
+        return {}
+
+    def finish(self, record: Members) -> Members:
+        """Return the record of one member at the end of a step: unit quaternions restored, states limited."""
+        return record
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages of controller and integration, each if the class overrides its method."""
+        cls, found = type(self), []
+        if cls.control is not Population.control:
+            rate = self.control_freq
+            when = None if rate is None else functools.partial(tick, freq=rate)
+            name = f"{self.name}_control"
+            found.append(Placement(Stage(self._controlled, self.name, when, name=name), name=name))
+        if cls.derivative is not Population.derivative:
+            name = f"{self.name}_integration"
+            step = functools.partial(self._integrated, scheme_of(sim.integrator, self.positions))
+            found.append(Placement(Stage(step, self.name, name=name), before="increment_steps", name=name))
+        return found
+
+    def with_poses(self, record: R, pos: Array, quat: Array) -> R:
+        """Return a record of all worlds with other poses; by default in fields ``pos`` and ``quat``, if it has them.
+
+        Args:
+            record: The record.
+            pos: Positions, world frame, m. (n_worlds, n_members, 3)
+            quat: Attitudes, body to world, xyzw. (n_worlds, n_members, 4)
+        """
+        return record.replace(**{k: x for k, x in (("pos", pos), ("quat", quat)) if k in _fields(record)})
+
+    def commanded(self, data: SimData, command: Any) -> SimData:
+        """Return the data of all worlds with a command for every member. (n_worlds, n_members, k)
+
+        Raises:
+            ConfigError: If the population takes no commands.
+            ValueError: If the command has another shape, or is NaN or infinite.
+        """
+        record, field = self.read(data), self.command_field
+        if field is None:
+            raise ConfigError(f"expected a population that takes commands, got {self.name!r}, which takes none")
+        like = getattr(record, field)
+        command = check_command(self.name, like.shape, command, like.dtype)
+        inside_jit = isinstance(like, jax.core.Tracer) or isinstance(command, jax.core.Tracer)
+        new = jnp.asarray(command) if inside_jit else jax.device_put(command, like.sharding)
+        return self.write(data, record.replace(**{field: new}))
+
+    def _controlled(self, data: SimData) -> SimData:
+        return self.write(data, self.control(data))
+
+    def _integrated(self, scheme: Callable[..., Members], data: SimData) -> SimData:
+        def rates(record: Members) -> dict[str, Array]:
+            return own_rates(self, self.write(data, record))
+
+        moved = scheme(self.read(data), rates, 1 / data.core.freq)
+        return self.write(data, self.finish(moved))
+
+
+Rates = Callable[[R], dict[str, Array]]
+"""From the record of one member to its derivatives by field."""
+
+
+def along(record: R, rates: Mapping[str, Array], dt: float) -> R:
+    """Return a record ``dt`` seconds along a derivative."""
+    return record.replace(**{field: getattr(record, field) + dt * rate for field, rate in rates.items()})
+
+
+def euler(record: R, rates: Rates, dt: float) -> R:
+    """Return a record one explicit Euler step later."""
+    return along(record, rates(record), dt)
+
+
+def symplectic_euler(record: R, rates: Rates, dt: float, positions: Sequence[str]) -> R:
+    """Return a record one semi-implicit Euler step later: positions move with the new values of the other states."""
+    others = along(record, {k: rate for k, rate in rates(record).items() if k not in positions}, dt)
+    return along(others, {k: rate for k, rate in rates(others).items() if k in positions}, dt)
+
+
+def rk4(record: R, rates: Rates, dt: float) -> R:
+    """Return a record one step of the classical Runge-Kutta method of order 4 later."""
+    k1 = rates(record)
+    k2 = rates(along(record, k1, dt / 2))
+    k3 = rates(along(record, k2, dt / 2))
+    k4 = rates(along(record, k3, dt))
+    return along(record, jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4), dt)
+
+
+def scheme_of(integrator: Integrator, positions: Sequence[str]) -> Callable[..., Any]:
+    """Return the function ``(record, rates, dt) -> record`` of an integration scheme."""
+    semi_implicit = functools.partial(symplectic_euler, positions=positions)
+    return {
+        Integrator.euler: euler,
+        Integrator.symplectic_euler: semi_implicit,
+        Integrator.rk4: rk4,
+    }[integrator]
+
+
+def populations(data: SimData) -> dict[str, Members]:
+    """Return the records of the populations beside the drones, by name."""
+    return {name: x for name, x in data.plugins.items() if isinstance(x, Members) and x.population == name}
+
+
+def _fields(record: Members) -> set[str]:
+    return {f.name for f in dataclasses.fields(record)}  # type: ignore[arg-type]
+
+
+def check_command(name: str, shape: tuple[int, ...], command: Any, dtype: Any) -> Array | np.ndarray:
+    """Return a command of some shape as an array of a type.
+
+    Raises:
+        ValueError: If it has another shape, or a number on the host is NaN or infinite.
+    """
+    on_host = not isinstance(command, jax.Array)
+    array = np.asarray(command, dtype) if on_host else command
+    if array.shape != shape:
+        raise ValueError(
+            f"expected a command of shape {shape} for {name!r}, got {array.shape}. For one command to all use "
+            f"np.broadcast_to(command, {shape})."
+        )
+    if on_host and not np.all(np.isfinite(array)):
+        raise ValueError(f"expected finite numbers as command of {name!r}, got NaN or infinity. Check its computation.")
+    return array.astype(dtype)
+
+
+def _of_members(name: str, value: Any, metadata: Mapping[str, Any], counts: tuple[int, int]) -> np.ndarray:
+    """Return a value repeated for every member of every world.
+
+    Raises:
+        ConfigError: If its shape does not allow that.
+    """
+    array = np.asarray(value)
+    is_integer = array.dtype.kind in "iu" and hasattr(
+        value, "dtype"
+    )  # numbers of Python may be written without a point
+    dtype = np.int32 if is_integer else floating() if array.dtype.kind in "iuf" else array.dtype
+    n_core = metadata["core_ndim"]
+    core = array.shape[max(array.ndim - n_core, 0) :] if array.ndim >= n_core else None
+    batch = array.shape[: array.ndim - n_core] if core is not None else ()
+    if core is None or metadata["core"] not in (None, core) or batch not in ((), counts[1:], counts):
+        raise ConfigError(
+            f"expected {name} with {n_core} dimensions for all members, or behind {counts[1:]} = (n_members,) or "
+            f"{counts} = (n_worlds, n_members), got shape {array.shape}. Use np.broadcast_to."
+        )
+    return np.array(np.broadcast_to(array, (*counts, *core)), dtype)

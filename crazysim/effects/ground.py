@@ -1,0 +1,92 @@
+"""The ground of a world: the flat floor, or terrain, with height and normal at any place as pure functions."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.geometry.heightfield import FAR, surface
+from crazysim.pytree import PyTree, leaf, static
+
+
+class TerrainData(PyTree):
+    """Heights of the ground on a grid, and below every drone."""
+
+    heights: Array = leaf("shared", 2)
+    """Heights of the nodes above the middle of the terrain, rows along y and columns along x, m. (n_rows, n_columns)"""
+    middle: Array = leaf("shared", 1)
+    """Position of the middle of the terrain, world frame, m. (3,)"""
+    half: Array = leaf("shared", 1)
+    """Half extents along x and y, m. (2,)"""
+    below: Array = leaf("drone", 1)
+    """Height of the ground below the drone after the last step, world frame, m. (n_worlds, n_drones, 1)"""
+    floor: bool = static()
+    """True where a flat floor at z = 0 surrounds the terrain; False where its border continues for ever."""
+
+    def surface_at(self, pos: Array) -> tuple[Array, Array]:
+        """Return height and normal of the ground at a place, whose z does not count.
+
+        The surface is linear on the two triangles of each cell, as MuJoCo draws and collides it: contacts, rays and
+        images have the same ground.
+
+        Args:
+            pos: Position, world frame, m. (..., 3)
+
+        Returns:
+            Height, world frame, m (..., 1), and unit normal, upwards (..., 3).
+        """
+        height, normal, inside = surface(self.heights, self.half, pos - self.middle)
+        if self.floor:
+            normal = jnp.where(inside[..., None], normal, jnp.asarray([0.0, 0.0, 1.0], normal.dtype))
+            return jnp.where(inside, height + self.middle[2], 0.0)[..., None], normal
+        return (height + self.middle[2])[..., None], normal
+
+    def gap_at(self, point: Array) -> tuple[Array, Array]:
+        """Return the distance of a point to the plane of the triangle below it, and the plane's normal.
+
+        Args:
+            point: Position, world frame, m. (..., 3)
+
+        Returns:
+            Distance, m, ``FAR`` beyond the border of a terrain that a flat floor surrounds (...), and unit normal
+            (..., 3).
+        """
+        height, normal, inside = surface(self.heights, self.half, point - self.middle)
+        gap = (point[..., 2] - self.middle[2] - height) * normal[..., 2]
+        return jnp.where(inside, gap, FAR) if self.floor else gap, normal
+
+
+def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
+    """Return height and normal of the ground at a place, whose z does not count; flat and zero without terrain.
+
+    Where terrains overlap, the highest counts.
+
+    Args:
+        data: Simulation, one world or one drone of it.
+        pos: Position, world frame, m. (..., 3)
+
+    Returns:
+        Height, world frame, m (..., 1), and unit normal, upwards (..., 3).
+    """
+    height = jnp.zeros_like(pos[..., :1])
+    normal = jnp.zeros_like(pos).at[..., 2].set(1.0)
+    for k, terrain in enumerate(x for x in data.plugins.values() if isinstance(x, TerrainData)):
+        here, up = terrain.surface_at(pos)
+        higher = here > height if k else jnp.ones_like(here, bool)
+        height, normal = jnp.where(higher, here, height), jnp.where(higher, up, normal)
+    return height, normal
+
+
+def ground_height(data: SimData, pos: Array) -> Array:
+    """Return the height of the ground at a place, m, as ``ground_at`` does. (..., 1)"""
+    return ground_at(data, pos)[0]
+
+
+def ground_below(data: SimData) -> Array | float:
+    """Return the height of the ground below a drone, m, after the last step; zero without terrain. (..., 1)"""
+    below = [x.below for x in data.plugins.values() if isinstance(x, TerrainData)]
+    height: Array | float = below[0] if below else 0.0
+    for other in below[1:]:
+        height = jnp.maximum(height, other)
+    return height

@@ -1,0 +1,209 @@
+"""Contact manifolds: the points at which two balls or boxes touch, with normals and gaps.
+
+For one pair, on small arrays; ``jax.vmap`` takes many. The number of points is that of the kinds of the pair, and points
+that do not exist have a large gap.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from crazysim import rotation
+from crazysim.geometry.heightfield import FAR
+
+PARALLEL = 1e-3
+"""Sine of the angle of two edges below which they span no separating axis."""
+EDGE_SHARE, EDGE_BIAS = 0.95, 0.01
+"""An axis of two edges is taken where its overlap is below this share of that of the best face, by more than this share
+of the smaller box: faces have several points, which rest more steadily."""
+WITHIN = 1 - 1e-4
+"""Share of a face within which the corners of the other are points of their own; beyond, its clipped edges are."""
+
+
+class Manifold(NamedTuple):
+    """Points at which two bodies touch or may touch next, world frame."""
+
+    gap: Array
+    """Distance along the normal, m, negative where they overlap. (n,)"""
+    normal: Array
+    """Unit normal, from the second body to the first. (n, 3)"""
+    point: Array
+    """Middle of the gap, m. (n, 3)"""
+
+
+def balls(radius_a: Array, pos_a: Array, radius_b: Array, pos_b: Array) -> Manifold:
+    """Return the contact point of two balls, of radii, m (), and positions, world frame, m (3,)."""
+    offset = pos_a - pos_b
+    up = jnp.asarray([0.0, 0.0, 1.0], offset.dtype)
+    normal = rotation.safe_normalize(offset, up)
+    gap = rotation.safe_norm(offset) - (radius_a + radius_b)
+    return Manifold(gap, normal[None], (pos_b + normal * (radius_b + 0.5 * gap))[None])
+
+
+def ball_on_box(radius: Array, pos: Array, size: Array, pos_box: Array, rot_box: Array) -> Manifold:
+    """Return the contact point of a ball, the first body, and a box.
+
+    Args:
+        radius: Radius of the ball, m. ()
+        pos: Position of its centre, world frame, m. (3,)
+        size: Half lengths of the box, m. (3,)
+        pos_box: Position of its centre, world frame, m. (3,)
+        rot_box: Rotation matrix from its frame to the world. (3, 3)
+    """
+    centre = rotation.matvec(rot_box.T, pos - pos_box)
+    nearest = rotation.safe_clip(centre, -size, size)
+    out = centre - nearest
+    distance = rotation.safe_norm(out)
+    # A centre inside the box leaves through the nearest face.
+    depth = size - jnp.abs(centre)
+    leaves = jnp.arange(3) == jnp.argmin(depth)
+    face = jnp.where(leaves, jnp.where(centre < 0, -1.0, 1.0), 0.0)
+    is_out = distance > 0
+    normal = jnp.where(is_out, out / jnp.where(is_out, distance, 1.0), face)
+    gap = jnp.where(is_out, distance, -jnp.min(depth)) - radius
+    normal = rotation.matvec(rot_box, normal)
+    return Manifold(gap, normal[None], (pos - normal * (radius + 0.5 * gap))[None])
+
+
+def boxes(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b: Array, rot_b: Array) -> Manifold:
+    """Return the contact points of two boxes.
+
+    They are separated by the axis of least overlap among the normals of their faces and the products of their edges
+    (Gottschalk, Lin and Manocha 1996). On a face the nearest face of the other box is clipped against it, which gives
+    up to twelve points; two edges meet at one.
+
+    Args:
+        half_a: Half lengths of the first box, m. (3,)
+        pos_a: Position of its centre, world frame, m. (3,)
+        rot_a: Rotation matrix from its frame to the world. (3, 3)
+        half_b: Half lengths of the second box, m. (3,)
+        pos_b: Position of its centre, world frame, m. (3,)
+        rot_b: Rotation matrix from its frame to the world. (3, 3)
+    """
+    offset = pos_a - pos_b
+    turn = _product(rot_b.T, rot_a)
+    size = jnp.abs(turn)
+    along_a, along_b = rotation.matvec(rot_a.T, offset), rotation.matvec(rot_b.T, offset)
+    faces = jnp.concatenate([
+        jnp.abs(along_a) - half_a - rotation.matvec(size.T, half_b),
+        jnp.abs(along_b) - half_b - rotation.matvec(size, half_a),
+    ])  # fmt: skip
+    best = jnp.argmax(lax.stop_gradient(faces))
+    axes = rotation.cross(rot_b.T[:, None], rot_a.T[None])  # (3 of b, 3 of a, 3)
+    length = rotation.safe_norm(axes)
+    spans = length[..., 0] > PARALLEL
+    axes = axes / jnp.where(length > PARALLEL, length, 1.0)
+    reach = jnp.sum(half_a * jnp.abs(jnp.sum(axes[..., None] * rot_a, axis=-2)), axis=-1)
+    reach = reach + jnp.sum(half_b * jnp.abs(jnp.sum(axes[..., None] * rot_b, axis=-2)), axis=-1)
+    edges = jnp.where(spans, jnp.abs(jnp.sum(axes * offset, axis=-1)) - reach, -FAR).reshape(-1)
+    pair = jnp.argmax(lax.stop_gradient(edges))
+    smaller = jnp.minimum(jnp.min(half_a), jnp.min(half_b))
+    by_edge = edges[pair] > EDGE_SHARE * faces[best] + EDGE_BIAS * smaller
+    # Apart, the axis of largest distance counts, face or edge.
+    by_edge = jnp.where(faces[best] > 0, edges[pair] > faces[best], by_edge)
+
+    is_a = best < 3
+    own = (half_a, pos_a, rot_a), (half_b, pos_b, rot_b)
+    face = tuple(jnp.where(is_a, x, y) for x, y in zip(*own, strict=True))
+    other = tuple(jnp.where(is_a, y, x) for x, y in zip(*own, strict=True))
+    gap, normal, point = _clipped(face, best % 3, other)
+    gap_edge, normal_edge, point_edge = _crossed(own, pair, axes.reshape(-1, 3)[pair], offset)
+    gap = jnp.concatenate([jnp.where(by_edge, FAR, gap), jnp.where(by_edge, gap_edge, FAR)[None]])
+    normal = jnp.where(is_a, -normal, normal)
+    normal = jnp.concatenate([jnp.broadcast_to(normal, point.shape), normal_edge[None]])
+    return Manifold(gap, normal, jnp.concatenate([point, point_edge[None]]))
+
+
+def _clipped(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+    """Return gaps, normal of the face towards the other box, and points of the other's nearest face clipped to it.
+
+    Args:
+        face: Half lengths, position and attitude of the box whose face it is.
+        axis: Axis of the face, 0 to 2.
+        other: The same of the other box.
+    """
+    half, pos, rot = _rolled(face, axis)
+    offset = other[1] - pos
+    side = jnp.where(jnp.sum(offset * rot[:, 0]) < 0, -1.0, 1.0)
+    normal = side * rot[:, 0]
+    against = rotation.matvec(other[2].T, normal)
+    turned = jnp.argmax(lax.stop_gradient(jnp.abs(against)))
+    half_o, pos_o, rot_o = _rolled(other, turned)
+    # The other's nearest face: its middle and its half edges, in the plane of the face (u, v) and along its normal (s).
+    sign = jnp.where(against[turned] > 0, -1.0, 1.0)
+    frame = jnp.stack([rot[:, 1], rot[:, 2], normal])
+    middle = rotation.matvec(frame, offset + sign * half_o[0] * rot_o[:, 0]) - jnp.stack([0 * side, 0 * side, half[0]])
+    edge_1, edge_2 = half_o[1] * rotation.matvec(frame, rot_o[:, 1]), half_o[2] * rotation.matvec(frame, rot_o[:, 2])
+    ring = jnp.stack([middle + x * edge_1 + y * edge_2 for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
+    along = jnp.roll(ring, -1, axis=0) - ring
+    limit = half[1:]
+    first, last = jnp.zeros(4, pos.dtype), jnp.ones(4, pos.dtype)
+    for k in range(2):
+        speed = along[:, k]
+        moves = jnp.abs(speed) > 1e-9
+        inverse = 1 / jnp.where(moves, speed, 1.0)
+        ends = (-limit[k] - ring[:, k]) * inverse, (limit[k] - ring[:, k]) * inverse
+        within = jnp.abs(ring[:, k]) <= limit[k]
+        first = jnp.maximum(first, jnp.where(moves, jnp.minimum(*ends), jnp.where(within, 0.0, 2.0)))
+        last = jnp.minimum(last, jnp.where(moves, jnp.maximum(*ends), 1.0))
+    exists = first <= last
+    found = [ring + first[:, None] * along, ring + last[:, None] * along]
+    valid = [exists, exists & (last < 1)]  # the end of an edge is the beginning of the next
+    # Corners of the face below the inside of the other's.
+    at = jnp.stack([jnp.stack([x * limit[0], y * limit[1]]) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
+    det = edge_1[0] * edge_2[1] - edge_1[1] * edge_2[0]
+    det = jnp.where(jnp.abs(det) > 1e-12, det, 1e-12)
+    away = at - middle[:2]
+    p = (away[:, 0] * edge_2[1] - away[:, 1] * edge_2[0]) / det
+    q = (edge_1[0] * away[:, 1] - edge_1[1] * away[:, 0]) / det
+    valid.append((jnp.abs(p) < WITHIN) & (jnp.abs(q) < WITHIN))
+    height = middle[2] + p * edge_1[2] + q * edge_2[2]
+    found.append(jnp.concatenate([at, height[:, None]], axis=-1))
+    points = jnp.concatenate(found)
+    gap = jnp.where(jnp.concatenate(valid), points[:, 2], FAR)
+    place = jnp.concatenate([points[:, :2], half[0] + 0.5 * points[:, 2:]], axis=-1)
+    return gap, normal, pos + jnp.sum(place[:, :, None] * frame[None], axis=-2)
+
+
+def _crossed(
+    boxes: tuple[tuple[Array, ...], ...], pair: Array, axis: Array, offset: Array
+) -> tuple[Array, Array, Array]:
+    """Return gap, normal and point of two edges, whose numbers are ``pair // 3`` of b and ``pair % 3`` of a."""
+    normal = jnp.where(jnp.sum(axis * offset) < 0, -1.0, 1.0) * axis
+    ends = []
+    for (half, pos, rot), number, side in zip(boxes, (pair % 3, pair // 3), (-1.0, 1.0), strict=True):
+        toward = rotation.matvec(rot.T, normal)
+        is_edge = jnp.arange(3) == number
+        place = jnp.where(is_edge, 0.0, side * jnp.where(toward < 0, -1.0, 1.0) * half)
+        along = jnp.sum(jnp.where(is_edge, rot, 0.0), axis=-1)
+        ends.append((pos + rotation.matvec(rot, place), along, jnp.sum(jnp.where(is_edge, half, 0.0))))
+    (p, u, reach_p), (q, v, reach_q) = ends
+    between = p - q
+    c, d, e = (jnp.sum(x * y) for x, y in ((u, v), (u, between), (v, between)))
+    det = jnp.maximum(1 - c * c, PARALLEL**2)
+    s = rotation.safe_clip((c * e - d) / det, -reach_p, reach_p)
+    t = rotation.safe_clip((e - c * d) / det, -reach_q, reach_q)
+    on_a, on_b = p + s * u, q + t * v
+    return jnp.sum((on_a - on_b) * normal), normal, 0.5 * (on_a + on_b)
+
+
+def _rolled(box: tuple[Array, ...], axis: Array) -> tuple[Array, ...]:
+    """Return half lengths, position and attitude of a box with its axes renumbered so that one comes first."""
+    half, pos, rot = box
+
+    def pick(options: list[Array]) -> Array:
+        return jnp.where(axis == 0, options[0], jnp.where(axis == 1, options[1], options[2]))
+
+    return (
+        pick([jnp.roll(half, -k) for k in range(3)]),
+        pos,
+        pick([jnp.roll(rot, -k, axis=1) for k in range(3)]),
+    )
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Return ``a @ b`` of 3 x 3 matrices by components: a GPU may round matrix products to 10 bits. (3, 3)"""
+    return jnp.stack([rotation.matvec(a, b[:, k]) for k in range(3)], axis=-1)

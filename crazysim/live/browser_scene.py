@@ -1,0 +1,259 @@
+"""The scene of a live simulation in a browser: batches of meshes whose poses are sent once per picture."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.live.picture import Picture
+from crazysim.media.trail import MIN_ALPHA, colors_of
+from crazysim.media.web import add_static, mesh_of, rgb
+from crazysim.scene.visual_geoms import VisualGeom
+
+TRAIL_PERIOD = 0.05
+"""Time between two samples of a trail, s."""
+SETPOINT_RADIUS = 0.025
+"""Radius of a setpoint's sphere, m."""
+MARK_RADIUS = 0.12
+"""Radius of the sphere around a drone that touches something or is selected, m."""
+WIND_SCALE = 0.1
+"""Length of a wind arrow per speed, s."""
+FLOOR_GREY = 0.8
+"""Grey that trails fade to, 0 to 1."""
+CONTACT_COLOR, SELECTED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
+"""Colours of marks, rgb, 0 to 255."""
+
+
+class BrowserScene:
+    """Nodes of one viser server that show some worlds, side by side in a grid."""
+
+    def __init__(self, server: Any, shapes: list[VisualGeom], picture: Picture, spacing: float, trail: float):
+        """Add all nodes.
+
+        Args:
+            server: Server of viser.
+            shapes: Visible geoms of the scene.
+            picture: First picture.
+            spacing: Distance between the origins of neighbouring worlds, m.
+            trail: Duration of trails, s; 0 for none.
+        """
+        self._scene = scene = server.scene
+        n_worlds, n_drones = picture.drones.shape[:2]
+        self.offsets = grid_offsets(n_worlds, spacing)
+        self._root = scene.add_frame("/world", show_axes=False)
+        by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
+        by_body: dict[int, list[VisualGeom]] = defaultdict(list)
+        for shape in shapes:
+            if shape.mocap < 0:
+                by_color[tuple(np.round(shape.rgba, 3))].append(shape)
+            elif shape.kind != "plane":
+                by_body[shape.mocap].append(shape)
+        for k, (rgba, fixed) in enumerate(by_color.items()):
+            infinite = [s for s in fixed if s.kind == "plane" and not s.size[:2].any()]
+            others = [s for s in fixed if not any(s is plane for plane in infinite)]
+            if infinite:
+                add_static(scene, f"/world/floor/{k}", infinite, rgba)
+            for w, offset in enumerate(self.offsets if others else []):
+                node = scene.add_frame(f"/world/fixed/{w}/{k}", position=offset, show_axes=False)
+                add_static(scene, node.name, others, rgba)
+        self._batches: list[tuple[Any, NDArray]] = []
+        for bodies in _alike(by_body):
+            self._add_bodies(np.array(bodies), by_body[bodies[0]], picture)
+
+        colors = np.tile(colors_of(n_drones, None)[:, :3], (n_worlds, 1))
+        drones = self._moved(picture.drones).reshape(-1, 3)
+        self._setpoints = self._add_balls("setpoints", SETPOINT_RADIUS, picture.setpoint, rgb_of(colors), 0.8)
+        self._contacts = self._add_balls("contacts", MARK_RADIUS, picture.drones, CONTACT_COLOR, 0.45)
+        self._contacts.batched_scales = np.full(len(drones), 1e-6, np.float32)
+        self._selected = scene.add_icosphere(
+            "/world/selected", radius=MARK_RADIUS, color=SELECTED_COLOR, opacity=0.25, visible=False
+        )
+        self._label = scene.add_label("/world/selected/name", "", position=(0, 0, MARK_RADIUS), anchor="bottom-center")
+        self._wind = None
+        self._trail = Trails(scene, drones, colors, trail) if trail > 0 else None
+        self.visible = dict.fromkeys(("trails", "setpoints", "contacts", "wind"), True)
+
+    def update(self, picture: Picture, follow: bool) -> None:
+        """Show a picture.
+
+        Args:
+            picture: Picture.
+            follow: True to keep the selected drone in the middle: the worlds move, and the camera stays.
+        """
+        pos, show = self._moved(picture.pos), self.visible
+        for handle, bodies in self._batches:
+            handle.batched_positions = _finite(pos[:, bodies].reshape(-1, 3))
+            handle.batched_wxyzs = _finite(np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4), (1, 0, 0, 0))
+        drones = self._moved(picture.drones)
+        if self._setpoints is not None:
+            self._setpoints.visible = show["setpoints"]
+            self._setpoints.batched_positions = _finite(self._moved(picture.setpoint).reshape(-1, 3))
+        touching = picture.touching.ravel() & show["contacts"]
+        self._contacts.batched_scales = np.where(touching, 1.0, 1e-6).astype(np.float32)
+        if touching.any():
+            self._contacts.batched_positions = _finite(drones.reshape(-1, 3))
+        self._show_wind(drones, picture)
+        if self._trail is not None:
+            self._trail.update(picture.time, _finite(drones.reshape(-1, 3)), show["trails"])
+        self._show_selected(drones, picture, follow)
+
+    def pick(self, picture: Picture, origin: Any, direction: Any) -> tuple[int, int | None, NDArray | None]:
+        """Return what a ray from the camera hits: index of the world, drone or None, point of the floor or None.
+
+        Args:
+            picture: Picture that the user has seen.
+            origin: Origin of the ray in the browser's scene, m. (3,)
+            direction: Direction of the ray. (3,)
+        """
+        origin = np.asarray(origin, float) - np.asarray(self._root.position, float)
+        direction = np.asarray(direction, float) / np.linalg.norm(direction)
+        drones = self._moved(picture.drones)
+        relative = drones - origin
+        along = relative @ direction
+        beside = np.linalg.norm(relative - along[..., None] * direction, axis=-1)
+        hit = (along > 0) & (beside < np.maximum(MARK_RADIUS, 0.02 * along))
+        if hit.any():
+            world, drone = np.unravel_index(np.where(hit, along, np.inf).argmin(), hit.shape)
+            return int(world), int(drone), None
+        if direction[2] > -1e-6:
+            return 0, None, None
+        point = origin - direction * origin[2] / direction[2]
+        world = int(np.linalg.norm(self.offsets - point, axis=-1).argmin())
+        return world, None, point - self.offsets[world]
+
+    def _add_bodies(self, bodies: NDArray, shapes: list[VisualGeom], picture: Picture) -> None:
+        """Add bodies of equal geoms, one batch for each colour."""
+        by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
+        for shape in shapes:
+            by_color[tuple(np.round(shape.rgba, 3))].append(shape)
+        pos = self._moved(picture.pos)[:, bodies].reshape(-1, 3)
+        quat = np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4)
+        for k, (rgba, same) in enumerate(by_color.items()):
+            mesh = mesh_of(same)
+            handle = self._scene.add_batched_meshes_simple(
+                f"/world/bodies/{bodies[0]}/{k}", np.asarray(mesh.vertices, np.float32),
+                np.asarray(mesh.faces, np.uint32), _finite(quat, (1, 0, 0, 0)), _finite(pos), batched_colors=rgb(rgba),
+                opacity=None if rgba[3] >= 1 else float(rgba[3]), lod="off", flat_shading=True, side="double",
+            )  # fmt: skip
+            self._batches.append((handle, bodies))
+
+    def _add_balls(self, name: str, radius: float, pos: NDArray, colors: Any, opacity: float) -> Any:
+        """Add a sphere for each point of all worlds, or None if there are none."""
+        if not pos.size:
+            return None
+        import trimesh
+
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+        points = _finite(self._moved(pos).reshape(-1, 3))
+        return self._scene.add_batched_meshes_simple(
+            f"/world/{name}", np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32),
+            np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)), points, batched_colors=colors, opacity=opacity, lod="off",
+        )  # fmt: skip
+
+    def _show_wind(self, drones: NDArray, picture: Picture) -> None:
+        if not picture.wind.size:
+            return
+        begin = _finite(drones.reshape(-1, 3))
+        ends = np.stack([begin, begin + WIND_SCALE * _finite(picture.wind.reshape(-1, 3))], axis=1)
+        ends = ends.astype(np.float32)
+        if self._wind is None:
+            self._wind = self._scene.add_arrows(
+                "/world/wind", ends, WIND_COLOR, shaft_radius=0.006, head_radius=0.015, head_length=0.04
+            )
+        self._wind.visible = self.visible["wind"]
+        self._wind.points = ends
+
+    def _show_selected(self, drones: NDArray, picture: Picture, follow: bool) -> None:
+        k = None
+        if picture.selected is not None:
+            k = next((i for i, world in enumerate(picture.worlds) if world == picture.selected[0]), None)
+        self._selected.visible = k is not None
+        if k is None or picture.selected is None:
+            self._root.position = (0.0, 0.0, 0.0)
+            return
+        pos = _finite(drones[k, picture.selected[1]])
+        self._selected.position = pos
+        self._label.text = picture.name
+        self._root.position = -pos if follow else (0.0, 0.0, 0.0)
+
+    def _moved(self, pos: NDArray) -> NDArray:
+        """Return positions of every world at the world's place in the grid."""
+        return pos + self.offsets[:, None]
+
+
+class Trails:
+    """The recent positions of all drones, as one set of line segments of constant size."""
+
+    def __init__(self, scene: Any, pos: NDArray, colors: NDArray, seconds: float):
+        """Begin with trails of no length.
+
+        Args:
+            scene: Scene of viser.
+            pos: Positions of all drones, m. (n, 3)
+            colors: Their colours, 0 to 1. (n, 3)
+            seconds: Duration, s.
+        """
+        self._length = max(round(seconds / TRAIL_PERIOD), 1)
+        self._samples: deque[NDArray] = deque(maxlen=self._length)
+        self._last = -np.inf
+        pos = _finite(pos)
+        fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]  # towards the floor, as lines are opaque
+        shades = np.round(255 * (FLOOR_GREY - fade * (FLOOR_GREY - colors))).astype(np.uint8)
+        self._handle = scene.add_line_segments(
+            "/world/trails", self._segments(pos), np.repeat(shades.reshape(-1, 1, 3), 2, axis=1), thickness=2.0,
+            thickness_units="screen",
+        )  # fmt: skip
+
+    def update(self, time: float, pos: NDArray, visible: bool) -> None:
+        """Add a sample if one is due, and show the trails up to the present positions; a jump in time clears them."""
+        self._handle.visible = visible
+        if time < self._last:
+            self._samples.clear()
+            self._last = -np.inf
+        if time - self._last < TRAIL_PERIOD:
+            return
+        self._samples.append(pos)
+        self._last = time
+        if visible:
+            self._handle.points = self._segments(pos)
+
+    def _segments(self, pos: NDArray) -> NDArray:
+        """Return segments, oldest first, padded at the beginning. (length * n, 2, 3)"""
+        path = [*self._samples, pos]
+        path = [path[0]] * (self._length + 1 - len(path)) + path
+        points = np.stack(path[-self._length - 1 :])
+        return np.stack([points[:-1], points[1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
+
+
+def grid_offsets(n: int, spacing: float) -> NDArray:
+    """Return the places of n worlds in a square grid around the origin, m. (n, 3)"""
+    columns = int(np.ceil(np.sqrt(n)))
+    row, column = np.divmod(np.arange(n), columns)
+    rows = -(-n // columns)
+    return spacing * np.stack([column - (columns - 1) / 2, (rows - 1) / 2 - row, np.zeros(n)], axis=-1)
+
+
+def rgb_of(colors: NDArray) -> NDArray:
+    """Return colours, 0 to 1, as whole numbers from 0 to 255. (n, 3)"""
+    return np.round(255 * colors[:, :3]).astype(np.uint8)
+
+
+def _alike(by_body: dict[int, list[VisualGeom]]) -> list[list[int]]:
+    """Return the bodies in groups of equal geoms."""
+    groups: dict[tuple, list[int]] = defaultdict(list)
+    for body, shapes in by_body.items():
+        key = tuple(
+            (s.kind, *(np.round(x, 6).tobytes() for x in (s.size, s.rgba, s.pos, s.quat)), s.vertices.tobytes())
+            for s in shapes
+        )
+        groups[key].append(body)
+    return list(groups.values())
+
+
+def _finite(values: NDArray, rest: Any = 0.0) -> NDArray:
+    """Return rows of numbers, with those that are not finite replaced."""
+    bad = ~np.isfinite(values).all(-1, keepdims=True)
+    return np.where(bad, np.asarray(rest, float), values)

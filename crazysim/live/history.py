@@ -1,0 +1,55 @@
+"""Snapshots of a live simulation, to go back in time."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from numpy.typing import NDArray
+
+from crazysim.core.data import SimData
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """Data and commands at a control step."""
+
+    step: int
+    """Control step."""
+    data: SimData
+    """Data of the simulation; immutable, so that a snapshot costs the memory of its arrays only."""
+    commands: NDArray | None
+    """Commands that processes had written; None if none had. (n_worlds, n_drones, k)"""
+
+
+class History:
+    """The first snapshot since a reset, and the latest ones."""
+
+    def __init__(self, length: int):
+        """Begin empty.
+
+        Args:
+            length: Most snapshots to keep beside the first.
+        """
+        self._first: Snapshot | None = None
+        self._latest: deque[Snapshot] = deque(maxlen=length)
+
+    def add(self, snapshot: Snapshot) -> None:
+        """Add a snapshot; one at the step of the last, after a jump back to it, is left out."""
+        if self._first is None:
+            self._first = snapshot
+        elif snapshot.step > (self._latest[-1] if self._latest else self._first).step:
+            self._latest.append(snapshot)
+
+    def before(self, step: int) -> Snapshot | None:
+        """Return the latest snapshot at or before a control step, and forget those after it; None if there is none."""
+        while self._latest and self._latest[-1].step > step:
+            self._latest.pop()
+        if self._latest:
+            return self._latest[-1]
+        return self._first if self._first is not None and self._first.step <= step else None
+
+    def clear(self) -> None:
+        """Forget all snapshots."""
+        self._first = None
+        self._latest.clear()

@@ -1,0 +1,69 @@
+"""Keys of a viewer: those that are held, and what those that were pressed do."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from crazysim.errors import ConfigError
+
+if TYPE_CHECKING:
+    from crazysim.live.loop import Live
+
+NAMES = ("up", "down", "left", "right", "space", "tab", "backspace", "escape", "enter")
+"""Names of keys that are not characters."""
+
+
+class Keyboard:
+    """Keys by name: a lower-case character, or one of ``NAMES``. Viewers press and release them from any thread."""
+
+    def __init__(self) -> None:
+        """Begin with all keys released and without functions."""
+        self._held: dict[str, float] = {}
+        self._pressed: deque[str] = deque(maxlen=100)
+        self._calls: dict[str, Callable[[Live], Any]] = {}
+
+    def press(self, key: str) -> None:
+        """Note that a key is pressed."""
+        self._held[key] = math.inf
+        self._pressed.append(key)
+
+    def hold(self, key: str, seconds: float) -> None:
+        """Hold a key for a while, s, for viewers that do not report when it is released; calls nothing."""
+        self._held[key] = time.monotonic() + seconds
+
+    def release(self, key: str) -> None:
+        """Note that a key is released."""
+        self._held.pop(key, None)
+
+    def release_all(self) -> None:
+        """Note that no key is held any more, as when a viewer closes or loses the focus."""
+        self._held.clear()
+
+    def is_held(self, key: str) -> bool:
+        """Return True while a key is held."""
+        return self._held.get(key, 0.0) > time.monotonic()
+
+    def axis(self, positive: str, negative: str) -> float:
+        """Return 1, -1 or 0 for two opposite keys."""
+        return float(self.is_held(positive)) - float(self.is_held(negative))
+
+    def bind(self, key: str, call: Callable[[Live], Any]) -> None:
+        """Let a key call a function of the loop when it is pressed, in place of what it did before.
+
+        Raises:
+            ConfigError: If there is no such key.
+        """
+        if key not in NAMES and (len(key) != 1 or key != key.lower()):
+            raise ConfigError(f"expected a lower-case character or one of {', '.join(NAMES)} as a key, got {key!r}")
+        self._calls[key] = call
+
+    def run(self, live: Live) -> None:
+        """Call the functions of the keys that were pressed since the last call."""
+        while self._pressed:
+            call = self._calls.get(self._pressed.popleft())
+            if call is not None:
+                call(live)

@@ -1,0 +1,35 @@
+"""Motion capture: sources of poses, the rules for what they send, recordings, and twins in the scene."""
+
+from crazysim.live.mocap.capture import SYSTEMS, MotionCaptureSource
+from crazysim.live.mocap.frames import Convention, Frame
+from crazysim.live.mocap.playback import Playback
+from crazysim.live.mocap.recording import MocapRecorder, ReplaySource, read_polls
+from crazysim.live.mocap.reports import Report, Reports
+from crazysim.live.mocap.source import FunctionSource, MocapSource, Poll, RealTimeSource, ThreadSource, show_source
+from crazysim.live.mocap.tracker import Rules, Tracker
+from crazysim.live.mocap.twins import Twin, Twins, discover, twin_of
+
+__all__ = [
+    "SYSTEMS",
+    "Convention",
+    "Frame",
+    "FunctionSource",
+    "MocapRecorder",
+    "MocapSource",
+    "MotionCaptureSource",
+    "Playback",
+    "Poll",
+    "RealTimeSource",
+    "ReplaySource",
+    "Report",
+    "Reports",
+    "Rules",
+    "ThreadSource",
+    "Tracker",
+    "Twin",
+    "Twins",
+    "discover",
+    "read_polls",
+    "show_source",
+    "twin_of",
+]

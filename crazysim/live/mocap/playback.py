@@ -1,0 +1,105 @@
+"""Playback in the compiled step: recorded objects in thousands of worlds, for rollouts and training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation
+from crazysim.core.stage import stage
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, leaf
+from crazysim.scene.objects import Handle
+
+
+class PlaybackData(PyTree):
+    """Poses at equal intervals, and the time at which each world begins."""
+
+    pos: Array = leaf("shared", 3)
+    """Positions, world frame, m. (n_samples, n_objects, 3)"""
+    quat: Array = leaf("shared", 3)
+    """Attitudes, body to world, xyzw, of the same sign from sample to sample. (n_samples, n_objects, 4)"""
+    vel: Array = leaf("shared", 3)
+    """Velocities, world frame, m/s. (n_samples, n_objects, 3)"""
+    freq: Array = leaf("shared", 0)
+    """Samples per second, Hz. ()"""
+    start: Array = leaf("world")
+    """Time of the recording at the reset of a world, s. (n_worlds, 1)"""
+
+
+class Playback(Plugin):
+    """Objects that follow sampled poses in every world, and rest after the last one; see ``Twins.playback``."""
+
+    handles: Sequence[Handle]
+    """Handles of one object each, in the order of the samples."""
+    pos: Any
+    """Positions, world frame, m. (n_samples, n_objects, 3)"""
+    quat: Any
+    """Attitudes, body to world, xyzw. (n_samples, n_objects, 4)"""
+    freq: float
+    """Samples per second, Hz."""
+    start: Any = 0.0
+    """Time of the recording at the reset of a world, s. () or (n_worlds,)"""
+    name: str = "playback"
+
+    def record(self, sim: Simulation) -> PlaybackData:
+        """Return the samples, with velocities from their differences.
+
+        Raises:
+            ConfigError: If shapes do not fit, or a number is not finite.
+        """
+        pos, quat, start = (np.asarray(x, float) for x in (self.pos, self.quat, self.start))
+        n = len(self.handles)
+        if pos.ndim != 3 or pos.shape[1:] != (n, 3) or quat.shape != (*pos.shape[:2], 4) or len(pos) < 2:
+            raise ConfigError(
+                f"expected at least two samples of {n} positions and attitudes, got shapes {pos.shape} and {quat.shape}"
+            )
+        if not all(np.isfinite(x).all() for x in (pos, quat, start)) or not 0 < self.freq < np.inf:
+            raise ConfigError(
+                "expected finite poses and starts, and a positive number of samples per second, got others"
+            )
+        if start.shape not in ((), (sim.n_worlds,)):
+            raise ConfigError(f"expected start of shape () or ({sim.n_worlds},), got {start.shape}")
+        signs = np.where((quat[1:] * quat[:-1]).sum(-1) < 0, -1.0, 1.0)
+        quat = quat * np.concatenate([np.ones((1, n)), np.cumprod(signs, axis=0)])[..., None]
+        vel = np.gradient(pos, 1 / self.freq, axis=0)
+        vel[-1] = 0.0
+        dtype = sim.data.states.pos.dtype
+        return PlaybackData(
+            pos=jnp.asarray(pos, dtype),
+            quat=jnp.asarray(quat, dtype),
+            vel=jnp.asarray(vel, dtype),
+            freq=jnp.asarray(self.freq, dtype),
+            start=jnp.asarray(np.broadcast_to(start, sim.n_worlds)[:, None], dtype),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that moves the objects."""
+        del sim
+        return [Placement(stage("world")(self.move))]
+
+    def move(self, data: SimData) -> SimData:
+        """Return the data of one world with the objects at their poses."""
+        record = self.read(data)
+        last = record.pos.shape[0] - 1
+        at = jnp.clip((data.core.steps / data.core.freq + record.start) * record.freq, 0, last)
+        before = jnp.minimum(jnp.floor(at), last - 1)
+        share, k = at - before, before.astype(jnp.int32)
+        pos, quat, vel = (x[k] + share * (x[k + 1] - x[k]) for x in (record.pos, record.quat, record.vel))
+        quat = quat / jnp.sqrt(jnp.sum(quat * quat, axis=-1, keepdims=True))
+        objects: Any = data.objects
+        rows = {handle.rows[0]: i for i, handle in enumerate(self.handles)}
+
+        def placed(old: Array, new: Array) -> Array:
+            parts = [new[rows[k]] if k in rows else old[..., k, :].reshape(old.shape[-1]) for k in range(old.shape[-2])]
+            return jnp.stack(parts).reshape(old.shape)
+
+        moved = objects.replace(
+            pos=placed(objects.pos, pos), quat=placed(objects.quat, quat), vel=placed(objects.vel, vel)
+        )
+        return data.replace(objects=moved)

@@ -1,0 +1,46 @@
+"""Reports of live sources: what happened, to which name, at which time."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter, deque
+from typing import NamedTuple
+
+log = logging.getLogger(__name__)
+
+KEPT = 1000
+"""Number of reports that are kept."""
+
+
+class Report(NamedTuple):
+    """One event of a source."""
+
+    kind: str
+    """Kind, such as ``"dropped"`` or ``"unknown"``."""
+    name: str
+    """Name of the body or of the source."""
+    time: float
+    """Time of the frame or of the poll, s."""
+    text: str
+    """Description with numbers."""
+
+
+class Reports:
+    """The latest reports, and counts of all. The first and every tenth, hundredth, ... of a kind and name is logged."""
+
+    def __init__(self) -> None:
+        """Begin without reports."""
+        self.latest: deque[Report] = deque(maxlen=KEPT)
+        self.counts: Counter[tuple[str, str]] = Counter()
+
+    def add(self, kind: str, name: str, time: float, text: str) -> None:
+        """Add a report."""
+        self.latest.append(Report(kind, name, time, text))
+        self.counts[kind, name] += 1
+        n = self.counts[kind, name]
+        if n == 10 ** (len(str(n)) - 1):
+            log.warning("%s %s at %.3f s: %s%s", name, kind, time, text, f" ({n} times)" if n > 1 else "")
+
+    def count(self, kind: str) -> int:
+        """Return the number of reports of a kind."""
+        return sum(n for (k, _), n in self.counts.items() if k == kind)

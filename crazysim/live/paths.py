@@ -1,0 +1,63 @@
+"""Trajectories on the host: setpoints of one vehicle at one time, without a compiled call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.trajectories import Trajectory
+
+
+class Path(NamedTuple):
+    """One trajectory in float64."""
+
+    ends: NDArray
+    """End of each piece, s since the start. (n_pieces,)"""
+    coefficients: NDArray
+    """Coefficients of x, y, z, m, and yaw, rad, constant term first, of the piece's time divided by its length.
+    (n_pieces, 4, degree + 1)"""
+    repeats: bool
+    """True where the trajectory starts again after its end."""
+
+    @staticmethod
+    def of(trajectory: Trajectory) -> Path:
+        """Return one trajectory on the host."""
+        ends, coefficients = (np.asarray(x, float) for x in (trajectory.ends, trajectory.coefficients))
+        return Path(ends, coefficients, bool(trajectory.repeats))
+
+    @property
+    def duration(self) -> float:
+        """Time from the start to the end, s."""
+        return float(self.ends[-1])
+
+    def at(self, t: float) -> NDArray:
+        """Return position, m, and yaw, rad, at a time since the start, s. (4,)"""
+        return self.derivatives(t, 0)[0]
+
+    def derivatives(self, t: float, n: int) -> NDArray:
+        """Return position and yaw and their first n derivatives at a time since the start, s. (n + 1, 4)"""
+        inside = t >= 0 and (self.repeats or t <= self.ends[-1])
+        t = t % self.ends[-1] if self.repeats and t > 0 else min(max(t, 0.0), float(self.ends[-1]))
+        k = min(int(np.searchsorted(self.ends, t, side="right")), len(self.ends) - 1)
+        begin = float(self.ends[k - 1]) if k else 0.0
+        length = float(self.ends[k]) - begin
+        u, c, scale = (t - begin) / length if length > 0 else 1.0, self.coefficients[k], 1.0
+        found = [(c * u ** np.arange(c.shape[1])).sum(-1)]
+        for _ in range(n):
+            c, scale = c[:, 1:] * np.arange(1, c.shape[1]), scale / length if length > 0 else 0.0
+            found.append((c * u ** np.arange(c.shape[1])).sum(-1) * scale if inside else np.zeros(4))
+        return np.stack(found)
+
+
+def paths_of(trajectories: Trajectory | Sequence[Trajectory]) -> list[Path]:
+    """Return trajectories on the host: of one record, with or without a leading axis, or of a sequence."""
+    if not isinstance(trajectories, Trajectory):
+        return [Path.of(t) for t in trajectories]
+    if np.ndim(trajectories.ends) == 1:
+        return [Path.of(trajectories)]
+    t = trajectories
+    leaves = [np.asarray(x) for x in (t.ends, t.coefficients, t.repeats)]
+    return [Path(e.astype(float), c.astype(float), bool(r)) for e, c, r in zip(*leaves, strict=True)]

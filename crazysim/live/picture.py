@@ -1,0 +1,147 @@
+"""Pictures of a live simulation: everything that a viewer draws at one moment, as arrays of the host."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.core.data import SimData
+from crazysim.core.stage import over_drones, over_worlds
+from crazysim.effects.wind import WindData
+from crazysim.effects.wind_field import WindFieldData
+from crazysim.media.poses import mocap_poses
+from crazysim.sim.sim import Sim
+
+if TYPE_CHECKING:
+    from crazysim.live.loop import Live
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """The scene of some worlds at one moment."""
+
+    worlds: NDArray
+    """Indices of the worlds. (n,)"""
+    time: float
+    """Simulated time since the last reset, s."""
+    status: str
+    """State of the loop: time, speed, pause, recording."""
+    pos: NDArray
+    """Positions of all mocap bodies, world frame, m. (n, n_mocap, 3)"""
+    quat: NDArray
+    """Attitudes of all mocap bodies, body to world, xyzw. (n, n_mocap, 4)"""
+    drones: NDArray
+    """Positions of the drones, world frame, m. (n, n_drones, 3)"""
+    setpoint: NDArray
+    """Positions of state commands, m; no drones with other commands. (n, n_drones or 0, 3)"""
+    touching: NDArray
+    """True where a drone touches something. (n, n_drones)"""
+    wind: NDArray
+    """Velocity of the air at every drone, world frame, m/s; no drones without wind. (n, n_drones or 0, 3)"""
+    selected: tuple[int, int] | None
+    """Selected world and drone; None for none."""
+    name: str
+    """Name of the selected drone; empty for none."""
+    controls: tuple[str, ...]
+    """Buttons and sliders of the loop, for viewers without a panel."""
+    plot: NDArray
+    """Values of the plotted quantity of the selected drone. (k,)"""
+
+
+class PictureSource:
+    """Source of the pictures of one viewer."""
+
+    def __init__(self, sim: Sim, worlds: Sequence[int], contacts: bool, wind: bool):
+        """Prepare; functions are compiled at the first picture.
+
+        Args:
+            sim: Simulation.
+            worlds: Indices of the worlds to show.
+            contacts: True to compute which drones touch something.
+            wind: True to compute the wind at every drone, where there is wind.
+        """
+        self._sim, self._worlds = sim, np.asarray(worlds)
+        self._contacts, self._wind = contacts, wind
+        self._wind_fn = jax.jit(over_worlds(over_drones(_air)))
+
+    def take(self, live: Live, plot: str = "") -> Picture:
+        """Return a picture of the simulation as it is now.
+
+        Args:
+            live: Loop of the simulation.
+            plot: Path of the quantity to plot, one of ``quantities``; empty for none.
+        """
+        sim, worlds = self._sim, self._worlds
+        data = sim.data
+        pos, quat = mocap_poses(sim, worlds)
+        drones = np.asarray(data.states.pos, float)[worlds]
+        none = np.zeros((len(worlds), 0, 3))
+        state, setpoint, air = data.controls.state, none, none
+        if state is not None:
+            setpoint = np.asarray(state.staged_cmd, float)[worlds, :, :3]
+        if self._wind and _winds(data):
+            air = np.asarray(self._wind_fn(data), float)[worlds]
+        touching = np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drones.shape[:2], bool)
+        values = np.zeros(0)
+        if plot and live.selected is not None:
+            own = live.quantities.get(plot)
+            values = quantity(data, plot)(*live.selected) if own is None else np.ravel(np.asarray(own(live), float))
+        name = "" if live.selected is None else sim.drone_names[live.selected[1]]
+        return Picture(
+            worlds,
+            live.time,
+            live.status,
+            pos,
+            quat,
+            drones,
+            setpoint,
+            touching,
+            air,
+            live.selected,
+            name,
+            live.control_lines,
+            values,
+        )
+
+
+def _winds(data: SimData) -> list[WindData | WindFieldData]:
+    """Return the records of all winds."""
+    return [record for record in data.plugins.values() if isinstance(record, (WindData, WindFieldData))]
+
+
+def _air(data: SimData) -> jax.Array:
+    """Return the velocity of the air at a drone, world frame, m/s; of one drone. (3,)"""
+    return sum((record.velocity_at(data.states.pos) for record in _winds(data)), jnp.zeros_like(data.states.pos))
+
+
+def quantities(sim: Sim) -> list[str]:
+    """Return the paths of all arrays of the data that have values for every drone, such as ``states.vel``."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(sim.data)
+    size = (sim.n_worlds, sim.n_drones)
+    return [_path(path) for path, x in leaves if np.ndim(x) >= 3 and np.shape(x)[:2] == size and x.dtype.kind in "fiub"]
+
+
+def quantity(data: Any, path: str) -> Callable[[int, int], NDArray]:
+    """Return a function from world and drone to the values of an array of the data.
+
+    Args:
+        data: Data of a simulation.
+        path: One of ``quantities``.
+
+    Raises:
+        KeyError: If there is no such array.
+    """
+    for found, x in jax.tree_util.tree_flatten_with_path(data)[0]:
+        if _path(found) == path:
+            return lambda world, drone: np.asarray(x)[world, drone].ravel().astype(float)
+    raise KeyError(path)
+
+
+def _path(path: Any) -> str:
+    return ".".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)

@@ -1,0 +1,110 @@
+"""Processes and timed events of a live simulation: functions that its loop calls between steps."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from crazysim.errors import ConfigError
+
+if TYPE_CHECKING:
+    from crazysim.live.loop import Live
+
+OnError = Literal["raise", "report"]
+"""Reaction of the loop to an error of a process: end with it, or log it and continue."""
+QUIET = 1.0
+"""Least time between two log messages of one kind, s."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Process:
+    """A function that is called every so many control steps, with figures of its calls."""
+
+    name: str
+    """Name in messages."""
+    call: Callable[[Live], Any]
+    """The function; it must return at once, as the loop waits for it."""
+    period: int
+    """Control steps from one call to the next."""
+    on_error: OnError = "raise"
+    """``"raise"`` or ``"report"``."""
+    longest: float = 0.0
+    """Longest call, s."""
+    longest_at: float = 0.0
+    """Simulated time at which it began, s."""
+    failures: int = 0
+    """Number of errors that were reported."""
+    _reported: float = field(default=-QUIET, repr=False)
+
+    def run(self, live: Live) -> None:
+        """Call the function, and measure it."""
+        begin = time.perf_counter()
+        try:
+            self.call(live)
+        except Exception as error:
+            if self.on_error == "raise":
+                raise
+            self.failures += 1
+            if begin - self._reported >= QUIET:
+                self._reported = begin
+                log.warning("%s failed at %.3f s (%d in all): %s", self.name, live.time, self.failures, error)
+        took = time.perf_counter() - begin
+        if took > self.longest:
+            self.longest, self.longest_at = took, live.time
+
+    def reset(self, live: Live) -> None:
+        """Call the method ``reset`` of the function, if it has one, after a reset or a jump in time."""
+        if hasattr(self.call, "reset"):
+            self.call.reset(live)  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True)
+class Event:
+    """A function that is called once the simulation reaches a time."""
+
+    step: int
+    """Control step before which it is called."""
+    call: Callable[[Live], Any]
+    """The function."""
+    name: str
+    """Name in messages."""
+
+
+class RateLimit:
+    """Permission to log one message a second."""
+
+    def __init__(self) -> None:
+        """Begin with the permission."""
+        self._last = -QUIET
+
+    def __call__(self) -> bool:
+        """Return True if a message may be logged now."""
+        now = time.monotonic()
+        if now - self._last < QUIET:
+            return False
+        self._last = now
+        return True
+
+
+def period_of(freq: float | None, control_freq: int, name: str) -> int:
+    """Return the number of control steps from one call to the next.
+
+    Args:
+        freq: Rate of the calls, Hz; None for that of the control steps.
+        control_freq: Rate of the control steps, Hz.
+        name: Name of the process, for the message.
+
+    Raises:
+        ConfigError: If the rate does not divide that of the control steps.
+    """
+    if freq is None:
+        return 1
+    period = round(control_freq / freq) if freq > 0 else 0
+    if period < 1 or abs(period * freq - control_freq) > 1e-6 * control_freq:
+        raise ConfigError(f"expected a rate of {name!r} that divides {control_freq} Hz, got {freq!r} Hz")
+    return period

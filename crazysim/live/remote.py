@@ -1,0 +1,27 @@
+"""Commands from the network, in a live simulation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from crazysim.live.fleet import Fleet
+from crazysim.live.server import CommandQueue
+
+if TYPE_CHECKING:
+    from crazysim.live.loop import Live
+
+
+class RemoteCommands:
+    """Process that carries out what has arrived in a queue: ``live.add(RemoteCommands(fleet, server))``."""
+
+    def __init__(self, fleet: Fleet, queue: CommandQueue):
+        """Take a fleet of the simulation, and a ``CommandServer`` or ``StreamListener``."""
+        self._fleet, self._queue = fleet, queue
+
+    def __call__(self, live: Live) -> None:
+        """Carry out the commands that have arrived since the last call."""
+        self._fleet.apply(self._queue.commands())
+
+    def reset(self, live: Live) -> None:
+        """Let the drones hover where a reset, or a jump in time, has put them."""
+        self._fleet.reset()

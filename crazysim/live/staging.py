@@ -1,0 +1,60 @@
+"""Commands of a live simulation: one array that processes write into, staged once per control step."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.control import Control
+from crazysim.sim.sim import Sim
+
+UNSET = np.eye(16)[12]
+"""State command of a drone that has had none: the origin, level. (16,)"""
+
+
+class StagedCommands:
+    """The command of every drone, as the simulation's command level has it; staged while it is in use."""
+
+    def __init__(self, sim: Sim):
+        """Take the commands as they are staged now; drones with state commands stay where they are."""
+        self._sim = sim
+        self._array: NDArray | None = None
+        self._staged: NDArray | None = None
+
+    @property
+    def array(self) -> NDArray:
+        """Command of every drone, writable. (n_worlds, n_drones, k)"""
+        if self._array is None:
+            self._array = _present(self._sim)
+        return self._array
+
+    def stage(self) -> None:
+        """Stage the commands if they have changed since the last call."""
+        if self._array is None or (self._staged is not None and np.array_equal(self._array, self._staged)):
+            return
+        self._staged = self._array.copy()
+        getattr(self._sim, f"{self._sim.control.value}_control")(self._staged)
+
+    def copy(self) -> NDArray | None:
+        """Return the commands for ``restore``."""
+        return None if self._array is None else self._array.copy()
+
+    def restore(self, array: NDArray | None) -> None:
+        """Return to commands that ``copy`` returned, or to those staged in the data if None."""
+        self._staged = None
+        if array is not None:
+            self.array[:] = array
+        elif self._array is not None:
+            self._array[:] = _present(self._sim)
+
+
+def _present(sim: Sim) -> NDArray:
+    """Return the staged commands; of drones that have had no state command, hovering where they are."""
+    controls = sim.data.controls
+    if sim.control == Control.rotor_vel:
+        return np.array(controls.rotor_vel, float)
+    command = np.array(getattr(controls, sim.control.value).staged_cmd, float)
+    if sim.control == Control.state:
+        unset = (command == UNSET).all(-1)
+        command[unset, :3] = np.asarray(sim.data.states.pos, float)[unset]
+    return command

@@ -1,0 +1,7 @@
+"""Swarms of simulated drones that take the commands of Crazyflies."""
+
+from crazysim.live.swarm.commander import Commander
+from crazysim.live.swarm.plan import Plan
+from crazysim.live.swarm.swarm import DroneState, Swarm
+
+__all__ = ["Commander", "DroneState", "Plan", "Swarm"]

@@ -1,0 +1,326 @@
+"""Commander of one drone: which setpoint is in force, as in the firmware of the Crazyflie.
+
+High-level commands plan smooth moves. Streamed setpoints take precedence until they stop: after 0.5 s without one the
+drone stays in its place, after 2 s its motors stop (``COMMANDER_WDT_TIMEOUT_STABILIZE`` and ``_SHUTDOWN`` in
+commander.h of crazyflie-firmware). Until the first command, and after landing, the motors are off.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.control import Control
+from crazysim.errors import ConfigError
+from crazysim.live.paths import Path
+from crazysim.live.swarm.plan import Plan, move, nearest_yaw
+
+STABILIZE, SHUTDOWN = 0.5, 2.0
+"""Time without a streamed setpoint after which the drone stays in its place, and after which its motors stop, s."""
+FARTHEST = 1e3
+"""Largest coordinate of a command, m, and largest number of any command."""
+SHORTEST, LONGEST = 1e-3, 1e4
+"""Limits of durations, s, and of factors of durations, 1."""
+N_TRAJECTORIES = 256
+"""Number of trajectories that a drone holds; their IDs are one byte."""
+
+
+class Commander:
+    """Setpoints of one drone from commands; all times are simulated, s."""
+
+    def __init__(self, control: Control = Control.state):
+        """Begin on the floor with motors off.
+
+        Args:
+            control: Command level of the simulation.
+        """
+        self.control = control
+        self.group = 0
+        self.params: dict[str, float] = {}
+        self.trajectories: dict[int, Path] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Return to the floor with motors off; trajectories and parameters stay."""
+        self.now = 0.0
+        self.pos, self.vel, self.yaw = np.zeros(3), np.zeros(3), 0.0
+        self.armed, self.locked = True, False
+        self._plan: Plan | None = None
+        self._stream: tuple[str, NDArray] | None = None
+        self._stream_time, self._released = 0.0, math.inf
+        self._reference = np.zeros(4)  # position and yaw that velocity setpoints move
+        self._last = np.zeros((3, 4))
+
+    # State ----------------------------------------------------------------------------------------------------------
+
+    @property
+    def motors_on(self) -> bool:
+        """True while a command is in force."""
+        return self.armed and not self.locked and (self._plan is not None or self._stream is not None)
+
+    @property
+    def finished(self) -> bool:
+        """True where no planned move is under way."""
+        return self._plan is None or self._plan.finished(self.now)
+
+    def goal(self) -> NDArray:
+        """Return position and yaw, their rates and second derivatives in force, or of the drone itself. (3, 4)"""
+        if self._stream is not None:
+            return self._last
+        if self._plan is not None:
+            return self._plan.at(self.now)
+        return np.array([[*self.pos, self.yaw], [*self.vel, 0.0], [0.0] * 4])
+
+    def in_group(self, mask: int) -> bool:
+        """Return True if a command for a group of drones is for this one."""
+        return mask == 0 or (mask & self.group) != 0
+
+    # High-level commands --------------------------------------------------------------------------------------------
+
+    def take_off(self, height: float, duration: float, yaw: float | None = None) -> None:
+        """Rise to a height, m; None keeps the yaw."""
+        self._vertical(height, duration, yaw, lands=False)
+
+    def land(self, height: float, duration: float, yaw: float | None = None) -> None:
+        """Sink to a height, m, and stop the motors there; None keeps the yaw."""
+        self._vertical(height, duration, yaw, lands=True)
+
+    def go_to(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, linear: bool = False) -> None:
+        """Move to a position, m (3,), and yaw, rad; relative ones are added to the present setpoint."""
+        goal, (yaw,) = _numbers("goal", goal, 3), _numbers("yaw", [yaw], 1)
+        self._require(Control.state)
+        begin = self.goal()
+        if relative:
+            goal, yaw = goal + begin[0, :3], yaw + begin[0, 3]
+        end = [*goal, nearest_yaw(begin[0, 3], yaw)]
+        self._start(Plan(move(begin, end, _duration(duration), linear), self.now))
+
+    def stop(self) -> None:
+        """Stop the motors."""
+        self._plan = self._stream = None
+
+    def upload(self, identity: int, path: Path) -> None:
+        """Receive a trajectory.
+
+        Raises:
+            ConfigError: If its number is not from 0 to 255.
+        """
+        if not 0 <= identity < N_TRAJECTORIES:
+            raise ConfigError(f"expected the number of a trajectory from 0 to {N_TRAJECTORIES - 1}, got {identity}")
+        self.trajectories[identity] = path
+
+    def start_trajectory(
+        self,
+        identity: int,
+        timescale: float = 1.0,
+        relative: bool = True,
+        reversed: bool = False,
+        relative_yaw: bool = False,
+    ) -> None:
+        """Follow a trajectory that was uploaded.
+
+        Args:
+            identity: Number of the trajectory.
+            timescale: Factor of its duration, 1.
+            relative: True to begin at the present setpoint.
+            reversed: True to follow it from its end to its start.
+            relative_yaw: True to begin at the present yaw too.
+
+        Raises:
+            ConfigError: If there is none, or the factor is out of range.
+        """
+        if identity not in self.trajectories:
+            raise ConfigError(
+                f"expected one of the trajectories {sorted(self.trajectories)}, got {identity}. Upload it."
+            )
+        if not SHORTEST <= timescale <= LONGEST:
+            raise ConfigError(f"expected a timescale from {SHORTEST:g} to {LONGEST:g}, got {timescale}")
+        self._require(Control.state)
+        plan = Plan(self.trajectories[identity], self.now, timescale, bool(reversed))
+        begin, first = self.goal()[0], plan.at(self.now)[0]
+        shift = np.zeros(4)
+        if relative:
+            shift[:3] = begin[:3] - first[:3]
+            if relative_yaw:
+                shift[3] = begin[3] - nearest_yaw(begin[3], first[3])
+        self._start(plan._replace(shift=shift))
+
+    # Streamed setpoints ---------------------------------------------------------------------------------------------
+
+    def command(self, level: Control | str, values: ArrayLike) -> None:
+        """Stream a command of the simulator's own: the numbers of ``sim.state_control`` and so on, of one drone. (k,)
+
+        Raises:
+            ConfigError: If the simulation has another command level, or a number is not finite.
+        """
+        level = Control(level)
+        self._require(level)
+        size = {Control.state: 16, Control.rotor_vel: np.size(values)}.get(level, 4)
+        self._put("command", _numbers(f"{level.value} command", values, size, limit=math.inf))
+
+    def full_state(self, pos: ArrayLike, vel: ArrayLike, acc: ArrayLike, quat: ArrayLike, ang_vel: ArrayLike) -> None:
+        """Stream a state: position, m, velocity, m/s, acceleration, m/s^2, attitude, xyzw, body rates, rad/s."""
+        parts = [_numbers("full state", x, n) for x, n in ((pos, 3), (vel, 3), (acc, 3), (quat, 4), (ang_vel, 3))]
+        norm = np.linalg.norm(parts[3])
+        if norm < 1e-3:
+            raise ConfigError(f"expected a unit quaternion, xyzw, got {list(parts[3])}")
+        parts[3] = parts[3] / norm
+        self._require(Control.state)
+        self._put("command", np.concatenate(parts))
+
+    def position(self, pos: ArrayLike, yaw: float) -> None:
+        """Stream a position, m (3,), and yaw, rad."""
+        self._require(Control.state)
+        self._put("position", np.append(_numbers("position", pos, 3), _numbers("yaw", [yaw], 1)))
+
+    def velocity(self, vel: ArrayLike, yaw_rate: float) -> None:
+        """Stream a velocity, world frame, m/s (3,), and yaw rate, rad/s; a reference position moves with it."""
+        self._require(Control.state)
+        self._put("velocity", np.append(_numbers("velocity", vel, 3), _numbers("yaw rate", [yaw_rate], 1)))
+
+    def hover(self, vx: float, vy: float, yaw_rate: float, height: float) -> None:
+        """Stream a horizontal velocity in the axes of the drone's yaw, m/s, yaw rate, rad/s, and height, m."""
+        self._require(Control.state)
+        self._put("hover", _numbers("hover setpoint", [vx, vy, yaw_rate, height], 4))
+
+    def attitude(self, roll: float, pitch: float, yaw_rate: float, thrust: float) -> None:
+        """Stream roll, pitch, rad, yaw rate, rad/s, and collective thrust, N."""
+        self._require(Control.attitude)
+        self._put("attitude", _numbers("attitude setpoint", [roll, pitch, yaw_rate, thrust], 4))
+
+    def notify_setpoints_stop(self, remain_valid: float = 0.0) -> None:
+        """Let high-level commands take over after some time, s, in which the last setpoint stays in force."""
+        self._released = self.now + max(float(remain_valid), 0.0)
+
+    # Safety ---------------------------------------------------------------------------------------------------------
+
+    def arm(self, armed: bool = True) -> None:
+        """Arm, or stop the motors and refuse commands."""
+        if not armed:
+            self.stop()
+        self.armed = bool(armed)
+
+    def emergency(self) -> None:
+        """Stop the motors, and refuse commands until a reset."""
+        self.stop()
+        self.locked = True
+
+    # The loop -------------------------------------------------------------------------------------------------------
+
+    def tick(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
+        """Return the command in force, of the simulation's level; None with the motors off.
+
+        Args:
+            now: Time, s.
+            pos: Position, m. (3,)
+            vel: Velocity, m/s. (3,)
+            yaw: Yaw, rad.
+        """
+        dt, self.now = now - self.now, now
+        self.pos, self.vel, self.yaw = pos, vel, yaw
+        if self._stream is not None:
+            age = now - self._stream_time
+            if now >= self._released and self._plan is not None:
+                self._stream = None
+            elif age > SHUTDOWN:
+                self.stop()
+            elif age > STABILIZE and self._stream[0] != "stay":
+                self._stream = ("stay", np.append(pos, yaw))
+        plan = self._plan
+        if self._stream is None and plan is not None and plan.lands and plan.finished(now):
+            self.stop()
+        if not self.motors_on:
+            return None
+        return self._streamed(dt) if self._stream is not None else _state_command(*self.goal())
+
+    def _streamed(self, dt: float) -> NDArray:
+        kind, x = self._stream  # type: ignore[misc]
+        if self.control != Control.state:
+            return self._streamed_attitude(kind, x, dt)
+        if kind == "command":
+            self._last = np.array([[*x[:3], _yaw(x[9:13])], [*x[3:6], x[15]], [*x[6:9], 0.0]])
+            self._reference = self._last[0].copy()
+            return x
+        rate = np.zeros(4)
+        if kind in ("position", "stay"):
+            self._reference = x.copy()
+        else:
+            c, s = math.cos(self._reference[3]), math.sin(self._reference[3])
+            rate = x if kind == "velocity" else np.array([c * x[0] - s * x[1], s * x[0] + c * x[1], 0.0, x[2]])
+            self._reference = self._reference + dt * rate
+            if kind == "hover":
+                self._reference[2] = x[3]
+        self._last = np.array([self._reference, rate, np.zeros(4)])
+        return _state_command(*self._last)
+
+    def _streamed_attitude(self, kind: str, x: NDArray, dt: float) -> NDArray:
+        if kind == "attitude":
+            self._reference[3] += dt * x[2]
+            return np.array([x[0], x[1], self._reference[3], x[3]])
+        if kind == "stay":  # level, with the thrust of the last command
+            return np.array([0.0, 0.0, self._reference[3] if self.control == Control.attitude else 0.0, self._thrust])
+        return x
+
+    def _put(self, kind: str, values: NDArray) -> None:
+        if self._stream is None:
+            begin = self.goal()[0]
+            self._reference = begin.copy()
+        self._stream, self._stream_time, self._released, self._plan = (kind, values), self.now, math.inf, None
+        self._thrust = float(values[3]) if kind in ("command", "attitude") else 0.0
+
+    def _start(self, plan: Plan) -> None:
+        self._plan = plan
+
+    def _vertical(self, height: float, duration: float, yaw: float | None, lands: bool) -> None:
+        self._require(Control.state)
+        (height,) = _numbers("height", [height], 1)
+        here = self.goal()[0]
+        goal = here.copy()
+        goal[2] = height
+        if yaw is not None:
+            goal[3] = nearest_yaw(here[3], _numbers("yaw", [yaw], 1)[0])
+        begin = np.array([here, np.zeros(4), np.zeros(4)])
+        self._start(Plan(move(begin, goal, _duration(duration)), self.now, lands=lands))
+
+    def _require(self, level: Control) -> None:
+        if self.locked or not self.armed:
+            raise ConfigError(
+                f"expected a drone that is armed, got one that is {'locked' if self.locked else 'disarmed'}"
+            )
+        if level != self.control:
+            raise ConfigError(
+                f"expected a command that Sim(control={self.control.value!r}) takes, got one of level {level.value!r}. "
+                f"Use Sim(control={level.value!r})."
+            )
+
+
+def _numbers(name: str, values: Any, n: int, limit: float = FARTHEST) -> NDArray:
+    """Return finite numbers within a limit. (n,)"""
+    try:
+        x = np.array(values, float)
+    except (TypeError, ValueError):
+        raise ConfigError(f"expected {n} numbers for {name}, got {values!r}") from None
+    if x.shape != (n,) or not np.isfinite(x).all() or (np.abs(x) > limit).any():
+        raise ConfigError(f"expected {n} finite numbers up to {limit:g} for {name}, got {x.tolist()}")
+    return x
+
+
+def _duration(value: float) -> float:
+    (value,) = _numbers("duration", [value], 1, LONGEST)
+    if value < SHORTEST:
+        raise ConfigError(f"expected a positive duration of at least {SHORTEST:g} s, got {value} s")
+    return value
+
+
+def _state_command(point: NDArray, rate: NDArray, second: NDArray) -> NDArray:
+    """Return the state command of position and yaw, their rates and second derivatives. (16,)"""
+    half = point[3] / 2
+    return np.array([*point[:3], *rate[:3], *second[:3], 0.0, 0.0, math.sin(half), math.cos(half), 0.0, 0.0, rate[3]])
+
+
+def _yaw(quat: NDArray) -> float:
+    x, y, z, w = quat
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

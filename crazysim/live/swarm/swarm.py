@@ -1,0 +1,237 @@
+"""A simulation whose drones take the commands of Crazyflies, each through a commander of its own."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.control import Control
+from crazysim.dynamics import Dynamics
+from crazysim.effects import MotorFailure
+from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.live.closing import Closing
+from crazysim.live.mocap.frames import rotate, to_rpy
+from crazysim.live.mocap.reports import Reports
+from crazysim.live.swarm.commander import Commander
+from crazysim.sim.sim import Sim
+
+GRAVITY = 9.81
+"""Standard acceleration of accelerometers' readings, m/s^2."""
+
+
+class DroneState(NamedTuple):
+    """State of one drone, simulated or real."""
+
+    time: float
+    """Time, s."""
+    pos: NDArray
+    """Position, world frame, m. (3,)"""
+    quat: NDArray
+    """Attitude, body to world, xyzw. (4,)"""
+    vel: NDArray
+    """Velocity, world frame, m/s. (3,)"""
+    ang_vel: NDArray
+    """Angular velocity, body frame, rad/s. (3,)"""
+    acc: NDArray
+    """Reading of the accelerometer, body frame, m/s^2: at rest it points up. (3,)"""
+
+    @property
+    def rpy(self) -> NDArray:
+        """Roll, pitch and yaw, rad. (3,)"""
+        return to_rpy(self.quat)
+
+
+class Swarm(Closing):
+    """A simulation of one world, driven by commanders.
+
+        swarm = Swarm(Sim(n_drones=2, control="state"))
+        swarm["cf1"].take_off(1.0, 2.0)
+        swarm.advance(3.0)
+
+    Commands come from other threads or from the same one; ``lock`` protects them. The simulation advances by
+    ``advance``, by ``start`` in real time, or by a loop that calls the swarm, such as ``Live.add(swarm)``.
+    """
+
+    reports: Reports
+    """Refused commands and packets."""
+    colors: NDArray
+    """Colour of the light of each drone, red, green, blue from 0 to 1. (n_drones, 3)"""
+
+    def __init__(self, sim: Sim, names: Sequence[str] | None = None):
+        """Let commands drive a simulation.
+
+        Args:
+            sim: Simulation of one world. High-level commands need ``control="state"``; attitudes and body rates need
+                those command levels.
+            names: Names of the drones; None for ``cf1``, ``cf2``, ...
+
+        Raises:
+            ConfigError: If there are several worlds, or not one name for each drone.
+        """
+        if sim.n_worlds != 1:
+            raise ConfigError(f"expected a simulation of one world, got {sim.n_worlds}")
+        names = [f"cf{k + 1}" for k in range(sim.n_drones)] if names is None else list(names)
+        if len(names) != sim.n_drones or len(set(names)) < len(names):
+            raise ConfigError(f"expected {sim.n_drones} different names, got {names}")
+        self.sim, self.names, self.lock = sim, tuple(names), threading.RLock()
+        self.commanders = [Commander(sim.control) for _ in names]
+        self.colors, self.reports = np.zeros((len(names), 3)), Reports()
+        self.listeners: list[Callable[[], Any]] = []
+        self._period = sim.freq // sim.control_freq
+        self._motors = self._add_motors()
+        self._on = np.ones(len(names), bool)
+        self._states: list[DroneState] = []
+        self._home = np.asarray(sim.data.states.pos[0], float)
+        self._thread: threading.Thread | None = None
+        self._stopped = threading.Event()
+        self._read()
+        self._write()
+
+    def __getitem__(self, name: str) -> Commander:
+        """Return the commander of a drone."""
+        return self.commanders[self.index(name)]
+
+    def index(self, name: str) -> int:
+        """Return the index of a drone.
+
+        Raises:
+            UnknownNameError: If there is none of that name.
+        """
+        if name not in self.names:
+            raise UnknownNameError(f"expected one of the drones {list(self.names)}, got {name!r}")
+        return self.names.index(name)
+
+    @property
+    def time(self) -> float:
+        """Time of the states, s."""
+        return self._states[0].time
+
+    def state(self, drone: int | str) -> DroneState:
+        """Return the state of a drone after the last control step."""
+        return self._states[self.index(drone) if isinstance(drone, str) else drone]
+
+    def home(self, drone: int | str) -> NDArray:
+        """Return the position of a drone when the swarm was made, m. (3,)"""
+        return self._home[self.index(drone) if isinstance(drone, str) else drone].copy()
+
+    # Time -----------------------------------------------------------------------------------------------------------
+
+    def __call__(self, live: Any) -> None:
+        """Stage the commands in force, for a loop such as ``Live``, which has the simulation as ``live.sim``.
+
+        Raises:
+            ConfigError: If it is another simulation.
+        """
+        if live.sim is not self.sim:
+            raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
+        self.update()
+
+    def update(self) -> None:
+        """Read the states and stage the commands in force, between two control steps."""
+        with self.lock:
+            self._read()
+            self._write()
+            for listener in self.listeners:
+                listener()
+
+    def advance(self, seconds: float) -> None:
+        """Advance by a number of control steps, as many as reach a time, s, as fast as possible.
+
+        Raises:
+            ConfigError: If a thread advances the simulation.
+        """
+        if self._thread is not None:
+            raise ConfigError("expected a swarm that no thread advances, got a running one. Use sleep.")
+        for _ in range(max(round(seconds * self.sim.freq / self._period), 0)):
+            self.update()
+            self.sim.step(self._period)
+        with self.lock:
+            self._read()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait for simulated time to pass, s: advance, or wait for the thread that advances."""
+        if self._thread is None:
+            self.advance(seconds)
+            return
+        end = self.time + seconds
+        while self.time < end - 1e-9 and self._thread.is_alive():
+            time.sleep(0.001)
+
+    def start(self, speed: float = 1.0) -> Swarm:
+        """Advance in a thread, in real time or at another speed, and return the swarm."""
+        self._stopped.clear()
+        self._thread = threading.Thread(target=self._run, args=(speed,), name="swarm", daemon=True)
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Stop the thread, if there is one."""
+        self._stopped.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _run(self, speed: float) -> None:
+        dt = self._period / self.sim.freq / speed
+        due = time.perf_counter()
+        while not self._stopped.is_set():
+            with self.lock:
+                self.update()
+                self.sim.step(self._period)
+            due = max(due + dt, time.perf_counter() - 0.1)
+            self._stopped.wait(max(due - time.perf_counter(), 0.0))
+
+    # State and commands ---------------------------------------------------------------------------------------------
+
+    def _add_motors(self) -> MotorFailure | None:
+        """Return the plugin that switches motors; None if the dynamics have no rotors."""
+        if self.sim.dynamics != Dynamics.first_principles:
+            return None
+        return self.sim.add(MotorFailure(name="motor_switch"))
+
+    def _read(self) -> None:
+        data = self.sim.data
+        states = data.states
+        pos, quat, vel, ang_vel = (
+            np.asarray(x[0], float) for x in (states.pos, states.quat, states.vel, states.ang_vel)
+        )
+        now = float(np.asarray(data.core.steps)[0, 0]) / self.sim.freq
+        before = self._states
+        if before and now < before[0].time:
+            for commander in self.commanders:
+                commander.reset()
+            before, self._on = [], np.ones(len(self.names), bool)
+        lift = np.array([0.0, 0.0, GRAVITY])
+        found = []
+        for k in range(len(self.names)):
+            dt = now - before[k].time if before else 0.0
+            acc = rotate(quat[k] * (-1, -1, -1, 1), (vel[k] - before[k].vel) / dt + lift) if dt > 0 else None
+            held = before[k].acc if before else rotate(quat[k] * (-1, -1, -1, 1), lift)
+            found.append(DroneState(now, pos[k], quat[k], vel[k], ang_vel[k], held if acc is None else acc))
+        self._states = found
+
+    def _write(self) -> None:
+        sim, size = self.sim, {Control.state: 16, Control.rotor_vel: self.sim.airframe.n_rotors}
+        command = np.zeros((1, len(self.names), size.get(sim.control, 4)))
+        on = np.ones(len(self.names), bool)
+        for k, (commander, state) in enumerate(zip(self.commanders, self._states, strict=True)):
+            yaw = float(state.rpy[2])
+            found = commander.tick(state.time, state.pos, state.vel, yaw)
+            on[k] = found is not None
+            if found is not None:
+                command[0, k] = found
+            elif sim.control == Control.state:
+                command[0, k, :3], command[0, k, 11:13] = state.pos, (np.sin(yaw / 2), np.cos(yaw / 2))
+        getattr(sim, f"{sim.control.value}_control")(command)
+        if self._motors is not None and (on != self._on).any():
+            self._on = on
+            record = self._motors.read(sim.data)
+            shape = record.effectiveness.shape
+            switched = jnp.asarray(np.broadcast_to(on[None, :, None], shape), record.effectiveness.dtype)
+            sim.data = self._motors.write(sim.data, record.replace(effectiveness=switched))

@@ -1,0 +1,131 @@
+"""Journals: files of chunks that are written as they come, and stay readable after a crash.
+
+A file is its first line, ``crazysim journal 1``, and chunks: kind (4 bytes), length of the content (8 bytes, little
+endian), CRC-32 of kind and content (4 bytes), content. Each chunk is handed to the operating system in one write, so
+that the end of the process, even by SIGKILL, loses nothing that was appended. A chunk that is cut off, by a full disk
+or a loss of power, ends the file for a reader.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+
+MAGIC = b"crazysim journal 1\n"
+"""First line of a journal."""
+HEAD = struct.Struct("<4sQI")
+"""Head of a chunk: kind, length of the content, checksum."""
+
+
+class Journal:
+    """A file that chunks are appended to."""
+
+    path: Path
+    """Path of the file."""
+
+    def __init__(self, path: str | Path):
+        """Create the file.
+
+        Raises:
+            ConfigError: If it exists, which protects earlier recordings, or cannot be created.
+        """
+        self.path = Path(path)
+        try:
+            self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644)
+        except FileExistsError:
+            raise ConfigError(f"expected a new file, got {str(path)!r}, which exists. Use another name.") from None
+        except OSError as error:
+            raise ConfigError(f"expected a file that can be created, got {str(path)!r}: {error}") from error
+        self._write(MAGIC)
+
+    @property
+    def is_open(self) -> bool:
+        """True until the journal is closed."""
+        return self._file >= 0
+
+    def append(self, kind: bytes, content: bytes) -> None:
+        """Append a chunk.
+
+        Args:
+            kind: Kind of the chunk, 4 bytes.
+            content: Content.
+
+        Raises:
+            ConfigError: If the kind has another length.
+            OSError: If it cannot be written, for example because the disk is full.
+        """
+        if len(kind) != 4:
+            raise ConfigError(f"expected a kind of 4 bytes, got {kind!r}")
+        self._write(HEAD.pack(kind, len(content), zlib.crc32(content, zlib.crc32(kind))) + content)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self.is_open:
+            os.close(self._file)
+            self._file = -1
+
+    def _write(self, content: bytes) -> None:
+        rest = memoryview(content)
+        while rest:
+            rest = rest[os.write(self._file, rest) :]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
+    """Yield kind and content of the chunks of a file, which may still be growing, up to the first incomplete one.
+
+    Raises:
+        ConfigError: If the file does not exist or is not a journal.
+    """
+    path = Path(path)
+    if not is_journal(path):
+        raise ConfigError(f"expected a journal, got {str(path)!r}")
+    with path.open("rb") as file:
+        file.seek(len(MAGIC))
+        size = path.stat().st_size
+        while len(head := file.read(HEAD.size)) == HEAD.size:
+            kind, length, checksum = HEAD.unpack(head)
+            content = file.read(length) if length <= size - file.tell() else b""
+            if len(content) < length or zlib.crc32(content, zlib.crc32(kind)) != checksum:
+                return
+            yield kind, content
+
+
+def is_journal(path: str | Path) -> bool:
+    """Return True if a file exists and begins as a journal does."""
+    path = Path(path)
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+def pack_arrays(**arrays: NDArray) -> bytes:
+    """Return arrays as the content of a chunk."""
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+def unpack_arrays(content: bytes) -> dict[str, NDArray]:
+    """Return the arrays in the content of a chunk."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return dict(arrays)

@@ -1,0 +1,61 @@
+"""Panels: flat pieces of a load's surface, on which air presses."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from crazysim.geometry import Shape
+
+N_OF_BALL = 24
+"""Least number of panels of a ball."""
+
+
+class Panels(NamedTuple):
+    """Flat pieces of a surface, in the frame of its shape."""
+
+    pos: np.ndarray
+    """Centres, m. (n, 3)"""
+    normal: np.ndarray
+    """Unit outward normals. (n, 3)"""
+    area: np.ndarray
+    """Areas, m^2. (n, 1)"""
+
+
+def panels_of(shape: Shape, largest: float) -> Panels:
+    """Return the surface of a ball or a box as panels.
+
+    The panels of a box are equal rectangles on each side. Those of a ball lie on a spiral of equal areas (Fibonacci).
+
+    Args:
+        shape: Sphere or box.
+        largest: Largest edge of a panel, m.
+    """
+    if shape.kind == "sphere":
+        return _of_ball(shape.size[0], largest)
+    half = np.array(shape.size)
+    pos, normal, area = [], [], []
+    for axis in range(3):
+        across = [k for k in range(3) if k != axis]
+        counts = [max(1, math.ceil(2 * half[k] / largest - 1e-9)) for k in across]
+        lines = [half[k] * (2 * (np.arange(n) + 0.5) / n - 1) for k, n in zip(across, counts, strict=True)]
+        grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
+        for side in (-1.0, 1.0):
+            points = np.zeros((len(grid), 3))
+            points[:, across], points[:, axis] = grid, side * half[axis]
+            pos.append(points)
+            normal.append(np.tile(side * np.eye(3)[axis], (len(grid), 1)))
+            area.append(np.full((len(grid), 1), 4 * half[across[0]] * half[across[1]] / len(grid)))
+    return Panels(*(np.concatenate(x) for x in (pos, normal, area)))
+
+
+def _of_ball(radius: float, largest: float) -> Panels:
+    surface = 4 * math.pi * radius**2
+    n = max(N_OF_BALL, math.ceil(surface / largest**2))
+    z = 1 - 2 * (np.arange(n) + 0.5) / n
+    angle = np.arange(n) * math.pi * (3 - math.sqrt(5))
+    level = np.sqrt(1 - z**2)
+    normal = np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=-1)
+    return Panels(radius * normal, normal, np.full((n, 1), surface / n))

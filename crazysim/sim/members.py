@@ -1,0 +1,149 @@
+"""Drones and members of populations by name: ``sim["Crazyflie_0"]``."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from crazysim.core import functional as F
+from crazysim.core.data import SimData, command_shape
+from crazysim.core.population import Population
+from crazysim.errors import ConfigError, UnknownNameError
+
+if TYPE_CHECKING:
+    from crazysim.sim.sim import Sim
+
+DRONE = "drone"
+"""Population of the drones."""
+
+
+class Member:
+    """One drone, or one member of a population, in all worlds: a view that reads and writes the simulation's data.
+
+    Fields of the record, such as ``pos``, ``quat`` and ``vel``, are attributes. (n_worlds, ...) each
+    """
+
+    def __init__(self, sim: Sim, name: str, population: str, index: int):
+        """Take the simulation, the name, the population and the index in it."""
+        self._sim, self.name, self.population, self.index = sim, name, population, index
+
+    def __getattr__(self, field: str) -> Array:
+        """Return a field of the record. (n_worlds, ...)
+
+        Raises:
+            AttributeError: If there is no such field.
+        """
+        value = None if field.startswith("_") else getattr(self._record(), field, None)
+        if np.ndim(value) < 2:
+            raise AttributeError(f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}.")
+        return value[:, self.index]
+
+    def set(self, **values: Any) -> None:
+        """Write fields of the record, such as ``pos``, in all worlds: (...), or (n_worlds, ...) for each.
+
+        Raises:
+            UnknownNameError: If there is no such field.
+            ValueError: If a value has another shape, or is NaN or infinite.
+        """
+        record, new = self._record(), {}
+        for field, value in values.items():
+            if field not in self._fields():
+                raise UnknownNameError(
+                    f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}."
+                )
+            new[field] = self._with_row(f"{field} of {self.name}", getattr(record, field), value)
+        self._sim.data = self._written(self._sim.data, record.replace(**new))
+
+    def command(self, command: Any) -> None:
+        """Stage a command for this one alone: (k,), or (n_worlds, k) for each world.
+
+        A drone takes the command of the simulation's level, a member of a population that of its population.
+
+        Raises:
+            ConfigError: If the population takes no commands.
+            ValueError: If the command has another shape, or is NaN or infinite.
+        """
+        sim, data = self._sim, self._sim.data
+        if self.population != DRONE:
+            plugin: Any = sim.plugins[self.population]
+            if plugin.command_field is None:
+                raise ConfigError(f"expected a population that takes commands, got {self.population!r}, which does not")
+            record = plugin.read(data)
+            staged = self._with_row(f"command of {self.name}", getattr(record, plugin.command_field), command)
+            sim.data = plugin.write(data, record.replace(**{plugin.command_field: staged}))
+            return
+        level: Any = data.controls
+        staged = level.rotor_vel if sim.control == "rotor_vel" else getattr(level, sim.control.value).staged_cmd
+        if sim.control == "rotor_vel":
+            command = self._for_rotors(command, command_shape(data, sim.control)[-1])
+        staged = self._with_row(f"{sim.control.value} command of {self.name}", staged, command)
+        after: Any = F.stage_command(data, staged)
+        before = getattr(level.state, "staged_feedforward", None)
+        if before is not None:  # that of the other drones stays
+            state = after.controls.state
+            own = before.at[:, self.index].set(state.staged_feedforward[:, self.index])
+            after = after.replace(controls=after.controls.replace(state=state.replace(staged_feedforward=own)))
+        sim.data = after
+
+    def _for_rotors(self, command: Any, n_rotors: int) -> Any:
+        """Return rotor speeds with zeros for rotors that other drones of the simulation have."""
+        own = self._sim.airframes[self.index].n_rotors
+        if np.shape(command)[-1:] != (own,) or own == n_rotors:
+            return command
+        return np.pad(np.asarray(command), [(0, 0)] * (np.ndim(command) - 1) + [(0, n_rotors - own)])
+
+    def _with_row(self, what: str, x: Array, value: Any) -> Array:
+        shape = x.shape[:1] + x.shape[2:]
+        if np.shape(value) not in (shape[1:], shape):
+            raise ValueError(
+                f"expected the {what} of shape {shape[1:]}, or {shape} with one for each world, got {np.shape(value)}"
+            )
+        if not isinstance(value, jax.Array):
+            value = np.asarray(value, x.dtype)
+            if not np.all(np.isfinite(value)):
+                raise ValueError(f"expected finite numbers as {what}, got NaN or infinity. Check its computation.")
+        return x.at[:, self.index].set(value)
+
+    def _record(self) -> Any:
+        data = self._sim.data
+        return data.states if self.population == DRONE else self._sim.plugins[self.population].read(data)
+
+    def _written(self, data: SimData, record: Any) -> SimData:
+        if self.population == DRONE:
+            return data.replace(states=record)
+        return self._sim.plugins[self.population].write(data, record)
+
+    def _fields(self) -> list[str]:
+        record = self._record()
+        shared = ("population", "n_members", "member_id")
+        return [name for name in vars(record) if name not in shared and np.ndim(getattr(record, name, None)) >= 2]
+
+    def __repr__(self) -> str:
+        """Return name, population and index."""
+        return f"<{self.name}: {self.population} {self.index}>"
+
+
+def find_member(sim: Sim, name: Any) -> Member:
+    """Return the view of a drone or member.
+
+    Raises:
+        UnknownNameError: If there is none of that name, with those that are probably meant.
+    """
+    if name in sim.drone_names:
+        return Member(sim, name, DRONE, sim.drone_names.index(name))
+    for plugin in sim.plugins.values():
+        if isinstance(plugin, Population) and name in plugin.names:
+            return Member(sim, name, plugin.name, plugin.names.index(name))
+    raise UnknownNameError(f"expected the name of a drone or member, got {name!r}. {_suggestion(str(name), sim.names)}")
+
+
+def _suggestion(name: str, names: Sequence[str]) -> str:
+    if len(names) <= 8:
+        return f"There are {', '.join(names)}."
+    close = difflib.get_close_matches(name, names) or names[:3]
+    return f"Did you mean {' or '.join(close)}? sim.names has all."

@@ -1,0 +1,416 @@
+"""Cars: a population of ground vehicles, driven by commands or along paths."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim.core.data import Objects, SimData
+from crazysim.core.plugin import Placement, Simulation, parameter
+from crazysim.core.population import Population
+from crazysim.core.stage import Stage, tick
+from crazysim.dynamics.core import GRAVITY
+from crazysim.effects.ground import TerrainData, ground_at
+from crazysim.errors import ConfigError
+from crazysim.pytree import Members, PyTree, floating, leaf
+from crazysim.trajectories import Trajectory
+from crazysim.vehicles import appearance
+from crazysim.vehicles.following import PathController, PurePursuit, motor_reference, path_state
+from crazysim.vehicles.kinematic import kinematic
+from crazysim.vehicles.model import VehicleModel, load_vehicle
+from crazysim.vehicles.parameters import CarParams
+from crazysim.vehicles.path import Path
+from crazysim.vehicles.single_track import single_track
+from crazysim.vehicles.state import CarState, tilted, to_body, to_world
+
+CONTROL_FREQ = 50
+"""Default rate of the controllers, Hz, lowered to the next divisor of the simulation's rate."""
+SPEED_GAIN = 4.0
+"""Acceleration over the error of speed at the command level ``speed``, 1/s."""
+SETTLING = 0.02
+"""Time in which height and tilt of a car follow the ground, s: that of stiff springs."""
+GAP = 1.0
+"""Distance of neighbours that start in a row, m."""
+
+
+class CarData(Members):
+    """States, commands and parameters of the cars of a population."""
+
+    pos: Array = leaf("member", 1)
+    """Position of the centre of mass, world frame, m. (n_worlds, n_members, 3)"""
+    yaw: Array = leaf("member", 1)
+    """Heading, rad, not wrapped. (n_worlds, n_members, 1)"""
+    body_vel: Array = leaf("member", 1)
+    """Forward and left velocity of the centre of mass, body frame, m/s. (n_worlds, n_members, 2)"""
+    yaw_rate: Array = leaf("member", 1)
+    """Rate of the heading, rad/s. (n_worlds, n_members, 1)"""
+    normal: Array = leaf("member", 1)
+    """Unit normal of the ground below, upwards, world frame; it follows terrain within ``SETTLING``.
+    (n_worlds, n_members, 3)"""
+    steer: Array = leaf("member", 1)
+    """Steering angle in the middle of the front axle, rad, positive to the left. (n_worlds, n_members, 1)"""
+    distance: Array = leaf("member", 1)
+    """Distance that the wheels rolled, m; backwards it decreases. (n_worlds, n_members, 1)"""
+    joints: Array | None = leaf("member", 1)
+    """Headings of the trailer's drawbar and deck, rad, not wrapped; None without trailers. (n_worlds, n_members, 2)"""
+    command: Array = leaf("member", 1)
+    """Command: motor reference, 1, or speed, m/s, by the command level, and steering angle, rad.
+    (n_worlds, n_members, 2)"""
+    applied: Array | None = leaf("member", 1)
+    """Motor reference and steering angle, rad, of the last tick of the controller; None at the level ``drive``, where
+    they are the command. (n_worlds, n_members, 2)"""
+    force: Array = leaf("member", 1)
+    """External force on the centre of mass, world frame, N; kept until it is changed. (n_worlds, n_members, 3)"""
+    torque: Array = leaf("member", 1)
+    """External torque, world frame, N m, of which z acts; kept until it is changed. (n_worlds, n_members, 3)"""
+    params: CarParams
+    """Parameters of the dynamics."""
+    path: Path | None
+    """Paths; None for cars that follow none."""
+    index: Array | None = leaf("parameter", 1, (1,))
+    """Number of the path that a car follows. (1,)"""
+    start: Array | None = leaf("parameter", 1, (1,))
+    """Time of the world at which a car is at the start of its path, s. (1,)"""
+    arc: Array | None = leaf("member", 1)
+    """Arc length of the car's projection on its path, m. (n_worlds, n_members, 1)"""
+    memory: Any
+    """Memory of the path controller."""
+    gains: Any
+    """Gains of the path controller."""
+
+    @property
+    def state(self) -> CarState:
+        """State of the dynamics."""
+        return CarState(**{name: getattr(self, name) for name in CarState._fields})
+
+    @property
+    def quat(self) -> Array:
+        """Attitude, body to world, xyzw. (n_worlds, n_members, 4)"""
+        return tilted(self.yaw, self.normal)
+
+    @property
+    def vel(self) -> Array:
+        """Velocity of the centre of mass, world frame, m/s. (n_worlds, n_members, 3)"""
+        level = to_world(self.yaw, self.body_vel)
+        return jnp.concatenate([level, jnp.zeros_like(self.yaw)], axis=-1)
+
+    @property
+    def ang_vel(self) -> Array:
+        """Angular velocity, body frame, rad/s. (n_worlds, n_members, 3)"""
+        zero = jnp.zeros_like(self.yaw_rate)
+        return jnp.concatenate([zero, zero, self.yaw_rate], axis=-1)
+
+    def with_vel(self, vel: Array, ang_vel: Array) -> CarData:
+        """Return the record with other velocities of cars, of which those on the ground count.
+
+        Args:
+            vel: Velocity of the centre of mass, world frame, m/s. (..., 3)
+            ang_vel: Angular velocity, rad/s. (..., 3)
+        """
+        return self.replace(body_vel=to_body(self.yaw, vel[..., :2]), yaw_rate=ang_vel[..., 2:])
+
+
+class Cars(Population):
+    """Cars, driven by commands, or along paths by a controller, on level ground or on terrain.
+
+    Commands are held until they change: at the level ``drive`` the motor reference and the steering angle, at ``speed``
+    the speed and the steering angle. With a path the cars need no commands. On terrain the dynamics are those of level
+    ground with the pull of the slope; height and tilt follow the ground. Wheels do not leave it.
+    """
+
+    members: int | Sequence[str] = 1
+    """Number of cars in each world, or their names."""
+    vehicle: Any = "f1tenth_ros"
+    """Vehicle model, as for ``load_vehicle``."""
+    pos: Any = parameter(default=None)
+    """Positions at the start, x and y, m; None for the start of the path, or a row along y with gaps of 1 m.
+    (2,), (n_members, 2) or (n_worlds, n_members, 2)"""
+    yaw: Any = parameter(default=None)
+    """Headings at the start, rad; None for that of the path, or zero. (), (n_members,) or (n_worlds, n_members)"""
+    level: Literal["drive", "speed"] = "drive"
+    """Command level of cars without a path."""
+    path: Any = None
+    """Path, trajectory, or a sequence of them to follow; None to drive by commands."""
+    controller: PathController | None = None
+    """Controller that follows paths; None for ``PurePursuit()``."""
+    reference: Literal["time", "arc"] = "time"
+    """``time`` to keep to the timing of the path; ``arc`` to drive at the speed of the place where the car is."""
+    index: Any = parameter(default=None)
+    """Number of the path of each car; None for car i path i modulo their number. () or (n_worlds, n_members)"""
+    start: Any = parameter(default=None)
+    """Time at which a car is at the start of its path, s; None for zero, and at equal intervals for the cars of one
+    closed path. () or (n_worlds, n_members)"""
+    trailer: bool = False
+    """True for cars that tow a trailer."""
+    rate: int | None = None
+    """Rate of the controller, Hz, a divisor of the simulation's rate; None for the largest one up to 50 Hz."""
+    rgba: Any = None
+    """Colour; None for the default. (4,)"""
+    in_scene: bool = True
+    """True to put the cars into the scene, where they are drawn and reported as contacts of drones."""
+    name: str = "cars"
+    prefix: ClassVar[str] = "Fleet1Tenth"
+    positions: ClassVar[tuple[str, ...]] = ("pos", "yaw", "distance")
+    command_field: ClassVar[str | None] = "command"
+
+    @property
+    def control_freq(self) -> int | None:
+        """Rate of the controller, Hz."""
+        return self.rate
+
+    @property
+    def model(self) -> VehicleModel:
+        """The vehicle model."""
+        return load_vehicle(self.vehicle)
+
+    @property
+    def follows(self) -> PathController | None:
+        """The path controller, or None."""
+        if self.path is None:
+            return None
+        return PurePursuit() if self.controller is None else self.controller
+
+    def rate_in(self, freq: int) -> int:
+        """Return the rate of the controller in a simulation of a rate, Hz."""
+        if self.rate is not None:
+            return self.rate
+        return next(f for f in range(min(CONTROL_FREQ, freq), 0, -1) if freq % f == 0)
+
+    def record(self, sim: Simulation) -> CarData:
+        """Return the cars at rest at their starts."""
+        self.check(sim)
+        vehicle, freq, counts = self.model, sim.data.core.freq, (sim.n_worlds, self.n_members)
+        self._check_settings(vehicle)
+        paths, follows = self._paths(), self.follows
+        index = start = arc = gains = memory = None
+        params = CarParams.create(vehicle, freq, self.trailer)
+        pos, yaw = _row(self.n_members), np.zeros((self.n_members, 1))
+        if paths is not None and follows is not None:
+            follows.check(vehicle, paths)
+            index = _numbers("index", self._indices(paths), counts, paths.n_paths)
+            start = _numbers("start", self._starts(paths, index), counts)
+            pos, yaw, arc = _on_path(paths, index, start, counts)
+            gains, memory = follows.gains(vehicle, params, self.rate_in(freq)), follows.memory()
+        if self.pos is not None:
+            pos = _places("pos", self.pos, counts, (2,))
+        if self.yaw is not None:
+            yaw = _places("yaw", np.asarray(self.yaw, float)[..., None], counts, (1,))
+        pos, yaw = (np.broadcast_to(x, (*counts, x.shape[-1])) for x in (pos, yaw))
+        if arc is not None and self.pos is not None:
+            arc = _projected(paths, index, pos, arc)
+        height, normal = ground_at(sim.data, jnp.asarray(np.concatenate([pos, pos[..., :1]], axis=-1), floating()))
+        z = np.asarray(height) + vehicle.number("wheels.radius")
+        zero = np.zeros((*counts, 1))
+        two, three = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)
+        if self.in_scene:
+            appearance.add_to_scene(sim, self, vehicle)
+        held = self.level == "drive" and follows is None
+        return self.create(
+            sim,
+            CarData,
+            pos=np.concatenate([pos, z], axis=-1),
+            yaw=yaw,
+            body_vel=two,
+            yaw_rate=zero,
+            normal=np.asarray(normal),
+            steer=zero,
+            distance=zero,
+            joints=np.concatenate([yaw, yaw], axis=-1) if self.trailer else None,
+            command=two,
+            applied=None if held else two,
+            force=three,
+            torque=three,
+            params=params,
+            path=paths,
+            index=index,
+            start=start,
+            arc=arc,
+            memory=_for_members(memory, counts),
+            gains=gains,
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages of controller and integration; commands of the level ``drive`` need no controller."""
+        placed = [x for x in Population.stages(self, sim) if x.name != f"{self.name}_control"]
+        if self.follows is None and self.level == "drive":
+            return placed
+        name, when = f"{self.name}_control", functools.partial(tick, freq=self.rate_in(sim.data.core.freq))
+        return [Placement(Stage(self._controlled, self.name, when, name=name), name=name), *placed]
+
+    def control(self, data: SimData) -> CarData:
+        """Return the record of one car with motor reference and steering angle for the next period."""
+        car = self.read(data)
+        follows = self.follows
+        if follows is None:
+            acc = SPEED_GAIN * (car.command[:1] - car.body_vel[:1])
+            drive = motor_reference(car.command[:1], acc, car.params)
+            return car.replace(applied=jnp.concatenate([drive, car.command[1:]]))
+        time = data.core.steps / data.core.freq - car.start[0] if self.reference == "time" else None
+        at = path_state(car.state, car.path, car.index[0], car.arc, follows.ahead(car.params), time)
+        applied, memory = follows.update(car.state, at, car.memory, car.gains, car.params)
+        return car.replace(applied=applied, arc=at.arc, memory=memory)
+
+    def derivative(self, data: SimData) -> Mapping[str, Array]:
+        """Return the rates of the states of one car."""
+        car = self.read(data)
+        model = kinematic if self.model.dynamics == "kinematic" else single_track
+        command = car.command if car.applied is None else car.applied
+        force, settling = car.force[:2], {}
+        if any(isinstance(record, TerrainData) for record in data.plugins.values()):
+            force = force - GRAVITY[2] * car.params.mass * car.normal[2:] * car.normal[:2]
+            settling = self._settling(data, car)
+        push = jnp.concatenate([to_body(car.yaw, force), car.torque[2:]])
+        rates = model(car.state, command, car.params, push)._asdict() | settling
+        return {name: rate for name, rate in rates.items() if rate is not None}
+
+    def _settling(self, data: SimData, car: CarData) -> dict[str, Array]:
+        """Return the rates of position and normal of one car that follows terrain."""
+        height, normal = ground_at(data, car.pos)
+        vel, rate = car.vel, 1 / max(SETTLING, 2 / data.core.freq)
+        climb = -(normal[:1] * vel[:1] + normal[1:2] * vel[1:2]) / normal[2:]
+        sink = rate * (height + self.model.number("wheels.radius") - car.pos[2:])
+        return {"pos": jnp.concatenate([vel[:2], climb + sink]), "normal": rate * (normal - car.normal)}
+
+    def place(self, data: SimData) -> Objects:
+        """Return the objects of a world with the cars' bodies, wheels and trailers at their poses."""
+        return appearance.placed(data.objects, self, self.read(data))  # type: ignore[arg-type]
+
+    @property
+    def placed_kinds(self) -> tuple[str, ...] | None:
+        """Names of the objects that ``place`` moves, without their numbers."""
+        return appearance.kinds(self)
+
+    @property
+    def places(self) -> bool:
+        """True if the cars are in the scene."""
+        return self.in_scene
+
+    def _check_settings(self, vehicle: VehicleModel) -> None:
+        """Check settings that are not numbers.
+
+        Raises:
+            ConfigError: If one is invalid.
+        """
+        for name, allowed in (("level", ("drive", "speed")), ("reference", ("time", "arc"))):
+            if getattr(self, name) not in allowed:
+                raise ConfigError(f"expected {name} of {self.name!r} as one of {allowed}, got {getattr(self, name)!r}")
+        if self.controller is not None and self.path is None:
+            raise ConfigError(f"expected a path for the controller of {self.name!r}, got none. Use Cars(path=...).")
+        if self.controller is not None and not isinstance(self.controller, PathController):
+            raise ConfigError(f"expected a PathController, got {self.controller!r}. Use controller=PurePursuit().")
+        if self.trailer and not vehicle.has_trailer:
+            raise ConfigError(f"expected a vehicle with a table [trailer], got {vehicle.name!r}. Use 'aiml_head'.")
+
+    def _paths(self) -> Path | None:
+        """Return all paths in one record."""
+        if self.path is None:
+            return None
+        given = [self.path] if isinstance(self.path, (Path, Trajectory)) else self.path
+        if not isinstance(given, Sequence) or not all(isinstance(x, (Path, Trajectory)) for x in given):
+            raise ConfigError(
+                f"expected a Path, a Trajectory or a sequence of them, got {self.path!r}. Use "
+                f"Path.of_points([(0, 0), (1, 0), (2, 1)])."
+            )
+        return Path.stack([Path.of_trajectory(x) if isinstance(x, Trajectory) else x for x in given])
+
+    def _indices(self, paths: Path) -> Any:
+        return np.arange(self.n_members) % paths.n_paths if self.index is None else self.index
+
+    def _starts(self, paths: Path, index: NDArray[Any]) -> Any:
+        """Return the starts: as given, or at equal intervals on a closed path of several cars."""
+        if self.start is not None:
+            return self.start
+        own = np.broadcast_to(index.reshape(-1)[: self.n_members], (self.n_members,))
+        starts = np.zeros(self.n_members)
+        for path in np.unique(own):
+            cars = np.flatnonzero(own == path)
+            if np.asarray(paths.closed)[path]:
+                starts[cars] = -np.arange(len(cars)) / len(cars) * float(paths.duration[path])
+        return starts
+
+
+def _row(n: int) -> NDArray[Any]:
+    """Return places in a row along y around the origin. (n, 2)"""
+    return np.stack([np.zeros(n), GAP * (np.arange(n) - (n - 1) / 2)], axis=1)
+
+
+def _places(name: str, value: Any, counts: tuple[int, int], core: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return a value for all cars, or for each. (..., *core)
+
+    Raises:
+        ConfigError: If it has another shape or is not finite.
+    """
+    array = np.asarray(value, float)
+    shapes = [core, (counts[1], *core), (*counts, *core)]
+    if array.shape not in shapes or not np.all(np.isfinite(array)):
+        raise ConfigError(
+            f"expected {name} as finite numbers of shape {' or '.join(map(str, shapes))} = (n_worlds, n_members, ...), "
+            f"got shape {array.shape}"
+        )
+    return array
+
+
+def _numbers(name: str, value: Any, counts: tuple[int, int], n: int | None = None) -> NDArray[Any]:
+    """Return a number for all cars, (1,), or for each, (n_worlds, n_members, 1); whole numbers below n if it is given.
+
+    Raises:
+        ConfigError: If it has another shape or an invalid value.
+    """
+    array = np.asarray(value)
+    whole = n is None or (array.dtype.kind in "iu" and np.all((array >= 0) & (array < n)))
+    if array.shape not in ((), counts[1:], counts) or array.dtype.kind not in "iuf" or not whole:
+        what = "a number" if n is None else f"a whole number from 0 to {n - 1}"
+        raise ConfigError(
+            f"expected {name} as {what} for all cars, or for each, {counts[1:]} or {counts} = (n_worlds, n_members), "
+            f"got {value!r}"
+        )
+    if not np.all(np.isfinite(array)):
+        raise ConfigError(f"expected {name} to be finite, got {value!r}")
+    array = array.astype(floating() if n is None else np.int32)
+    return array[None] if array.ndim == 0 else np.array(np.broadcast_to(array, counts))[..., None]
+
+
+def _on_path(
+    paths: Path, index: NDArray[Any], start: NDArray[Any], counts: tuple[int, int]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return positions (..., 2), headings (..., 1) and arc lengths (..., 1) of cars on their paths at time zero."""
+    index, start = (np.broadcast_to(x, (*counts, 1)) for x in (index, start))
+    pos, yaw, arc = np.zeros((*counts, 2)), np.zeros((*counts, 1)), np.zeros((*counts, 1))
+    found: dict[tuple[int, float], tuple[Any, ...]] = {}
+    for at in np.ndindex(counts):
+        key = int(index[at][0]), float(start[at][0])
+        if key not in found:
+            found[key] = paths.at_time(*key)
+        pos[at], yaw[at], arc[at] = found[key]
+    return pos, yaw, arc
+
+
+def _projected(paths: Any, index: Any, pos: NDArray[Any], arc: NDArray[Any]) -> NDArray[Any]:
+    """Return the arc lengths next to positions, in the round of a reference. (n_worlds, n_members, 1)"""
+    index, found = np.broadcast_to(index, arc.shape), np.empty_like(arc)
+    for at in np.ndindex(arc.shape[:2]):
+        k = int(index[at][0])
+        nearest, length = paths.nearest(k, pos[at]), float(paths.length[k])
+        rounds = round((float(arc[at][0]) - nearest) / length) if paths.closed[k] else 0
+        found[at] = nearest + rounds * length
+    return found
+
+
+def _for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTree | None:
+    """Return a record of one member repeated for all."""
+    return None if record is None else jax.tree.map(lambda x: np.array(np.broadcast_to(x, (*counts, *x.shape))), record)
+
+
+class Bicycles(Cars):
+    """Bicycles of AIMotionLab-Virtual: the motor reference is the torque of the rear wheel, N m; no steering."""
+
+    vehicle: Any = "bicycle"
+    name: str = "bicycles"
+    prefix: ClassVar[str] = "Bicycle"

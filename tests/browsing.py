@@ -1,0 +1,103 @@
+"""A real browser for tests of pages, with the pixels that it shows."""
+
+import base64
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
+
+import numpy as np
+import pytest
+from imageio_ffmpeg import get_ffmpeg_exe
+
+NEAR = 12
+"""Pixels between where something is seen and where it is."""
+
+
+class Browser:
+    """A browser without a screen, spoken to over its debugging protocol."""
+
+    def __init__(self, program, folder, width=640, height=480):
+        from websockets.sync.client import connect
+
+        options = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader"]
+        options += ["--enable-unsafe-swiftshader", "--remote-debugging-port=0", f"--user-data-dir={folder}"]
+        self._process = subprocess.Popen(
+            [program, *options, f"--window-size={width},{height}", "about:blank"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        ready = folder / "DevToolsActivePort"
+        try:
+            wait_for(lambda: ready.exists() and ready.read_text().count("\n") > 0)
+        except AssertionError:
+            self._process.kill()
+            raise
+        with urllib.request.urlopen(f"http://127.0.0.1:{ready.read_text().split()[0]}/json") as answer:
+            tabs = json.load(answer)
+        tab = next(tab for tab in tabs if tab["type"] == "page")
+        self._socket = connect(tab["webSocketDebuggerUrl"], max_size=None)
+        self._n = 0
+
+    def call(self, method, **params):
+        self._n += 1
+        self._socket.send(json.dumps({"id": self._n, "method": method, "params": params}))
+        while True:
+            answer = json.loads(self._socket.recv(60))
+            if answer.get("id") == self._n:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def value(self, expression):
+        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    def box(self, selector):
+        """Return left, top, width and height of an element, or None while it is not there."""
+        return self.value(
+            f"(() => {{ const e = document.querySelector('{selector}'); if (!e) return null;"
+            f" const b = e.getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; }})()"
+        )
+
+    def picture(self):
+        """Return the window's pixels. (height, width, 3)"""
+        png = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        size = self.value("[window.innerWidth, window.innerHeight]")
+        decode = [get_ffmpeg_exe(), "-loglevel", "error", "-f", "png_pipe", "-i", "-"]
+        decode += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+        pixels = subprocess.run(decode, input=png, capture_output=True, check=True).stdout
+        return np.frombuffer(pixels, np.uint8).reshape(size[1], size[0], 3).astype(int)
+
+    def mask(self, rgb):
+        """Return rows and columns of what has a hue."""
+        picture, on = self.picture(), np.asarray(rgb) > 0
+        return np.nonzero(picture[..., on].min(-1) > picture[..., ~on].max(-1) + 60)
+
+    def find(self, rgb, near):
+        """Return column and row of the middle of what has a hue, once that is near a place or half a minute is over."""
+        place, deadline = np.full(2, np.inf), time.monotonic() + 30
+        while time.monotonic() < deadline and not np.allclose(place, near, atol=NEAR):
+            rows, columns = self.mask(rgb)
+            if len(rows) > 20:
+                place = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+        return place
+
+    def close(self):
+        self._socket.close()
+        self._process.terminate()
+        self._process.wait(20)
+
+
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come to be"
+        time.sleep(0.1)
+
+
+def start_browser(folder, kind=Browser, **size):
+    """Return a browser, or skip the test where there is none; CI forbids the skip."""
+    program = shutil.which("chromium") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip("no chromium")
+    return kind(program, folder, **size)

@@ -1,0 +1,85 @@
+"""A small population for tests: point masses on springs, alone or tied to the drones of their world."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from crazysim.core.plugin import Placement, parameter
+from crazysim.core.population import Population
+from crazysim.core.stage import stage
+from crazysim.pytree import Members, leaf
+
+STIFFNESS = 40.0
+
+
+class Masses(Members):
+    """Point masses."""
+
+    pos: jax.Array = leaf("member", 1)
+    vel: jax.Array = leaf("member", 1)
+    cmd: jax.Array = leaf("member", 1)
+    ticks: jax.Array = leaf("member")
+    stiffness: jax.Array = leaf("parameter", 1, (1,))
+
+
+class Springs(Population):
+    """Masses of 1 kg, each on a spring towards the command that its controller has taken over."""
+
+    members: int = 1
+    name: str = "springs"
+    rate: int | None = 100
+    stiffness: float | tuple = parameter(default=STIFFNESS)
+    prefix: ClassVar[str] = "Mass"
+    command_field: ClassVar[str] = "cmd"
+
+    @property
+    def control_freq(self):
+        return self.rate
+
+    def record(self, sim):
+        start = np.arange(1.0, self.n_members + 1)[:, None] * np.ones(3)
+        stiffness = np.atleast_1d(np.float32(self.stiffness))
+        return self.create(
+            sim, Masses, pos=start, vel=np.zeros(3), cmd=np.zeros(3), ticks=np.int32(0), stiffness=stiffness
+        )
+
+    def control(self, data):
+        record = self.read(data)
+        return record.replace(ticks=record.ticks + 1)
+
+    def derivative(self, data):
+        record = self.read(data)
+        assert record.pos.shape == (3,)
+        assert data.states.pos.shape == (data.core.n_drones, 3)
+        return {"pos": record.vel, "vel": record.stiffness * (record.cmd - record.pos)}
+
+
+class Tied(Springs):
+    """The same, pulled by the drones too."""
+
+    def derivative(self, data):
+        rates = super().derivative(data)
+        return rates | {"vel": rates["vel"] + jnp.mean(data.states.pos - self.read(data).pos, axis=0)}
+
+
+class Tying(Springs):
+    """The same, pulling at the drones, and colliding with them in each world: momentum is exchanged."""
+
+    def stages(self, sim):
+        @stage("drone")
+        def pull(data):
+            offsets = self.read(data).pos - data.states.pos
+            force = 0.01 * jnp.sum(offsets, axis=0)
+            return data.replace(states=data.states.replace(force=force))
+
+        @stage("world")
+        def exchange(data):
+            record, states = self.read(data), data.states
+            swapped = 0.01 * (states.vel[0] - record.vel[-1])
+            data = data.replace(states=states.replace(vel=states.vel.at[0].add(-swapped)))
+            return self.write(data, record.replace(vel=record.vel.at[-1].add(swapped)))
+
+        placed = [Placement(pull, name=f"{self.name}_pull"), Placement(exchange, name=f"{self.name}_exchange")]
+        return [*placed, *super().stages(sim)]

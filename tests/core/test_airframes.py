@@ -1,0 +1,251 @@
+"""Drones of several airframes in a world: each flies as in a simulation of its own airframe."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import crazysim as cs
+from crazysim import ConfigError, Sim, load_airframe
+from crazysim.core.airframes import for_drones
+from crazysim.dynamics import first_principles
+from crazysim.errors import UnknownNameError
+from crazysim.pytree import check_axes
+
+ANGLES = np.pi / 3 * np.arange(6) + np.pi / 6
+HEXAROTOR = {
+    "base": "cf21B_500",
+    "name": "hexarotor",
+    "rotors": {
+        "position": np.stack([0.05 * np.cos(ANGLES), 0.05 * np.sin(ANGLES), 0 * ANGLES], axis=-1),
+        "yaw_torque_sign": [1, -1, 1, -1, 1, -1],
+    },
+}
+FLEET = ("cf21B_500", "bumblebee", HEXAROTOR, "cf2x_L250")
+FIRMWARE = ("cf21B_500", HEXAROTOR, "cf2x_L250")
+STATES = ("pos", "quat", "vel", "ang_vel")
+CASES = [
+    ("attitude", "crazyflow", FLEET),
+    ("state", "crazyflow", FLEET),
+    ("body_rate", "crazyflow", FLEET),
+    ("force_torque", "crazyflow", FLEET),
+    ("rotor_vel", "crazyflow", FLEET),
+    ("state", "geometric", FLEET),
+    ("state", "lqr", FLEET),
+    ("state", "indi", FLEET),
+    ("state", "mellinger", FIRMWARE),
+    ("state", "pid", FIRMWARE),
+    ("attitude", "mellinger", FIRMWARE),
+]
+COMMANDS = {
+    "attitude": [0.1, 0.05, 0.2, 0.35],
+    "body_rate": [0.1, 0.05, 0.2, 0.35],
+    "force_torque": [0.35, 1e-5, 2e-5, 0],
+    "rotor_vel": [15000.0, 15100, 14900, 15000, 15050, 15000],
+    "state": [0.3, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0],
+}
+
+
+def in_flight(sim, pos):
+    """Return the simulation with drones at positions, moving, with a command."""
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=pos, vel=jnp.full_like(pos, 0.1)))
+    n_rotors = sim.data.states.rotor_vel.shape[-1]
+    command = COMMANDS[sim.control.value][: n_rotors if sim.control == "rotor_vel" else None]
+    getattr(sim, f"{sim.control.value}_control")(np.tile(command, (*pos.shape[:2], 1)))
+    return sim
+
+
+def positions(n_worlds, n_drones):
+    return jnp.asarray(np.random.default_rng(0).uniform(0.9, 1.1, (n_worlds, n_drones, 3)), jnp.float32)
+
+
+@pytest.mark.parametrize(("control", "controller", "fleet"), CASES)
+def test_each_drone_flies_as_in_a_simulation_of_its_own(control, controller, fleet):
+    pos = positions(1, len(fleet))
+    mixed = in_flight(Sim(drone=fleet, control=control, controller=controller, engine="lanes"), pos)
+    mixed.step(100)
+    for k, airframe in enumerate(fleet):
+        own = in_flight(Sim(drone=airframe, control=control, controller=controller, engine="lanes"), pos[:, k : k + 1])
+        own.step(100)
+        n = own.airframe.n_rotors
+        for name in STATES:
+            expected, got = getattr(own.data.states, name)[0, 0], getattr(mixed.data.states, name)[0, k]
+            np.testing.assert_allclose(got, expected, rtol=3e-5, atol=3e-5, err_msg=f"{airframe} {name}")
+        expected, got = own.data.states.rotor_vel[0, 0], mixed.data.states.rotor_vel[0, k]
+        np.testing.assert_allclose(got[:n], expected, rtol=1e-3)
+        np.testing.assert_array_equal(got[n:], 0)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "symplectic_euler", "rk4"])
+def test_engines_agree_on_a_mixed_fleet(integrator):
+    found = []
+    for engine in ("plain", "fused"):
+        sim = in_flight(Sim(2, drone=FLEET, control="attitude", integrator=integrator, engine=engine), positions(2, 4))
+        sim.step(50)
+        assert sim.step_fn.engines == [engine]
+        found.append(sim.data.states)
+    for name in STATES:
+        np.testing.assert_allclose(getattr(found[0], name), getattr(found[1], name), rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("dynamics", ["so_rpy", "so_rpy_rotor"])
+def test_fitted_models_may_be_mixed(dynamics):
+    fleet = ("cf21B_500", "cf2x_L250")
+    pos = positions(2, 2)
+    mixed = in_flight(Sim(2, drone=fleet, dynamics=dynamics, engine="plain"), pos)
+    mixed.step(50)
+    for k, airframe in enumerate(fleet):
+        own = in_flight(Sim(2, drone=airframe, dynamics=dynamics, engine="plain"), pos[:, k : k + 1])
+        own.step(50)
+        np.testing.assert_allclose(mixed.data.states.pos[:, k], own.data.states.pos[:, 0], rtol=1e-6)
+
+
+def test_alike_airframes_share_their_parameters():
+    """Nothing changes where all are alike, named once or once for each."""
+    one, each = Sim(2, 2), Sim(2, drone=["cf21B_500", "cf21B_500"])
+    assert each.n_drones == 2
+    assert each.airframe.name == "cf21B_500"
+    shapes = [[x.shape for x in jax.tree.leaves(sim.data)] for sim in (one, each)]
+    assert shapes[0] == shapes[1]
+    assert jax.tree.structure(one.data) == jax.tree.structure(each.data)
+
+
+def test_only_what_differs_is_one_per_drone():
+    params = Sim(3, drone=FLEET).data.params
+    assert params.gravity_vec.shape == (3,)
+    assert params.mass.shape == (3, 4, 1)
+    assert params.mixing_matrix.shape == (3, 4, 3, 6)
+    exists = params.rotor_vel_max[0, :, 4:] > 0
+    np.testing.assert_array_equal(jnp.all(exists, axis=-1), [False, False, True, False])
+    np.testing.assert_array_equal(jnp.any(exists, axis=-1), [False, False, True, False])
+
+
+@pytest.mark.parametrize("n_worlds", [1, 2, 3])
+def test_worlds_and_drones_may_be_equally_many(n_worlds):
+    sim = Sim(n_worlds, drone=FLEET[:n_worlds] if n_worlds > 1 else FLEET[:2], engine="plain")
+    check_axes(sim.data, n_worlds, sim.n_drones)
+    mass = [airframe.value("rigid_body.mass") for airframe in sim.airframes]
+    np.testing.assert_allclose(sim.data.params.mass[..., 0], np.broadcast_to(mass, (n_worlds, sim.n_drones)), rtol=1e-6)
+
+
+def test_hover_of_a_mixed_fleet_carries_the_weight_of_each():
+    params = Sim(1, drone=FLEET).data.params
+    speed = first_principles.hover_rotor_vel(params)
+    thrust = jnp.sum(first_principles.curve(speed, params.rpm2thrust), axis=-1)
+    np.testing.assert_allclose(thrust, 9.81 * params.mass[..., 0], rtol=1e-5)
+    np.testing.assert_array_equal(speed[0, 0, 4:], 0)
+
+
+def test_gradients_of_a_mixed_fleet_are_finite():
+    """Law 7: missing rotors are no division by zero."""
+    for controller in ("crazyflow", "geometric"):
+        sim = in_flight(Sim(1, drone=FLEET, control="state", controller=controller, engine="lanes"), positions(1, 4))
+
+        def height(command, sim=sim):
+            data = cs.functional.state_control(sim.data, command)
+            return jnp.sum(sim.step_fn(data, 10).states.pos)
+
+        slope = jax.grad(height)(jnp.broadcast_to(jnp.asarray(COMMANDS["state"]), (1, 4, 16)))
+        assert np.all(np.isfinite(slope))
+        assert np.all(slope[0, :, 2] != 0)
+
+
+def test_effects_take_the_numbers_of_each_airframe():
+    fleet = ("cf21B_500", HEXAROTOR | {"shape": {"propeller_radius": 0.03}})
+    sim = Sim(2, drone=fleet, engine="plain")
+    effects = (cs.Battery(0.35, 0.1), cs.GroundEffect(), cs.MotorFailure(), cs.Downwash())
+    for effect in effects:
+        sim.add(effect)
+    for k, airframe in enumerate(fleet):
+        own = Sim(2, drone=airframe, engine="plain")
+        for effect in effects:
+            record, mixed = own.add(effect).read(own.data), effect.read(sim.data)
+            for name in ("full_speed_voltage", "propeller_radius", "rotor_pos", "diameter"):
+                if hasattr(record, name):
+                    expected = np.asarray(getattr(record, name))
+                    got = np.asarray(getattr(mixed, name))
+                    got = got[0, k] if got.ndim > expected.ndim else got
+                    got = got[: len(expected)]  # rows of rotors that it lacks follow
+                    np.testing.assert_allclose(got, expected, rtol=1e-6, err_msg=name)
+    sim.step(2)
+    assert np.all(np.isfinite(sim.data.states.pos))
+
+
+def test_contacts_and_rays_meet_the_shape_of_each_drone():
+    fleet = ("cf21B_500", "bumblebee", "cf21B_500")
+    sim = Sim(1, drone=fleet)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray([[[0.0, 0, 2], [5, 0, 2], [0, 5, 2]]])))
+    radii = np.array([airframe.value("shape.collision_sphere")[3] for airframe in sim.airframes])
+    heights = np.array([airframe.value("shape.collision_sphere")[2] for airframe in sim.airframes])
+    report = sim.contact_report()
+    np.testing.assert_allclose(report.floor_distance[0], 2 + heights - radii, atol=1e-5)
+    between = np.linalg.norm([5.0, 0, heights[0] - heights[1]]) - radii[0] - radii[1]
+    np.testing.assert_allclose(report.drone_distance[0, :2], between, atol=1e-5)
+    alone = cs.RangeFinder(directions=[[0.0, 0, -1]])
+    sim.add(alone)
+    sim.step()
+    assert sim.contact_report().nearest_drone.shape == (1, 3)
+
+
+def test_a_mixed_fleet_is_drawn():
+    sim = Sim(1, drone=("cf21B_500", "bumblebee", HEXAROTOR))
+    model = sim.mj_model
+    n_geoms = [sum(model.geom_bodyid == model.body(f"drone:{k}").id) for k in range(3)]
+    assert n_geoms[2] == n_geoms[0] + 6  # arm, motor and propeller of two more rotors
+    sizes = [model.geom(f"col_sphere:{k}").size[0] for k in range(2)]
+    assert sizes[1] > 2 * sizes[0]
+
+
+def test_drones_of_a_mixed_fleet_stand_on_the_floor():
+    sim = Sim(1, drone=("cf21B_500", "bumblebee"), engine="plain")
+    sim.add(cs.ContactResponse())
+    pos = sim.data.states.pos.at[..., 2].set(0.3)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    sim.step(1000)
+    for k, airframe in enumerate(sim.airframes):
+        box = airframe.value("shape.collision_box")
+        np.testing.assert_allclose(sim.data.states.pos[0, k, 2], box[5] - box[2], atol=5e-3)
+
+
+def test_one_airframe_is_asked_for_where_there_are_several():
+    sim = Sim(drone=("cf21B_500", "bumblebee"))
+    for name in ("airframe", "drone"):
+        with pytest.raises(ConfigError, match=r"'cf21B_500', 'bumblebee'\. Use sim\.airframes, one for each"):
+            getattr(sim, name)
+    assert [airframe.name for airframe in sim.airframes] == ["cf21B_500", "bumblebee"]
+
+
+@pytest.mark.parametrize(
+    ("n_drones", "fleet", "error", "message"),
+    [
+        (3, ["cf21B_500", "bumblebee"], ConfigError, r"expected 3 airframes, .* got 2. Use Sim\(n_drones=2\)"),
+        (1, [], ConfigError, "expected 1 airframes, one for each drone, got 0"),
+        (2, ["cf21B_500", "bumble"], UnknownNameError, "expected a drone as one of .* got 'bumble'"),
+        (2, ["cf21B_500", 3], ConfigError, "expected a drone as a name"),
+    ],
+)
+def test_wrong_lists_are_refused(n_drones, fleet, error, message):
+    """Law 9."""
+    with pytest.raises(error, match=message):
+        Sim(n_drones=n_drones, drone=fleet)
+
+
+def test_airframes_that_lack_gains_are_named():
+    with pytest.raises(ConfigError, match=r"airframe 'bumblebee' has no table \[mellinger\]"):
+        Sim(drone=FLEET, control="state", controller="mellinger")
+    lacking = for_drones
+    records = {"cf21B_500": first_principles.Params.create(load_airframe("cf21B_500"))}
+    records["bumblebee"] = records["cf21B_500"].replace(L=None)
+    with pytest.raises(ConfigError, match="the same numbers for Params, got 'cf21B_500' and 'bumblebee'"):
+        lacking([load_airframe(name) for name in records], lambda airframe: records[airframe.name], 1)
+
+
+def test_resets_keep_the_airframes():
+    sim = in_flight(Sim(2, drone=FLEET), positions(2, 4))
+    mass = np.asarray(sim.data.params.mass)
+    sim.step(5)
+    sim.reset(np.array([True, False]))
+    np.testing.assert_array_equal(sim.data.params.mass, mass)
+    sim.reset()
+    np.testing.assert_array_equal(sim.data.params.mass, mass)

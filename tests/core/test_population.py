@@ -1,0 +1,439 @@
+"""Populations: records with members, stages of one member, and programs of their own."""
+
+import re
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from springs import STIFFNESS, Masses, Springs, Tied, Tying
+
+from crazysim import ConfigError, Sim, stage
+from crazysim.core.pipeline import insert_fn_before
+from crazysim.core.population import Population
+from crazysim.core.random import member_key, world_key
+from crazysim.core.sharding import world_mesh
+from crazysim.engine import Step, kernel
+from crazysim.errors import EngineWarning, UnknownNameError
+from crazysim.pytree import PyTree, check_axes, leaf, scopes
+
+COUNTS = [(1, 1, 1), (2, 2, 2), (3, 3, 3), (3, 2, 4), (2, 4, 3), (4, 3, 1), (2, 1, 2)]
+KINDS = (Springs, Tied, Tying)
+ENGINES = ("plain", "lanes", "fused", "interpret")
+
+
+def build(kind, n_worlds=2, n_drones=2, n_members=3, **settings):
+    """Return a simulation of drones in the air, different ones, with a population."""
+    sim = Sim(n_worlds, n_drones, control="attitude", attitude_freq=250, **settings)
+    sim.add(kind(n_members))
+    rng = np.random.default_rng(0)
+    pos = jnp.asarray(rng.uniform(1, 2, (n_worlds, n_drones, 3)), jnp.float32)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    cmd = rng.uniform(-1, 1, (n_worlds, n_members, 3))
+    sim.data = sim.plugins["springs"].commanded(sim.data, cmd)
+    sim.build_default_data()
+    sim.attitude_control(np.tile([0.1, 0.0, 0.0, 0.4], (n_worlds, n_drones, 1)))
+    return sim
+
+
+def numbers(data):
+    """Return the states of drones and masses."""
+    record = data.plugins["springs"]
+    return {"drones": data.states.pos, "speeds": data.states.vel, "masses": record.pos, "ticks": record.ticks}
+
+
+@pytest.mark.parametrize(("n_worlds", "n_drones", "n_members"), COUNTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_engines_agree_for_any_counts(kind, n_worlds, n_drones, n_members):
+    """Law 2: axes are the declared ones, also where worlds, drones and members are equally many."""
+    found = {}
+    for engine in ("plain", "lanes", "interpret"):
+        sim = build(kind, n_worlds, n_drones, n_members, engine=engine)
+        sim.step(7)
+        assert sim.step_fn.engines == [engine]
+        found[engine] = numbers(sim.data)
+    for engine, values in found.items():
+        for name, value in values.items():
+            np.testing.assert_allclose(value, found["plain"][name], rtol=2e-5, atol=2e-6, err_msg=f"{engine} {name}")
+    assert np.ptp(found["plain"]["masses"]) > 0
+    np.testing.assert_array_equal(found["plain"]["ticks"], 2)  # 100 Hz: steps 0 and 5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_kernel_computes_what_plain_does(kind):
+    plain, fused = (build(kind, 3, 2, 4, engine=engine) for engine in ("plain", "fused"))
+    for sim in (plain, fused):
+        sim.step(11)
+    assert fused.step_fn.plan(fused.data).engine == "fused"
+    for name, value in numbers(plain.data).items():
+        np.testing.assert_allclose(numbers(fused.data)[name], value, rtol=2e-5, atol=2e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("engine", ["plain", "lanes"])
+def test_a_member_moves_as_it_does_alone(engine):
+    """Law 1."""
+    sim = build(Springs, 3, 2, 4, engine=engine)
+    sim.step(9)
+    record = sim.data.plugins["springs"]
+    for world, member in ((0, 0), (2, 1), (1, 3)):
+        one = Sim(engine=engine)
+        one.add(Springs(1))
+        mass, start = one.data.plugins["springs"], sim.default_data.plugins["springs"]
+        own = mass.replace(pos=start.pos[world, member][None, None], cmd=start.cmd[world, member][None, None])
+        one.data = one.plugins["springs"].write(one.data, own)
+        one.step(9)
+        np.testing.assert_allclose(one.data.plugins["springs"].pos[0, 0], record.pos[world, member], rtol=1e-6)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "symplectic_euler", "rk4"])
+def test_integration_follows_the_scheme(integrator):
+    """Law 8: a spring is a cosine; the error falls with the order of the scheme."""
+    errors, freqs = [], (50, 100, 200)
+    with jax.enable_x64(True):
+        for freq in freqs:
+            sim = Sim(freq=freq, integrator=integrator, engine="plain")
+            sim.add(Springs(1, rate=None))
+            sim.step(2 * freq // 5)
+            exact = np.cos(np.sqrt(STIFFNESS) * 0.4)
+            errors.append(abs(float(sim.data.plugins["springs"].pos[0, 0, 0]) - exact))
+    slope = np.polyfit(np.log(1 / np.asarray(freqs)), np.log(errors), 1)[0]
+    assert abs(slope - sim.integrator.order) < 0.35
+
+
+def test_semi_implicit_euler_keeps_energy():
+    energies = {}
+    for integrator in ("euler", "symplectic_euler"):
+        sim = Sim(integrator=integrator, engine="plain")
+        sim.add(Springs(1, rate=None))
+        sim.step(2000)
+        record = sim.data.plugins["springs"]
+        energies[integrator] = float(jnp.sum(STIFFNESS * record.pos**2 + record.vel**2)) / (3 * STIFFNESS)
+    assert abs(energies["symplectic_euler"] - 1) < 0.02
+    assert energies["euler"] > 1.3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_pass_through_a_population(kind):
+    def loss(sim, cmd):
+        data = sim.plugins["springs"].commanded(sim.data, cmd)
+        data = sim.step_fn(data, 5)
+        return jnp.sum(data.plugins["springs"].pos ** 2) + jnp.sum(data.states.pos)
+
+    found = []
+    for engine in ("plain", "lanes", "fused"):
+        sim = build(kind, 2, 2, 3, engine=engine)
+        found.append(jax.grad(lambda cmd, sim=sim: loss(sim, cmd))(jnp.ones((2, 3, 3))))
+    assert np.all(np.abs(found[0]) > 0)
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], rtol=1e-4, atol=1e-8)
+    h = jnp.zeros((2, 3, 3)).at[1, 2, 0].set(0.5)  # the loss is quadratic
+    central = loss(sim, jnp.ones((2, 3, 3)) + h) - loss(sim, jnp.ones((2, 3, 3)) - h)
+    np.testing.assert_allclose(found[0][1, 2, 0], central, rtol=2e-2)
+
+
+def test_a_derivative_reaches_the_drones_from_a_mass():
+    sim = build(Tying, 2, 2, 3, engine="fused")
+
+    def height(pos):
+        record = sim.data.plugins["springs"].replace(pos=pos)
+        return sim.step_fn(sim.plugins["springs"].write(sim.data, record), 5).states.pos[1, 0, 2]
+
+    slope = jax.grad(height)(sim.data.plugins["springs"].pos)
+    assert np.all(slope[1, :, 2] != 0)
+    assert np.all(slope[0] == 0)
+
+
+def test_worlds_are_reset_with_their_members():
+    sim = build(Tying, 3, 2, 2)
+    sim.step(20)
+    before = sim.data.plugins["springs"]
+    sim.reset(np.array([True, False, True]))
+    after, start = sim.data.plugins["springs"], sim.default_data.plugins["springs"]
+    for name in ("pos", "vel", "ticks"):
+        np.testing.assert_array_equal(getattr(after, name)[::2], getattr(start, name)[::2])
+        np.testing.assert_array_equal(getattr(after, name)[1], getattr(before, name)[1])
+    assert not np.array_equal(before.pos[0], start.pos[0])
+
+
+@pytest.mark.parametrize("kind", [Springs, Tying])
+@pytest.mark.parametrize("engine", ["plain", "lanes", "fused"])
+def test_worlds_are_spread_over_devices(kind, engine):
+    alone = build(kind, 4, 2, 3, engine=engine)
+    spread = build(kind, 4, 2, 3, engine=engine, mesh=world_mesh(jax.devices("cpu")[:2]))
+    for sim in (alone, spread):
+        sim.step(8)
+    assert spread.step_fn.plan(spread.data).engine == engine
+    assert len(spread.data.plugins["springs"].pos.sharding.device_set) == 2
+    for name, value in numbers(alone.data).items():
+        np.testing.assert_allclose(numbers(spread.data)[name], value, rtol=1e-6, atol=1e-7, err_msg=name)
+
+
+def test_random_numbers_are_those_of_world_and_member():
+    """Law 10: they do not depend on how many worlds and members there are."""
+
+    @stage("springs")
+    def kick(data):
+        record = data.plugins["springs"]
+        vel = record.vel + jax.random.normal(member_key(data, "springs", "kick"), (3,))
+        return data.replace(plugins=data.plugins | {"springs": record.replace(vel=vel)})
+
+    drawn = {}
+    for engine, counts in (("plain", (3, 2, 4)), ("lanes", (2, 1, 3))):
+        sim = Sim(*counts[:2], engine=engine)
+        sim.add(Springs(counts[2], stiffness=0.0))
+        insert_fn_before(sim.step_pipeline, "integration", kick)
+        sim.step(3)
+        drawn[engine] = sim.data.plugins["springs"].vel
+    np.testing.assert_allclose(drawn["plain"][:2, :3], drawn["lanes"], rtol=1e-6)
+    assert len(np.unique(drawn["plain"])) == drawn["plain"].size
+    data = sim.data
+    one = data.replace(core=jax.tree.map(lambda x: x.reshape(-1)[0], data.core))
+    assert world_key(one, "kick") != member_key(one.replace(plugins={"springs": _first(data)}), "springs", "kick")
+
+
+def _first(data):
+    record = data.plugins["springs"]
+    return record.replace(member_id=record.member_id[0, 0])
+
+
+def test_an_independent_population_costs_the_drones_nothing():
+    """The drones' kernel and the leaves that they read are those without a population."""
+    alone, beside = Sim(2, 2, engine="lanes"), Sim(2, 2, engine="lanes")
+    beside.add(Springs(3))
+    programs = beside.step_fn.plan(beside.data).programs
+    assert [p.population for p in programs] == ["drone", "springs"]
+    plan = alone.step_fn.plan(alone.data)
+    for target in ("cuda", "host"):
+        assert _source(programs[0], target) == _source(plan.program, target)
+        assert kernel.write(programs[1], target).group == 1
+    assert len(plan.programs) == 1
+    assert "fused, for one member of 'springs': springs_control, springs_integration" in beside.explain()
+
+
+def _source(program, target):
+    """Return the source of a kernel, with another name for the packed leaf, whose number is that of leaves."""
+    return re.sub(rf"\b([px]){len(program.leaves) - 1}(?=\b|_)", r"\1packed", kernel.write(program, target).text)
+
+
+def test_what_depends_on_each_other_runs_together():
+    for kind, n in ((Springs, 2), (Tied, 1), (Tying, 1)):
+        sim = build(kind, engine="lanes")
+        assert len(sim.step_fn.plan(sim.data).programs) == n, kind
+
+
+def test_two_populations_are_two_programs():
+    sim = Sim(2, 2, engine="fused")
+    sim.add(Springs(3))
+    sim.add(Springs(["Mass_7", "Mass_8"], name="others", stiffness=0.0))
+    assert [p.population for p in sim.step_fn.plan(sim.data).programs] == ["drone", "springs", "others"]
+    sim.step(50)
+    springs, others = sim.data.plugins["springs"], sim.data.plugins["others"]
+    assert springs.pos.shape == (2, 3, 3)
+    np.testing.assert_array_equal(others.pos, np.broadcast_to(np.arange(1.0, 3)[:, None], (2, 2, 3)))
+    assert np.all(np.abs(springs.pos - others.pos[:, [0, 1, 1]]) > 0.01)
+    np.testing.assert_array_equal(sim.data.core.steps, 50)
+
+
+def test_parameters_may_differ_between_members():
+    for engine in ("plain", "lanes", "fused"):
+        sim = build(Springs, 2, 1, 2, engine=engine)
+        record = sim.data.plugins["springs"]
+        assert jax.tree.leaves(scopes(record)) == ["springs"] * 5 + ["shared"]
+        stiffness = jnp.asarray([[[0.0], [10.0]], [[20.0], [0.0]]])
+        sim.data = sim.plugins["springs"].write(sim.data, record.replace(stiffness=stiffness))
+        assert jax.tree.leaves(scopes(sim.data.plugins["springs"]))[-1] == "springs"
+        sim.step(10)
+        moved = np.any(sim.data.plugins["springs"].vel != 0, axis=-1)
+        np.testing.assert_array_equal(moved, [[False, True], [True, False]])
+
+
+def test_many_members_that_read_the_drones_run_unfused_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", EngineWarning)
+        sim = build(Tied, 2, 2, 9, engine="lanes")
+        sim.step(3)
+    plain = build(Tied, 2, 2, 9, engine="plain")
+    plain.step(3)
+    for name, value in numbers(plain.data).items():
+        np.testing.assert_allclose(numbers(sim.data)[name], value, rtol=2e-5, atol=2e-6, err_msg=name)
+
+
+def test_a_stage_that_no_engine_supports_is_reported_once():
+    @stage("springs")
+    def turned(data):
+        record = data.plugins["springs"]
+        q, _ = jnp.linalg.qr(jnp.eye(3) + jnp.outer(record.pos, record.pos))
+        return data.replace(plugins=data.plugins | {"springs": record.replace(vel=record.vel + 0 * q[0])})
+
+    sim = build(Springs, engine="lanes")
+    insert_fn_before(sim.step_pipeline, "integration", turned)
+    with pytest.warns(EngineWarning, match="'turned' is not fused") as caught:
+        sim.step(2)
+    assert len(caught) == 1
+
+
+def test_a_mass_that_is_not_finite_flags_its_world_alone():
+    for engine in ("plain", "lanes", "fused"):
+        sim = build(Springs, 3, 2, 2, engine=engine)
+        record = sim.data.plugins["springs"]
+        sim.data = sim.plugins["springs"].write(sim.data, record.replace(vel=record.vel.at[1, 0, 0].set(jnp.nan)))
+        sim.step(2)
+        np.testing.assert_array_equal(sim.data.core.nonfinite[:, 0], [False, True, False], engine)
+        assert np.all(np.isfinite(sim.data.states.pos))
+
+
+def test_a_population_is_added_replaced_and_removed():
+    sim = Sim(2, 2, engine="lanes")
+    before, leaves = list(sim.step_pipeline), len(jax.tree.leaves(sim.data))
+    sim.add(Springs(2))
+    assert list(sim.step_pipeline) == [
+        *before[:-3],
+        "springs_control",
+        *before[-3:-1],
+        "springs_integration",
+        before[-1],
+    ]
+    sim.step(5)
+    speed = sim.data.plugins["springs"].vel
+    size = sim.step_fn._cache_size()
+    sim.replace(Springs(2, stiffness=0.0))
+    np.testing.assert_array_equal(sim.data.plugins["springs"].vel, speed)
+    sim.step(5)
+    np.testing.assert_array_equal(sim.data.plugins["springs"].vel, speed)
+    assert sim.step_fn._cache_size() <= size + 1  # zeros of shared parameters are folded
+    sim.remove("springs")
+    assert list(sim.step_pipeline) == before
+    assert len(jax.tree.leaves(sim.data)) == leaves
+
+
+def test_ten_calls_are_one_trace():
+    """Law 6."""
+    sim = build(Springs, engine="lanes")
+    for n in range(10):
+        sim.step(n + 1)
+    assert sim.step_fn._cache_size() == 1
+
+
+def test_names_are_those_given_or_numbers():
+    assert Springs(2).names == ("Mass_0", "Mass_1")
+    assert Springs(["Mass_7", "Mass_2"]).names == ("Mass_7", "Mass_2")
+
+
+@pytest.mark.parametrize(
+    ("plugin", "message"),
+    [
+        (Springs(0), "a positive number or a list of names, got 0"),
+        (Springs(True), "a positive number or a list of names, got True"),
+        (Springs("Mass_0"), "a positive number or a list of names, got 'Mass_0'"),
+        (Springs(["Mass_0", 1]), "a positive number or a list of names"),
+        (Springs(["Mass_0", "Mass_0"]), "distinct names of members, got 'Mass_0' twice"),
+        (Springs(name="drone"), "name of a population, got 'drone'"),
+        (Springs(name="shared"), "name of a population, got 'shared'"),
+        (Springs(rate=300), "to divide freq = 500 Hz, got 300 Hz. Use the nearest rate below, 250 Hz"),
+        (Springs(rate=-1), "control_freq of 'springs' is -1; it must be a positive whole number"),
+    ],
+)
+def test_wrong_settings_are_refused(plugin, message):
+    """Law 9; the simulation stays as it was."""
+    sim = Sim(2, 2)
+    pipeline = dict(sim.step_pipeline)
+    with pytest.raises(ConfigError, match=message):
+        sim.add(plugin)
+    assert sim.step_pipeline == pipeline
+    assert not sim.data.plugins
+
+
+def test_a_stage_of_a_population_that_does_not_exist_is_refused():
+    sim = Sim(engine="plain")
+
+    @stage("cars")
+    def drive(data):
+        return data
+
+    insert_fn_before(sim.step_pipeline, "integration", drive)
+    with pytest.raises(ConfigError, match="'drive' is declared for one 'cars', and there is no population"):
+        sim.step()
+    sim.add(Springs(2))
+    with pytest.raises(ConfigError, match="there are 'springs'"):
+        sim.step()
+
+
+def test_a_stage_writes_its_own_population_alone():
+    sim = build(Springs, engine="plain")
+
+    @stage("springs")
+    def greedy(data):
+        return data.replace(states=data.states.replace(pos=data.states.pos + 1))
+
+    insert_fn_before(sim.step_pipeline, "integration", greedy)
+    with pytest.raises(ConfigError, match=r"'greedy' is declared for one springs and writes states\.pos"):
+        sim.step()
+
+
+def test_commands_of_another_shape_are_refused():
+    sim = build(Springs, 2, 2, 3)
+    springs = sim.plugins["springs"]
+    with pytest.raises(ValueError, match=r"expected a command of shape \(2, 3, 3\) for 'springs', got \(3,\)"):
+        springs.commanded(sim.data, np.zeros(3))
+    with pytest.raises(ValueError, match="expected finite numbers as command of 'springs'"):
+        springs.commanded(sim.data, np.full((2, 3, 3), np.nan))
+
+    class Still(Population):
+        name: str = "still"
+
+        def record(self, sim):
+            return self.create(sim, Masses, pos=0, vel=np.zeros(3), cmd=np.zeros(3), ticks=0, stiffness=np.ones(1))
+
+    with pytest.raises(ConfigError, match="expected pos with 1 dimensions"):
+        sim.add(Still())
+
+
+def test_leaves_have_the_axes_of_their_population():
+    sim = build(Springs, 2, 2, 3)
+    record = sim.data.plugins["springs"]
+    for wrong in (record.replace(pos=record.pos[:, :2]), record.replace(stiffness=jnp.ones((2, 2, 1)))):
+        with pytest.raises(ConfigError, match=r"begin with \(2, 3\).*for 2 worlds of 3 springs"):
+            check_axes(sim.plugins["springs"].write(sim.data, wrong), 2, 2)
+
+
+def test_records_within_a_record_belong_to_its_population():
+    class Inner(PyTree):
+        x: jax.Array = leaf("member")
+
+    class Outer(Masses):
+        inner: Inner
+
+    record = build(Springs).data.plugins["springs"]
+    values = {name: getattr(record, name) for name in ("member_id", "pos", "vel", "cmd", "ticks", "stiffness")}
+    outer = Outer("springs", 3, inner=Inner(record.ticks), **values)
+    assert scopes(outer).inner.x == "springs"
+
+
+def test_a_rate_of_something_else_is_refused():
+    class Wrong(Springs):
+        def derivative(self, data):
+            return {"mass": 1.0}
+
+    sim = Sim(engine="plain")
+    sim.add(Wrong())
+    with pytest.raises(ConfigError, match="rates of leaves of members in its record, which are 'member_id', 'pos'"):
+        sim.step()
+
+
+def test_the_step_is_used_inside_jit_and_vmap():
+    sim = build(Tying, 2, 2, 3, engine="lanes")
+    step = Step(sim.step_pipeline, "lanes")
+
+    def final(cmd):
+        return step(sim.plugins["springs"].commanded(sim.data, cmd), 3).plugins["springs"].pos
+
+    commands = jnp.stack([jnp.ones((2, 3, 3)), jnp.zeros((2, 3, 3))])
+    both = jax.jit(jax.vmap(final))(commands)
+    for k in range(2):
+        np.testing.assert_allclose(both[k], final(commands[k]), rtol=1e-6)
+
+
+def test_an_unknown_plugin_is_refused():
+    with pytest.raises(UnknownNameError, match="springs"):
+        Springs().read(Sim().data)

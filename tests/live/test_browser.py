@@ -1,0 +1,208 @@
+"""A live simulation in a real browser: seen, clicked, piloted, and left."""
+
+import logging
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+from browsing import NEAR, start_browser, wait_for
+
+from crazysim import Wind
+from crazysim.errors import ConfigError, RenderError
+from crazysim.live import Browser, Live, Pilot
+from crazysim.live.browser_scene import grid_offsets
+from crazysim.live.picture import PictureSource, quantities, quantity
+from crazysim.media.web import FOV
+from crazysim.sim import Sim
+
+MAGENTA = (1, 0, 1)
+
+
+@pytest.fixture(scope="module")
+def sim(plain_scene):
+    """Two magenta drones that hover at 1 m, 2 m apart."""
+    sim = Sim(n_drones=2, control="state", xml_path=plain_scene)
+    sim.mj_model.mat_rgba[:] = [1, 0, 1, 1]
+    pos = np.array([[[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]]])
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    sim.build_default_data()
+    return sim
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory):
+    browser = start_browser(tmp_path_factory.mktemp("browser"), width=1400, height=700)
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def live(sim):
+    """A running loop, paused, with a page."""
+    sim.reset()
+    live = Live(sim)
+    live.command[..., 2] = 1.0
+    live.selected = None
+    live.paused = True
+    return live
+
+
+class Running:
+    """A loop that runs in a thread while a test uses the page."""
+
+    def __init__(self, live):
+        self.live, self._thread = live, threading.Thread(target=live.run)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.live.post(lambda live: live.stop())
+        self._thread.join(30)
+        self.live.close()
+
+
+def pixel(chromium, point, size):
+    """Return column and row at which the page's camera sees a point at first."""
+    position, target = np.array([0.0, -0.9 * size, 0.6 * size + 0.5]), np.array([0, 0, 0.5])
+    ahead = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
+    left, top, width, height = chromium.box("canvas")
+    focal = 0.5 * height / np.tan(np.deg2rad(FOV / 2))
+    x, y, z = (np.asarray(point) - position) @ np.stack([right, np.cross(right, ahead), ahead]).T
+    return np.array([left + 0.5 * width + focal * x / z, top + 0.5 * height - focal * y / z])
+
+
+def click(chromium, place):
+    where = {"x": float(place[0]), "y": float(place[1]), "button": "left", "clickCount": 1}
+    chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=where["x"], y=where["y"])
+    for event in ("mousePressed", "mouseReleased"):
+        chromium.call("Input.dispatchMouseEvent", type=event, **where)
+
+
+def press(chromium, text):
+    """Press the button with a text, once it is there."""
+    find = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() === {text!r})"
+    wait_for(lambda: chromium.value(f"!!{find}"))
+    chromium.value(f"{find}.click()")
+
+
+SIZE = 4.0
+"""Extent of the worlds of these tests, m: 2 m between the drones, and 1 m of margin on both sides."""
+
+
+def test_a_page_is_watched_and_used(viser, chromium, live):
+    pilot, clicked, values = Pilot(), [], []
+    live.add(pilot)
+    live.on_click = lambda live, world, point: clicked.append((world, point))
+    live.button("Shoot", lambda live: values.append("shot"))
+    live.slider("wind", 0.0, 10.0, 5.0, lambda live, value: values.append(value))
+    page = live.show(Browser(port=0, trail=0.5))
+    with Running(live):
+        chromium.call("Page.navigate", url=page.url)
+        wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
+
+        # The left drone is where it is.
+        live.post(lambda live: live.select(0, 0))
+        left, right = pixel(chromium, [-1, 0, 1], SIZE), pixel(chromium, [1, 0, 1], SIZE)
+        wait_for(lambda: len(chromium.mask(MAGENTA)[0]) > 40)
+        columns = np.sort(chromium.mask(MAGENTA)[1])
+        assert abs(columns[0] - left[0]) < 4 * NEAR
+        np.testing.assert_allclose(columns[-1], right[0], atol=4 * NEAR)
+
+        # A click on the right one selects it, one on the ground is reported in the world's frame.
+        wait_for(lambda: (click(chromium, right), time.sleep(0.3), live.selected == (0, 1))[-1])
+        click(chromium, pixel(chromium, [-0.5, -1.0, 0.0], SIZE))
+        wait_for(lambda: clicked)
+        assert clicked[0][0] == 0
+        np.testing.assert_allclose(clicked[0][1], [-0.5, -1.0, 0.0], atol=0.05)
+
+        # Buttons: single steps, events, pause, reset.
+        step = live.step
+        press(chromium, "step")
+        wait_for(lambda: live.step == step + 1)
+        press(chromium, "Shoot")
+        wait_for(lambda: values == ["shot"])
+        press(chromium, "pause")
+        wait_for(lambda: live.step > 50)
+        text = "document.body.innerText"
+        wait_for(lambda: "real time" in chromium.value(text) and "paused" not in chromium.value(text))
+
+        # A key of the page flies the selected drone, upwards.
+        before = float(live.command[0, 1, 2])
+        for kind in ("keyDown", "keyUp"):
+            chromium.call("Input.dispatchKeyEvent", type=kind, key="w", code="KeyW", windowsVirtualKeyCode=87)
+        wait_for(lambda: live.command[0, 1, 2] > before + 0.05)
+        press(chromium, "pause")
+        wait_for(lambda: live.paused)
+
+        # The browser leaves and comes back; the loop does not care.
+        chromium.call("Page.navigate", url="about:blank")
+        wait_for(lambda: page.n_clients == 0)
+        press_again = live.step
+        live.post(lambda live: live.advance(5))
+        wait_for(lambda: live.step == press_again + 5)
+        chromium.call("Page.navigate", url=page.url)
+        wait_for(lambda: page.n_clients == 1 and len(chromium.mask(MAGENTA)[0]) > 40)
+    assert not page.is_open
+
+
+def test_a_port_in_use_is_named(viser, live, caplog):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(RenderError, match=f"expected a free address, got 127.0.0.1:{port}"):
+            live.show(Browser(port=port))
+    with pytest.raises(RenderError, match="Choose another port"):
+        live.show(Browser(port=99_999))
+    assert "every machine" not in caplog.text
+    with caplog.at_level(logging.WARNING), live:
+        live.show(Browser(port=0, host="0.0.0.0"))
+    assert "listening at 0.0.0.0" in caplog.text
+    assert "every machine of that network" in caplog.text
+
+
+def test_wrong_settings(viser, live):
+    with pytest.raises(ConfigError, match="trail of 0 or more"):
+        Browser(trail=-1)
+    with pytest.raises(ConfigError, match="spacing of 0 or more"):
+        Browser(spacing=float("nan"))
+    with pytest.raises(ConfigError, match="a world from 0 to 0, got 3"):
+        live.show(Browser(port=0, worlds=[3]))
+
+
+def test_worlds_stand_in_a_grid():
+    np.testing.assert_allclose(grid_offsets(1, 3.0), [[0, 0, 0]])
+    np.testing.assert_allclose(grid_offsets(4, 2.0), [[-1, 1, 0], [1, 1, 0], [-1, -1, 0], [1, -1, 0]])
+    assert len(np.unique(grid_offsets(7, 1.0), axis=0)) == 7
+
+
+def test_a_picture_has_what_is_drawn():
+    sim = Sim(n_worlds=3, n_drones=2, control="state")
+    sim.scene.add("sphere", "ball", pos=[0, 0, 3])
+    sim.add(Wind(velocity=(1.0, 2.0, 0.0)))
+    pos = sim.data.states.pos.at[1, 0].set(np.array([0.3, 0.2, 1.0], np.float32)).at[2, :, 2].set(5.0)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    live = Live(sim)
+    live.command[1, 0, :3] = [1, 2, 3]
+    live._commands.stage()
+    live.select(1, 0)
+    live.quantities["double"] = lambda live: 2.0
+    source = PictureSource(sim, [1, 2], contacts=True, wind=True)
+    picture = source.take(live, "states.pos")
+    np.testing.assert_allclose(picture.drones[0, 0], [0.3, 0.2, 1.0], atol=1e-6)
+    np.testing.assert_allclose(picture.pos[:, np.asarray(sim.data.core.drone_mocap_ids)], picture.drones)
+    np.testing.assert_allclose(picture.pos[:, np.asarray(sim.data.objects.mocap_ids)], [[[0, 0, 3]]] * 2)
+    np.testing.assert_allclose(picture.setpoint[0, 0], [1, 2, 3])
+    np.testing.assert_allclose(picture.wind, np.broadcast_to([1, 2, 0], (2, 2, 3)))
+    np.testing.assert_array_equal(picture.touching, [[False, True], [False, False]])  # one stands on the floor
+    np.testing.assert_allclose(picture.plot, [0.3, 0.2, 1.0], atol=1e-6)
+    np.testing.assert_allclose(source.take(live, "double").plot, [2.0])
+    assert "0.00 s" in picture.status
+    assert picture.name == sim.drone_names[0]
+    assert {"states.pos", "states.rotor_vel", "controls.state.cmd"} <= set(quantities(sim))
+    assert "core.steps" not in quantities(sim)
+    with pytest.raises(KeyError):
+        quantity(sim.data, "states.nothing")

@@ -1,0 +1,130 @@
+"""What was appended is read back, whatever happens to the process, and a broken end loses only itself."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+from imageio_ffmpeg import get_ffmpeg_exe
+
+from crazysim.errors import ConfigError
+from crazysim.media import Film, Flight, Recorder, View
+from crazysim.media.journal import HEAD, Journal, is_journal, read_journal
+from crazysim.sim import Sim
+
+CHUNKS = [(b"AAAA", b"first"), (b"BBBB", b""), (b"CCCC", bytes(range(256)))]
+
+
+@pytest.fixture
+def written(tmp_path):
+    path = tmp_path / "x.journal"
+    with Journal(path) as journal:
+        for chunk in CHUNKS:
+            journal.append(*chunk)
+        assert list(read_journal(path)) == CHUNKS  # while it is open
+    assert not journal.is_open
+    return path
+
+
+def test_cut_anywhere_it_has_the_chunks_before(written):
+    content = written.read_bytes()
+    last = len(content) - HEAD.size - len(CHUNKS[-1][1])
+    for length in (last, last + 1, last + HEAD.size, len(content) - 1):
+        written.write_bytes(content[:length])
+        assert list(read_journal(written)) == CHUNKS[:2]
+
+
+def test_a_damaged_chunk_ends_the_file(written):
+    content = bytearray(written.read_bytes())
+    content[content.index(b"first")] ^= 1
+    written.write_bytes(content)
+    assert list(read_journal(written)) == []
+    content[-300:] = b"\xff" * 300  # a head of nonsense that promises exabytes
+    written.write_bytes(content)
+    assert list(read_journal(written)) == []
+
+
+def test_wrong_files(written, tmp_path):
+    with pytest.raises(ConfigError, match="expected a new file"):
+        Journal(written)
+    assert list(read_journal(written)) == CHUNKS, "what was there stays"
+    with pytest.raises(ConfigError, match="expected a file that can be created"):
+        Journal(tmp_path / "nowhere" / "x")
+    other = tmp_path / "other"
+    other.write_text("else")
+    assert not is_journal(other)
+    with pytest.raises(ConfigError, match="expected a journal"):
+        list(read_journal(other))
+    with Journal(tmp_path / "y") as journal, pytest.raises(ConfigError, match="kind of 4 bytes"):
+        journal.append(b"TOOLONG", b"")
+
+
+def test_a_recorder_with_a_path_writes_the_same_flight(tmp_path):
+    sim = Sim(n_worlds=2, n_drones=2, control="state")
+    sim.scene.add("sphere", "ball", pos=[0, 1, 0.5])
+    memory, file = Recorder(sim), Recorder(sim, path=tmp_path / "f.journal")
+    command = np.zeros((2, 2, 16))
+    command[..., 2], command[..., 12] = [[1, 2], [3, 4]], 1
+    sim.state_control(command)
+    for _ in range(4):
+        memory.add()
+        file.add()
+        file.add()  # at the same time
+        sim.step(10)
+    assert len(memory) == len(file) == 4
+    file.close()
+    kept, read = memory.flight(), Flight.load(tmp_path / "f.journal")
+    assert read.pos.shape == (4, 2, 2, 3)
+    assert read.body_pos.shape == (4, 2, 1, 3)
+    for name in ("time", "pos", "quat", "body_pos", "body_quat", "setpoint", "worlds", "drone_ids", "body_ids"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(kept, name), err_msg=name)
+    assert [shape.kind for shape in read.shapes] == [shape.kind for shape in kept.shapes]
+    read.save(tmp_path / "f.npz")
+    np.testing.assert_array_equal(Flight.load(tmp_path / "f.npz").pos, kept.pos)
+
+
+def test_a_recording_without_samples_is_refused(tmp_path):
+    sim = Sim()
+    Recorder(sim, path=tmp_path / "f.journal").close()
+    with pytest.raises(ConfigError, match="at least one sample"):
+        Flight.load(tmp_path / "f.journal")
+
+
+KILLED = textwrap.dedent("""
+    import os, signal, sys
+    import numpy as np
+    from crazysim.media import Film, View
+    film = Film(sys.argv[1], View(width=64, height=48), fps=10)
+    for k in range(int(sys.argv[2])):
+        film.write(np.full((48, 64, 3), k % 256, np.uint8))
+    os.kill(film._ffmpeg.pid if sys.argv[3] == "ffmpeg" else os.getpid(), signal.SIGKILL)
+    os.waitpid(film._ffmpeg.pid, 0)
+""")
+
+
+def n_frames(path):
+    decode = [get_ffmpeg_exe(), "-loglevel", "fatal", "-i", path, "-f", "rawvideo", "-pix_fmt", "gray", "-"]
+    return len(subprocess.run(decode, capture_output=True, check=True).stdout) // (64 * 48)
+
+
+def test_a_film_survives_the_end_of_its_process(tmp_path):
+    """A killed simulation loses no frame; a killed encoder what it had not yet encoded, some seconds."""
+    path = tmp_path / "film.mp4"
+    ended = subprocess.run([sys.executable, "-c", KILLED, path, "200", "python"], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    deadline = 100
+    while (n := n_frames(path) if path.exists() and path.stat().st_size else 0) < 200 and deadline:
+        deadline -= 1
+        os.sched_yield()
+    assert n == 200
+    subprocess.run([sys.executable, "-c", KILLED, path, "400", "ffmpeg"], check=True)
+    assert n_frames(path) > 200
+
+
+def test_film_closes_in_order(tmp_path):
+    with Film(tmp_path / "film.mp4", View(width=64, height=48), fps=10) as film:
+        film.write(np.zeros((48, 64, 3), np.uint8), 30)
+    assert n_frames(tmp_path / "film.mp4") == 30

@@ -1,0 +1,40 @@
+"""A virtual screen for tests of windows."""
+
+import os
+import select
+import shutil
+import subprocess
+import time
+
+import numpy as np
+import pytest
+
+
+def virtual_screen(folder):
+    """Yield the name of a virtual screen, and the file that holds its pixels."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("no Xvfb")
+    read, write = os.pipe()
+    options = ["-displayfd", str(write), "-screen", "0", "800x600x24", "-fbdir", str(folder), "-nolisten", "tcp"]
+    server = subprocess.Popen(["Xvfb", *options], pass_fds=[write], stderr=subprocess.DEVNULL)
+    os.close(write)
+    ready, _, _ = select.select([read], [], [], 30)
+    number = os.read(read, 16).decode().strip() if ready else ""
+    assert number, "Xvfb did not start"
+    yield f":{number}", folder / "Xvfb_screen0"
+    server.terminate()
+    server.wait(10)
+    os.close(read)
+
+
+def screen_pixels(path):
+    """Return what a screen shows once it is at rest, read from its X window dump. (height, width, 3)"""
+    raw, before, deadline = path.read_bytes(), b"", time.monotonic() + 20
+    while raw != before and time.monotonic() < deadline:  # the server draws an image strip by strip
+        time.sleep(0.3)
+        raw, before = path.read_bytes(), raw
+    header = np.frombuffer(raw[:100], ">u4").astype(int)
+    start = header[0] + 12 * header[19]
+    width, height, line = header[4], header[5], header[12]
+    rows = np.frombuffer(raw[start : start + height * line], np.uint8).reshape(height, line)
+    return rows[:, : 4 * width].reshape(height, width, 4)[..., 2::-1]

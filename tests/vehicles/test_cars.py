@@ -1,0 +1,239 @@
+"""Cars in a simulation: engines, counts, commands, paths, gradients, the scene, terrain, and wrong input."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim, Terrain
+from crazysim.trajectories import circle, figure_eight
+from crazysim.vehicles import LPV, Bicycles, Cars, Path, PathLQR, PurePursuit, Stanley, ackermann
+
+EIGHT = figure_eight(5, 1.5, period=14.0, height=0.0)
+CONTROLLERS = {"pursuit": PurePursuit(), "stanley": Stanley(), "lpv": LPV(), "lqr": PathLQR()}
+
+
+def build(n_worlds=2, n_drones=1, engine="lanes", **settings):
+    sim = Sim(n_worlds, n_drones, engine=engine)
+    cars = sim.add(Cars(**settings))
+    return sim, cars
+
+
+def states_of(sim):
+    record = sim.data.plugins["cars"]
+    return {name: np.asarray(getattr(record, name)) for name in ("pos", "yaw", "body_vel", "yaw_rate", "steer")}
+
+
+@pytest.mark.parametrize(("n_worlds", "n_drones", "n_cars"), [(1, 1, 1), (2, 2, 2), (3, 1, 3), (2, 3, 4)])
+def test_engines_agree_for_any_counts(n_worlds, n_drones, n_cars):
+    found = {}
+    for engine in ("plain", "lanes", "fused"):
+        sim, cars = build(n_worlds, n_drones, engine, members=n_cars, level="speed", in_scene=False)
+        command = np.random.default_rng(0).uniform([0.5, -0.3], [1.5, 0.3], (n_worlds, n_cars, 2))
+        sim.data = cars.commanded(sim.data, command)
+        sim.step(300)
+        assert sim.step_fn.engines == [engine]
+        found[engine] = states_of(sim)
+    for engine, values in found.items():
+        for name, value in values.items():
+            np.testing.assert_allclose(value, found["plain"][name], rtol=1e-4, atol=1e-4, err_msg=f"{engine} {name}")
+    np.testing.assert_allclose(found["plain"]["body_vel"][..., 0], command[..., 0], atol=0.1)
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_cars_follow_a_path(name):
+    """Three cars on a figure eight at up to 1.5 m/s, in their places on it, that start beside it and turned."""
+    sim, _ = build(1, engine="fused", members=3, path=EIGHT, controller=CONTROLLERS[name], in_scene=False)
+    record = sim.data.plugins["cars"]
+    pos = record.pos + jnp.array([0.0, 0.1, 0.0])
+    sim.data = sim.plugins["cars"].write(sim.data, record.replace(pos=pos, yaw=record.yaw + 0.3))
+    sim.step(3000)
+    worst, lags = 0.0, []
+    for _ in range(20):
+        sim.step(150)
+        record = sim.data.plugins["cars"]
+        for k in range(3):
+            arc = record.path.project(0, record.pos[0, k, :2], record.arc[0, k, 0])
+            worst = max(worst, float(jnp.linalg.norm(record.pos[0, k, :2] - record.path.at(0, arc).pos)))
+            reference = record.path.time_reference(0, sim.data.core.steps[0, 0] / 500 - record.start[0, k, 0])[0]
+            lags.append(float(reference[0] - arc))
+    assert worst < {"pursuit": 0.06, "stanley": 0.1, "lpv": 0.05, "lqr": 0.03}[name]
+    assert np.abs(lags).max() < 0.15
+
+
+@pytest.mark.parametrize("controller", [PurePursuit(), PathLQR()], ids=["pursuit", "lqr"])
+def test_cars_follow_a_path_backwards(controller):
+    path = Path.of_trajectory(circle(2.0, speed=0.6), backwards=True)
+    sim, _ = build(1, engine="fused", path=path, controller=controller, in_scene=False)
+    sim.step(5000)
+    record = sim.data.plugins["cars"]
+    assert float(record.body_vel[0, 0, 0]) == pytest.approx(-0.6, abs=0.05)
+    assert float(jnp.linalg.norm(record.pos[0, 0, :2])) == pytest.approx(2.0, abs=0.08)
+
+
+def test_references_by_arc_length_stop_at_the_end():
+    path = Path.of_points([(0, 0), (1, 0.3), (2, 0), (3, 0.5)], speed=1.0)
+    sim, _ = build(1, engine="fused", path=path, reference="arc", in_scene=False)
+    sim.step(4000)
+    record = sim.data.plugins["cars"]
+    np.testing.assert_allclose(record.pos[0, 0, :2], [3, 0.5], atol=0.1)
+    assert float(jnp.abs(record.body_vel[0, 0, 0])) < 0.02
+
+
+def test_a_car_drives_as_it_does_alone():
+    sim, _ = build(2, 1, members=3, path=[EIGHT, circle(2.0, speed=1.0)], in_scene=False)
+    sim.step(200)
+    alone, _ = build(1, 1, path=circle(2.0, speed=1.0), in_scene=False)
+    alone.step(200)
+    for name, value in states_of(alone).items():
+        np.testing.assert_allclose(states_of(sim)[name][1, 1], value[0, 0], rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_reach_commands_and_parameters():
+    sim, cars = build(1, engine="plain", in_scene=False)
+
+    def end(command, mass):
+        data = cars.commanded(sim.data, command)
+        record = cars.read(data)
+        data = cars.write(data, record.replace(params=record.params.replace(mass=mass)))
+        return jnp.sum(cars.read(sim.step_fn(data, 100)).pos[..., :2])
+
+    command, mass = jnp.array([[[0.2, 0.1]]]), cars.read(sim.data).params.mass
+    by_command, by_mass = jax.grad(end, argnums=(0, 1))(command, mass)
+    assert np.all(np.asarray(by_command) > 0)
+    assert float(by_mass[0]) < 0
+    step = jnp.array([[[0.02, 0.0]]])
+    central = (end(command + step, mass) - end(command - step, mass)) / 0.04
+    assert float(by_command[0, 0, 0]) == pytest.approx(float(central), rel=0.02)
+
+
+def test_rest_has_finite_gradients():
+    sim, cars = build(1, engine="plain", path=EIGHT, controller=PathLQR(), in_scene=False)
+    record = cars.read(sim.data)
+
+    def end(pos):
+        return jnp.sum(cars.read(sim.step_fn(cars.write(sim.data, record.replace(pos=pos)), 60)).pos)
+
+    assert np.all(np.isfinite(jax.grad(end)(record.pos)))
+
+
+def test_resets_restore_the_start():
+    sim, _ = build(3, members=2, path=EIGHT, in_scene=False)
+    start = states_of(sim)
+    sim.step(100)
+    sim.reset(np.array([True, False, True]))
+    for name, value in states_of(sim).items():
+        np.testing.assert_array_equal(value[[0, 2]], start[name][[0, 2]])
+    assert np.ptp(states_of(sim)["pos"][1] - start["pos"][1]) > 0
+
+
+def test_external_forces_move_a_car():
+    sim, cars = build(1, in_scene=False)
+    record = cars.read(sim.data)
+    sim.data = cars.write(sim.data, record.replace(force=record.force.at[..., 0].set(2.923)))
+    sim.step(10)
+    assert float(cars.read(sim.data).body_vel[0, 0, 0]) == pytest.approx(0.02 * 2.923 / 2.923, rel=0.15)
+
+
+def test_bicycles_are_driven_by_a_torque():
+    """The acceleration is the torque over the radius, over mass and rotating inertia."""
+    sim = Sim()
+    bikes = sim.add(Bicycles(2, in_scene=False))
+    assert bikes.names == ("Bicycle_0", "Bicycle_1")
+    sim.data = bikes.commanded(sim.data, np.full((1, 2, 2), [0.01, 0.3]))
+    sim.step(500)
+    record = bikes.read(sim.data)
+    inertia = 1 + 2 * 0.1507964 + 2 * (0.01 / 0.04**2 + 0.1507964 / 2)
+    speed = float(record.body_vel[0, 0, 0])
+    # The friction of both wheels is 0.001 N m / 0.04 m, of which a part acts below the slip speed.
+    assert (0.01 / 0.04 - 2 * 0.001 / 0.04) / inertia < speed < 0.01 / 0.04 / inertia
+    np.testing.assert_array_equal(record.steer, 0.0)
+
+
+def test_wheels_roll_and_steer_in_the_scene():
+    sim, cars = build(1, members=2, trailer=True, vehicle="aiml_head", pos=[(1, 0), (-1, 0)], yaw=[0.0, np.pi / 2])
+    sim.data = cars.commanded(sim.data, np.tile([0.05, 0.3], (1, 2, 1)))
+    sim.step(100)
+    sim.sync()
+    model, data, record = sim.mj_model, sim.mj_data, cars.read(sim.data)
+    left, right = np.asarray(ackermann(record.steer[0, 0], 0.32226, 0.24477))
+    for k, angle in ((0, left), (1, right), (2, 0.0), (3, 0.0)):
+        axis = data.body(f"cars_wheel:{k}").xmat.reshape(3, 3)[:, 1]
+        np.testing.assert_allclose(np.arctan2(-axis[0], axis[1]), angle + record.yaw[0, 0, 0], atol=1e-5)
+    wheel = data.body("cars_wheel:7").xmat.reshape(3, 3)
+    rolled = np.arctan2(-wheel[2, 0], wheel[2, 2])
+    np.testing.assert_allclose(rolled, record.distance[0, 1, 0] / 0.052388, atol=1e-5)
+    np.testing.assert_allclose(data.body("cars:1").xpos, record.pos[0, 1], atol=1e-6)
+    deck = data.body("cars_trailer:0").xmat.reshape(3, 3)
+    np.testing.assert_allclose(np.arctan2(deck[1, 0], deck[0, 0]), record.joints[0, 0, 1], atol=1e-6)
+    assert model.nbody > 2 * (1 + 4 + 1 + 1 + 4)
+
+
+def test_contacts_of_drones_name_the_car():
+    sim, _ = build(2, pos=(0, 0))
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[1, 0].set(jnp.array([0.0, 0.0, 0.1]))))
+    report = sim.contact_report()
+    assert "cars:0" in report.object_names
+    touched = np.asarray(report.objects)[..., report.object_names.index("cars:0")]
+    assert touched[1].all()
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[1, 0].set(jnp.array([0.0, 0.0, 1.0]))))
+    assert not np.asarray(sim.contact_report().objects)[1].any()
+
+
+def test_cars_roll_down_a_slope():
+    """Without drive a car on a plane of 0.1 rad accelerates by g sin(a) and loses what its damping takes."""
+    x = np.linspace(-20, 20, 41)
+    heights = np.tile(5 - np.tan(0.1) * x, (41, 1))
+    sim = Sim(engine="fused")
+    sim.add(Terrain(heights, size=(40.0, 40.0)))
+    cars = sim.add(Cars(pos=(0, 0), in_scene=False))
+    record = cars.read(sim.data)
+    np.testing.assert_allclose(record.pos[0, 0, 2], 5 + 0.052388, atol=1e-4)
+    sim.step(250)
+    record = cars.read(sim.data)
+    np.testing.assert_allclose(record.normal[0, 0], [np.sin(0.1), 0, np.cos(0.1)], atol=1e-5)
+    np.testing.assert_allclose(record.pos[0, 0, 2] - 0.052388, 5 - np.tan(0.1) * record.pos[0, 0, 0], atol=2e-3)
+    free = 9.81 * np.sin(0.1) * np.cos(0.1) * 0.5
+    lost = (4.03 * free / 2 + 0.87) / 2.923 * 0.5
+    assert float(record.body_vel[0, 0, 0]) == pytest.approx(free - lost, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"vehicle": "tank"}, "expected a vehicle as one of"),
+        ({"level": "torque"}, "expected level of 'cars' as one of"),
+        ({"reference": "place"}, "expected reference of 'cars' as one of"),
+        ({"controller": PurePursuit()}, "expected a path for the controller"),
+        ({"controller": "lqr", "path": EIGHT}, "expected a PathController"),
+        ({"path": "eight"}, "expected a Path, a Trajectory"),
+        ({"path": EIGHT, "index": 1}, "a whole number from 0 to 0"),
+        ({"path": EIGHT, "start": [0.0, 1.0]}, "expected start as a number"),
+        ({"path": EIGHT, "controller": Stanley(gain=-1.0)}, "expected gain of Stanley to be at least zero"),
+        ({"path": EIGHT, "vehicle": "bicycle"}, "expected a vehicle that steers"),
+        ({"vehicle": "bicycle", "trailer": True}, "expected a vehicle with a table [trailer]"),
+        ({"path": Path.of_points([(0, 0), (1, 0), (2, 0)], -1.0), "controller": LPV()}, "can drive forwards"),
+        ({"members": 2, "pos": [(0, 0, 0)]}, "expected pos as finite numbers of shape"),
+        ({"yaw": np.nan}, "expected yaw as finite numbers"),
+        ({"rate": 40}, "to divide freq = 500 Hz"),
+        ({"members": ["a", "a"]}, "got 'a' twice"),
+    ],
+)
+def test_wrong_settings_are_errors(settings, message):
+    sim = Sim()
+    before = sim.data
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        sim.add(Cars(**settings))
+    assert sim.data is before
+    assert "cars" not in sim.plugins
+
+
+def test_wrong_commands_are_errors():
+    sim, cars = build(2, members=3, in_scene=False)
+    for command, message in ((np.zeros((2, 3, 4)), "(2, 3, 2)"), (np.full((2, 3, 2), np.nan), "finite")):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            cars.commanded(sim.data, command)

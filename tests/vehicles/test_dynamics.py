@@ -1,0 +1,257 @@
+"""Dynamics of vehicles: limits with closed forms, invariants, and finite values and gradients everywhere."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crazysim.vehicles import CarParams, CarState, ackermann, kinematic, load_vehicle, single_track
+from crazysim.vehicles.single_track import drive_force, tyre_force
+
+MODELS = {"single_track": single_track, "kinematic": kinematic}
+
+
+@functools.cache
+def params(name="f1tenth_ros", trailer=False):
+    return CarParams.create(load_vehicle(name), 500, trailer)
+
+
+def state(speed=0.0, side=0.0, yaw_rate=0.0, steer=0.0, yaw=0.0, joints=None) -> CarState:
+    vel = jnp.array([speed, side], float)
+    one = [jnp.array([x], float) for x in (yaw, yaw_rate, steer, 0.0)]
+    return CarState(jnp.zeros(3), one[0], vel, one[1], one[2], one[3], joints)
+
+
+def simulate(model, car, start, command, duration, freq=500):
+    """Return the states of a vehicle under a constant command, by the classical Runge-Kutta method."""
+
+    @jax.jit
+    def run(start, command):
+        def step(s, _):
+            def at(rate, dt):
+                return jax.tree.map(lambda a, b: a + dt * b, s, rate)
+
+            k1 = model(s, command, car)
+            k2 = model(at(k1, 0.5 / freq), command, car)
+            k3 = model(at(k2, 0.5 / freq), command, car)
+            k4 = model(at(k3, 1 / freq), command, car)
+            s = jax.tree.map(lambda a, b, c, d, e: a + (b + 2 * c + 2 * d + e) / (6 * freq), s, k1, k2, k3, k4)
+            return s, s
+
+        return jax.lax.scan(step, start, length=round(duration * freq))[1]
+
+    return run(start, jnp.asarray(command, float))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_small_slip_is_the_published_model(seed):
+    """The equations of the lab's simulator, whose slip angles are small: the difference is of order three."""
+    with jax.enable_x64(True):
+        car = jax.tree.map(lambda x: np.asarray(x, np.float64), CarParams.create(load_vehicle("f1tenth_ros"), 500))
+        car = car.replace(grip=np.full(2, np.inf), slip_speed=np.full(1, 1e-9))
+        rng, errors, sizes = np.random.default_rng(seed), [], 0.1 * 0.5 ** np.arange(4)
+        d, side, delta, turn = rng.uniform(-1, 1, 4)
+        for size in sizes:
+            vx, vy, steer, w = 3.0, 3.0 * size * side, size * delta, 5 * size * turn
+            m, inertia, lf, lr, front, rear = 2.923, 0.0796, 0.163, 0.168, 41.7372, 29.4662
+            force = 41.796 * d - 2.0152 * vx - 0.4328
+            f_y, r_y = front * (steer - (w * lf + vy) / vx), rear * (w * lr - vy) / vx
+            theirs = [
+                (force + force * np.cos(steer) - f_y * np.sin(steer)) / m + vy * w,
+                (r_y + force * np.sin(steer) + f_y * np.cos(steer)) / m - vx * w,
+                (f_y * lf * np.cos(steer) + force * lf * np.sin(steer) - r_y * lr) / inertia,
+            ]
+            rate = single_track(state(vx, vy, w, steer), jnp.array([d, steer]), car)
+            errors.append(np.concatenate([rate.body_vel, rate.yaw_rate]) - theirs)
+        slopes = np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
+        assert np.all(slopes > 2.7), (slopes, errors)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_slow_vehicles_roll_on_the_circle_of_their_wheels(model):
+    """At 0.2 m/s tyres hardly slip: the yaw rate is v tan(d) / L."""
+    car = params()
+    reference = (4.0304 * 0.2 + 0.8656 * 0.2 / np.hypot(0.2, 0.1)) / 83.592
+    end = jax.tree.map(lambda x: x[-1], simulate(MODELS[model], car, state(), [reference, 0.3], 8.0))
+    expected = float(end.body_vel[0]) * np.tan(0.3) / 0.331
+    # Slip angles m v^2 / (R C) of 0.001 rad, and the force of the drive, of which a share acts across: 2%.
+    assert float(end.yaw_rate[0]) == pytest.approx(expected, rel=0.02)
+
+
+def test_steady_cornering_has_the_understeer_gradient():
+    """``d = L / R + (m / L) (l_r / C_f - l_f / C_r) v^2 / R`` for small angles, with the drive's lateral share."""
+    car = params().replace(front_share=np.zeros(1, np.float32), slip_speed=np.full(1, 1e-3, np.float32))
+    speed, steer = 2.0, 0.01
+    reference = (4.0304 * speed + 0.8656) / 83.592
+    end = jax.tree.map(lambda x: x[-1], simulate(single_track, car, state(speed), [reference, steer], 6.0))
+    gradient = 2.923 / 0.331 * (0.168 / 41.7372 - 0.163 / 29.4662)
+    v = float(end.body_vel[0])
+    assert float(end.yaw_rate[0]) == pytest.approx(steer * v / (0.331 + gradient * v**2), rel=5e-3)
+
+
+def test_wheels_lock_at_the_friction_coefficient():
+    """With all the brake there is, the deceleration is the friction coefficient times g."""
+    car = params()
+    rate = single_track(state(5.0), jnp.array([-100.0, 0.0]), car)
+    assert float(rate.body_vel[0]) == pytest.approx(-1.0489 * 9.81, rel=1e-3)
+    assert abs(float(kinematic(state(5.0), jnp.array([-100.0, 0.0]), car).body_vel[0]) + 1.0489 * 9.81) < 0.02
+
+
+@given(st.floats(-50, 50), st.floats(-20, 20), st.floats(-20, 20), st.floats(0.1, 100))
+@settings(deadline=None, max_examples=50)
+def test_forces_stay_in_the_friction_circle_and_oppose_slip(drive, along, across, grip):
+    force = tyre_force(*(jnp.asarray(x, float) for x in ([drive], [along, across], [40.0], [grip], [0.1])))
+    assert np.hypot(*np.asarray(force)[:, 0]) <= grip * (1 + 1e-5)
+    assert float(force[1][0]) * across <= 0
+
+
+@pytest.mark.parametrize("name", ["f1tenth_ros", "aiml_head"])
+def test_a_sliding_vehicle_loses_energy(name):
+    """Tyres and losses only take energy from a vehicle without drive, forwards, backwards and sideways."""
+    car = params(name)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        speed, side, turn, steer = rng.uniform(-1, 1, 4) * [8, 8, 20, 0.5]
+        s = state(speed, side, turn, steer)
+        rate = single_track(s, jnp.array([0.0, steer]), car)
+        power = float(car.mass[0] * jnp.sum(s.body_vel * rate.body_vel) + car.yaw_inertia[0] * turn * rate.yaw_rate[0])
+        assert power < 0
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_mirrored_motion(model):
+    """Left and right are alike."""
+    rng = np.random.default_rng(1)
+    speed, side, turn, steer, d = rng.uniform(-1, 1, 5) * [5, 2, 5, 0.4, 0.3]
+    car = params()
+    left = MODELS[model](state(speed, side, turn, steer), jnp.array([d, steer / 2]), car)
+    right = MODELS[model](state(speed, -side, -turn, -steer), jnp.array([d, -steer / 2]), car)
+    np.testing.assert_allclose(left.body_vel * jnp.array([1, -1]), right.body_vel, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(left.yaw_rate, -right.yaw_rate, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(left.steer, -right.steer)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_reversing_retraces_the_circle(model):
+    """Backwards a slow vehicle rolls along the same circle."""
+    car, radius = params(), 0.331 / np.tan(0.3)
+    for d in (0.02, -0.02):
+        path = simulate(MODELS[model], car, state(steer=0.3), [d, 0.3], 6.0)
+        end = jax.tree.map(lambda x: x[-1], path)
+        assert float(end.body_vel[0]) * d > 0
+        # The middle of the rear axle, around the point beside it.
+        axle = path.pos[:, :2] - 0.168 * jnp.concatenate([jnp.cos(path.yaw), jnp.sin(path.yaw)], axis=-1)
+        distance = jnp.linalg.norm(axle - jnp.array([-0.168, radius]), axis=-1)
+        np.testing.assert_allclose(distance, radius, rtol=0.03)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("name", ["f1tenth_ros", "aiml_head", "bicycle"])
+def test_rest_stays_at_rest_with_finite_gradients(model, name):
+    if model == "single_track" and name == "bicycle":
+        model = "kinematic"
+    car = params(name, trailer=name == "aiml_head")
+    rest = CarState.at_rest(jnp.zeros(3), jnp.zeros(1), trailer=name == "aiml_head")
+    rate = MODELS[model](rest, jnp.zeros(2), car)
+    assert all(np.all(np.asarray(x) == 0) for x in jax.tree.leaves(rate))
+
+    def total(s, command, car):
+        return sum(jnp.sum(x) for x in jax.tree.leaves(MODELS[model](s, command, car)))
+
+    for speed, side, turn, steer, d in ((0, 0, 0, 0, 0), (-3, 2, 1, 0.4, 0.3), (9, -9, 30, -0.5, -1), (0, 5, 0, 0, 0)):
+        s = state(speed, side, turn, steer, joints=rest.joints)
+        slopes = jax.grad(total, argnums=(0, 1))(s, jnp.array([d, 0.1]), car)
+        assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(slopes))
+
+
+@given(*[st.floats(-30, 30)] * 3, st.floats(-0.6, 0.6), st.floats(-5, 5), st.floats(-2, 2))
+@settings(deadline=None, max_examples=40)
+def test_values_and_gradients_are_finite(speed, side, turn, steer, d, command):
+    s, car = state(speed, side, turn, steer), params()
+    rate = single_track(s, jnp.array([d, command]), car)
+    slope = jax.grad(lambda s: sum(jnp.sum(x) for x in jax.tree.leaves(single_track(s, jnp.array([d, command]), car))))(
+        s
+    )
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((rate, slope)))
+
+
+def test_long_slides_stay_finite():
+    """Spun and thrown, a vehicle at the lowest rate comes to rest and stays finite."""
+    car = CarParams.create(load_vehicle("f1tenth_ros"), 50)
+    end = simulate(single_track, car, state(10.0, -8.0, 40.0, 0.5), [0.0, 0.5], 30.0, freq=50)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(end))
+    assert float(jnp.linalg.norm(end.body_vel[-1])) < 0.02
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_gradients_equal_central_differences(model):
+    with jax.enable_x64(True):
+        car = jax.tree.map(lambda x: np.asarray(x, np.float64), params())
+
+        def end(command):
+            path = simulate(MODELS[model], car, state(1.0), command, 0.4)
+            return path.pos[-1, 0] + 2 * path.pos[-1, 1] + path.yaw[-1, 0]
+
+        command, h = jnp.array([0.1, 0.15]), 1e-6
+        slope = jax.grad(end)(command)
+        for k in range(2):
+            step = jnp.zeros(2).at[k].set(h)
+            assert float(slope[k]) == pytest.approx(
+                float(end(command + step) - end(command - step)) / (2 * h), rel=1e-6
+            )
+
+
+def test_drive_holds_the_speed_of_its_balance():
+    """``gain d = damping v + friction`` at constant speed."""
+    end = simulate(single_track, params(), state(1.0), [0.1, 0.0], 12.0)
+    assert float(end.body_vel[-1, 0]) == pytest.approx((8.3592 - 0.8656) / 4.0304, rel=2e-3)
+    # At full reference the lab's motors give their largest torque, most of which accelerates their own rotors.
+    force = float(drive_force(jnp.ones(1), jnp.ones(1), params("aiml_head"))[0])
+    motors, losses = 4 * 2.0 / 0.052388, 4 * 1e-5 / 0.052388**2 + 4 * 0.01 / 0.052388 / np.hypot(1, 0.1)
+    assert force == pytest.approx((motors - losses) * 3.4 / (3.4 + 4 * (0.05 / 0.052388**2 + 0.05)), rel=1e-5)
+
+
+def test_external_forces_push_a_vehicle():
+    rate = single_track(state(), jnp.zeros(2), params(), jnp.array([2.923, 5.846, 0.0796]))
+    np.testing.assert_allclose(rate.body_vel, [1.0, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(rate.yaw_rate, [1.0], rtol=1e-6)
+
+
+def test_steering_keeps_its_limits():
+    rate = single_track(state(), jnp.array([0.0, 9.0]), params()).steer
+    np.testing.assert_allclose(rate, [3.2], rtol=1e-6)
+    end = simulate(single_track, params(), state(), [0.0, 9.0], 1.0)
+    np.testing.assert_allclose(end.steer[-1], [0.5], rtol=1e-5)
+
+
+@given(st.floats(-0.6, 0.6))
+@settings(deadline=None, max_examples=30)
+def test_ackermann_axes_meet_on_the_rear_axle(steer):
+    """Each front wheel stands across the line to the one centre of turning."""
+    left, right = np.asarray(ackermann(jnp.array([steer]), 0.331, 0.24))
+    centre = 0.331 / np.tan(steer) if steer else np.inf
+    np.testing.assert_allclose(np.tan(left), 0.331 / (centre - 0.12), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(np.tan(right), 0.331 / (centre + 0.12), rtol=1e-4, atol=1e-6)
+
+
+def test_ackermann_of_the_fact_sheet():
+    left, right = np.asarray(ackermann(jnp.array([0.3]), 0.32226, 0.24477))
+    assert (round(float(left), 3), round(float(right), 3)) == (0.337, 0.270)
+
+
+def test_a_trailer_follows_on_its_own_circle():
+    """In steady cornering hitch, front and rear axle are on circles: each radius and its rod make a right angle."""
+    car, steer = params("aiml_head", True), 0.2
+    start = state(joints=jnp.zeros(2))
+    end = jax.tree.map(lambda x: x[-1], simulate(kinematic, car, start, [0.05, steer], 30.0))
+    hitch, drawbar, axles = np.asarray(car.trailer)
+    radius = 0.32226 / np.tan(steer)  # of the middle of the rear axle
+    at_hitch = np.hypot(radius, hitch - 0.16113)
+    at_front = np.sqrt(at_hitch**2 - drawbar**2)
+    bar, deck = float(end.yaw[0] - end.joints[0]), float(end.joints[0] - end.joints[1])
+    assert bar == pytest.approx(np.arctan((hitch - 0.16113) / radius) + np.arcsin(drawbar / at_hitch), rel=1e-3)
+    assert deck == pytest.approx(np.arcsin(axles / at_front), rel=1e-3)
