@@ -54,10 +54,14 @@ class Trajectory(PyTree):
         if lengths.ndim != 1 or not lengths.size or c.ndim != 3 or c.shape[1] not in (3, 4) or len(c) != len(lengths):
             raise ConfigError(
                 f"expected durations (n_pieces,) and coefficients (n_pieces, 4, degree + 1), or (n_pieces, 3, "
-                f"degree + 1) without yaw, got shapes {lengths.shape} and {c.shape}"
+                f"degree + 1) without yaw, got shapes {lengths.shape} and {c.shape}. Pass one set of coefficients "
+                "per piece."
             )
         if not c.shape[2] or not np.all(np.isfinite(c)):
-            raise ConfigError(f"expected finite coefficients, at least one for each axis, got shape {c.shape}")
+            raise ConfigError(
+                f"expected finite coefficients, at least one for each axis, got shape {c.shape}. Check the input for "
+                "NaN."
+            )
         ends = np.cumsum(lengths).astype(floating())
         steps = np.diff(ends, prepend=0.0)
         if not np.all(np.isfinite(ends)) or not np.all(lengths > 0) or not np.all(steps > 0):
@@ -122,9 +126,9 @@ class Trajectory(PyTree):
         end, repeats = _at(ends, index, ends.shape[1] - 1), _at(jnp.asarray(self.repeats), index)
         local, inside = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
         piece = _piece(ends, index, local)
-        begin = jnp.where(piece > 0, _at(ends, index, piece - 1), 0.0)
-        inverse = _inverse(jnp, _at(ends, index, piece) - begin)
-        u, of_piece = (local - begin) * inverse, _at(coefficients, index, piece)
+        start = jnp.where(piece > 0, _at(ends, index, piece - 1), 0.0)
+        inverse = _inverse(jnp, _at(ends, index, piece) - start)
+        u, of_piece = (local - start) * inverse, _at(coefficients, index, piece)
         degrees = [self.degree] * 4 if degrees is None else degrees
         rows: dict[int, list[Array]] = {}
         for degree in sorted(set(degrees)):
@@ -145,9 +149,9 @@ class Trajectory(PyTree):
             Values, their first derivatives, and so on. (4,) each
         """
         xp, n = _module(self), self.n_pieces
-        begins = xp.concatenate([xp.zeros_like(self.ends[:1]), self.ends[:-1]])
+        starts = xp.concatenate([xp.zeros_like(self.ends[:1]), self.ends[:-1]])
         # One row of a table for each piece: a single lookup, whose parts begin at multiples of four.
-        numbers = [begins, _inverse(xp, self.ends - begins), xp.zeros((2, n), self.ends.dtype)]
+        numbers = [starts, _inverse(xp, self.ends - starts), xp.zeros((2, n), self.ends.dtype)]
         table = xp.concatenate([xp.vstack(numbers).T, self.coefficients.reshape(n, -1)], axis=1)
         local, inside = _local_time(jnp.asarray(t, self.ends.dtype), self.ends[-1], self.repeats)
         piece = _piece(jnp.asarray(self.ends)[None], 0, local)
@@ -177,7 +181,7 @@ class Trajectory(PyTree):
             ConfigError: If there is none.
         """
         if not trajectories:
-            raise ConfigError("expected at least one trajectory, got none")
+            raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
         n_pieces, degree = max(t.n_pieces for t in trajectories), max(t.degree for t in trajectories)
         padded = [t.padded(n_pieces, degree) for t in trajectories]
         xp = _module(padded)
