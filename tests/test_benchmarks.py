@@ -224,6 +224,14 @@ def test_mocap_takes_less_than_a_millisecond_a_frame(run):
     assert line["frame_ms"] < 1
 
 
+def test_live_prints_the_factor_and_the_lateness(run):
+    fast, timed = run("live.py", "--seconds", "0.3", "--drones", "2", "--only", "max", "jitter")
+    assert fast["factor"] > 1
+    assert fast["late"] == 0
+    assert 0.5 < timed["factor"] < 1.2
+    assert timed["worst_ms"] > 0
+
+
 def test_controllers_are_compared_on_the_same_flights(run):
     lines = run("controllers.py", "--controllers", "geometric", "--worlds", "4", "--repeats", "1")
     assert [line["controller"] for line in lines] == ["geometric"]

@@ -163,7 +163,7 @@ class Population(Plugin):
         return found
 
     def with_poses(self, record: R, pos: Array, quat: Array) -> R:
-        """Return a record of all worlds with other poses; by default in its fields ``pos`` and ``quat``, if it has them.
+        """Return a record of all worlds with other poses; by default in fields ``pos`` and ``quat``, if it has them.
 
         Args:
             record: The record.

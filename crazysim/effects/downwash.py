@@ -78,7 +78,7 @@ class Downwash(Plugin):
         axis = rotation.z_axis(s.quat)
         own = jet_source(collective_thrust(data), record.diameter, record.air_density)
 
-        def at_places(other: tuple[Array, Array, JetSource], is_self: Array) -> dict[str, Array]:
+        def at_places(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
             origin, axis, source = other
             return {name: jet_speed(pos - origin, axis, source) * axis for name, pos in places.items()}
 

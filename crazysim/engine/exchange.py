@@ -76,19 +76,10 @@ class Exchange(Protocol):
         ...
 
 
-class Registers:
-    """Lanes of one warp or vector, which read each other's registers."""
+class OneLane:
+    """Code that is written once for a lane, whose variables hold in all of it."""
 
     depth = 0
-    declarations: list[str] = []  # noqa: RUF012  (always empty)
-
-    def publish(self, writer: Writer, values: Published, live: Live, depth: int) -> list[Read]:
-        """Return how numbers are read from the registers of another lane."""
-        names = []
-        for kind, value in values:
-            names.append(writer.new())
-            writer.line(f"const auto {names[-1]} = {kind}_lanes({value});", depth)
-        return [lambda j, x=x: f"of_drone({x}, {j})" for x in names]
 
     def variable(self, writer: Writer, name: str, kind: str, value: str, depth: int) -> str:
         """Write a variable, and return its name."""
@@ -107,7 +98,24 @@ class Registers:
         """Write nothing."""
 
 
-class SharedMemory(Registers):
+class Registers(OneLane):
+    """Lanes of one warp or vector, which read each other's registers."""
+
+    def publish(self, writer: Writer, values: Published, live: Live, depth: int) -> list[Read]:
+        """Return how numbers are read from the registers of another lane."""
+        names = []
+        for kind, value in values:
+            names.append(writer.new())
+            writer.line(f"const auto {names[-1]} = {kind}_lanes({value});", depth)
+        return [lambda j, x=x: f"of_drone({x}, {j})" for x in names]
+
+    @property
+    def declarations(self) -> list[str]:
+        """Return no lines."""
+        return []
+
+
+class SharedMemory(OneLane):
     """Threads of one block of a GPU, which read what the others wrote to the block's memory."""
 
     def __init__(self, lanes: int):
@@ -140,8 +148,8 @@ class SharedMemory(Registers):
         return [lambda j, n=place[k]: f"{where}[world + {j}].x{n}" for k in range(len(values))]
 
     @property
-    def declarations(self) -> list[str]:  # type: ignore[override]
-        """Records, and the memory for them."""
+    def declarations(self) -> list[str]:
+        """Return the records, and the memory for them."""
         lines = []
         for text, k in self._records.items():
             lines.append(f"struct __align__(16) Record{k} {{ {text}}};")

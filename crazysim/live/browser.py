@@ -152,7 +152,7 @@ class Browser(Viewer):
         """Stop the server."""
         if self._server is not None:
             server, self._server = self._server, None
-            with contextlib.redirect_stdout(io.StringIO()):  # viser says so
+            with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it stops
                 server.stop()
 
 

@@ -190,7 +190,7 @@ class BrowserPanel:
         @slider.on_update
         def _(_: Any) -> None:
             value = float(slider.value)
-            live.post(lambda live: control.call(live, value))
+            live.post(lambda live: live.set_value(control.name, value))
 
 
 def _post(button: Any, live: Live, call: Any) -> None:

@@ -176,7 +176,7 @@ class BrowserScene:
             return
         pos = _finite(drones[k, picture.selected[1]])
         self._selected.position = pos
-        self._label.text = f"drone {picture.selected[1]}"
+        self._label.text = picture.name
         self._root.position = -pos if follow else (0.0, 0.0, 0.0)
 
     def _moved(self, pos: NDArray) -> NDArray:

@@ -35,10 +35,10 @@ class History:
         self._latest: deque[Snapshot] = deque(maxlen=length)
 
     def add(self, snapshot: Snapshot) -> None:
-        """Add a snapshot later than all others."""
+        """Add a snapshot; one at the step of the last, after a jump back to it, is left out."""
         if self._first is None:
             self._first = snapshot
-        else:
+        elif snapshot.step > (self._latest[-1] if self._latest else self._first).step:
             self._latest.append(snapshot)
 
     def before(self, step: int) -> Snapshot | None:

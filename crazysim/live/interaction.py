@@ -1,4 +1,4 @@
-"""What people do to a live simulation: keys, buttons, sliders, clicks and the selection of a drone."""
+"""Interaction with a live simulation: keys, buttons, sliders, clicks and the selection of a drone."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ class Interaction:
     """Keys that are held in a viewer."""
     controls: list[Control]
     """Buttons and sliders that viewers show."""
+    values: dict[str, float]
+    """Present values of the sliders, by name."""
     selected: tuple[int, int] | None
     """World and drone that are followed, plotted and piloted; None for none."""
     quantities: dict[str, Callable[[Live], Any]]
@@ -37,15 +39,16 @@ class Interaction:
     def __init__(self, sim: Sim):
         """Begin with the first drone selected, and with the keys that every live simulation has."""
         self.sim = sim
-        self.keyboard, self.controls, self.quantities = Keyboard(), [], {}
+        self.keyboard, self.controls, self.values, self.quantities = Keyboard(), [], {}, {}
         self.selected, self.on_click = (0, 0), None
+        self._slider = 0
         self._posted: deque[Callable[[Live], Any]] = deque()
         for key, call in BINDINGS.items():
             self.keyboard.bind(key, call)
 
     def button(self, name: str, call: Callable[[Live], Any], key: str | None = None) -> None:
         """Add a button to viewers that are shown from now on, and a key that does the same."""
-        self.controls.append(Button(name, call))
+        self.controls.append(Button(name, call, key))
         if key is not None:
             self.keyboard.bind(key, call)
 
@@ -57,7 +60,47 @@ class Interaction:
         """
         if not (np.isfinite([low, high]).all() and low < high and low <= value <= high):
             raise ConfigError(f"expected low <= value <= high of slider {name!r}, got {low!r}, {value!r}, {high!r}")
+        if name in self.values:
+            raise ConfigError(f"expected a new name of a slider, got {name!r} twice. Use another name.")
         self.controls.append(Slider(name, low, high, value, call))
+        self.values[name] = float(value)
+
+    def set_value(self, name: str, value: float) -> None:
+        """Move a slider, within its limits, and call its function.
+
+        Raises:
+            ConfigError: If there is no such slider, or the value is not finite.
+        """
+        found = next((slider for slider in self._sliders if slider.name == name), None)
+        if found is None or not np.isfinite(value):
+            raise ConfigError(f"expected a slider of {list(self.values)} and a finite value, got {name!r}, {value!r}")
+        self.values[name] = float(np.clip(value, found.low, found.high))
+        found.call(self, self.values[name])  # type: ignore[arg-type]
+
+    @property
+    def control_lines(self) -> tuple[str, ...]:
+        """Buttons with their keys, and sliders with their values, for viewers without a panel."""
+        chosen = self._sliders[self._slider].name if self._sliders else None
+        return tuple(
+            f"{c.name}: {self.values[c.name]:.3g}" + ("  [ ]" if c.name == chosen else "")
+            if isinstance(c, Slider)
+            else f"{c.name}  {c.key or ''}".rstrip()
+            for c in self.controls
+        )
+
+    @property
+    def _sliders(self) -> list[Slider]:
+        return [control for control in self.controls if isinstance(control, Slider)]
+
+    def turn(self, parts: float) -> None:
+        """Move the chosen slider by some parts of its range, as keys do."""
+        if self._sliders:
+            slider = self._sliders[self._slider]
+            self.set_value(slider.name, self.values[slider.name] + parts * (slider.high - slider.low))
+
+    def choose_next_slider(self) -> None:
+        """Choose the next slider for ``turn``."""
+        self._slider = (self._slider + 1) % max(len(self._sliders), 1)
 
     def select(self, world: int, drone: int) -> None:
         """Select a drone to follow, plot and pilot.
@@ -87,6 +130,10 @@ class Interaction:
         self._posted.append(call)
 
 
+KEY_TURN = 0.05
+"""Part of a slider's range by which a key moves it."""
+
+
 def _toggle(live: Live) -> None:
     live.paused = not live.paused
 
@@ -111,6 +158,9 @@ BINDINGS: dict[str, Callable[[Live], Any]] = {
     "+": _scale(2.0),
     "-": _scale(0.5),
     "r": lambda live: live.toggle_recording(),
+    "[": lambda live: live.turn(-KEY_TURN),
+    "]": lambda live: live.turn(KEY_TURN),
+    "'": lambda live: live.choose_next_slider(),
     "escape": lambda live: live.stop(),
 }
 """Keys that every live simulation has, and the functions that they call."""

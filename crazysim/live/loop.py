@@ -140,7 +140,7 @@ class Live(Interaction, Closing):
     def go_to(self, time: float) -> None:
         """Go to a time since the last reset, s: forwards as fast as possible, backwards from the snapshot before it.
 
-        Processes and events take part, and processes with a method ``reset(live)`` are told of a jump backwards.
+        Processes and events take part; the method ``reset(live)`` of processes is called after a jump backwards.
 
         Raises:
             ConfigError: If the time is negative, not finite, or before the first snapshot.

@@ -46,6 +46,10 @@ class Picture:
     """Velocity of the air at every drone, world frame, m/s; no drones without wind. (n, n_drones or 0, 3)"""
     selected: tuple[int, int] | None
     """Selected world and drone; None for none."""
+    name: str
+    """Name of the selected drone; empty for none."""
+    controls: tuple[str, ...]
+    """Buttons and sliders of the loop, for viewers without a panel."""
     plot: NDArray
     """Values of the plotted quantity of the selected drone. (k,)"""
 
@@ -88,8 +92,21 @@ class PictureSource:
         if plot and live.selected is not None:
             own = live.quantities.get(plot)
             values = quantity(data, plot)(*live.selected) if own is None else np.ravel(np.asarray(own(live), float))
+        name = "" if live.selected is None else sim.drone_names[live.selected[1]]
         return Picture(
-            worlds, live.time, live.status, pos, quat, drones, setpoint, touching, air, live.selected, values
+            worlds,
+            live.time,
+            live.status,
+            pos,
+            quat,
+            drones,
+            setpoint,
+            touching,
+            air,
+            live.selected,
+            name,
+            live.control_lines,
+            values,
         )
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from crazysim.live.loop import Live
 
 OnError = Literal["raise", "report"]
-"""What the loop does when a process raises an error: end with it, or log it and continue."""
+"""Reaction of the loop to an error of a process: end with it, or log it and continue."""
 QUIET = 1.0
 """Least time between two log messages of one kind, s."""
 

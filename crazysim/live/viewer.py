@@ -1,4 +1,4 @@
-"""What the loop needs of a viewer, and the controls that viewers show."""
+"""Base class of viewers, and the controls that viewers show."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ class Button:
     """Text on the button."""
     call: Callable[[Live], None]
     """Function of the loop."""
+    key: str | None = None
+    """Key that does the same; None for none."""
 
 
 @dataclass(frozen=True)

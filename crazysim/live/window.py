@@ -21,7 +21,7 @@ import numpy as np
 
 import crazysim
 from crazysim.errors import ConfigError, RenderError
-from crazysim.live.picture import Picture, PictureSource
+from crazysim.live.picture import Picture, PictureSource, quantities
 from crazysim.live.viewer import Viewer
 from crazysim.media.worlds import world_indices
 from crazysim.scene.render import camera_id, require_size
@@ -46,8 +46,9 @@ class Window(Viewer):
 
     The mouse turns, moves and zooms the view. A double click on a drone selects it, one on the ground calls
     ``live.on_click``. Keys go to ``live.keyboard``: space pauses, a full stop makes a single step, backspace resets,
-    tab selects the next drone, plus and minus change the speed, R records, escape ends the run. The window draws in a
-    process of its own, as fast as it can, and never delays the simulation.
+    tab selects the next drone, plus and minus change the speed, [ and ] turn the chosen slider, an apostrophe chooses
+    the next one, R records, escape ends the run. The window draws in a process of its own, as fast as it can, and never
+    delays the simulation.
     """
 
     worlds: Sequence[int] = (0,)
@@ -70,6 +71,8 @@ class Window(Viewer):
     """True to mark drones that touch something, which is computed for every picture."""
     wind: bool = True
     """True to draw the wind at every drone."""
+    plot: str = ""
+    """Quantity of the selected drone that is plotted over time, such as ``"states.pos"``; empty for none."""
 
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation."""
@@ -96,6 +99,8 @@ class Window(Viewer):
         sim = live.sim
         worlds = world_indices(sim, self.worlds).tolist()
         camera_id(sim.mj_model, self.camera)
+        if self.plot and self.plot not in (known := [*live.quantities, *quantities(sim)]):
+            raise ConfigError(f"expected a quantity to plot, one of {', '.join(known)}, got {self.plot!r}")
         self._source = PictureSource(sim, worlds, self.contacts, self.wind)
         path = os.pathsep.join([str(Path(crazysim.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
         self._process = process = subprocess.Popen(
@@ -114,7 +119,7 @@ class Window(Viewer):
 
     def update(self, live: Live) -> None:
         """Hand the present picture to the process of the window, in place of one that it has not taken yet."""
-        picture = self._source.take(live)
+        picture = self._source.take(live, self.plot)
         with self._changed:
             self._next = picture
             self._changed.notify()

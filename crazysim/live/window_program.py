@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from crazysim.errors import RenderError
+from crazysim.live.chart import Chart
 from crazysim.live.picture import Picture
 from crazysim.live.window import LENGTH
 from crazysim.media.trail import Trail, colors_of
@@ -92,6 +93,8 @@ class Program:
                 setattr(self._camera, key, value if np.ndim(value) == 0 else np.asarray(value, float))
         self.window = Window(model, 100_000 + model.ngeom, settings["width"], settings["height"])
         self.window.on_key = lambda key, down: self._say("press" if down else "release", key)
+        self._chart = Chart(settings["plot"])
+        self.window.on_drawn = self._chart.draw
         self._was_down, self._click = False, (-np.inf, (0.0, 0.0))
 
     def run(self, inbox: Inbox) -> None:
@@ -105,6 +108,8 @@ class Program:
                 continue
             if picture is not shown and self._trail is not None:
                 self._trail.add(np.full(len(picture.worlds), picture.time), picture.drones)
+            if picture is not shown:
+                self._chart.add(picture)
             shown, drawn = picture, now
             self.draw(picture)
         self.window.close()
@@ -141,12 +146,16 @@ class Program:
             if air.any():
                 overlays.capsule(pos, pos + WIND_SCALE * air, 0.006, AIR, cylinder=True)
         if picture.selected is not None and picture.selected[0] == picture.worlds[k]:
-            overlays.points(drones[picture.selected[1]][None], SELECTED, MARK_RADIUS)
+            place = drones[picture.selected[1]]
+            overlays.points(place[None], SELECTED, MARK_RADIUS)
+            overlays.label(_ascii(picture.name), place + [0.0, 0.0, MARK_RADIUS])
         text = picture.status if k == 0 else ""
         if len(picture.worlds) > 1:
             text = f"world {picture.worlds[k]}\n{text}".strip()
         if text:
             overlays.text(text, "top left")
+        if k == 0 and picture.controls:
+            overlays.text(_ascii("\n".join(picture.controls)), "bottom left")
         return data, overlays
 
     def _double_clicked(self) -> bool:
@@ -180,6 +189,11 @@ class Program:
             self._out.flush()
         except OSError:  # the simulation has ended
             self.window.close()
+
+
+def _ascii(text: str) -> str:
+    """Return text that MuJoCo's font can show."""
+    return text.encode("ascii", "replace").decode()
 
 
 def main() -> int:

@@ -67,19 +67,19 @@ class ContactLog(Plugin):
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return a stage of one drone for floor and objects, and one of one world for other drones and for loads.
+        """Return a stage of one drone, and one of one world for loads and other objects that plugins place.
 
         Two, because a stage of one world computes everything for all its drones.
         """
         names, found = self._names(sim), []
         placed = placed_by(sim.scene.plugins(), names)
         others = [name for name in names if name not in placed]
-        if others or self.floor:
-            alone = self._stage(sim.scene.contact_fn(others, self.floor, drones=False), "drone")
+        if others or self.floor or self.drones:
+            alone = self._stage(sim.scene.contact_fn(others, self.floor, self.drones), "drone")
             found.append(Placement(alone, before="increment_steps"))
-        if placed or self.drones:
-            together = self._stage(sim.scene.contact_fn(list(placed), floor=False, drones=self.drones), "world")
-            found.append(Placement(together, before="increment_steps", name=f"{self.name}_of_drones"))
+        if placed:
+            together = self._stage(sim.scene.contact_fn(list(placed), floor=False, drones=False), "world")
+            found.append(Placement(together, before="increment_steps", name=f"{self.name}_of_placed"))
         return found
 
     def _names(self, sim: Simulation) -> tuple[str, ...]:

@@ -36,5 +36,5 @@ def of_kind(found: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) -> Any:
     for kind, other in others:
         present: Any = kind.present(drone_id)
         mask = present[..., None] if present.ndim else present
-        result = jax.tree.map(lambda x, y, mask=mask: jnp.where(mask, y, x), result, other)
+        result = jax.tree.map(lambda x, y, mask=mask: x if y is x else jnp.where(mask, y, x), result, other)
     return result

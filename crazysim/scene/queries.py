@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
@@ -106,8 +107,9 @@ def _of_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
 
     def of_poses(pos: Array, quat: Array, objects_pos: Array | None, objects_quat: Array | None, mocap: Any) -> Any:
         states, objects = bare.states.replace(pos=pos, quat=quat), bare.objects
+        core = bare.core.replace(drone_id=jnp.broadcast_to(jnp.arange(pos.shape[-2]), pos.shape[:-1]))
         if objects is not None:
             objects = objects.replace(pos=objects_pos, quat=objects_quat)
-        return fn(bare.replace(states=states, objects=objects, plugins={}), mocap)
+        return fn(bare.replace(states=states, objects=objects, core=core, plugins={}), mocap)
 
     return of_poses

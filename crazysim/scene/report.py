@@ -18,6 +18,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.others import reduce_over_others
 from crazysim.errors import ConfigError
 from crazysim.geometry import distance
 from crazysim.pytree import PyTree, static
@@ -52,7 +53,7 @@ class ContactReport(PyTree):
     drone_distance: Array | None
     """Distance to the nearest other drone, m; infinite for a single drone. (n_worlds, n_drones)"""
     nearest_drone: Array | None
-    """Index of that drone; the drone's own for a single drone. (n_worlds, n_drones)"""
+    """Index of that drone; the drone's own for a single drone. None in a stage of one drone. (n_worlds, n_drones)"""
     object_names: tuple[str, ...] = static()
     """Names of the objects' bodies."""
 
@@ -86,7 +87,7 @@ def build(
         model: Collision model of the scene.
         objects: Handles or names of the objects to report; None for all, () for none.
         floor: True to report the floor.
-        drones: True to report other drones; a stage of one drone has no access to them.
+        drones: True to report other drones. For one drone this needs a stage, and ``nearest_drone`` is None there.
         plugins: Returns the plugins of the simulation, whose objects are put at their poses first.
 
     Raises:
@@ -123,12 +124,7 @@ def build(
             gap = jnp.concatenate([_to_group(own, drone_rot, group, data) for group in groups], axis=-1)
             found |= {"objects": gap < 0, "object_distance": gap, "nearest_object": jnp.argmin(gap, axis=-1)}
         if drones:
-            if pos.ndim == 1:
-                raise ConfigError(
-                    "expected the data of a world, got those of one drone, which do not contain the other drones. "
-                    "Declare the stage @stage('world'), or build the contacts with drones=False."
-                )
-            gap, nearest = _to_drones(own, drone_rot)
+            gap, nearest = (_to_others(own, drone_rot), None) if pos.ndim == 1 else _to_drones(own, drone_rot)
             found |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": nearest}
         return ContactReport(**found, object_names=names)
 
@@ -232,6 +228,23 @@ def _smallest(gaps: list[Array], pos: Array) -> Array:
     if not gaps:
         return jnp.full(pos.shape[:-1], jnp.inf, pos.dtype)
     return functools.reduce(lambda a, b: jnp.where(b < a, b, a), gaps)
+
+
+def _to_others(own: Own, drone_rot: Array | None) -> Array:
+    """Return the distance of one drone to the nearest other of its world, m. ()"""
+
+    def between(other: tuple[list[Array], Array | None], is_self: Array) -> Array:
+        places, rot = other
+        inverse = None if rot is None else rot.T
+        turned = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
+        gaps = []
+        for mine, at in own:
+            for (geom, _), there in zip(own, places, strict=True):
+                inside = at - there if inverse is None else rotation.matvec(inverse, at - there)
+                gaps.append(distance(mine.shape, geom.shape, inside, turned))
+        return jnp.where(is_self, jnp.inf, _smallest(gaps, own[0][1]))
+
+    return reduce_over_others(between, ([at for _, at in own], drone_rot), "min")
 
 
 def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:

@@ -60,6 +60,8 @@ class Window:
         self._cursor = (0.0, 0.0)
         self.on_key: Callable[[str, bool], None] | None = None
         """Function that is called with the name of a key, and True when it is pressed, False when it is released."""
+        self.on_drawn: Callable[[mujoco.MjrRect, mujoco.MjrContext], None] | None = None
+        """Function that draws over the finished image, with its rectangle, pixels."""
         self._names = {getattr(glfw, f"KEY_{key}"): name for key, name in KEYS.items()}
         glfw.set_key_callback(self._window, self._on_key)
         glfw.set_cursor_pos_callback(self._window, self._on_move)
@@ -105,6 +107,8 @@ class Window:
             overlays.write(self._scene)
             mujoco.mjr_render(pixels, self._scene, self._context)
             overlays.write_text(pixels, self._context)
+        if self.on_drawn is not None:
+            self.on_drawn(mujoco.MjrRect(0, 0, *glfw.get_framebuffer_size(self._window)), self._context)
         glfw.swap_buffers(self._window)
 
     def look_at(self, point: NDArray) -> None:

@@ -152,18 +152,21 @@ def test_gradients_of_a_mixed_fleet_are_finite():
 
 
 def test_effects_take_the_numbers_of_each_airframe():
-    fleet = ("cf21B_500", "bumblebee")
+    fleet = ("cf21B_500", HEXAROTOR | {"shape": {"propeller_radius": 0.03}})
     sim = Sim(2, drone=fleet, engine="plain")
-    plugins = [sim.add(kind()) for kind in (cs.Battery, cs.GroundEffect, cs.MotorFailure, cs.Downwash)]
+    effects = (cs.Battery(0.35, 0.1), cs.GroundEffect(), cs.MotorFailure(), cs.Downwash())
+    for effect in effects:
+        sim.add(effect)
     for k, airframe in enumerate(fleet):
         own = Sim(2, drone=airframe, engine="plain")
-        for plugin, kind in zip(plugins, (cs.Battery, cs.GroundEffect, cs.MotorFailure, cs.Downwash), strict=True):
-            record, mixed = own.add(kind()).read(own.data), plugin.read(sim.data)
+        for effect in effects:
+            record, mixed = own.add(effect).read(own.data), effect.read(sim.data)
             for name in ("full_speed_voltage", "propeller_radius", "rotor_pos", "diameter"):
                 if hasattr(record, name):
                     expected = np.asarray(getattr(record, name))
                     got = np.asarray(getattr(mixed, name))
                     got = got[0, k] if got.ndim > expected.ndim else got
+                    got = got[: len(expected)]  # rows of rotors that it lacks follow
                     np.testing.assert_allclose(got, expected, rtol=1e-6, err_msg=name)
     sim.step(2)
     assert np.all(np.isfinite(sim.data.states.pos))

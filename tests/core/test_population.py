@@ -225,7 +225,7 @@ def test_what_depends_on_each_other_runs_together():
 def test_two_populations_are_two_programs():
     sim = Sim(2, 2, engine="fused")
     sim.add(Springs(3))
-    sim.add(Springs(2, name="others", stiffness=0.0))
+    sim.add(Springs(["Mass_7", "Mass_8"], name="others", stiffness=0.0))
     assert [p.population for p in sim.step_fn.plan(sim.data).programs] == ["drone", "springs", "others"]
     sim.step(50)
     springs, others = sim.data.plugins["springs"], sim.data.plugins["others"]

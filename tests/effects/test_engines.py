@@ -38,7 +38,7 @@ def test_every_effect_is_fused(sim):
     segments = program.fused_segments
     fused = {name for s in segments for name in s.stages}
     assert {"wind", "wind_field", "wind_field_displacement", "downwash", "battery", "motors"} <= fused
-    assert [s.scope for s in segments] == ["drone", "world", "drone"]
+    assert [s.scope for s in segments] == ["drone"]
 
 
 def test_effects_mean_the_same_on_every_engine(sim):

@@ -5,8 +5,11 @@ import dataclasses
 import pytest
 from cases import shared_sim
 
+from crazysim import Downwash, Sim
 from crazysim.engine import Step, cuda, jaxcompat, kernel
-from crazysim.engine.errors import KernelError
+from crazysim.engine.errors import KernelError, UnsupportedError
+from crazysim.engine.exchange import exchange_for
+from crazysim.engine.source import Writer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,3 +72,34 @@ def test_what_nvrtc_refuses_is_unsupported(source):
         pytest.skip("no NVRTC here")
     with pytest.raises(KernelError, match="NVRTC refused the kernel"):
         cuda._compile("not CUDA", cuda.DEFAULT_ARCHITECTURE, "PTX")
+
+
+@pytest.mark.parametrize(
+    ("n_drones", "threads", "lanes"), [(3, 64, 60), (32, 64, 64), (33, 256, 231), (64, 64, 64), (256, 256, 256)]
+)
+def test_worlds_whose_drones_act_on_each_other_fill_warps_or_blocks(n_drones, threads, lanes):
+    """A warp reads registers; a block reads records in its memory, four numbers at a time, between two barriers."""
+    sim = Sim(n_worlds=2, n_drones=n_drones, control="attitude", engine="lanes")
+    sim.add(Downwash())
+    made = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
+    assert (made.threads, made.lanes) == (threads, lanes)
+    if cuda.nvrtc() is None:
+        pytest.skip("no NVRTC here; CI has it")
+    code = cuda.ptx(made, cuda.DEFAULT_ARCHITECTURE)
+    in_block = n_drones > 32
+    assert ("ld.shared.v4.f32" in code, "shfl.sync" in code) == (in_block, not in_block)
+    assert code.count("bar.sync") == (2 if in_block else 0)
+
+
+def test_a_world_that_does_not_fit_into_a_block_runs_on_lanes():
+    sim = Sim(n_worlds=1, n_drones=1025, control="rotor_vel", engine="lanes")
+    sim.add(Downwash())
+    program = sim.build_step_fn().plan(sim.data).program
+    with pytest.raises(UnsupportedError, match="up to 1024 on a GPU"):
+        kernel.write(program, "cuda")
+
+
+def test_records_that_do_not_fit_into_a_block_are_refused():
+    exchange = exchange_for("cuda", 1024)
+    with pytest.raises(UnsupportedError, match="a GPU's block has 49152"):
+        exchange.publish(Writer(exchange), [("f32", "0")] * 13, [], 1)

@@ -201,6 +201,7 @@ def test_a_picture_has_what_is_drawn():
     np.testing.assert_allclose(picture.plot, [0.3, 0.2, 1.0], atol=1e-6)
     np.testing.assert_allclose(source.take(live, "double").plot, [2.0])
     assert "0.00 s" in picture.status
+    assert picture.name == sim.drone_names[0]
     assert {"states.pos", "states.rotor_vel", "controls.state.cmd"} <= set(quantities(sim))
     assert "core.steps" not in quantities(sim)
     with pytest.raises(KeyError):

@@ -111,6 +111,24 @@ def test_keys(live):
     assert live.step == 0
 
 
+def test_sliders_and_buttons_by_key(live):
+    moved, pressed = [], []
+    live.slider("wind", 0.0, 10.0, 5.0, lambda live, value: moved.append(value))
+    live.slider("mass", -1.0, 1.0, 0.98, lambda live, value: moved.append(-value))
+    live.button("shoot", pressed.append, key="f")
+    assert live.control_lines == ("wind: 5  [ ]", "mass: 0.98", "shoot  f")
+    for key in "]]['" + "]]f":
+        live.keyboard.press(key)
+    live.run(0.01)
+    np.testing.assert_allclose(moved, [5.5, 6.0, 5.5, -1.0, -1.0])
+    assert pressed == [live]
+    assert live.values == {"wind": 5.5, "mass": 1.0}
+    with pytest.raises(ConfigError, match="a slider of \\['wind', 'mass'\\]"):
+        live.set_value("speed", 1.0)
+    with pytest.raises(ConfigError, match="'wind' twice"):
+        live.slider("wind", 0.0, 1.0, 0.0, lambda live, value: None)
+
+
 def test_going_back_repeats_what_was_flown_bit_for_bit(live):
     resets = []
 
@@ -311,9 +329,17 @@ def test_other_command_levels(live):
 
 
 def test_memory_stays_where_it_is(live):
-    """An hour of control steps, in short: nothing grows but the snapshots, which are bounded."""
+    """Nothing grows with time but the snapshots, which are bounded; the first is kept, and jumps add none."""
     live.run(70.0)
     assert len(live._history._latest) == 60
+    live.go_to(65.0)
+    live.go_to(65.0)
+    live.advance()
+    assert [snapshot.step for snapshot in live._history._latest][-2:] == [6400, 6500]
+    with pytest.raises(ConfigError, match="time that was flown"):
+        Live(live.sim).go_to(1.0)
+    live.go_to(5.0)
+    assert live.time == pytest.approx(5.0)
     assert live._pace._counts.shape == (5000,)
 
 

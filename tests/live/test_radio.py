@@ -2,16 +2,19 @@
 
 import socket
 
+import jax
 import numpy as np
 import pytest
 
 from crazysim import Sim
+from crazysim.envs import make
 from crazysim.errors import ConfigError
 from crazysim.live.crtp import add_cflib_driver, remove_cflib_driver
 from crazysim.live.link import SimLink, TrainedPolicy, fly_policy
 from crazysim.live.mocap import Frame
 from crazysim.live.radio import Radio
-from crazysim.live.swarm import Swarm
+from crazysim.live.swarm import DroneState, Swarm
+from crazysim.train.export import describe
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:cflib", "ignore::DeprecationWarning:usb")
 
@@ -170,3 +173,20 @@ def test_trained_policies_get_their_observations():
     np.testing.assert_allclose(asked["rot"], np.eye(3).reshape(9))
     with pytest.raises(ConfigError, match="got gates"):
         TrainedPolicy(policy, meta | {"observations": {"gates": 3}})
+
+
+def test_observations_over_a_link_equal_those_of_the_task():
+    env = make("hover", 1)
+    step = env.reset(jax.random.key(3))
+    states, seen = step.data.states, {}
+    values = [np.asarray(x[0, 0], float) for x in (states.pos, states.quat, states.vel, states.ang_vel)]
+    goal = values[0] + np.asarray(step.obs["difference_to_goal"])[0, 0]
+
+    def policy(observations):
+        seen.update(observations)
+        return np.zeros(4)
+
+    TrainedPolicy(policy, describe(env), goal)(DroneState(0.0, *values, np.zeros(3)))
+    assert sorted(seen) == sorted(step.obs)
+    for name, value in seen.items():
+        np.testing.assert_allclose(value, np.asarray(step.obs[name])[0, 0], atol=1e-5)

@@ -95,7 +95,9 @@ def test_a_member_takes_the_command_of_its_population():
 
 
 def test_rotors_of_other_drones_need_no_command():
-    hexarotor = {"base": "cf21B_500", "rotors": {"position": np.eye(6, 3), "yaw_torque_sign": [1, -1] * 3}}
+    angles = np.pi / 3 * np.arange(6)
+    rotors = 0.05 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=-1)
+    hexarotor = {"base": "cf21B_500", "rotors": {"position": rotors, "yaw_torque_sign": [1, -1] * 3}}
     sim = Sim(drone=["cf21B_500", hexarotor], control="rotor_vel")
     sim["Crazyflie_0"].command([1000.0, 2000, 3000, 4000])
     np.testing.assert_array_equal(sim.data.controls.rotor_vel[0, 0], [1000, 2000, 3000, 4000, 0, 0])

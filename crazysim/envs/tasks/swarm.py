@@ -12,6 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.others import reduce_over_others
 from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
@@ -90,11 +91,16 @@ class Swarm(Task):
             as_formation(self.formation, sim.n_drones)
         zero = jnp.zeros_like(sim.data.states.pos)
 
-        @stage("world")
+        @stage("drone")
         def keep_closest(data: SimData) -> SimData:
-            """Note how close others have come."""
-            own = swarm_of(data)
-            return with_record(data, own.replace(closest=jnp.minimum(own.closest, separation(data.states.pos))))
+            """Keep the smallest separation from another drone."""
+            own, place = swarm_of(data), data.states.pos / np.array(SEPARATION, data.states.pos.dtype)
+
+            def square(other: Array, is_self: Array) -> Array:
+                return jnp.where(is_self, jnp.inf, jnp.sum((place - other) ** 2))
+
+            nearest = rotation.safe_sqrt(reduce_over_others(square, place, "min"))
+            return with_record(data, own.replace(closest=jnp.minimum(own.closest, nearest)))
 
         record = SwarmRecord(zero, jnp.full(zero.shape[:2], jnp.inf, zero.dtype))
         install_rules(sim, record, keep_closest)

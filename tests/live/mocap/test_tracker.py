@@ -102,6 +102,14 @@ def test_a_jump_is_refused_once_and_accepted_when_it_stays():
     np.testing.assert_array_equal(tracker.vel[0], 0)
 
 
+def test_frames_in_a_burst_do_not_make_a_body_fast():
+    tracker, t = tracked()
+    tracker.accept(frame(t, a=(t, 0, 1)))
+    tracker.accept(frame(t + 1e-6, a=(t + 0.03, 0, 1)))
+    np.testing.assert_allclose(tracker.vel[0], [10, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(tracker.pos[0], [t + 0.03, 0, 1])
+
+
 def test_unknown_and_duplicate_names():
     tracker, t = tracked()
     twice = Frame(t, ("a", "ghost", "a", "b"), np.array([[9, 9, 9.0]] * 3 + [[0, 5, 0.01]]), np.tile(LEVEL, (4, 1)), t)

@@ -1,0 +1,219 @@
+"""Reductions over the drones of a world: against all pairs written out, and on every engine."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import with_states
+
+from crazysim import ConfigError, Downwash, Plugin, Sim, reduce_over_others, stage
+from crazysim.core import insert_fn_before
+from crazysim.engine import Step, native
+from crazysim.engine.program import UnfusedStage
+
+ENGINES = ["lanes", "interpret", *(["fused"] if native.compiler() else [])]
+
+
+@stage("drone")
+def crowd(data):
+    """Push drones apart, harder where one is near, and let a bool and an integer take part."""
+    pos = data.states.pos
+
+    def pair(other, is_self):
+        offset = pos - other["pos"]
+        return jnp.where(is_self, 0.0, other["gain"] * offset / (jnp.dot(offset, offset) + 0.1))
+
+    push = reduce_over_others(pair, {"pos": pos, "gain": 1e-3 * jnp.exp(-jnp.abs(pos[2]))})
+    square = reduce_over_others(lambda other, me: jnp.where(me, jnp.inf, jnp.sum((pos - other) ** 2)), pos, "min")
+    higher = reduce_over_others(lambda other, me: other > pos[2], pos[2], "max")
+    count = reduce_over_others(lambda other, me: jnp.int32(other > pos[2]), pos[2])
+    force = push + jnp.where(higher, 1e-4, 0.0) * jnp.minimum(square, 2.0) + 1e-5 * count
+    return data.replace(states=data.states.replace(force=force))
+
+
+def crowd_by_hand(pos):
+    """Return the same forces, pair by pair in float64. (n_drones, 3)"""
+    force = np.zeros_like(pos)
+    for i, p in enumerate(pos):
+        others = [j for j in range(len(pos)) if j != i]
+        for j in others:
+            offset = p - pos[j]
+            force[i] += 1e-3 * np.exp(-abs(pos[j, 2])) * offset / (offset @ offset + 0.1)
+        higher = sum(pos[j, 2] > p[2] for j in others)
+        nearest = min([np.sum((p - pos[j]) ** 2) for j in others], default=np.inf)
+        force[i] += (1e-4 if higher else 0.0) * min(nearest, 2.0) + 1e-5 * higher
+    return force
+
+
+def as_float64(data):
+    """Return the data with all floating-point numbers in float64."""
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if x.dtype == jnp.float32 else x, data)
+
+
+def random_places(n_worlds, n_drones, seed=0):
+    """Return places in a cube of 2 m above the floor. (n_worlds, n_drones, 3)"""
+    return np.random.default_rng(seed).uniform(-1, 1, (n_worlds, n_drones, 3)) + [0, 0, 2]
+
+
+def simulation(n_worlds, n_drones, **settings):
+    """Return drones in a crowd that push each other."""
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude", **settings)
+    sim.data = with_states(sim.data, pos=random_places(n_worlds, n_drones))
+    insert_fn_before(sim.step_pipeline, "integration", crowd)
+    return sim
+
+
+@pytest.mark.parametrize("n_drones", [1, 2, 3, 9, 17])
+def test_all_engines_compute_all_pairs(n_drones):
+    """Counts below, at and above the lanes of a vector and of a warp; rounding of float32 alone."""
+    sim = simulation(3, n_drones)
+    expected = np.stack([crowd_by_hand(pos) for pos in np.asarray(sim.data.states.pos, np.float64)])
+    assert np.abs(expected).max() > 1e-4 or n_drones == 1
+    for engine in ["plain", *ENGINES]:
+        step = Step(sim.step_pipeline, engine, strict=True)
+        found = step(sim.data, jnp.int32(1))
+        np.testing.assert_allclose(found.states.force, expected, rtol=2e-5, atol=1e-9, err_msg=engine)
+        if engine != "plain":
+            assert not step.plan(sim.data).program.unfused_stages
+
+
+@pytest.mark.parametrize("n_drones", [3, 9])
+def test_law_08_gradients_equal_central_differences(n_drones, x64):
+    """In float64 engines agree to its rounding, and the slope of a sum over velocities is that of differences."""
+    sim = simulation(2, n_drones)
+    sim.add(Downwash())
+    data = as_float64(sim.data)
+    rng = np.random.default_rng(2)
+    way = jnp.asarray(rng.normal(size=data.states.pos.shape))
+    ends = {}
+    for engine in ["plain", *ENGINES]:
+        step = Step(sim.step_pipeline, engine)
+
+        def loss(size, step=step):
+            states = data.states.replace(pos=data.states.pos + size * way)
+            after = step(data.replace(states=states), 2)
+            return jnp.sum(after.states.vel[..., 2]) * 1e3 + jnp.sum(after.plugins["downwash"].air_vel ** 2)
+
+        ends[engine] = float(loss(0.0))
+        np.testing.assert_allclose(ends[engine], ends["plain"], rtol=1e-12)
+        if engine != "interpret":
+            slope, h = float(jax.grad(loss)(0.0)), 1e-6
+            difference = (float(loss(h)) - float(loss(-h))) / (2 * h)
+            assert abs(slope) > 1e-3
+            np.testing.assert_allclose(slope, difference, rtol=1e-6)
+
+
+def test_the_order_of_the_drones_does_not_matter():
+    """What the drones of a world get is permuted along with them."""
+    order = np.random.default_rng(1).permutation(17)
+    sim = simulation(2, 17)
+    turned = with_states(sim.data, pos=np.asarray(sim.data.states.pos)[:, order])
+    for engine in ENGINES[::2]:
+        step = Step(sim.step_pipeline, engine)
+        a, b = step(sim.data, jnp.int32(1)), step(turned, jnp.int32(1))
+        np.testing.assert_allclose(b.states.force, np.asarray(a.states.force)[:, order], rtol=2e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("n_drones", [3, 9])
+def test_law_07_a_bad_world_does_not_touch_another(n_drones):
+    sim = simulation(3, n_drones)
+    pos = np.array(sim.data.states.pos)
+    pos[1, 0] = np.nan
+    bad = with_states(sim.data, pos=pos)
+    for engine in ENGINES:
+        step = Step(sim.step_pipeline, engine)
+        a, b = step(sim.data, jnp.int32(2)), step(bad, jnp.int32(2))
+        np.testing.assert_array_equal(np.asarray(b.states.pos)[[0, 2]], np.asarray(a.states.pos)[[0, 2]])
+        assert np.asarray(b.core.nonfinite).ravel().tolist() == [False, True, False]
+        assert np.isnan(np.asarray(b.states.force)[1, :, 0]).all()
+
+
+def test_a_condition_selects_what_a_stage_computes():
+    """Drones publish at every step; a stage that acts at every third changes the others' numbers then alone."""
+    sim = simulation(2, 9)
+    rare = stage("drone", when=lambda data: data.core.steps % 3 == 0)(crowd.fn)
+    rare.__name__ = "crowd"
+    sim.step_pipeline["crowd"] = rare
+    moved = {}
+    for engine in ["plain", *ENGINES]:
+        data = sim.data
+        step, seen = Step(sim.step_pipeline, engine), []
+        for _ in range(4):
+            data = step(data, jnp.int32(1))
+            seen.append(np.asarray(data.states.force))
+        moved[engine] = seen
+        np.testing.assert_array_equal(seen[0], seen[2])
+        assert np.any(seen[3] != seen[2])
+        np.testing.assert_allclose(seen[3], moved["plain"][3], rtol=1e-4, atol=1e-9)
+
+
+class Push(Plugin):
+    """Push drones apart in proportion to their distance."""
+
+    name: str = "push"
+
+    def influence(self, data):
+        pos, gains = data.states.pos, jnp.asarray([1e-3, 2e-3])
+        both = jax.vmap(lambda k: reduce_over_others(lambda other, me: k * (pos - other), pos))(gains)
+        return data.replace(states=data.states.replace(force=data.states.force + both.sum(0)))
+
+
+def test_an_inner_vmap_and_an_influence_may_reduce():
+    """RK4 evaluates an influence four times a step, each time at the places of that time."""
+
+    for n_drones in (3, 9):
+        sim = Sim(n_worlds=2, n_drones=n_drones, control="attitude", integrator="rk4")
+        sim.data = with_states(sim.data, pos=random_places(2, n_drones), vel=random_places(2, n_drones, 1) - [0, 0, 2])
+        sim.add(Push())
+        expected = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(3)).states
+        pos = np.asarray(sim.data.states.pos, np.float64)
+        still = Sim(n_worlds=2, n_drones=n_drones, control="attitude", integrator="rk4")
+        still.data = sim.data.replace(plugins={})
+        free = Step(still.step_pipeline, "plain")(still.data, jnp.int32(3)).states
+        pull = 3e-3 * (n_drones * pos - pos.sum(1, keepdims=True)) / 0.0434
+        np.testing.assert_allclose(np.asarray(expected.vel - free.vel), 3 * 0.002 * pull, rtol=0.02, atol=2e-5)
+        for engine in ENGINES:
+            found = Step(sim.step_pipeline, engine)(sim.data, jnp.int32(3)).states
+            np.testing.assert_allclose(found.vel, expected.vel, rtol=1e-5, atol=1e-6, err_msg=engine)
+
+
+@pytest.mark.parametrize("n_drones", [3, 9])
+def test_law_08_gradients_are_those_of_plain(n_drones):
+    sim = simulation(2, n_drones)
+    sim.add(Downwash())
+
+    def loss(step, pos):
+        data = step(sim.data.replace(states=sim.data.states.replace(pos=pos)), 3)
+        return jnp.sum(data.states.vel**2) + jnp.sum(data.plugins["downwash"].air_vel ** 2)
+
+    expected = jax.grad(lambda pos: loss(Step(sim.step_pipeline, "plain"), pos))(sim.data.states.pos)
+    for engine in set(ENGINES) - {"interpret"}:
+        found = jax.grad(lambda pos, e=engine: loss(Step(sim.step_pipeline, e), pos))(sim.data.states.pos)
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+
+
+def test_law_09_wrong_uses_are_errors():
+    with pytest.raises(ConfigError, match="expected reduce_over_others in a function of one drone"):
+        reduce_over_others(lambda other, me: other, jnp.ones(3))
+    with pytest.raises(ConfigError, match="'sum', 'min' or 'max', got 'mean'"):
+        reduce_over_others(lambda other, me: other, jnp.ones(3), "mean")
+    with pytest.raises(ConfigError, match="got bools"):
+        reduce_over_others(lambda other, me: other > 0, jnp.ones(3))
+
+
+def test_a_reduction_in_a_loop_is_not_fused():
+    @stage("drone")
+    def looped(data):
+        pos = data.states.pos
+
+        def body(_, x):
+            return x + reduce_over_others(lambda other, me: other, pos)
+
+        force = jax.lax.fori_loop(0, 3, body, jnp.zeros(3)) * 1e-4
+        return data.replace(states=data.states.replace(force=force))
+
+    sim = Sim(n_worlds=2, n_drones=3)
+    insert_fn_before(sim.step_pipeline, "integration", looped)
+    with pytest.warns(match="stands in a loop"):
+        (unfused,) = Step(sim.step_pipeline, "lanes").plan(sim.data).program.unfused_stages
+    assert isinstance(unfused, UnfusedStage)
