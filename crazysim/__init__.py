@@ -7,17 +7,19 @@ from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.others import reduce_over_others
 from crazysim.core.plugin import Placement, Plugin, parameter
+from crazysim.core.population import Population
 from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.effects import Battery, Downwash, GroundEffect, Latency, MotorFailure, Wind, WindField
 from crazysim.errors import ConfigError
 from crazysim.lazy import lazy
-from crazysim.pytree import PyTree, leaf, static
+from crazysim.pytree import Members, PyTree, leaf, static
 from crazysim.sim.sim import Sim
 from crazysim.version import __version__
 
 if TYPE_CHECKING:
+    from crazysim.bodies import DroneCollisions, FreeBodies
     from crazysim.core import functional as functional
     from crazysim.envs import make
     from crazysim.payloads import Hook, RotorJet, SharedLoad, SlungLoad
@@ -43,15 +45,19 @@ __all__ = [
     "Controller",
     "Downwash",
     "Drone",
+    "DroneCollisions",
     "Dynamics",
     "Follow",
+    "FreeBodies",
     "GroundEffect",
     "Hook",
     "Integrator",
     "Latency",
+    "Members",
     "MotorFailure",
     "Placement",
     "Plugin",
+    "Population",
     "PyTree",
     "Radar",
     "RangeFinder",
@@ -80,7 +86,9 @@ __getattr__ = lazy(
         "Cars": "crazysim.vehicles",
         "ContactLog": "crazysim.scene.contact_log",
         "ContactResponse": "crazysim.scene.response",
+        "DroneCollisions": "crazysim.bodies",
         "Follow": "crazysim.trajectories",
+        "FreeBodies": "crazysim.bodies",
         "Hook": "crazysim.payloads",
         "MPPI": "crazysim.sim.mppi",
         "RotorJet": "crazysim.payloads",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from collections.abc import Collection
+from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -10,13 +11,15 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.bodies.pairs import Found, Solids, between, joined, on_ground, on_surface
-from crazysim.bodies.solver import Bodies, solve_contacts
+from crazysim.bodies.pairs import CORNERS, Found, Solids, between, joined, on_ground, on_surface
+from crazysim.bodies.solver import Bodies, Impulses, solve_contacts
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
 from crazysim.core.population import populations
 from crazysim.core.stage import over_worlds
 from crazysim.effects.ground import TerrainData
+from crazysim.geometry.linear import apply, matmul
+from crazysim.geometry.manifold import N_OF_BOXES
 from crazysim.scene.collision import CollisionGeom
 from crazysim.scene.report import choose
 
@@ -42,7 +45,7 @@ class Touching:
         """Collect the solids of the scene as they are now."""
         self.plugin, self.shapes = plugin, plugin.shapes
         self.n_drones = sim.n_drones if plugin.drones else 0
-        self.box = np.asarray(sim.airframe.value("shape.collision_box"), np.float64)
+        self.boxes = boxes_of_drones(sim)
         model = sim.scene.collision_model
         self.carriers = [Carrier(None, None, tuple(model.floor))] if model.floor else []
         kinds = {kind: p for p in sim.scene.plugins() for kind in p.placed_kinds or ()}
@@ -55,6 +58,23 @@ class Touching:
                 self.carriers.append(Carrier(kind, int(number), body.geoms))
             elif kind not in kinds:
                 self.carriers.append(Carrier(None, body.row, body.geoms))
+
+    def n_contacts(self, terrains: Collection[str]) -> int:
+        """Return the number of contact points, of which most are out of contact.
+
+        Args:
+            terrains: Names of the plugins whose height fields are terrain.
+        """
+        balls = [shape.kind == "sphere" for shape in self.shapes]
+        geoms = [geom for carrier in self.carriers for geom in carrier.geoms]
+        others = [False] * self.n_drones + [g.shape.kind == "sphere" for g in geoms if g.shape.kind in EXACT]
+        pairs = [*combinations(balls, 2), *product(balls, others)]
+        n = sum(1 if any(pair) else N_OF_BOXES for pair in pairs)
+        for geom in geoms:
+            if geom.shape.kind not in EXACT:
+                only_corners = geom.shape.kind == "plane" or geom.name in terrains
+                n += sum(1 if ball else len(CORNERS) + (not only_corners) for ball in balls)
+        return n
 
     def respond(self, data: SimData) -> SimData:
         """Return the data of all worlds with the velocities after contact."""
@@ -77,9 +97,17 @@ class Touching:
             jnp.concatenate([x[:, 0], jnp.zeros(size - n_free, x.dtype)]) for x in (record.friction, record.restitution)
         )
         contacts = joined(found, friction, restitution)
-        after, impulse = solve_contacts(bodies, contacts, 1 / data.core.freq, plugin.softness, plugin.iterations)
+        before = Impulses(record.press, record.drag)
+        after, at, impulse = solve_contacts(
+            bodies, contacts, before, 1 / data.core.freq, plugin.softness, plugin.iterations
+        )
         ang_vel = rotation.rotate_inverse(record.quat, after.ang_vel[:n_free])
-        data = plugin.write(data, record.replace(vel=after.vel[:n_free], ang_vel=ang_vel, impulse=impulse[:n_free]))
+        data = plugin.write(
+            data,
+            record.replace(
+                vel=after.vel[:n_free], ang_vel=ang_vel, impulse=impulse[:n_free], press=at.press, drag=at.drag
+            ),
+        )
         if n_drones:
             own = slice(n_free, first_carrier)
             ang_vel = rotation.rotate_inverse(s.quat, after.ang_vel[own])
@@ -88,14 +116,11 @@ class Touching:
 
     def _bodies(self, data: SimData, record: Any) -> Bodies:
         """Return the bodies: free ones, drones, then those that are not pushed."""
-        s, p, dtype = data.states, data.params, record.pos.dtype
+        dtype = record.pos.dtype
         rows = [(record.pos, record.vel, rotation.rotate(record.quat, record.ang_vel), 1 / record.mass[:, 0],
                  _turned(record.quat, 1 / record.inertia))]  # fmt: skip
         if self.n_drones:
-            rot, inverse = rotation.matrix(s.quat), jnp.broadcast_to(p.J_inv, (self.n_drones, 3, 3))
-            inverse = _product(_product(rot, inverse), jnp.swapaxes(rot, -1, -2))
-            inv_mass = jnp.broadcast_to(1 / p.mass, (self.n_drones, 1))[:, 0]
-            rows.append((s.pos, s.vel, rotation.rotate(s.quat, s.ang_vel), inv_mass, inverse))
+            rows.append(drones_as_bodies(data))
         for carrier in self.carriers:
             pos, quat, vel, ang_vel = _motion(data, carrier)
             spin = rotation.rotate(quat, ang_vel)
@@ -104,7 +129,7 @@ class Touching:
 
     def _solids(self, data: SimData, record: Any) -> Solids:
         """Return the shapes of free bodies and drones, and the balls and boxes of objects, at their poses."""
-        n_free, s = record.pos.shape[0], data.states
+        n_free = record.pos.shape[0]
         dtype = record.pos.dtype
         owners, balls, sizes = list(range(n_free)), [x.kind == "sphere" for x in self.shapes], []
         sizes = [np.resize(x.size, 3) for x in self.shapes]
@@ -112,9 +137,9 @@ class Touching:
         if self.n_drones:
             owners += range(n_free, n_free + self.n_drones)
             balls += [False] * self.n_drones
-            sizes += [self.box[3:]] * self.n_drones
-            pos.append(s.pos + rotation.rotate(s.quat, jnp.asarray(self.box[:3], dtype)))
-            rot.append(rotation.matrix(s.quat))
+            sizes += list(self.boxes[:, 3:])
+            for whole, part in zip((pos, rot), drones_as_boxes(data, self.boxes), strict=True):
+                whole.append(part)
         for k, carrier in enumerate(self.carriers):
             for geom in carrier.geoms:
                 if geom.shape.kind in EXACT:
@@ -144,6 +169,31 @@ class Touching:
         return found
 
 
+def drones_as_bodies(data: SimData) -> Bodies:
+    """Return the drones of one world as bodies."""
+    s, p, n = data.states, data.params, data.states.pos.shape[0]
+    rot, inverse = rotation.matrix(s.quat), jnp.broadcast_to(p.J_inv, (n, 3, 3))
+    inverse = matmul(matmul(rot, inverse), jnp.swapaxes(rot, -1, -2))
+    inv_mass = jnp.broadcast_to(1 / p.mass, (n, 1))[:, 0]
+    return Bodies(s.pos, s.vel, rotation.rotate(s.quat, s.ang_vel), inv_mass, inverse)
+
+
+def boxes_of_drones(sim: Simulation) -> np.ndarray:
+    """Return centre and half extents of each drone's collision box, body frame, m. (n_drones, 6)"""
+    return np.array([airframe.value("shape.collision_box") for airframe in sim.airframes], np.float64)
+
+
+def drones_as_boxes(data: SimData, boxes: np.ndarray) -> tuple[Array, Array]:
+    """Return positions, m (n, 3), and attitudes (n, 3, 3) of the drones' collision boxes; of one world.
+
+    Args:
+        data: One world.
+        boxes: Centre and half extents of each drone's box, body frame, m. (n_drones, 6)
+    """
+    s = data.states
+    return s.pos + rotation.rotate(s.quat, jnp.asarray(boxes[:, :3], s.pos.dtype)), rotation.matrix(s.quat)
+
+
 def _motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Array, Array]:
     """Return position, attitude, velocity, world frame, and angular velocity, body frame, of a carrier."""
     dtype = data.states.pos.dtype
@@ -161,16 +211,11 @@ def _pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: Any) -> t
     """Return position and rotation matrix of a geom, world frame."""
     pos, quat, _, _ = _motion(data, carrier)
     rot = rotation.matrix(quat)
-    at = pos + rotation.matvec(rot, jnp.asarray(geom.pos, dtype))
-    return at, rot if geom.rot is None else _product(rot, jnp.asarray(geom.rot, dtype))
+    at = pos + apply(rot, jnp.asarray(geom.pos, dtype))
+    return at, rot if geom.rot is None else matmul(rot, jnp.asarray(geom.rot, dtype))
 
 
 def _turned(quat: Array, diagonal: Array) -> Array:
     """Return the matrices ``R diag(d) R^T``. (n, 3, 3)"""
     rot = rotation.matrix(quat)
-    return _product(rot * diagonal[:, None, :], jnp.swapaxes(rot, -1, -2))
-
-
-def _product(a: Array, b: Array) -> Array:
-    """Return ``a @ b`` by components: a GPU may round matrix products to 10 bits. (..., 3, 3)"""
-    return jnp.stack([rotation.matvec(a, b[..., k]) for k in range(3)], axis=-1)
+    return matmul(rot * diagonal[:, None, :], jnp.swapaxes(rot, -1, -2))

@@ -15,11 +15,12 @@ from crazysim.core.data import Objects, SimData
 from crazysim.core.plugin import Placement, Simulation, parameter
 from crazysim.core.population import Population
 from crazysim.core.stage import Stage
+from crazysim.effects.ground import TerrainData
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
 from crazysim.payloads.body import shape_of
 from crazysim.payloads.core import placed
-from crazysim.pytree import Members, leaf
+from crazysim.pytree import Members, leaf, of_host
 from crazysim.scene.report import Objects as ObjectNames
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -45,6 +46,11 @@ class FreeBodiesData(Members):
     """External torque, world frame, N m; kept until it is changed. (n_worlds, n_members, 3)"""
     impulse: Array = leaf("member", 1)
     """Impulse of all contacts in the last step, world frame, N s. (n_worlds, n_members, 3)"""
+    press: Array = leaf("world", 1)
+    """Impulses of the last step along the normals of the contact points, N s, with which the next begins.
+    (n_worlds, 1, n_contacts)"""
+    drag: Array = leaf("world", 2)
+    """The same across the normals, world frame, N s. (n_worlds, 1, n_contacts, 3)"""
     mass: Array = leaf("member", 1)
     """Mass, kg. (n_worlds, n_members, 1)"""
     inertia: Array = leaf("member", 1)
@@ -82,12 +88,12 @@ class FreeBodies(Population):
     """Ratio of the speeds after and before a bounce, 0 to 1; of two bodies the larger counts. (), (n_members,) or
     (n_worlds, n_members)"""
     objects: ObjectNames = None
-    """Handles, or names of objects that the bodies touch; None for all at the time of adding, () for the ground alone."""
+    """Handles, or names of objects that the bodies touch; None for all at the time of adding, () for the ground."""
     drones: bool = True
     """True for contact with drones."""
     softness: float = 0.03
     """Time constant with which an overlap is pushed out, s; at least two steps."""
-    iterations: int = 30
+    iterations: int = 20
     """Iterations of the solver."""
     rgba: Any = None
     """Colour, one or one for each body; None for the default. (4,) or (n_members, 4)"""
@@ -106,6 +112,11 @@ class FreeBodies(Population):
         if listed and len(size) != n:
             raise ConfigError(f"expected one size for all {n} bodies or a list of {n}, got a list of {len(size)}")
         return tuple(shape_of(tuple(s) if np.ndim(s) else s) for s in (size if listed else [size] * n))
+
+    @property
+    def pushes_drones(self) -> bool:
+        """True if the contacts of this plugin are those with drones, so that ``ContactResponse`` leaves them out."""
+        return self.drones
 
     @property
     def placed_kinds(self) -> tuple[str, ...]:
@@ -139,8 +150,12 @@ class FreeBodies(Population):
         for name, value in (("pos", pos), ("vel", self.vel)):
             if not np.all(np.isfinite(np.asarray(value, np.float64))):
                 raise ConfigError(f"expected {name} to be finite, got {value!r}")
+        self.check(sim)
+        self._add_to_scene(sim, shapes)
+        terrains = [name for name, x in sim.data.plugins.items() if isinstance(x, TerrainData)]
+        n_contacts = Touching(sim, self).n_contacts(terrains)
         zero = np.zeros(3)
-        record = self.create(
+        return self.create(
             sim,
             FreeBodiesData,
             pos=np.asarray(pos, np.float64),
@@ -150,11 +165,11 @@ class FreeBodies(Population):
             force=zero,
             torque=zero,
             impulse=zero,
+            press=of_host(0.0, sim.n_worlds, 1, n_contacts),
+            drag=of_host(0.0, sim.n_worlds, 1, n_contacts, 3),
             inertia=numbers["mass"] * np.stack([inertia_per_mass(shape) for shape in shapes]),
             **numbers,
         )
-        self._add_to_scene(sim, shapes)
-        return record
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages of the integration and of the contacts."""

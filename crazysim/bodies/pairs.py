@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -12,10 +13,14 @@ from jax import Array
 from crazysim import rotation
 from crazysim.bodies.solver import Contacts
 from crazysim.geometry import Shape, distance, point_distance
+from crazysim.geometry.linear import apply
 from crazysim.geometry.manifold import Manifold, ball_on_box, balls, boxes
 from crazysim.scene.collision import CollisionGeom
 
+GapFn = Callable[[Array], tuple[Array, Array]]
+"""From points (n, 3) to gaps (n,) and normals (n, 3)."""
 CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+"""Corners of a box of half lengths one. (8, 3)"""
 
 
 class Solids(NamedTuple):
@@ -83,13 +88,13 @@ def on_surface(solids: Solids, number: int, geom: CollisionGeom, carrier: int, p
     shape = geom.shape
     if is_ball:
         radius = float(solids.size[number, 0])
-        gap, normal = _height(shape, rotation.matvec(turn.T, pos - at))
-        normal, gap = rotation.matvec(turn, normal), gap - radius
+        gap, normal = _height(shape, apply(turn.T, pos - at))
+        normal, gap = apply(turn, normal), gap - radius
         found = Manifold(gap[None], normal[None], (pos - normal * (radius + 0.5 * gap))[None])
     else:
-        corners = pos + rotation.matvec(rot, jnp.asarray(CORNERS * solids.size[number], dtype))
-        gap, normal = _height(shape, rotation.matvec(turn.T, corners - at))
-        found = Manifold(gap, rotation.matvec(turn, normal), corners)
+        corners = pos + apply(rot, jnp.asarray(CORNERS * solids.size[number], dtype))
+        gap, normal = _height(shape, apply(turn.T, corners - at))
+        found = Manifold(gap, apply(turn, normal), corners)
         if shape.kind != "plane":
             nearest = _nearest(Shape("box", tuple(map(float, solids.size[number]))), pos, rot, shape, at, turn)
             found = Manifold(*(jnp.concatenate(x) for x in zip(found, nearest, strict=True)))
@@ -97,7 +102,7 @@ def on_surface(solids: Solids, number: int, geom: CollisionGeom, carrier: int, p
     return Found(np.full(n, solids.body[number]), np.full(n, carrier), found)
 
 
-def on_ground(solids: Solids, number: int, carrier: int, gap_at) -> Found:  # noqa: ANN001
+def on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> Found:
     """Return the contact points of a solid with terrain, of which ``gap_at(points)`` gives gaps and normals."""
     pos, rot = solids.pos[number], solids.rot[number]
     if solids.is_ball[number]:
@@ -106,7 +111,7 @@ def on_ground(solids: Solids, number: int, carrier: int, gap_at) -> Found:  # no
         gap = gap - radius
         found = Manifold(gap, normal, pos - normal * (radius + 0.5 * gap[:, None]))
     else:
-        corners = pos + rotation.matvec(rot, jnp.asarray(CORNERS * solids.size[number], pos.dtype))
+        corners = pos + apply(rot, jnp.asarray(CORNERS * solids.size[number], pos.dtype))
         found = Manifold(*gap_at(corners), corners)
     n = found.gap.shape[0]
     return Found(np.full(n, solids.body[number]), np.full(n, carrier), found)
@@ -137,13 +142,13 @@ def _nearest(box: Shape, pos: Array, rot: Array, shape: Shape, at: Array, turn: 
 
     def gap_at(move: Array, turned: Array) -> Array:
         spun = rot + jnp.stack([rotation.cross(turned, rot[:, k]) for k in range(3)], axis=-1)
-        columns = [rotation.matvec(turn.T, spun[:, k]) for k in range(3)]
-        return distance(box, shape, rotation.matvec(turn.T, pos + move - at), jnp.stack(columns, axis=-1))
+        columns = [apply(turn.T, spun[:, k]) for k in range(3)]
+        return distance(box, shape, apply(turn.T, pos + move - at), jnp.stack(columns, axis=-1))
 
     gap, pull = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
     normal, torque = pull(jnp.ones_like(gap))
     half = jnp.asarray(box.size, pos.dtype)
-    reach = jnp.sum(jnp.abs(rotation.matvec(rot.T, normal)) * half)
+    reach = jnp.sum(jnp.abs(apply(rot.T, normal)) * half)
     point = pos + rotation.cross(normal, torque) - reach * normal
     return Manifold(gap[None], normal[None], point[None])
 

@@ -1,7 +1,7 @@
 """Contact manifolds: the points at which two balls or boxes touch, with normals and gaps.
 
-For one pair, on small arrays; ``jax.vmap`` takes many. The number of points is that of the kinds of the pair, and points
-that do not exist have a large gap.
+For one pair, on small arrays; ``jax.vmap`` takes many. The number of points depends on the kinds of the pair only, and
+points that do not exist have a large gap.
 """
 
 from __future__ import annotations
@@ -13,7 +13,10 @@ from jax import Array, lax
 
 from crazysim import rotation
 from crazysim.geometry.heightfield import FAR
+from crazysim.geometry.linear import apply, matmul
 
+N_OF_BOXES = 13
+"""Number of points of two boxes."""
 PARALLEL = 1e-3
 """Sine of the angle of two edges below which they span no separating axis."""
 EDGE_SHARE, EDGE_BIAS = 0.95, 0.01
@@ -53,7 +56,7 @@ def ball_on_box(radius: Array, pos: Array, size: Array, pos_box: Array, rot_box:
         pos_box: Position of its centre, world frame, m. (3,)
         rot_box: Rotation matrix from its frame to the world. (3, 3)
     """
-    centre = rotation.matvec(rot_box.T, pos - pos_box)
+    centre = apply(rot_box.T, pos - pos_box)
     nearest = rotation.safe_clip(centre, -size, size)
     out = centre - nearest
     distance = rotation.safe_norm(out)
@@ -64,7 +67,7 @@ def ball_on_box(radius: Array, pos: Array, size: Array, pos_box: Array, rot_box:
     is_out = distance > 0
     normal = jnp.where(is_out, out / jnp.where(is_out, distance, 1.0), face)
     gap = jnp.where(is_out, distance, -jnp.min(depth)) - radius
-    normal = rotation.matvec(rot_box, normal)
+    normal = apply(rot_box, normal)
     return Manifold(gap, normal[None], (pos - normal * (radius + 0.5 * gap))[None])
 
 
@@ -84,12 +87,12 @@ def boxes(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b: Array
         rot_b: Rotation matrix from its frame to the world. (3, 3)
     """
     offset = pos_a - pos_b
-    turn = _product(rot_b.T, rot_a)
+    turn = matmul(rot_b.T, rot_a)
     size = jnp.abs(turn)
-    along_a, along_b = rotation.matvec(rot_a.T, offset), rotation.matvec(rot_b.T, offset)
+    along_a, along_b = apply(rot_a.T, offset), apply(rot_b.T, offset)
     faces = jnp.concatenate([
-        jnp.abs(along_a) - half_a - rotation.matvec(size.T, half_b),
-        jnp.abs(along_b) - half_b - rotation.matvec(size, half_a),
+        jnp.abs(along_a) - half_a - apply(size.T, half_b),
+        jnp.abs(along_b) - half_b - apply(size, half_a),
     ])  # fmt: skip
     best = jnp.argmax(lax.stop_gradient(faces))
     axes = rotation.cross(rot_b.T[:, None], rot_a.T[None])  # (3 of b, 3 of a, 3)
@@ -129,14 +132,14 @@ def _clipped(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> 
     offset = other[1] - pos
     side = jnp.where(jnp.sum(offset * rot[:, 0]) < 0, -1.0, 1.0)
     normal = side * rot[:, 0]
-    against = rotation.matvec(other[2].T, normal)
+    against = apply(other[2].T, normal)
     turned = jnp.argmax(lax.stop_gradient(jnp.abs(against)))
-    half_o, pos_o, rot_o = _rolled(other, turned)
+    half_o, _, rot_o = _rolled(other, turned)
     # The other's nearest face: its middle and its half edges, in the plane of the face (u, v) and along its normal (s).
     sign = jnp.where(against[turned] > 0, -1.0, 1.0)
     frame = jnp.stack([rot[:, 1], rot[:, 2], normal])
-    middle = rotation.matvec(frame, offset + sign * half_o[0] * rot_o[:, 0]) - jnp.stack([0 * side, 0 * side, half[0]])
-    edge_1, edge_2 = half_o[1] * rotation.matvec(frame, rot_o[:, 1]), half_o[2] * rotation.matvec(frame, rot_o[:, 2])
+    middle = apply(frame, offset + sign * half_o[0] * rot_o[:, 0]) - jnp.stack([0 * side, 0 * side, half[0]])
+    edge_1, edge_2 = half_o[1] * apply(frame, rot_o[:, 1]), half_o[2] * apply(frame, rot_o[:, 2])
     ring = jnp.stack([middle + x * edge_1 + y * edge_2 for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     along = jnp.roll(ring, -1, axis=0) - ring
     limit = half[1:]
@@ -175,11 +178,11 @@ def _crossed(
     normal = jnp.where(jnp.sum(axis * offset) < 0, -1.0, 1.0) * axis
     ends = []
     for (half, pos, rot), number, side in zip(boxes, (pair % 3, pair // 3), (-1.0, 1.0), strict=True):
-        toward = rotation.matvec(rot.T, normal)
+        toward = apply(rot.T, normal)
         is_edge = jnp.arange(3) == number
         place = jnp.where(is_edge, 0.0, side * jnp.where(toward < 0, -1.0, 1.0) * half)
         along = jnp.sum(jnp.where(is_edge, rot, 0.0), axis=-1)
-        ends.append((pos + rotation.matvec(rot, place), along, jnp.sum(jnp.where(is_edge, half, 0.0))))
+        ends.append((pos + apply(rot, place), along, jnp.sum(jnp.where(is_edge, half, 0.0))))
     (p, u, reach_p), (q, v, reach_q) = ends
     between = p - q
     c, d, e = (jnp.sum(x * y) for x, y in ((u, v), (u, between), (v, between)))
@@ -202,8 +205,3 @@ def _rolled(box: tuple[Array, ...], axis: Array) -> tuple[Array, ...]:
         pos,
         pick([jnp.roll(rot, -k, axis=1) for k in range(3)]),
     )
-
-
-def _product(a: Array, b: Array) -> Array:
-    """Return ``a @ b`` of 3 x 3 matrices by components: a GPU may round matrix products to 10 bits. (3, 3)"""
-    return jnp.stack([rotation.matvec(a, b[:, k]) for k in range(3)], axis=-1)

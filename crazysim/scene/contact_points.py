@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
+from crazysim.core.population import populations
 from crazysim.effects.ground import TerrainData
 from crazysim.geometry import Shape, distance, point_distance
 from crazysim.geometry.heightfield import field_gap
@@ -36,15 +37,27 @@ class Surface(NamedTuple):
     geom: CollisionGeom
     """The geom, in the frame of its object or of the world."""
     row: int | None
-    """Row of the movable object that carries it in ``data.objects``; None for a fixed one."""
+    """Row of the movable object that carries it in ``data.objects``, or number of the member; None for a fixed one."""
+    population: str | None = None
+    """Name of the population of which a member carries it; None for an object."""
 
 
 def surfaces_of(sim: Simulation, objects: Objects, loads: Collection[str] = ()) -> list[Surface]:
-    """Return the surfaces of the floor and of some objects, without those that are loads."""
+    """Return the surfaces of the floor, of some objects, and of members of populations, such as cars.
+
+    Loads are left out, and bodies that exchange impulses with drones in a stage of their own.
+    """
     model = sim.scene.collision_model
     found = [Surface(geom, None) for geom in model.floor]
+    placing = {kind: plugin for plugin in sim.scene.plugins() for kind in plugin.placed_kinds or ()}
+    members = populations(sim.data)
     for body in choose(model, objects):
-        found += [Surface(geom, body.row) for geom in body.geoms if body.name not in loads]
+        kind, _, number = body.name.rpartition(":")
+        if kind in members and hasattr(members[kind], "ang_vel"):
+            if not getattr(placing.get(kind), "pushes_drones", False):
+                found += [Surface(geom, int(number), kind) for geom in body.geoms]
+        elif body.name not in loads and kind not in placing:
+            found += [Surface(geom, body.row) for geom in body.geoms]
     return found
 
 
@@ -83,9 +96,10 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
     turn = quat[..., None, :]
     in_world = pos[..., None, :] + rotation.rotate(turn, corners)
     found = []
-    for geom, row in surfaces:
-        into, back, vel = _frame(data, geom, row)
-        still = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(turn, vel[..., None, :])
+    for surface in surfaces:
+        geom = surface.geom
+        into, back, vel = _frame(data, surface)
+        still = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(turn, vel(in_world))
         if geom.shape.kind == "hfield":
             gap, normal = _above(data, geom, in_world, into, back)
             normal = rotation.rotate_inverse(turn, normal)
@@ -112,8 +126,9 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
     pos, quat = body.pos[..., None, :], body.quat[..., None, :]
     axes = [rotation.rotate(quat, jnp.eye(3, dtype=pos.dtype)[k]) for k in range(3)]
     gaps, normals, vels = [], [], []
-    for geom, row in surfaces:
-        into, back, vel = _frame(data, geom, row)
+    for surface in surfaces:
+        geom = surface.geom
+        into, back, vel = _frame(data, surface)
         if geom.shape.kind == "hfield":
             gap, normal = _above(data, geom, pos, into, back)
             gap = gap - _reach(shape, jnp.stack([rotation.dot(axis, normal)[..., 0] for axis in axes], axis=-1))
@@ -123,7 +138,7 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
             normal = pull(jnp.ones_like(gap))[0]
         gaps.append(gap)
         normals.append(normal)
-        vels.append(jnp.zeros_like(pos) if vel is None else jnp.broadcast_to(vel[..., None, :], pos.shape))
+        vels.append(jnp.zeros_like(pos) if vel is None else vel(pos))
     return ContactPoints(
         jnp.concatenate(gaps, axis=-1), jnp.concatenate(normals, axis=-2), None, jnp.concatenate(vels, axis=-2)
     )
@@ -170,15 +185,24 @@ def _nearest(
     return ContactPoints(gap, normal, point, jnp.broadcast_to(vel, normal.shape))
 
 
-def _frame(data: SimData, geom: CollisionGeom, row: int | None) -> tuple[Callable, Callable, Array | None]:
-    """Return functions that take points and directions into a geom's frame, and directions back, and its velocity."""
+def _frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Callable | None]:
+    """Return functions that take points and directions into a geom's frame, and directions back, and its velocity.
+
+    The last one takes points in the world frame; it is None for a fixed surface.
+    """
+    geom, row = surface.geom, surface.row
     dtype = data.states.pos.dtype
     at = jnp.asarray(geom.pos, dtype)
     rot = None if geom.rot is None else jnp.asarray(geom.rot, dtype)
-    if row is None:
-        own_pos = own_quat = vel = None
-    else:
-        objects = data.objects
+    own_pos = own_quat = vel = spin = None
+    if surface.population is not None:
+        record = data.plugins[surface.population]
+        own_pos, own_quat, vel, ang_vel = (
+            getattr(record, name)[..., row, :] for name in ("pos", "quat", "vel", "ang_vel")
+        )
+        spin = rotation.rotate(own_quat, ang_vel)
+    elif row is not None:
+        objects: Any = data.objects
         own_pos, own_quat, vel = (x[..., row, :] for x in (objects.pos, objects.quat, objects.vel))
 
     def into(x: Array, is_point: bool) -> Array:
@@ -191,4 +215,10 @@ def _frame(data: SimData, geom: CollisionGeom, row: int | None) -> tuple[Callabl
         x = x if rot is None else rotation.matvec(rot, x)
         return x if own_quat is None else rotation.rotate(own_quat[..., None, :], x)
 
-    return into, back, vel
+    def moving(x: Array) -> Array:
+        out = jnp.broadcast_to(vel[..., None, :], x.shape)  # type: ignore[index]
+        if spin is None or own_pos is None:
+            return out
+        return out + rotation.cross(jnp.broadcast_to(spin[..., None, :], x.shape), x - own_pos[..., None, :])
+
+    return into, back, None if vel is None else moving

@@ -204,8 +204,8 @@ def add_bodies(
 
     Args:
         spec: Scene.
-        what: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec; or a list of one of the last
-            four for each body.
+        what: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec; or a list of one of these,
+            but no primitive, for each body.
         names: Names of the bodies.
         pos: Positions, m. (n, 3)
         quat: Attitudes, xyzw. (n, 4)

@@ -50,7 +50,8 @@ class ContactResponseData(PyTree):
 class ContactResponse(Plugin):
     """Response of floor and objects to contacts with drones and loads; replaces the stage ``clip_floor_pos``.
 
-    Drones do not push each other, and objects do not move. A drone that stands on the floor has its centre half its
+    Drones do not push each other (``DroneCollisions``), and objects do not move; drones ride on members of populations,
+    such as cars, that are in the scene at the time of adding. A drone that stands on the floor has its centre half its
     collision box above it. Loads, and hooks that carry none, that are objects of the scene at the time of adding are
     stopped by all objects but the flat floor, where they stop without it too. If they are among ``objects``, they
     exchange impulses with drones and with each other.

@@ -1,0 +1,329 @@
+"""Free bodies: rest, slides, bounces, stacks and rides against C MuJoCo and by hand, pushes, laws, wrong input."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from cases import with_states
+
+from crazysim import ConfigError, FreeBodies, Sim, Terrain, rotation
+from crazysim.core.stage import stage
+
+FREQ = 500
+
+
+def build(members=1, size=(0.2, 0.2, 0.2), mass=0.1, n_worlds=1, n_drones=1, drone_pos=(-3.0, 0.0, 1.0), **kwargs):
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", freq=FREQ)
+    sim.data = with_states(sim.data, pos=drone_pos)
+    sim.build_default_data()
+    return sim, sim.add(FreeBodies(members, size=size, mass=mass, **kwargs))
+
+
+def mujoco_track(bodies, seconds, friction=0.6, record=5):
+    """Return positions and quaternions, xyzw, of free bodies of C MuJoCo at 0.5 ms, every ``record`` of our steps.
+
+    Args:
+        bodies: Size (radius or full lengths), mass, position and velocity of each.
+    """
+    text = ""
+    for size, mass, pos, _ in bodies:
+        kind = "sphere" if np.ndim(size) == 0 else "box"
+        half = f"{size}" if np.ndim(size) == 0 else " ".join(str(s / 2) for s in size)
+        text += f'<body pos="{pos[0]} {pos[1]} {pos[2]}"><freejoint/>'
+        text += f'<geom type="{kind}" size="{half}" mass="{mass}"/></body>'
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.0005" cone="elliptic" impratio="10"/>
+        <default><geom friction="{friction} 0 0" condim="3" solref="0.004 1"/></default>
+        <worldbody><geom type="plane" size="0 0 1"/>{text}</worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    for k, (_, _, _, vel) in enumerate(bodies):
+        data.qvel[6 * k : 6 * k + 3] = vel
+    found = []
+    for step in range(int(seconds / 0.0005) + 1):
+        if step % (4 * record) == 0:
+            pose = data.qpos.reshape(-1, 7)
+            found.append((pose[:, :3].copy(), np.roll(pose[:, 3:], -1, axis=1)))
+        mujoco.mj_step(model, data)
+    return [np.stack(x) for x in zip(*found, strict=True)]
+
+
+def track(sim, plugin, seconds, record=5):
+    """Return positions and quaternions of the bodies of the first world, every few steps."""
+    found = []
+    for step in range(int(seconds * FREQ / record) + 1):
+        if step:
+            sim.step(record)
+        body = plugin.read(sim.data)
+        found.append((np.asarray(body.pos[0], np.float64), np.asarray(body.quat[0], np.float64)))
+    return [np.stack(x) for x in zip(*found, strict=True)]
+
+
+def compared(bodies, seconds, friction=0.6):
+    sizes, masses, pos, vel = zip(*bodies, strict=True)
+    sim, plugin = build(
+        len(bodies), list(sizes), masses, pos=np.array(pos), vel=np.array(vel), friction=friction, drones=False
+    )
+    return track(sim, plugin, seconds), mujoco_track(bodies, seconds, friction)
+
+
+def test_boxes_and_balls_rest_where_they_are():
+    """No creep, no sinking, no drift of attitude over ten seconds."""
+    sim, plugin = build(
+        2, [(0.2, 0.3, 0.1), 0.1], pos=[[1, 0, 0.05], [2, 0, 0.1]], quat=[[0, 0, 0.2588190, 0.9659258], [0, 0, 0, 1]]
+    )
+    sim.step(5000)
+    body = plugin.read(sim.data)
+    np.testing.assert_allclose(body.pos[0], [[1, 0, 0.05], [2, 0, 0.1]], atol=2e-5)
+    np.testing.assert_allclose(body.quat[0], [[0, 0, 0.2588190, 0.9659258], [0, 0, 0, 1]], atol=2e-5)
+    np.testing.assert_allclose(body.impulse[0, :, 2], 0.1 * 9.81 / FREQ, rtol=1e-3)
+
+
+def test_a_slide_as_in_mujoco():
+    """A box slides v^2 / (2 mu g) = 0.34 m and stops without tipping."""
+    ours, theirs = compared([((0.2, 0.2, 0.1), 0.5, (0, 0, 0.05), (2.0, 0.5, 0))], 1.2)
+    np.testing.assert_allclose(
+        ours[0][-1, 0, :2], np.array([2.0, 0.5]) * np.hypot(2, 0.5) / (2 * 0.6 * 9.81), rtol=0.02
+    )
+    assert np.abs(ours[0] - theirs[0]).max() < 0.01
+
+
+def test_a_ball_that_slides_begins_to_roll_as_in_mujoco():
+    """It rolls with 5/7 of its speed."""
+    ours, theirs = compared([(0.1, 0.3, (0, 0, 0.1), (1.4, 0, 0))], 1.0)
+    assert np.abs(ours[0] - theirs[0]).max() < 0.01
+    speed = (ours[0][-1, 0, 0] - ours[0][-6, 0, 0]) * FREQ / 25
+    np.testing.assert_allclose(speed, 1.0, rtol=0.01)
+
+
+def test_a_stack_of_two_stands_as_in_mujoco():
+    bodies = [((0.2, 0.2, 0.2), 0.5, (0, 0, 0.1), (0, 0, 0)), ((0.2, 0.16, 0.1), 0.3, (0.04, 0.03, 0.25), (0, 0, 0))]
+    ours, theirs = compared(bodies, 2.0)
+    np.testing.assert_allclose(ours[0][-1], [[0, 0, 0.1], [0.04, 0.03, 0.25]], atol=2e-4)
+    assert np.abs(ours[0] - theirs[0]).max() < 1e-3
+    np.testing.assert_allclose(ours[1][-1], [[0, 0, 0, 1]] * 2, atol=2e-4)
+
+
+def test_a_box_over_the_edge_of_another_falls_as_in_mujoco():
+    """Its centre is 2 cm beyond the edge: it tips over and lands on the floor."""
+    bodies = [((0.2, 0.2, 0.2), 2.0, (0, 0, 0.1), (0, 0, 0)), ((0.2, 0.16, 0.1), 0.1, (0.12, 0, 0.25), (0, 0, 0))]
+    ours, theirs = compared(bodies, 0.3)
+    assert np.abs(ours[0] - theirs[0]).max() < 0.01, "until it slips off"
+    assert ours[0][-1, 1, 2] < 0.21
+    long, _ = compared(bodies, 1.5)
+    assert long[0][-1, 1, 2] < 0.11
+
+
+def test_a_stack_that_falls_on_its_corner_comes_to_rest():
+    sim, plugin = build(
+        2, (0.2, 0.16, 0.1), 0.3, pos=[[1, 0, 0.4], [1.02, 0.01, 0.8]], quat=[[0.3, 0.2, 0.1, 0.9], [-0.2, 0.4, 0, 0.8]]
+    )
+    energy = []
+    for _ in range(100):
+        sim.step(15)
+        body = plugin.read(sim.data)
+        kinetic = 0.5 * body.mass * body.vel**2 + 0.5 * body.inertia * body.ang_vel**2
+        energy.append(float(jnp.sum(kinetic) + jnp.sum(0.3 * 9.81 * body.pos[..., 2])))
+    assert np.diff(energy).max() < 1e-3 * energy[0], "contact adds no energy"
+    assert float(jnp.abs(body.vel).max()) < 2e-3
+    assert float(jnp.abs(body.ang_vel).max()) < 2e-2
+
+
+def test_bounces_keep_their_share_of_the_speed():
+    """From 0.5 m with restitution 0.7: the next height is 0.49 of it, to a step's fall of 5 %."""
+    sim, plugin = build(1, 0.05, 0.2, pos=(1, 0, 0.55), restitution=0.7)
+    pos, _ = track(sim, plugin, 1.2, record=1)
+    z = pos[:, 0, 2] - 0.05
+    first = int(np.argmax(z < 2e-2))
+    np.testing.assert_allclose(z[first + 20 :].max(), 0.49 * 0.5, rtol=0.05)
+
+
+def test_two_balls_exchange_their_velocities():
+    """A central impact of equal balls with restitution 1, far above the ground: momentum is kept."""
+    sim, plugin = build(2, 0.1, 0.5, pos=[[0, 0, 20], [0.3, 0, 20]], vel=[[2.0, 0, 0], [0, 0, 0]], restitution=1.0)
+    sim.step(100)
+    body = plugin.read(sim.data)
+    np.testing.assert_allclose(body.vel[0, :, 0], [0, 2.0], atol=1e-3)
+
+
+def test_law_08_momentum_and_angular_momentum_are_kept(rng):
+    sim, plugin = build(3, [(0.2, 0.3, 0.2), 0.12, (0.1, 0.2, 0.3)], [0.5, 0.2, 0.3], friction=0.8, restitution=0.5,
+                        pos=[[0, 0, 30], [0.35, 0.02, 30], [0, 0.4, 30.05]],
+                        vel=[[0, 0, 0], [-2, 0, 0], [0, -2.0, 0.2]])  # fmt: skip
+
+    def momenta():
+        b = plugin.read(sim.data)
+        spin = np.asarray(rotation.rotate(b.quat, b.inertia * b.ang_vel), np.float64)[0]
+        m, p, v = (np.asarray(x[0], np.float64) for x in (b.mass, b.pos, b.vel))
+        return (m * v).sum(axis=0), (spin + m * np.cross(p, v)).sum(axis=0)
+
+    gravity = np.array([0, 0, -9.81])
+    sim.data = plugin.write(sim.data, plugin.read(sim.data).replace(force=-plugin.read(sim.data).mass * gravity))
+    before = momenta()
+    sim.step(150)
+    assert np.abs(np.asarray(plugin.read(sim.data).vel[0]) - [[0, 0, 0], [-2, 0, 0], [0, -2, 0.2]]).max() > 0.5
+    after = momenta()
+    np.testing.assert_allclose(after[0], before[0], atol=2e-5)
+    np.testing.assert_allclose(after[1], before[1], atol=2e-3)  # about the origin 30 m below, float32
+
+
+def test_a_drone_lands_on_a_body_and_rides_on_it():
+    """It comes to rest on a sliding slab, and moves with it; the slab carries its weight."""
+    sim, plugin = build(1, (0.6, 0.6, 0.1), 1.0, pos=(0, 0, 0.05), friction=0.9, drone_pos=(0.0, 0.0, 0.2))
+    sim.step(800)
+    half = float(sim.airframe.value("shape.collision_box")[5] - sim.airframe.value("shape.collision_box")[2])
+    np.testing.assert_allclose(sim.data.states.pos[0, 0], [0, 0, 0.1 + half], atol=2e-3)
+    body = plugin.read(sim.data)
+    np.testing.assert_allclose(body.impulse[0, 0, 2], 9.81 / FREQ, rtol=0.02)
+    sim.data = plugin.write(
+        sim.data, body.replace(force=jnp.asarray([[[12.0, 0, 0]]]))
+    )  # 12 N against 9.2 N of friction
+    sim.step(300)
+    body = plugin.read(sim.data)
+    moved = float(body.pos[0, 0, 0])
+    assert moved > 0.2
+    np.testing.assert_allclose(sim.data.states.pos[0, 0, 0], moved, atol=0.01)
+    np.testing.assert_allclose(sim.data.states.vel[0, 0, 0], body.vel[0, 0, 0], rtol=0.02)
+
+
+def test_drones_and_bodies_push_each_other():
+    """A drone that flies into a ball in the air: momentum goes over, along x."""
+    sim, plugin = build(1, 0.1, 0.02, pos=(0.3, 0, 5.0), drone_pos=(0.0, 0.0, 5.0))
+    sim.data = with_states(sim.data, vel=[2.0, 0, 0])
+    mass = float(np.ravel(sim.data.params.mass)[0])
+    sim.step(75)
+    ball, drone = float(plugin.read(sim.data).vel[0, 0, 0]), float(sim.data.states.vel[0, 0, 0])
+    assert ball > 1.0 > 0
+    assert drone < 1.9
+    np.testing.assert_allclose(0.02 * ball + mass * drone, 2 * mass, rtol=0.08)  # less the drone's drag over 0.15 s
+
+
+def test_an_object_moved_by_the_user_pushes_a_body():
+    sim = Sim(control="rotor_vel")
+    pusher = sim.scene.add("box", "pusher", size=(0.2, 0.2, 0.2), pos=(0, 0, 0.1))
+    plugin = sim.add(FreeBodies(1, size=(0.2, 0.2, 0.2), pos=(0.25, 0, 0.1)))
+    for k in range(100):
+        sim.data = pusher.set_pose(sim.data, [0.002 * (k + 1), 0, 0.1], vel=[0.2, 0, 0])
+        sim.step(5)
+    body = plugin.read(sim.data)
+    np.testing.assert_allclose(body.pos[0, 0], [0.4, 0, 0.1], atol=3e-3)
+    # between two poses of the object friction may brake for five steps
+    np.testing.assert_allclose(body.vel[0, 0, 0], 0.2, atol=5 * 0.6 * 9.81 / FREQ)
+
+
+def test_objects_of_any_kind_carry_bodies():
+    sim = Sim(control="rotor_vel")
+    sim.scene.add("landing_pad", pos=(0, 0, 0.3), radius=0.4, mocap=False)
+    sim.scene.add("sphere", pos=(3, 0, 0.2), radius=0.2, mocap=False)
+    plugin = sim.add(
+        FreeBodies(3, size=[(0.2, 0.2, 0.2), 0.1, 0.1], pos=[[0, 0, 0.45], [0.25, 0, 0.45], [3.0, 0, 0.55]])
+    )
+    sim.step(1000)
+    z = np.asarray(plugin.read(sim.data).pos)[0, :, 2]
+    np.testing.assert_allclose(z, [0.4, 0.4, 0.5], atol=1e-3)
+
+
+def test_bodies_rest_on_terrain():
+    """Level ground of 0.4 m, and a slope of 0.3 that friction of 0.6 holds."""
+    heights = np.concatenate([np.full((4, 3), 0.4), 0.4 + 0.3 * np.tile(np.arange(1.0, 4.0), (4, 1))], axis=1)
+    sim = Sim(control="rotor_vel")
+    sim.add(Terrain(heights, (5.0, 3.0)))
+    plugin = sim.add(FreeBodies(2, size=(0.2, 0.2, 0.1), pos=[[-1.5, 0, 0.5], [1.5, 0.1, 0.95]]))
+    sim.step(1000)
+    body = plugin.read(sim.data)
+    np.testing.assert_allclose(body.pos[0, 0], [-1.5, 0, 0.45], atol=1e-3)
+    at = np.asarray(body.pos[0, 1])
+    sim.step(500)
+    assert np.abs(np.asarray(plugin.read(sim.data).pos[0, 1]) - at).max() < 2e-3
+    assert at[2] > 0.9
+
+
+def test_law_10_and_05_resets_and_the_scene():
+    sim, plugin = build(2, pos=[[1, 0, 0.5], [2, 0, 0.5]], n_worlds=3)
+    first = plugin.read(sim.data).pos
+    sim.step(100)
+    fallen = np.asarray(plugin.read(sim.data).pos)
+    assert fallen[0, 0, 2] < 0.4
+    sim.reset(np.array([True, False, False]))
+    np.testing.assert_array_equal(plugin.read(sim.data).pos[0], first[0])
+    np.testing.assert_array_equal(plugin.read(sim.data).pos[1:], fallen[1:])
+    assert not np.asarray(plugin.read(sim.data).press[0]).any()
+    report = sim.contact_report(drones=False)
+    assert {"bodies:0", "bodies:1"} <= set(report.object_names)
+    sim.data = with_states(sim.data, pos=fallen[1, 0])
+    index = report.object_names.index("bodies:0")
+    assert bool(sim.contact_report().objects[1, 0, index])
+
+
+def test_law_01_worlds_do_not_see_each_other():
+    sim, plugin = build(2, pos=np.array([[[1, 0, 0.1], [1.05, 0, 0.35]], [[1, 0, 0.1], [4, 0, 0.5]]]), n_worlds=2)
+    alone, other = build(2, pos=[[1, 0, 0.1], [4, 0, 0.5]], n_worlds=1)
+    for one in (sim, alone):
+        one.step(200)
+    np.testing.assert_allclose(plugin.read(sim.data).pos[1], other.read(alone.data).pos[0], atol=1e-6)
+
+
+def test_law_07_a_lost_world_stays_alone():
+    sim, plugin = build(2, pos=[[1, 0, 0.5], [2, 0, 0.5]], n_worlds=2)
+    record = plugin.read(sim.data)
+    sim.data = plugin.write(sim.data, record.replace(pos=record.pos.at[0, 0, 0].set(np.nan)))
+    sim.step(50)
+    assert np.isfinite(np.asarray(plugin.read(sim.data).pos[1])).all()
+
+
+def test_law_08_gradients_equal_central_differences(x64):
+    """Of a slide with friction, with respect to the speed at the start: d(v^2 / (2 mu g)) / dv."""
+    sim, plugin = build(1, (0.2, 0.2, 0.1), 0.5, pos=(0, 0, 0.05))
+    step = sim.build_step_fn()
+
+    def end(speed):
+        record = plugin.read(sim.data)
+        data = plugin.write(sim.data, record.replace(vel=record.vel.at[0, 0, 0].set(speed)))
+        return plugin.read(step(data, 60)).pos[0, 0, 0]
+
+    h = 1e-5
+    central = (end(1.0 + h) - end(1.0 - h)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(end)(1.0), central, rtol=1e-3)
+    assert 0.05 < float(central) < 0.13
+
+
+def test_stages_see_the_bodies():
+    sim, plugin = build(2, pos=[[1, 0, 0.5], [2, 0, 0.5]])
+
+    @stage("bodies")
+    def lift(data):
+        body = plugin.read(data)
+        return plugin.write(data, body.replace(force=jnp.asarray([0.0, 0.0, 9.81]) * body.mass))
+
+    sim.step_pipeline = {"lift": lift, **sim.step_pipeline}
+    sim.build_step_fn()
+    sim.step(100)
+    np.testing.assert_allclose(plugin.read(sim.data).pos[0, :, 2], 0.5, atol=1e-4)
+
+
+@pytest.mark.parametrize("args, kwargs, message", [
+    ((0,), {}, "expected members"),
+    ((2,), {"size": [0.1]}, "a list of 2"),
+    ((1,), {"size": (0.1, 0.2)}, "expected size"),
+    ((1,), {"size": -0.1}, "expected size"),
+    ((1,), {"mass": 0.0}, "expected mass to be finite and positive"),
+    ((1,), {"friction": -1.0}, "expected friction"),
+    ((1,), {"restitution": 1.5}, "expected restitution"),
+    ((1,), {"quat": (0, 0, 0, 0)}, "expected quat"),
+    ((1,), {"pos": (0, np.nan, 0)}, "expected pos to be finite"),
+    ((2,), {"pos": np.zeros((3, 3))}, "expected pos"),
+    ((1,), {"softness": 0.001}, "softness"),
+    ((1,), {"objects": "nothing"}, "nothing"),
+])  # fmt: skip
+def test_law_09_wrong_settings_leave_the_simulation_as_it_was(args, kwargs, message):
+    sim = Sim()
+    with pytest.raises(ConfigError, match=message):
+        sim.add(FreeBodies(*args, **kwargs))
+    assert sim.data.plugins == {}
+
+
+def test_law_09_one_plugin_holds_all():
+    sim, _ = build(1)
+    with pytest.raises(ConfigError, match="expected one FreeBodies"):
+        sim.add(FreeBodies(["Ball_0"], name="more"))

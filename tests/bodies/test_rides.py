@@ -1,0 +1,55 @@
+"""Drones that ride on cars, and bodies that cars push."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import with_states
+
+from crazysim import ContactResponse, FreeBodies, Sim
+from crazysim.vehicles import Cars
+
+
+def build(**kwargs):
+    sim = Sim(control="rotor_vel")
+    cars = sim.add(Cars(1, pos=(0.0, 0.0), yaw=0.0, level="speed", **kwargs))
+    return sim, cars
+
+
+def deck(sim):
+    """Return the height of the upper side of the car's box, world frame, m."""
+    body = next(b for b in sim.scene.collision_model.objects if b.name == "cars:0")
+    geom = max(body.geoms, key=lambda g: g.pos[2] + g.shape.size[2])
+    return geom.pos[2] + geom.shape.size[2] + float(sim.data.plugins["cars"].pos[0, 0, 2]), geom.pos
+
+
+def test_a_drone_lands_on_a_moving_car_and_rides():
+    sim, cars = build()
+    height, at = deck(sim)
+    sim.add(ContactResponse(friction=0.9))
+    sim.data = cars.commanded(sim.data, np.float32([[[0.8, 0.0]]]))
+    sim.step(1000)
+    car = cars.read(sim.data)
+    np.testing.assert_allclose(car.vel[0, 0, 0], 0.8, rtol=0.05)
+    start = np.asarray(car.pos[0, 0]) + np.array([at[0], at[1], 0.0])
+    start[2] = height + 0.06
+    sim.data = with_states(sim.data, pos=start, vel=[0.8, 0, 0], quat=[0, 0, 0, 1], ang_vel=0.0)
+    sim.step(250)
+    gap = np.asarray(sim.data.states.pos[0, 0] - cars.read(sim.data).pos[0, 0])
+    sim.data = cars.commanded(sim.data, np.float32([[[0.8, 0.15]]]))  # it turns
+    sim.step(500)
+    car, s = cars.read(sim.data), sim.data.states
+    assert abs(float(car.yaw[0, 0, 0])) > 0.15
+    assert float(s.pos[0, 0, 2]) > height
+    np.testing.assert_allclose(float(jnp.linalg.norm((s.pos - car.pos)[0, 0, :2])), np.linalg.norm(gap[:2]), atol=0.02)
+    np.testing.assert_allclose(s.vel[0, 0, :2], car.vel[0, 0, :2], atol=0.08)
+
+
+def test_a_car_pushes_a_body():
+    sim, cars = build()
+    bodies = sim.add(FreeBodies(1, size=(0.2, 0.2, 0.2), mass=0.2, pos=(0.6, 0, 0.1), drones=False))
+    sim.data = cars.commanded(sim.data, np.float32([[[0.5, 0.0]]]))
+    sim.step(1500)
+    car, body = cars.read(sim.data), bodies.read(sim.data)
+    assert float(body.pos[0, 0, 0]) > 0.8
+    assert float(body.pos[0, 0, 0] - car.pos[0, 0, 0]) > 0.2
+    assert float(body.vel[0, 0, 0]) == pytest.approx(float(car.vel[0, 0, 0]), abs=0.05)
