@@ -103,7 +103,8 @@ def test_a_ball_on_a_box_by_hand(centre, gap, normal):
 
 def test_gaps_are_those_of_mujoco(rng):
     """Balls and boxes apart: MuJoCo's distance; of boxes the largest separation is at most that."""
-    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><freejoint/><geom type="sphere" size="0.05"/></body>
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
+        <body><freejoint/><geom type="sphere" size="0.05"/></body>
         <body><freejoint/><geom type="box" size="0.12 0.2 0.06"/></body></worldbody></mujoco>""")
     data = mujoco.MjData(model)
     pos, _, rot = poses(rng, 40)
