@@ -1,4 +1,4 @@
-"""A virtual screen for tests of windows."""
+"""A virtual screen for tests of windows, and what it shows."""
 
 import os
 import select
@@ -11,11 +11,11 @@ import pytest
 
 
 def virtual_screen(folder):
-    """Yield the name of a virtual screen, and the file that holds its pixels."""
+    """Yield the display of a virtual screen, and the file in a folder that holds its pixels."""
     if shutil.which("Xvfb") is None:
         pytest.skip("no Xvfb")
     read, write = os.pipe()
-    options = ["-displayfd", str(write), "-screen", "0", "800x600x24", "-fbdir", str(folder), "-nolisten", "tcp"]
+    options = ["-displayfd", str(write), "-screen", "0", "1280x720x24", "-fbdir", str(folder), "-nolisten", "tcp"]
     server = subprocess.Popen(["Xvfb", *options], pass_fds=[write], stderr=subprocess.DEVNULL)
     os.close(write)
     ready, _, _ = select.select([read], [], [], 30)
@@ -27,10 +27,10 @@ def virtual_screen(folder):
     os.close(read)
 
 
-def screen_pixels(path):
-    """Return what a screen shows once it is at rest, read from its X window dump. (height, width, 3)"""
+def screen_pixels(path, wait=True):
+    """Return what a screen shows, by default once it is at rest, read from its X window dump. (height, width, 3)"""
     raw, before, deadline = path.read_bytes(), b"", time.monotonic() + 20
-    while raw != before and time.monotonic() < deadline:  # the server draws an image strip by strip
+    while wait and raw != before and time.monotonic() < deadline:  # the server draws an image strip by strip
         time.sleep(0.3)
         raw, before = path.read_bytes(), raw
     header = np.frombuffer(raw[:100], ">u4").astype(int)

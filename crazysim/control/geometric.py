@@ -9,33 +9,24 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.allocation import AllocationParams
 from crazysim.control.bandwidth import Bandwidth, bandwidth
 from crazysim.control.core import Control
 from crazysim.control.flatness import Attitude, attitude_of_thrust
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
+from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.dynamics.core import GRAVITY
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.pytree import as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
 Gains = Literal["bandwidth", "airframe"]
 """Rule for the gains: by bandwidth, or from the airframe's table ``[geometric]``."""
 
 
-class GeometricParams(PyTree):
+class GeometricParams(RigidBodyParams):
     """Gains and parameters of geometric control, each shared or one per drone."""
 
-    mass: Array = leaf("parameter", 1, (1,))
-    """Mass that the controller assumes, kg. (1,)"""
-    gravity_vec: Array = leaf("parameter", 1)
-    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
-    J: Array = leaf("parameter", 2)
-    """Inertia that the controller assumes, body frame, kg m^2. (3, 3)"""
-    drag_matrix: Array = leaf("parameter", 2)
-    """Linear drag coefficients that the controller compensates, body frame, N s/m. (3, 3)"""
     kr: Array = leaf("parameter", 1)
     """Gain on position, N/m. (3,)"""
     kv: Array = leaf("parameter", 1)
@@ -44,8 +35,6 @@ class GeometricParams(PyTree):
     """Gain on the rotation error, N m. (3,)"""
     kw: Array = leaf("parameter", 1)
     """Gain on the body rates, N m s. (3,)"""
-    allocation: AllocationParams
-    """Limits of the rotors."""
 
     @staticmethod
     def create(airframe: Airframe, freq: int, gains: Gains = "bandwidth") -> GeometricParams:
@@ -61,18 +50,13 @@ class GeometricParams(PyTree):
         Raises:
             ConfigError: If the airframe lacks a value.
         """
-        mass, drag = airframe.value("rigid_body.mass", ()), airframe.value("drag.coefficients")
         if gains == "airframe":
             table = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
         else:
             table = gains_of(airframe, bandwidth(airframe, freq))
         return GeometricParams(
-            mass=as_parameter(mass),
-            gravity_vec=as_parameter(GRAVITY),
-            J=as_parameter(airframe.inertia),
-            drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
+            **rigid_body(airframe),
             **{key: as_parameter(np.broadcast_to(value, (3,))) for key, value in table.items()},
-            allocation=AllocationParams.create(airframe),
         )
 
 

@@ -15,6 +15,7 @@ from crazysim.control.bandwidth import bandwidth, rotor_rate
 from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.control.geometric import GeometricParams, attitude_errors, gains_of
+from crazysim.control.low_pass import butterworth
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
@@ -43,7 +44,7 @@ class INDIParams(PyTree):
     lead: Array = leaf("parameter", 1)
     """Factor on the difference of commanded and present rotor speeds, 1. (1,)"""
     filter: Array = leaf("parameter", 1)
-    """Coefficients b0, b1, b2, a1, a2 of the low-pass filter. (5,)"""
+    """Coefficients b0, a1, a2 of the low-pass filter. (3,)"""
 
     @staticmethod
     def create(airframe: Airframe, freq: int, cutoff: float) -> INDIParams:
@@ -54,7 +55,7 @@ class INDIParams(PyTree):
         Args:
             airframe: The airframe.
             freq: Rate of the controller, Hz.
-            cutoff: Cutoff frequency of the filter, Hz.
+            cutoff: Cutoff frequency of the filter, Hz; at most 0.45 of the rate is used.
 
         Raises:
             ConfigError: If the airframe lacks a value, or the cutoff is not positive.
@@ -69,7 +70,7 @@ class INDIParams(PyTree):
             geometric=params.replace(**{key: as_parameter(np.broadcast_to(x, (3,))) for key, x in gains.items()}),
             mixing_matrix=as_parameter(mixing),
             lead=as_parameter(LEAD),
-            filter=as_parameter(butterworth(cutoff, freq)),
+            filter=as_parameter(butterworth(min(cutoff, 0.45 * freq), freq)),
         )
 
 
@@ -91,40 +92,25 @@ class INDIMemory(PyTree):
         return INDIMemory(*(as_parameter(np.zeros(n)) for n in (3, 3, 24, 1)))
 
 
-def butterworth(cutoff: float, freq: float) -> np.ndarray:
-    """Return the coefficients b0, b1, b2, a1, a2 of a low-pass Butterworth filter of order 2.
-
-    By the bilinear transform with its frequency warped, so that the gain at the cutoff is 1/sqrt(2).
-
-    Args:
-        cutoff: Cutoff frequency, Hz; at most 0.45 of the sampling rate is used.
-        freq: Sampling rate, Hz.
-    """
-    k = math.tan(math.pi * min(cutoff / freq, 0.45))
-    scale = 1 / (1 + math.sqrt(2) * k + k * k)
-    b = k * k * scale
-    return np.array([b, 2 * b, b, 2 * (k * k - 1) * scale, (1 - math.sqrt(2) * k + k * k) * scale])
-
-
 def filtered(x: Array, state: Array, coefficients: Array) -> tuple[Array, Array]:
     """Return signals after a filter of order 2, and the filter's new states (direct form II transposed).
 
     Args:
         x: Signals. (..., n)
         state: States. (..., 2 n)
-        coefficients: From ``butterworth``. (..., 5)
+        coefficients: From ``butterworth``. (..., 3)
     """
-    b0, b1, b2, a1, a2 = (coefficients[..., i : i + 1] for i in range(5))
+    b0, a1, a2 = (coefficients[..., i : i + 1] for i in range(3))
     n = x.shape[-1]
     first, second = state[..., :n], state[..., n:]
     y = b0 * x + first
-    return y, jnp.concatenate([b1 * x - a1 * y + second, b2 * x - a2 * y], axis=-1)
+    return y, jnp.concatenate([2 * b0 * x - a1 * y + second, b0 * x - a2 * y], axis=-1)
 
 
 def steady(x: Array, coefficients: Array) -> Array:
     """Return the states of a filter whose signals have always been ``x``. (..., n) -> (..., 2 n)"""
-    _, b1, b2, a1, a2 = (coefficients[..., i : i + 1] for i in range(5))
-    return jnp.concatenate([(b1 - a1 + b2 - a2) * x, (b2 - a2) * x], axis=-1)
+    b0, a1, a2 = (coefficients[..., i : i + 1] for i in range(3))
+    return jnp.concatenate([(3 * b0 - a1 - a2) * x, (b0 - a2) * x], axis=-1)
 
 
 def indi_control(

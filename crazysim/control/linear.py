@@ -39,15 +39,28 @@ def drone_derivative(x: Array, u: Array, mass: Array, J: Array, gravity_vec: Arr
 
 
 def load_derivative(
-    x: Array, u: Array, mass: Array, J: Array, gravity_vec: Array, load_mass: Array, length: Array
+    x: Array,
+    u: Array,
+    mass: Array,
+    J: Array,
+    gravity_vec: Array,
+    load_mass: Array,
+    length: Array,
+    attach: Array | None = None,
 ) -> Array:
     """Return the derivative of the state of a drone with a point load on a rigid, massless rod.
 
-    The rod hangs from the centre of mass by a joint without friction, so it exerts no torque on the drone. With the
-    thrust ``f`` and the unit vector q from drone to load (Sreenath, Lee and Kumar 2013):
+    The rod hangs by a joint without friction. At the centre of mass it exerts no torque on the drone. With the thrust
+    ``f`` and the unit vector q from joint to load (Sreenath, Lee and Kumar 2013):
 
         m L q'' = q x (q x f) - m L |q'|^2 q
         (m + m_L) (v' - g) = f - m_L L q''
+
+    A joint at ``d`` from the centre of mass moves with the acceleration p'' of that point. With p_0'' as without the
+    rod, w_0' likewise, and the pull ``t q`` per mass of the load:
+
+        t (1 + m_L / m + m_L (d x q).J^-1 (d x q)) = q.(g - p_0'') + L |q'|^2
+        L q'' = g - t q - p'',   v' = v_0' + m_L / m t q,   w' = w_0' + m_L t J^-1 (d x q)
 
     Two angles give the direction, ``q = (-sin b cos a, sin a, -cos b cos a)``: the rod turns about y by b, then about
     its own x by a.
@@ -60,6 +73,7 @@ def load_derivative(
         gravity_vec: Gravitational acceleration, m/s^2. (3,)
         load_mass: Mass of the load, kg. (1,)
         length: Length of the rod, m. (1,)
+        attach: Joint, from the centre of mass, body frame, m; None for the centre of mass. (3,)
 
     Returns:
         Derivative, per second. (16,)
@@ -67,13 +81,29 @@ def load_derivative(
     vel, rpy, ang_vel, angles, rates = x[3:6], x[6:9], x[9:12], x[12:14], x[14:16]
     force = u[0] * _z_axis(rpy)
     q, q_rate = jax.jvp(rod_direction, (angles,), (rates,))
-    q_acc = cross(q, cross(q, force)) / (mass * length) - dot(q_rate, q_rate) * q
-    acc = (force - load_mass * length * q_acc) / (mass + load_mass) + gravity_vec
+    rpy_rate, ang_acc = _rotational(rpy, ang_vel, u[1:], J)
+    if attach is None:
+        q_acc = cross(q, cross(q, force)) / (mass * length) - dot(q_rate, q_rate) * q
+        acc = (force - load_mass * length * q_acc) / (mass + load_mass) + gravity_vec
+    else:
+        matrix = rotation.matrix(rotation.from_rpy(rpy))
+        lever = cross(attach, matvec(matrix.T, q))
+        turn = jnp.linalg.solve(J, lever)
+
+        def of_joint(acc: Array, ang_acc: Array) -> Array:
+            """Return the acceleration of the joint."""
+            return acc + matvec(matrix, cross(ang_acc, attach) + cross(ang_vel, cross(ang_vel, attach)))
+
+        acc = force / mass + gravity_vec
+        along = dot(q, gravity_vec - of_joint(acc, ang_acc)) + length * dot(q_rate, q_rate)
+        pull = along / (1 + load_mass / mass + load_mass * dot(lever, turn))
+        acc, ang_acc = acc + load_mass / mass * pull * q, ang_acc + load_mass * pull * turn
+        q_acc = (gravity_vec - pull * q - of_joint(acc, ang_acc)) / length
     # q'' = J a'' + J' a': the columns of J are orthogonal, so the angles' accelerations are two projections.
     slope, slope_rate = jax.jvp(jax.jacfwd(rod_direction), (angles,), (rates,))
     rest = q_acc - slope_rate @ rates
     angles_acc = slope.T @ rest / jnp.sum(slope * slope, axis=0)
-    return jnp.concatenate([vel, acc, *_rotational(rpy, ang_vel, u[1:], J), rates, angles_acc])
+    return jnp.concatenate([vel, acc, rpy_rate, ang_acc, rates, angles_acc])
 
 
 def rod_direction(angles: Array) -> Array:

@@ -9,7 +9,6 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.allocation import AllocationParams
 from crazysim.control.bandwidth import bandwidth
 from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust, direction_of
@@ -18,6 +17,7 @@ from crazysim.control.lqr import Reference, as_weights, into_heading, on_host, s
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.riccati import gain_discrete
+from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.core import GRAVITY
@@ -32,30 +32,28 @@ ROD_JERK_MAX = 500.0
 """Largest third derivative of the direction of the rod that is fed forward, 1/s^3: a swing of 0.5 rad at 10 rad/s."""
 
 
-class LoadLQRParams(PyTree):
+class LoadLQRParams(RigidBodyParams):
     """Gain and parameters of the LQR with load, each shared or one per drone."""
 
-    mass: Array = leaf("parameter", 1, (1,))
-    """Mass of the drone that the controller assumes, kg. (1,)"""
     load_mass: Array = leaf("parameter", 1, (1,))
     """Mass of the load that the controller assumes, kg. (1,)"""
     length: Array = leaf("parameter", 1, (1,))
     """Length of the rod that the controller assumes, m. (1,)"""
-    gravity_vec: Array = leaf("parameter", 1)
-    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
-    J: Array = leaf("parameter", 2)
-    """Inertia that the controller assumes, body frame, kg m^2. (3, 3)"""
-    drag_matrix: Array = leaf("parameter", 2)
-    """Linear drag coefficients that the controller compensates, body frame, N s/m. (3, 3)"""
     gain: Array = leaf("parameter", 2)
     """Gain K from the errors of position, velocity, rotation, body rates, rod angles and their rates to the wrench.
     (4, 16)"""
-    allocation: AllocationParams
-    """Limits of the rotors."""
+    attach: Array | None = leaf("parameter", 1, (3,))
+    """Joint of the rod, from the centre of mass, body frame, m; None for the centre of mass. (3,)"""
 
     @staticmethod
     def create(
-        airframe: Airframe, freq: int, load_mass: float, length: float, Q: Any = None, R: Any = None
+        airframe: Airframe,
+        freq: int,
+        load_mass: float,
+        length: float,
+        Q: Any = None,
+        R: Any = None,
+        attach: Any = (0.0, 0.0, 0.0),
     ) -> LoadLQRParams:
         """Return the shared parameters of an airframe, with the gain computed in float64.
 
@@ -67,30 +65,34 @@ class LoadLQRParams(PyTree):
             Q: Weights of position, velocity, roll, pitch, yaw, body rates, rod angles and their rates, (16,) or
                 (16, 16); None for ``default_load_weights``.
             R: Weights of collective thrust and torque (4,) or (4, 4); None for ``default_load_weights``.
+            attach: Joint of the rod, from the centre of mass, body frame, m. (3,)
 
         Raises:
-            ConfigError: If the airframe lacks a value, mass or length is negative or not finite, a weight has another
-                shape, or no gain stabilises the drone.
+            ConfigError: If the airframe lacks a value, mass or length is negative or not finite, a joint or a weight
+                has another shape, or no gain stabilises the drone.
         """
         if not (0 <= load_mass < np.inf and 0 < length < np.inf):
             raise ConfigError(
                 f"expected load_mass of at least 0 kg and a positive length, m, got {load_mass!r} and {length!r}. Use "
                 f"LoadLQR(load_mass=0.05, length=0.4)."
             )
-        mass, inertia, drag = airframe.value("rigid_body.mass"), airframe.inertia, airframe.value("drag.coefficients")
+        joint = np.asarray(attach)
+        if joint.shape != (3,) or joint.dtype.kind not in "iuf" or not np.all(np.isfinite(joint)):
+            raise ConfigError(
+                f"expected attach as three finite numbers, m, got {attach!r}. Use LoadLQR(attach=(0.0, 0.0, -0.02))."
+            )
+        mass, inertia = airframe.value("rigid_body.mass"), airframe.inertia
         weights = default_load_weights(airframe, freq, load_mass, length)
         Q = as_weights("Q", weights[0] if Q is None else Q, 16)
         R = as_weights("R", weights[1] if R is None else R, 4)
-        gain = on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R)
+        off_centre = [joint] if np.any(joint) else []
+        gain = on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R, *off_centre)
         return LoadLQRParams(
-            mass=as_parameter(mass),
+            **rigid_body(airframe),
             load_mass=as_parameter(load_mass),
             length=as_parameter(length),
-            gravity_vec=as_parameter(GRAVITY),
-            J=as_parameter(inertia),
-            drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
             gain=as_parameter(gain),
-            allocation=AllocationParams.create(airframe),
+            attach=as_parameter(joint) if off_centre else None,
         )
 
 
@@ -111,7 +113,16 @@ def default_load_weights(
     return errors**-2, inputs**-2
 
 
-def load_gain(mass: Array, J: Array, load_mass: Array, length: Array, dt: Array, Q: Array, R: Array) -> Array:
+def load_gain(
+    mass: Array,
+    J: Array,
+    load_mass: Array,
+    length: Array,
+    dt: Array,
+    Q: Array,
+    R: Array,
+    attach: Array | None = None,
+) -> Array:
     """Return the gain of the discrete LQR about hover with a load, or NaN if there is none; pure and differentiable.
 
     The model is that of ``load_derivative``, discretised by ``A_d = I + dt A``, ``B_d = dt B``.
@@ -124,6 +135,7 @@ def load_gain(mass: Array, J: Array, load_mass: Array, length: Array, dt: Array,
         dt: Period of the controller, s. ()
         Q: Weights of the states. (16, 16)
         R: Weights of collective thrust and torque. (4, 4)
+        attach: Joint of the rod, from the centre of mass, body frame, m; None for the centre of mass. (3,)
 
     Returns:
         Gain K of ``u = -K x``. (4, 16)
@@ -132,9 +144,10 @@ def load_gain(mass: Array, J: Array, load_mass: Array, length: Array, dt: Array,
     gravity = jnp.asarray(GRAVITY, J.dtype)
 
     def model(x: Array, u: Array) -> Array:
-        return load_derivative(x, u, mass, J, gravity, load_mass, jnp.reshape(length, (1,)))
+        return load_derivative(x, u, mass, J, gravity, load_mass, jnp.reshape(length, (1,)), attach)
 
-    x, u = jnp.zeros(16, J.dtype), jnp.concatenate([-GRAVITY[2] * (mass + load_mass), jnp.zeros(3, J.dtype)])
+    torque = jnp.zeros(3, J.dtype) if attach is None else -cross(attach, load_mass * gravity)
+    x, u = jnp.zeros(16, J.dtype), jnp.concatenate([-GRAVITY[2] * (mass + load_mass), torque])
     A, B = linearize(model, x, u)
     return gain_discrete(jnp.eye(16, dtype=J.dtype) + dt * A, dt * B, Q, R)
 
@@ -147,7 +160,8 @@ def load_reference(
     The rod pulls the load along its specific force, ``q = -(a_L - g) / |a_L - g|``, so the drone is at ``r_L - L q``,
     and its thrust is ``f = (m + m_L)(a_L - g) - m L q_tt``, plus the drag of a level drone. The body rates follow from
     ``f_t = (m + m_L) j_L - m L q_ttt``, in which the last term needs the fifth derivative of the load's position: more
-    than a setpoint has.
+    than a setpoint has. A joint off the centre of mass shifts the drone, and the load's pull adds a torque; the
+    acceleration of the joint relative to the centre of mass is neglected.
 
     Args:
         setpoint: Setpoint of the load.
@@ -164,6 +178,9 @@ def load_reference(
     rate = total * sp.jerk - (0.0 if rod_jerk is None else p.mass * p.length * rod_jerk)
     rate = rate - matvec(p.drag_matrix, sp.acc + p.length * up_acc)
     reference = _reference(sp.pos + p.length * up, vel, force, rate, sp, p)
+    if p.attach is not None:
+        arm, moving = _joint(reference.matrix, reference.ang_vel, p.attach)
+        reference = reference._replace(pos=reference.pos - arm, vel=reference.vel - moving)
     return reference, -up, -up_rate
 
 
@@ -185,11 +202,23 @@ def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Refere
     return _reference(sp.pos, sp.vel, force, rate, sp, p), -up, -up_rate
 
 
+def _joint(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, Array]:
+    """Return the joint of the rod from the centre of mass, m, and its velocity relative to that, m/s. (..., 3) each"""
+    attach = jnp.broadcast_to(attach, ang_vel.shape)
+    return matvec(matrix, attach), matvec(matrix, cross(ang_vel, attach))
+
+
 def _reference(pos: Array, vel: Array, force: Array, rate: Array, sp: Setpoint, p: LoadLQRParams) -> Reference:
-    """Return the reference of a drone whose thrust vector is ``force``, N, with the derivative ``rate``, N/s."""
+    """Return the reference of a drone whose thrust vector is ``force``, N, with the derivative ``rate``, N/s.
+
+    The torque holds against a load that accelerates as the setpoint does, at the joint of the rod.
+    """
     total = p.mass + p.load_mass
     attitude = attitude_of_thrust(force / total, rate / total, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
     torque = matvec(p.J, attitude.ang_acc) + cross(attitude.ang_vel, matvec(p.J, attitude.ang_vel))
+    if p.attach is not None:
+        pull = matvec(jnp.swapaxes(attitude.matrix, -1, -2), p.load_mass * (p.gravity_vec - sp.acc))
+        torque = torque - cross(jnp.broadcast_to(p.attach, pull.shape), pull)
     wrench = jnp.concatenate([rotation.safe_norm(force), torque], axis=-1)
     return Reference(pos, vel, attitude.matrix, attitude.ang_vel, wrench)
 
@@ -217,7 +246,7 @@ def load_lqr_control(
         quat: Attitude, body to world, unit, xyzw. (..., 4)
         vel: Velocity of the drone, world frame, m/s. (..., 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
-        direction: Unit vector from drone to load, world frame. (..., 3)
+        direction: Unit vector from the joint of the rod to the load, world frame. (..., 3)
         direction_rate: Its derivative, 1/s. (..., 3)
         setpoint: Setpoint with the leading axes of the state.
         params: Gain, shared or with the leading axes of the state.
@@ -250,10 +279,7 @@ class LoadLQRMemory(PyTree):
 
 
 class LoadLQR(Controller):
-    """Linear quadratic regulator of a drone with a load (``load_lqr_control``) for setpoints of load or drone.
-
-    The rod is assumed to be attached at the drone's centre of mass.
-    """
+    """Linear quadratic regulator of a drone with a load (``load_lqr_control``) for setpoints of load or drone."""
 
     name: ClassVar[str] = "load_lqr"
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
@@ -264,6 +290,8 @@ class LoadLQR(Controller):
     """Mass of the load, kg."""
     length: float = 0.4
     """Length of the rod, m."""
+    attach: Any = (0.0, 0.0, 0.0)
+    """Joint of the rod, from the centre of mass, body frame, m: the ``attach`` of the load's plugin. (3,)"""
     target: Target = "load"
     """Body that setpoints describe."""
     load: str = "load"
@@ -276,7 +304,7 @@ class LoadLQR(Controller):
 
     def params(self, airframe: Airframe) -> LoadLQRParams:
         """Return gain and constants for an airframe."""
-        return LoadLQRParams.create(airframe, self.freq, self.load_mass, self.length, self.Q, self.R)
+        return LoadLQRParams.create(airframe, self.freq, self.load_mass, self.length, self.Q, self.R, self.attach)
 
     def memory(self, airframe: Airframe) -> LoadLQRMemory:
         """Return the memory before the first tick."""
@@ -305,6 +333,9 @@ class LoadLQR(Controller):
         # An empty hook swings too, and its load stands elsewhere.
         tip_pos, tip_vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
         offset, rate = tip_pos - s.pos, tip_vel - s.vel
+        if params.attach is not None:
+            arm, moving = _joint(rotation.matrix(s.quat), s.ang_vel, params.attach)
+            offset, rate = offset - arm, rate - moving
         distance = jnp.maximum(rotation.safe_norm(offset), 1e-3)
         direction = offset / distance
         turning = (rate - dot(direction, rate) * direction) / distance

@@ -10,7 +10,6 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.allocation import AllocationParams
 from crazysim.control.bandwidth import bandwidth
 from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust
@@ -18,29 +17,20 @@ from crazysim.control.linear import drone_derivative, linearize
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.riccati import check_gain, gain_continuous
+from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.core import GRAVITY
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.pytree import as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
 
-class LQRParams(PyTree):
+class LQRParams(RigidBodyParams):
     """Gain and parameters of the LQR about hover, each shared or one per drone."""
 
-    mass: Array = leaf("parameter", 1, (1,))
-    """Mass that the controller assumes, kg. (1,)"""
-    gravity_vec: Array = leaf("parameter", 1)
-    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
-    J: Array = leaf("parameter", 2)
-    """Inertia that the controller assumes, body frame, kg m^2. (3, 3)"""
-    drag_matrix: Array = leaf("parameter", 2)
-    """Linear drag coefficients that the controller compensates, body frame, N s/m. (3, 3)"""
     gain: Array = leaf("parameter", 2)
     """Gain K from the errors of position, velocity, rotation and body rates to the wrench. (4, 12)"""
-    allocation: AllocationParams
-    """Limits of the rotors."""
 
     @staticmethod
     def create(airframe: Airframe, freq: int, Q: Any = None, R: Any = None) -> LQRParams:
@@ -56,17 +46,12 @@ class LQRParams(PyTree):
         Raises:
             ConfigError: If the airframe lacks a value, a weight has another shape, or no gain stabilises the drone.
         """
-        mass, inertia, drag = airframe.value("rigid_body.mass"), airframe.inertia, airframe.value("drag.coefficients")
         weights = default_weights(airframe, freq)
         Q = as_weights("Q", weights[0] if Q is None else Q, 12)
         R = as_weights("R", weights[1] if R is None else R, 4)
         return LQRParams(
-            mass=as_parameter(mass),
-            gravity_vec=as_parameter(GRAVITY),
-            J=as_parameter(inertia),
-            drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
-            gain=as_parameter(on_host(hover_gain, mass, inertia, Q, R)),
-            allocation=AllocationParams.create(airframe),
+            **rigid_body(airframe),
+            gain=as_parameter(on_host(hover_gain, airframe.value("rigid_body.mass"), airframe.inertia, Q, R)),
         )
 
 

@@ -162,6 +162,8 @@ class Mellinger(Controller):
     output: ClassVar[Control] = Control.rotor_vel
     freq: int = 500
     """Rate, Hz (``ATTITUDE_RATE``)."""
+    whole_numbers: bool = False
+    """True to truncate torque and PWM to integers where the firmware does; gradients are those without."""
 
     def params(self, airframe: Airframe) -> MellingerParams:
         """Return the gains of an airframe.
@@ -185,7 +187,8 @@ class Mellinger(Controller):
         memory = memory.replace(
             integral=jnp.where(off, 0.0, memory.integral), integral_m=jnp.where(off, 0.0, memory.integral_m)
         )
-        return rotor_vel_of_pwm(distribute(thrust, torque, params=p.motors), params=p.motors), memory
+        pwm = distribute(thrust, torque, params=p.motors, whole_numbers=self.whole_numbers)
+        return rotor_vel_of_pwm(pwm, params=p.motors), memory
 
     def take_over(
         self,

@@ -51,6 +51,8 @@ class PID(Controller):
     hold_yaw: bool = False
     """True if a commanded yaw rate moves a yaw angle that the attitude loop holds, as in the firmware. That loop acts
     on Euler angles, so it disturbs the rates of a drone that is tilted far. False: the rate loop follows it."""
+    whole_numbers: bool = False
+    """True to truncate torque and PWM to integers where the firmware does; gradients are those without."""
 
     def params(self, airframe: Airframe) -> PIDParams:
         """Return the gains of an airframe.
@@ -67,6 +69,7 @@ class PID(Controller):
     def outer(self, data: Any, command: Setpoint, memory: PIDMemory, params: PIDParams) -> PIDMemory:
         """Return the memory after position and velocity loop, with the desired roll, pitch and thrust."""
         s, heading = data.states, heading_of(data.states.quat)
+        # In world axes, as in the firmware (positionControllerResetAllPID), whose derivative gain here is zero.
         position = memory.position.started_at(s.pos, memory.started)
         vel_des, position = velocity_of_position(
             s.pos, heading, command.pos, position, self.outer_freq, loop=params.position
@@ -85,7 +88,8 @@ class PID(Controller):
         thrust = memory.thrust if isinstance(command, Setpoint) else pwm_of_thrust(command[3:], params=params.motors)
         rpy_des, attitude, ang_vel_des = self._desired_rates(data, command, memory, params, rpy)
         torque, rate = torque_of_rates(ang_vel, ang_vel_des, memory.rate, self.freq, loop=params.rate)
-        rotor_vel = rotor_vel_of_pwm(distribute(thrust, torque, params=params.motors), params=params.motors)
+        pwm = distribute(thrust, torque, params=params.motors, whole_numbers=self.whole_numbers)
+        rotor_vel = rotor_vel_of_pwm(pwm, params=params.motors)
         after = memory.replace(
             attitude=attitude, rate=rate, rpy_des=rpy_des, thrust=thrust, started=jnp.ones_like(memory.started)
         )

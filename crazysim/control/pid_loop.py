@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.control.low_pass import butterworth
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import safe_clip
@@ -55,7 +55,7 @@ class Loop(PyTree):
             kd=kd,
             integral_max=None if ki is None else as_parameter(limit),
             output_max=as_parameter(airframe.value(f"{path}.output_max", (3,))) if "output_max" in table else None,
-            low_pass=as_parameter(low_pass(float(airframe.value(f"{path}.cutoff", ())), freq)) if filtered else None,
+            low_pass=as_parameter(butterworth(float(airframe.value(f"{path}.cutoff", ())), freq)) if filtered else None,
         )
 
 
@@ -156,21 +156,6 @@ def continued(memory: LoopMemory, out: Array, wanted: Array, *, loop: Loop) -> L
         return memory
     missing = jnp.where(loop.ki == 0, 0.0, (wanted - out) / jnp.where(loop.ki == 0, 1.0, loop.ki))
     return memory.replace(integral=safe_clip(memory.integral + missing, -integral_max, integral_max))
-
-
-def low_pass(cutoff: float, freq: float) -> list[float]:
-    """Return the coefficients b0, a1, a2 of a Butterworth low-pass filter of second order.
-
-    ``b1 = 2 b0`` and ``b2 = b0``. Source: ``lpf2pSetCutoffFreq`` in filter.c of bitcraze/crazyflie-firmware.
-
-    Args:
-        cutoff: Cutoff frequency, Hz.
-        freq: Sampling rate, Hz.
-    """
-    ohm = math.tan(math.pi * cutoff / freq)
-    damping = 2 * math.cos(math.pi / 4) * ohm
-    c = 1 + damping + ohm * ohm
-    return [ohm * ohm / c, 2 * (ohm * ohm - 1) / c, (1 - damping + ohm * ohm) / c]
 
 
 def _filtered(sample: Array, delays: Array, coefficients: Array) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ import functools
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from crazysim.control.core import allocation_matrix, number_of, where_present
 from crazysim.drones import Airframe
@@ -53,32 +53,45 @@ def torque_allocation(airframe: Airframe) -> np.ndarray:
     The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the least-norm
     allocation of a quadrotor in X. Other layouts get the same factors.
     """
-    return allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0]
+    # Without the rounding errors of the pseudoinverse, which would change what is truncated.
+    return np.round(allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0], 12)
 
 
-def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams) -> Array:
+def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams, whole_numbers: bool = False) -> Array:
     """Return the PWM of the motors for a thrust and a torque.
 
     Where a motor would exceed its maximum, all motors are lowered by the largest excess, which keeps the torque at the
     expense of thrust. Then negative PWM is raised to zero, the firmware's default idle thrust. A thrust of zero or less
     switches the motors off. Source: ``powerDistributionLegacy`` and ``powerDistributionCap`` in
-    power_distribution_quadrotor.c of bitcraze/crazyflie-firmware, commit 2a18fc29, without its rounding to integers.
+    power_distribution_quadrotor.c of bitcraze/crazyflie-firmware, commit 2a18fc29. It keeps the torque, half of it for
+    roll and pitch, and the PWM as integers. Without that, the PWM differs by less than 4, and by less than 5 where a
+    motor is at its maximum.
 
     Args:
         thrust: Thrust of each motor, PWM. (..., 1)
         torque: Torque about the body axes, PWM. (..., 3)
         params: Parameters, shared or with the leading axes of the command.
+        whole_numbers: True to truncate to integers where the firmware does; the gradient is that without.
 
     Returns:
         PWM of each motor. (..., n_rotors)
     """
     p = params
-    pwm = thrust + matvec(p.torque_allocation, torque)
+    if whole_numbers:
+        shares = truncated(p.torque_allocation * truncated(torque)[..., None, :])
+        pwm = truncated(thrust + jnp.sum(shares, axis=-1))
+    else:
+        pwm = thrust + matvec(p.torque_allocation, torque)
     # The gradient of jnp.max divides by the number of equal elements, which is zero where XLA rounds a copy otherwise.
     highest = functools.reduce(jnp.maximum, [pwm[..., i : i + 1] for i in range(pwm.shape[-1])])
     excess = highest - p.pwm_max
     pwm = pwm - jnp.where(excess > 0, excess, 0.0)
     return jnp.where(thrust <= 0, 0.0, jnp.where(pwm < 0, 0.0, pwm))
+
+
+def truncated(x: Array) -> Array:
+    """Return numbers without their fractional parts, as a conversion to integers in C; the gradient is one. (...)"""
+    return x + lax.stop_gradient(jnp.trunc(x) - x)
 
 
 def rotor_vel_of_pwm(pwm: Array, *, params: PowerDistributionParams) -> Array:

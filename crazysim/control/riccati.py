@@ -29,13 +29,13 @@ def solve_discrete(A: Array, B: Array, Q: Array, R: Array) -> Array:
     rounding errors.
 
     Args:
-        A: (n, n)
-        B: (n, m)
-        Q: Positive semidefinite. (n, n)
-        R: Positive definite. (m, m)
+        A: State matrix. (n, n)
+        B: Input matrix. (n, m)
+        Q: Weights of the states, symmetric and positive semidefinite. (n, n)
+        R: Weights of the inputs, symmetric and positive definite. (m, m)
 
     Returns:
-        (n, n)
+        Solution P. (n, n)
     """
     P = _doubled(A, B @ jnp.linalg.solve(R, B.T), Q)
     for _ in range(REFINEMENTS):
@@ -53,13 +53,13 @@ def solve_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
     solved by doubling, and Newton's method (Kleinman 1968) removes the rounding errors of the transform.
 
     Args:
-        A: (n, n)
-        B: (n, m)
-        Q: Positive semidefinite. (n, n)
-        R: Positive definite. (m, m)
+        A: State matrix. (n, n)
+        B: Input matrix. (n, m)
+        Q: Weights of the states, symmetric and positive semidefinite. (n, n)
+        R: Weights of the inputs, symmetric and positive definite. (m, m)
 
     Returns:
-        (n, n)
+        Solution P. (n, n)
     """
     eye, G = jnp.eye(A.shape[0], dtype=A.dtype), B @ jnp.linalg.solve(R, B.T)
     shift = jnp.sqrt(jnp.sqrt(jnp.linalg.norm(G) * jnp.linalg.norm(Q))) + jnp.linalg.norm(A) / A.shape[0]
@@ -75,7 +75,7 @@ def solve_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
 
 def _doubled(A: Array, G: Array, H: Array) -> Array:
-    """Return the limit of H under doubling, or NaN where A does not converge to zero."""
+    """Return the limit of H under doubling, or NaN where A does not converge to zero. (n, n)"""
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
 
     def double(carry: tuple[Array, Array, Array], _: Any) -> tuple[tuple[Array, Array, Array], None]:
@@ -91,7 +91,7 @@ def _doubled(A: Array, G: Array, H: Array) -> Array:
 
 
 def solve_lyapunov(A: Array, Q: Array) -> Array:
-    """Return X with ``A^T X + X A + Q = 0`` for a stable A, by Cayley transform and doubling."""
+    """Return X with ``A^T X + X A + Q = 0`` for a stable A, by Cayley transform and doubling. (n, n)"""
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
     shift = jnp.linalg.norm(A) / jnp.sqrt(A.shape[0])
     inverse = jnp.linalg.inv(A - shift * eye)
@@ -99,7 +99,7 @@ def solve_lyapunov(A: Array, Q: Array) -> Array:
 
 
 def _smith(A: Array, Q: Array) -> Array:
-    """Return X with ``X = A^T X A + Q`` for a stable A, by doubling (Smith 1968)."""
+    """Return X with ``X = A^T X A + Q`` for a stable A, by doubling (Smith 1968). (n, n)"""
 
     def double(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
         X, power = carry

@@ -12,10 +12,8 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.allocation import AllocationParams
 from crazysim.control.core import Control
 from crazysim.control.lqr import (
-    LQRParams,
     Reference,
     as_weights,
     default_weights,
@@ -26,36 +24,27 @@ from crazysim.control.lqr import (
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.riccati import gain_continuous, solve_lyapunov
+from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.core import GRAVITY
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.pytree import as_parameter, leaf
 from crazysim.rotation import cross, matvec
 
 MAX_KNOTS = 60
 """Largest number of gains in a table."""
 
 
-class TrackingLQRParams(PyTree):
+class TrackingLQRParams(RigidBodyParams):
     """Gains and parameters of the LQR along a trajectory, each shared or one per drone."""
 
-    mass: Array = leaf("parameter", 1, (1,))
-    """Mass that the controller assumes, kg. (1,)"""
-    gravity_vec: Array = leaf("parameter", 1)
-    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
-    J: Array = leaf("parameter", 2)
-    """Inertia that the controller assumes, body frame, kg m^2. (3, 3)"""
-    drag_matrix: Array = leaf("parameter", 2)
-    """Linear drag coefficients that the controller compensates, body frame, N s/m. (3, 3)"""
     gains: Array = leaf("parameter", 3)
     """Gains at the knots. (n_knots, 4, 12)"""
     dt: Array = leaf("parameter", 1)
     """Time from one knot to the next, s. (1,)"""
     start: Array = leaf("parameter", 1)
     """Time of the first knot, s since the reset. (1,)"""
-    allocation: AllocationParams
-    """Limits of the rotors."""
 
 
 class _Model(NamedTuple):
@@ -213,7 +202,7 @@ class TrackingLQR(Controller):
         """Return gains and constants for an airframe.
 
         Raises:
-            ConfigError: If the setpoints are missing or too many, or no gain stabilises the drone.
+            ConfigError: If the setpoints are missing, too many or not finite, or no gain stabilises the drone.
         """
         shape = np.shape(self.setpoints.pos) if isinstance(self.setpoints, Setpoint) else ()
         n = shape[0] if len(shape) == 2 else 0
@@ -222,24 +211,24 @@ class TrackingLQR(Controller):
                 f"expected setpoints of one drone with a leading axis of 2 to {MAX_KNOTS}, and a positive dt, got "
                 f"positions of shape {shape} and {self.dt}. Use jax.vmap(trajectory.evaluate)(times) with a larger dt."
             )
-        hover = LQRParams.create(airframe, self.freq, self.Q, self.R)
+        bad = [name for name, x in vars(self.setpoints).items() if not np.all(np.isfinite(x))]
+        if bad:
+            raise ConfigError(
+                f"expected finite setpoints, got NaN or infinity in {', '.join(bad)}. Evaluate the trajectory at "
+                f"times that it covers, and check its limits."
+            )
         weights = default_weights(airframe, self.freq)
         Q = as_weights("Q", weights[0] if self.Q is None else self.Q, 12)
         R = as_weights("R", weights[1] if self.R is None else self.R, 4)
-        mass = airframe.value("rigid_body.mass")
-        drag = airframe.value("drag.coefficients")
+        mass, drag = airframe.value("rigid_body.mass"), airframe.value("drag.coefficients")
         drag = np.diag(drag) if drag.ndim == 1 else drag
         gains_of = functools.partial(tracking_gains, substeps=math.ceil(self.dt * self.freq))
         gains = on_host(gains_of, self.setpoints, self.dt, mass, airframe.inertia, drag, Q, R)
         return TrackingLQRParams(
-            mass=hover.mass,
-            gravity_vec=hover.gravity_vec,
-            J=hover.J,
-            drag_matrix=hover.drag_matrix,
+            **rigid_body(airframe),
             gains=as_parameter(gains),
             dt=as_parameter(self.dt),
             start=as_parameter(self.start),
-            allocation=hover.allocation,
         )
 
     def update(self, data: Any, command: Any, memory: Any, params: TrackingLQRParams) -> tuple[Array, Any]:

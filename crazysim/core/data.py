@@ -146,6 +146,8 @@ class Objects(PyTree):
     """MuJoCo mocap ids of the bodies of the objects. (n_objects,)"""
     names: tuple[str, ...] = static()
     """Names of the bodies of the objects."""
+    recorded: bool = static(default=False)
+    """True where the poses are those of a recording, also of objects that plugins place, such as loads."""
 
 
 class SimData(PyTree):

@@ -172,9 +172,11 @@ class PluginRegistry(Mapping[str, Plugin]):
         return jax.vmap(lambda values: of_drones(axes.treedef.unflatten(values)), (worlds,))(of_world)
 
     def placed(self, data: SimData) -> SimData:
-        """Return the data with the plugins' objects of the scene at their poses."""
+        """Return the data with the plugins' objects of the scene at their poses, unless these are recorded ones."""
+        if data.objects is None or data.objects.recorded:
+            return data
         for name, plugin in self.items():
-            if plugin.places and data.objects is not None:
+            if plugin.places:
                 if self._placing.get(name, (None, None))[0] is not plugin:
                     self._placing[name] = plugin, jax.jit(over_worlds(plugin.place))
                 data = data.replace(objects=self._placing[name][1](data))

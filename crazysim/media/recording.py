@@ -168,7 +168,8 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
 def put(sim: Sim, flight: Flight, time: float) -> None:
     """Set poses, setpoints and clock of a simulation to those of a flight, to draw them.
 
-    Velocities and controllers stay as they are. To continue a simulation, keep ``data = sim.data`` and restore it.
+    Bodies are drawn as they were recorded, also those that plugins place, such as loads. Velocities, controllers and
+    records of plugins stay as they are. To continue a simulation, keep ``data = sim.data`` and restore it.
 
     Args:
         sim: Simulation with the drones, worlds and bodies of the one that was recorded.
@@ -200,6 +201,7 @@ def put(sim: Sim, flight: Flight, time: float) -> None:
         objects = objects.replace(
             pos=objects.pos.at[worlds, 0].set(now["body_pos"][:, columns]),
             quat=objects.quat.at[worlds, 0].set(now["body_quat"][:, columns]),
+            recorded=any(plugin.places for plugin in sim.plugins.values()),
         )
     sim.data = data.replace(states=states, core=core, controls=controls, objects=objects)
     body_pos, body_quat = _bodies(sim, worlds)

@@ -1,7 +1,8 @@
-"""Loads as bodies that collide: point masses with a shape."""
+"""Loads and hooks as bodies that collide: point masses with a shape."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,10 @@ from crazysim.geometry import Shape
 
 
 class LoadBody(NamedTuple):
-    """State of loads with the poses of their shapes, world frame. Leading axes: () for one drone, else (n_loads,)."""
+    """State of point masses with the poses of their shapes, world frame.
+
+    Leading axes are () for one drone, else (n_loads,).
+    """
 
     pos: Array
     """Centre of the shape, m. (..., 3)"""
@@ -23,6 +27,22 @@ class LoadBody(NamedTuple):
     """Velocity of the point mass, m/s. (..., 3)"""
     mass: Array
     """Mass, kg. (..., 1)"""
+    exists: Array | None = None
+    """True where it collides; None for always. (...)"""
+
+
+class Collider(NamedTuple):
+    """Bodies of one shape, one for each load, as contacts use them. Its functions take one drone or one world."""
+
+    shape: Shape
+    """Shape of each."""
+    body: Callable[[SimData], LoadBody]
+    """Returns their state."""
+    with_vel: Callable[[SimData, Array], SimData]
+    """Returns the data with other velocities of them. (..., 3)"""
+    joined: Callable[[SimData], Array]
+    """Returns True where a rigid rod joins a body to a drone, and the two cannot touch; of one world.
+    (n_loads, n_drones)"""
 
 
 class Colliding:
@@ -36,9 +56,18 @@ class Colliding:
     """Radius of a ball, or full lengths of a box, m: () or (3,)."""
 
     @property
+    def solid_kinds(self) -> tuple[str, ...]:
+        """Names of the objects of the scene that stand for its bodies, without their numbers."""
+        return (self.name,)
+
+    @property
     def placed_kinds(self) -> tuple[str, ...]:
         """Names of the loads and their links in the scene."""
-        return (self.name, f"{self.name}_link")
+        return (*self.solid_kinds, f"{self.name}_link")
+
+    def colliders(self) -> tuple[Collider, ...]:
+        """Return all bodies that collide: the loads."""
+        return (Collider(self.shape(), self.body, self.with_vel, self.joined),)
 
     def shape(self) -> Shape:
         """Return the shape of a load."""
@@ -65,7 +94,10 @@ def shape_of(size: Any) -> Shape:
     """
     dims = np.shape(size)
     if dims not in ((), (3,)) or not np.all(np.asarray(size) > 0):
-        raise ConfigError(f"expected size as a positive radius, or as three positive lengths of a box, m, got {size!r}")
+        raise ConfigError(
+            f"expected size as a positive radius, or as three positive lengths of a box, m, got {size!r}. Use "
+            "size=0.05 or size=(0.1, 0.1, 0.05)."
+        )
     return Shape("sphere", (float(size),)) if dims == () else Shape("box", tuple(float(x) / 2 for x in size))
 
 

@@ -29,8 +29,12 @@ WIRE_RADIUS, HOOK_RADIUS = 0.003, 0.0045
 """Radii of the wires by which a drawn load hangs, and of a drawn hook, m."""
 HOOK_OUTLINE = ((0, -0.045), (-0.02, -0.025), (-0.014, -0.004), (0, 0.003), (0.014, -0.004), (0.02, -0.02))
 """Drawn shape of a hook: x, and z towards the load from the hook's position, m."""
+HEAD_RADIUS, HEAD_HEIGHT = 0.0245, 0.021
+"""Radius of the ball around that outline, with which a hook collides, and its height above the hook's position, m."""
 DARK, STEEL, YELLOW = (0.15, 0.15, 0.15, 1.0), (0.35, 0.35, 0.4, 1.0), (0.95, 0.75, 0.1, 1.0)
 """Colours of rods, wires and hooks."""
+SOLID = 'contype="0" conaffinity="2"'
+"""MJCF attributes of a geom that drones touch."""
 
 
 class LoadData(Exposed):
@@ -207,17 +211,19 @@ def add_to_scene(
     rgba = (0.85, 0.55, 0.2, 1.0) if rgba is None else rgba
     half = np.full(3, float(size)) if np.ndim(size) == 0 else np.asarray(size, float) / 2
     kind = "sphere" if np.ndim(size) == 0 else "box"
-    body = f'<geom type="{kind}" size="{_numbers(half)}" contype="0" conaffinity="2" rgba="{_numbers(rgba)}"/>'
+    body = f'<geom type="{kind}" size="{_numbers(half)}" {SOLID} rgba="{_numbers(rgba)}"/>'
     shank = 0.0 if ring is None else HOOK_OUTLINE[0][1]
     link = _rod((0, 0, -length / n_pieces / 2), (0, 0, length / n_pieces / 2 + shank), LINK_RADIUS, DARK)
+    kinds = [(body, name, n_loads), (link, f"{name}_link", sim.n_drones * n_pieces)]
     if ring is not None:
         ends = [(side * half[0], 0, 0 if kind == "sphere" else half[2]) for side in (-1, 1)]
         body += "".join(_rod(end, (0, 0, ring), WIRE_RADIUS, STEEL) for end in ends)
-        link += "".join(
-            _rod((x, 0, length / 2 + z), (x_2, 0, length / 2 + z_2), HOOK_RADIUS, YELLOW)
-            for (x, z), (x_2, z_2) in pairwise(HOOK_OUTLINE)
+        head = f'<geom type="sphere" pos="0 0 {HEAD_HEIGHT}" size="{HEAD_RADIUS}" group="3" {SOLID}/>'
+        head += "".join(
+            _rod((x, 0, -z), (x_2, 0, -z_2), HOOK_RADIUS, YELLOW) for (x, z), (x_2, z_2) in pairwise(HOOK_OUTLINE)
         )
-    for text, kind, count in ((body, name, n_loads), (link, f"{name}_link", sim.n_drones * n_pieces)):
+        kinds = [(body, name, n_loads), kinds[1], (head, f"{name}_hook", n_loads)]
+    for text, kind, count in kinds:
         sim.scene.add(f"<mujoco><worldbody>{text}</worldbody></mujoco>", kind, count=count)
 
 

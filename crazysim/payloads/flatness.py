@@ -47,7 +47,7 @@ class LoadedState(NamedTuple):
     """Torque, body frame, N m. (..., 3)"""
 
 
-def flat_states(
+def load_flat_state(
     path: Array, yaw: Array, mass: Array, load_mass: Array, length: Array, inertia: Array, gravity_vec: Array
 ) -> LoadedState:
     """Return states and inputs with which a drone carries a point load along a path.
@@ -66,7 +66,7 @@ def flat_states(
         gravity_vec: Gravitational acceleration, world frame, m/s^2. (3,)
     """
     if path.ndim > 2:
-        return jax.vmap(lambda p, y: flat_states(p, y, mass, load_mass, length, inertia, gravity_vec))(path, yaw)
+        return jax.vmap(lambda p, y: load_flat_state(p, y, mass, load_mass, length, inertia, gravity_vec))(path, yaw)
 
     def derivatives(order: int, t: Array) -> Array:
         """Return a derivative of the path as a function of the time from now."""

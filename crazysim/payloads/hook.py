@@ -14,9 +14,19 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter,
 from crazysim.core.stage import Stage
 from crazysim.effects.ground import ground_height
 from crazysim.errors import ConfigError
-from crazysim.payloads.body import Colliding, LoadBody, rest_height
-from crazysim.payloads.core import LoadData, air_and_gravity, hanging, on_floor, turned_z
-from crazysim.payloads.link import TINY, Link, couple, end_relative_motion
+from crazysim.geometry import Shape
+from crazysim.payloads.body import Collider, Colliding, LoadBody, rest_height
+from crazysim.payloads.core import (
+    HEAD_HEIGHT,
+    HEAD_RADIUS,
+    LoadData,
+    air_and_gravity,
+    hanging,
+    on_floor,
+    placed,
+    turned_z,
+)
+from crazysim.payloads.link import TINY, Link, couple, end_relative_motion, relative
 from crazysim.payloads.slung import load_record, place_loads, upward
 from crazysim.pytree import leaf, select_worlds
 from crazysim.rotation import dot
@@ -98,7 +108,7 @@ class Hook(Colliding, Plugin):
     def record(self, sim: Simulation) -> HookData:
         """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
         if self.dof not in (1, 2):
-            raise ConfigError(f"expected dof as 1 or 2, got {self.dof!r}")
+            raise ConfigError(f"expected dof as 1 or 2, got {self.dof!r}. Use Hook(mass, dof=2).")
         load = load_record(self, sim, False, rest_height(self.size) + self.ring, self.ring)
 
         def check(name: str) -> Array:
@@ -125,7 +135,7 @@ class Hook(Colliding, Plugin):
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages of picking up and letting go, and of the floor."""
         return [
-            Placement(Stage(self.grip, "drone"), "integration", name=f"{self.name}_grip"),
+            Placement(Stage(self.pick_up_and_release, "drone"), "integration", name=f"{self.name}_grip"),
             Placement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor"),
         ]
 
@@ -149,7 +159,7 @@ class Hook(Colliding, Plugin):
         }
         return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
 
-    def grip(self, data: SimData) -> SimData:
+    def pick_up_and_release(self, data: SimData) -> SimData:
         """Pick up a load that is near and slow, or let go, as ``grip`` of the record commands; of one drone.
 
         Hook and ring stay together after an impact that keeps momentum: the mean of their velocities by mass, then the
@@ -221,7 +231,19 @@ class Hook(Colliding, Plugin):
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
         holds = np.ones(load.tip_pos.shape[0], bool)
-        return place_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring)  # type: ignore[arg-type]
+        objects = place_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring)  # type: ignore[arg-type]
+        heads = {f"{self.name}_hook": (load.tip_pos, turned_z(-self._along(data, load)))}
+        return placed(objects, heads)
+
+    @property
+    def solid_kinds(self) -> tuple[str, ...]:
+        """Names of the objects of the scene that stand for loads and hooks, without their numbers."""
+        return (self.name, f"{self.name}_hook")
+
+    def colliders(self) -> tuple[Collider, ...]:
+        """Return all bodies that collide: the loads, and balls around the hooks that carry none."""
+        head = Collider(Shape("sphere", (HEAD_RADIUS,)), self.head, self.with_head_vel, self.joined_head)
+        return (*super().colliders(), head)
 
     def body(self, data: SimData) -> LoadBody:
         """Return the loads, with the hooks that hold them; of one drone or of one world."""
@@ -237,6 +259,27 @@ class Hook(Colliding, Plugin):
     def joined(self, data: SimData) -> Array:
         """Return True where a load is on the hook of a drone; of one world. (n_drones, n_drones)"""
         return np.eye(data.states.pos.shape[0], dtype=bool) & self.read(data).attached
+
+    def head(self, data: SimData) -> LoadBody:
+        """Return the hooks, which collide while they carry nothing; of one drone or of one world."""
+        load = self.read(data)
+        up = -self._along(data, load)
+        mass = jnp.broadcast_to(load.hook_mass, (*load.tip_pos.shape[:-1], 1))
+        return LoadBody(load.tip_pos + HEAD_HEIGHT * up, turned_z(up), load.tip_vel, mass, ~load.attached)
+
+    def with_head_vel(self, data: SimData, vel: Array) -> SimData:
+        """Return the data with other velocities of hooks that carry nothing. (..., 3)"""
+        load = self.read(data)
+        return self.write(data, load.replace(tip_vel=jnp.where(load.attached[..., None], load.tip_vel, vel)))
+
+    def joined_head(self, data: SimData) -> Array:
+        """Return True for a hook and its drone; of one world. (n_drones, n_drones)"""
+        return np.eye(data.states.pos.shape[0], dtype=bool)  # type: ignore[return-value]
+
+    @staticmethod
+    def _along(data: SimData, load: HookData) -> Array:
+        """Return the unit vectors along the rods, world frame. (..., 3)"""
+        return relative(data.states, load.tip_pos, load.tip_vel, load.attach).direction
 
     @staticmethod
     def _held(load: HookData, mass: Array) -> Array:

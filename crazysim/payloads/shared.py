@@ -52,7 +52,8 @@ class SharedLoad(PointLoad, Plugin):
     """One load, a point mass, on rods or cables from all drones of a world.
 
     The tensions follow from one system of equations of all drones. It needs an integrator that moves positions with new
-    velocities, ``symplectic_euler`` or ``rk4``. It starts at rest below the drones' mean position.
+    velocities, ``symplectic_euler`` or ``rk4``. It starts at rest below the drones' mean position. Its gravity is
+    the mean of the drones'.
     """
 
     coupling: ClassVar[Literal["drone", "world"]] = "world"
@@ -88,7 +89,9 @@ class SharedLoad(PointLoad, Plugin):
         for name, value in (("mass", self.mass), ("friction", self.friction), ("size", rest_height(self.size))):
             scalars[name] = check_parameter(sim, name, value, low=0.0)
             if scalars[name].ndim > 1:
-                raise ConfigError(f"expected {name} as one number, got shape {scalars[name].shape}")
+                raise ConfigError(
+                    f"expected {name} as one number, got shape {scalars[name].shape}. The load belongs to all drones."
+                )
         if self.in_scene:
             add_to_scene(
                 sim, self.name, self.size, self.rgba, float(jnp.max(length)), 1,
@@ -119,7 +122,7 @@ class SharedLoad(PointLoad, Plugin):
         """Return the derivative with the pull of the load on all drones, and the load's rates; of one world."""
         load, p, s, freq = self.read(data), data.params, data.states, data.core.freq
         m, n = load.mass, s.pos.shape[0]
-        gravity = p.gravity_vec if p.gravity_vec.ndim == 1 else p.gravity_vec[0]
+        gravity = p.gravity_vec if p.gravity_vec.ndim == 1 else jnp.mean(p.gravity_vec, axis=0)
         r = relative(s, load.pos, load.vel, load.attach)
         q, out = r.direction, rotation.dot(r.direction, r.vel)
         pull = Pull.create(q, r.rot, p.J_inv, load.attach)

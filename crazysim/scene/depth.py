@@ -17,6 +17,7 @@ from crazysim.core.data import SimData
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.collision import CollisionModel, body_name
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
+from crazysim.scene.placement import Placing, place, placed_by
 from crazysim.scene.rays import Hits, cast
 
 MAX_RAYS = 1 << 22
@@ -122,6 +123,7 @@ def build(
     drones: bool,
     hide_own: bool,
     along: Along,
+    plugins: Placing = tuple,
 ) -> DepthFn:
     """Return ``depth(data, mocap=None) -> Hits`` (n_worlds, n_cameras, height, width); see ``Scene.depth_fn``.
 
@@ -155,8 +157,9 @@ def build(
     in_data = model.without_mocap_bodies()
 
     def depth(data: SimData, mocap: MocapPoses = None) -> Hits:
-        require_poses(model, [*(body.name for body in model.objects), *(c.body for c in cameras)], mocap)
-        data = with_mocap_bodies(model, data, mocap)
+        bodies = [*(body.name for body in model.objects), *(c.body for c in cameras)]
+        require_poses(model, bodies, mocap)
+        data = with_mocap_bodies(model, place(data, placed_by(plugins(), bodies)), mocap)
         n_worlds, at_a_time = data.core.n_worlds, max(1, MAX_RAYS // n_rays)
         if n_worlds <= at_a_time:
             return of_worlds(data)

@@ -27,10 +27,14 @@ def placed_by(plugins: Iterable[Plugin], names: Sequence[str]) -> dict[str, Plug
 def place(data: SimData, placed: Mapping[str, Plugin]) -> SimData:
     """Return the data of all worlds, or of one world, with objects at the poses of their plugins.
 
+    Recorded poses stay.
+
     Raises:
         ConfigError: If the data are of one drone, which do not contain the other drones' objects.
     """
-    if placed and data.states.pos.ndim == 1:
+    if not placed or data.objects is None or data.objects.recorded:
+        return data
+    if data.states.pos.ndim == 1:
         name, plugin = next(iter(placed.items()))
         raise ConfigError(
             f"expected the data of a world, got those of one drone, from which the pose of {name!r}, an object of "

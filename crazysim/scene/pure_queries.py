@@ -81,7 +81,8 @@ class PureQueries:
         """Return ``depth(data, mocap=None) -> Hits``, pure: depth images of all worlds, by one ray for each pixel.
 
         ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), with ``normal`` and ``number`` (the
-        body that was hit) beside it. Inside jit, fields that are not used are not computed.
+        body that was hit) beside it. Inside jit, fields that are not used are not computed. Objects of plugins, such as
+        loads, are where the plugins' records in ``data`` have them.
 
         Args:
             camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones (n_cameras is n_drones then); or the name
@@ -99,4 +100,4 @@ class PureQueries:
         """
         objects = (*self.added.movable, *self.visual_model.mocap_bodies)
         cameras = depth.find_cameras(self.mj_model, camera, objects)
-        return depth.build(self.visual_model, cameras, width, height, drones, hide_own, along)
+        return depth.build(self.visual_model, cameras, width, height, drones, hide_own, along, self.plugins)

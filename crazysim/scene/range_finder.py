@@ -18,6 +18,7 @@ from crazysim.deprecation import renamed, warn_renamed
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 from crazysim.scene.collision import CollisionModel
+from crazysim.scene.placement import place, placed_by
 from crazysim.scene.rays import cast
 
 MULTI_RANGER = {
@@ -45,7 +46,8 @@ class RangeFinderData(PyTree):
 class RangeFinder(Plugin):
     """Rays from the centre of mass of every drone that measure distances.
 
-    A ray ignores its own drone. Other drones have the shapes that they collide with.
+    A ray ignores its own drone, and rods and cables of loads, which are thin. Other drones have the shapes that they
+    collide with.
     """
 
     MULTI_RANGER: ClassVar[Mapping[str, tuple[int, int, int]]] = MULTI_RANGER
@@ -77,13 +79,24 @@ class RangeFinder(Plugin):
         return RangeFinderData(distance, jnp.asarray(rays, float), jnp.asarray(far))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that measures, of one drone, or of one world if drones are to be measured."""
+        """Return the stage that measures, of one drone, or of one world if drones or loads are to be measured."""
+        visual, solid = sim.scene.visual_model, sim.scene.collision_model
+        placed = placed_by(sim.scene.plugins(), [body.name for body in visual.objects])
+        touched = {body.name for body in solid.objects}
+        objects = tuple(body for body in visual.objects if body.name in touched or body.name not in placed)
         # The outline of a drone is enough for a few rays.
-        model = dataclasses.replace(sim.scene.visual_model, drones=sim.scene.collision_model.drones)
+        model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
+        placed = {name: plugin for name, plugin in placed.items() if name in touched}
+        scope = "world" if self.drones or placed else "drone"
         period = self._period(sim)
         when = None if period == 1 else lambda data: data.core.steps % period == 0
-        measure = Stage(lambda data: self._measure(model, data), "world" if self.drones else "drone", when)
-        return [Placement(measure, before="increment_steps")]
+
+        def measure(data: SimData) -> SimData:
+            """Measure distances, to loads where they are now."""
+            present = {name: plugin for name, plugin in placed.items() if plugin.name in data.plugins}
+            return self.write(data, self._measured(model, place(data, present), scope == "world"))
+
+        return [Placement(Stage(measure, scope, when), before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the distances, m."""
@@ -109,16 +122,17 @@ class RangeFinder(Plugin):
             raise ConfigError(f"expected freq to divide the {steps} Hz of the simulation, got {freq}. Use a divisor.")
         return steps // freq
 
-    def _measure(self, model: CollisionModel, data: SimData) -> SimData:
+    def _measured(self, model: CollisionModel, data: SimData, of_world: bool) -> RangeFinderData:
+        """Return the record with the distances of one drone, or of one world."""
         record, states = self.read(data), data.states
-        pos, quat = (states.pos, states.quat) if self.drones else (states.pos[None], states.quat[None])
+        pos, quat = (states.pos, states.quat) if of_world else (states.pos[None], states.quat[None])
         direction = rotation.rotate(quat[:, None], record.direction)
         n_rays = direction.shape[1]
         origin = jnp.broadcast_to(pos[:, None], direction.shape)
         own = np.repeat(np.arange(direction.shape[0]), n_rays) if self.drones else None
         hits = cast(model, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, self.drones)
         distance = jnp.minimum(hits.distance, record.max_range).reshape(direction.shape[:2])
-        return self.write(data, record.replace(distance=distance if self.drones else distance[0]))
+        return record.replace(distance=distance if of_world else distance[0])
 
 
 def add_range_finder(

@@ -25,7 +25,7 @@ from crazysim.pytree import PyTree, leaf
 from crazysim.scene.contact_points import Surface, contact_points, is_ground, surfaces_of
 from crazysim.scene.drone_boxes import Boxes, boxes_of, of_kind
 from crazysim.scene.impulse import Material, after_contact, inertia_matrix
-from crazysim.scene.load_contacts import hit_drones, loads_of, names_of, stop_loads
+from crazysim.scene.load_contacts import hit_drones, hit_each_other, loads_of, names_of, stop_loads
 from crazysim.scene.report import Objects, choose
 
 
@@ -52,8 +52,9 @@ class ContactResponse(Plugin):
 
     Drones do not push each other (``DroneCollisions``), and objects do not move; drones ride on members of populations,
     such as cars, that are in the scene at the time of adding. A drone that stands on the floor has its centre half its
-    collision box above it. Loads that are objects of the scene at the time of adding are stopped by all objects but the
-    flat floor, where they stop without it too, and exchange impulses with drones if they are among ``objects``.
+    collision box above it. Loads, and hooks that carry none, that are objects of the scene at the time of adding are
+    stopped by all objects but the flat floor, where they stop without it too. If they are among ``objects``, they
+    exchange impulses with drones and with each other.
     """
 
     objects: Objects = None
@@ -100,29 +101,50 @@ class ContactResponse(Plugin):
         obstacles = [surface for surface in surfaces if not is_ground(surface)]
         hits = any(body.name in names for body in choose(sim.scene.collision_model, self.objects))
         for plugin in plugins:
-            found += self._load_stages(plugin, obstacles, boxes if hits else [])
+            found += self._load_stages(plugin, obstacles, boxes if hits else [], sim.n_drones)
         return found
 
-    def _load_stages(self, plugin: Any, obstacles: list[Surface], boxes: Boxes) -> list[Placement]:
-        """Return the stages of a plugin's loads: with obstacles, and with drones if there are boxes of these."""
+    def _load_stages(self, plugin: Any, obstacles: list[Surface], boxes: Boxes, n_drones: int) -> list[Placement]:
+        """Return the stages of a plugin's loads: with obstacles, with drones and with each other.
+
+        Args:
+            plugin: Plugin with the loads.
+            obstacles: Surfaces of objects.
+            boxes: Collision boxes of the drones; empty for obstacles only.
+            n_drones: Number of drones in a world.
+        """
+        colliders = plugin.colliders()
+        meet = len(colliders) > 1 or (plugin.coupling == "drone" and n_drones > 1)
 
         def stop(data: SimData) -> SimData:
             if plugin.name not in data.plugins:
                 return data
-            return stop_loads(data, plugin, obstacles, self.read(data).material, self.iterations)
+            for collider in colliders:
+                data = stop_loads(data, collider, obstacles, self.read(data).material, self.iterations)
+            return data
 
         def hit(data: SimData) -> SimData:
             if plugin.name not in data.plugins:
                 return data
             record = self.read(data)
-            data, impulse = hit_drones(data, plugin, record.material, boxes)
-            return self.write(data, record.replace(impulse=record.impulse + impulse))
+            impulse = record.impulse
+            for collider in colliders:
+                data, part = hit_drones(data, collider, record.material, boxes)
+                impulse = impulse + part
+            return self.write(data, record.replace(impulse=impulse))
+
+        def hit_others(data: SimData) -> SimData:
+            if plugin.name not in data.plugins:
+                return data
+            return hit_each_other(data, colliders, self.read(data).material)
 
         found = []
         if obstacles:
             found.append((Stage(stop, plugin.coupling), f"{self.name}_of_{plugin.name}"))
         if boxes:
             found.append((Stage(hit, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
+            if meet:
+                found.append((Stage(hit_others, "world"), f"{self.name}_between_{plugin.name}"))
         return [Placement(stage, before="increment_steps", name=name) for stage, name in found]
 
 

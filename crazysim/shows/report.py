@@ -14,7 +14,7 @@ N_LISTED = 5
 """Pairs that a summary lists."""
 
 
-def closest_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArray]:
+def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArray]:
     """Return the least distance of every pair of drones, and the time at which it occurs.
 
     Between samples the distance is that of drones at constant velocities: its square is a parabola of time, through the
@@ -73,7 +73,7 @@ def tracking_rms(flight: ShowFlight) -> dict[str, float]:
 def collisions(flight: ShowFlight) -> list[dict[str, Any]]:
     """Return the pairs of drones whose collision spheres touched, each with the time of the first contact, by time."""
     reach = 2 * collision_radius(flight)
-    distance, _ = closest_approaches(flight.times, flight.pos)
+    distance, _ = sampled_approaches(flight.times, flight.pos)
     found = []
     for i, j in np.argwhere(np.triu(distance < reach, 1)):
         apart = np.linalg.norm(flight.pos[:, i] - flight.pos[:, j], axis=-1)
@@ -105,7 +105,7 @@ def report(flight: ShowFlight) -> dict[str, Any]:
 
 
 def _pairs(flight: ShowFlight, pos: NDArray) -> list[dict[str, Any]]:
-    distance, when = closest_approaches(flight.times, pos)
+    distance, when = sampled_approaches(flight.times, pos)
     first, second = np.triu_indices(len(distance), 1)
     names = flight.show.names
     order = np.argsort(distance[first, second], kind="stable")

@@ -72,9 +72,12 @@ def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
     if not np.isfinite(speed) or speed <= 0:
         raise ConfigError(f"expected a positive speed, got {speed!r}")
     sim, recorded, camera = flight.sim, media_flight(flight), view_of(flight, **view)
-    data, begin = sim.data, time.perf_counter()
+    data = sim.data
     try:
-        while (now := speed * (time.perf_counter() - begin)) < flight.duration:
+        put(sim, recorded, 0.0)
+        camera.show(sim)
+        start = time.perf_counter()  # opening the window can take longer than a short show
+        while sim.viewer.has_window and (now := speed * (time.perf_counter() - start)) < flight.duration:
             put(sim, recorded, now)
             camera.show(sim)
     finally:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crazysim.trajectories.fleet import Fleet, Floats, Ints
+from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 
 CELL = 0.4
 """Length of a cell at the first level, s."""
@@ -33,7 +33,7 @@ class Approach:
     """Time of the closest approach, s."""
 
 
-def closest_approaches(fleet: Fleet, tolerance: float = 1e-3) -> list[Approach]:
+def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Approach]:
     """Return the closest approach of every pair, nearest pair first.
 
     In a cell of time, the relative motion deviates from its chord by at most ``dt^2 / 8`` times its largest
@@ -43,26 +43,26 @@ def closest_approaches(fleet: Fleet, tolerance: float = 1e-3) -> list[Approach]:
     the middle and the largest snaps, so that drones in formation need no short cells.
 
     Args:
-        fleet: Trajectories.
+        pieces: Trajectories.
         tolerance: Largest error of a distance, m. The distance is that at the time given, thus never too small.
     """
-    n = fleet.n_drones
+    n = pieces.n_drones
     first, second = np.triu_indices(n, 1)
     if not len(first):
         return []
     best, when = np.full(len(first), np.inf), np.zeros(len(first))
-    n_cells = int(np.ceil(fleet.duration / CELL))
-    dt, motion = fleet.duration / n_cells, _Motion(fleet)
+    n_cells = int(np.ceil(pieces.duration / CELL))
+    dt, motion = pieces.duration / n_cells, _Motion(pieces)
     pair, cell = np.repeat(np.arange(len(first)), n_cells), np.tile(np.arange(n_cells), len(first))
     while len(pair) and dt > SHORTEST:
-        worthwhile = n_cells * fleet.n_drones <= min(TABLE, len(pair))
+        worthwhile = n_cells * pieces.n_drones <= min(TABLE, len(pair))
         table = motion.table(n_cells, dt) if worthwhile else None
         keep = np.zeros(len(pair), bool)
         for k in range(0, len(pair), BATCH):
             part = slice(k, k + BATCH)
             i, j = first[pair[part]], second[pair[part]]
             one, other = (motion.in_cells(drone, cell[part], dt, table) for drone in (i, j))
-            lower = _lower_bounds(fleet, one, other, (i, j), pair[part], cell[part], dt, best, when)
+            lower = _lower_bounds(pieces, one, other, (i, j), pair[part], cell[part], dt, best, when)
             keep[part] = lower < best[pair[part]] - tolerance
         pair, cell = np.repeat(pair[keep], SPLIT), (cell[keep][:, None] * SPLIT + np.arange(SPLIT)).ravel()
         dt, n_cells = dt / SPLIT, n_cells * SPLIT
@@ -73,22 +73,22 @@ def closest_approaches(fleet: Fleet, tolerance: float = 1e-3) -> list[Approach]:
 class _Motion:
     """Motion of single drones in cells of time: positions at both ends, derivatives in the middle, and a bound."""
 
-    def __init__(self, fleet: Fleet) -> None:
-        self.fleet = fleet
-        snap = fleet.coefficients_of(4)[:, :3]
+    def __init__(self, pieces: PieceTable) -> None:
+        self.pieces = pieces
+        snap = pieces.coefficients_of(4)[:, :3]
         control_points = snap @ _to_bernstein(snap.shape[-1] - 1)  # a polynomial lies in their convex hull
         self.snaps = np.cumsum(np.max(np.linalg.norm(control_points, axis=1), axis=-1))
-        jumps = np.zeros((4, len(fleet.drone)))
-        piece = np.flatnonzero(fleet.drone[1:] == fleet.drone[:-1])
+        jumps = np.zeros((4, len(pieces.drone)))
+        piece = np.flatnonzero(pieces.drone[1:] == pieces.drone[:-1])
         for order in range(4):
-            before = fleet.within(piece, np.ones(len(piece)), order)
-            after = fleet.within(piece + 1, np.zeros(len(piece)), order)
+            before = pieces.within(piece, np.ones(len(piece)), order)
+            after = pieces.within(piece + 1, np.zeros(len(piece)), order)
             jumps[order, piece + 1] = np.linalg.norm((after - before)[:, :3], axis=-1)
         self.jumps = np.cumsum(jumps, axis=1)
 
     def table(self, n_cells: int, dt: float) -> tuple[Floats, ...]:
         """Return the motion of every drone in every cell. (n_drones, n_cells, ...)"""
-        return self.in_cells(np.arange(self.fleet.n_drones)[:, None], np.arange(n_cells), dt, None)
+        return self.in_cells(np.arange(self.pieces.n_drones)[:, None], np.arange(n_cells), dt, None)
 
     def in_cells(self, drone: Ints, cell: Ints, dt: float, table: tuple[Floats, ...] | None) -> tuple[Floats, ...]:
         """Return positions at start and end, acceleration and jerk in the middle (..., 3) and bound (...) of each cell.
@@ -98,18 +98,18 @@ class _Motion:
         if table is not None:
             return tuple(x[drone, cell] for x in table)
         drone, cell = np.broadcast_arrays(drone, cell)
-        begin, end = cell * dt, (cell + 1) * dt
-        a, b = self.fleet.piece(drone, begin), self.fleet.piece(drone, end)
+        start, end = cell * dt, (cell + 1) * dt
+        a, b = self.pieces.piece(drone, start), self.pieces.piece(drone, end)
         jumps = self.jumps[:, b] - self.jumps[:, a]
         snap = self.snaps[b] - np.where(a > 0, self.snaps[a - 1], 0.0)  # the sum over all pieces of the cell
         acc_change = dt / 2 * (dt / 2 * snap + jumps[3]) + jumps[2]
         bound = dt**2 / 8 * acc_change + dt / 4 * jumps[1] + jumps[0]
-        times = ((begin, 0), (end, 0), (begin + dt / 2, 2), (begin + dt / 2, 3))
-        return *(self.fleet.at(drone, t, order)[..., :3] for t, order in times), bound
+        times = ((start, 0), (end, 0), (start + dt / 2, 2), (start + dt / 2, 3))
+        return *(self.pieces.at(drone, t, order)[..., :3] for t, order in times), bound
 
 
 def _lower_bounds(
-    fleet: Fleet,
+    pieces: PieceTable,
     one: tuple[Floats, ...],
     other: tuple[Floats, ...],
     drones: tuple[Ints, Ints],
@@ -120,17 +120,17 @@ def _lower_bounds(
     when: Floats,
 ) -> Floats:
     """Return a lower bound of the distance in each cell; update the smallest distance of each pair in place."""
-    begin, end, acc, jerk = (a - b for a, b in zip(one[:4], other[:4], strict=True))
+    start, end, acc, jerk = (a - b for a, b in zip(one[:4], other[:4], strict=True))
     deviation = dt**2 / 8 * (_norm(acc) + dt / 2 * _norm(jerk)) + one[4] + other[4]
-    step = end - begin
+    step = end - start
     square = _dot(step, step)
-    u = np.clip(-_dot(begin, step) / np.where(square > 0, square, 1.0), 0.0, 1.0)
-    to_chord = _norm(begin + u[:, None] * step)
+    u = np.clip(-_dot(start, step) / np.where(square > 0, square, 1.0), 0.0, 1.0)
+    to_chord = _norm(start + u[:, None] * step)
 
     order = np.lexsort((to_chord, pair))  # the cell in which each pair comes closest is evaluated exactly
     k = order[np.unique(pair[order], return_index=True)[1]]
     t = (cell[k] + u[k]) * dt
-    distance = _norm((fleet.at(drones[0][k], t) - fleet.at(drones[1][k], t))[:, :3])
+    distance = _norm((pieces.at(drones[0][k], t) - pieces.at(drones[1][k], t))[:, :3])
     closer = distance < best[pair[k]]
     best[pair[k[closer]]], when[pair[k[closer]]] = distance[closer], t[closer]
     return to_chord - deviation

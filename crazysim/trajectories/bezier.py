@@ -57,12 +57,12 @@ def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
     return _to_bernstein(raised) @ padded.T
 
 
-def restricted(coefficients: NDArray, begin: float, end: float) -> NDArray:
-    """Return polynomials of u in [0, 1] as polynomials on the part from ``begin`` to ``end``, scaled to [0, 1].
+def restricted(coefficients: NDArray, start: float, end: float) -> NDArray:
+    """Return polynomials of u in [0, 1] as polynomials on the part from ``start`` to ``end``, scaled to [0, 1].
 
     Args:
         coefficients: Constant term first. (k, n)
-        begin: Argument where the part begins.
+        start: Argument where the part starts.
         end: Argument where the part ends.
 
     Returns:
@@ -72,7 +72,7 @@ def restricted(coefficients: NDArray, begin: float, end: float) -> NDArray:
     matrix = np.zeros((n, n))
     for j in range(n):
         for i in range(j + 1):
-            matrix[j, i] = comb(j, i) * begin ** (j - i) * (end - begin) ** i
+            matrix[j, i] = comb(j, i) * start ** (j - i) * (end - start) ** i
     return coefficients @ matrix
 
 

@@ -56,25 +56,25 @@ def fill_in_corridors(nodes: Floats, durations: Floats, radii: Floats) -> Floats
     )
 
 
-def _deviation(paths: Floats, begin: Floats, end: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
+def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the vectors from line segments to curves, their feet on the segments, and their lengths.
 
     Args:
         paths: Coefficients. (n, 3, degree + 1)
-        begin: First points of the segments, m. (n, 3)
+        start: First points of the segments, m. (n, 3)
         end: Last points, m. (n, 3)
         u: Time within each piece over its length. (n,) or (n, n_times)
 
     Returns:
         (n, 3) or (n, n_times, 3), twice, and the same without the last axis.
     """
-    u, along = np.asarray(u), end - begin
+    u, along = np.asarray(u), end - start
     shape = (len(u), *[1] * (u.ndim - 1), 3)
-    begin, along = begin.reshape(shape), along.reshape(shape)
+    start, along = start.reshape(shape), along.reshape(shape)
     pos = np.einsum("n...k,nak->n...a", u[..., None] ** np.arange(paths.shape[-1]), paths)
     square = np.sum(along**2, axis=-1)
-    part = np.sum((pos - begin) * along, axis=-1) / np.where(square > 0, square, 1.0)
-    nearest = begin + np.clip(part, 0.0, 1.0)[..., None] * along
+    part = np.sum((pos - start) * along, axis=-1) / np.where(square > 0, square, 1.0)
+    nearest = start + np.clip(part, 0.0, 1.0)[..., None] * along
     return pos - nearest, nearest, np.linalg.norm(pos - nearest, axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""Limits of trajectories: what a drone and a fleet may do, and the check that they do."""
+"""Limits of trajectories: what a drone and a table may do, and the check that they do."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 from crazysim.drones import Airframe, load_airframe
 from crazysim.errors import ConfigError
 from crazysim.trajectories.approaches import Approach, closest_approaches
-from crazysim.trajectories.fleet import Fleet
 from crazysim.trajectories.peaks import GRAVITY, QUANTITIES, Peak, peaks
+from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.trajectory import Trajectory
 
 ROUNDING = 1e-4
@@ -24,7 +24,7 @@ ROUNDING = 1e-4
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a trajectory and of a fleet; None for no limit."""
+    """Limits of a trajectory and of a table; None for no limit."""
 
     speed: float | None = None
     """Largest speed, m/s."""
@@ -139,7 +139,7 @@ class Report:
         return not self.violations
 
     def __str__(self) -> str:
-        """Return the extremes of the fleet and every violation, a line each."""
+        """Return the extremes of the table and every violation, a line each."""
         lines = [f"{len(self.names)} drone{'s' * (len(self.names) > 1)}, {self.duration:.2f} s"]
         for name, peak in self.peaks.items():
             k = int(np.argmax(QUANTITIES[name].sign * peak.value))
@@ -182,14 +182,16 @@ def check(
             or the tolerance is not positive.
     """
     several = _unstacked(trajectories) if isinstance(trajectories, Trajectory) else list(trajectories)
-    fleet = Fleet.of(several, starts, duration)
+    table = PieceTable.of(several, starts, duration)
     labels = tuple(names) if names is not None else tuple(f"drone {k}" for k in range(len(several)))
     if len(labels) != len(several):
-        raise ConfigError(f"expected {len(several)} names, one for each drone, got {len(labels)}")
+        raise ConfigError(
+            f"expected {len(several)} names, one for each drone, got {len(labels)}. Pass one name per trajectory."
+        )
     if not 0 < tolerance < np.inf:
         raise ConfigError(f"expected a positive, finite tolerance, m, got {tolerance!r}. Use 1e-3.")
     allowed = (limits if airframe is None else limits.of_airframe(airframe)).given()
-    found, closest = peaks(fleet, tuple(QUANTITIES)), tuple(closest_approaches(fleet, tolerance))
+    found, closest = peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))
     violations = []
     for name, peak in found.items():
         if name not in allowed:
@@ -204,7 +206,7 @@ def check(
         if pair.distance < separation * (1 - ROUNDING):
             who = tuple(labels[k] for k in pair.drones)
             violations.append(Violation("separation", pair.drones, pair.time, pair.distance, separation, who))
-    return Report(tuple(violations), closest, found, labels, fleet.duration)
+    return Report(tuple(violations), closest, found, labels, table.duration)
 
 
 def _unstacked(trajectories: Trajectory) -> list[Trajectory]:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from crazysim.control.flatness import attitude_of_thrust
-from crazysim.trajectories.fleet import Fleet, Floats, Ints
+from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 
 GRAVITY = 9.81
 """Gravitational acceleration, m/s^2: that of the dynamics and controllers."""
@@ -90,7 +90,7 @@ class Peak:
     """Time at which it is reached, s. (n_drones,)"""
 
 
-def peaks(fleet: Fleet, names: Sequence[str]) -> dict[str, Peak]:
+def peaks(table: PieceTable, names: Sequence[str]) -> dict[str, Peak]:
     """Return the peaks of some quantities.
 
     Each piece is sampled at ``N_INTERVALS + 1`` times; every local maximum of the samples that lies at most ``NEAR`` of
@@ -100,35 +100,35 @@ def peaks(fleet: Fleet, names: Sequence[str]) -> dict[str, Peak]:
     narrower than an interval may be missed.
 
     Args:
-        fleet: Trajectories.
+        table: Trajectories.
         names: Names of quantities, keys of ``QUANTITIES``.
     """
-    return {name: _peak(fleet, QUANTITIES[name]) for name in names}
+    return {name: _peak(table, QUANTITIES[name]) for name in names}
 
 
-def _peak(fleet: Fleet, quantity: Quantity) -> Peak:
+def _peak(table: PieceTable, quantity: Quantity) -> Peak:
     u = np.linspace(0.0, 1.0, N_INTERVALS + 1)
-    powers = u ** np.arange(fleet.coefficients.shape[-1])[:, None]
+    powers = u ** np.arange(table.coefficients.shape[-1])[:, None]
 
     def sampled(part: slice) -> Floats:
-        derivatives = [fleet.coefficients_of(k)[part] for k in quantity.orders]
+        derivatives = [table.coefficients_of(k)[part] for k in quantity.orders]
         values = [np.swapaxes(c @ powers[: c.shape[-1]], 1, 2) for c in derivatives]
         return quantity.sign * quantity.compute(*values)
 
-    samples = np.concatenate([sampled(slice(k, k + PIECES)) for k in range(0, len(fleet.drone), PIECES)])
-    high = np.maximum.reduceat(samples.max(axis=1), fleet.first)
-    low = np.minimum.reduceat(samples.min(axis=1), fleet.first)
-    piece, at = _candidates(samples, (high - NEAR * (high - low))[fleet.drone])
+    samples = np.concatenate([sampled(slice(k, k + PIECES)) for k in range(0, len(table.drone), PIECES)])
+    high = np.maximum.reduceat(samples.max(axis=1), table.first)
+    low = np.minimum.reduceat(samples.min(axis=1), table.first)
+    piece, at = _candidates(samples, (high - NEAR * (high - low))[table.drone])
 
     def value(u: Floats) -> Floats:
-        return quantity.sign * quantity.compute(*(fleet.within(piece, u, k) for k in quantity.orders))
+        return quantity.sign * quantity.compute(*(table.within(piece, u, k) for k in quantity.orders))
 
     refined, where = _golden_sections(value, np.maximum(u[at] - u[1], 0.0), np.minimum(u[at] + u[1], 1.0))
     is_better = refined > samples[piece, at]
     best, where = np.where(is_better, refined, samples[piece, at]), np.where(is_better, where, u[at])
-    order = np.lexsort((-best, fleet.drone[piece]))
-    first = order[np.searchsorted(fleet.drone[piece][order], np.arange(fleet.n_drones))]
-    time = fleet.begin[piece] + where * fleet.length[piece]
+    order = np.lexsort((-best, table.drone[piece]))
+    first = order[np.searchsorted(table.drone[piece][order], np.arange(table.n_drones))]
+    time = table.start[piece] + where * table.length[piece]
     return Peak(quantity.sign * best[first], time[first])
 
 

@@ -36,13 +36,19 @@ def spline(times: Any, points: Any, degree: int = 5, yaw: Any = 0.0, at_rest: bo
             points.
     """
     if degree not in SPLINE_ORDERS:
-        raise ConfigError(f"expected a spline of degree 3, 5 or 7, got {degree!r}")
+        raise ConfigError(f"expected a spline of degree 3, 5 or 7, got {degree!r}. Use spline(times, points, 7).")
     at, x = np.asarray(times, float), np.asarray(points, float)
     if at.ndim != 1 or x.shape != (len(at), 3):
-        raise ConfigError(f"expected times (n_points,) and points (n_points, 3), got shapes {at.shape} and {x.shape}")
+        raise ConfigError(
+            f"expected times (n_points,) and points (n_points, 3), got shapes {at.shape} and {x.shape}. Pass one "
+            "time per point."
+        )
     least = 2 if at_rest else SPLINE_ORDERS[degree]
     if len(at) < least:
-        raise ConfigError(f"expected at least {least} points for a spline of degree {degree}, got {len(at)}")
+        raise ConfigError(
+            f"expected at least {least} points for a spline of degree {degree}, got {len(at)}. Add points, or lower "
+            "the degree."
+        )
     durations = np.diff(at)
     if not np.all(np.isfinite(at)) or not np.all(durations > 0):
         raise ConfigError(f"expected finite, ascending times, got {at.tolist()}. Remove points that share their time.")
@@ -72,11 +78,15 @@ def of_bezier(ends: Any, control_points: Sequence[Any], repeats: bool = False) -
     curves = [np.asarray(points, float) for points in control_points]
     shapes = [curve.shape for curve in curves]
     if at.shape != (len(curves),) or not curves:
-        raise ConfigError(f"expected ends (n_pieces,) for {len(curves)} curves, at least one, got shape {at.shape}")
+        raise ConfigError(
+            f"expected ends (n_pieces,) for {len(curves)} curves, at least one, got shape {at.shape}. Pass the time "
+            "at which each ends."
+        )
     is_curve = [len(shape) == 2 and shape[0] > 0 and shape[1] in (3, 4) for shape in shapes]
     if not all(is_curve) or len({shape[1] for shape in shapes}) != 1:
         raise ConfigError(
-            f"expected control points (degree + 1, 3) for all curves or (degree + 1, 4) for all, got {shapes}"
+            f"expected control points (degree + 1, 3) for all curves or (degree + 1, 4) for all, got {shapes}. Give "
+            "all curves a yaw, or none."
         )
     durations = np.diff(at, prepend=0.0)
     if not np.all(np.isfinite(at)) or not np.all(durations > 0):
@@ -112,7 +122,10 @@ def unwrapped(yaw: Any, n_points: int) -> NDArray[np.float64]:
     """
     angles = finite(np.asarray(yaw, float), "yaw")
     if angles.shape not in ((), (n_points,)):
-        raise ConfigError(f"expected one yaw, or one for each of {n_points} points, got shape {angles.shape}")
+        raise ConfigError(
+            f"expected one yaw, or one for each of {n_points} points, got shape {angles.shape}. Pass a number, or an "
+            "array of that length."
+        )
     return np.unwrap(np.broadcast_to(angles, (n_points,)))
 
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation
-from crazysim.trajectories.fleet import Fleet
 from crazysim.trajectories.interpolation import Floats
 from crazysim.trajectories.limits import Limits
 from crazysim.trajectories.peaks import QUANTITIES, peaks
+from crazysim.trajectories.piece_table import PieceTable
 
 MARGIN = 1e-4
 """Part of a limit that is left unused, for the rounding of trajectories in float32."""
@@ -72,12 +72,12 @@ def violated(durations: Floats, coefficients: Floats, limits: Limits) -> list[st
         durations: Length of each piece, s. (n_pieces,)
         coefficients: Coefficients of x, y, z and yaw, of a piece's time divided by its length.
             (n_pieces, 4, degree + 1)
-        limits: Limits; the separation is that of a fleet, and not checked.
+        limits: Limits; the separation is that of a table, and not checked.
     """
     given = {name: limit for name, limit in limits.given().items() if name in QUANTITIES}
     ends = np.cumsum(durations)
-    fleet = Fleet(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
-    found = peaks(fleet, tuple(given))
+    table = PieceTable(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
+    found = peaks(table, tuple(given))
     signs = {name: QUANTITIES[name].sign for name in given}
     return [
         name for name, limit in given.items() if signs[name] * (found[name].value[0] - limit) > -MARGIN * abs(limit)

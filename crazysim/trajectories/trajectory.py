@@ -53,10 +53,14 @@ class Trajectory(PyTree):
         if lengths.ndim != 1 or not lengths.size or c.ndim != 3 or c.shape[1] not in (3, 4) or len(c) != len(lengths):
             raise ConfigError(
                 f"expected durations (n_pieces,) and coefficients (n_pieces, 4, degree + 1), or (n_pieces, 3, "
-                f"degree + 1) without yaw, got shapes {lengths.shape} and {c.shape}"
+                f"degree + 1) without yaw, got shapes {lengths.shape} and {c.shape}. Pass one set of coefficients "
+                "per piece."
             )
         if not c.shape[2] or not np.all(np.isfinite(c)):
-            raise ConfigError(f"expected finite coefficients, at least one for each axis, got shape {c.shape}")
+            raise ConfigError(
+                f"expected finite coefficients, at least one for each axis, got shape {c.shape}. Check the input for "
+                "NaN."
+            )
         ends = np.cumsum(lengths).astype(floating())
         steps = np.diff(ends, prepend=0.0)
         if not np.all(np.isfinite(ends)) or not np.all(lengths > 0) or not np.all(steps > 0):
@@ -126,10 +130,10 @@ class Trajectory(PyTree):
         local = jnp.where(local > end, end, jnp.where(local < 0, 0.0, local))
         inside = (t >= 0) & (repeats | (t <= end))
         piece = _piece(ends, index, local)
-        begin = jnp.where(piece > 0, _at(ends, index, piece - 1), 0.0)
-        length = _at(ends, index, piece) - begin
+        start = jnp.where(piece > 0, _at(ends, index, piece - 1), 0.0)
+        length = _at(ends, index, piece) - start
         inverse = 1 / jnp.where(length > 0, length, 1.0)  # padding has no length
-        u, of_piece = (local - begin) * inverse, _at(coefficients, index, piece)
+        u, of_piece = (local - start) * inverse, _at(coefficients, index, piece)
         degrees = [self.degree] * 4 if degrees is None else degrees
         rows: dict[int, list[Array]] = {}
         for degree in sorted(set(degrees)):
@@ -168,7 +172,7 @@ class Trajectory(PyTree):
             ConfigError: If there is none.
         """
         if not trajectories:
-            raise ConfigError("expected at least one trajectory, got none")
+            raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
         n_pieces, degree = max(t.n_pieces for t in trajectories), max(t.degree for t in trajectories)
         padded = [t.padded(n_pieces, degree) for t in trajectories]
         xp = _module(padded)

@@ -140,7 +140,9 @@ def _nodes(waypoints: Any, fixed: tuple[Any, ...]) -> Floats:
     """Return the derivatives at each waypoint, NaN where free. (n, k, 3)"""
     at = np.asarray(waypoints, float)
     if at.ndim != 2 or at.shape[1] != 3 or len(at) < 2:
-        raise ConfigError(f"expected waypoints (n, 3), at least two, got shape {at.shape}")
+        raise ConfigError(
+            f"expected waypoints (n, 3), at least two, got shape {at.shape}. Pass an array with a row for each point."
+        )
     nodes = np.full((len(at), len(fixed) + 1, 3), np.nan)
     nodes[:, 0] = finite(at, "waypoints")
     for k, (name, values) in enumerate(zip(("velocities", "accelerations", "jerks"), fixed, strict=False), start=1):
@@ -149,7 +151,10 @@ def _nodes(waypoints: Any, fixed: tuple[Any, ...]) -> Floats:
             continue
         given = np.asarray(values, float)
         if given.shape != at.shape or np.any(np.isinf(given)):
-            raise ConfigError(f"expected finite {name} {at.shape}, NaN where free, got shape {given.shape}")
+            raise ConfigError(
+                f"expected finite {name} {at.shape}, NaN where free, got shape {given.shape}. Pass one row per "
+                "waypoint."
+            )
         nodes[:, k] = given
     return nodes
 
@@ -166,5 +171,8 @@ def _given(durations: Any, n_pieces: int) -> Floats:
     """Return the durations of the pieces, s. (n_pieces,)"""
     lengths = np.asarray(durations, float)
     if lengths.shape != (n_pieces,) or not np.all(np.isfinite(lengths)) or not np.all(lengths > 0):
-        raise ConfigError(f"expected {n_pieces} positive, finite durations, one less than waypoints, got {durations!r}")
+        raise ConfigError(
+            f"expected {n_pieces} positive, finite durations, one less than waypoints, got {durations!r}. Pass "
+            "limits= to have them chosen."
+        )
     return lengths

@@ -14,7 +14,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, floating, leaf
 from crazysim.rotation import safe_clip
 from crazysim.trajectories import interpolation
-from crazysim.trajectories.fleet import Fleet
+from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.splines import spline
 from crazysim.trajectories.trajectory import Trajectory
 
@@ -85,14 +85,14 @@ class Path(PyTree):
         Raises:
             ConfigError: If the path has no length, stops on its way, or repeats without ending at its start.
         """
-        fleet = Fleet.of([trajectory])
+        pieces = PieceTable.of([trajectory])
 
         def curve(t: Floats, order: int) -> Floats:
-            return fleet.at(np.zeros(len(t), int), t, order)[:, :2]
+            return pieces.at(np.zeros(len(t), int), t, order)[:, :2]
 
-        times = np.linspace(0.0, fleet.duration, SAMPLES)
+        times = np.linspace(0.0, pieces.duration, SAMPLES)
         speed = np.hypot(*curve(times, 1).T)
-        table = np.linspace(0.0, fleet.duration, N_TIMES)
+        table = np.linspace(0.0, pieces.duration, N_TIMES)
         arc = _arc_length(times, speed)
         progress = np.stack([np.interp(table, times, arc), np.hypot(*curve(table, 1).T)], axis=1)
         return _of_curve(curve, times, speed, progress, bool(np.asarray(trajectory.repeats)), backwards)
@@ -127,10 +127,10 @@ class Path(PyTree):
         knots = np.concatenate([[0.0], np.cumsum(chords)])
         trajectory = spline(knots, np.pad(xy, ((0, 0), (0, 1))), at_rest=False)
         begin, end = (knots[REPEATED], knots[-1 - REPEATED]) if closed else (0.0, knots[-1])
-        fleet = Fleet.of([trajectory])
+        pieces = PieceTable.of([trajectory])
 
         def curve(t: Floats, order: int) -> Floats:
-            return fleet.at(np.zeros(len(t), int), t, order)[:, :2]
+            return pieces.at(np.zeros(len(t), int), t, order)[:, :2]
 
         times = np.linspace(begin, end, SAMPLES)
         rate = np.hypot(*curve(times, 1).T)

@@ -1,5 +1,8 @@
 """The firmware's PID and Mellinger controllers, against a second implementation and against what they are for."""
 
+import dataclasses
+from pathlib import Path
+
 import firmware_flights as flown
 import jax
 import jax.numpy as jnp
@@ -50,6 +53,40 @@ def test_in_float64_they_agree_to_rounding(controller, mode, drone, make):
     states, commands = flown.flights(mode, 6, 200, seed=8)
     expected = flown.reference(make, mode, states, commands)
     np.testing.assert_allclose(flown.law(controller, mode, states, commands, drone), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("controller, mode, drone, make", CASES, ids=NAMES)
+def test_the_motors_are_those_of_the_firmware(controller, mode, drone, make, request):
+    """Those of the compiled C sources (docs/guides/controllers.md), whose integers differ by up to 5 PWM from reals.
+
+    Roll, pitch, yaw and motor lose less than one each. Where all motors are lowered by the excess of the highest, the
+    difference of two motors counts: twice two of the torques, and less than one.
+    """
+    states, commands = (x.astype(np.float32) for x in flown.flights(mode, 8, 240, seed=11))
+    with np.load(Path(__file__).with_name("firmware_motors.npz")) as file:
+        expected = file[request.node.callspec.id].astype(float)
+    assert 0.05 < np.mean(expected == 0) < 0.5
+    assert 0.05 < np.mean(expected == 65535) < 0.5
+    smooth = np.abs(flown.law(controller, mode, states, commands, drone) - expected)
+    assert smooth.max() < 5.0 + FLOAT32_PWM
+    assert np.mean(smooth < 4) > 0.998
+    whole = dataclasses.replace(controller, whole_numbers=True)
+    difference = np.abs(flown.law(whole, mode, states, commands, drone) - expected)
+    assert difference.max() < 4.0
+    assert np.mean(difference < 0.5) > 0.9  # equal; rounding of float32 moves a number across an integer
+
+
+@pytest.mark.usefixtures("x64")
+def test_whole_numbers_leave_the_gradient(motors):
+    def total(torque, whole):
+        return distribute(jnp.array([30000.3]), torque, params=motors, whole_numbers=whole) @ jnp.array([1.0, 2, 3, 5])
+
+    torque = jnp.array([1001.7, -500.2, 300.9])
+    smooth, whole = (jax.grad(total)(torque, flag) for flag in (False, True))
+    np.testing.assert_allclose(whole, smooth)
+    # 1001 / 2, 500 / 2 and 300, truncated, with the signs of each rotor.
+    pwm = distribute(jnp.array([30000.3]), torque, params=motors, whole_numbers=True)
+    np.testing.assert_allclose(sorted(np.asarray(pwm)), [29450, 29550, 29950, 31050], atol=1e-9)
 
 
 @pytest.fixture(scope="module")

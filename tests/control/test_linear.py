@@ -61,6 +61,29 @@ def test_drone_and_load_keep_energy_and_the_height_of_free_fall():
     assert np.abs(after[12:14] - x[12:14]).max() > 0.3
 
 
+def test_a_load_off_the_centre_keeps_energy_and_momentum():
+    """Without thrust and gravity: linear and angular momentum about the origin, and energy."""
+    attach, still = np.array([0.05, -0.03, 0.02]), np.zeros(3)
+    off = jax.jit(lambda x, u: load_derivative(x, u, MASS, J, still, LOAD, LENGTH, attach))
+    x = np.linspace(-0.4, 0.5, 16)
+    x[14:16] = [2.0, 3.0]
+
+    def kept(x):
+        turn = Rotation.from_euler("ZYX", x[8:5:-1])
+        q, q_rate = jax.jvp(rod_direction, (jnp.asarray(x[12:14]),), (jnp.asarray(x[14:16]),))
+        pos = x[:3] + turn.apply(attach) + LENGTH * np.asarray(q)
+        vel = x[3:6] + turn.apply(np.cross(x[9:12], attach)) + LENGTH * np.asarray(q_rate)
+        spin = turn.apply(J @ x[9:12])
+        angular = MASS * np.cross(x[:3], x[3:6]) + LOAD * np.cross(pos, vel) + spin
+        energy = 0.5 * (MASS * x[3:6] @ x[3:6] + LOAD * vel @ vel + x[9:12] @ J @ x[9:12])
+        return np.concatenate([MASS * x[3:6] + LOAD * vel, angular, [energy]])
+
+    after = advanced(off, x, np.zeros(4), 1e-3, 300)
+    np.testing.assert_allclose(kept(after), kept(x), rtol=1e-8, atol=1e-10)
+    centred = load_derivative(x, np.array([7.0, 0.01, -0.02, 0.003]), MASS, J, GRAVITY, LOAD, LENGTH, np.zeros(3))
+    np.testing.assert_allclose(centred, load(x, np.array([7.0, 0.01, -0.02, 0.003])), rtol=1e-10)
+
+
 def test_a_small_swing_has_the_period_of_a_pendulum_on_a_free_body():
     """Thrust equal to the weight: w^2 = (g / L)(m + m_L) / m, by hand from the linearised equations."""
     A, _ = linearize(load, np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0]))

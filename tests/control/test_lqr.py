@@ -108,6 +108,13 @@ def test_a_trajectory_has_one_leading_axis_and_a_time(shape, dt, got):
         TrackingLQR(setpoints=setpoints, dt=dt).params(load_airframe("bumblebee"))
 
 
+def test_setpoints_of_a_trajectory_are_finite():
+    setpoints = jax.tree.map(lambda x: np.zeros((4, *x.shape)), setpoint_of(figure_eight, 0.0))
+    setpoints = setpoints.replace(jerk=np.full((4, 3), np.nan), yaw=np.full((4, 1), np.inf))
+    with pytest.raises(ConfigError, match=r"expected finite setpoints, got NaN or infinity in jerk, yaw\. Evaluate"):
+        TrackingLQR(setpoints=setpoints, dt=0.1).params(load_airframe("bumblebee"))
+
+
 # Along a trajectory -------------------------------------------------------------------------------------------------
 
 

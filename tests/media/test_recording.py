@@ -5,6 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from crazysim import SlungLoad
 from crazysim.errors import ConfigError
 from crazysim.media import Flight, Recorder, View, flight_of
 from crazysim.media.recording import put
@@ -169,6 +170,34 @@ def test_objects_with_handles_are_recorded_and_put_back():
     np.testing.assert_allclose(pos, flight.at(0.5)["body_pos"], atol=1e-6)
     np.testing.assert_allclose(quat, flight.at(0.5)["body_quat"], atol=1e-6)
     np.testing.assert_allclose(pos[:, 0, 0], 0.5, atol=1e-6)
+
+
+@pytest.mark.parametrize("cable", [True, False], ids=["cable", "rod"])
+def test_loads_are_put_back_where_they_were(cable):
+    """Also after the load was dropped, from which its pose in the recording does not follow."""
+    sim = Sim(n_worlds=2, control="rotor_vel")
+    load = sim.add(SlungLoad(mass=0.1, length=0.5, cable=cable))
+    recorder = Recorder(sim)
+    pos = sim.data.states.pos
+    for k in range(2):
+        sim.data = sim.data.replace(
+            states=sim.data.states.replace(pos=pos + jnp.array([0.3 * k, 0, 2.0])),
+            core=sim.data.core.replace(steps=jnp.full_like(sim.data.core.steps, 500 * k)),
+        )
+        sim.data = load.hang(sim.data)
+        recorder.add()
+    flight = recorder.flight()
+    sim.data = load.release(sim.data)
+    sim.step(100)
+    now = sim.data
+    put(sim, flight, 1.0)
+    sim.sync(1)
+    np.testing.assert_allclose(sim.mj_data.body("load:0").xpos, [0.3, 0, 1.5], atol=1e-5)
+    ids = flight.body_ids
+    np.testing.assert_allclose(sim.mj_data.mocap_pos[ids], flight.body_pos[1, 1], atol=1e-6)
+    sim.data = now
+    sim.sync(1)
+    np.testing.assert_allclose(sim.mj_data.body("load:0").xpos, load.read(now).pos[1, 0], atol=1e-6)
 
 
 def test_a_reset_does_not_turn_the_recording_back(sim):

@@ -171,6 +171,72 @@ def test_a_load_hits_a_drone_head_on(x64):
     np.testing.assert_allclose(load.read(sim.data).vel[0, :, 2], drone - 1.0, rtol=1e-6)
 
 
+def test_two_loads_head_on(x64):
+    """Of different mass, loose, along the line between them: the speeds of two bodies with restitution, by hand."""
+    sim = weightless(flying(n_drones=2, engine="lanes"))
+    load = sim.add(SlungLoad(mass=[[0.1, 0.3]], size=RADIUS))
+    sim.add(ContactResponse(restitution=0.5, friction=0.0))
+    at = [[[0, 0, 1.0], [0.2, 0, 1.0]]]
+    sim.data = with_load(load, load.release(sim.data), pos=at, vel=[[[2.0, 0, 0], [0, 0, 0]]])
+    sim.step(150)
+    after = 2.0 * 0.1 * 1.5 / 0.4
+    np.testing.assert_allclose(load.read(sim.data).vel[0], [[after - 1.0, 0, 0], [after, 0, 0]], atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
+def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(size, x64, rng):
+    """Three loose loads and three empty hooks in a heap: of the contact stage alone; energy is not gained."""
+    sim = weightless(flying(n_drones=3, engine="plain"))
+    hook = sim.add(Hook(mass=[[0.1, 0.2, 0.3]], hook_mass=0.05, size=size, ring=0.1, load_at=[0, 0, 1.0]))
+    sim.add(ContactResponse(restitution=0.7, friction=0.5))
+    step = Step({"hit": sim.step_pipeline["contact_response_between_load"]}, "plain")
+    mass = np.array([0.1, 0.2, 0.3, 0.05, 0.05, 0.05])[:, None]
+    start, hits = sim.data, {"load": 0, "hook": 0}
+    heap = np.array([0, 0, 3.0])
+    for _ in range(60):
+        state = {name: rng.normal(size=(1, 3, 3)) for name in ("vel", "tip_vel")}
+        pos = heap + rng.uniform(-0.08, 0.08, (1, 3, 3))
+        tip = heap + rng.uniform(-0.08, 0.08, (1, 3, 3))
+        data = with_load(hook, start, pos=pos + [0, 0, 0.1], tip_pos=tip, **state)
+        before, after = (hook.read(x) for x in (data, step(data, jnp.int32(1))))
+        old, new = (np.concatenate([x.vel[0], x.tip_vel[0]]) for x in (before, after))
+        np.testing.assert_allclose((mass * new).sum(0), (mass * old).sum(0), atol=1e-12)
+        assert np.sum(mass * new**2) < np.sum(mass * old**2) + mass.sum() * 0.25**2
+        hits["load"] += bool(np.abs(new - old)[:3].max() > 1e-3)
+        hits["hook"] += bool(np.abs(new - old)[3:].max() > 1e-3)
+    assert min(hits.values()) > 20
+
+
+def test_an_empty_hook_stops_at_an_obstacle_and_pushes_a_load():
+    """It swings into a box 1 cm before it, and in the other world into a load of its own mass, both at its height."""
+    sim = weightless(flying(2, strict=True))
+    sim.data = sim.data.replace(params=sim.data.params.replace(mass=jnp.full(1, 1e9)))
+    hook = sim.add(Hook(mass=0.1, hook_mass=0.1, damping=0.0, size=RADIUS, ring=0.01, load_at=[0, 0, 1.0]))
+    box = sim.scene.add("box", pos=[5, 0, 0], size=(0.1, 1.0, 1.0))
+    sim.add(ContactResponse(restitution=0.5, friction=0.0))
+    tip = np.asarray(sim.data.states.pos) - [0, 0, 0.4]
+    sim.data = box.set_pose(sim.data, [[tip[0, 0] + [0.0245 + 0.05 + 0.01, 0, 0]], [[9, 9, 9]]])
+    sim.data = with_load(hook, sim.data, tip_pos=tip, tip_vel=[1.0, 0, 0], reach=0.001)
+    record = hook.read(sim.data)
+    pos = jnp.asarray(tip).at[0].set(5.0).at[1].add(jnp.array([0.0245 + RADIUS + 0.01, 0, 0.021 + 0.01]))
+    sim.data = hook.write(sim.data, record.replace(pos=pos.astype(record.pos.dtype)))
+    sim.step(10)
+    record = hook.read(sim.data)
+    np.testing.assert_allclose(record.tip_vel[:, 0, 0], [-0.5, 0.25], atol=0.01)
+    np.testing.assert_allclose(record.vel[:, 0, 0], [0.0, 0.75], atol=0.01)
+    assert "not fused" not in sim.explain()
+
+
+def test_a_report_has_empty_hooks():
+    sim = flying(n_drones=2)
+    hook = sim.add(Hook(mass=0.1, load_at=[0, 0, 1.0]))
+    tip = np.asarray(sim.data.states.pos)[:, ::-1]
+    sim.data = with_load(hook, sim.data, tip_pos=tip)
+    report = sim.contact_report(floor=False, drones=False)
+    assert report.object_names == ("load:0", "load:1", "load_hook:0", "load_hook:1")
+    np.testing.assert_array_equal(report.objects[0], [[False, False, False, True], [False, False, True, False]])
+
+
 def test_a_wall_that_stops_a_load_holds_back_the_drone(x64):
     """Through the taut rod, in the next step: the drone flies on towards the wall only until the load is there."""
     sim = weightless(flying(engine="lanes"))

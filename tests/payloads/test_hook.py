@@ -28,7 +28,7 @@ def test_picking_up_keeps_momentum(integrator, x64):
     sim.data = hook.write(
         sim.data, record.replace(vel=record.vel + u, tip_vel=record.tip_vel + np.array([0.1, 0.0, 0.0]))
     )
-    after = hook.grip(sim.data.replace(
+    after = hook.pick_up_and_release(sim.data.replace(
         states=type(sim.data.states)(**{k: v[0, 0] for k, v in vars(sim.data.states).items()}),
         plugins={"load": type(record)(**{
             k: v[0, 0] if v is not None and v.ndim > 1 else v for k, v in vars(hook.read(sim.data)).items()
@@ -117,7 +117,7 @@ def test_hook_and_load_are_drawn_where_they_meet(size):
         return {b for b in range(model.nbody) if model.body_rootid[b] == model.body(name).id}
 
     ring = np.array([0.0, 0.0, 2.0 - 0.4])
-    for body in ("load:0", "load_link:0"):
+    for body in ("load:0", "load_hook:0"):
         assert np.linalg.norm(ends(body) - ring, axis=-1).min() < 4e-3, body
     box = next(
         g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies_of("load:0") and model.geom_conaffinity[g]

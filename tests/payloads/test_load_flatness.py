@@ -7,7 +7,7 @@ import pytest
 
 from crazysim import Sim, rotation
 from crazysim.payloads import SlungLoad
-from crazysim.payloads.flatness import flat_states
+from crazysim.payloads.flatness import load_flat_state
 
 LENGTH, LOAD = 0.4, 0.2
 DT = 1e-5
@@ -38,7 +38,7 @@ def flat(sim):
     yaw[:-1] = np.stack([0.3 * np.sin(t), 0.3 * np.cos(t), -0.3 * np.sin(t)], axis=-1)
 
     def torque(paths):
-        states = flat_states(paths, yaw, p.mass[0], LOAD, LENGTH, p.J, p.gravity_vec)
+        states = load_flat_state(paths, yaw, p.mass[0], LOAD, LENGTH, p.J, p.gravity_vec)
         return jnp.sum(states.torque), states
 
     with jax.enable_x64(True):

@@ -70,6 +70,18 @@ def test_cables_go_slack_and_drones_let_go(x64):
     np.testing.assert_allclose(moved[2, :2], 0, atol=1e-12)
 
 
+def test_where_gravity_differs_the_load_falls_with_the_mean(x64):
+    """Whatever the order of the drones."""
+    sim, load = carrying(2, "symplectic_euler")
+    gravity = np.zeros((1, 2, 3))
+    gravity[0, :, 2] = [-8.0, -10.0]
+    sim.data = sim.data.replace(params=sim.data.params.replace(gravity_vec=jnp.asarray(gravity)))
+    sim.data = load.release(sim.data)
+    start = np.asarray(load.read(sim.data).vel)
+    sim.step(10)
+    np.testing.assert_allclose((load.read(sim.data).vel - start)[0, 0], [0, 0, -9.0 * 10 / 500], rtol=1e-9, atol=1e-12)
+
+
 def test_explicit_euler_is_refused():
     with pytest.raises(ConfigError, match="symplectic_euler"):
         carrying(2, "euler")

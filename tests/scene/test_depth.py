@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from cases import trees_equal
 
-from crazysim import ConfigError, RangeFinder, Sim
+from crazysim import ConfigError, RangeFinder, Sim, SlungLoad
 from crazysim.scene.depth import pixel_directions
 
 WIDTH, HEIGHT, FOVY = 24, 16, 70.0
@@ -163,6 +163,26 @@ def test_a_range_finder_measures_in_the_step(engine):
     assert found[0, 0, names.index("right")] < 1.0  # the other drone
     assert found[1, 0, names.index("right")] == 3.0
     assert "not fused" not in sim.explain()
+
+
+@pytest.mark.parametrize("engine", ["plain", "auto"])
+def test_rays_in_a_step_meet_loads_where_they_are_now(engine):
+    """No image was drawn since the load and its drone moved. The rod, which begins at the drone, is not measured."""
+    sim = Sim(n_worlds=2, control="rotor_vel", engine=engine)
+    load = sim.add(SlungLoad(mass=0.0, length=0.5, size=0.1))
+    sim.add(RangeFinder([[0, 0, -1], [1, 0, 0]], max_range=3.0))
+    sim.sync()
+    placed(sim, [[[0, 0, 2]], [[5, 5, 2]]])
+    sim.data = load.hang(sim.data)
+    sim.step()
+    found = np.asarray(sim.data.plugins["range_finder"].distance)
+    np.testing.assert_allclose(found, [[[0.4, 3.0]]] * 2, atol=1e-3)
+    assert "not fused" not in sim.explain()
+    look = sim.scene.depth_fn(sim.mj_model.cam("fpv_cam:0").id, 3, 3, hide_own=False)
+    aside = load.write(sim.data, load.read(sim.data).replace(pos=sim.data.states.pos + jnp.array([1.1, 0, 0])))
+    seen = look(aside).distance[:, 0, 1, 1]
+    np.testing.assert_allclose(seen, look(sim.plugins.placed(aside)).distance[:, 0, 1, 1])
+    assert np.all(seen < 1.1)
 
 
 def test_a_range_finder_measures_at_its_rate():

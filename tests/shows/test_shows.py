@@ -1,24 +1,29 @@
 """Flying shows: closest approaches, collisions and tracking errors by hand, films, pages, the command."""
 
 import json
+import os
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from screens import screen_pixels, virtual_screen
 
 from crazysim.__main__ import main
 from crazysim.errors import ConfigError
-from crazysim.shows import closest_approaches, collisions, film, fly, page, report, summary, tracking_rms
+from crazysim.shows import collisions, film, fly, page, report, sampled_approaches, summary, tracking_rms
 from crazysim.trajectories import Trajectory
 from crazysim.trajectories.files import Lights, Show, save_show
 
 
-def line(begin, end, seconds=2.0):
+def line(start, end, seconds=2.0):
     """A straight move at rest at both ends."""
     c = np.zeros((1, 4, 8))
-    c[0, :3, 0] = begin
-    c[0, :3, 4:] = np.subtract(end, begin)[:, None] * np.array([35.0, -84.0, 70.0, -20.0])
+    c[0, :3, 0] = start
+    c[0, :3, 4:] = np.subtract(end, start)[:, None] * np.array([35.0, -84.0, 70.0, -20.0])
     return Trajectory.of_pieces([seconds], c / seconds ** np.arange(8))
 
 
@@ -48,7 +53,7 @@ def test_closest_approach_of_straight_lines():
     t = np.arange(0.0, 3.0, 0.1)
     x = t - 1.234
     pos = np.stack([np.stack([x, 0 * x, 0 * x], -1), np.stack([-x, 0 * x + 0.3, 0 * x], -1)], axis=1)
-    distance, when = closest_approaches(t, pos)
+    distance, when = sampled_approaches(t, pos)
     assert distance[0, 1] == distance[1, 0] == pytest.approx(0.3, abs=1e-6)
     assert when[0, 1] == pytest.approx(1.234, abs=1e-6)
     assert np.all(np.isinf(np.diag(distance)))
@@ -57,11 +62,66 @@ def test_closest_approach_of_straight_lines():
 @given(st.integers(0, 10**6), st.integers(1, 12), st.integers(2, 5))
 def test_closest_approach_is_at_most_the_closest_sample(seed, n, n_drones):
     pos = np.random.default_rng(seed).normal(size=(n, n_drones, 3)).cumsum(axis=0)
-    distance, when = closest_approaches(0.5 * np.arange(n), pos)
+    distance, when = sampled_approaches(0.5 * np.arange(n), pos)
     between = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1).min(0)
     off = ~np.eye(n_drones, dtype=bool)
     assert np.all(distance[off] <= between[off] + 1e-12)
     assert np.all((when >= 0) & (when <= 0.5 * (n - 1)))
+
+
+@pytest.fixture(scope="module")
+def screen(tmp_path_factory):
+    yield from virtual_screen(tmp_path_factory.mktemp("screen"))
+
+
+def in_window(screen, *arguments):
+    """Start Python in a process whose windows open on the screen."""
+    environment = os.environ | {"DISPLAY": screen[0], "MUJOCO_GL": "glfw"}
+    return subprocess.Popen([sys.executable, *arguments], stdout=subprocess.PIPE, env=environment, text=True)
+
+
+def test_the_window_plays_the_show_from_its_start(screen, tmp_path, opengl):
+    """A drone is lit red, then blue: both are seen, although opening the window takes as long as the show."""
+    slow = Trajectory.stack([line((0, 0, 1), (1, 0, 1), 4.0)])
+    lights = Lights.stack([Lights.of_pieces([0.0, 1.5], [(1, 0, 0), (0, 0, 1)])])
+    save_show(Show(names=("a",), trajectories=slow, lights=lights), tmp_path / "show.skyc")
+    program, seen = in_window(screen, "-m", "crazysim", "show", str(tmp_path / "show.skyc"), "--window"), []
+    deadline = time.monotonic() + 120
+    while program.poll() is None and time.monotonic() < deadline:
+        picture = screen_pixels(screen[1], wait=False).astype(int)
+        red = np.all(picture[..., :1] > picture[..., 1:] + 180, axis=-1).sum()
+        blue = np.all(picture[..., 2:] > picture[..., :2] + 180, axis=-1).sum()
+        seen += [name for name, n in (("red", red), ("blue", blue)) if n > 50 and name not in seen]
+        time.sleep(0.05)
+    assert " 4.0 s, computed in" in program.communicate(timeout=10)[0]
+    assert program.returncode == 0
+    assert seen == ["red", "blue"]
+
+
+CLOSED = """
+import sys
+from crazysim.shows import fly
+from crazysim.shows.view import play
+from crazysim.trajectories.files import load_show
+
+frames = []
+
+def close(sim, world):
+    frames.append(sim.time)
+    if len(frames) == 3:
+        window = sim.viewer._windows[0]
+        window._glfw.set_window_should_close(window._window, True)
+
+play(fly(load_show(sys.argv[1])), speed=0.001, draw=close, width=64, height=48)
+print(len(frames))
+"""
+
+
+def test_closing_the_window_ends_the_play(screen, tmp_path, opengl):
+    """It would take 2,000 s."""
+    save_show(SHOW, tmp_path / "show.skyc")
+    program = in_window(screen, "-c", CLOSED, str(tmp_path / "show.skyc"))
+    assert program.communicate(timeout=120)[0] == "3\n"
 
 
 def test_planned_is_the_show(flight):

@@ -79,9 +79,9 @@ def _of_samples(rows: NDArray, place: str) -> Trajectory:
     rates = np.zeros_like(values)
     rates[1:-1] = (values[2:] - values[:-2]) / (times[2:] - times[:-2])[:, None]
     lengths = np.diff(times)[:, None]
-    begin, end, first, last = values[:-1], values[1:], rates[:-1] * lengths, rates[1:] * lengths
+    start, end, first, last = values[:-1], values[1:], rates[:-1] * lengths, rates[1:] * lengths
     # Cubic Hermite polynomial of u in [0, 1].
-    c = [begin, first, 3 * (end - begin) - 2 * first - last, 2 * (begin - end) + first + last]
+    c = [start, first, 3 * (end - start) - 2 * first - last, 2 * (start - end) + first + last]
     return trajectory_of(times[1:], np.stack(c, axis=-1))
 
 
@@ -118,7 +118,8 @@ def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayL
         header += ",yaw"
     if len({len(column) for column in columns}) != 1 or columns[1].shape[1:] != (3,):
         raise ConfigError(
-            f"expected times (n,), positions (n, 3) and yaw (n,), got shapes {[column.shape for column in columns]}"
+            f"expected times (n,), positions (n, 3) and yaw (n,), got shapes {[column.shape for column in columns]}. "
+            "Pass one row per time."
         )
     lines = [header, *(",".join(f"{x:.9g}" for x in row) for row in np.concatenate(columns, axis=1))]
     checks.write_bytes(path, "".join(f"{line}\n" for line in lines).encode())

@@ -158,11 +158,11 @@ class _Machine:
 
     def end_loop(self) -> None:
         if not self.loops:
-            self.refuse("the begin of a loop in front of its end", "none")
-        begin, left = self.loops.pop()
+            self.refuse("the start of a loop in front of its end", "none")
+        start, left = self.loops.pop()
         if left != 1:
-            self.loops.append((begin, max(left - 1, 0)))
-            self.at = begin
+            self.loops.append((start, max(left - 1, 0)))
+            self.at = start
 
     def jump(self, address: int) -> None:
         if address >= len(self.code):
@@ -172,9 +172,9 @@ class _Machine:
 
     def lights(self) -> Lights:
         """Return the colours so far: of pieces that begin at one time, the last."""
-        last = {begin: (a, b) for begin, a, b in self.pieces}
-        begins, colors = list(last), np.array(list(last.values()), float) / 255
-        return Lights.of_pieces(TICK * np.array(begins), colors[:, 0], colors[:, 1])
+        last = {start: (a, b) for start, a, b in self.pieces}
+        starts, colors = list(last), np.array(list(last.values()), float) / 255
+        return Lights.of_pieces(TICK * np.array(starts), colors[:, 0], colors[:, 1])
 
 
 def encode_lights(lights: Lights) -> bytes:
@@ -186,17 +186,17 @@ def encode_lights(lights: Lights) -> bytes:
     Raises:
         ConfigError: If they are those of several drones.
     """
-    times, begins, ends = (np.asarray(x, float) for x in (lights.times, lights.begins, lights.ends))
+    times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
     if times.ndim != 1:
         raise ConfigError(f"expected the lights of one drone, got shape {times.shape}. Encode one drone at a time.")
     ticks = np.maximum(np.round((times - min(times[0], 0.0)) / TICK), 0).astype(int)
-    first, last = np.round(255 * begins).astype(int), np.round(255 * ends).astype(int)
+    first, last = np.round(255 * starts).astype(int), np.round(255 * ends).astype(int)
     code = bytearray()
     color = None
     if ticks[0] > 0:
         code += _colored(SET_COLOR, first[0], ticks[0])
-    for k, begin in enumerate(ticks):
-        duration = ticks[k + 1] - begin if k + 1 < len(ticks) else 0
+    for k, start in enumerate(ticks):
+        duration = ticks[k + 1] - start if k + 1 < len(ticks) else 0
         if k + 1 < len(ticks) and not duration:
             continue  # padding, or a piece shorter than a tick
         fades = duration and not np.array_equal(first[k], last[k])
@@ -228,7 +228,9 @@ def _colored(code: int, color: np.ndarray, duration: int) -> bytes:
 
 def _varint(value: int) -> bytes:
     if value > MAX_VARINT:
-        raise ConfigError(f"expected durations of at most {MAX_VARINT * TICK:g} s, got {value * TICK:g} s")
+        raise ConfigError(
+            f"expected durations of at most {MAX_VARINT * TICK:g} s, got {value * TICK:g} s. Split longer pieces."
+        )
     code = bytearray()
     while value >= 0x80:
         code.append(value & 0x7F | 0x80)

@@ -21,30 +21,31 @@ class Lights(PyTree):
     """
 
     times: Array = leaf("shared", 1)
-    """Begin of each piece, s, ascending. Padding repeats the last one. (n_pieces,)"""
-    begins: Array = leaf("shared", 2)
+    """Start of each piece, s, ascending. Padding repeats the last one. (n_pieces,)"""
+    starts: Array = leaf("shared", 2)
     """Colour where each piece begins, red, green and blue, 0 to 1. (n_pieces, 3)"""
     ends: Array = leaf("shared", 2)
-    """Colour that each piece approaches at the begin of the next; ``begins`` where it is constant. (n_pieces, 3)"""
+    """Colour that each piece approaches at the start of the next; ``starts`` where it is constant. (n_pieces, 3)"""
 
     @staticmethod
-    def of_pieces(times: Any, begins: Any, ends: Any = None) -> Lights:
+    def of_pieces(times: Any, starts: Any, ends: Any = None) -> Lights:
         """Return the lights of one drone.
 
         Args:
-            times: Begin of each piece, s, ascending. (n_pieces,)
-            begins: Colour where each piece begins, 0 to 1. (n_pieces, 3)
+            times: Start of each piece, s, ascending. (n_pieces,)
+            starts: Colour where each piece begins, 0 to 1. (n_pieces, 3)
             ends: Colour that each piece fades to until the next begins; None for constant colours. The last piece is
                 constant in any case. (n_pieces, 3)
 
         Raises:
             ConfigError: If the shapes do not fit, a number is out of range, or the times do not ascend.
         """
-        t, a = np.asarray(times, float), np.asarray(begins, float)
+        t, a = np.asarray(times, float), np.asarray(starts, float)
         b = a.copy() if ends is None else np.array(ends, float)
         if t.ndim != 1 or not t.size or a.shape != (len(t), 3) or b.shape != a.shape:
             raise ConfigError(
-                f"expected times (n_pieces,) and colours (n_pieces, 3), got shapes {t.shape}, {a.shape} and {b.shape}"
+                f"expected times (n_pieces,) and colours (n_pieces, 3), got shapes {t.shape}, {a.shape} and "
+                f"{b.shape}. Pass one colour per time."
             )
         if not np.all(np.isfinite(t)) or not np.all(np.diff(t) >= 0):
             raise ConfigError("expected ascending, finite times of lights; sort the pieces by time")
@@ -70,7 +71,7 @@ class Lights(PyTree):
             ConfigError: If there are none.
         """
         if not lights:
-            raise ConfigError("expected the lights of at least one drone, got none")
+            raise ConfigError("expected the lights of at least one drone, got none. Pass a list with one per drone.")
         n = max(x.times.shape[-1] for x in lights)
 
         def padded(x: Any) -> Any:
@@ -91,10 +92,10 @@ class Lights(PyTree):
         times = jnp.asarray(self.times)
         n, t = times.shape[0], jnp.asarray(t, times.dtype)
         i = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, n - 1)
-        begin, end = times[i], times[jnp.minimum(i + 1, n - 1)]
-        length = end - begin
-        weight = jnp.where(length > 0, jnp.clip((t - begin) / jnp.where(length > 0, length, 1.0), 0.0, 1.0), 0.0)
-        a, b = jnp.asarray(self.begins)[i], jnp.asarray(self.ends)[i]
+        start, end = times[i], times[jnp.minimum(i + 1, n - 1)]
+        length = end - start
+        weight = jnp.where(length > 0, jnp.clip((t - start) / jnp.where(length > 0, length, 1.0), 0.0, 1.0), 0.0)
+        a, b = jnp.asarray(self.starts)[i], jnp.asarray(self.ends)[i]
         return a + weight * (b - a)
 
     def colors(self, times: Any) -> np.ndarray:

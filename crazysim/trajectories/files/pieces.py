@@ -48,12 +48,12 @@ def split(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[NDArray
     cuts = np.union1d(ends, inside)
     cuts = cuts[np.diff(cuts, append=np.inf) > 1e-6]  # a cut beside an end is that end
     cuts[-1] = ends[-1]
-    begins = np.concatenate([[0.0], cuts[:-1]])
+    from_cuts = np.concatenate([[0.0], cuts[:-1]])
     starts, lengths = np.concatenate([[0.0], ends[:-1]]), np.diff(ends, prepend=0.0)
-    piece = np.minimum(np.searchsorted(ends, 0.5 * (begins + cuts)), len(ends) - 1)
+    piece = np.minimum(np.searchsorted(ends, 0.5 * (from_cuts + cuts)), len(ends) - 1)
     parts = [
-        restricted(coefficients[k], (begin - starts[k]) / lengths[k], (end - starts[k]) / lengths[k])
-        for k, begin, end in zip(piece, begins, cuts, strict=True)
+        restricted(coefficients[k], (start - starts[k]) / lengths[k], (end - starts[k]) / lengths[k])
+        for k, start, end in zip(piece, from_cuts, cuts, strict=True)
     ]
     return cuts, np.stack(parts)
 

@@ -54,7 +54,7 @@ class Show:
     """Settings of the show but its cues, as in ``show.json``; ``validation`` has maxAltitude, m, maxVelocityXY and
     maxVelocityZ, m/s, and minDistance, m."""
     homes: NDArray = None  # type: ignore[assignment]  # replaced at construction
-    """Home of each drone, m; None for the begins of the trajectories. (n_drones, 3)"""
+    """Home of each drone, m; None for where the trajectories start. (n_drones, 3)"""
     landings: NDArray = None  # type: ignore[assignment]  # replaced at construction
     """Landing place of each drone, m; None for the ends of the trajectories. (n_drones, 3)"""
     parameters: tuple[tuple[ParameterChange, ...], ...] = ()
@@ -74,7 +74,10 @@ class Show:
         """
         n = len(self.names)
         if not n or len(set(self.names)) != n:
-            raise ConfigError(f"expected one or more drones with different names, got {list(self.names)[:10]}")
+            raise ConfigError(
+                f"expected one or more drones with different names, got {list(self.names)[:10]}. Rename those that "
+                "repeat."
+            )
         start, end = self._points(0.0), self._points(self.duration)
         defaults = {
             "homes": start[:, :3],
@@ -90,7 +93,9 @@ class Show:
         sizes |= {"trajectories": len(self.trajectories.ends), "lights": len(self.lights.times)}
         wrong = {name: size for name, size in sizes.items() if size != n}
         if wrong:
-            raise ConfigError(f"expected one entry for each of {n} drones, got {wrong}")
+            raise ConfigError(
+                f"expected one entry for each of {n} drones, got {wrong}. Pass as many as there are names."
+            )
 
     @property
     def n_drones(self) -> int:

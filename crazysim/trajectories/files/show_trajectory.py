@@ -63,13 +63,13 @@ def parse_trajectory(value: Any, place: str, yaw_control: Any = None) -> tuple[T
             curves.append(np.stack([last, *via, end]))
         last = end
     checks.ascending(np.array(times), checks.MIN_LENGTH, place)
-    begin = takeoff + times[0]
+    start = takeoff + times[0]
     if times[-1] + takeoff > checks.MAX_TIME:
         checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1] + takeoff:g} s", place)
     first = curves[0][:1] if curves else np.asarray(last)[None]
     ends = [takeoff + t for t in times[1:]]
-    if begin >= checks.MIN_LENGTH or not curves:  # a shorter rest belongs to the first curve
-        ends, curves = [max(begin, checks.MIN_LENGTH), *ends], [first, *curves]
+    if start >= checks.MIN_LENGTH or not curves:  # a shorter rest belongs to the first curve
+        ends, curves = [max(start, checks.MIN_LENGTH), *ends], [first, *curves]
     return _of_curves(np.array(ends), curves, yaw_control, place), encoding
 
 
@@ -102,9 +102,9 @@ def _with_yaw(ends: Any, c: Any, yaw_control: Any, place: str) -> tuple[Any, Any
     times, yaw = pairs[:, 0], np.deg2rad(pairs[:, 1])
     checks.ascending(times, checks.MIN_LENGTH, place)
     ends, c = split(ends, c, times)
-    begins = np.concatenate([[0.0], ends[:-1]])
+    starts = np.concatenate([[0.0], ends[:-1]])
     c[:, 3] = 0.0
-    c[:, 3, 0] = np.interp(begins, times, yaw)
+    c[:, 3, 0] = np.interp(starts, times, yaw)
     c[:, 3, 1] = np.interp(ends, times, yaw) - c[:, 3, 0]
     return ends, c
 
@@ -123,7 +123,7 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw:
         ConfigError: If the encoding does not exist, or the degree is higher than 7.
     """
     if encoding not in ENCODINGS:
-        raise ConfigError(f"expected type {' or '.join(ENCODINGS)}, got {encoding!r}")
+        raise ConfigError(f"expected type {' or '.join(ENCODINGS)}, got {encoding!r}. Use one of these.")
     ends, c = pieces_of(trajectory)
     degrees = (1, 3, 7) if encoding == "COMPRESSED" else range(1, MAX_DEGREE + 1)
     c = c if yaw else c[:, :3]

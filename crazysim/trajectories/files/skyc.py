@@ -238,7 +238,7 @@ def save_show(show: Show, path: str | Path) -> None:
     """
     path = Path(path)
     if path.suffix != ".skyc":
-        raise ConfigError(f"expected the name of a show to end with .skyc, got {str(path)!r}")
+        raise ConfigError(f"expected the name of a show to end with .skyc, got {str(path)!r}. Rename the file.")
     files: dict[str, Any] = {}
     drones = []
     for i, name in enumerate(show.names):
@@ -275,10 +275,10 @@ def save_show(show: Show, path: str | Path) -> None:
 def _format_lights(lights: Lights) -> dict[str, Any]:
     """Return the contents of a ``lights.json``."""
     value: dict[str, Any] = {"version": 1, "data": base64.b64encode(encode_lights(lights)).decode()}
-    times, begins, ends = (np.asarray(x, float) for x in (lights.times, lights.begins, lights.ends))
-    if np.array_equal(begins, ends):
+    times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
+    if np.array_equal(starts, ends):
         kept = np.diff(times, append=np.inf) > 0
-        colors = np.round(255 * begins[kept]).astype(int).tolist()
+        colors = np.round(255 * starts[kept]).astype(int).tolist()
         value["colors"] = [
             [float(str(t)), color] for t, color in zip(np.asarray(lights.times)[kept], colors, strict=True)
         ]

@@ -76,7 +76,7 @@ WRONG = {
     "missing argument": ([4, 1, 2], "argument"),
     "endless number": ([2, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x00], "at most 268435455"),
     "large number": ([2, 0xFF, 0xFF, 0xFF, 0xFF, 0x0F], "at most 268435455"),
-    "end of no loop": ([13], "begin of a loop"),
+    "end of no loop": ([13], "start of a loop"),
     "deep loops": ([12, 2] * 5, "at most 4 deep"),
     "endless loop in no time": ([12, 0, 13], "at most"),
     "jump in no time": ([18, 0], "at most"),
@@ -96,7 +96,7 @@ def test_not_base64_and_too_long():
         decode_lights("?")
     with pytest.raises(ConfigError, match="at most 1048576 bytes"):
         decode_lights(bytes(2**20 + 1))
-    assert np.array_equal(decode_lights(base64.b64encode(bytes([7, 0])).decode()).begins[-1], WHITE)
+    assert np.array_equal(decode_lights(base64.b64encode(bytes([7, 0])).decode()).starts[-1], WHITE)
 
 
 @given(st.binary(max_size=60))
@@ -106,7 +106,7 @@ def test_any_program_is_decoded_or_refused(program):
     except ConfigError:
         return
     assert np.all(np.diff(lights.times) >= 0)
-    assert np.all((lights.begins >= 0) & (lights.ends <= 1))
+    assert np.all((lights.starts >= 0) & (lights.ends <= 1))
 
 
 pieces = st.lists(

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from crazysim import ConfigError
 from crazysim.trajectories import Trajectory, spline
-from crazysim.trajectories.fleet import Fleet
+from crazysim.trajectories.piece_table import PieceTable
 
 RNG = np.random.default_rng(2)
 TRAJECTORIES = [
@@ -17,7 +17,7 @@ TRAJECTORIES = [
 ]
 TRAJECTORIES[1] = TRAJECTORIES[1].replace(repeats=np.bool_(True))
 STARTS = np.array([0.5, 0.0, 2.0])
-FLEET = Fleet.of(TRAJECTORIES, STARTS, duration=12.0)
+TABLE = PieceTable.of(TRAJECTORIES, STARTS, duration=12.0)
 STACK = Trajectory.stack(TRAJECTORIES)
 evaluate = jax.jit(lambda k, t: STACK.evaluate_one(k, t))
 
@@ -25,28 +25,28 @@ evaluate = jax.jit(lambda k, t: STACK.evaluate_one(k, t))
 @given(drone=st.integers(0, 2), t=st.floats(0.01, 11.99))
 def test_it_evaluates_as_the_record_does(drone, t):
     setpoint = evaluate(drone, t - STARTS[drone])
-    np.testing.assert_allclose(FLEET.at(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
+    np.testing.assert_allclose(TABLE.at(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
     end = STARTS[drone] + float(TRAJECTORIES[drone].duration)
     if abs(t - end) > 1e-3 and abs(t - STARTS[drone]) > 1e-3:  # there the derivatives jump
         for order, expected in enumerate((setpoint.vel, setpoint.acc, setpoint.jerk), start=1):
-            np.testing.assert_allclose(FLEET.at(drone, t, order)[:3], expected, atol=5e-3, rtol=1e-3)
+            np.testing.assert_allclose(TABLE.at(drone, t, order)[:3], expected, atol=5e-3, rtol=1e-3)
 
 
 def test_many_at_once_are_those_one_by_one():
     drones, times = np.repeat([0, 1, 2], 7), np.tile(np.linspace(0, 12, 7), 3)
-    together = FLEET.at(drones, times, 1)
-    alone = [FLEET.at(int(d), float(t), 1) for d, t in zip(drones, times, strict=True)]
+    together = TABLE.at(drones, times, 1)
+    alone = [TABLE.at(int(d), float(t), 1) for d, t in zip(drones, times, strict=True)]
     np.testing.assert_array_equal(together, alone)
 
 
 def test_padding_has_no_pieces():
     padded = TRAJECTORIES[0].padded(9, 7)
-    assert len(Fleet.of([padded]).begin) == 3
+    assert len(PieceTable.of([padded]).start) == 3
 
 
 def test_the_default_duration_ends_with_the_last_drone():
     ends = [float(t.duration) + s for t, s in zip(TRAJECTORIES, STARTS, strict=True)]
-    assert Fleet.of(TRAJECTORIES, STARTS).duration == max(ends)
+    assert PieceTable.of(TRAJECTORIES, STARTS).duration == max(ends)
 
 
 @pytest.mark.parametrize(
@@ -60,4 +60,4 @@ def test_the_default_duration_ends_with_the_last_drone():
 )
 def test_law_09_bad_fleets_are_errors(arguments, message):
     with pytest.raises(ConfigError, match=message):
-        Fleet.of(*arguments)
+        PieceTable.of(*arguments)

@@ -19,14 +19,14 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Fleet:
+class PieceTable:
     """Pieces of several trajectories on one clock, sorted by drone and time."""
 
     duration: float
     """Duration, s."""
     drone: Ints
     """Drone of each piece. (n_pieces,)"""
-    begin: Floats
+    start: Floats
     """Start of each piece, s. (n_pieces,)"""
     length: Floats
     """Duration of each piece, s. (n_pieces,)"""
@@ -34,7 +34,7 @@ class Fleet:
     """Coefficients of x, y, z, m, and yaw, rad, of a piece's time divided by its length. (n_pieces, 4, degree + 1)"""
 
     @staticmethod
-    def of(trajectories: Sequence[Trajectory], starts: Any = 0.0, duration: float | None = None) -> Fleet:
+    def of(trajectories: Sequence[Trajectory], starts: Any = 0.0, duration: float | None = None) -> PieceTable:
         """Return the pieces of trajectories, with those at rest before the start and after the end.
 
         Args:
@@ -47,21 +47,21 @@ class Fleet:
             ConfigError: If there is no trajectory, a start is negative or the duration is not positive.
         """
         if not trajectories:
-            raise ConfigError("expected at least one trajectory, got none")
-        begins = np.asarray(starts, float)
+            raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
+        given = np.asarray(starts, float)
         n_drones = len(trajectories)
-        if begins.shape not in ((), (n_drones,)) or not np.all(begins >= 0) or not np.all(np.isfinite(begins)):
+        if given.shape not in ((), (n_drones,)) or not np.all(given >= 0) or not np.all(np.isfinite(given)):
             raise ConfigError(f"expected one start, or one for each of {n_drones} drones, at least 0 s, got {starts!r}")
-        begins = np.broadcast_to(begins, (n_drones,))
+        starts = np.broadcast_to(given, (n_drones,))
         host = [jax.tree.map(np.asarray, trajectory) for trajectory in trajectories]
-        ends = [begin + float(t.ends[-1]) for begin, t in zip(begins, host, strict=True)]
+        ends = [start + float(t.ends[-1]) for start, t in zip(starts, host, strict=True)]
         end = max(ends) if duration is None else float(duration)
         if not 0 < end < np.inf:
             raise ConfigError(f"expected a positive, finite duration, s, got {duration!r}")
         size = max(t.coefficients.shape[-1] for t in host)
-        parts = [_pieces(t, begin, end, size) for t, begin in zip(host, begins, strict=True)]
+        parts = [_pieces(t, start, end, size) for t, start in zip(host, starts, strict=True)]
         drone = np.repeat(np.arange(n_drones), [len(part[0]) for part in parts])
-        return Fleet(end, drone, *(np.concatenate(x) for x in zip(*parts, strict=True)))
+        return PieceTable(end, drone, *(np.concatenate(x) for x in zip(*parts, strict=True)))
 
     @property
     def n_drones(self) -> int:
@@ -75,8 +75,8 @@ class Fleet:
 
     @functools.cached_property
     def _keys(self) -> Floats:
-        """Begins on a common axis, on which one search finds the pieces of all drones. (n_pieces,)"""
-        return self.drone * (self.duration + 1) + self.begin
+        """Starts on a common axis, on which one search finds the pieces of all drones. (n_pieces,)"""
+        return self.drone * (self.duration + 1) + self.start
 
     @functools.cached_property
     def _derivatives(self) -> list[Floats]:
@@ -118,31 +118,31 @@ class Fleet:
     def at(self, drone: Any, t: Any, order: int = 0) -> Floats:
         """Return a derivative of x, y, z and yaw of drones at times. (...) -> (..., 4)"""
         piece = self.piece(drone, t)
-        return self.within(piece, (t - self.begin[piece]) / self.length[piece], order)
+        return self.within(piece, (t - self.start[piece]) / self.length[piece], order)
 
 
 def _pieces(t: Any, start: float, duration: float, size: int) -> tuple[Floats, Floats, Floats]:
-    """Return begins, lengths and coefficients of the pieces of one trajectory up to a duration."""
+    """Return starts, lengths and coefficients of the pieces of one trajectory up to a duration."""
     ends = np.asarray(t.ends, float)
-    begins = np.concatenate([[0.0], ends[:-1]])
-    real = ends > begins  # others are padding
-    begins, lengths = begins[real], (ends - begins)[real]
-    c = np.zeros((len(begins), 4, size))
+    starts = np.concatenate([[0.0], ends[:-1]])
+    real = ends > starts  # others are padding
+    starts, lengths = starts[real], (ends - starts)[real]
+    c = np.zeros((len(starts), 4, size))
     c[..., : t.coefficients.shape[-1]] = t.coefficients[real]
     n_rounds = max(1, int(np.ceil((duration - start) / ends[-1] - 1e-9))) if t.repeats else 1
-    begins = (start + ends[-1] * np.arange(n_rounds)[:, None] + begins).ravel()
-    parts = [(begins, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))]
+    starts = (start + ends[-1] * np.arange(n_rounds)[:, None] + starts).ravel()
+    parts = [(starts, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))]
     first, last = c[0, :, :1], c[-1].sum(axis=-1, keepdims=True)
     end = start + ends[-1] * n_rounds
     if start > 0:
         parts.insert(0, _rest(0.0, start, first, size))
     if end < duration:
         parts.append(_rest(end, duration - end, last, size))
-    begins, lengths, c = (np.concatenate(x) for x in zip(*parts, strict=True))
-    inside = begins < duration
-    return begins[inside], lengths[inside], c[inside]
+    starts, lengths, c = (np.concatenate(x) for x in zip(*parts, strict=True))
+    inside = starts < duration
+    return starts[inside], lengths[inside], c[inside]
 
 
-def _rest(begin: float, length: float, at: Floats, size: int) -> tuple[Floats, Floats, Floats]:
+def _rest(start: float, length: float, at: Floats, size: int) -> tuple[Floats, Floats, Floats]:
     """Return a piece that stays at one position and yaw, (4, 1)."""
-    return np.array([begin]), np.array([length]), np.pad(at, ((0, 0), (0, size - 1)))[None]
+    return np.array([start]), np.array([length]), np.pad(at, ((0, 0), (0, size - 1)))[None]

@@ -1,0 +1,44 @@
+"""Parameters of a drone that controllers of a wrench assume."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jax import Array
+
+from crazysim.control.allocation import AllocationParams
+from crazysim.drones import Airframe
+from crazysim.dynamics.core import GRAVITY
+from crazysim.pytree import PyTree, as_parameter, leaf
+
+
+class RigidBodyParams(PyTree):
+    """Parameters of a drone that a controller assumes, each shared or one per drone; a base of records with gains."""
+
+    mass: Array = leaf("parameter", 1, (1,))
+    """Mass that the controller assumes, kg. (1,)"""
+    gravity_vec: Array = leaf("parameter", 1)
+    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
+    J: Array = leaf("parameter", 2)
+    """Inertia that the controller assumes, body frame, kg m^2. (3, 3)"""
+    drag_matrix: Array = leaf("parameter", 2)
+    """Linear drag coefficients that the controller compensates, body frame, N s/m. (3, 3)"""
+    allocation: AllocationParams
+    """Limits of the rotors."""
+
+
+def rigid_body(airframe: Airframe) -> dict[str, Any]:
+    """Return the fields of ``RigidBodyParams`` for an airframe.
+
+    Raises:
+        ConfigError: If the airframe lacks a value.
+    """
+    drag = airframe.value("drag.coefficients")
+    return {
+        "mass": as_parameter(airframe.value("rigid_body.mass")),
+        "gravity_vec": as_parameter(GRAVITY),
+        "J": as_parameter(airframe.inertia),
+        "drag_matrix": as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
+        "allocation": AllocationParams.create(airframe),
+    }
