@@ -61,6 +61,19 @@ def test_a_box_on_a_box_rests_on_the_corners_of_their_overlap():
     np.testing.assert_allclose(points[:, 2], 0.0595, atol=1e-6)
 
 
+@pytest.mark.parametrize("above", [True, False])
+def test_a_small_box_on_a_large_one_rests_on_its_four_corners_once_each(above):
+    small, large = (
+        (jnp.asarray((0.05, 0.04, 0.03)), jnp.asarray([0.1, 0.0, 0.089])),
+        (jnp.asarray(HALF_B), jnp.zeros(3)),
+    )
+    first, second = (small, large) if above else (large, small)
+    found = boxes(*first, jnp.eye(3), *second, jnp.eye(3))
+    points = np.asarray(found.point)[np.asarray(found.gap) < 1]
+    expected = [(x, y) for x in (0.05, 0.12) for y in (-0.04, 0.04)]  # cut at the edge of the large one, at 0.12
+    np.testing.assert_allclose(sorted(points[:, :2].round(4).tolist()), expected, atol=1e-4)
+
+
 def test_edges_that_cross_touch_at_one_point():
     """Two long bars turned by 45 degrees about their axes, one along x above one along y."""
     half = jnp.asarray([1.0, 0.1, 0.1])
