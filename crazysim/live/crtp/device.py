@@ -195,7 +195,7 @@ class CrtpDevice:
 
     def _force(self, thrust: int) -> float:
         """Return the collective thrust, N, of 16 bits: full scale is the largest thrust of all rotors."""
-        airframe = self.swarm.sim.airframe
+        airframe = self.swarm.sim.airframes[self.drone]
         return thrust / 65535 * airframe.n_rotors * float(np.max(airframe.value("rotors.thrust_max")))
 
     def _generic(self, channel: int, data: bytes) -> list[Packet]:

@@ -217,7 +217,7 @@ class Swarm(Closing):
         self._states = found
 
     def _write(self) -> None:
-        sim, size = self.sim, {Control.state: 16, Control.rotor_vel: self.sim.airframe.n_rotors}
+        sim, size = self.sim, {Control.state: 16, Control.rotor_vel: self.sim.data.states.rotor_vel.shape[-1]}
         command = np.zeros((1, len(self.names), size.get(sim.control, 4)))
         on = np.ones(len(self.names), bool)
         for k, (commander, state) in enumerate(zip(self.commanders, self._states, strict=True)):
