@@ -136,7 +136,7 @@ def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
 
 
 MAX_UNROLLED = 8
-"""Most drones of a world whose pairs are written out one drone after the other; those of more have an axis."""
+"""Most drones of a world whose loop over the others is unrolled; the pairs of more have an axis."""
 
 
 def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
