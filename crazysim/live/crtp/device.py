@@ -134,8 +134,13 @@ class CrtpDevice:
         return found
 
     def _value(self, k: int, layout: str, state: object) -> bytes:
-        reading = self.readings[self.log.variables[k].name][1]
-        return pack(layout, float(reading(state, self.commander)))  # type: ignore[arg-type]
+        name = self.log.variables[k].name
+        try:
+            value = float(self.readings[name][1](state, self.commander))  # type: ignore[arg-type]
+        except Exception as error:  # of a reading that a user has added
+            self._report(f"log variable {name} failed: {error}")
+            value = math.nan
+        return pack(layout, value)
 
     def _report(self, text: str) -> None:
         self.swarm.reports.add("refused", self.name, self.swarm.time, text)
