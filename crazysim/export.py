@@ -14,11 +14,11 @@ from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, as_stages
 from crazysim.engine import symbolic
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.lower_stages import lower_stages
 from crazysim.engine.passes import fuse
 from crazysim.engine.program import Program, Slot, UnfusedStage
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.jaxcompat import is_key
 
 if TYPE_CHECKING:
     from crazysim.sim.sim import Sim

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeGuard, TypeVar
 
 import jax
 import numpy as np
 
-from crazysim.drones import Airframe
+from crazysim.drones import Airframe, load_airframe
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 
@@ -24,8 +25,36 @@ PER_ROTOR = ("L", "prop_inertia", "rpm2thrust", "rpm2torque", "rotor_dyn_coef")
 """Fields that missing rotors have like the last one; all others are zero for missing rotors."""
 
 
+AirframeSource = str | Path | Mapping[str, Any] | Airframe
+"""Name of a built-in airframe, path of a TOML file, dict, or airframe."""
 Airframes = Airframe | Sequence[Airframe]
 """Airframe of all drones, or of each."""
+
+
+def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: int) -> tuple[Airframe, ...]:
+    """Return the airframe of each drone; drones of the same source have the same one. (n_drones,)
+
+    Raises:
+        UnknownNameError: If an airframe does not exist.
+        ConfigError: If an airframe is invalid, or a list has another length than there are drones.
+    """
+    if not is_list(drone):
+        return (load_airframe(drone),) * n_drones  # type: ignore[arg-type]
+    if len(drone) != n_drones:
+        raise ConfigError(
+            f"expected {n_drones} airframes, one for each drone, got {len(drone)}. Use Sim(n_drones={len(drone)}), or "
+            f"one airframe for all."
+        )
+    loaded: dict[Any, Airframe] = {}
+    for source in drone:
+        key = str(source) if isinstance(source, (str, Path)) else id(source)
+        loaded[key] = loaded[key] if key in loaded else load_airframe(source)
+    return tuple([loaded[str(source) if isinstance(source, (str, Path)) else id(source)] for source in drone])
+
+
+def is_list(drone: Any) -> TypeGuard[Sequence[AirframeSource]]:
+    """Check for a list of airframes, one for each drone."""
+    return isinstance(drone, Sequence) and not isinstance(drone, str)
 
 
 def as_airframes(airframes: Airframes, n_drones: int = 1) -> tuple[Airframe, ...]:

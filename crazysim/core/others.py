@@ -12,10 +12,9 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
-from jax.interpreters import batching, mlir
 
 from crazysim.errors import ConfigError
+from crazysim.jaxcompat import ClosedJaxpr, batched_primitive, jaxpr_as_fun, without_constants
 
 AXIS = "members"
 """Name of the axis of ``vmap`` over the drones of a world, or over the members of another population."""
@@ -83,21 +82,9 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
     if reduce == "sum" and any(x.dtype == bool for x in traced.out_avals):
         raise ConfigError("expected numbers to sum over the other drones, got bools. Use reduce='max' for any of them.")
     found = reduce_over_others_p.bind(
-        *traced.consts, *leaves, jaxpr=_without_constants(traced), n_own=len(traced.consts), reduce=reduce
+        *traced.consts, *leaves, jaxpr=without_constants(traced), n_own=len(traced.consts), reduce=reduce
     )
     return structure.unflatten(found)
-
-
-reduce_over_others_p = Primitive("reduce_over_others")
-"""The reduction as a primitive: operands are the values that the function closes over, then those that are published.
-``jaxpr`` maps them and ``is_self`` to results, for one pair; ``n_own`` is the number of the first."""
-reduce_over_others_p.multiple_results = True
-
-
-def _without_constants(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """Return a jaxpr that takes what it closes over as its first inputs."""
-    x = closed.jaxpr
-    return ClosedJaxpr(Jaxpr((), [*x.constvars, *x.invars], x.outvars, x.eqns, x.effects, x.debug_info), ())
 
 
 def _outside(*args: Any, **params: Any) -> Any:
@@ -153,7 +140,6 @@ def _of_all(
     return jax.lax.map(in_turn, (numbers, each), batch_size=max(1, MAX_PAIRS // n))
 
 
-reduce_over_others_p.def_impl(_outside)
-reduce_over_others_p.def_abstract_eval(_results)
-batching.fancy_primitive_batchers[reduce_over_others_p] = _batched
-mlir.register_lowering(reduce_over_others_p, _outside)
+reduce_over_others_p = batched_primitive("reduce_over_others", _results, _batched, _outside)
+"""The reduction as a primitive: operands are the values that the function closes over, then those that are published.
+``jaxpr`` maps them and ``is_self`` to results, for one pair; ``n_own`` is the number of the first."""

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 
 import jax
 
-from crazysim.engine import jaxcompat
-from crazysim.engine.jaxcompat import ClosedJaxpr, Literal
+from crazysim import jaxcompat
 from crazysim.engine.ops import TABLE
+from crazysim.jaxcompat import ClosedJaxpr, Literal
 
 WORTH = 8.0
 """Repeated arithmetic for each element of a value from which a barrier pays, in multiply-adds. Of 4, 8, 16, 32 and 64,

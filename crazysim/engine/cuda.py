@@ -20,7 +20,8 @@ import jax
 import numpy as np
 from jax import Array
 
-from crazysim.engine import dump, jaxcompat
+from crazysim import jaxcompat
+from crazysim.engine import dump
 from crazysim.engine.errors import KernelError
 from crazysim.engine.kernel import Kernel
 from crazysim.engine.native import Launch

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim import jaxcompat
 from crazysim.core.stage import with_leaves
-from crazysim.engine import cuda, jaxcompat, kernel, lanes, native, passes
+from crazysim.engine import cuda, kernel, lanes, native, passes
 from crazysim.engine.native import Launch
 from crazysim.engine.program import Program
 

@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from crazysim.engine import jaxcompat
+from crazysim import jaxcompat
 
 LENGTH = 24
 """Hexadecimal digits of a hash in a name: 96 bits."""

@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.engine import jaxcompat, xla
+from crazysim import jaxcompat
+from crazysim.engine import xla
 from crazysim.engine.ir import Block
-from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.program import TABLE, Phase, Program, Segment, Slot, UnfusedStage
+from crazysim.jaxcompat import is_key
 
 Execute = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
 """Runs a block: from the block, its inputs and the lanes' shape to its outputs."""

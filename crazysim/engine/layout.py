@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.listing import PACKED
 from crazysim.engine.program import Leaf, Program, Segment, Slot
+from crazysim.jaxcompat import is_key
 
 
 def pack_shared(program: Program) -> Program:

@@ -18,11 +18,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from crazysim.engine import jaxcompat, ops
+from crazysim import jaxcompat
+from crazysim.engine import ops
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import Block, Builder, Element, Value, constant
-from crazysim.engine.jaxcompat import ClosedJaxpr, Literal, is_key
 from crazysim.engine.simplify import known_zero
+from crazysim.jaxcompat import ClosedJaxpr, Literal, is_key
 
 Elements = np.ndarray
 """An array of elements, of type object. A random key is a pair of elements."""

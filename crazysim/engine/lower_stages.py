@@ -14,11 +14,11 @@ from crazysim.core.others import reduce_over_others_p
 from crazysim.core.stage import Axes, Stage
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir import Builder, Element, Value, constant, prune
-from crazysim.engine.jaxcompat import equations, is_key
 from crazysim.engine.lower import Elements, Entry, Lowering, as_elements, inputs, scalars
 from crazysim.engine.program import TABLE, Leaf, Phase, Program, Segment, Slot, UnfusedStage
 from crazysim.engine.relative import RelativeAxes, viewed
 from crazysim.engine.tracing import TracedStage
+from crazysim.jaxcompat import equations, is_key
 
 MAX_UNROLLED_DRONES = 8
 """Most drones of a world for which a stage of one world is lowered; its block grows with their square."""

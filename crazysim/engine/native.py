@@ -19,7 +19,8 @@ import jax
 import numpy as np
 from jax import Array
 
-from crazysim.engine import dump, jaxcompat, kernel_cache
+from crazysim import jaxcompat
+from crazysim.engine import dump, kernel_cache
 from crazysim.engine.errors import KernelError
 from crazysim.engine.kernel import Kernel
 from crazysim.errors import ConfigError

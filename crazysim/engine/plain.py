@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim import jaxcompat
 from crazysim.core.data import SimData
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.stage import Axes, Stage, with_leaves
 from crazysim.core.stages import finite
-from crazysim.engine import jaxcompat
 from crazysim.engine.barriers import compute_once
 from crazysim.pytree import has_members
 

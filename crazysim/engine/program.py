@@ -17,7 +17,7 @@ import numpy as np
 from crazysim.engine import listing
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import Block
-from crazysim.engine.jaxcompat import is_key
+from crazysim.jaxcompat import is_key
 
 Slot = tuple[int, int]
 """Place of a number: which leaf, and which element of the part of it that belongs to one drone (or one world)."""

@@ -10,11 +10,12 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
+from crazysim import jaxcompat
 from crazysim.core.data import SimData
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS, Location, locate
 from crazysim.core.stage import Axes, as_stages, with_leaves
-from crazysim.engine import fused, jaxcompat
+from crazysim.engine import fused
 from crazysim.engine.flat import FlatData, PackCache, Zeros, ZerosCache
 from crazysim.engine.plan import ENGINES, Plan, Planner
 from crazysim.errors import ConfigError

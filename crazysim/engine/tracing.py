@@ -7,8 +7,9 @@ from typing import Any
 
 import jax
 
+from crazysim import jaxcompat
 from crazysim.core.stage import Axes, Stage
-from crazysim.engine import dump, jaxcompat
+from crazysim.engine import dump
 
 
 class TracedStage:

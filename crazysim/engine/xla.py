@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from crazysim import jaxcompat
 from crazysim.core.others import largest, smallest
-from crazysim.engine import jaxcompat, ops
+from crazysim.engine import ops
 from crazysim.engine.ir import Block, Element, Operation, Value
 
 Env = dict[Value, Any]

@@ -4,49 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import jax
 from jax.sharding import Mesh
 
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import find_controller
+from crazysim.core.airframes import AirframeSource, is_list, load_airframes
 from crazysim.core.controls import require_controller, require_pair
 from crazysim.core.integration import Integrator
 from crazysim.core.settings import control_freqs, controller_at_rates, find_device, member, physics_freq, positive
-from crazysim.drones import Airframe, load_airframe
+from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.core import require_support
-from crazysim.errors import ConfigError
-
-AirframeSource = str | Path | Mapping[str, Any] | Airframe
-"""Name of a built-in airframe, path of a TOML file, dict, or airframe."""
-
-
-def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: int) -> tuple[Airframe, ...]:
-    """Return the airframe of each drone; drones of the same source have the same one. (n_drones,)
-
-    Raises:
-        UnknownNameError: If an airframe does not exist.
-        ConfigError: If an airframe is invalid, or a list has another length than there are drones.
-    """
-    if not _is_list(drone):
-        return (load_airframe(drone),) * n_drones  # type: ignore[arg-type]
-    if len(drone) != n_drones:
-        raise ConfigError(
-            f"expected {n_drones} airframes, one for each drone, got {len(drone)}. Use Sim(n_drones={len(drone)}), or "
-            f"one airframe for all."
-        )
-    loaded: dict[Any, Airframe] = {}
-    for source in drone:
-        key = str(source) if isinstance(source, (str, Path)) else id(source)
-        loaded[key] = loaded[key] if key in loaded else load_airframe(source)
-    return tuple([loaded[str(source) if isinstance(source, (str, Path)) else id(source)] for source in drone])
-
-
-def _is_list(drone: Any) -> TypeGuard[Sequence[AirframeSource]]:
-    return isinstance(drone, Sequence) and not isinstance(drone, str)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +74,7 @@ class Configuration:
             ValueError: For an argument that is invalid or contradicts another, with what was expected.
         """
         n_worlds, n_drones, freq = positive("n_worlds", n_worlds), positive("n_drones", n_drones), physics_freq(freq)
-        n_drones = len(drone) if n_drones == 1 and _is_list(drone) and len(drone) else n_drones
+        n_drones = len(drone) if n_drones == 1 and is_list(drone) and len(drone) else n_drones
         dynamics, control = member(Dynamics, "dynamics", dynamics), member(Control, "control", control)
         integrator = member(Integrator, "integrator", integrator)
         require_pair(dynamics, control)

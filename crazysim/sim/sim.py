@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import CASCADE
 from crazysim.core import functional as F
-from crazysim.core.airframes import airframe_of, drone_names
+from crazysim.core.airframes import AirframeSource, airframe_of, drone_names
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
 from crazysim.core.random import seed_sim
@@ -33,7 +33,7 @@ from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim.adopt import adopt
 from crazysim.sim.commands import Commands
-from crazysim.sim.configuration import AirframeSource, Configuration
+from crazysim.sim.configuration import Configuration
 from crazysim.sim.members import Member, find_member
 from crazysim.sim.pipelines import Pipelines
 from crazysim.sim.plugins import PluginMethods

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 from cases import shared_sim
 
-from crazysim import Downwash, Sim
-from crazysim.engine import Step, cuda, jaxcompat, kernel
+from crazysim import Downwash, Sim, jaxcompat
+from crazysim.engine import Step, cuda, kernel
 from crazysim.engine.errors import KernelError, UnsupportedError
 from crazysim.engine.exchange import exchange_for
 from crazysim.engine.source import Writer

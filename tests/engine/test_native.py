@@ -30,7 +30,7 @@ def place(tmp_path, monkeypatch):
     """An empty cache folder, and nothing loaded from an earlier one."""
     monkeypatch.setattr(kernel_cache, "folder", lambda: tmp_path)
     monkeypatch.setattr(native, "_LOADED", {})
-    monkeypatch.setattr("crazysim.engine.jaxcompat.register_host_target", lambda name, function: None)
+    monkeypatch.setattr("crazysim.jaxcompat.register_host_target", lambda name, function: None)
     native.toolchain.cache_clear()
     yield tmp_path
     native.toolchain.cache_clear()
@@ -171,11 +171,11 @@ def test_nothing_partial_is_ever_seen(source, place, monkeypatch, tmp_path_facto
 
 def test_a_shared_folder_that_cannot_be_written_is_not_used(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr("crazysim.engine.jaxcompat.cache_folder", lambda: str(tmp_path / "file"))
+    monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path / "file"))
     assert kernel_cache.folder() == kernel_cache.temporary()
-    monkeypatch.setattr("crazysim.engine.jaxcompat.cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path))
     assert kernel_cache.folder() == tmp_path / "crazysim"
-    monkeypatch.setattr("crazysim.engine.jaxcompat.cache_folder", lambda: None)
+    monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: None)
     assert kernel_cache.folder() == kernel_cache.temporary()
 
 

@@ -11,11 +11,11 @@ from cases import shared_sim
 from crazysim.core.stage import as_stages, stage
 from crazysim.engine import interpret, passes
 from crazysim.engine.ir import Builder, Operation, Value
-from crazysim.engine.jaxcompat import is_key
 from crazysim.engine.layout import as_rows, pack_shared
 from crazysim.engine.lower_stages import lower_stages
 from crazysim.engine.program import Leaf, Program, Segment
 from crazysim.engine.verify import VerificationError, verify
+from crazysim.jaxcompat import is_key
 
 N_WORLDS = 5
 F32 = np.float32

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 
 from crazysim.engine.ir import Block, Element, constant, is_constant
-from crazysim.engine.jaxcompat import ClosedJaxpr, as_function, closed, expanded
 from crazysim.engine.lower import (
     MAX_UNROLL,
     Elements,
@@ -20,6 +19,7 @@ from crazysim.engine.lower import (
     rule,
     scalars,
 )
+from crazysim.jaxcompat import ClosedJaxpr, as_function, closed, expanded
 
 
 @rule("jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_lin", "run_state")

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from jax.lax import RoundingMethod
 
-from crazysim.engine import jaxcompat, ops
+from crazysim import jaxcompat
+from crazysim.engine import ops
 from crazysim.engine.lower import Elements, Lowering, UnsupportedError, constants, rule
 
 OWN_RULE = frozenset(

@@ -10,10 +10,10 @@ import numpy as np
 from jax.lax import GatherScatterMode
 
 from crazysim.engine.ir import Element, constant, is_constant
-from crazysim.engine.jaxcompat import ClosedJaxpr
 from crazysim.engine.lower import MAX_UNROLL, Elements, Lowering, UnsupportedError, as_elements, constants, rule
 from crazysim.engine.rules import tables
 from crazysim.engine.rules.movement import move_many, run_now
+from crazysim.jaxcompat import ClosedJaxpr
 
 
 @rule("dynamic_slice")

@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from crazysim.engine.jaxcompat import bind
 from crazysim.engine.lower import Elements, Lowering, as_elements, constants, rule
+from crazysim.jaxcompat import bind
 
 MOVEMENT = (
     "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "split", "unstack",

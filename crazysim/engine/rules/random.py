@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from crazysim.engine.ir import is_constant
-from crazysim.engine.jaxcompat import bits_generator, threefry_prng_impl
 from crazysim.engine.lower import Elements, Lowering, UnsupportedError, as_elements, rule
 from crazysim.engine.rules.movement import run_now
+from crazysim.jaxcompat import bits_generator, threefry_prng_impl
 
 
 @rule("random_wrap")

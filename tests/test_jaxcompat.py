@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim.engine import jaxcompat
+from crazysim import jaxcompat
 from crazysim.engine.errors import UnsupportedError
 
 
@@ -115,6 +115,33 @@ def test_primitives_written_in_terms_of_others_are_expanded():
                 for a, b in zip(jaxcompat.expanded(eqn)(*args), expected, strict=True):
                     np.testing.assert_allclose(a, b, rtol=1e-6)
     assert not found or tuple(map(int, jax.__version__.split(".")[:2])) >= (0, 12)
+
+
+def test_a_primitive_is_replaced_under_vmap_and_an_error_elsewhere():
+    def outside(*args, **params):
+        raise TypeError("outside")
+
+    def batched(axis, args, dims, factor):
+        assert (axis.name, axis.size, dims) == ("some", 3, (0,))
+        return [factor * args[0]], [0]
+
+    p = jaxcompat.batched_primitive("scaled", lambda x, factor: [x], batched, outside)
+    scale = lambda x: p.bind(x, factor=2.0)[0]  # noqa: E731
+    found = jax.jit(jax.vmap(scale, axis_name="some"))(jnp.arange(3.0))
+    np.testing.assert_array_equal(found, [0.0, 2.0, 4.0])
+    for fn in (scale, jax.jit(scale)):
+        with pytest.raises(TypeError, match="outside"):
+            fn(jnp.float32(1))
+
+
+def test_a_jaxpr_takes_what_it_closes_over():
+    table = jnp.arange(3.0)
+    closed = jax.make_jaxpr(lambda x: x + table)(1.0)
+    assert len(closed.consts) == 1
+    opened = jaxcompat.without_constants(closed)
+    assert not opened.consts
+    (found,) = jaxcompat.jaxpr_as_fun(opened)(table, 1.0)
+    np.testing.assert_array_equal(found, [1.0, 2.0, 3.0])
 
 
 # Random numbers ------------------------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """All use of JAX beyond its documented, stable interface; a new release of JAX is met here first.
 
-Each name has a test in ``tests/engine/test_jaxcompat.py``, which continuous integration runs on the oldest and the
+Each name has a test in ``tests/test_jaxcompat.py``, which continuous integration runs on the oldest and the
 newest JAX that are supported.
 """
 
@@ -17,10 +17,11 @@ import jaxlib
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.experimental.layout import Layout, with_layout_constraint
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
 from jax.extend.random import threefry2x32_p, threefry_prng_impl
+from jax.interpreters import batching, mlir
 
-from crazysim.engine.errors import UnsupportedError
+from crazysim.errors import UnsupportedError
 
 __all__ = [
     "DIGAMMA_AT_ZERO",
@@ -30,6 +31,7 @@ __all__ = [
     "Literal",
     "Parameters",
     "as_function",
+    "batched_primitive",
     "batched_rule",
     "bind",
     "bits_generator",
@@ -51,6 +53,7 @@ __all__ = [
     "versions",
     "with_inputs",
     "with_major_to_minor",
+    "without_constants",
 ]
 
 
@@ -132,6 +135,33 @@ def reading(eqn: Any) -> Iterator[Equation]:
         raise UnsupportedError(
             f"its parameter {owner!r} has no {error.name!r} in JAX {jax.__version__}", name
         ) from error
+
+
+def batched_primitive(
+    name: str, results: Callable[..., list[Any]], batched: Callable[..., Any], outside: Callable[..., Any]
+) -> Primitive:
+    """Return a primitive that ``vmap`` replaces by other operations.
+
+    Args:
+        name: Its name.
+        results: From operands and parameters to the shapes and types of its results.
+        batched: From the axis of ``vmap``, which has ``name`` and ``size``, the operands, their batched dimensions and
+            parameters to results and their batched dimensions.
+        outside: Called where no ``vmap`` replaced it, to raise an error.
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(outside)
+    primitive.def_abstract_eval(results)
+    batching.fancy_primitive_batchers[primitive] = batched
+    mlir.register_lowering(primitive, outside)
+    return primitive
+
+
+def without_constants(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """Return a jaxpr that takes what it closes over as its first inputs."""
+    x = closed.jaxpr
+    return ClosedJaxpr(Jaxpr((), [*x.constvars, *x.invars], x.outvars, x.eqns, x.effects, x.debug_info), ())
 
 
 def bind(eqn: Any, *args: Any, **params: Any) -> list[Any]:
