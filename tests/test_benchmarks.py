@@ -246,3 +246,13 @@ def test_the_flight_stack_is_timed_against_its_references(run):
         ("state", "state"), ("rotor", "rotor"), ("geometric", "state"), ("rod", "rotor")
     ]  # fmt: skip
     assert all(line["ratio"] > 0 and line["operations"]["mul"] > 0 for line in lines)
+
+
+def test_cars_are_timed_alone_and_beside_drones(run):
+    lines = run("vehicles.py", "--worlds", "4", "--cases", "drive", "path", "beside_drone", "--repeats", "1")
+    assert [(line["case"], line["alone"]) for line in lines] == [
+        ("drive", True),
+        ("path", True),
+        ("beside_drone", False),
+    ]
+    assert all(line["steps_per_s"] > 0 for line in lines)

@@ -21,7 +21,7 @@ RUBBER, WOOD = (0.16, 0.16, 0.16, 1.0), (0.7, 0.6, 0.35, 1.0)
 TOUCHES, GHOST = 'contype="0" conaffinity="2"', 'contype="0" conaffinity="0"'
 """Attributes of geoms that drones touch, and of others."""
 SPOKES = 5
-"""Spokes of a wheel, by which one sees it turn."""
+"""Spokes of a wheel, which make its rotation visible."""
 
 
 def kinds(cars: Any) -> tuple[str, ...]:

@@ -69,7 +69,7 @@ def path_state(state: CarState, path: Path, index: Array, guess: Array, ahead: A
     cross = tangent[0] * heading[1] - tangent[1] * heading[0]
     dot = tangent[0] * heading[0] + tangent[1] * heading[1]
     if time is None:
-        speed, lag = path.speed_at(index, arc), jnp.zeros_like(guess)
+        speed, lag = path.speed_at(index, (arc - sign * ahead)[0]), jnp.zeros_like(guess)
     else:
         reference, speed = path.time_reference(index, time)
         lag = sign * (reference - arc) + ahead  # of the centre of mass

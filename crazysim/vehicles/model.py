@@ -154,7 +154,7 @@ def _read(source: str | Path) -> tuple[str, dict[str, Any]]:
     try:
         return path.stem, tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}. {GUIDE} shows the format.") from error
+        raise ConfigError(f"{path} is not valid TOML: {error}; see {GUIDE} for the format") from error
 
 
 def _numbers(name: str, node: Any, prefix: str = "") -> Iterator[tuple[str, NDArray[np.float64]]]:

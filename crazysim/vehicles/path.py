@@ -34,7 +34,7 @@ SLOWEST = 0.1
 """Least speed of a reference by arc length, as a share of the path's largest: one must leave a start at rest."""
 SLOW = 0.05
 """Rate of a curve, of its largest, below which its path is straight."""
-REPEATED = 4
+REPEATED = 12
 """Points of a closed path that are repeated on both sides, so that its spline is smooth where it closes."""
 
 Floats = NDArray[np.float64]

@@ -75,7 +75,7 @@ def test_batch_equals_one():
     for i in range(len(x)):
         one = commonroad_single_track(state_of(x[i]), jnp.asarray(u[i], jnp.float32), params)
         for a, b in zip(many, one, strict=True):
-            np.testing.assert_array_equal(a[i], b)
+            np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-6)  # XLA rounds a batch in another order
 
 
 @pytest.mark.parametrize("seed", range(3))
