@@ -71,10 +71,13 @@ def read(url: str) -> Any:
     """Read what the server of a page sends, as a browser does, and discard it."""
     from viser import __version__
     from websockets.sync.client import connect
+    from websockets.typing import Subprotocol
 
     with (
         contextlib.suppress(Exception),
-        connect(url.replace("http", "ws"), subprotocols=[f"viser-v{__version__}"], max_size=None) as socket,
+        connect(
+            url.replace("http", "ws"), subprotocols=[Subprotocol(f"viser-v{__version__}")], max_size=None
+        ) as socket,
     ):
         while True:
             socket.recv()

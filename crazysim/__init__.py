@@ -7,13 +7,14 @@ from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.others import reduce_over_others
 from crazysim.core.plugin import Placement, Plugin, parameter
+from crazysim.core.population import Population
 from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.effects import Battery, Downwash, GroundEffect, Latency, MotorFailure, Wind, WindField
 from crazysim.errors import ConfigError
 from crazysim.lazy import lazy
-from crazysim.pytree import PyTree, leaf, static
+from crazysim.pytree import Members, PyTree, leaf, static
 from crazysim.sim.sim import Sim
 from crazysim.version import __version__
 
@@ -52,9 +53,11 @@ __all__ = [
     "Hook",
     "Integrator",
     "Latency",
+    "Members",
     "MotorFailure",
     "Placement",
     "Plugin",
+    "Population",
     "PyTree",
     "Radar",
     "RangeFinder",

@@ -24,7 +24,12 @@ T = TypeVar("T")
 
 
 def leaf(
-    scope: Scope, core_ndim: int = 0, core: tuple[int, ...] | None = None, *, default: Any = dataclasses.MISSING
+    scope: Scope,
+    core_ndim: int = 0,
+    core: tuple[int, ...] | None = None,
+    *,
+    sparse: bool = False,
+    default: Any = dataclasses.MISSING,
 ) -> Any:
     """Declare an array field, or a dict of such arrays.
 
@@ -36,9 +41,12 @@ def leaf(
         core_ndim: Number of dimensions of the core shape.
         core: The core shape, if it is fixed. It keeps one mass for each of three worlds from passing for one along
             each of three axes.
+        sparse: True for a parameter whose zeros are terms that are absent, as an offset along one axis has. While it is
+            shared, a step is compiled without them, and again after one of them changes.
         default: Value of the field where none is given.
     """
-    return dataclasses.field(default=default, metadata={"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core})
+    metadata = {"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 def static(**kwargs: Any) -> Any:
@@ -108,6 +116,11 @@ def scopes(tree: Any) -> Any:
     and stages receive it like an opaque leaf.
     """
     return _map_declared(lambda x, metadata, _, members: _scope(x, metadata, members), tree, {}, "", None)
+
+
+def sparse_leaves(tree: Any) -> Any:
+    """Return the same tree with True in the place of every leaf that is declared sparse, and False elsewhere."""
+    return _map_declared(lambda _, metadata, *__: bool(metadata.get("sparse")), tree, {}, "", None)
 
 
 def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:

@@ -45,7 +45,7 @@ class Touching:
         """Collect the solids of the scene as they are now."""
         self.plugin, self.shapes = plugin, plugin.shapes
         self.n_drones = sim.n_drones if plugin.drones else 0
-        self.box = np.asarray(sim.airframe.value("shape.collision_box"), np.float64)
+        self.boxes = boxes_of_drones(sim)
         model = sim.scene.collision_model
         self.carriers = [Carrier(None, None, tuple(model.floor))] if model.floor else []
         kinds = {kind: p for p in sim.scene.plugins() for kind in p.placed_kinds or ()}
@@ -137,8 +137,8 @@ class Touching:
         if self.n_drones:
             owners += range(n_free, n_free + self.n_drones)
             balls += [False] * self.n_drones
-            sizes += [self.box[3:]] * self.n_drones
-            for whole, part in zip((pos, rot), drones_as_boxes(data, self.box), strict=True):
+            sizes += list(self.boxes[:, 3:])
+            for whole, part in zip((pos, rot), drones_as_boxes(data, self.boxes), strict=True):
                 whole.append(part)
         for k, carrier in enumerate(self.carriers):
             for geom in carrier.geoms:
@@ -178,15 +178,20 @@ def drones_as_bodies(data: SimData) -> Bodies:
     return Bodies(s.pos, s.vel, rotation.rotate(s.quat, s.ang_vel), inv_mass, inverse)
 
 
-def drones_as_boxes(data: SimData, box: np.ndarray) -> tuple[Array, Array]:
+def boxes_of_drones(sim: Simulation) -> np.ndarray:
+    """Return centre and half extents of each drone's collision box, body frame, m. (n_drones, 6)"""
+    return np.array([airframe.value("shape.collision_box") for airframe in sim.airframes], np.float64)
+
+
+def drones_as_boxes(data: SimData, boxes: np.ndarray) -> tuple[Array, Array]:
     """Return positions, m (n, 3), and attitudes (n, 3, 3) of the drones' collision boxes; of one world.
 
     Args:
         data: One world.
-        box: Centre and half extents of the box, body frame, m. (6,)
+        boxes: Centre and half extents of each drone's box, body frame, m. (n_drones, 6)
     """
     s = data.states
-    return s.pos + rotation.rotate(s.quat, jnp.asarray(box[:3], s.pos.dtype)), rotation.matrix(s.quat)
+    return s.pos + rotation.rotate(s.quat, jnp.asarray(boxes[:, :3], s.pos.dtype)), rotation.matrix(s.quat)
 
 
 def _motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Array, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.bodies.contacts import drones_as_bodies, drones_as_boxes
+from crazysim.bodies.contacts import boxes_of_drones, drones_as_bodies, drones_as_boxes
 from crazysim.bodies.pairs import Solids, between, joined
 from crazysim.bodies.solver import Impulses, solve_contacts
 from crazysim.core.data import SimData
@@ -78,13 +78,13 @@ class DroneCollisions(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage of the collisions."""
-        box, n = np.asarray(sim.airframe.value("shape.collision_box"), np.float64), sim.n_drones
+        boxes, n = boxes_of_drones(sim), sim.n_drones
         pairs = np.array(list(combinations(range(n), 2)))
 
         def of_world(data: SimData) -> SimData:
             record, s = self.read(data), data.states
-            pos, rot = drones_as_boxes(data, box)
-            solids = Solids(np.arange(n), np.zeros(n, bool), np.tile(box[3:], (n, 1)), pos, rot)
+            pos, rot = drones_as_boxes(data, boxes)
+            solids = Solids(np.arange(n), np.zeros(n, bool), boxes[:, 3:], pos, rot)
             each = (jnp.broadcast_to(x, (n,)) for x in (record.friction, record.restitution))
             contacts = joined(between(solids, pairs), *each)
             before, dt = Impulses(record.press, record.drag), 1 / data.core.freq

@@ -22,7 +22,22 @@ AXIS = "members"
 
 Reduction = Literal["sum", "min", "max"]
 
-REDUCTIONS: dict[str, Callable[..., Array]] = {"sum": jnp.sum, "min": jnp.min, "max": jnp.max}
+
+def smallest(x: Array, axis: int) -> Array:
+    """Return the smallest number along an axis, or NaN if there is one; ``jnp.min`` with a safe derivative.
+
+    The derivative of ``jnp.min`` goes to the numbers that equal the result. Where XLA computes them once more, with
+    another rounding, none does, and the derivative is lost.
+    """
+    return jnp.squeeze(jnp.take_along_axis(x, jnp.argmin(x, axis=axis, keepdims=True), axis), axis)
+
+
+def largest(x: Array, axis: int) -> Array:
+    """Return the largest number along an axis, as ``smallest`` does."""
+    return jnp.squeeze(jnp.take_along_axis(x, jnp.argmax(x, axis=axis, keepdims=True), axis), axis)
+
+
+REDUCTIONS: dict[str, Callable[..., Array]] = {"sum": jnp.sum, "min": smallest, "max": largest}
 
 MAX_PAIRS = 2**20
 """Pairs of a world that are computed at once; those of a larger swarm follow in turns, which bounds the memory."""

@@ -164,6 +164,14 @@ def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:
     return begins * source.strength * q * w * w
 
 
+def mean_rotor_vel(data: SimData) -> Array:
+    """Return the mean speed of the rotors that a drone has, rpm. (..., 1)"""
+    rotor_vel, limit = data.states.rotor_vel, data.params.rotor_vel_max  # type: ignore[union-attr]
+    if limit.shape[-1] == 1:
+        return jnp.mean(rotor_vel, axis=-1, keepdims=True)
+    return jnp.sum(rotor_vel, axis=-1, keepdims=True) / jnp.sum(limit > 0, axis=-1, keepdims=True)
+
+
 def collective_thrust(data: SimData) -> Array:
     """Return the collective thrust of a drone, N, from its rotor speeds or by the fitted model. (..., 1)"""
     p: Any = data.params

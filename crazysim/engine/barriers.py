@@ -11,7 +11,8 @@ computes it from inputs and barriers. Its evaluations are the elements of it tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import heapq
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -63,20 +64,10 @@ def compute_once(
 
 def choose(jaxpr: ClosedJaxpr, least: int) -> set[Any]:
     """Return the variables of a jaxpr that get a barrier, of at least as many elements as ``least``."""
-    nodes = [_node(eqn) for eqn in jaxpr.jaxpr.eqns]
-    asked = [v for v in jaxpr.jaxpr.outvars if not isinstance(v, Literal)]
-    chosen: set[Any] = set()
-    while True:
-        evaluations = _evaluations(nodes, asked, chosen)
-        best, most = None, 0.0
-        for v, work in _work(nodes, chosen).items():
-            size = v.aval.size
-            saved = (evaluations.get(v, 0.0) - size) * work
-            if saved > max(most, WORTH * size) and size >= least and v not in chosen:
-                best, most = v, saved
-        if best is None:
-            return chosen
-        chosen.add(best)
+    estimate = _Estimate([_node(eqn) for eqn in jaxpr.jaxpr.eqns], jaxpr.jaxpr.outvars, least)
+    while (best := estimate.best()) is not None:
+        estimate.add_barrier(best)
+    return estimate.chosen
 
 
 class _Node(NamedTuple):
@@ -118,21 +109,119 @@ def _work(nodes: Sequence[_Node], chosen: set[Any]) -> dict[Any, float]:
     work: dict[Any, float] = {}
     for node in nodes:
         if node.fused:
-            amount = node.cost + sum(n * work.get(v, 0.0) for v, n in node.operands if v not in chosen)
-            work.update(dict.fromkeys(node.results, amount))
+            work.update(dict.fromkeys(node.results, _own_work(node, work, chosen)))
     return work
 
 
-def _evaluations(nodes: Sequence[_Node], asked: Sequence[Any], chosen: set[Any]) -> dict[Any, float]:
-    """Return how many elements of every value are computed in all that uses it."""
-    count: dict[Any, float] = {}
-    for v in asked:
-        count[v] = count.get(v, 0.0) + v.aval.size
-    for node in reversed(nodes):
-        results = sum(count.get(v, 0.0) if node.fused and v not in chosen else v.aval.size for v in node.results)
-        for v, n in node.operands:
-            count[v] = count.get(v, 0.0) + results * n
-    return count
+def _own_work(node: _Node, work: dict[Any, float], chosen: set[Any]) -> float:
+    return node.cost + sum(n * work.get(v, 0.0) for v, n in node.operands if v not in chosen)
+
+
+class _Queue:
+    """Numbers in ascending order, each once."""
+
+    def __init__(self, numbers: Iterable[int]):
+        self._heap: list[int] = []
+        self._waiting: set[int] = set()
+        self.extend(numbers)
+
+    def __len__(self) -> int:
+        return len(self._heap)
+
+    def extend(self, numbers: Iterable[int]) -> None:
+        for k in numbers:
+            if k not in self._waiting:
+                self._waiting.add(k)
+                heapq.heappush(self._heap, k)
+
+    def pop(self) -> int:
+        k = heapq.heappop(self._heap)
+        self._waiting.discard(k)
+        return k
+
+
+class _Estimate:
+    """Work and evaluations of every fused value. A barrier updates those that it changes, and no others."""
+
+    def __init__(self, nodes: Sequence[_Node], outputs: Sequence[Any], least: int):
+        self.nodes, self.least = nodes, least
+        self.chosen: set[Any] = set()
+        self.work = _work(nodes, self.chosen)
+        self.order = {v: k for k, v in enumerate(self.work)}
+        self.size = {v: v.aval.size for node in nodes for v in node.results}
+        self.producer = {v: k for k, node in enumerate(nodes) for v in node.results}
+        self.users: dict[Any, list[tuple[int, float]]] = {}
+        self.outputs: dict[Any, float] = {}
+        """Elements of a value that are outputs, as often as it is one."""
+        for k, node in enumerate(nodes):
+            for v, n in node.operands:
+                self.users.setdefault(v, []).append((k, n))
+        for v in outputs:
+            if not isinstance(v, Literal):
+                self.outputs[v] = self.outputs.get(v, 0.0) + v.aval.size
+        self.count: dict[Any, float] = {}
+        """Evaluations: how many elements of a value are computed in all that uses it."""
+        self.requested = [0.0] * len(nodes)
+        """Elements that are computed of all results of a node."""
+        self.candidates: list[tuple[float, int, Any]] = []
+        for k in reversed(range(len(nodes))):
+            self._count_results(k)
+        for v in self.work:
+            self._propose(v)
+
+    def best(self) -> Any:
+        """Return the value whose barrier saves most, the first of several; None if none saves enough."""
+        while self.candidates:
+            saved, _, v = heapq.heappop(self.candidates)
+            if v not in self.chosen and -saved == self._saved(v):
+                return v
+        return None
+
+    def add_barrier(self, barrier: Any) -> None:
+        """Put a barrier behind a value: what follows no longer computes it, and it is computed once."""
+        self.chosen.add(barrier)
+        changed: set[Any] = set()
+        later = _Queue(k for k, _ in self.users.get(barrier, ()))
+        while later:  # ascending, so that all operands are known
+            node = self.nodes[later.pop()]
+            amount = _own_work(node, self.work, self.chosen) if node.fused and node.results else None
+            if amount is None or amount == self.work[node.results[0]]:
+                continue
+            for v in node.results:
+                self.work[v] = amount
+                changed.add(v)
+                if v not in self.chosen:
+                    later.extend(user for user, _ in self.users.get(v, ()))
+        earlier = _Queue([-self.producer[barrier]])
+        while earlier:  # descending, so that all users are known
+            k = -earlier.pop()
+            before = self.requested[k]
+            self._count_results(k)
+            changed.update(self.nodes[k].results)
+            if self.requested[k] != before:
+                earlier.extend(-self.producer[v] for v, _ in self.nodes[k].operands if v in self.producer)
+        for v in changed:
+            self._propose(v)
+
+    def _count_results(self, k: int) -> None:
+        """Count the evaluations of the results of a node, whose users are counted."""
+        node, requested = self.nodes[k], 0.0
+        for v in node.results:
+            count = self.outputs.get(v, 0.0)
+            for user, n in reversed(self.users.get(v, ())):
+                count += self.requested[user] * n
+            self.count[v] = count
+            requested += count if node.fused and v not in self.chosen else self.size[v]
+        self.requested[k] = requested
+
+    def _saved(self, v: Any) -> float:
+        return (self.count[v] - self.size[v]) * self.work[v]
+
+    def _propose(self, v: Any) -> None:
+        """Add a value to the candidates if a barrier behind it saves enough."""
+        size = self.size[v]
+        if size >= self.least and v in self.work and (saved := self._saved(v)) > WORTH * size:
+            heapq.heappush(self.candidates, (-saved, self.order[v], v))
 
 
 def _evaluate(jaxpr: ClosedJaxpr, args: Sequence[Any], chosen: set[Any], barrier: Callable[[Any], Any]) -> list[Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.pytree import scopes
+from crazysim.pytree import scopes, sparse_leaves
 
 if TYPE_CHECKING:
     from crazysim.engine.plan import Plan
@@ -65,6 +65,8 @@ def _concatenated(arrays: list[Any]) -> Array:
 class ZerosCache:
     """Elements of shared parameters that are zero: an inertia without products, a force without a component.
 
+    These are parameters of drones and controllers, and those of plugins that are declared sparse.
+
     Values are read once for each array. Under a trace they are unknown, and no element counts as zero.
     """
 
@@ -86,13 +88,14 @@ class ZerosCache:
         return self._found
 
     def _places(self, data: SimData, leaves: list[Any]) -> list[int]:
-        key = tuple([x.ndim for x in jax.tree.leaves((data.params, data.controls))])
+        key = tuple([x.ndim for x in leaves])
         if key not in self._shared:
             ids = {id(x) for x in jax.tree.leaves((data.params, data.controls))}
+            rows = zip(jax.tree.leaves(scopes(data)), jax.tree.leaves(sparse_leaves(data)), leaves, strict=True)
             self._shared[key] = [
                 i
-                for i, (scope, x) in enumerate(zip(jax.tree.leaves(scopes(data)), leaves, strict=True))
-                if scope == "shared" and id(x) in ids and jnp.issubdtype(x.dtype, jnp.floating)
+                for i, (scope, is_sparse, x) in enumerate(rows)
+                if scope == "shared" and (is_sparse or id(x) in ids) and jnp.issubdtype(x.dtype, jnp.floating)
             ]
         return self._shared[key]
 

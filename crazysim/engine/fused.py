@@ -50,12 +50,41 @@ def build(
     """
 
     def compiled(part: Program) -> Compiled:
-        source = kernel.write(part, "cuda" if platform == "gpu" else "host")
-        return source, cuda.compiled(source, devices) if platform == "gpu" else native.compiled(source)
+        return _compiled(kernel.write(part, "cuda" if platform == "gpu" else "host"), platform, devices)
 
     run = _one_kernel(program, compiled(program)) if program.fused else _split(program, compiled)
     on_lanes = program if platform == "gpu" else passes.separate(program)
     return differentiable(on_lanes, _over_batches(program, run))
+
+
+def build_sampler(
+    program: Program, platform: str, samples: Sequence[int], devices: Sequence[jax.Device] | None = None
+) -> Callable[[list[Any], int, int], tuple[list[Any], Array, list[Any]]]:
+    """Compile a program to a kernel that takes samples, and return the function that runs it, without derivatives.
+
+    The function takes leaves, the number of steps between samples, and the number of samples. It returns the written
+    leaves, the worlds that are flagged as not finite, and the samples, with time in front.
+
+    Args:
+        program: The program, which one kernel can run.
+        platform: ``"cpu"`` or ``"gpu"``.
+        samples: Leaves to sample, of drones or worlds, which the program writes.
+        devices: As for ``build``.
+
+    Raises:
+        UnsupportedError: If an operation or type has no source.
+        KernelError: If the compiler refuses the kernel or takes too long.
+    """
+    compiled = _compiled(kernel.write(program, "cuda" if platform == "gpu" else "host", samples), platform, devices)
+
+    def run(leaves: list[Any], n_steps: int, n_samples: int) -> tuple[list[Any], Array, list[Any]]:
+        return _launch(program, compiled, leaves, jnp.asarray([n_steps, n_samples], jnp.int32), n_samples)
+
+    return run
+
+
+def _compiled(source: kernel.Kernel, platform: str, devices: Sequence[jax.Device] | None) -> Compiled:
+    return source, cuda.compiled(source, devices) if platform == "gpu" else native.compiled(source)
 
 
 def differentiable(program: Program, run: Run) -> Callable[[list[Any], int | Array], tuple[list[Any], Array]]:
@@ -161,25 +190,36 @@ def _split(program: Program, compile_part: Callable[[Program], Compiled]) -> Run
 
 
 def _call(program: Program, compiled: Compiled, leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+    written, flagged, _ = _launch(program, compiled, leaves, count.reshape(1))
+    return written, flagged
+
+
+def _launch(
+    program: Program, compiled: Compiled, leaves: list[Any], counts: Array, n_samples: int = 0
+) -> tuple[list[Any], Array, list[Any]]:
+    """Return what a kernel writes: leaves, the worlds that are flagged, and samples."""
     source, launch = compiled
     n_worlds, n_drones = lanes.batch(program, leaves)
     n_lanes = n_worlds * n_drones
+
+    def shape(i: int, *before: int) -> jax.ShapeDtypeStruct:
+        leaf = program.leaves[i]
+        of_leaf = (program.rows[i], n_lanes) if i in program.rows else (n_worlds, *leaf.shape[1:])
+        return jax.ShapeDtypeStruct((*before, *of_leaf, *([2] if jaxcompat.is_key(leaf) else [])), leaf.number)
+
+    def as_keys(i: int, x: Array) -> Array:
+        return jax.random.wrap_key_data(x) if jaxcompat.is_key(program.leaves[i]) else x
+
+    flags = [] if program.check is None else [jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)]
+    samples = [shape(i, n_samples) for i in source.samples]
     inputs = [_as_numbers(leaves[i]) for i in source.inputs]
-    like = {i: program.leaves[i] for i in source.outputs}
-    shapes = {i: (program.rows[i], n_lanes) if i in program.rows else (n_worlds, *x.shape[1:]) for i, x in like.items()}
-    outputs = [
-        jax.ShapeDtypeStruct((*shapes[i], 2) if jaxcompat.is_key(x) else shapes[i], x.number) for i, x in like.items()
-    ]
-
-    def as_keys(written: list[Array]) -> list[Array]:
-        pairs = zip(written, like.values(), strict=True)
-        return [jax.random.wrap_key_data(x) if jaxcompat.is_key(leaf) else x for x, leaf in pairs]
-
-    if program.check is None:
-        return as_keys(launch(n_lanes, count.reshape(1), inputs, outputs)), jnp.zeros((n_worlds, 1), bool)
-    flags = jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)
-    *written, flagged = launch(n_lanes, count.reshape(1), inputs, [*outputs, flags])
-    return as_keys(written), flagged if n_drones == 1 else jnp.any(flagged, axis=1, keepdims=True)
+    out = launch(n_lanes, counts, inputs, [*(shape(i) for i in source.outputs), *flags, *samples])
+    n = len(source.outputs)
+    written = [as_keys(i, x) for i, x in zip(source.outputs, out[:n], strict=True)]
+    kept = [as_keys(i, x) for i, x in zip(source.samples, out[n + len(flags) :], strict=True)]
+    if not flags:
+        return written, jnp.zeros((n_worlds, 1), bool), kept
+    return written, out[n] if n_drones == 1 else jnp.any(out[n], axis=1, keepdims=True), kept
 
 
 def _as_numbers(x: Any) -> Array:

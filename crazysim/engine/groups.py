@@ -16,7 +16,7 @@ class Group(NamedTuple):
     """Stages that run together, step by step."""
 
     population: str
-    """Population whose members the engine computes side by side; those of others are written out for each world."""
+    """Population whose members the engine computes side by side; those of others are unrolled for each world."""
     stages: tuple[Stage, ...]
     """The stages, in order."""
     owned: frozenset[int] | None

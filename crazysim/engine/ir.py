@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from crazysim.engine import ops
-from crazysim.engine.simplify import constant_key, simplify
+from crazysim.engine.simplify import constant_key, is_known_zero, simplify
 
 Element = Any
 """A ``Value``, or a NumPy scalar for a constant."""
@@ -132,7 +132,11 @@ class Builder:
         """Return the result of an operation: a new value, one that is known already, or a constant."""
         args, dtype = tuple(args), np.dtype(dtype)
         simple = simplify(name, args, dtype, params)
-        return self._add(name, args, (dtype,), params)[0] if simple is None else simple
+        if simple is not None:
+            return simple
+        if name == "sub" and is_known_zero(args[0]):  # a negative operand costs nothing in a product or a sum
+            name, args = "neg", args[1:]
+        return self._add(name, args, (dtype,), params)[0]
 
     def add_many(
         self,

@@ -12,6 +12,7 @@ from importlib import resources
 
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.exchange import exchange_for, lanes_of_block
+from crazysim.engine.ir import Block
 from crazysim.engine.program import TABLE, Phase, Program, Segment, Slot
 from crazysim.engine.source import TYPES, Writer, require, type_name
 
@@ -37,6 +38,8 @@ class Kernel:
     """Threads of a block on a GPU."""
     lanes: int = BLOCK
     """Threads of a block that are lanes: as many as make whole worlds, where drones read each other's numbers."""
+    samples: tuple[int, ...] = ()
+    """Leaves of which it also writes samples, behind all other outputs."""
 
     def aliases(self) -> dict[int, int]:
         """Return the result that each operand in place is, by number; two numbers precede the operands."""
@@ -61,8 +64,16 @@ def epilogue(target: str) -> str:
     return resources.files("crazysim.engine").joinpath("targets", "host_call.h").read_text()
 
 
-def write(program: Program, target: str) -> Kernel:
+def write(program: Program, target: str, samples: Sequence[int] = ()) -> Kernel:
     """Return the source of a program for ``cuda`` or ``host``.
+
+    A kernel takes the number of steps as an array of one number. One that writes samples takes a second number, and
+    repeats the steps that often: after each repetition it writes the sampled leaves.
+
+    Args:
+        program: The program.
+        target: ``"cuda"`` or ``"host"``.
+        samples: Leaves of drones or worlds to sample, which the program writes.
 
     Raises:
         UnsupportedError: If there is no source for an operation or a type; the error names the stage.
@@ -112,12 +123,23 @@ def write(program: Program, target: str) -> Kernel:
             [exchange.keep(writer, writer.new("h"), kind, x, depth) for kind, x in zip(kinds, outs, strict=True)]
         )
     exchange.end(writer, 1)
+    if samples:
+        writer.line("for (int sample = 0; sample < n_samples; ++sample) {", 1)
     writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
     exchange.begin(writer, 2)
     for segment, constants in zip(each, hoisted, strict=True):
         _write_segment(writer, program, segment, names, constants, 1 + depth)
     exchange.end(writer, 2)
     writer.line("}", 1)
+    if samples:
+        exchange.begin(writer, 2)
+        for leaf in samples:
+            kind, size, n_drones = _type(program, leaf), program.leaves[leaf].size, _drones(program, leaf)
+            writer.line(f"{kind}* const r{leaf} = s{leaf} + sample * (n_lanes / {n_drones} * {size}ll);", 2)
+            for k in range(size):
+                writer.line(f"STORE({size}, {n_drones}, r{leaf}, {k}, {kind}_lanes({names[leaf, k]}))", 2)
+        exchange.end(writer, 2)
+        writer.line("}", 1)
     exchange.begin(writer, 1)
     if check is not None:
         (flagged,) = writer.block(check.block, [names[slot] for slot in checked], depth)
@@ -130,15 +152,24 @@ def write(program: Program, target: str) -> Kernel:
     pointers = [f"const {_type(program, i)}* __restrict__ p{i}" for i in inputs]
     pointers += [f"{_type(program, i)}* __restrict__ q{i}" for i in outputs]
     pointers += ["b1* __restrict__ flagged"] if check is not None else []
+    pointers += [f"{_type(program, i)}* __restrict__ s{i}" for i in samples]
     threads, lanes = lanes_of_block(program.group)
     body = "\n".join(writer.lines)
     frame = _cuda(pointers, body, threads, lanes) if target == "cuda" else _host(pointers, body, exchange.depth > 0)
     widest = 8 if any(_type(program, i) == "f64" for i in (*inputs, *outputs)) else 4
     defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n#define BLOCK_THREADS {threads}\n"
+    defines += f"#define OPERATIONS {sum(_n_operations(s.block) for s in each)}\n"
+    defines += f"#define SAMPLES {'count[1]' if samples else 1}\n"
     declared = "".join(f"{line}\n" for line in (*writer.tables, *exchange.declarations))
     text = defines + preamble(target) + declared + frame + epilogue(target)
     in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
-    return Kernel(text, inputs, outputs, in_place, threads, lanes)
+    return Kernel(text, inputs, outputs, in_place, threads, lanes, tuple(samples))
+
+
+def _n_operations(block: Block) -> int:
+    """Return the number of operations of a block, with those for each of the others of a world."""
+    inner = [dict(op.params).get("n_members", 1) * sum(map(_n_operations, op.blocks)) for op in block.operations]
+    return len(block.operations) + sum(inner)
 
 
 def _require(program: Program) -> None:
@@ -277,7 +308,7 @@ def _cuda(pointers: Sequence[str], body: str, threads: int, lanes: int) -> str:
     arguments = ", ".join([*scalars, *pointers])
     return f"""
 extern "C" __global__ void __launch_bounds__({threads}, {UNBOUNDED}) advance({arguments}) {{
-  const int n_lanes = sizes[0], n_steps = count[0];
+  const int n_lanes = sizes[0], n_steps = count[0], n_samples = SAMPLES;
   const int thread = threadIdx.x % THREADS, place = threadIdx.x / THREADS * LANES + thread;
   const int wanted = blockIdx.x * {lanes} + place;
   const bool active = thread < LANES && wanted < n_lanes;
@@ -295,14 +326,15 @@ def _host(pointers: Sequence[str], body: str, in_memory: bool) -> str:
     n_in = sum(p.startswith("const") for p in pointers)
     buffers = [f"({kind}*)in[{k + 2}]->data" if k < n_in else f"({kind}*)out[{k - n_in}]->data"
                for k, kind in enumerate(kinds)]  # fmt: skip
-    call = f"n_lanes, n_steps, {', '.join(buffers)}"
+    call = f"n_lanes, n_steps, n_samples, {', '.join(buffers)}"
+    sizes = "int64_t n_lanes, int n_steps, int n_samples"
     if in_memory:
-        block = f"static void advance_world(World& w, int64_t begin, int64_t n_lanes, int n_steps, {arguments}) {{\n"
+        block = f"static void advance_world(World& w, int64_t begin, {sizes}, {arguments}) {{\n"
         each = f"""    World* const w = static_cast<World*>(std::aligned_alloc(64, (sizeof(World) + 63) / 64 * 64));
     for (int64_t first = begin; first < end; first += GROUP) advance_world(*w, first, {call});
     std::free(w);"""
     else:
-        block = f"""static void advance_block(int64_t first, int64_t n_lanes, int n_steps, {arguments}) {{
+        block = f"""static void advance_block(int64_t first, {sizes}, {arguments}) {{
   const int n_active = n_lanes - first < LANES ? int(n_lanes - first) : LANES;
   const i32v own = numbers() % GROUP;
 """
@@ -313,10 +345,11 @@ def _host(pointers: Sequence[str], body: str, in_memory: bool) -> str:
 
 static void advance(XLA_FFI_Buffer** in, XLA_FFI_Buffer** out) {{
   const int64_t n_lanes = *(int*)in[0]->data;
-  const int n_steps = *(int*)in[1]->data;
+  const int* count = (int*)in[1]->data;
+  const int n_steps = count[0], n_samples = SAMPLES;
   const auto run = [=](int64_t begin, int64_t end) {{
 {each}
   }};
-  in_parallel(n_lanes, n_steps, run);
+  in_parallel(n_lanes, int64_t(n_steps) * n_samples, run);
 }}
 """

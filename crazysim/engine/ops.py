@@ -225,7 +225,8 @@ where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)``
 ``while(*carry)`` runs its second block as long as its first is true. ``custom_jvp(*args, slope=)`` runs its block, and
 has a derivative of its own. ``over_others(*published, reduce=, n_members=)`` runs its block for each drone of the
 world: the block's inputs are what that drone published, and whether it is the drone itself; ``reduce`` names the
-operation that combines its outputs. It stands in no inner block. ``threefry2x32`` is the cipher of JAX's random numbers.
+operation that combines its outputs. It stands in no inner block. ``threefry2x32`` is the cipher of JAX's random
+numbers.
 ``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=, aligned=)`` the entry at the sum of an
 int32, which is a multiple of four if that is aligned, and a constant; whoever makes one ensures that there is one.
 

@@ -36,10 +36,15 @@ def known_zero(dtype: Any) -> np.generic | None:
     return None if kind is None else kind(0)
 
 
+def is_known_zero(x: Element) -> bool:
+    """Return True for a parameter that is zero."""
+    return isinstance(x, KnownZero32 | KnownZero64)
+
+
 def simplify(name: str, args: tuple[Element, ...], dtype: np.dtype, params: tuple) -> Element | None:
     """Return the element that an operation reduces to without being computed at run time, or None."""
     n_known = sum([isinstance(x, np.generic) for x in args])
-    if n_known and dtype.kind == "f" and any([isinstance(x, KnownZero32 | KnownZero64) for x in args]):
+    if n_known and dtype.kind == "f" and any(map(is_known_zero, args)):
         simple = _without_zero_terms(name, args, dtype)
         if simple is not None:
             return simple
@@ -72,7 +77,7 @@ def simplify(name: str, args: tuple[Element, ...], dtype: np.dtype, params: tupl
 
 def _without_zero_terms(name: str, args: tuple[Element, ...], dtype: np.dtype) -> Element | None:
     """Return what is left of an operation when a zero of a shared parameter takes its term with it."""
-    zeros = [isinstance(x, KnownZero32 | KnownZero64) for x in args]
+    zeros = [is_known_zero(x) for x in args]
     match name:
         case "mul" | "neg" | "convert_element_type":
             return known_zero(dtype)

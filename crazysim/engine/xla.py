@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from crazysim.core.others import largest, smallest
 from crazysim.engine import jaxcompat, ops
 from crazysim.engine.ir import Block, Element, Operation, Value
 
@@ -178,8 +179,8 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
 
 REDUCE: dict[str, Callable[..., Array]] = {
     "add": jnp.sum,
-    "min": jnp.min,
-    "max": jnp.max,
+    "min": smallest,
+    "max": largest,
     "or": jnp.any,
     "and": jnp.all,
 }

@@ -8,6 +8,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.control import COMMAND_FIELDS, Control
+from crazysim.core.airframes import Airframes, as_airframes
 from crazysim.core.data import SimParams
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles, fitted
@@ -44,22 +45,22 @@ class Actions:
     """
 
     def __init__(self, centre: np.ndarray, scale: np.ndarray, control: Control):
-        """Take the map, in the units of the command level. (k,) each
+        """Take the map, in the units of the command level. (k,) each, or (n_drones, k) where drones differ
 
         Raises:
-            ConfigError: If the two do not have the same shape (k,).
+            ConfigError: If the two do not have the same shape.
         """
         self.centre, self.scale, self.control = np.asarray(centre, float), np.asarray(scale, float), control
-        if self.centre.shape != self.scale.shape or self.centre.ndim != 1:
+        if self.centre.shape != self.scale.shape or self.centre.ndim not in (1, 2):
             raise ConfigError(
-                f"expected centre and scale of actions of one shape (k,), got {self.centre.shape} and "
-                f"{self.scale.shape}"
+                f"expected centre and scale of actions of one shape, (k,) or (n_drones, k), got {self.centre.shape} "
+                f"and {self.scale.shape}"
             )
 
     @property
     def size(self) -> int:
         """Size of an action."""
-        return len(self.centre)
+        return self.centre.shape[-1]
 
     def command(self, action: Array) -> Array:
         """Return the command of an action, in the units of the command level. (..., k) -> (..., n)"""
@@ -77,16 +78,26 @@ class Actions:
         return f"{self.control.value} ({what}): {self.centre - self.scale} to {self.centre + self.scale}"
 
 
-def actions_of(airframe: Airframe, params: SimParams, control: Control, tilt: float = TILT) -> Actions:
+def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: float = TILT) -> Actions:
     """Return the usual map of a command level; see ``Actions``.
 
     Args:
-        airframe: Airframe, for the limits of the rotors.
-        params: Parameters, for the hover command; where each drone has its own, those of the first are used.
+        airframe: Airframe of all drones, or of each, for the limits of the rotors.
+        params: Parameters, for the hover command; where drones of one airframe have their own, those of the first are
+            used.
         control: Command level.
         tilt: Largest roll and pitch of the attitude level, rad.
     """
-    params = jax.tree.map(lambda scope, x: x[0, 0] if scope == "drone" else x, scopes(params), params)
+    airframes = as_airframes(airframe)
+    if all(other is airframes[0] for other in airframes):
+        return _of_drone(airframes[0], params, control, tilt, 0)
+    each = [_of_drone(one, params, control, tilt, k) for k, one in enumerate(airframes)]
+    return Actions(np.stack([one.centre for one in each]), np.stack([one.scale for one in each]), control)
+
+
+def _of_drone(airframe: Airframe, params: SimParams, control: Control, tilt: float, drone: int) -> Actions:
+    """Return the map of one drone of the first world."""
+    params = jax.tree.map(lambda scope, x: x[0, drone] if scope == "drone" else x, scopes(params), params)
     n_rotors = airframe.n_rotors
     each = float(airframe.value("rotors.thrust_max", ()))
     hover = float(hover_thrust(params)[0])

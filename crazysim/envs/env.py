@@ -169,7 +169,7 @@ class DroneEnv(Env):
                 f"{freq} Hz: some actions would never reach the controller. Use a divisor."
             )
         self._sim, self._task, self.freq = sim, task, freq
-        self._actions = actions_of(sim.airframe, sim.data.params, sim.control) if actions is None else actions
+        self._actions = actions_of(sim.airframes, sim.data.params, sim.control) if actions is None else actions
         check_task(task, sim.default_data, self._actions.size)
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)

@@ -74,7 +74,7 @@ class BrowserScene:
         self._label = scene.add_label("/world/selected/name", "", position=(0, 0, MARK_RADIUS), anchor="bottom-center")
         self._wind = None
         self._trail = Trails(scene, drones, colors, trail) if trail > 0 else None
-        self.visible = dict.fromkeys(("trails", "setpoints", "contacts", "wind"), True)
+        self.visible: dict[str, bool] = dict.fromkeys(("trails", "setpoints", "contacts", "wind"), True)
 
     def update(self, picture: Picture, follow: bool) -> None:
         """Show a picture.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +75,7 @@ class Interaction:
         if found is None or not np.isfinite(value):
             raise ConfigError(f"expected a slider of {list(self.values)} and a finite value, got {name!r}, {value!r}")
         self.values[name] = float(np.clip(value, found.low, found.high))
-        found.call(self, self.values[name])  # type: ignore[arg-type]
+        found.call(cast("Live", self), self.values[name])
 
     @property
     def control_lines(self) -> tuple[str, ...]:

@@ -183,8 +183,8 @@ class Live(Interaction, Closing):
             raise ConfigError(f"expected a function of the loop, got {process!r}")
         if on_error not in ("raise", "report"):
             raise ConfigError(f"expected on_error 'raise' or 'report', got {on_error!r}")
-        name = name or getattr(process, "__name__", type(process).__name__)
-        self._processes.append(Process(name, process, period_of(freq, self.control_freq, name), on_error))
+        label = str(name or getattr(process, "__name__", type(process).__name__))
+        self._processes.append(Process(label, process, period_of(freq, self.control_freq, label), on_error))
         return self._processes[-1]
 
     def at(self, time: float, call: Callable[[Live], Any], name: str | None = None) -> None:

@@ -114,7 +114,8 @@ class Pace:
             speed: Simulated seconds per second, or ``"max"``.
             clock: Returns the time, s.
         """
-        self._dt, self._speed, self._clock = dt, check_speed(speed), clock
+        self._dt, self._clock = dt, clock
+        self._speed: Speed = check_speed(speed)
         self._counts = np.zeros(N_BINS, np.int64)
         self.steps = self.late = 0
         self.worst = self.worst_at = self.lost = 0.0
@@ -155,7 +156,7 @@ class Pace:
         if lateness > MAX_LAG:
             self.lost += lateness
             self.restart()
-        self._due += self._dt / self._speed
+        self._due += self._dt / float(self._speed)
         return lateness
 
     def quantile(self, part: float) -> float:

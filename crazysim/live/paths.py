@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_right
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -39,17 +42,24 @@ class Path(NamedTuple):
 
     def derivatives(self, t: float, n: int) -> NDArray:
         """Return position and yaw and their first n derivatives at a time since the start, s. (n + 1, 4)"""
-        inside = t >= 0 and (self.repeats or t <= self.ends[-1])
-        t = t % self.ends[-1] if self.repeats and t > 0 else min(max(t, 0.0), float(self.ends[-1]))
-        k = min(int(np.searchsorted(self.ends, t, side="right")), len(self.ends) - 1)
+        last = float(self.ends[-1])
+        inside = t >= 0 and (self.repeats or t <= last)
+        t = t % last if self.repeats and t > 0 else min(max(t, 0.0), last)
+        k = min(bisect_right(self.ends, t), len(self.ends) - 1)  # type: ignore[arg-type]
         begin = float(self.ends[k - 1]) if k else 0.0
         length = float(self.ends[k]) - begin
-        u, c, scale = (t - begin) / length if length > 0 else 1.0, self.coefficients[k], 1.0
-        found = [(c * u ** np.arange(c.shape[1])).sum(-1)]
-        for _ in range(n):
-            c, scale = c[:, 1:] * np.arange(1, c.shape[1]), scale / length if length > 0 else 0.0
-            found.append((c * u ** np.arange(c.shape[1])).sum(-1) * scale if inside else np.zeros(4))
-        return np.stack(found)
+        u, rate = ((t - begin) / length, 1 / length) if length > 0 else (1.0, 0.0)
+        factors, exponents, orders = _powers(n, self.coefficients.shape[2])
+        scale = (rate if inside else 0.0) ** orders
+        return (factors * u**exponents * scale[:, None]) @ self.coefficients[k].T
+
+
+@lru_cache
+def _powers(n: int, size: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Return factors and exponents of the terms of a polynomial's derivatives, (n + 1, size) each, and their orders."""
+    orders, powers = np.arange(n + 1), np.arange(size)
+    factors = np.array([[math.perm(k, j) for k in range(size)] for j in range(n + 1)], float)
+    return factors, np.maximum(powers - orders[:, None], 0), orders
 
 
 def paths_of(trajectories: Trajectory | Sequence[Trajectory]) -> list[Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from crazysim.core.stage import over_drones, over_worlds
 from crazysim.effects.wind import WindData
 from crazysim.effects.wind_field import WindFieldData
 from crazysim.media.poses import mocap_poses
+from crazysim.pytree import has_members, scopes
 from crazysim.sim.sim import Sim
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ class PictureSource:
         values = np.zeros(0)
         if plot and live.selected is not None:
             own = live.quantities.get(plot)
-            values = quantity(data, plot)(*live.selected) if own is None else np.ravel(np.asarray(own(live), float))
+            values = quantity(data, plot, *live.selected) if own is None else np.ravel(np.asarray(own(live), float))
         name = "" if live.selected is None else sim.drone_names[live.selected[1]]
         return Picture(
             worlds,
@@ -121,26 +122,41 @@ def _air(data: SimData) -> jax.Array:
 
 
 def quantities(sim: Sim) -> list[str]:
-    """Return the paths of all arrays of the data that have values for every drone, such as ``states.vel``."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(sim.data)
-    size = (sim.n_worlds, sim.n_drones)
-    return [_path(path) for path, x in leaves if np.ndim(x) >= 3 and np.shape(x)[:2] == size and x.dtype.kind in "fiub"]
+    """Return the paths of everything in the data that changes: ``states.vel`` of drones, ``plugins.cars.pos[1]``."""
+    found = []
+    for path, scope, x in _leaves(sim.data):
+        if scope in ("drone", "world"):
+            found.append(path)
+        elif has_members(scope) and scope not in ("shared", "opaque", "batched"):
+            found += [f"{path}[{k}]" for k in range(x.shape[1])]
+    return found
 
 
-def quantity(data: Any, path: str) -> Callable[[int, int], NDArray]:
-    """Return a function from world and drone to the values of an array of the data.
+def quantity(data: SimData, path: str, world: int, drone: int) -> NDArray:
+    """Return the present values of a quantity. (k,)
 
     Args:
         data: Data of a simulation.
         path: One of ``quantities``.
+        world: Index of the world.
+        drone: Index of the drone, for quantities of drones.
 
     Raises:
-        KeyError: If there is no such array.
+        KeyError: If there is no such quantity.
     """
-    for found, x in jax.tree_util.tree_flatten_with_path(data)[0]:
-        if _path(found) == path:
-            return lambda world, drone: np.asarray(x)[world, drone].ravel().astype(float)
+    wanted, _, member = path.rstrip("]").partition("[")
+    for found, scope, x in _leaves(data):
+        if found == wanted:
+            index = (world,) if scope == "world" else (world, int(member) if member else drone)
+            return np.asarray(x)[index].ravel().astype(float)
     raise KeyError(path)
+
+
+def _leaves(data: SimData) -> list[tuple[str, str, jax.Array]]:
+    """Return path, scope and value of every leaf that holds numbers."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(data)
+    named = zip(leaves, jax.tree.leaves(scopes(data)), strict=True)
+    return [(_path(path), scope, x) for (path, x), scope in named if getattr(x.dtype, "kind", "O") in "fiub"]
 
 
 def _path(path: Any) -> str:

@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 
 class Radio(Closing):
-    """Link to a real Crazyflie; a ``Link``.
+    """Link to a real Crazyflie that stands on the ground; a ``Link``.
 
     | Level | Packet of cflib | |
     | --- | --- | --- |
@@ -112,6 +112,7 @@ class Radio(Closing):
             self.close()
             raise ConfigError(f"expected log variables of {uri} within {timeout:g} s, got none. Use a newer firmware.")
         self._cf.supervisor.send_arming_request(True)
+        self._cf.commander.send_setpoint(0, 0, 0, 0)  # crtp_commander_rpyt.c ignores thrust until it was zero once
 
     def state(self) -> DroneState:
         """Return the latest state that the drone has sent; its time is that of the drone.

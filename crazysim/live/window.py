@@ -167,6 +167,7 @@ class Window(Viewer):
             elif kind == "click":
                 live.post(lambda live, where=values: live.click(where[0], np.array(where[1])))
         process.stdout.close()
+        process.wait()
         live.keyboard.release_all()
         ready.set()
 

@@ -99,7 +99,8 @@ class Flight:
         if not path.parent.is_dir():
             raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
         arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shapes"}
-        np.savez_compressed(path, format=FORMAT, **arrays, **shape_arrays(self.shapes))
+        arrays |= shape_arrays(self.shapes)
+        np.savez_compressed(path, format=FORMAT, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Flight:

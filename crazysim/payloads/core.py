@@ -48,7 +48,7 @@ class LoadData(Exposed):
     """Mass of the load, kg; zero for none. (1,)"""
     length: Array = leaf("parameter", 1, (1,))
     """Length of rod or cable, m. (1,)"""
-    attach: Array | None = leaf("parameter", 1, (3,))
+    attach: Array | None = leaf("parameter", 1, (3,), sparse=True)
     """Attachment on the drone, from its centre of mass, body frame, m; None for the centre of mass. (3,)"""
     damping: Array | None = leaf("parameter", 1, (1,))
     """Viscous torque of the joint over the angular velocity, N m s; None for none. (1,)"""

@@ -22,7 +22,7 @@ from jax import Array, lax
 
 from crazysim import rotation
 from crazysim.core.data import SimState, SimStateDeriv
-from crazysim.rotation import cross, dot, matvec
+from crazysim.rotation import add_cross, cross, dot, matvec
 
 TINY = 1e-12
 """Summand of denominators that vanish where both mass and damping are zero, kg."""
@@ -82,7 +82,7 @@ def relative(s: SimState, pos: Array, vel: Array, attach: Array | None) -> Relat
     offset, rel_vel = pos - s.pos, vel - s.vel
     if attach is not None:
         arm = matvec(rot, attach)
-        offset, rel_vel = offset - arm, rel_vel - matvec(rot, cross(s.ang_vel, attach))
+        offset, rel_vel = offset - arm, matvec(rot, -cross(s.ang_vel, attach), rel_vel)
     square = dot(offset, offset)
     inverse = lax.rsqrt(square + CLOSE)
     return Relative(rot, arm, offset, square * inverse, offset * inverse, rel_vel)
@@ -150,8 +150,7 @@ def couple(
     r, m = relative(s, pos, vel, link.attach), link.mass
     out = dot(r.direction, r.vel)
     attach_acc = acceleration_at(s, deriv, r.rot, link.attach, 1.0 if dt is None else 0.5)
-    damped = None if link.damping is None else _damping(s, r, link, freq)
-    rel_acc = free_acc - attach_acc if damped is None else free_acc + damped - attach_acc
+    rel_acc = free_acc - attach_acc
 
     first = Pull.create(r.direction, r.rot, J_inv, link.attach)
     # Of equal directions: their product is 1 but for rounding.
@@ -172,25 +171,37 @@ def couple(
         tensions = [jnp.maximum(tension, 0.0) if link.is_cable else tension]
     if link.holds is not None:
         tensions = [jnp.where(link.holds, t, 0.0) for t in tensions]
-
+    damping = None
+    if link.damping is not None:  # it pulls against the swing across the link
+        rate, swing = _damping(link, freq), _swing(s, r)[1]
+        damping = rate * swing
+        tensions[0] = tensions[0] - rate * out
     parts = [t * p.direction for t, p in zip(tensions, pulls, strict=True)]
     pull = sum(parts[1:], parts[0])
-    torques = [t * p.turn for t, p in zip(tensions, pulls, strict=True) if p.turn is not None]
-    if damped is not None:
-        damped = damped if link.holds is None else jnp.where(link.holds, damped, 0.0)
-        pull = pull - damped
-        arm = r.offset if r.arm is None else r.arm + r.offset
-        torques.append(matvec(J_inv, -to_body(r.rot, cross(arm, damped))))
-    acc, tip_acc = m / mass * pull, free_acc - pull
-    turned = deriv
-    if torques:
-        ang_acc = m * sum(torques[1:], torques[0])
-        turned = deriv.replace(ang_acc=deriv.ang_acc + ang_acc)
-        turned = turned if dt is None else turned.replace(ang_vel=deriv.ang_vel + dt * ang_acc)
-    after = turned.replace(acc=deriv.acc + acc)
-    after = after if dt is None else after.replace(vel=deriv.vel + dt * acc)
+    # Constants are multiplied first: what no step changes is then computed once, and the rest are multiply-adds.
+    share, turned = m / mass, deriv
+    if damping is not None:
+        pull = pull + damping
+        # All that pulls at the tip turns the body as if it were part of it: along the link no force has another lever.
+        torque = to_body(r.rot, cross(pos - s.pos, pull))
+        turned = _turned(deriv, m * J_inv, torque, dt)
+    elif any(p.turn is not None for p in pulls):
+        turns = [m * t * p.turn for t, p in zip(tensions, pulls, strict=True) if p.turn is not None]
+        turned = _turned(deriv, None, sum(turns[1:], turns[0]), dt)
+    tip_acc = free_acc - pull
+    after = turned.replace(acc=deriv.acc + share * pull)
+    after = after if dt is None else after.replace(vel=deriv.vel + dt * share * pull)
     rate = _tip_rate(s, deriv, r, link, vel, tip_acc, attach_acc, dt, freq)
     return Linked(after, rate, tip_acc)
+
+
+def _turned(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float | None) -> SimStateDeriv:
+    """Return a derivative with the angular acceleration ``factor @ torque`` added, and its share in the velocity."""
+    if factor is None:
+        turned = deriv.replace(ang_acc=deriv.ang_acc + torque)
+        return turned if dt is None else turned.replace(ang_vel=deriv.ang_vel + dt * torque)
+    turned = deriv.replace(ang_acc=matvec(factor, torque, deriv.ang_acc))
+    return turned if dt is None else turned.replace(ang_vel=matvec(dt * factor, torque, deriv.ang_vel))
 
 
 def to_body(rot: Array, vector: Array) -> Array:
@@ -202,21 +213,24 @@ def acceleration_at(s: SimState, deriv: SimStateDeriv, rot: Array, point: Array 
     """Return the acceleration of a point of the body, with a share of its centripetal part, m/s^2. (3,)"""
     if point is None:
         return deriv.acc
-    centripetal = share * cross(s.ang_vel, cross(s.ang_vel, point))
-    return matvec(rot, centripetal + cross(deriv.ang_acc, point), deriv.acc)
+    centripetal = cross(s.ang_vel, share * cross(s.ang_vel, point))
+    return matvec(rot, add_cross(centripetal, deriv.ang_acc, point), deriv.acc)
 
 
 def _swing(s: SimState, r: Relative) -> tuple[Array, Array]:
     """Return the body's angular velocity, world frame, and the velocity of the tip relative to the turning body."""
     ang_vel = matvec(r.rot, s.ang_vel)
-    return ang_vel, r.vel - cross(ang_vel, r.offset)
+    return ang_vel, add_cross(r.vel, r.offset, ang_vel)
 
 
-def _damping(s: SimState, r: Relative, link: Link, freq: int) -> Array:
-    """Return the acceleration of the tip by the damped joint; implicit in time, so that it cannot reverse a motion."""
-    swing = _swing(s, r)[1]
+def _damping(link: Link, freq: int) -> Array:
+    """Return the deceleration of the tip by the damped joint over its speed of swing, 1/s. (1,)
+
+    It is implicit in time, so that it cannot reverse a motion.
+    """
     stiff = link.damping / (link.length * link.length)  # type: ignore[operator]
-    return -stiff / (link.mass + stiff / freq + TINY) * (swing - dot(r.direction, swing) * r.direction)
+    rate = stiff / (link.mass + stiff / freq + TINY)
+    return rate if link.holds is None else jnp.where(link.holds, rate, 0.0)
 
 
 def _radial(r: Relative, out: Array, free: Array, link: Link, dt: float | None, freq: int) -> Array:
@@ -262,22 +276,24 @@ def _tip_rate(
     dt: float | None, freq: int,
 ) -> Array:  # fmt: skip
     """Return the rate of the tip's position, which removes errors in length, m/s. (3,)"""
-    stretch = r.distance - link.length
+    holds, stretch = link.holds, r.distance - link.length
     if link.is_cable:
         stretch = jnp.where(stretch > -BAND * link.length, stretch, 0.0)
-    error = stretch * r.direction
+    share = freq if dt is not None else PULL * freq
+    share = share if holds is None else jnp.where(holds, share, 0.0)
+    rate = vel if dt is None else vel + dt * tip_acc  # as the integrator has it: computed once
+    rate = rate - share * stretch * r.direction
     if link.is_hinge:
-        error = error + dot(r.rot[..., 1], r.offset) * r.rot[..., 1]
+        rate = rate - share * dot(r.rot[..., 1], r.offset) * r.rot[..., 1]
     if dt is None:
-        away = PULL * freq * error
-        return vel - (away if link.holds is None else jnp.where(link.holds, away, 0.0))
+        return rate
     # ``deriv.vel`` moves the body; the tip moves with its new velocity relative to that.
-    away = dt * attach_acc + freq * error
-    if deriv.vel is not s.vel:
-        away = away - (deriv.vel - s.vel)
+    carried = attach_acc
+    if deriv.vel is not s.vel:  # it is the new velocity of the body
+        carried = carried - deriv.acc
         if link.attach is not None:
-            away = away - matvec(r.rot, cross(deriv.ang_vel - s.ang_vel, link.attach))
-    return vel + dt * tip_acc - (away if link.holds is None else jnp.where(link.holds, away, 0.0))
+            carried = carried - matvec(r.rot, cross(deriv.ang_acc, link.attach))
+    return rate - (dt if holds is None else jnp.where(holds, dt, 0.0)) * carried
 
 
 def end_relative_motion(

@@ -15,7 +15,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter,
 from crazysim.core.stage import Stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.effects.core import require_rotors, zeros
-from crazysim.effects.downwash import AIR_DENSITY, collective_thrust, jet, stream_diameter
+from crazysim.effects.downwash import AIR_DENSITY, collective_thrust, jet, mean_rotor_vel, stream_diameter
 from crazysim.effects.grid import LARGEST_FUSED, interpolate, is_inside
 from crazysim.errors import ConfigError
 from crazysim.payloads.body import Colliding
@@ -176,7 +176,7 @@ def pressed(data: SimData, record: RotorJetData, drone: int | None, pos: Array, 
         vel: Velocity of the loads, world frame, m/s. (..., 3)
     """
     s = data.states
-    of_one = (s.pos, s.quat, s.rotor_vel, collective_thrust(data), record.diameter, record.air_density)
+    of_one = (s.pos, s.quat, mean_rotor_vel(data), collective_thrust(data), record.diameter, record.air_density)
     if drone is not None:
         of_one = tuple(x if x.ndim == 1 else x[drone] for x in of_one)
     # An axis for the panels.
@@ -193,7 +193,7 @@ def pressed(data: SimData, record: RotorJetData, drone: int | None, pos: Array, 
     if record.speeds is None:
         axis = rotation.z_axis(quat)
         return momentum(-jet(offset, axis, thrust, diameter, density) * axis)
-    speed = jnp.mean(rotor_vel, axis=-1, keepdims=True) * RPM_TO_RAD_S
+    speed = rotor_vel * RPM_TO_RAD_S
     share, place = between(speed, record.speeds)
     cell = (rotation.rotate_inverse(quat, offset) - record.origin) / record.spacing
     shape = record.velocity.shape if record.pressure is None else record.pressure.shape

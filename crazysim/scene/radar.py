@@ -114,7 +114,7 @@ class Radar(Plugin):
         """Draw the lobes."""
         if not self.visible:
             return
-        detected = np.asarray(self.detects(sim.data)[world]).any(axis=0)
+        detected = np.any(np.asarray(self.detects(sim.data)[world]), axis=0).reshape(-1)
         record = self.read(sim.data)
         for k, pos in enumerate(np.asarray(record.pos, np.float64)):
             shape = (float(x[k]) for x in (record.size, record.exponent, record.height_scale, record.tilt))

@@ -233,18 +233,19 @@ def _smallest(gaps: list[Array], pos: Array) -> Array:
 def _to_others(own: Own, drone_rot: Array | None) -> Array:
     """Return the distance of one drone to the nearest other of its world, m. ()"""
 
-    def between(other: tuple[list[Array], Array | None], is_self: Array) -> Array:
-        places, rot = other
+    def between(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
+        places, theirs, rot = other
         inverse = None if rot is None else rot.T
         turned = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
         gaps = []
-        for mine, at in own:
-            for (geom, _), there in zip(own, places, strict=True):
+        for mine, at, has in own:
+            for (geom, *_), there, other_has in zip(own, places, theirs, strict=True):
                 inside = at - there if inverse is None else rotation.matvec(inverse, at - there)
-                gaps.append(distance(mine.shape, geom.shape, inside, turned))
+                both = None if has is None or other_has is None else has & other_has
+                gaps.append(_of(both, distance(mine.shape, geom.shape, inside, turned)))
         return jnp.where(is_self, jnp.inf, _smallest(gaps, own[0][1]))
 
-    return reduce_over_others(between, ([at for _, at in own], drone_rot), "min")
+    return reduce_over_others(between, ([at for _, at, _ in own], [has for *_, has in own], drone_rot), "min")
 
 
 def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:
@@ -261,7 +262,9 @@ def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:
         for mine, at, has in own:
             here = jnp.take(at, chunk, axis=-2)[..., :, None, :]
             for geom, other, other_has in own:
-                both = None if has is None else jnp.take(has, chunk, axis=-1)[..., :, None] & other_has[..., None, :]
+                both = None
+                if has is not None and other_has is not None:
+                    both = jnp.take(has, chunk, axis=-1)[..., :, None] & other_has[..., None, :]
                 offset = here - other[..., None, :, :]
                 if drone_rot is None:
                     gaps.append(_of(both, distance(mine.shape, geom.shape, offset, jnp.eye(3))))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
 from crazysim.dynamics import first_principles
+from crazysim.engine.samples import compile_sampler
 from crazysim.errors import ConfigError
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Follow, Trajectory
@@ -78,16 +79,17 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
     n = max(int(np.ceil(end * rate - 1e-6)), 1)
     times = np.arange(n + 1) / rate
 
-    fly_chunk = _compiled(sim, sim.freq // rate)
+    fly_chunk = compile_sampler(sim.step_fn, sim.data, _pose, CHUNK, sim.freq // rate)
     jax.block_until_ready(_planned(show.trajectories, jnp.asarray(times)))  # compiles
     show.lights.colors(times)
     begin = time.perf_counter()
-    states = [np.asarray(x) for x in (sim.data.states.pos, sim.data.states.quat)]
-    recorded = [states]
+    data = sim.data
+    recorded = [[np.asarray(x)[None, 0] for x in _pose(data)]]
     chunks = range(0, n, CHUNK)
     for _ in chunks if progress is None else progress(chunks, "flying"):
-        sim.data, kept = fly_chunk(sim.data)
-        recorded.append([np.asarray(x)[:, 0] for x in kept])
+        data, samples = fly_chunk(data)
+        recorded.append([np.asarray(x)[:, 0] for x in samples])
+    sim.data = data
     pos, quat = (np.concatenate(parts)[: n + 1] for parts in zip(*recorded, strict=True))
     planned = np.asarray(_planned(show.trajectories, jnp.asarray(times)))
     colors = show.lights.colors(times)
@@ -129,19 +131,13 @@ def _rate(freq: int, seconds: float, n_drones: int) -> int:
     )
 
 
-def _compiled(sim: Sim, n_steps: int) -> Callable[[SimData], tuple[SimData, tuple[Array, Array]]]:
-    """Return a compiled function that flies ``CHUNK`` samples of some steps each, and returns data, pos and quat."""
-    step = sim.build_step_fn()
-
-    def sample(data: SimData, _: None) -> tuple[SimData, tuple[Array, Array]]:
-        data = step(data, n_steps)
-        return data, (data.states.pos, data.states.quat)
-
-    return jax.jit(lambda data: jax.lax.scan(sample, data, length=CHUNK)).lower(sim.data).compile()
+def _pose(data: SimData) -> tuple[Array, Array]:
+    """Return positions and attitudes of the drones."""
+    return data.states.pos, data.states.quat
 
 
 @jax.jit
 def _planned(trajectories: Trajectory, times: Array) -> Array:
     """Return planned positions, m. (n, n_drones, 3)"""
-    of_all = jax.vmap(lambda trajectory, t: trajectory.evaluate(t).pos, in_axes=(0, None))
+    of_all = jax.vmap(lambda trajectory, t: trajectory.derivatives(t, 0)[0][:3], in_axes=(0, None))
     return jax.vmap(of_all, in_axes=(None, 0))(trajectories, times)

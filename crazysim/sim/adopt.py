@@ -21,8 +21,13 @@ if TYPE_CHECKING:
 Kind = Any
 """An airframe, or a subclass of ``Population``."""
 
-KINDS: dict[str, Kind] = {"Crazyflie": "crazyflie", "Bumblebee": "bumblebee"}
-"""Airframe or population by the prefix of names."""
+
+def known_kinds() -> dict[str, Kind]:
+    """Return the built-in airframes and populations by the prefix of names."""
+    from crazysim.vehicles import Bicycles, Cars  # imported where a file is adopted
+
+    return {"Crazyflie": "crazyflie", "Bumblebee": "bumblebee", Cars.prefix: Cars, Bicycles.prefix: Bicycles}
+
 
 NAME = re.compile(r"([A-Za-z][A-Za-z0-9]*)_(\d+)")
 """Names of vehicles: prefix and number."""
@@ -46,7 +51,7 @@ def adopt(
 ) -> Sim:
     """Return a simulation with the vehicles of an MJCF; see ``Sim.from_mjcf``."""
     spec = read_spec(xml_path)
-    vehicles = take_vehicles(spec, KINDS | dict(kinds or {}))
+    vehicles = take_vehicles(spec, known_kinds() | dict(kinds or {}))
     drones = [v for v in vehicles if not _is_population(v.kind)]
     if not drones:
         raise ConfigError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax
 from jax.sharding import Mesh
@@ -32,7 +32,7 @@ def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: i
         ConfigError: If an airframe is invalid, or a list has another length than there are drones.
     """
     if not _is_list(drone):
-        return (load_airframe(drone),) * n_drones
+        return (load_airframe(drone),) * n_drones  # type: ignore[arg-type]
     if len(drone) != n_drones:
         raise ConfigError(
             f"expected {n_drones} airframes, one for each drone, got {len(drone)}. Use Sim(n_drones={len(drone)}), or "
@@ -45,7 +45,7 @@ def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: i
     return tuple([loaded[str(source) if isinstance(source, (str, Path)) else id(source)] for source in drone])
 
 
-def _is_list(drone: Any) -> bool:
+def _is_list(drone: Any) -> TypeGuard[Sequence[AirframeSource]]:
     return isinstance(drone, Sequence) and not isinstance(drone, str)
 
 

@@ -38,7 +38,7 @@ class Member:
         Raises:
             AttributeError: If there is no such field.
         """
-        value = None if field.startswith("_") else getattr(self._record(), field, None)
+        value: Any = None if field.startswith("_") else getattr(self._record(), field, None)
         if np.ndim(value) < 2:
             raise AttributeError(f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}.")
         return value[:, self.index]
@@ -121,7 +121,7 @@ class Member:
     def _fields(self) -> list[str]:
         record = self._record()
         shared = ("population", "n_members", "member_id")
-        return [name for name in vars(record) if name not in shared and np.ndim(getattr(record, name, None)) >= 2]
+        return [name for name, x in vars(record).items() if name not in shared and getattr(x, "ndim", 0) >= 2]
 
     def __repr__(self) -> str:
         """Return name, population and index."""

@@ -167,8 +167,8 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         Args:
             xml_path: MJCF file.
             n_worlds: Number of worlds.
-            kinds: Airframes, or subclasses of ``Population``, by further prefixes; ``crazysim.sim.adopt.KINDS`` has
-                those that are known.
+            kinds: Airframes, or subclasses of ``Population``, by further prefixes; ``crazysim.sim.adopt.known_kinds``
+                returns those that are known.
             **settings: Further arguments of ``Sim``.
 
         Raises:

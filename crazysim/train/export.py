@@ -45,6 +45,11 @@ OPSET, IR_VERSION = 17, 8
 def describe(env: Env) -> dict[str, Any]:
     """Return the description of a policy's inputs and outputs that ``to_onnx`` and ``to_c`` require."""
     shapes = jax.eval_shape(env.reset, jax.random.key(0)).obs
+    if env.actions.centre.ndim > 1:
+        raise ConfigError(
+            "expected an environment whose drones have the same actions, got drones of several airframes. Describe "
+            "one with a single airframe for each of them."
+        )
     return {
         "crazysim": crazysim.__version__,
         "observations": {name: shapes[name].shape[-1] for name in sorted(shapes)},

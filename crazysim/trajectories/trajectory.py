@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -97,7 +98,7 @@ class Trajectory(PyTree):
         Args:
             t: Time since the start of the trajectory, s. ()
         """
-        return jax.tree.map(lambda x: jnp.asarray(x)[None], self).evaluate_one(0, t)
+        return _setpoint(self.derivatives(t, N_DERIVATIVES))
 
     def evaluate_one(self, index: Any, t: Any) -> Setpoint:
         """Return the setpoint of one of several trajectories at one time, with derivatives up to snap.
@@ -123,16 +124,10 @@ class Trajectory(PyTree):
         """
         ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
         end, repeats = _at(ends, index, ends.shape[1] - 1), _at(jnp.asarray(self.repeats), index)
-        t = jnp.asarray(t, ends.dtype)
-        local = jnp.where(t < 0, 0.0, t)
-        # A remainder by floor, which is a vector instruction where that of lax.rem is a call for each number.
-        local = local - jnp.where(repeats, end * lax.floor(local / end), 0.0)
-        local = jnp.where(local > end, end, jnp.where(local < 0, 0.0, local))
-        inside = (t >= 0) & (repeats | (t <= end))
+        local, inside = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
         piece = _piece(ends, index, local)
         start = jnp.where(piece > 0, _at(ends, index, piece - 1), 0.0)
-        length = _at(ends, index, piece) - start
-        inverse = 1 / jnp.where(length > 0, length, 1.0)  # padding has no length
+        inverse = _inverse(jnp, _at(ends, index, piece) - start)
         u, of_piece = (local - start) * inverse, _at(coefficients, index, piece)
         degrees = [self.degree] * 4 if degrees is None else degrees
         rows: dict[int, list[Array]] = {}
@@ -141,14 +136,28 @@ class Trajectory(PyTree):
             derivatives = _derivatives(of_piece[np.array(axes), : degree + 1], u, N_DERIVATIVES)
             rows.update((axis, [x[k] for x in derivatives]) for k, axis in enumerate(axes))
         values = [jnp.stack([rows[axis][k] for axis in range(4)]) for k in range(N_DERIVATIVES + 1)]
-        rate = factor = jnp.where(inside, inverse * rate, 0.0)
-        for k in range(1, N_DERIVATIVES + 1):
-            values[k], factor = values[k] * factor, factor * rate
-        pos, vel, acc, jerk, snap = values
-        return Setpoint(
-            pos=pos[:3], vel=vel[:3], acc=acc[:3], jerk=jerk[:3], snap=snap[:3],
-            yaw=pos[3:], yaw_rate=vel[3:], yaw_acc=acc[3:],
-        )  # fmt: skip
+        return _setpoint(_per_second(values, jnp.where(inside, inverse * rate, 0.0)))
+
+    def derivatives(self, t: Any, order: int) -> list[Array]:
+        """Return x, y, z, m, and yaw, rad, of one trajectory at one time, and their derivatives up to an order.
+
+        Args:
+            t: Time since the start of the trajectory, s. ()
+            order: Highest derivative, at most 4. What is above it is not computed.
+
+        Returns:
+            Values, their first derivatives, and so on. (4,) each
+        """
+        xp, n = _module(self), self.n_pieces
+        starts = xp.concatenate([xp.zeros_like(self.ends[:1]), self.ends[:-1]])
+        # One row of a table for each piece: a single lookup, whose parts begin at multiples of four.
+        numbers = [starts, _inverse(xp, self.ends - starts), xp.zeros((2, n), self.ends.dtype)]
+        table = xp.concatenate([xp.vstack(numbers).T, self.coefficients.reshape(n, -1)], axis=1)
+        local, inside = _local_time(jnp.asarray(t, self.ends.dtype), self.ends[-1], self.repeats)
+        piece = _piece(jnp.asarray(self.ends)[None], 0, local)
+        row = jnp.asarray(table).at[piece].get(mode="promise_in_bounds")
+        derivatives = _derivatives(row[4:].reshape(4, -1), (local - row[0]) * row[1], order)
+        return _per_second(derivatives, jnp.where(inside, row[1], 0.0))
 
     def degrees(self) -> tuple[int, ...]:
         """Return the largest degrees of x, y, z and yaw with a coefficient that is not zero, -1 for zero, on the host.
@@ -234,6 +243,40 @@ def _module(tree: Any) -> Any:
 def _at(x: Array, *index: Any) -> Array:
     """Return an entry of an array; an index that is too large or too small means the last or first one."""
     return x.at[index].get(mode="clip", wrap_negative_indices=False)
+
+
+def _local_time(t: Array, end: Any, repeats: Any) -> tuple[Array, Array]:
+    """Return the time between start and end at which a trajectory is at a time, s, and whether it moves. () each"""
+    local = jnp.where(t < 0, 0.0, t)
+    # A remainder by floor, which is a vector instruction where that of lax.rem is a call for each number.
+    local = local - jnp.where(repeats, end * lax.floor(local / end), 0.0)
+    local = jnp.where(local > end, end, jnp.where(local < 0, 0.0, local))
+    return local, (t >= 0) & (repeats | (t <= end))
+
+
+def _inverse(xp: Any, length: Any) -> Any:
+    """Return the inverse of the length of a piece, 1/s; padding has no length. (...)"""
+    return 1 / xp.where(length > 0, length, xp.ones_like(length))
+
+
+def _per_second(derivatives: list[Array], rate: Array) -> list[Array]:
+    """Return derivatives by the time of a piece as derivatives by the time in seconds.
+
+    Args:
+        derivatives: Value, first derivative, and so on. (4,) each
+        rate: Time of the piece that passes in one second, 1/s. ()
+    """
+    factors = itertools.accumulate([rate] * (len(derivatives) - 1), lambda a, b: a * b)
+    return [derivatives[0], *(x * factor for x, factor in zip(derivatives[1:], factors, strict=True))]
+
+
+def _setpoint(derivatives: list[Array]) -> Setpoint:
+    """Return the setpoint of x, y, z and yaw and their derivatives up to snap. (4,) each"""
+    pos, vel, acc, jerk, snap = derivatives
+    return Setpoint(
+        pos=pos[:3], vel=vel[:3], acc=acc[:3], jerk=jerk[:3], snap=snap[:3],
+        yaw=pos[3:], yaw_rate=vel[3:], yaw_acc=acc[3:],
+    )  # fmt: skip
 
 
 def _piece(ends: Array, index: Any, t: Array) -> Array:

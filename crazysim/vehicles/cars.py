@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from crazysim import rotation
 from crazysim.core.data import Objects, SimData
 from crazysim.core.plugin import Placement, Simulation, parameter
 from crazysim.core.population import Population
@@ -159,6 +160,12 @@ class Cars(Population):
     prefix: ClassVar[str] = "Fleet1Tenth"
     positions: ClassVar[tuple[str, ...]] = ("pos", "yaw", "distance")
     command_field: ClassVar[str | None] = "command"
+
+    def with_poses(self, record: CarData, pos: Array, quat: Array) -> CarData:
+        """Return a record with other positions and headings; trailers stand straight behind."""
+        yaw = rotation.to_rpy(quat)[..., 2:]
+        joints = None if record.joints is None else jnp.broadcast_to(yaw, record.joints.shape)
+        return record.replace(pos=pos, yaw=yaw, joints=joints)
 
     @property
     def control_freq(self) -> int | None:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import crazysim as cs
 from crazysim.core.plugin import Placement, parameter
 from crazysim.core.population import Population
 from crazysim.core.stage import stage
@@ -54,6 +55,18 @@ class Springs(Population):
         assert record.pos.shape == (3,)
         assert data.states.pos.shape == (data.core.n_drones, 3)
         return {"pos": record.vel, "vel": record.stiffness * (record.cmd - record.pos)}
+
+
+class Crowd(Springs):
+    """The same, attracted by each other."""
+
+    def derivative(self, data):
+        rates, own = super().derivative(data), self.read(data).pos
+
+        def pull(other, is_self):
+            return jnp.where(is_self, 0.0, other - own)
+
+        return rates | {"vel": rates["vel"] + cs.reduce_over_others(pull, own, "sum")}
 
 
 class Tied(Springs):

@@ -182,9 +182,13 @@ def test_contacts_and_rays_meet_the_shape_of_each_drone():
     np.testing.assert_allclose(report.floor_distance[0], 2 + heights - radii, atol=1e-5)
     between = np.linalg.norm([5.0, 0, heights[0] - heights[1]]) - radii[0] - radii[1]
     np.testing.assert_allclose(report.drone_distance[0, :2], between, atol=1e-5)
+    log = sim.add(cs.ContactLog(floor=False))
+    near = sim.data.states.pos.at[0, 2].set(sim.data.states.pos[0, 1] + jnp.array([0.0, radii[1] + radii[2] - 0.01, 0]))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=near))
     alone = cs.RangeFinder(directions=[[0.0, 0, -1]])
     sim.add(alone)
     sim.step()
+    np.testing.assert_array_equal(log.read(sim.data).drones[0], [False, True, True])
     assert sim.contact_report().nearest_drone.shape == (1, 3)
 
 

@@ -38,7 +38,16 @@ def lands(result):
     assert max(heights) < 0.01
 
 
-CHECKS = {"crazyswarm2": lands, "fit_flight": fits, "race": races, "replayed_twin": repeats}
+def mixes(result):
+    """Check that the drones carry their load, the cars drive, and the real drone was passed at a distance."""
+    heights, hanging, speeds, closest = result
+    assert heights.min() > 1.8
+    assert 0.9 < hanging < 1.3
+    assert speeds.min() > 0.5
+    assert 0.3 < closest < 2.0
+
+
+CHECKS = {"crazyswarm2": lands, "fit_flight": fits, "mixed_reality": mixes, "race": races, "replayed_twin": repeats}
 """Further checks of the values that ``main`` of an example returns."""
 
 

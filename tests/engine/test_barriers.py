@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim import rotation
+from crazysim.engine import barriers
 from crazysim.engine.barriers import choose, compute_once
 
 N = 64
@@ -83,3 +84,73 @@ def test_gradients_stay():
 def test_operands_that_are_returned_are_the_very_same():
     """A step finds what a stage wrote by identity."""
     assert compute_once(lambda x: (x, x + 1), X, N)(X)[0] is X
+
+
+def tangle(seed, n):
+    """Return a function of random operations, each on values of some operations before it."""
+    rng = np.random.default_rng(seed)
+    kinds = rng.integers(0, 6, n)
+    behind = [rng.integers(1, 9, 2) for _ in range(n)]
+
+    def fn(x):
+        values = [x, x * 2]
+        for kind, (i, j) in zip(kinds, behind, strict=True):
+            a, b = values[-min(i, len(values))], values[-min(j, len(values))]
+            new = [
+                lambda a, b: a * b,
+                lambda a, b: jnp.sin(a) + b,
+                lambda a, b: a / (2 + b),
+                lambda a, b: jnp.sum(a, axis=-1, keepdims=True) * b,
+                lambda a, b: jnp.concatenate([a[:, :2], b[:, 2:]], axis=-1),
+                lambda a, b: a @ jnp.ones((4, 4), a.dtype) - b,
+            ][kind](a, b)
+            values.append(new)
+        return values[-3:]
+
+    return fn
+
+
+def chosen_anew(jaxpr, least):
+    """Return what ``choose`` returns, with the whole estimate made again for each barrier."""
+    nodes = [barriers._node(eqn) for eqn in jaxpr.jaxpr.eqns]
+    found = set()
+    while True:
+        count = {}
+        for v in jaxpr.jaxpr.outvars:
+            count[v] = count.get(v, 0.0) + v.aval.size
+        for node in reversed(nodes):
+            n_results = sum(count.get(v, 0.0) if node.fused and v not in found else v.aval.size for v in node.results)
+            for v, n in node.operands:
+                count[v] = count.get(v, 0.0) + n_results * n
+        best, most = None, 0.0
+        for v, work in barriers._work(nodes, found).items():
+            size = v.aval.size
+            saved = (count.get(v, 0.0) - size) * work
+            if saved > max(most, barriers.WORTH * size) and size >= least and v not in found:
+                best, most = v, saved
+        if best is None:
+            return found
+        found.add(best)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("least", [1, 4 * N])
+def test_an_estimate_that_is_kept_up_to_date_chooses_as_one_made_anew(seed, least):
+    jaxpr = jax.make_jaxpr(tangle(seed, 60))(X)
+    expected = chosen_anew(jaxpr, least)
+    assert choose(jaxpr, least) == expected
+    assert len(expected) > 5
+
+
+def test_choosing_takes_time_in_proportion_to_the_length(monkeypatch):
+    calls = []
+    count = barriers._Estimate._count_results
+    monkeypatch.setattr(barriers._Estimate, "_count_results", lambda self, k: (calls.append(k), count(self, k)))
+
+    def visits(n):
+        calls.clear()
+        jaxpr = jax.make_jaxpr(tangle(0, n))(X)
+        assert len(choose(jaxpr, N)) > n / 10
+        return len(calls)
+
+    assert visits(400) < 3 * visits(200)

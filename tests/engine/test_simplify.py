@@ -133,3 +133,12 @@ def test_what_numpy_rounds_otherwise_is_not_folded():
     assert {"exp", "sin", "pow", "erf_inv", "integer_pow"} <= inexact
     assert simplify("exp", (F(1),), np.dtype(F), ()) is None
     assert simplify("sqrt", (F(2),), np.dtype(F), ()) == np.sqrt(F(2))
+
+
+def test_a_known_zero_less_a_number_is_its_negative():
+    b = Builder()
+    x = b.input(F)
+    b.add("sub", (known_zero(F), x), F)
+    assert [(op.name, op.args) for op in b.operations] == [("neg", (x,))]
+    b.add("sub", (F(0), x), F)  # of any other zero the sign counts
+    assert b.operations[-1].name == "sub"

@@ -80,6 +80,8 @@ CASES = {
     "in a branch": lambda t, i, j, k: jax.lax.cond(i > 2, lambda: t.ends[i], lambda: t.ends[j]),
     "in a loop": lambda t, i, j, k: jax.lax.fori_loop(0, 7, lambda n, x: x + t.ends[n + i], 0.0),
     "a bisection": lambda t, i, j, k: bisection(jnp.asarray(FAR)[::-1] * 0.5, i * 0.3),
+    "a search in constants": lambda t, i, j, k: jnp.searchsorted(jnp.asarray(FAR)[::-1] * 0.5, i * 0.3),
+    "a search in a table": lambda t, i, j, k: t.ends[jnp.searchsorted(t.ends[::-1], i * 0.3, side="right")],
 }
 
 

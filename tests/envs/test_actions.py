@@ -7,6 +7,7 @@ import pytest
 from cases import LEVELS, PAIRS
 
 from crazysim import ConfigError, Control, Drone, Dynamics, load_airframe
+from crazysim.core.data import create_params
 from crazysim.dynamics import first_principles, fitted, supported_dynamics
 from crazysim.envs import Actions, actions_of
 from crazysim.envs.actions import RATES, REACH, TILT, YAW, hover_thrust
@@ -111,7 +112,7 @@ def test_an_action_says_what_it_is():
 
 
 def test_a_map_of_two_lengths_is_refused():
-    with pytest.raises(ConfigError, match=r"of one shape \(k,\), got \(3,\) and \(4,\)"):
+    with pytest.raises(ConfigError, match=r"of one shape, \(k,\) or \(n_drones, k\), got \(3,\) and \(4,\)"):
         Actions(np.zeros(3), np.ones(4), Control.attitude)
 
 
@@ -119,3 +120,16 @@ def test_hover_thrust_takes_parameters_of_every_drone():
     params = first_principles.Params.create(load_airframe("cf21B_500"))
     masses = jnp.array([[[0.03]], [[0.06]]])
     np.testing.assert_allclose(hover_thrust(params.replace(mass=masses)), 9.81 * masses, rtol=1e-6)
+
+
+@pytest.mark.parametrize("control", ["attitude", "body_rate", "force_torque", "rotor_vel", "state"])
+def test_drones_of_several_airframes_have_actions_of_their_own(control):
+    fleet = [load_airframe(name) for name in ("cf21B_500", "bumblebee")]
+    params = create_params(Dynamics.first_principles, fleet)
+    actions = actions_of(fleet, params, Control(control))
+    commands = actions.command(jnp.full((2, actions.size), 0.3))
+    for k, airframe in enumerate(fleet):
+        own = actions_of(airframe, create_params(Dynamics.first_principles, airframe), Control(control))
+        np.testing.assert_allclose(commands[k], own.command(jnp.full(own.size, 0.3)), rtol=1e-6)
+    alike = actions_of([fleet[0]] * 2, create_params(Dynamics.first_principles, fleet[0]), Control(control))
+    assert alike.centre.ndim == 1

@@ -16,6 +16,7 @@ from crazysim.live.browser_scene import grid_offsets
 from crazysim.live.picture import PictureSource, quantities, quantity
 from crazysim.media.web import FOV
 from crazysim.sim import Sim
+from crazysim.vehicles import Cars
 
 MAGENTA = (1, 0, 1)
 
@@ -33,7 +34,7 @@ def sim(plain_scene):
 
 @pytest.fixture(scope="module")
 def chromium(tmp_path_factory):
-    browser = start_browser(tmp_path_factory.mktemp("browser"), width=1400, height=700)
+    browser = start_browser(tmp_path_factory.mktemp("browser"), width=1100, height=500)
     yield browser
     browser.close()
 
@@ -42,7 +43,7 @@ def chromium(tmp_path_factory):
 def live(sim):
     """A running loop, paused, with a page."""
     sim.reset()
-    live = Live(sim)
+    live = Live(sim, fps=10)  # the browser of the tests draws without a GPU
     live.command[..., 2] = 1.0
     live.selected = None
     live.paused = True
@@ -146,7 +147,7 @@ def test_a_page_is_watched_and_used(viser, chromium, live):
         live.post(lambda live: live.advance(5))
         wait_for(lambda: live.step == press_again + 5)
         chromium.call("Page.navigate", url=page.url)
-        wait_for(lambda: page.n_clients == 1 and len(chromium.mask(MAGENTA)[0]) > 40)
+        wait_for(lambda: page.n_clients == 1 and len(chromium.mask(MAGENTA)[0]) > 40, 120)
     assert not page.is_open
 
 
@@ -202,7 +203,18 @@ def test_a_picture_has_what_is_drawn():
     np.testing.assert_allclose(source.take(live, "double").plot, [2.0])
     assert "0.00 s" in picture.status
     assert picture.name == sim.drone_names[0]
-    assert {"states.pos", "states.rotor_vel", "controls.state.cmd"} <= set(quantities(sim))
-    assert "core.steps" not in quantities(sim)
+    assert {"states.pos", "states.rotor_vel", "controls.state.cmd", "core.steps"} <= set(quantities(sim))
+    np.testing.assert_allclose(quantity(sim.data, "states.pos", 2, 1)[2], 5.0)
     with pytest.raises(KeyError):
-        quantity(sim.data, "states.nothing")
+        quantity(sim.data, "states.nothing", 0, 0)
+
+
+def test_quantities_of_members():
+    """Two cars beside two drones: scopes, not counts, say which numbers are whose."""
+    sim = Sim(n_drones=2, control="state")
+    sim.add(Cars(["Fleet1Tenth_0", "Fleet1Tenth_1"]))
+    names = quantities(sim)
+    assert "plugins.cars.pos[1]" in names
+    assert "plugins.cars.pos" not in names
+    pos = np.asarray(sim.data.plugins["cars"].pos)[0, 1]
+    np.testing.assert_allclose(quantity(sim.data, "plugins.cars.pos[1]", 0, 0), pos)

@@ -286,6 +286,38 @@ def test_own_log_variables(swarm):
     assert struct.unpack("<H", packet[5:]) == (1234,)
 
 
+def test_a_failing_log_variable_is_nan_and_reported(swarm):
+    def broken(state, commander):
+        raise RuntimeError("no sensor")
+
+    swarm.reports.latest.clear()
+    device = CrtpDevice(swarm, 1, log={"range.front": ("float", broken)})
+    send(device, 5, 1, b"\x06\x01" + struct.pack("<BH", 7, device.log.ids["range.front"]))
+    send(device, 5, 1, b"\x03\x01\x01")
+    swarm.advance(0.05)
+    (packet,) = device.due()
+    assert np.isnan(struct.unpack("<f", packet[5:])[0])
+    assert "no sensor" in swarm.reports.latest[-1].text
+
+
+def test_a_server_continues_after_a_packet_that_fails(swarm, caplog):
+    with CrtpServer(swarm, port=0) as server:
+        peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        peer.settimeout(5)
+        address = ("127.0.0.1", int(server.uris[0].rpartition(":")[2]))
+        handle = server.devices[0].handle
+        server.devices[0].handle = lambda packet: 1 / 0
+        peer.sendto(b"\xfd\x00", address)
+        end = time.monotonic() + 5
+        while "was not answered" not in caplog.text and time.monotonic() < end:
+            time.sleep(0.01)
+        server.devices[0].handle = handle
+        peer.sendto(b"\xfd\x00", address)
+        assert peer.recv(100).startswith(b"\xfdBitcraze")
+        peer.close()
+    assert "cf1: a packet was not answered" in caplog.text
+
+
 ports = st.sampled_from([0, 2, 3, 4, 5, 6, 7, 8, 9, 13, 15])
 packets = st.one_of(
     st.binary(max_size=64),

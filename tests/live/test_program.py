@@ -21,7 +21,7 @@ def test_headless_it_flies_and_prints_the_factor(tmp_path, capsys):
     assert len(flight.time) == 201
     late = flight.pos[100:, 0]
     assert np.abs(late[..., 2] - HEIGHT).max() < 0.3
-    assert np.ptp(late[..., :2], axis=0).min() > RADIUS
+    assert np.ptp(late[..., :2], axis=0).min() > 0.8 * RADIUS
 
 
 def test_circles_are_consistent():
@@ -48,7 +48,10 @@ def test_piloted_and_commanded(capsys):
         (["--headless", "--browser", "--seconds", "1"], "expected --headless or --browser, got both"),
         (["--headless", "--seconds", "1", "--speed", "fast"], "positive speed or max, got 'fast'"),
         (["--headless", "--seconds", "1", "--speed", "-2"], "positive speed or 'max', got -2.0"),
-        (["--headless", "--seconds", "1", "--control-freq", "33"], "divides freq=500 Hz, got 33 Hz"),
+        (
+            ["--headless", "--seconds", "1", "--control-freq", "33"],
+            "state_freq is 33 Hz, which does not divide freq = 500 Hz",
+        ),
         (["--headless", "--seconds", "1", "--record", "nowhere/f"], "file that can be created"),
         (["--headless", "--seconds", "1", "--pilot", "--commands"], "or a pilot, got both"),
     ],

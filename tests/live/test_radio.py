@@ -118,6 +118,8 @@ def test_signs_and_units_of_attitudes_and_rates(level, values):
                 break
             link.sleep(0.01)
         np.testing.assert_allclose(stream[1], values, atol=2e-5)
+    first = next(data for port, _, data in radio.packets if port == 3)
+    assert first == bytes(14)  # unlocks the thrust
 
 
 def hover(state):

@@ -53,39 +53,39 @@ WATCHED = textwrap.dedent("""
 """)
 
 
-def blue(pixels):
-    """Return the columns of pixels of the mark of the selected drone."""
-    pixels = pixels[:200, :400].astype(int)
-    return np.nonzero(pixels[..., 2] > pixels[..., 0] + 25)[1]
+def marked(pixels):
+    """Return the columns of pixels, in the right tile, of the mark of the selected drone."""
+    tile = pixels[:200, 200:400].astype(int)
+    return 200 + np.nonzero(tile[..., 2] > tile[..., 0] + 25)[1]
 
 
 def test_a_window_shows_worlds_and_its_end_is_no_end(screen, opengl):
     display, path = screen
     environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": "egl", "PYTHONPATH": ":".join(sys.path)}
-    program = subprocess.Popen(
-        [sys.executable, "-c", WATCHED], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-    )
+    command = [sys.executable, "-c", WATCHED]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as program:
 
-    def do(what):
-        program.stdin.write(what + "\n")
-        program.stdin.flush()
-        return program.stdout.readline().split()
+        def do(what):
+            program.stdin.write(what + "\n")
+            program.stdin.flush()
+            return program.stdout.readline().split()
 
-    assert program.stdout.readline().strip() == "shown"
-    for _ in range(20):
-        do("select")
-        columns = blue(screen_pixels(path))
-        if len(columns) > 50:
-            break
-    # The right tile shows world 1, whose drone is 0.3 m beside the middle, and is selected. From 2 m with 45 degrees
-    # of height for 200 pixels a metre has 200 / (2 * 2 * tan 22.5) = 121 pixels: 36 beside the middle of the tile.
-    assert len(columns) > 50, "no mark of the selected drone"
-    np.testing.assert_allclose(columns.mean(), 200 + 100 + 36, atol=6)
-    assert do("kill") == ["kill", "0", "False"]
-    assert do("close")[0] == "close"
-    program.stdin.close()
-    assert program.wait(30) == 0
-    program.stdout.close()
+        assert program.stdout.readline().strip() == "shown"
+        for _ in range(20):
+            do("select")
+            columns = marked(screen_pixels(path))
+            if len(columns) > 50:
+                break
+        # The right tile shows world 1, whose drone is 0.3 m beside the middle, and is selected. From 2 m with 45
+        # degrees of height for 200 pixels a metre has 200 / (2 * 2 * tan 22.5) = 121 pixels: 36 beside the middle.
+        assert len(columns) > 50, "no mark of the selected drone"
+        np.testing.assert_allclose(columns.mean(), 200 + 100 + 36, atol=6)
+        assert do("kill") == ["kill", "0", "False"]
+        assert do("close")[0] == "close"
+        program.stdin.close()
+        assert program.wait(30) == 0
 
 
 def test_without_a_screen_a_window_is_refused(monkeypatch):

@@ -313,3 +313,18 @@ def test_other_numbers_compile_nothing():
     sim.replace(SlungLoad(mass=0.3, length=0.5, in_scene=False))
     assert sim.step_fn is before
     assert float(load.read(sim.data).mass[0]) == pytest.approx(0.3)
+
+
+def test_zeros_of_an_attachment_are_left_out_of_the_step_until_they_change():
+    sim = flying()
+    load = SlungLoad(mass=LOAD, attach=(0.0, 0.0, -0.03), in_scene=False)
+    sim.add(load)
+
+    def n_operations():
+        return sum(s.n_operations for s in sim.step_fn.plan(sim.data).program.fused_segments)
+
+    few, other = n_operations(), with_load(load, sim.data, attach=(0.0, 0.0, -0.02))
+    sim.data = other
+    assert n_operations() == few
+    sim.data = with_load(load, sim.data, attach=OFFSET)
+    assert n_operations() > few + 40

@@ -29,6 +29,7 @@ VEHICLES = [
     ("Mass_4", "4 5 6", "1 0 0 0"),
     ("Crazyflie_2", "0 1 1", "1 0 0 0"),
 ]
+CAR = ("Fleet1Tenth_5", "2 3 0.05", "0 0 0 1")
 
 
 def fleet(**settings):
@@ -146,10 +147,22 @@ def test_the_vehicles_of_a_file_are_adopted(tmp_path):
     assert jnp.all(sim.data.core.steps == 0)
 
 
+def test_cars_of_a_file_are_adopted(tmp_path):
+    sim = Sim.from_mjcf(file_with(tmp_path, [CAR, *VEHICLES[:2]]), 2)
+    assert sim.names == ("Bumblebee_3", "Crazyflie_0", "Fleet1Tenth_5")
+    car = sim["Fleet1Tenth_5"]
+    np.testing.assert_allclose(car.pos[:, :2], [[2, 3]] * 2)
+    np.testing.assert_allclose(np.abs(car.yaw), np.pi, rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("vehicles", "error", "message"),
     [
-        ([("Tractor_0", "0 0 0", "1 0 0 0")], UnknownNameError, "prefixes Crazyflie, Bumblebee, got 'Tractor_0'"),
+        (
+            [("Tractor_0", "0 0 0", "1 0 0 0")],
+            UnknownNameError,
+            "prefixes Crazyflie, Bumblebee, Fleet1Tenth, Bicycle, got 'Tractor_0'",
+        ),
         (VEHICLES, UnknownNameError, "got 'Mass_4'. Use kinds="),
         ([], ConfigError, "expected at least one drone"),
     ],

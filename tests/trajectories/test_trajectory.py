@@ -171,3 +171,15 @@ def test_coefficients_that_are_not_finite_are_refused():
         Trajectory.of_pieces([1.0], np.full((1, 4, 2), np.nan))
     with pytest.raises(ConfigError, match="at least one trajectory"):
         Trajectory.stack([])
+
+
+@pytest.mark.parametrize("order", [0, 2])
+def test_derivatives_up_to_an_order_are_those_of_the_setpoint(order):
+    trajectory = Trajectory.of_pieces(*random_pieces(n_pieces=20))
+    times = np.linspace(-0.5, float(trajectory.duration) + 0.5, 60)
+    found = jax.vmap(lambda t: jnp.stack(trajectory.derivatives(t, order)))(times)
+    setpoints = evaluate(trajectory, times)
+    assert found.shape == (60, order + 1, 4)
+    for k in range(order + 1):
+        np.testing.assert_allclose(found[:, k, :3], getattr(setpoints, DERIVATIVES[k]), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(found[:, k, 3:], getattr(setpoints, YAW[k]), rtol=1e-9, atol=1e-9)

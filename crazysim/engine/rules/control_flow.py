@@ -34,9 +34,16 @@ def _custom_jvp(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]
 
 @rule("call_hi_primitive")
 def _high_level(ctx: Lowering, eqn: Any, args: list[Elements]) -> list[Elements]:
-    """Expand a primitive that is defined by others, which JAX has from 0.12 on."""
+    """Expand a primitive that is defined by others, which JAX has from 0.12 on.
+
+    Results without a derivative, such as the places that ``jnp.searchsorted`` finds, are computed as in any call, from
+    tables where the operands are tables.
+    """
     avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-    return _with_derivative(ctx, eqn, args, jax.make_jaxpr(expanded(eqn))(*avals))
+    called = jax.make_jaxpr(expanded(eqn))(*avals)
+    if not any(jax.numpy.issubdtype(v.aval.dtype, np.inexact) for v in eqn.outvars):
+        return ctx.lower(called, args)
+    return _with_derivative(ctx, eqn, args, called)
 
 
 def _with_derivative(ctx: Lowering, eqn: Any, args: list[Elements], called: ClosedJaxpr) -> list[Elements]:

@@ -342,6 +342,10 @@ static int64_t n_cores() {  // that this process may use
 #endif
   return sysconf(_SC_NPROCESSORS_ONLN);
 }
+// Operations on a block that are worth a thread: some 50 us, as a sleeping core takes up to 100 us to wake. Loading and
+// storing a block takes as long as some steps.
+#define WORTH_A_THREAD (1 << 19)
+#define IO_STEPS 8
 static int64_t least(int64_t a, int64_t b) { return b < a ? b : a; }
 template <class F> struct Share { const F* run; int64_t from, to; pthread_t thread; bool begun; };
 template <class F> static void* work(void* share) {
@@ -349,9 +353,10 @@ template <class F> static void* work(void* share) {
   (*s->run)(s->from, s->to);
   return nullptr;
 }
-template <class F> static void in_parallel(int64_t n_lanes, int n_steps, const F& run) {
+template <class F> static void in_parallel(int64_t n_lanes, int64_t n_steps, const F& run) {
   const int most = 256;
-  const int64_t n_blocks = (n_lanes + LANES_OF_BLOCK - 1) / LANES_OF_BLOCK, worth = n_blocks * VECTORS * (n_steps + 1) / 512;
+  const int64_t n_blocks = (n_lanes + LANES_OF_BLOCK - 1) / LANES_OF_BLOCK;
+  const int64_t worth = n_blocks * VECTORS * (n_steps + IO_STEPS) * OPERATIONS / WORTH_A_THREAD;
   const int64_t n_threads = worth < 2 ? 1 : least(least(n_cores(), most), worth);
   const auto bound = [=](int64_t k) { return least(n_lanes, n_blocks * k / n_threads * LANES_OF_BLOCK); };
   Share<F> shares[most];

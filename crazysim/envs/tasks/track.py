@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -89,21 +90,25 @@ class TrackTrajectory(Task):
         """Return position, m, and velocity, m/s, at times on the trajectory, s. (...) to (..., 3) each"""
         if not isinstance(self.trajectory, Trajectory):
             return self.trajectory(t)
-        evaluate: Any = self.trajectory.evaluate
+        pos, vel = self._derivatives(t, 1)
+        return pos, vel
+
+    def _derivatives(self, t: Array, order: int) -> list[Array]:
+        """Return position, m, and its derivatives up to an order. (...) to (..., 3) each"""
+        evaluate: Any = functools.partial(self.trajectory.derivatives, order=order)
         for _ in range(t.ndim):
             evaluate = jax.vmap(evaluate)
-        setpoint = evaluate(t)
-        return setpoint.pos, setpoint.vel
+        return [x[..., :3] for x in evaluate(t)]
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the differences from the trajectory, and the ways to its next samples, m."""
         t, s = self.time(data), data.states
-        ahead = (self.spacing * (1 + np.arange(self.n_samples))).astype(t.dtype)
-        points = self.motion(t[..., None] + ahead)[0] - s.pos[..., None, :]
-        pos, vel = self.motion(t)
+        times = t[..., None] + (self.spacing * np.arange(1 + self.n_samples)).astype(t.dtype)
+        pos, vel = self.motion(times)  # now, and at the samples
+        points = pos[..., 1:, :] - s.pos[..., None, :]
         return state_of(data) | {
-            "difference_to_goal": pos - s.pos,
-            "difference_to_target_vel": vel - s.vel,
+            "difference_to_goal": pos[..., 0, :] - s.pos,
+            "difference_to_target_vel": vel[..., 0, :] - s.vel,
             "local_samples": points.reshape(*points.shape[:-2], -1),
         }
 
@@ -134,4 +139,5 @@ class TrackTrajectory(Task):
 
     def target(self, data: SimData) -> Array:
         """Return the point of the trajectory, m."""
-        return self.motion(self.time(data))[0]
+        t = self.time(data)
+        return self._derivatives(t, 0)[0] if isinstance(self.trajectory, Trajectory) else self.motion(t)[0]

@@ -134,8 +134,13 @@ class CrtpDevice:
         return found
 
     def _value(self, k: int, layout: str, state: object) -> bytes:
-        reading = self.readings[self.log.variables[k].name][1]
-        return pack(layout, float(reading(state, self.commander)))  # type: ignore[arg-type]
+        name = self.log.variables[k].name
+        try:
+            value = float(self.readings[name][1](state, self.commander))  # type: ignore[arg-type]
+        except Exception as error:  # of a reading that a user has added
+            self._report(f"log variable {name} failed: {error}")
+            value = math.nan
+        return pack(layout, value)
 
     def _report(self, text: str) -> None:
         self.swarm.reports.add("refused", self.name, self.swarm.time, text)
@@ -195,7 +200,7 @@ class CrtpDevice:
 
     def _force(self, thrust: int) -> float:
         """Return the collective thrust, N, of 16 bits: full scale is the largest thrust of all rotors."""
-        airframe = self.swarm.sim.airframe
+        airframe = self.swarm.sim.airframes[self.drone]
         return thrust / 65535 * airframe.n_rotors * float(np.max(airframe.value("rotors.thrust_max")))
 
     def _generic(self, channel: int, data: bytes) -> list[Packet]:

@@ -84,12 +84,16 @@ class CrtpServer(Closing):
         while not self._stopped.is_set():
             for key, _ in self._selector.select(POLL):
                 k = key.data
-                with contextlib.suppress(OSError):  # of a client that is gone
+                try:
                     packet, address = self._sockets[k].recvfrom(2048)
                     if packet != b"\xff":
                         self._clients[k] = address
                     for answer in self.devices[k].handle(packet):
                         self._sockets[k].sendto(answer, address)
+                except OSError:  # of a client that is gone
+                    continue
+                except Exception:  # the other drones are answered nevertheless
+                    log.exception("%s: a packet was not answered", self.swarm.names[k])
 
     def _send_due(self) -> None:
         """Send the log packets that are due; the swarm calls it after every control step."""

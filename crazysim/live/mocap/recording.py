@@ -132,6 +132,7 @@ class ReplaySource(MocapSource):
         if by not in ("poll", "time"):
             raise ConfigError(f"expected by as 'poll' or 'time', got {by!r}")
         self.name, self.by, self.path = f"replay of {Path(path).name}", by, path
+        self.simulated = by == "time"
         self._polls = list(read_polls(path))
         self._frames = [frame for poll in self._polls for frame in poll.frames]
         self._next, self._step = 0, -1

@@ -39,6 +39,8 @@ class MocapSource(Closing):
 
     name: str = "mocap"
     """Name in reports."""
+    simulated: bool = False
+    """True where the frames follow simulated time, which a reset sets back."""
 
     def poll(self, step: int, freq: int) -> Poll:
         """Return the frames that have arrived since the last call.
@@ -60,6 +62,8 @@ class MocapSource(Closing):
 
 class FunctionSource(MocapSource):
     """Poses as a function of simulated time, sampled at a rate of their own; a run can be repeated bit for bit."""
+
+    simulated = True
 
     def __init__(
         self,

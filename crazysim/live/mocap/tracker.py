@@ -118,8 +118,8 @@ class Tracker:
                 self._report("backwards", self.source, now, f"frame refused: {before - now:.4f} s before the last one")
                 return False
             self._report("restarted", self.source, now, f"clock stepped back by {before - now:.3f} s")
-            self._stamps[self.seen] = -np.inf
-            self._least_delay, before = np.inf, None
+            self.restart()
+            before, self._received = None, frame.received
         if before is not None:
             self._watch_interval(now, now - before)
         self._watch_delay(now, frame.received - now)
@@ -132,6 +132,11 @@ class Tracker:
             self._lost[k], self.vel[k] = True, 0.0
             self._report("lost", self.names[k], now, f"no valid pose for {now - self._stamps[k]:.3f} s; it stays there")
         return True
+
+    def restart(self) -> None:
+        """Accept the next frame whatever its time; poses stay, and velocities begin again at zero."""
+        self._stamps[self.seen] = -np.inf
+        self._least_delay, self._least_at, self._stamp, self._received = np.inf, -np.inf, None, None
 
     def advance(self, now: float, lost: int = 0, ended: str | None = None) -> None:
         """Check at the end of a poll that the source is alive.

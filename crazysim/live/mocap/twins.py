@@ -120,7 +120,7 @@ class Twins(Closing):
         }
         self._rows = np.array([handle.rows[0] for handle in self.handles.values()], np.int32)
         self.tracker = Tracker(self.names, rules, source.name)
-        self._frozen = np.zeros(len(self.names), bool)
+        self._frozen, self._step = np.zeros(len(self.names), bool), 0
         self._recorder = None if record is None else MocapRecorder(record)
         of_twins = found.values()
         self._turn = from_rpy([t.turn for t in of_twins]).reshape(-1, 4)
@@ -145,7 +145,11 @@ class Twins(Closing):
 
     def update(self, sim: Sim) -> None:
         """Read the frames that have arrived, and write all poses; it never waits for the source."""
-        poll = self.source.poll(int(sim.data.core.steps[0, 0]), sim.freq)
+        step = int(sim.data.core.steps[0, 0])
+        if self.source.simulated and step < self._step:
+            self.tracker.restart()
+        self._step = step
+        poll = self.source.poll(step, sim.freq)
         if self._recorder is not None:
             self._recorder.write(poll)
         for frame in poll.frames:

@@ -49,6 +49,7 @@ class Commander:
         self.pos, self.vel, self.yaw = np.zeros(3), np.zeros(3), 0.0
         self.armed, self.locked = True, False
         self._plan: Plan | None = None
+        self._held: tuple[Plan, NDArray] | None = None
         self._stream: tuple[str, NDArray] | None = None
         self._stream_time, self._released = 0.0, math.inf
         self._reference = np.zeros(4)  # position and yaw that velocity setpoints move
@@ -234,7 +235,13 @@ class Commander:
             self.stop()
         if not self.motors_on:
             return None
-        return self._streamed(dt) if self._stream is not None else _state_command(*self.goal())
+        if self._stream is not None:
+            return self._streamed(dt)
+        if plan is None or not plan.finished(now):
+            return _state_command(*self.goal())
+        if self._held is None or self._held[0] is not plan:  # a drone that hovers costs nothing
+            self._held = plan, _state_command(plan.at(now)[0], np.zeros(4), np.zeros(4))
+        return self._held[1]
 
     def _streamed(self, dt: float) -> NDArray:
         kind, x = self._stream  # type: ignore[misc]

@@ -84,9 +84,11 @@ class Swarm(Closing):
         self.colors, self.reports = np.zeros((len(names), 3)), Reports()
         self.listeners: list[Callable[[], Any]] = []
         self._period = sim.freq // sim.control_freq
+        self._size = {Control.state: 16, Control.rotor_vel: sim.data.controls.rotor_vel.shape[-1]}.get(sim.control, 4)
         self._motors = self._add_motors()
         self._on = np.ones(len(names), bool)
         self._states: list[DroneState] = []
+        self._yaws: list[float] = []
         self._home = np.asarray(sim.data.states.pos[0], float)
         self._thread: threading.Thread | None = None
         self._stopped = threading.Event()
@@ -199,7 +201,7 @@ class Swarm(Closing):
         data = self.sim.data
         states = data.states
         pos, quat, vel, ang_vel = (
-            np.asarray(x[0], float) for x in (states.pos, states.quat, states.vel, states.ang_vel)
+            np.asarray(x)[0].astype(float) for x in (states.pos, states.quat, states.vel, states.ang_vel)
         )
         now = float(np.asarray(data.core.steps)[0, 0]) / self.sim.freq
         before = self._states
@@ -207,21 +209,21 @@ class Swarm(Closing):
             for commander in self.commanders:
                 commander.reset()
             before, self._on = [], np.ones(len(self.names), bool)
-        lift = np.array([0.0, 0.0, GRAVITY])
-        found = []
-        for k in range(len(self.names)):
-            dt = now - before[k].time if before else 0.0
-            acc = rotate(quat[k] * (-1, -1, -1, 1), (vel[k] - before[k].vel) / dt + lift) if dt > 0 else None
-            held = before[k].acc if before else rotate(quat[k] * (-1, -1, -1, 1), lift)
-            found.append(DroneState(now, pos[k], quat[k], vel[k], ang_vel[k], held if acc is None else acc))
-        self._states = found
+        dt = now - before[0].time if before else 0.0
+        moved = np.stack([state.vel for state in before]) if before else vel
+        force = (vel - moved) / dt if dt > 0 else np.zeros_like(vel)
+        acc = rotate(quat * (-1, -1, -1, 1), force + [0.0, 0.0, GRAVITY])
+        if before and dt == 0:
+            acc = np.stack([state.acc for state in before])
+        self._yaws = to_rpy(quat)[:, 2].tolist()
+        self._states = [DroneState(now, *x) for x in zip(pos, quat, vel, ang_vel, acc, strict=True)]
 
     def _write(self) -> None:
-        sim, size = self.sim, {Control.state: 16, Control.rotor_vel: self.sim.airframe.n_rotors}
-        command = np.zeros((1, len(self.names), size.get(sim.control, 4)))
+        sim = self.sim
+        command = np.zeros((1, len(self.names), self._size))
         on = np.ones(len(self.names), bool)
-        for k, (commander, state) in enumerate(zip(self.commanders, self._states, strict=True)):
-            yaw = float(state.rpy[2])
+        drones = zip(self.commanders, self._states, self._yaws, strict=True)
+        for k, (commander, state, yaw) in enumerate(drones):
             found = commander.tick(state.time, state.pos, state.vel, yaw)
             on[k] = found is not None
             if found is not None:

@@ -158,6 +158,19 @@ def test_a_reset_keeps_the_measured_pose(sim):
     np.testing.assert_allclose(sim.data.objects.pos[0, 0, 0], [1, 0, 1])
 
 
+def test_a_source_in_simulated_time_begins_again_after_a_reset(sim):
+    twins = Twins(sim, FunctionSource(lambda t: {"a": ((1 + t, 0, 1), LEVEL)}, 100.0), {"": BOX}, ["a"])
+    for _ in range(2):
+        for _ in range(5):
+            twins.update(sim)
+            sim.step(50)
+        assert twins.pose("a")[0][0] == pytest.approx(1.4)
+        sim.reset()
+    twins.update(sim)
+    assert twins.pose("a")[0][0] == pytest.approx(1.0)
+    assert not twins.reports.latest
+
+
 def test_simulated_drones_measure_report_and_hit_a_real_one():
     sim = Sim(n_worlds=1, n_drones=1, control="state")
     states = sim.data.states
