@@ -178,7 +178,9 @@ def report(sim: Sim, frames: Frame) -> None:
         sim: The simulation.
         frames: All measurements. Leaves (n_frames, n_worlds, ...)
     """
-    print(f"closest           {100 * frames.drones.min():.1f} cm between drones, {100 * frames.cars.min():.1f} cm to cars")
+    print(
+        f"closest           {100 * frames.drones.min():.1f} cm between drones, {100 * frames.cars.min():.1f} cm to cars"
+    )
     began = frames.touches[1:] & ~frames.touches[:-1]
     n_begun, n_worlds = int(began.sum() + frames.touches[0].sum()), int(frames.touches.any((0, 2)).sum())
     print(f"contacts          {n_begun:,} begun, in {n_worlds:,} of {sim.n_worlds:,} worlds")
