@@ -1,0 +1,80 @@
+"""Steps per second of mixed fleets: drones beside cars, and drones of two airframes in one world.
+
+One JSON line for each case. ``cars``: worlds of drones and cars, beside the same worlds without cars; the figure is
+the rate of the drones over that of the drones alone. ``airframes``: every other drone is of a second airframe, beside
+drones of one airframe whose parameters are one per drone. The two of a case are measured in turns.
+
+    python benchmarks/fleets.py [--device gpu] [--worlds 4096] [--drones 4] [--cars 2]
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from measure import Flight, digits, engine_of, medians, report
+
+from crazysim import Sim, __version__
+from crazysim.vehicles import Cars
+
+LEVELS = ("state", "attitude", "body_rate", "force_torque")
+PAIR = ("cf21B_500", "cf2x_L250")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--worlds", type=int, default=4096)
+    parser.add_argument("--drones", type=int, default=4, help="drones of a world")
+    parser.add_argument("--cars", type=int, default=2, help="cars of a world")
+    parser.add_argument("--steps", type=int, default=100, help="physics steps per call")
+    parser.add_argument("--repeats", type=int, default=9)
+    args = parser.parse_args()
+    cases = {"cars": (drones(args), beside_cars(args)), "airframes": (drones(args, own=True), two_airframes(args))}
+    for case, (reference, fleet) in cases.items():
+        flights = {name: Flight(sim, "state", args.steps, args.device)
+                   for name, sim in (("reference", reference), ("fleet", fleet))}  # fmt: skip
+        taken = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
+        n_steps = args.worlds * args.drones * args.steps
+        rates = {name: digits(n_steps / seconds) for name, seconds in taken.items()}
+        report(args.device, benchmark="fleets", case=case, n_worlds=args.worlds, n_drones=args.drones,
+               n_cars=args.cars * (case == "cars"), n_steps=args.steps, engine=engine_of(fleet),
+               drone_steps_per_s=rates,
+               ratio=digits(taken["reference"] / taken["fleet"]), crazysim=__version__)  # fmt: skip
+
+
+def drones(args: argparse.Namespace, own: bool = False) -> Sim:
+    """Return drones alone, with parameters of their own if asked."""
+    sim = Sim(args.worlds, args.drones, control="state", device=args.device)
+    if own:
+        shape = sim.data.states.pos.shape[:2]
+
+        def spread(record: Any) -> Any:
+            return jax.tree.map(lambda x: jnp.broadcast_to(x, (*shape, *x.shape)), record)
+
+        levels = {level: getattr(sim.data.controls, level) for level in LEVELS}
+        changes = {level: x.replace(params=spread(x.params)) for level, x in levels.items() if x is not None}
+        sim.data = sim.data.replace(params=spread(sim.data.params), controls=sim.data.controls.replace(**changes))
+    return sim
+
+
+def two_airframes(args: argparse.Namespace) -> Sim:
+    """Return drones of two airframes in turn."""
+    kinds = [PAIR[k % 2] for k in range(args.drones)]
+    return Sim(args.worlds, args.drones, drone=kinds, control="state", device=args.device)
+
+
+def beside_cars(args: argparse.Namespace) -> Sim:
+    """Return drones and cars, which drive circles."""
+    sim = drones(args)
+    cars = sim.add(Cars(args.cars, in_scene=False))
+    command = np.tile(np.float32([0.08, 0.2]), (args.worlds, args.cars, 1))
+    sim.data = cars.commanded(sim.data, command)
+    return sim
+
+
+if __name__ == "__main__":
+    main()
