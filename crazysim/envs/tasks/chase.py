@@ -50,6 +50,8 @@ class Chase(TouchDown):
 
     name = "chase"
     what = "roof"
+    progress = 6.0
+    crash = 4.0
 
     speed: float = 1.0
     """Largest speed of a car, m/s; the smallest is 0.3 times that."""

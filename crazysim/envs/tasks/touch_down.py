@@ -52,6 +52,10 @@ class TouchDown(Task):
     Record = Landing
     what: ClassVar[str] = "place"
     """Name of the place in observations: ``difference_to_{what}``."""
+    progress: ClassVar[float] = 2.0
+    """Reward of a metre of progress towards the place."""
+    crash: ClassVar[float] = 10.0
+    """Cost of a crash."""
 
     seconds: float = 6.0
     """Length of an episode, s."""
@@ -115,12 +119,12 @@ class TouchDown(Task):
         own, d = landing_of(data), self.error(data)
         drift = rotation.safe_norm(self.place(data)[1] - data.states.vel)[..., 0]
         paid = {
-            "progress": 2.0 * (own.to_go_before - d),
+            "progress": self.progress * (own.to_go_before - d),
             "speed": -0.1 * drift * jnp.exp(-4 * d),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "landed": 10.0 * own.landed,
-            "crashed": -10.0 * own.crashed,
+            "crashed": -self.crash * own.crashed,
         }
         return terms.only_where(~own.out_before, paid)
 
