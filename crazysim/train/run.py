@@ -60,7 +60,7 @@ RECIPES: dict[str, Recipe] = {
         practice={"practice": True},
     ),
     "transport": Recipe(n_worlds=4096, config={"iterations": 400, "discount": 0.99}),
-    "chase": Recipe(config={"iterations": 150}),
+    "chase": Recipe(config={"iterations": 200, "discount": 0.99}),
     "deliver": Recipe(n_worlds=4096, config={"iterations": 400, "discount": 0.99}),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
 }

@@ -200,8 +200,8 @@ class Deliver(Task):
         drift = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
         return {
             "progress": 5.0 * (own.to_go_before - to_go),
-            "meeting": jnp.where(own.taken, 1.0, 0.3 * jnp.exp(-4 * apart) * (1 + jnp.exp(-2 * drift))),
-            "proximity": own.taken * terms.proximity(self.error(data), coarse=3.0),
+            "meeting": jnp.where(own.taken, 0.6, 0.3 * jnp.exp(-4 * apart) * (1 + jnp.exp(-2 * drift))),
+            "proximity": 2.0 * own.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "crash": -10.0 * own.crashed,
