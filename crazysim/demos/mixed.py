@@ -29,8 +29,8 @@ CARS = ("cars", "towing")
 """Names of the populations: a car, and a car with a trailer."""
 LOAD, LENGTH = 0.2, 0.4
 """Mass of the Bumblebee's load, kg, and length of its rod, m."""
-HILLS, SIZE = 0.12, (9.0, 7.0)
-"""Height of the hills, and size of the terrain along x and y, m."""
+HILLS, SIZE, GRASS = 0.4, (9.0, 7.0), (0.45, 0.55, 0.35, 1.0)
+"""Height of the hills, size of the terrain along x and y, m, and its colour."""
 INNER, OUTER = (1.3, 1.1, 7.5), (2.8, 2.2, 13.0)
 """Half axes of the cars' paths, m, and their periods, s."""
 ABOVE = 0.45
@@ -81,7 +81,7 @@ def run(
     sim = build(n_worlds, device)
     engine = sim.explain().splitlines()[0]
     print(f"{n_worlds:,} worlds of {', '.join(sim.names)}, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
-    view = View(width=960, height=544, cam_config={"lookat": [0, 0, 0.5], "distance": 7.0, "elevation": -28})
+    view = View(width=960, height=544, cam_config={"lookat": [0, 0, 0.5], "distance": 5.6, "elevation": -24})
     out.mkdir(parents=True, exist_ok=True)
     flight = FilmedFlight(sim, out / "mixed.mp4", view, film)
     measure, frames = build_measure(sim), []
@@ -100,7 +100,7 @@ def build(n_worlds: int, device: str) -> Sim:
     controllers = ["lqr", LoadLQR(load_mass=LOAD, length=LENGTH)]
     is_loaded = np.broadcast_to([0, 0, 1], (n_worlds, len(DRONES)))
     sim = Sim(n_worlds, drone=DRONES, control="state", controller=controllers, switch=is_loaded, device=device)
-    sim.add(Terrain(hills(), size=SIZE))
+    sim.add(Terrain(hills(), size=SIZE, rgba=GRASS))
     share = np.arange(n_worlds) / n_worlds
     for number, (name, path) in enumerate(zip(CARS, (ellipse(*INNER), ellipse(*OUTER)), strict=True)):
         time = share * float(path.duration)
@@ -125,7 +125,7 @@ def build(n_worlds: int, device: str) -> Sim:
 def hills() -> np.ndarray:
     """Return the heights of the ground, m. (n_rows, n_columns)"""
     x, y = (np.linspace(-1, 1, n) * length / 2 for n, length in zip((46, 36), SIZE, strict=True))
-    waves = 0.5 + 0.5 * np.sin(1.1 * x) * np.cos(1.3 * y[:, None])
+    waves = 0.55 + 0.45 * np.sin(1.1 * x) * np.cos(1.3 * y[:, None])
     edge = np.cos(np.pi * x / SIZE[0]) * np.cos(np.pi * y[:, None] / SIZE[1])
     return HILLS * waves * np.sqrt(np.maximum(edge, 0))
 
