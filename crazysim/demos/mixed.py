@@ -47,7 +47,7 @@ class Frame(PyTree):
     cars: Array
     """Smallest distance of a drone and a car or trailer. (n_worlds,)"""
     touches: Array
-    """True where a drone touches anything. (n_worlds, n_drones)"""
+    """True where a drone touches another or a car. (n_worlds, n_drones)"""
     drone_errors: Array
     """Distances of the drones from their setpoints, of the Bumblebee's load from its own. (n_worlds, n_drones)"""
     car_errors: Array
@@ -137,7 +137,7 @@ def ellipse(x: float, y: float, period: float, height: float = 0.0) -> Trajector
 
 def flown() -> list[Trajectory]:
     """Return the trajectories of an eight above all, of the escort of a car, and of the Bumblebee's load."""
-    return [figure_eight(4.0, 2.5, period=8.0, height=1.9), ellipse(*INNER, HILLS + ABOVE), ellipse(2.0, 1.0, 9.0, 0.9)]
+    return [figure_eight(4.0, 2.5, period=8.0, height=2.4), ellipse(*INNER, HILLS + ABOVE), ellipse(2.0, 1.0, 9.0, 1.4)]
 
 
 def build_measure(sim: Sim) -> Callable[[], Frame]:
@@ -154,7 +154,7 @@ def build_measure(sim: Sim) -> Callable[[], Frame]:
         return jnp.linalg.norm(body - goal, axis=-1), jnp.concatenate(off, axis=-1)
 
     def measure() -> Frame:
-        seen = sim.contact_report(parts)
+        seen = sim.contact_report(parts, floor=False)
         near = seen.drone_distance.min(-1), seen.object_distance.min((-2, -1))  # type: ignore[union-attr]
         return jax.device_get(Frame(*near, seen.any, *errors(sim.data)))
 

@@ -45,6 +45,8 @@ STEER = 0.25
 """Largest steering angle of a car, rad: circles of 1.3 m radius."""
 GOAL = ((-1.0, -1.0, 0.8), (1.0, 1.0, 1.3))
 """Lowest and highest goal of a load from its car's first place, m."""
+LIFTED = 0.8
+"""Height of a load up to which its height is rewarded, m: at zero action a drone sinks with its load."""
 SLOW = 0.2
 """Largest speed of a load that is delivered, m/s."""
 
@@ -194,13 +196,14 @@ class Deliver(Task):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return progress, carrying and proximity, and costs of turning, changing actions and a crash."""
+        """Return progress, carrying, lift and proximity, and costs of turning, changing actions and a crash."""
         own, load, to_go = delivery_of(data), data.plugins["load"], self.to_go(data)
         apart = rotation.safe_norm(load.pos - load.tip_pos)[..., 0]
         drift = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
         return {
             "progress": 5.0 * (own.to_go_before - to_go),
             "meeting": jnp.where(own.taken, 0.6, 0.3 * jnp.exp(-4 * apart) * (1 + jnp.exp(-2 * drift))),
+            "lift": own.taken * jnp.minimum(load.pos[..., 2], LIFTED),
             "proximity": 2.0 * own.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
