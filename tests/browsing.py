@@ -23,6 +23,7 @@ class Browser:
 
         options = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader"]
         options += ["--enable-unsafe-swiftshader", "--remote-debugging-port=0", f"--user-data-dir={folder}"]
+        options += ["--disable-features=BackForwardCache"]  # a page that is left must end
         self._process = subprocess.Popen(
             [program, *options, f"--window-size={width},{height}", "about:blank"],
             stdout=subprocess.DEVNULL,

@@ -1,4 +1,4 @@
-"""How the lanes of a kernel read each other's numbers: where drones of one world are in one warp, block or vector."""
+"""Exchange of numbers between the lanes of a kernel: drones of one world are in one warp, block or set of vectors."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Writer:
         """Begin without lines.
 
         Args:
-            exchange: How lanes read each other's numbers; None for registers.
+            exchange: Exchange of numbers between lanes; None for registers.
         """
         self.exchange = Registers() if exchange is None else exchange
         self.lines: list[str] = []

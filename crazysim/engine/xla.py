@@ -136,7 +136,7 @@ def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
 
 
 MAX_UNROLLED = 8
-"""Most drones of a world whose pairs are written out one drone after the other; those of more have an axis."""
+"""Most drones of a world whose loop over the others is unrolled; the pairs of more have an axis."""
 
 
 def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
@@ -154,7 +154,7 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
         for j in range(n):
             other = [x[:, j : j + 1] if np.ndim(x) else x for x in rows]
             turns.append(run(block, [*other, number == j], (n_worlds, n), fixed | mine))
-        combine = [getattr(lax, ops.TABLE[name].xla or name) for name in op.param("reduce")]
+        combine = [COMBINE[name] for name in op.param("reduce")]
         found = [functools.reduce(fn, [_lanes(x, (n_worlds, n)) for x in some])
                  for fn, some in zip(combine, zip(*turns, strict=True), strict=True)]  # fmt: skip
         return [jnp.reshape(x, shape) for x in found]
@@ -176,6 +176,11 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
         found = lax.map(jax.checkpoint(of_one), (numbers, columns), batch_size=at_once)
     return [x.T.reshape(shape) for x in found]
 
+
+COMBINE: dict[str, Callable[..., Array]] = {
+    "add": lax.add, "min": lax.min, "max": lax.max, "or": lax.bitwise_or, "and": lax.bitwise_and,
+}  # fmt: skip
+"""Operations on two numbers that reductions are made of."""
 
 REDUCE: dict[str, Callable[..., Array]] = {
     "add": jnp.sum,

@@ -156,7 +156,8 @@ class Path(PyTree):
             speeds = np.concatenate([path.speeds, np.repeat(path.speeds[:, -1:], more, axis=1)], axis=1)
             padded.append(path.replace(coefficients=coefficients, speeds=speeds))
         fields = ("coefficients", "length", "spacing", "closed", "speeds", "progress", "duration")
-        return Path(**{name: np.concatenate([getattr(path, name) for path in padded]) for name in fields})
+        joined: dict[str, Any] = {name: np.concatenate([getattr(path, name) for path in padded]) for name in fields}
+        return Path(**joined)
 
     @property
     def n_paths(self) -> int:

@@ -6,6 +6,8 @@ import pytest
 from cases import with_states
 
 from crazysim import ContactResponse, FreeBodies, Sim
+from crazysim.core.stage import over_drones, over_worlds
+from crazysim.scene.contact_points import contact_points, surfaces_of
 from crazysim.vehicles import Cars
 
 
@@ -53,3 +55,17 @@ def test_a_car_pushes_a_body():
     assert float(body.pos[0, 0, 0]) > 0.8
     assert float(body.pos[0, 0, 0] - car.pos[0, 0, 0]) > 0.2
     assert float(body.vel[0, 0, 0]) == pytest.approx(float(car.vel[0, 0, 0]), abs=0.05)
+
+
+def test_the_deck_of_a_turning_car_moves_with_its_points():
+    """At every corner of the drone: v + w x r, of a car with 0.5 m/s and 2 rad/s."""
+    sim, cars = build()
+    car = cars.read(sim.data)
+    sim.data = cars.write(sim.data, car.with_vel(jnp.asarray([[[0.5, 0, 0]]]), jnp.asarray([[[0, 0, 2.0]]])))
+    sim.data = with_states(sim.data, pos=[0.1, 0.2, 0.3], quat=[0, 0, 0, 1])
+    surfaces = [surface for surface in surfaces_of(sim, None) if surface.population == "cars"]
+    box = np.asarray(sim.airframe.value("shape.collision_box"))
+    points = over_worlds(over_drones(lambda one: contact_points(one, surfaces[:1], box)._asdict()))(sim.data)
+    lever = np.asarray(points["point"])[0, 0, :8] + [0.1, 0.2, 0.3] - np.asarray(car.pos)[0, 0]
+    expected = np.array([0.5, 0, 0]) + np.cross([0, 0, 2.0], lever)
+    np.testing.assert_allclose(np.asarray(points["vel"])[0, 0, :8], expected, atol=1e-5)
