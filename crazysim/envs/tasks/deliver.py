@@ -45,8 +45,8 @@ STEER = 0.25
 """Largest steering angle of a car, rad: circles of 1.3 m radius."""
 GOAL = ((-1.0, -1.0, 0.8), (1.0, 1.0, 1.3))
 """Lowest and highest goal of a load from its car's first place, m."""
-LIFTED = 0.8
-"""Height of a load up to which its height is rewarded, m: at zero action a drone sinks with its load."""
+DROPPED = 0.15
+"""Height of a ring below which a load that was taken counts as dropped, m: it hangs lower than the trailer."""
 SLOW = 0.2
 """Largest speed of a load that is delivered, m/s."""
 
@@ -65,7 +65,7 @@ class Delivery(PyTree):
     delivered: Array = leaf("drone", 0)
     """True where the load has stayed at its goal for long enough. (n_worlds, n_drones)"""
     crashed: Array = leaf("drone", 0)
-    """True where the drone has left its part of the arena. (n_worlds, n_drones)"""
+    """True where the drone has left its part of the arena, or dropped the load. (n_worlds, n_drones)"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +76,7 @@ class Deliver(Task):
     above it, with a hook on a swinging rod, which picks the load up within 7 cm of the ring at less than 0.6 m/s
     relative to it. On the trailer the load does not slip. It is delivered when it has been within ``tolerance`` of its
     goal, at most 0.2 m/s fast, for ``hold`` seconds. Getting lower than 0.25 m, higher than 2.5 m or too far away is a
-    crash, which ends the episode.
+    crash, as is a load that sinks below 0.15 m; it ends the episode.
     """
 
     name = "deliver"
@@ -125,7 +125,7 @@ class Deliver(Task):
             vel = jnp.where(taken, load.vel, data.core.freq * (ring - load.pos))
             load = load.replace(pos=jnp.where(taken, load.pos, ring), vel=vel)
             data = data.replace(plugins=data.plugins | {"load": load})
-            crashed = own.crashed | beyond(data)
+            crashed = own.crashed | beyond(data) | (taken & (load.pos[2] < DROPPED))
             steps = jnp.where(self.at_goal(data) & ~crashed, own.steps_there + 1, 0)
             delivered = own.delivered | (steps >= enough)
             new = own.replace(taken=taken, crashed=crashed, steps_there=steps, delivered=delivered)
@@ -196,18 +196,17 @@ class Deliver(Task):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return progress, carrying, lift and proximity, and costs of turning, changing actions and a crash."""
+        """Return progress, carrying and proximity, and costs of turning, changing actions and a crash."""
         own, load, to_go = delivery_of(data), data.plugins["load"], self.to_go(data)
         apart = rotation.safe_norm(load.pos - load.tip_pos)[..., 0]
         drift = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
         return {
             "progress": 5.0 * (own.to_go_before - to_go),
-            "meeting": jnp.where(own.taken, 0.6, 0.3 * jnp.exp(-4 * apart) * (1 + jnp.exp(-2 * drift))),
-            "lift": own.taken * jnp.minimum(load.pos[..., 2], LIFTED),
+            "meeting": jnp.where(own.taken, 1.0, 0.1 * jnp.exp(-4 * apart) * (1 + jnp.exp(-2 * drift))),
             "proximity": 2.0 * own.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "crash": -10.0 * own.crashed,
+            "crash": -5.0 * own.crashed,
         }
 
     def terminated(self, data: SimData) -> Array:
