@@ -109,10 +109,10 @@ class Deliver(Task):
     def install(self, sim: Sim) -> None:
         """Add the cars with their trailers, the hooks with the loads on the trailers, and the rules."""
         places = SPACING * grid_2d(sim.n_drones)
-        settings = {"pos": places, "level": "speed", "trailer": True, "name": CARS}
+        settings: dict[str, Any] = {"pos": places, "level": "speed", "trailer": True, "name": CARS}
         sim.add(Cars(sim.n_drones, vehicle=VEHICLE, **settings))
         rings = np.broadcast_to(np.pad(places, ((0, 0), (0, 1))), (sim.n_worlds, sim.n_drones, 3))
-        hook = {"hook_mass": HOOK_MASS, "damping": DAMPING, "reach": REACH, "max_speed": MAX_SPEED}
+        hook: dict[str, Any] = {"hook_mass": HOOK_MASS, "damping": DAMPING, "reach": REACH, "max_speed": MAX_SPEED}
         sim.add(Hook(self.mass, length=self.length, size=SIZE, ring=RING, load_at=rings, **hook))
         enough = round(self.hold * sim.freq)
 

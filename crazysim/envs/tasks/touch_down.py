@@ -1,4 +1,4 @@
-"""What tasks that end with a touch-down share: what counts as landed, observations and rewards."""
+"""Landing on a place that may stand still or move: the outcome, observations and rewards."""
 
 from __future__ import annotations
 
