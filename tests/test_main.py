@@ -70,6 +70,24 @@ def test_pick_and_place_succeeds_in_every_world(tmp_path, capsys):
     assert 0.01 < from_middle < 0.18, "it starts at a random place on the other pad"
 
 
+def test_a_mixed_fleet_keeps_to_its_paths_and_apart(tmp_path, capsys):
+    """Drones of two kinds and cars of two kinds, over hills: a second of two worlds."""
+    arguments = ["--worlds", "2", "--seconds", "1", "--no-film", "--out", str(tmp_path)]
+    assert main(["demo", "mixed", *arguments]) == 0
+    out = capsys.readouterr().out
+    for word in ("engine: fused", "Crazyflie_1, Bumblebee_0", "0 begun, in 0 of 2 worlds", "steps per second"):
+        assert word in out
+    closest = out.split("closest")[1].splitlines()[0].split()
+    assert float(closest[0]) > 20
+    assert 20 < float(closest[4]) < 80, "one drone escorts a car"
+    errors = [line for line in out.splitlines() if line.startswith("tracking error")]
+    for name, line in zip(("Crazyflie_0", "Crazyflie_1", "Bumblebee_0's load", "_0", "_1"), errors, strict=True):
+        assert name in line
+        assert float(line.split("cm RMS")[0].split()[-1]) < 15
+    assert main(["demo", "mixed", "--drones", "2"]) == 2
+    assert "--drones 3" in capsys.readouterr().err
+
+
 def test_without_opengl_the_demo_says_so_and_does_the_rest(tmp_path, capsys, monkeypatch):
     def no_picture(*args, **kwargs):
         raise flight.RenderError("no OpenGL context could be made")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from crazysim.core.data import SimData
+from crazysim.core.population import populations
 from crazysim.pytree import has_members, map_batched, scopes
 
 _AXES = {"drone": (0, 1), "world": (0,)}
@@ -45,7 +46,12 @@ def spread(data: SimData, n_worlds: int, n_drones: int) -> SimData:
 def with_own(default: SimData, data: SimData) -> SimData:
     """Return the default data with the seed, numbers and flags of the data."""
     own = {name: getattr(data.core, name) for name in ("rng_key", "world_id", "drone_id", "n_worlds")}
-    return default.replace(core=default.core.replace(**own))
+    members = {
+        name: default.plugins[name].replace(member_id=record.member_id)
+        for name, record in populations(data).items()
+        if name in default.plugins
+    }
+    return default.replace(core=default.core.replace(**own), plugins=default.plugins | members)
 
 
 def reset_world(data: SimData, default: SimData) -> SimData:

@@ -12,6 +12,8 @@ from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv
 from crazysim.envs.task import Task
 from crazysim.envs.tasks.avoid import Avoid
+from crazysim.envs.tasks.chase import Chase
+from crazysim.envs.tasks.deliver import Deliver
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.tasks.land import Land
 from crazysim.envs.tasks.race import Race
@@ -49,6 +51,8 @@ TASKS: dict[str, Entry] = {
     "recover": Entry(Recover, "crazysim/Recover-v0"),
     "track": Entry(TrackTrajectory, "crazysim/Track-v0"),
     "land": Entry(Land, "crazysim/Land-v0"),
+    "chase": Entry(Chase, "crazysim/Chase-v0"),
+    "deliver": Entry(Deliver, "crazysim/Deliver-v0"),
     "race": Entry(Race, "crazysim/Race-v0"),
     "multi_race": Entry(Race, "crazysim/MultiRace-v0", n_drones=2),
     "avoid": Entry(Avoid, "crazysim/Avoid-v0"),

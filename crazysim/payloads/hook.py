@@ -231,7 +231,7 @@ class Hook(Colliding, Plugin):
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
         holds = np.ones(load.tip_pos.shape[0], bool)
-        objects = place_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring)  # type: ignore[arg-type]
+        objects = place_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring, bare=True)  # type: ignore[arg-type]
         heads = {f"{self.name}_hook": (load.tip_pos, turned_z(-self._along(data, load)))}
         return placed(objects, heads)
 

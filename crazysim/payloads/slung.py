@@ -30,6 +30,9 @@ from crazysim.payloads.core import (
 from crazysim.payloads.link import Link, couple, end_relative_motion, relative
 from crazysim.pytree import select_worlds
 
+OUT_OF_SIGHT = 1000.0
+"""Depth at which loads are that do not exist, m."""
+
 
 class SlungLoad(PointLoad, Plugin):
     """A load on a rod or a cable, a point mass that hangs from each drone.
@@ -181,9 +184,18 @@ def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, 
 
 
 def place_loads(
-    data: SimData, name: str, load: LoadData, tip: Array, holds: Array, n_pieces: int, ring: float = 0.0
+    data: SimData,
+    name: str,
+    load: LoadData,
+    tip: Array,
+    holds: Array,
+    n_pieces: int,
+    ring: float = 0.0,
+    bare: bool = False,
 ) -> Objects:
     """Return the scene's objects with loads and links at their poses; of one world.
+
+    Loads without mass, which do not exist, are out of sight.
 
     Args:
         data: One world.
@@ -193,13 +205,15 @@ def place_loads(
         holds: True where something is attached to the end; other links hang along the body's z axis. (n_drones,)
         n_pieces: Straight pieces of a link.
         ring: Height of the point by which a load hangs above its middle, m.
+        bare: True to show links without loads.
     """
+    away = jnp.where(load.mass > 0, 0.0, OUT_OF_SIGHT) * np.array([0.0, 0.0, 1.0], tip.dtype)
     r = relative(data.states, tip, load.vel, load.attach)
     offset = jnp.where(holds[..., None], r.offset, -load.length * r.rot[..., 2])
     up = upward(data, load, tip)
     top = data.states.pos if r.arm is None else data.states.pos + r.arm
-    links = pieces(top, offset, load.length, n_pieces)
-    rows = {name: (load.pos - ring * up, turned_z(up)), f"{name}_link": links}
+    links = pieces(top if bare else top - away, offset, load.length, n_pieces)
+    rows = {name: (load.pos - away - ring * up, turned_z(up)), f"{name}_link": links}
     return placed(data.objects, rows)  # type: ignore[arg-type]
 
 

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from crazysim.dynamics import first_principles
 from crazysim.engine import interpret
+from crazysim.engine.relative import on_data
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
 from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.spawn import flying
@@ -175,7 +176,7 @@ def test_one_program_is_the_whole_step(env, begun):
     auto = AutoReset(env, "SameStep")
     fused = FusedEnvStep(env.env, auto.policy, begun, begun.action)
     program = fused._run.program
-    fused._run._run = lambda leaves, n_steps: interpret.steps(program, leaves, n_steps)
+    fused._run._run = on_data(program, lambda leaves, n_steps: interpret.steps(program, leaves, n_steps))
     before, action = one_step_to_go(env, begun, ENDS), random_action(begun)
     found, expected = fused(before, jnp.asarray(action)), auto.step(before, action)
     assert kind(found)[0] == kind(expected)[0]

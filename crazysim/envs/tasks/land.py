@@ -14,13 +14,13 @@ from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
 from crazysim.core.plugin import Placement
 from crazysim.core.stage import stage
-from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.core import pick, state_of, with_record
+from crazysim.envs.task import NAME
+from crazysim.envs.tasks.core import pick, with_record
+from crazysim.envs.tasks.touch_down import Landing, TouchDown, landing_of, not_yet
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, static
+from crazysim.pytree import leaf, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
@@ -32,13 +32,9 @@ HALF_WIDTH, CEILING = 1.4, 2.5
 """Largest distance from the middle of the pad's path along x and y, and largest height, of a drone, m."""
 CIRCLE = (0.3, 0.7)
 """Smallest and largest radius of a moving pad's circle, m."""
-SOFT = 0.5
-"""Largest speed relative to the pad at touch-down, m/s."""
-UPRIGHT = np.cos(np.pi / 9)
-"""Smallest vertical component of the body z axis at touch-down: 20 degrees of tilt."""
 
 
-class Landing(PyTree):
+class PadLanding(Landing):
     """Path of each drone's pad, and the outcome of its landing."""
 
     circle: Array = leaf("drone", 1)
@@ -47,25 +43,12 @@ class Landing(PyTree):
     """Angular velocity of the pad on the circle, rad/s. (n_worlds, n_drones, 1)"""
     phase: Array = leaf("drone", 1)
     """Angle of the pad on the circle at the start of the episode, rad. (n_worlds, n_drones, 1)"""
-    landed: Array = leaf("drone", 0)
-    """True where the drone has touched down softly. (n_worlds, n_drones)"""
-    crashed: Array = leaf("drone", 0)
-    """True where it has touched anything otherwise, or left its part of the arena. (n_worlds, n_drones)"""
-    out_before: Array = leaf("drone", 0)
-    """True where it had landed or crashed before this environment step. (n_worlds, n_drones)"""
-    to_go_before: Array = leaf("drone", 0)
-    """Distance from the pad before this environment step, m. (n_worlds, n_drones)"""
     pads: Handle = static()
     """Handle of the pads, one per drone."""
 
-    @property
-    def out(self) -> Array:
-        """True where the drone has landed or crashed. (n_worlds, n_drones)"""
-        return self.landed | self.crashed
-
 
 @dataclass(frozen=True, kw_only=True)
-class Land(Task):
+class Land(TouchDown):
     """Land on a pad, 0.2 m above the floor.
 
     A drone has landed when it touches the pad from above, within its radius, with at most 0.5 m/s relative to it and a
@@ -74,14 +57,13 @@ class Land(Task):
     """
 
     name = "land"
-    Record = Landing
+    Record = PadLanding
+    what = "pad"
 
     speed: float = 0.0
     """Speed of a pad on a circle of 0.3 to 0.7 m radius, in either direction, m/s; zero for pads that stand still."""
     radius: float = RADIUS
     """Radius of a pad, m."""
-    seconds: float = 6.0
-    """Length of an episode, s."""
 
     def __post_init__(self) -> None:
         """Check the settings.
@@ -98,24 +80,6 @@ class Land(Task):
         """Add the pads, their motion and the check of contacts."""
         pads = sim.scene.add("landing_pad", "pad", count=sim.n_drones, pos=middles(sim.n_drones), radius=self.radius)
         contacts = sim.scene.contact_fn([pads], drones=False)
-        zero, no = jnp.zeros_like(sim.data.states.pos[..., :1]), jnp.zeros((sim.n_worlds, sim.n_drones), bool)
-
-        @stage("drone")
-        def touch(data: SimData) -> SimData:
-            """Decide at the first contact whether it is a landing."""
-            own, s, report = landing_of(data), data.states, contacts(data)
-            pos, vel = pad_of(data, data.core.steps + 1)
-            if report.objects is None or report.floor is None:
-                raise TypeError("expected contacts with pads and floor, got None")
-            mine = np.arange(data.core.n_drones) == data.core.drone_id
-            on_pad, elsewhere = jnp.any(report.objects & mine), jnp.any(report.objects & ~mine) | report.floor
-            offset, drift = s.pos - pos, s.vel - vel
-            above = (offset[2] > 0) & (offset[0] * offset[0] + offset[1] * offset[1] < self.radius**2)
-            soft = (rotation.dot(drift, drift)[0] <= SOFT**2) & (rotation.z_axis(s.quat)[2] >= UPRIGHT)
-            good = on_pad & above & soft & ~elsewhere
-            bad = (on_pad & ~good) | elsewhere | beyond(data)
-            new = own.replace(landed=own.landed | (good & ~own.crashed), crashed=own.crashed | (bad & ~own.landed))
-            return with_record(data, new)
 
         @stage("world")
         def move(data: SimData) -> SimData:
@@ -123,8 +87,9 @@ class Land(Task):
             pos, vel = pad_of(data, data.core.steps + 1)
             return pads.set_pose(data, pos, vel=vel)
 
-        record = Landing(zero, zero, zero, no, no, no, zero[..., 0], pads)
-        placements = [Placement(touch, before="increment_steps")]
+        zero = jnp.zeros_like(sim.data.states.pos[..., :1])
+        record = PadLanding(circle=zero, rate=zero, phase=zero, pads=pads, **not_yet(sim.data))
+        placements = [Placement(self.touch(contacts, self.radius), before="increment_steps")]
         if self.speed > 0:
             placements.insert(0, Placement(move, before="increment_steps", name=f"{NAME}_pads"))
         self.add_record(sim, record, placements)
@@ -145,62 +110,19 @@ class Land(Task):
         pos, along = pad_of(data, data.core.steps)
         return new.pads.set_pose(data, pos, vel=along) if self.speed > 0 else data
 
-    def before_step(self, data: SimData) -> SimData:
-        """Note the distance from the pad, and which drones are out."""
-        own = landing_of(data)
-        return with_record(data, own.replace(out_before=own.out, to_go_before=self.error(data)))
+    def place(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
+        """Return position, m, and velocity, m/s, of each drone's pad, of one drone or one world. (..., 3) each"""
+        return pad_of(data, data.core.steps + ahead if ahead else data.core.steps)
 
-    def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, and the way to its pad, m, and the pad's relative velocity, m/s."""
-        pos, vel = pad_of(data, data.core.steps)
-        return state_of(data) | {
-            "difference_to_pad": pos - data.states.pos,
-            "difference_to_pad_vel": vel - data.states.vel,
-        }
-
-    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return progress and the outcome, and costs of speed near the pad, of turning and of changing actions."""
-        own, d = landing_of(data), self.error(data)
-        drift = rotation.safe_norm(pad_of(data, data.core.steps)[1] - data.states.vel)[..., 0]
-        paid = {
-            "progress": 2.0 * (own.to_go_before - d),
-            "speed": -0.1 * drift * jnp.exp(-4 * d),
-            "spin": -0.002 * terms.spin(data),
-            "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "landed": 10.0 * own.landed,
-            "crashed": -10.0 * own.crashed,
-        }
-        return terms.only_where(~own.out_before, paid)
-
-    def terminated(self, data: SimData) -> Array:
-        """Return true where every drone has landed or crashed."""
-        return jnp.all(landing_of(data).out)
-
-    def error(self, data: SimData) -> Array:
-        """Return the distance from the pad, m."""
-        return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
-
-    def info(self, data: SimData) -> dict[str, Array]:
-        """Return which drones have landed and crashed."""
-        return {"landed": landing_of(data).landed, "crashed": landing_of(data).crashed}
+    def beyond(self, data: SimData) -> Array:
+        """Return true where a drone has left its part of the arena. (...)"""
+        pos = data.states.pos
+        return jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
         return {"lookat": (0, 0, 0.6), "distance": 3.5, "elevation": -20}
-
-    def target(self, data: SimData) -> Array:
-        """Return the middle of the pad, m."""
-        return pad_of(data, data.core.steps)[0]
-
-    def succeeded(self, data: SimData) -> Array:
-        """Return which drones have landed."""
-        return landing_of(data).landed
-
-
-def landing_of(data: SimData) -> Landing:
-    """Return the task's record."""
-    return data.plugins[NAME]
 
 
 def middles(n_drones: int) -> np.ndarray:
@@ -224,9 +146,3 @@ def pad_of(data: SimData, steps: Array) -> tuple[Array, Array]:
     out = jnp.concatenate([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
     along = jnp.concatenate([-jnp.sin(angle), jnp.cos(angle), 0 * angle], axis=-1)
     return middle_of(data) + own.circle * out, own.circle * own.rate * along
-
-
-def beyond(data: SimData) -> Array:
-    """Return true where a drone has left its part of the arena. (...)"""
-    pos = data.states.pos
-    return jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)

@@ -1,0 +1,129 @@
+"""Chase a car and land on its roof."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData, grid_2d
+from crazysim.core.plugin import Placement
+from crazysim.envs.random import between, draw, within
+from crazysim.envs.spawn import flying
+from crazysim.envs.tasks.core import pick
+from crazysim.envs.tasks.touch_down import Landing, TouchDown, not_yet
+from crazysim.errors import ConfigError
+from crazysim.sim.sim import Sim
+from crazysim.vehicles import Cars
+from crazysim.vehicles.cars import CarData
+from crazysim.vehicles.model import load_vehicle
+
+CARS, VEHICLE = "cars", "f1tenth_ros"
+"""Name of the population, and vehicle model."""
+SPACING = 6.0
+"""Distance between the first places of the cars of several drones, m; a drone observes its own car only."""
+NEAR, CEILING = 3.0, 2.5
+"""Largest horizontal distance of a drone from its car, and largest height of a drone, m."""
+SLOWEST = 0.3
+"""Smallest speed of a car, as a share of the largest."""
+STEER = 0.25
+"""Largest steering angle of a car, rad: circles of 1.3 m radius."""
+RADIUS = 0.12
+"""Largest horizontal distance of a drone from the middle of the roof at touch-down, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chase(TouchDown):
+    """Chase a car and land on its roof.
+
+    A car drives straight on or in circles, at a speed and with a steering angle of its own in every episode. A drone
+    starts in flight around it. It has landed when it touches the car from above, within 12 cm of the middle of the
+    roof, with at most 0.5 m/s relative to it and a tilt of at most 20 degrees; contact is checked at every physics
+    step. Any other contact with a car's body or the floor is a crash, as is getting 3 m away from the car. An episode
+    ends when every drone has landed or crashed.
+    """
+
+    name = "chase"
+    what = "roof"
+    progress = 6.0
+    crash = 4.0
+
+    speed: float = 1.0
+    """Largest speed of a car, m/s; the smallest is 0.3 times that."""
+
+    def __post_init__(self) -> None:
+        """Check the settings.
+
+        Raises:
+            ConfigError: If the speed is out of range.
+        """
+        if not isinstance(self.speed, (int, float)) or not 0 <= self.speed <= 3:
+            raise ConfigError(f"expected speed from 0 to 3 m/s, got {self.speed!r}")
+
+    def install(self, sim: Sim) -> None:
+        """Add the cars and the check of contacts."""
+        cars = Cars(sim.n_drones, vehicle=VEHICLE, pos=SPACING * grid_2d(sim.n_drones), level="speed", name=CARS)
+        sim.add(cars)
+        contacts = sim.scene.contact_fn([f"{CARS}:{k}" for k in range(sim.n_drones)], drones=False)
+        touch = Placement(self.touch(contacts, RADIUS, "world"), before="increment_steps")
+        self.add_record(sim, Landing(**not_yet(sim.data)), [touch])
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return cars that drive, and drones in flight around them."""
+        n, car, vehicle = data.core.n_drones, data.plugins[CARS], load_vehicle(VEHICLE)
+        x = draw(key, n, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1)
+        speed, steer = self.speed * between(x["speed"], SLOWEST, 1.0), within(x["steer"], STEER)
+        # Those of a car that rolls without slip; its tyres then slip a little.
+        side = jnp.tan(steer) * (vehicle.number("axles.rear") / vehicle.wheelbase)
+        car = car.replace(
+            yaw=within(x["yaw"], np.pi),
+            body_vel=jnp.concatenate([speed, side * speed], axis=-1),
+            yaw_rate=speed * jnp.tan(steer) / vehicle.wheelbase,
+            steer=steer,
+            command=jnp.concatenate([speed, steer], axis=-1),
+        )
+        data = data.replace(plugins=data.plugins | {CARS: car})
+        pos = car.pos + within(x["start"], np.array([1.0, 1.0, 0.4])) + np.array([0.0, 0.0, 1.1])
+        return flying(data, pos, rotation.from_rpy(within(x["rpy"], 0.2)), within(x["vel"], 0.3))
+
+    def place(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
+        """Return position, m, and velocity, m/s, of each drone's roof, of one drone or one world. (..., 3) each"""
+        del ahead
+        car: CarData = data.plugins[CARS]
+        top = jnp.asarray(roof(), car.pos.dtype)
+        arm = rotation.rotate(car.quat, jnp.broadcast_to(top, car.pos.shape))
+        turning = jnp.concatenate([0 * car.yaw_rate, 0 * car.yaw_rate, car.yaw_rate], axis=-1)
+        vel = car.vel + rotation.cross(turning, arm)
+        return pick(car.pos + arm, data.core.drone_id), pick(vel, data.core.drone_id)
+
+    def beyond(self, data: SimData) -> Array:
+        """Return true where a drone has lost its car. (...)"""
+        pos = data.states.pos
+        away = (pos - self.place(data)[0])[..., :2]
+        return (rotation.dot(away, away)[..., 0] > NEAR**2) | (pos[..., 2] > CEILING)
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state, the way to its roof, m, the roof's relative velocity, m/s, and the car's turning.
+
+        Those are ``heading``, the unit vector along the car in the horizontal plane, and ``yaw_rate``, rad/s.
+        """
+        car, drone = data.plugins[CARS], data.core.drone_id
+        heading = jnp.concatenate([jnp.cos(car.yaw), jnp.sin(car.yaw)], axis=-1)
+        return super().observe(data) | {"heading": pick(heading, drone), "yaw_rate": pick(car.yaw_rate, drone)}
+
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        """Return the camera of images and films."""
+        del n_drones
+        return {"lookat": (0, 0, 0.4), "distance": 6.0, "elevation": -25}
+
+
+def roof() -> np.ndarray:
+    """Return the middle of the roof in the frame of a car, m. (3,)"""
+    vehicle = load_vehicle(VEHICLE)
+    length, height = vehicle.number("shape.length"), vehicle.number("shape.height")
+    return np.array([-0.06 * length, 0.0, height])

@@ -1,0 +1,265 @@
+"""Take a load off a moving trailer with a hook, and bring it to a goal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData, grid_2d
+from crazysim.core.stage import stage
+from crazysim.envs import terms
+from crazysim.envs.random import between, draw, within
+from crazysim.envs.spawn import flying
+from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.core import install_rules, pick, state_of, with_record
+from crazysim.errors import ConfigError
+from crazysim.payloads import Hook
+from crazysim.pytree import PyTree, leaf
+from crazysim.sim.sim import Sim
+from crazysim.vehicles import Cars
+from crazysim.vehicles.cars import CarData
+from crazysim.vehicles.model import load_vehicle
+from crazysim.vehicles.state import to_world
+from crazysim.vehicles.trailer import trailer_axles
+
+CARS, VEHICLE = "cars", "f1tenth_ros"
+"""Name of the population, and vehicle model."""
+SPACING = 10.0
+"""Distance between the first places of the cars of several drones, m."""
+HALF_WIDTH, LOWEST, CEILING = 4.5, 0.25, 2.5
+"""Largest distance of a drone from its car's first place along x and y, and its smallest and largest height, m. The
+smallest keeps it above cars and trailers."""
+SIZE, RING = (0.08, 0.08, 0.05), 0.07
+"""Full lengths of a load, and height of its ring above its middle, m."""
+HOOK_MASS, DAMPING, REACH, MAX_SPEED = 0.003, 2e-4, 0.07, 0.6
+"""Mass of the hook, kg, damping of its joint, N m s, and its reach, m, and largest speed, m/s, to pick up a load."""
+SLOWEST = 0.3
+"""Smallest speed of a car, as a share of the largest."""
+STEER = 0.25
+"""Largest steering angle of a car, rad: circles of 1.3 m radius."""
+GOAL = ((-1.0, -1.0, 0.8), (1.0, 1.0, 1.3))
+"""Lowest and highest goal of a load from its car's first place, m."""
+DROPPED = 0.15
+"""Height of a ring below which a load that was taken counts as dropped, m: it hangs lower than the trailer."""
+SLOW = 0.2
+"""Largest speed of a load that is delivered, m/s."""
+
+
+class Delivery(PyTree):
+    """Goal of each load, and the outcome of its flight."""
+
+    goal: Array = leaf("drone", 1)
+    """Goal of the load's ring, m. (n_worlds, n_drones, 3)"""
+    to_go_before: Array = leaf("drone", 0)
+    """Way of hook and load to the goal before this environment step, m. (n_worlds, n_drones)"""
+    taken: Array = leaf("drone", 0)
+    """True from the time at which the hook takes the load off the trailer. (n_worlds, n_drones)"""
+    steps_there: Array = leaf("drone", 0)
+    """Physics steps that the load has been at its goal without a break. (n_worlds, n_drones)"""
+    delivered: Array = leaf("drone", 0)
+    """True where the load has stayed at its goal for long enough. (n_worlds, n_drones)"""
+    crashed: Array = leaf("drone", 0)
+    """True where the drone has left its part of the arena, or dropped the load. (n_worlds, n_drones)"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deliver(Task):
+    """Take a load off a moving trailer with a hook, and hold it at a goal.
+
+    Behind a car that drives straight on or in circles, a trailer carries a load with a ring. A drone starts in flight
+    above it, with a hook on a swinging rod, which picks the load up within 7 cm of the ring at less than 0.6 m/s
+    relative to it. On the trailer the load does not slip. It is delivered when it has been within ``tolerance`` of its
+    goal, at most 0.2 m/s fast, for ``hold`` seconds. Getting lower than 0.25 m, higher than 2.5 m or too far away is a
+    crash, as is a load that sinks below 0.15 m; it ends the episode.
+    """
+
+    name = "deliver"
+    Record = Delivery
+
+    mass: float = 0.008
+    """Mass of the load, kg."""
+    length: float = 0.3
+    """Length of the rod, m."""
+    speed: float = 0.5
+    """Largest speed of a car, m/s; the smallest is 0.3 times that."""
+    seconds: float = 8.0
+    """Length of an episode, s."""
+    tolerance: float = 0.1
+    """Distance of the load from its goal below which it counts as there, m."""
+    hold: float = 0.5
+    """Time that the load must stay there, s."""
+
+    def __post_init__(self) -> None:
+        """Check the settings.
+
+        Raises:
+            ConfigError: If a number is out of range.
+        """
+        for name, low, high, unit in (("mass", 1e-4, 1.0, "kg"), ("length", 0.2, 1.0, "m"), ("speed", 0.0, 2.0, "m/s")):
+            value = getattr(self, name)
+            if not isinstance(value, (int, float)) or not low <= value <= high:
+                raise ConfigError(f"expected {name} from {low} to {high} {unit}, got {value!r}")
+
+    def install(self, sim: Sim) -> None:
+        """Add the cars with their trailers, the hooks with the loads on the trailers, and the rules."""
+        places = SPACING * grid_2d(sim.n_drones)
+        settings: dict[str, Any] = {"pos": places, "level": "speed", "trailer": True, "name": CARS}
+        sim.add(Cars(sim.n_drones, vehicle=VEHICLE, **settings))
+        rings = np.broadcast_to(np.pad(places, ((0, 0), (0, 1))), (sim.n_worlds, sim.n_drones, 3))
+        hook: dict[str, Any] = {"hook_mass": HOOK_MASS, "damping": DAMPING, "reach": REACH, "max_speed": MAX_SPEED}
+        sim.add(Hook(self.mass, length=self.length, size=SIZE, ring=RING, load_at=rings, **hook))
+        enough = round(self.hold * sim.freq)
+
+        @stage("drone")
+        def judge(data: SimData) -> SimData:
+            """Move a load that waits with its trailer; note what is taken and delivered, and a crash."""
+            own, load = delivery_of(data), data.plugins["load"]
+            taken = own.taken | load.attached
+            ring = pick(rings_of(data.plugins[CARS]), data.core.drone_id)
+            vel = jnp.where(taken, load.vel, data.core.freq * (ring - load.pos))
+            load = load.replace(pos=jnp.where(taken, load.pos, ring), vel=vel)
+            data = data.replace(plugins=data.plugins | {"load": load})
+            crashed = own.crashed | beyond(data) | (taken & (load.pos[2] < DROPPED))
+            steps = jnp.where(self.at_goal(data) & ~crashed, own.steps_there + 1, 0)
+            delivered = own.delivered | (steps >= enough)
+            new = own.replace(taken=taken, crashed=crashed, steps_there=steps, delivered=delivered)
+            return with_record(data, new)
+
+        pos, no = sim.data.states.pos, jnp.zeros((sim.n_worlds, sim.n_drones), bool)
+        zero = jnp.zeros_like(pos[..., 0])
+        install_rules(sim, Delivery(jnp.zeros_like(pos), zero, no, no.astype(jnp.int32), no, no), judge)
+
+    def spawn(self, data: SimData, key: Array) -> SimData:
+        """Return cars that drive, loads on their trailers, drones in flight above, and goals."""
+        car, load = data.plugins[CARS], data.plugins["load"]
+        x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1, goal=3)
+        speed, steer = self.speed * between(x["speed"], SLOWEST, 1.0), within(x["steer"], STEER)
+        yaw = within(x["yaw"], np.pi)
+        car = car.replace(
+            yaw=yaw,
+            body_vel=jnp.concatenate([speed, 0 * speed], axis=-1),
+            joints=jnp.concatenate([yaw, yaw], axis=-1),
+            steer=0 * steer,
+            command=jnp.concatenate([speed, steer], axis=-1),
+        )
+        ring = rings_of(car)
+        pos = ring + within(x["start"], np.array([0.8, 0.8, 0.3])) + np.array([0.0, 0.0, self.length + 0.6])
+        vel = within(x["vel"], 0.3)
+        data = flying(data, pos, rotation.from_rpy(within(x["rpy"], 0.1)), vel)
+        s = data.states
+        load = load.replace(
+            pos=ring,
+            vel=jnp.concatenate([to_world(yaw, car.body_vel), 0 * speed], axis=-1),
+            tip_pos=s.pos - np.array([0.0, 0.0, self.length], pos.dtype),
+            tip_vel=s.vel,
+            grip=jnp.ones_like(load.grip),
+        )
+        data = data.replace(plugins=data.plugins | {CARS: car, "load": load})
+        goal = between(x["goal"], *np.array(GOAL)) + middle_of(data)
+        return with_record(data, delivery_of(data).replace(goal=goal))
+
+    def before_step(self, data: SimData) -> SimData:
+        """Note the way to go."""
+        return with_record(data, delivery_of(data).replace(to_go_before=self.to_go(data)))
+
+    def to_go(self, data: SimData) -> Array:
+        """Return the way of the hook to the load, and of the load to its goal, m. (...)"""
+        load = data.plugins["load"]
+        return rotation.safe_norm(load.pos - load.tip_pos)[..., 0] + self.error(data)
+
+    def at_goal(self, data: SimData) -> Array:
+        """Return true where a load is near its goal and slow. (...)"""
+        vel = data.plugins["load"].vel
+        return (rotation.dot(vel, vel)[..., 0] < SLOW**2) & (self.error(data) < self.tolerance)
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state, and hook, load and goal relative to it.
+
+        Those are ``hook_pos``, m, and ``hook_vel``, m/s, relative to the drone; ``difference_to_load``, m, and
+        ``difference_to_load_vel``, m/s, from the hook to the ring; ``difference_to_goal``, from the ring to its goal,
+        m; and ``taken``, 1 once the hook has taken the load.
+        """
+        s, load, own = data.states, data.plugins["load"], delivery_of(data)
+        return state_of(data) | {
+            "hook_pos": load.tip_pos - s.pos,
+            "hook_vel": load.tip_vel - s.vel,
+            "difference_to_load": load.pos - load.tip_pos,
+            "difference_to_load_vel": load.vel - load.tip_vel,
+            "difference_to_goal": own.goal - load.pos,
+            "taken": own.taken[..., None].astype(s.pos.dtype),
+        }
+
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return progress, carrying and proximity, and costs of turning, changing actions and a crash."""
+        own, load, to_go = delivery_of(data), data.plugins["load"], self.to_go(data)
+        apart = rotation.safe_norm(load.pos - load.tip_pos)[..., 0]
+        drift = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
+        return {
+            "progress": 5.0 * (own.to_go_before - to_go),
+            "meeting": jnp.where(own.taken, 1.0, 0.1 * jnp.exp(-4 * apart) * (1 + jnp.exp(-2 * drift))),
+            "proximity": 2.0 * own.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "crash": -5.0 * own.crashed,
+        }
+
+    def terminated(self, data: SimData) -> Array:
+        """Return true where a drone has crashed."""
+        return jnp.any(delivery_of(data).crashed)
+
+    def error(self, data: SimData) -> Array:
+        """Return the distance of the load's ring from its goal, m."""
+        return rotation.safe_norm(delivery_of(data).goal - data.plugins["load"].pos)[..., 0]
+
+    def info(self, data: SimData) -> dict[str, Array]:
+        """Return which loads are taken and delivered, and which drones have crashed."""
+        own = delivery_of(data)
+        return {"taken": own.taken, "delivered": own.delivered, "crashed": own.crashed}
+
+    def camera(self, n_drones: int) -> Mapping[str, Any]:
+        """Return the camera of images and films."""
+        del n_drones
+        return {"lookat": (0, 0, 0.6), "distance": 5.5, "elevation": -20}
+
+    def target(self, data: SimData) -> Array:
+        """Return the goal of the load's ring, m."""
+        return delivery_of(data).goal
+
+    def succeeded(self, data: SimData) -> Array:
+        """Return which loads have been delivered."""
+        return delivery_of(data).delivered
+
+
+def delivery_of(data: SimData) -> Delivery:
+    """Return the task's record."""
+    return data.plugins[NAME]
+
+
+def rings_of(car: CarData) -> Array:
+    """Return the rings of loads that stand in the middle of the trailers' decks, of one world, m. (n_members, 3)"""
+    vehicle = load_vehicle(VEHICLE)
+    centre, thickness = vehicle.value("trailer.deck_centre"), vehicle.value("trailer.deck")[2]
+    front, _ = trailer_axles(car.state, car.params)
+    back = jnp.concatenate([car.yaw * 0 + centre[0], car.yaw * 0], axis=-1)
+    at = front + to_world(car.joints[..., 1:], back)  # type: ignore[index]
+    height = vehicle.number("trailer.wheel_radius") + centre[2] + thickness / 2 + SIZE[2] / 2 + RING
+    return jnp.concatenate([at, jnp.full_like(car.yaw, height)], axis=-1)
+
+
+def middle_of(data: SimData) -> Array:
+    """Return the first place of each drone's car, of one drone or one world, m. (..., 3)"""
+    places = np.pad(SPACING * grid_2d(data.core.n_drones), ((0, 0), (0, 1)))
+    return pick(jnp.asarray(places, data.states.pos.dtype), data.core.drone_id)
+
+
+def beyond(data: SimData) -> Array:
+    """Return true where a drone has left its part of the arena. (...)"""
+    pos = data.states.pos
+    far = jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1)
+    return far | (pos[..., 2] < LOWEST) | (pos[..., 2] > CEILING)

@@ -1,0 +1,161 @@
+"""Landing on a place that may stand still or move: the outcome, observations and rewards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.stage import Stage, stage
+from crazysim.envs import terms
+from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.core import state_of, with_record
+from crazysim.pytree import PyTree, leaf
+from crazysim.scene.report import ContactFn
+
+SOFT = 0.5
+"""Largest speed relative to the place at touch-down, m/s."""
+UPRIGHT = np.cos(np.pi / 9)
+"""Smallest vertical component of the body z axis at touch-down: 20 degrees of tilt."""
+
+
+class Landing(PyTree):
+    """Outcome of each drone's landing."""
+
+    landed: Array = leaf("drone", 0)
+    """True where the drone has touched down softly. (n_worlds, n_drones)"""
+    crashed: Array = leaf("drone", 0)
+    """True where it has touched anything otherwise, or left its part of the arena. (n_worlds, n_drones)"""
+    out_before: Array = leaf("drone", 0)
+    """True where it had landed or crashed before this environment step. (n_worlds, n_drones)"""
+    to_go_before: Array = leaf("drone", 0)
+    """Distance from its place before this environment step, m. (n_worlds, n_drones)"""
+
+    @property
+    def out(self) -> Array:
+        """True where the drone has landed or crashed. (n_worlds, n_drones)"""
+        return self.landed | self.crashed
+
+
+@dataclass(frozen=True, kw_only=True)
+class TouchDown(Task):
+    """Base of tasks in which every drone lands on a place of its own, which may move.
+
+    Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``place`` and ``beyond``.
+    """
+
+    Record = Landing
+    what: ClassVar[str] = "place"
+    """Name of the place in observations: ``difference_to_{what}``."""
+    progress: ClassVar[float] = 2.0
+    """Reward of a metre of progress towards the place."""
+    crash: ClassVar[float] = 10.0
+    """Cost of a crash."""
+
+    seconds: float = 6.0
+    """Length of an episode, s."""
+
+    def place(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
+        """Return position, m, and velocity, m/s, of each drone's place, of one drone or one world. (..., 3) each
+
+        Args:
+            data: Simulation.
+            ahead: Steps that a place by time is ahead of the data: 1 in a stage behind the integration.
+        """
+        raise NotImplementedError(self._undefined("place(data)"))
+
+    def beyond(self, data: SimData) -> Array:
+        """Return true where a drone has left its part of the arena. (...)"""
+        raise NotImplementedError(self._undefined("beyond(data)"))
+
+    def touch(self, contacts: ContactFn, radius: float, scope: str = "drone") -> Stage:
+        """Return the stage that decides at the first contact whether it is a landing, before the steps increase.
+
+        Args:
+            contacts: Contacts with floor and objects, of which object i belongs to drone i.
+            radius: Largest horizontal distance from the middle of the place at touch-down, m.
+            scope: Scope of the stage: ``drone``, or ``world`` for objects that a population places.
+        """
+
+        @stage(scope)
+        def touch(data: SimData) -> SimData:
+            own, s, report = landing_of(data), data.states, contacts(data)
+            pos, vel = self.place(data, ahead=1)
+            if report.objects is None or report.floor is None:
+                raise TypeError("expected contacts with objects and floor, got None")
+            mine = np.arange(data.core.n_drones) == data.core.drone_id[..., None]
+            on_place = jnp.any(report.objects & mine, axis=-1)
+            elsewhere = jnp.any(report.objects & ~mine, axis=-1) | report.floor
+            offset, drift = s.pos - pos, s.vel - vel
+            within = offset[..., 0] * offset[..., 0] + offset[..., 1] * offset[..., 1] < radius**2
+            soft = (rotation.dot(drift, drift)[..., 0] <= SOFT**2) & (rotation.z_axis(s.quat)[..., 2] >= UPRIGHT)
+            good = on_place & (offset[..., 2] > 0) & within & soft & ~elsewhere
+            bad = (on_place & ~good) | elsewhere | self.beyond(data)
+            new = own.replace(landed=own.landed | (good & ~own.crashed), crashed=own.crashed | (bad & ~own.landed))
+            return with_record(data, new)
+
+        return touch
+
+    def before_step(self, data: SimData) -> SimData:
+        """Note the distance from the place, and which drones are out."""
+        own = landing_of(data)
+        return with_record(data, own.replace(out_before=own.out, to_go_before=self.error(data)))
+
+    def observe(self, data: SimData) -> dict[str, Array]:
+        """Return the drone's state, and the way to its place, m, and the place's relative velocity, m/s."""
+        pos, vel = self.place(data)
+        return state_of(data) | {
+            f"difference_to_{self.what}": pos - data.states.pos,
+            f"difference_to_{self.what}_vel": vel - data.states.vel,
+        }
+
+    def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
+        """Return progress and the outcome, and costs of speed near the place, of turning and of changing actions."""
+        own, d = landing_of(data), self.error(data)
+        drift = rotation.safe_norm(self.place(data)[1] - data.states.vel)[..., 0]
+        paid = {
+            "progress": self.progress * (own.to_go_before - d),
+            "speed": -0.1 * drift * jnp.exp(-4 * d),
+            "spin": -0.002 * terms.spin(data),
+            "action_rate": -0.02 * terms.action_rate(action, last_action),
+            "landed": 10.0 * own.landed,
+            "crashed": -self.crash * own.crashed,
+        }
+        return terms.only_where(~own.out_before, paid)
+
+    def terminated(self, data: SimData) -> Array:
+        """Return true where every drone has landed or crashed."""
+        return jnp.all(landing_of(data).out)
+
+    def error(self, data: SimData) -> Array:
+        """Return the distance from the place, m."""
+        return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
+
+    def info(self, data: SimData) -> dict[str, Array]:
+        """Return which drones have landed and crashed."""
+        return {"landed": landing_of(data).landed, "crashed": landing_of(data).crashed}
+
+    def target(self, data: SimData) -> Array:
+        """Return the middle of the place, m."""
+        return self.place(data)[0]
+
+    def succeeded(self, data: SimData) -> Array:
+        """Return which drones have landed."""
+        return landing_of(data).landed
+
+
+def landing_of(data: SimData) -> Any:
+    """Return the task's record."""
+    return data.plugins[NAME]
+
+
+def not_yet(data: SimData) -> dict[str, Array]:
+    """Return the fields of ``Landing`` for drones in the air, of all worlds."""
+    zero = jnp.zeros(data.states.pos.shape[:2], data.states.pos.dtype)
+    no = jnp.zeros(zero.shape, bool)
+    return {"landed": no, "crashed": no, "out_before": no, "to_go_before": zero}

@@ -1,0 +1,99 @@
+"""Chase: a roof that drives, what counts as landed on it, and what as crashed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError
+from crazysim.core.stage import over_worlds
+from crazysim.envs import make
+
+CONTACT = 0.066
+"""Height of the centre of mass over a level roof that the drone touches, m: radius 0.086 less 0.02."""
+CASES = {
+    # Place over the roof's middle, m, and velocity relative to it, m/s.
+    "soft": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.3)),
+    "to the side": ((0.0, 0.07, CONTACT + 0.003), (0, 0, -0.3)),
+    "fast": ((0.0, 0.0, CONTACT + 0.003), (0, 0, -0.7)),
+    "sliding": ((0.0, 0.0, CONTACT + 0.003), (0.6, 0, -0.3)),
+    "hood": ((0.2, 0.0, CONTACT - 0.057), (0, 0, -0.3)),
+    "floor": ((-0.7, 0.0, -0.085), (0, 0, -0.1)),
+    "far": ((0.0, 3.05, 0.5), (0, 0, 0)),
+    "high": ((0.0, 0.0, 2.45), (0, 0, 0)),
+    "hover": ((0.0, 0.0, 0.3), (0, 0, 0)),
+}
+"""One world each, over cars that drive ahead."""
+LANDED, IN_FLIGHT = {"soft", "to the side"}, {"hover"}
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make("chase", len(CASES))
+
+
+@pytest.fixture(scope="module")
+def begun(env):
+    return jax.jit(env.reset)(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def flown(env, begun):
+    """Return the state after a step from all cases, over cars at their full speed."""
+    data = begun.data
+    car = data.plugins["cars"]
+    ahead = {name: jnp.zeros_like(getattr(car, name)) for name in ("yaw", "yaw_rate", "steer", "command")}
+    car = car.replace(**ahead | {"body_vel": jnp.zeros_like(car.body_vel).at[..., 0].set(0.8)})
+    car = car.replace(command=car.command.at[..., 0].set(0.8))
+    data = data.replace(plugins=data.plugins | {"cars": car})
+    offset, vel = (np.array(x, np.float32)[:, None] for x in zip(*CASES.values(), strict=True))
+    roof, along = over_worlds(env.task.place)(data)
+    np.testing.assert_allclose(along, np.broadcast_to([0.8, 0, 0], along.shape), atol=1e-6)
+    level = jnp.broadcast_to(jnp.array([0.0, 0, 0, 1]), data.states.quat.shape)
+    states = data.states.replace(pos=roof + offset, vel=along + vel, quat=level, ang_vel=jnp.zeros_like(roof))
+    state = begun.replace(data=data.replace(states=states))
+    return jax.jit(env.step)(state, state.action)
+
+
+def names(mask):
+    return {name for name, x in zip(CASES, np.asarray(mask)[:, 0], strict=True) if x}
+
+
+def test_landed_is_who_touches_the_roof_softly_from_above(flown):
+    assert names(flown.info["landed"]) == LANDED
+
+
+def test_everything_else_that_touches_or_gets_away_crashes(flown):
+    assert names(flown.info["crashed"]) == set(CASES) - LANDED - IN_FLIGHT
+    np.testing.assert_array_equal(flown.terminated, [name not in IN_FLIGHT for name in CASES])
+
+
+def test_the_reward_is_for_landing(flown):
+    paid = dict(zip(CASES, np.asarray(flown.reward)[:, 0], strict=True))
+    assert min(paid[name] for name in LANDED) > 9 > 0 > -3 > max(paid[name] for name in ("fast", "hood", "far"))
+
+
+def test_the_roof_moves_with_the_car(env, begun):
+    """Its velocity is that of its place, also in a turn, and the drone observes both."""
+    before, after = begun.data, jax.jit(env.step)(begun, begun.action).data
+    (pos, vel), (later, _) = over_worlds(env.task.place)(before), over_worlds(env.task.place)(after)
+    dt = env.n_substeps / env.sim.freq
+    np.testing.assert_allclose((later - pos) / dt, vel, atol=0.05)
+    seen = over_worlds(env.task.observe)(before)
+    np.testing.assert_allclose(seen["difference_to_roof"] + before.states.pos, pos, atol=1e-5)
+    np.testing.assert_allclose(seen["difference_to_roof_vel"] + before.states.vel, vel, atol=1e-5)
+    assert np.ptp(np.linalg.norm(vel, axis=-1)) > 0.2, "each car has a speed of its own"
+
+
+def test_the_roof_is_the_top_of_the_car(env, begun):
+    body = next(b for b in env.sim.scene.collision_model.objects if b.name == "cars:0")
+    top = max(body.geoms, key=lambda geom: geom.pos[2] + geom.shape.size[2])
+    data = begun.data
+    height = np.asarray(over_worlds(env.task.place)(data)[0] - data.plugins["cars"].pos)[..., 2]
+    np.testing.assert_allclose(height, top.pos[2] + top.shape.size[2], atol=1e-6)
+
+
+@pytest.mark.parametrize("speed", [-1, 4.0, "x"])
+def test_a_speed_out_of_range_is_refused(speed):
+    with pytest.raises(ConfigError, match="expected speed from 0 to 3 m/s"):
+        make("chase", 1, speed=speed)
