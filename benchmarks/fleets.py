@@ -71,7 +71,7 @@ def beside_cars(args: argparse.Namespace) -> Sim:
     """Return drones and cars, which drive circles."""
     sim = drones(args)
     cars = sim.add(Cars(args.cars, in_scene=False))
-    command = np.tile(np.float32([0.08, 0.2]), (args.worlds, args.cars, 1))
+    command = np.tile(np.array([0.08, 0.2], np.float32), (args.worlds, args.cars, 1))
     sim.data = cars.commanded(sim.data, command)
     return sim
 

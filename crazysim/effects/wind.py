@@ -113,7 +113,7 @@ class Wind(Plugin):
             filters=None if speed is None else zeros(sim, 5),
             gust=None if speed is None else zeros(sim, 3),
         )
-        if record.roughness is not None and np.any(np.asarray(record.roughness >= record.reference_height)):
+        if record.roughness is not None and np.any(np.asarray(record.roughness) >= np.asarray(record.reference_height)):
             raise ConfigError(
                 f"expected a roughness below the reference height, got {self.roughness} m and "
                 f"{self.reference_height} m. The roughness length is about a tenth of the height of grass or bushes."

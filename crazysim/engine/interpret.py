@@ -100,7 +100,7 @@ def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], 
     """Combine the results of a block for each drone of the world, one after the other."""
     n = op.param("n_members")
     own = np.arange(shape[0]) % n
-    combine = [ops.TABLE[name].numpy for name in op.param("reduce")]
+    combine: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
     found = [np.full(shape, ops.neutral(name, x.dtype)) for name, x in zip(op.param("reduce"), op.results, strict=True)]
     for j in range(n):
         other = [np.repeat(x.reshape(-1, n)[:, j], n) for x in args]

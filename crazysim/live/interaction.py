@@ -123,7 +123,7 @@ class Interaction:
             point: Point, world frame, m. (3,)
         """
         if self.on_click is not None:
-            self.on_click(self, world, point)
+            self.on_click(self, world, point)  # type: ignore[arg-type]  # mixed into Live
 
     def post(self, call: Callable[[Live], Any]) -> None:
         """Let the loop call a function between two steps; may be called from any thread."""

@@ -111,7 +111,7 @@ def air_and_gravity(data: SimData, load: LoadData, name: str) -> Array:
         return acc
     air = wind_at(data, load.pos) + load.air_vel
     if any(isinstance(record, WindFieldData) for record in data.plugins.values()):
-        air = air + load.wind_vel
+        air = air + load.wind_vel  # type: ignore[operator]  # there are fields, so it is set
     return acc + load.drag / (load.mass + load.drag / data.core.freq + TINY) * (air - load.vel)
 
 

@@ -195,7 +195,8 @@ def pressed(data: SimData, record: RotorJetData, drone: int | None, pos: Array, 
         return momentum(-jet(offset, axis, thrust, diameter, density) * axis)
     speed = rotor_vel * RPM_TO_RAD_S
     share, place = between(speed, record.speeds)
-    cell = (rotation.rotate_inverse(quat, offset) - record.origin) / record.spacing
+    # A record with tables has their place.
+    cell = (rotation.rotate_inverse(quat, offset) - record.origin) / record.spacing  # type: ignore[operator]
     shape = record.velocity.shape if record.pressure is None else record.pressure.shape
     share = jnp.where(is_inside(shape[1:4], cell)[..., None], share, 0.0)
     where = jnp.concatenate([jnp.broadcast_to(place, (*cell.shape[:-1], 1)), cell], axis=-1)
