@@ -10,7 +10,7 @@ import pytest
 from cases import with_states
 from scipy.spatial.transform import Rotation
 
-from crazysim import ConfigError, FreeBodies, Sim, Terrain, rotation
+from crazysim import ConfigError, ContactResponse, FreeBodies, Sim, Terrain, rotation
 from crazysim.core.stage import stage
 
 FREQ = 500
@@ -249,6 +249,42 @@ def test_a_drone_lands_on_a_body_and_rides_on_it():
     assert moved > 0.2
     np.testing.assert_allclose(sim.data.states.pos[0, 0, 0], moved, atol=0.01)
     np.testing.assert_allclose(sim.data.states.vel[0, 0, 0], body.vel[0, 0, 0], rtol=0.02)
+
+
+def test_a_box_and_a_drone_ride_on_a_moving_platform_as_in_mujoco():
+    """The platform starts at 1 m/s: both slip back by v^2 / (2 mu g) = 8.5 cm, then move with it.
+
+    MuJoCo's platform is a body of 1000 t on a slide joint, since contacts with its mocap bodies do not drag. Its drone
+    is a box with the mass and the size of the collision box of ours, whose motors are off and which has no drag. The
+    tolerance is what the platform moves in a step.
+    """
+    speed, friction, seconds = 1.0, 0.6, 1.0
+    sim = Sim(control="rotor_vel", freq=FREQ)
+    box = np.asarray(sim.airframe.value("shape.collision_box"), np.float64)
+    mass = float(np.ravel(sim.data.params.mass)[0])
+    bodies = [((0.2, 0.2, 0.1), 0.5, (0, 0.2, 0.25), (0, 0, 0)),
+              (tuple(2 * box[3:]), mass, (0, -0.2, 0.2 + box[5]), (0, 0, 0))]  # fmt: skip
+    slide = """<body pos="0 0 0.15"><joint type="slide" axis="1 0 0"/>
+        <geom type="box" size="0.6 0.4 0.05" mass="1e6"/></body>"""
+    theirs = mujoco_track(bodies, seconds, friction, carrier=slide)[0]
+    platform = sim.scene.add("box", "platform", size=(1.2, 0.8, 0.1), pos=(0, 0, 0.15))
+    plugin = sim.add(FreeBodies(1, size=bodies[0][0], mass=0.5, pos=bodies[0][2], friction=friction, drones=False))
+    sim.add(ContactResponse(friction=friction))
+    params = sim.data.params
+    sim.data = sim.data.replace(params=params.replace(drag_matrix=0 * params.drag_matrix))
+    sim.data = with_states(sim.data, pos=np.array(bodies[1][2]) - box[:3])
+    found = []
+    for k in range(int(seconds * FREQ / 5) + 1):
+        found.append([plugin.read(sim.data).pos[0, 0], sim.data.states.pos[0, 0] + box[:3]])
+        sim.data = platform.set_pose(sim.data, [speed * 5 * k / FREQ, 0, 0.15], vel=[speed, 0, 0])
+        sim.step(5)
+    ours = np.asarray(found, np.float64)
+    assert np.abs(ours - theirs).max() < speed / FREQ
+    back = speed**2 / (2 * friction * 9.81)
+    for pos in (ours, theirs):
+        np.testing.assert_allclose((pos[-1, :, 0] - pos[-11, :, 0]) * FREQ / 50, speed, rtol=1e-4)
+        np.testing.assert_allclose(pos[-1, :, 0] - speed * seconds, -back, atol=speed / FREQ)
+        np.testing.assert_allclose(pos[-1, :, 1:], pos[0, :, 1:], atol=1e-5)
 
 
 def test_drones_and_bodies_push_each_other():
