@@ -19,7 +19,8 @@ class DefaultsFormatter(argparse.HelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         text, default = action.help, action.default
-        if text is None or default is None or default is False or default == [] or "default" in text:
+        states_none = default == [] or any(default is x for x in (None, False, argparse.SUPPRESS))
+        if text is None or states_none or "by default" in text:
             return text
         return f"{text} (default: %(default)s)"
 
@@ -162,11 +163,15 @@ def _add_training(commands: Any) -> None:
     train = commands.add_parser(
         "train", help="train a policy; write checkpoint, learning curve, policy and film", **with_defaults
     )
-    train.add_argument("task", help="hover, track, recover, race, ...; 'list' prints all tasks")
+    train.add_argument("task", help="name of a task, such as hover; list prints all")
     train.add_argument("--algorithm", help="ppo or apg; by default that of the task's recipe")
     train.add_argument("--seed", type=int, default=0, help="random seed")
     train.add_argument("--worlds", type=int, help="number of parallel worlds; by default that of the task's recipe")
-    train.add_argument("--iterations", type=int, help="number of iterations, each a rollout and its updates")
+    train.add_argument(
+        "--iterations",
+        type=int,
+        help="number of rollouts, each with its updates; by default that of the task's recipe",
+    )
     train.add_argument("--out", type=Path, help="folder of the run; by default out/TASK")
     train.add_argument("--resume", action="store_true", help="continue from the checkpoint in that folder")
     train.add_argument("--device", default="cpu", help="device: cpu, gpu")
