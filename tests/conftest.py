@@ -68,6 +68,19 @@ def pytest_collection_finish():
     gc.set_threshold(100_000, 20, 100)
 
 
+MEMORY = 3e9
+"""Memory of a worker, bytes, above which it looks for garbage between two files."""
+
+
+def pytest_runtest_teardown(item, nextitem):
+    """Look for garbage where a file ends: simulations hold the programs that were compiled for them."""
+    pages = Path("/proc/self/statm")
+    if nextitem is None or nextitem.path == item.path or not pages.exists():
+        return
+    if int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MEMORY:
+        gc.collect()
+
+
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item, call):
     """Fail what is skipped where nothing may be: a skip in CI would hide a test that never ran."""
