@@ -14,30 +14,67 @@ from crazysim.demos import DEMOS
 from crazysim.errors import RenderError
 
 
+class DefaultsFormatter(argparse.HelpFormatter):
+    """Help that states the defaults which are numbers or names; a help text that says "by default" states its own."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        text, default = action.help, action.default
+        states_none = default == [] or any(default is x for x in (None, False, argparse.SUPPRESS))
+        if text is None or states_none or "by default" in text:
+            return text
+        return f"{text} (default: %(default)s)"
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return the exit status; without a command, print the help."""
     parser = argparse.ArgumentParser(
-        prog="crazysim", description="A drone simulator in which thousands of worlds advance in one call."
+        prog="crazysim", description="A drone simulator in which millions of worlds advance in one call."
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command")
-    demo = commands.add_parser("demo", help="run a demonstration; print figures, write a plot and a film")
-    demo.add_argument("name", nargs="?", choices=DEMOS, default="flight", metavar="NAME", help=_listed(DEMOS))
-    demo.add_argument("--worlds", type=int, dest="n_worlds", help="number of worlds; by default the demonstration's")
-    demo.add_argument("--drones", type=int, dest="n_drones", help="drones in each world")
-    demo.add_argument("--seconds", type=float, help="duration, s")
-    demo.add_argument("--device", help="device: cpu, gpu")
+    demo = commands.add_parser(
+        "demo",
+        help="run a demonstration; print figures, write a plot and a film",
+        epilog=f"demonstrations:\n{_listed(DEMOS)}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    demo.add_argument(
+        "name",
+        nargs="?",
+        choices=DEMOS,
+        default="flight",
+        metavar="NAME",
+        help="demonstration, one of those below; by default flight",
+    )
+    demo.add_argument(
+        "--worlds",
+        type=int,
+        dest="n_worlds",
+        metavar="N",
+        help="number of worlds; by default that of the demonstration",
+    )
+    demo.add_argument(
+        "--drones",
+        type=int,
+        dest="n_drones",
+        metavar="N",
+        help="drones in each world; by default that of the demonstration",
+    )
+    demo.add_argument("--seconds", type=float, help="simulated time, s; by default that of the demonstration")
+    demo.add_argument("--device", help="device: cpu, gpu; by default cpu")
     demo.add_argument("--out", type=Path, help="folder of the files; by default out")
     demo.add_argument("--no-film", dest="film", action="store_const", const=False, help="write no film")
     replay = commands.add_parser(
         "replay",
         help="play a recorded flight in a browser",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=DefaultsFormatter,
     )
     replay.add_argument("flight", type=Path, help="flight saved by crazysim.media.Flight or recorded live")
     replay.add_argument("--world", type=int, help="world to show; by default the first that was recorded")
     replay.add_argument("--port", type=int, default=8080, help="port of the server; 0 for any free port")
     replay.add_argument("--host", default="127.0.0.1", help="address of the server; 0.0.0.0 to accept other machines")
-    replay.add_argument("--export", type=Path, metavar="FILE", help="write the page to an .html file instead")
+    replay.add_argument(
+        "--export", type=Path, metavar="FILE", help="write the page to an .html file instead of serving it"
+    )
     _add_show(commands)
     _add_live(commands)
     _add_training(commands)
@@ -60,20 +97,24 @@ def _add_show(commands: Any) -> None:
     show = commands.add_parser(
         "show",
         help="fly a light show; print separation and tracking errors, write a film or a report",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=DefaultsFormatter,
     )
     show.add_argument("file", type=Path, help="show to fly, a .skyc file")
     show.add_argument("--film", type=Path, metavar="FILE", help="film to write, .mp4 or .gif")
-    show.add_argument("--page", type=Path, metavar="FILE", help="page to write, .html, which plays in a browser")
-    show.add_argument("--browser", action="store_true", help="serve that page until interrupted")
+    show.add_argument(
+        "--page", type=Path, metavar="FILE", help="page to write, .html, which plays the show in a browser"
+    )
+    show.add_argument("--browser", action="store_true", help="play the show on a page in a browser, until Ctrl-C")
     show.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any free port")
     show.add_argument("--host", default="127.0.0.1", help="address of the page; 0.0.0.0 to accept other machines")
     show.add_argument("--window", action="store_true", help="play the show in a window")
     show.add_argument("--report", type=Path, metavar="FILE", help="figures to write, .json")
     show.add_argument("--seconds", type=float, help="duration of the flight, s; by default that of the show")
     show.add_argument("--fps", type=float, default=25.0, help="frames per second of the film")
-    show.add_argument("--drone", help="airframe; by default that of Sim")
-    show.add_argument("--controller", help="controller that follows the trajectories; by default that of Sim")
+    show.add_argument("--drone", help="airframe: a name or the path of a TOML file; by default cf21B_500")
+    show.add_argument(
+        "--controller", help="controller that follows the trajectories, such as mellinger; by default crazyflow"
+    )
     show.add_argument("--device", default="cpu", help="device: cpu, gpu")
 
 
@@ -82,45 +123,55 @@ def _add_live(commands: Any) -> None:
     live = commands.add_parser(
         "live",
         help="fly in real time: watch, pilot, command and record; print the factor of real time",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=DefaultsFormatter,
     )
-    live.add_argument("--drones", type=int, default=4, help="drones in each world")
-    live.add_argument("--worlds", type=int, default=1, help="number of worlds")
-    live.add_argument("--seconds", type=float, help="simulated time, s; by default until the viewer is closed")
+    live.add_argument("--drones", type=int, default=4, metavar="N", help="drones in each world")
+    live.add_argument("--worlds", type=int, default=1, metavar="N", help="number of worlds")
+    live.add_argument("--seconds", type=float, help="simulated time, s; by default until all viewers are closed")
     live.add_argument("--speed", default="1", help="simulated seconds per second, or max for as fast as possible")
-    live.add_argument("--window", action="store_true", help="show a window; the default where there is a screen")
-    live.add_argument("--browser", action="store_true", help="show a page; the default without a screen")
-    live.add_argument("--headless", action="store_true", help="show nothing")
+    live.add_argument("--window", action="store_true", help="show a window; by default where there is a screen")
+    live.add_argument(
+        "--browser", action="store_true", help="show a page in a browser; by default where there is no screen"
+    )
+    live.add_argument("--headless", action="store_true", help="show nothing; requires --seconds")
     live.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any free port")
     live.add_argument("--host", default="127.0.0.1", help="address of the page; 0.0.0.0 to accept other machines")
-    live.add_argument("--fps", type=float, default=50.0, help="pictures per second")
-    live.add_argument("--control-freq", type=int, default=100, help="control steps per simulated second")
-    live.add_argument("--freq", type=int, default=500, help="physics steps per simulated second")
+    live.add_argument("--fps", type=float, default=50.0, help="pictures per second, sent to viewers")
+    live.add_argument("--control-freq", type=int, default=100, metavar="HZ", help="rate of control steps, Hz")
+    live.add_argument("--freq", type=int, default=500, metavar="HZ", help="rate of physics steps, Hz")
     live.add_argument("--record", type=Path, metavar="FILE", help="file to record to, for crazysim replay")
-    live.add_argument("--pilot", action="store_true", help="pilot the first drone: arrow keys, W, S, A, D, clicks")
-    live.add_argument("--gamepad", action="store_true", help="pilot the first drone by gamepad and keyboard")
+    live.add_argument(
+        "--pilot", action="store_true", help="pilot the first drone with arrow keys, W, S, A, D and clicks"
+    )
+    live.add_argument("--gamepad", action="store_true", help="pilot the first drone with a gamepad and the keyboard")
     live.add_argument("--commands", action="store_true", help="listen for commands over TCP, at ports 7000 and 7002")
-    live.add_argument("--drone", help="airframe; by default that of Sim")
-    live.add_argument("--controller", help="controller of the setpoints; by default that of Sim")
+    live.add_argument("--drone", help="airframe: a name or the path of a TOML file; by default cf21B_500")
+    live.add_argument(
+        "--controller", help="controller that follows the setpoints, such as mellinger; by default crazyflow"
+    )
     live.add_argument("--device", help="device: cpu, gpu; by default cpu")
 
 
 def _listed(names: Mapping[str, str]) -> str:
     """Return names and what they are, for a help text."""
-    return "; ".join(f"{name}: {what}" for name, what in names.items())
+    return "\n".join(f"  {name:8}{what}" for name, what in names.items())
 
 
 def _add_training(commands: Any) -> None:
     """Add the commands that train, evaluate, export and film policies."""
-    with_defaults = {"formatter_class": argparse.ArgumentDefaultsHelpFormatter}
+    with_defaults = {"formatter_class": DefaultsFormatter}
     train = commands.add_parser(
         "train", help="train a policy; write checkpoint, learning curve, policy and film", **with_defaults
     )
-    train.add_argument("task", help="hover, track, recover, race, ...; 'list' prints all tasks")
+    train.add_argument("task", help="name of a task, such as hover; list prints all")
     train.add_argument("--algorithm", help="ppo or apg; by default that of the task's recipe")
     train.add_argument("--seed", type=int, default=0, help="random seed")
     train.add_argument("--worlds", type=int, help="number of parallel worlds; by default that of the task's recipe")
-    train.add_argument("--iterations", type=int, help="number of iterations, each a rollout and its updates")
+    train.add_argument(
+        "--iterations",
+        type=int,
+        help="number of rollouts, each with its updates; by default that of the task's recipe",
+    )
     train.add_argument("--out", type=Path, help="folder of the run; by default out/TASK")
     train.add_argument("--resume", action="store_true", help="continue from the checkpoint in that folder")
     train.add_argument("--device", default="cpu", help="device: cpu, gpu")

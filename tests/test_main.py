@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from crazysim.__main__ import main
+from crazysim.__main__ import COMMANDS, main
 from crazysim.demos import DEMOS, flight
 from crazysim.media import Flight
 
@@ -20,6 +20,19 @@ def test_without_a_command_it_lists_what_there_is(capsys):
 def test_as_a_module_in_a_process_of_its_own():
     out = subprocess.run([sys.executable, "-m", "crazysim", "--help"], capture_output=True, text=True, check=True)
     assert "demo" in out.stdout
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_of_a_command_states_defaults_once(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    out = " ".join(capsys.readouterr().out.split())
+    assert "(default: None)" not in out
+    assert "(default: False)" not in out
+    for argument in out.split(" --"):
+        assert argument.count("by default") + argument.count("(default:") <= 1, argument
+    if command == "train":
+        assert "random seed (default: 0)" in out
 
 
 def test_a_demo_has_a_name(capsys, monkeypatch):

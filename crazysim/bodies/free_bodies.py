@@ -64,9 +64,8 @@ class FreeBodiesData(Members):
 class FreeBodies(Population):
     """Balls and boxes that fall, slide, roll, bounce and stack.
 
-    They touch the ground, objects of the scene, other populations with shapes, drones and each other. What a drone, a
-    body or the user's object does to a body acts back on drones and bodies; objects and cars are not pushed. One
-    ``FreeBodies`` holds all free bodies of a simulation.
+    They touch the ground, objects of the scene, other populations with shapes, drones and each other. Drones and bodies
+    are pushed back; objects and other populations are not. One ``FreeBodies`` holds all free bodies of a simulation.
     """
 
     members: int | Sequence[str] = 1

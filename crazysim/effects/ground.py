@@ -22,7 +22,7 @@ class TerrainData(PyTree):
     below: Array = leaf("drone", 1)
     """Height of the ground below the drone after the last step, world frame, m. (n_worlds, n_drones, 1)"""
     floor: bool = static()
-    """True where a flat floor at z = 0 surrounds the terrain; False where its border continues for ever."""
+    """True where a flat floor at z = 0 surrounds the terrain; False where its border extends outwards without end."""
 
     def surface_at(self, pos: Array) -> tuple[Array, Array]:
         """Return height and normal of the ground at a place, whose z does not count.

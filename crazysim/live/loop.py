@@ -392,7 +392,10 @@ class Live(Interaction, Closing):
         if step < self.step:
             snapshot = self._history.before(step)
             if snapshot is None:
-                raise ConfigError(f"expected a time that was flown, got {step / self.control_freq:g} s")
+                raise ConfigError(
+                    f"expected a time that was flown in this loop, got {step / self.control_freq:g} s. Use reset() to "
+                    f"return to the start."
+                )
             self.sim.data, self.step = snapshot.data, snapshot.step
             self._commands.restore(snapshot.commands)
             self._jumped()

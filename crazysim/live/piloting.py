@@ -126,7 +126,9 @@ def require_state_control(live: Live) -> None:
         ConfigError: If the simulation has other commands.
     """
     if live.sim.control != Control.state:
-        raise ConfigError(f"expected a simulation with control='state', got {live.sim.control.value!r}")
+        raise ConfigError(
+            f"expected a simulation with control='state', got {live.sim.control.value!r}. Use Sim(control='state')."
+        )
 
 
 def setpoint_of(command: NDArray) -> NDArray:

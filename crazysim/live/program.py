@@ -121,7 +121,9 @@ def fly(
         RenderError: If this machine cannot show a viewer, or a port is in use.
     """
     if commands and (pilot or gamepad):
-        raise ConfigError("expected commands over TCP or a pilot, got both")
+        raise ConfigError(
+            "expected commands over TCP or a pilot, got both. Leave out --commands, or --pilot and --gamepad."
+        )
     sim = Sim(n_worlds, n_drones, control="state", freq=freq, state_freq=control_freq, **settings)
     with contextlib.ExitStack() as stack:
         live = stack.enter_context(Live(sim, control_freq, speed, fps))
@@ -154,9 +156,9 @@ def run(options: Namespace) -> None:
     """Run the command with its options, and print the figures."""
     viewers = [name for name in ("window", "browser") if getattr(options, name)]
     if options.headless and viewers:
-        raise ConfigError(f"expected --headless or --{viewers[0]}, got both")
+        raise ConfigError(f"expected --headless or --{viewers[0]}, got both. Leave one out.")
     if options.headless and options.seconds is None:
-        raise ConfigError("expected --seconds with --headless, got none")
+        raise ConfigError("expected --seconds with --headless, got none. Use --seconds 20, for example.")
     if not options.headless and not viewers:
         viewers = ["window" if _has_screen() else "browser"]
     given = {name: x for name in ("drone", "device", "controller") if (x := getattr(options, name)) is not None}

@@ -91,7 +91,7 @@ class Radio(Closing):
             from cflib.crazyflie.log import LogConfig
             from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
         except ImportError as error:
-            raise ConfigError("expected cflib, got none. Install it with pip install crazysim[radio].") from error
+            raise ConfigError("expected cflib, got none. Run pip install 'crazysim[radio]'.") from error
         if not cflib.crtp.CLASSES:
             cflib.crtp.init_drivers()
         self._sync = SyncCrazyflie(uri, cf=crazyflie or Crazyflie())

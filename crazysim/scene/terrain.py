@@ -29,8 +29,8 @@ FLATTEST = 1e-3
 class Terrain(Plugin):
     """A height field on which drones and loads land; replaces the stage ``clip_floor_pos``.
 
-    It is part of the scene: drawn, seen by range finders and depth cameras, and the floor of contact reports and of a
-    ``ContactResponse`` that is added later.
+    It is part of the scene: images, range finders and depth cameras include it, and it is the floor in contact reports
+    and for a ``ContactResponse`` that is added later.
     """
 
     heights: Any = parameter()
@@ -42,7 +42,7 @@ class Terrain(Plugin):
     """Middle of the terrain at height zero, world frame, m. (3,)"""
     floor: bool = True
     """True to keep the flat floor around it; False to remove it, which depressions below z = 0 need. The heights of the
-    border then continue for ever."""
+    border then extend outwards without end."""
     rgba: Any = None
     """Colour; None for that of the floor. (4,)"""
     name: str = "terrain"

@@ -44,8 +44,8 @@ class Chase(TouchDown):
     A car drives straight on or in circles, at a speed and with a steering angle of its own in every episode. A drone
     starts in flight around it. It has landed when it touches the car from above, within 12 cm of the middle of the
     roof, with at most 0.5 m/s relative to it and a tilt of at most 20 degrees; contact is checked at every physics
-    step. Any other contact with a car's body or the floor is a crash, as is getting 3 m away from the car. An episode
-    ends when every drone has landed or crashed.
+    step. Any other contact with a car's body or the floor is a crash, as is getting 3 m away from the car or higher
+    than 2.5 m. An episode ends when every drone has landed or crashed.
     """
 
     name = "chase"
@@ -102,7 +102,7 @@ class Chase(TouchDown):
         return pick(car.pos + arm, data.core.drone_id), pick(vel, data.core.drone_id)
 
     def beyond(self, data: SimData) -> Array:
-        """Return true where a drone has lost its car. (...)"""
+        """Return true where a drone is too far from its car, or too high. (...)"""
         pos = data.states.pos
         away = (pos - self.place(data)[0])[..., :2]
         return (rotation.dot(away, away)[..., 0] > NEAR**2) | (pos[..., 2] > CEILING)

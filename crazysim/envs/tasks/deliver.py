@@ -1,4 +1,4 @@
-"""Take a load off a moving trailer with a hook, and bring it to a goal."""
+"""Pick up a load from a moving trailer with a hook, and carry it to a goal."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Delivery(PyTree):
     goal: Array = leaf("drone", 1)
     """Goal of the load's ring, m. (n_worlds, n_drones, 3)"""
     to_go_before: Array = leaf("drone", 0)
-    """Way of hook and load to the goal before this environment step, m. (n_worlds, n_drones)"""
+    """Distance that hook and load have to travel to the goal before this environment step, m. (n_worlds, n_drones)"""
     taken: Array = leaf("drone", 0)
     """True from the time at which the hook takes the load off the trailer. (n_worlds, n_drones)"""
     steps_there: Array = leaf("drone", 0)
@@ -70,13 +70,14 @@ class Delivery(PyTree):
 
 @dataclass(frozen=True, kw_only=True)
 class Deliver(Task):
-    """Take a load off a moving trailer with a hook, and hold it at a goal.
+    """Pick up a load from a moving trailer with a hook, and hold it at a goal.
 
     Behind a car that drives straight on or in circles, a trailer carries a load with a ring. A drone starts in flight
     above it, with a hook on a swinging rod, which picks the load up within 7 cm of the ring at less than 0.6 m/s
     relative to it. On the trailer the load does not slip. It is delivered when it has been within ``tolerance`` of its
-    goal, at most 0.2 m/s fast, for ``hold`` seconds. Getting lower than 0.25 m, higher than 2.5 m or too far away is a
-    crash, as is a load that sinks below 0.15 m; it ends the episode.
+    goal, at most 0.2 m/s fast, for ``hold`` seconds. A drone crashes
+    when it gets lower than 0.25 m, higher than 2.5 m or too far away, or when its load, once picked up, sinks below
+    0.15 m. A crash ends the episode.
     """
 
     name = "deliver"

@@ -24,7 +24,7 @@ def add_cflib_driver(swarm: Swarm) -> list[str]:
     try:
         import cflib.crtp
     except ImportError as error:
-        raise ConfigError("expected cflib, got none. Install it with pip install crazysim[radio].") from error
+        raise ConfigError("expected cflib, got none. Run pip install 'crazysim[radio]'.") from error
     remove_cflib_driver(swarm)
     _drivers[id(swarm)] = _driver(swarm)
     cflib.crtp.CLASSES.insert(0, _drivers[id(swarm)])

@@ -51,7 +51,7 @@ class MotionCaptureSource(ThreadSource):
             hostname: Address of its server.
             convention: Convention of the system; None for z up, xyzw and metres.
             command: Program that prints frames as ``worker.py`` does; None for that program, which needs
-                ``pip install crazysim[mocap]``.
+                ``pip install 'crazysim[mocap]'``.
 
         Raises:
             ConfigError: If the system or the package does not exist.
@@ -60,7 +60,7 @@ class MotionCaptureSource(ThreadSource):
             raise ConfigError(f"expected one of {', '.join(SYSTEMS)}, got {system!r}")
         if command is None and find_spec("motioncapture") is None:
             raise ConfigError(
-                "expected the package motioncapture, got none installed. Install it with pip install crazysim[mocap]."
+                "expected the package motioncapture, got none installed. Run pip install 'crazysim[mocap]'."
             )
         super().__init__(f"{system} at {hostname}", convention)
         command = [sys.executable, str(WORKER)] if command is None else command

@@ -83,7 +83,10 @@ def read_polls(path: str | Path) -> Iterator[Poll]:
         raise ConfigError(f"expected a recording of motion capture, got {str(path)!r}: {error}") from error
     with file:
         if file.read(len(HEADER)) != HEADER:
-            raise ConfigError(f"expected a recording of motion capture, got {str(path)!r}, which is none. Record one.")
+            raise ConfigError(
+                f"expected a recording of motion capture, got {str(path)!r}, which is none. Write one with "
+                f"Twins(..., record=path)."
+            )
         names: list[str] = []
         size = Path(path).stat().st_size
         while True:

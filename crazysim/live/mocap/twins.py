@@ -111,7 +111,9 @@ class Twins(Closing):
         for name in self.names:
             twin = twin_of(name, twins)
             if twin is None:
-                raise UnknownNameError(f"expected names that begin with one of {list(twins)}, got {name!r}")
+                raise UnknownNameError(
+                    f"expected names that begin with one of {list(twins)}, got {name!r}. Add a twin for it."
+                )
             found[name] = twin
         self.twins = found
         self._order = _in_order(found)
@@ -159,7 +161,10 @@ class Twins(Closing):
         data = sim.data
         objects = data.objects
         if objects is None:
-            raise ConfigError("expected the simulation whose scene has the twins, got one without movable objects")
+            raise ConfigError(
+                "expected the simulation whose scene has the twins, got one without movable objects. Pass the one that "
+                "Twins(sim, ...) was made for."
+            )
         new = _written((objects.pos, objects.quat, objects.vel), self._rows, self._poses)
         sim.data = data.replace(objects=objects.replace(pos=new[0], quat=new[1], vel=new[2]))
 

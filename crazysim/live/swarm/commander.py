@@ -82,11 +82,11 @@ class Commander:
     # High-level commands --------------------------------------------------------------------------------------------
 
     def take_off(self, height: float, duration: float, yaw: float | None = None) -> None:
-        """Rise to a height, m; None keeps the yaw."""
+        """Rise to a height, m, within a duration, s; a yaw of None keeps the present one."""
         self._vertical(height, duration, yaw, lands=False)
 
     def land(self, height: float, duration: float, yaw: float | None = None) -> None:
-        """Sink to a height, m, and stop the motors there; None keeps the yaw."""
+        """Descend to a height, m, and stop the motors there; None keeps the yaw."""
         self._vertical(height, duration, yaw, lands=True)
 
     def go_to(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, linear: bool = False) -> None:

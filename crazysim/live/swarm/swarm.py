@@ -75,7 +75,7 @@ class Swarm(Closing):
             ConfigError: If there are several worlds, or not one name for each drone.
         """
         if sim.n_worlds != 1:
-            raise ConfigError(f"expected a simulation of one world, got {sim.n_worlds}")
+            raise ConfigError(f"expected a simulation of one world, got {sim.n_worlds} worlds. Use Sim(n_worlds=1).")
         names = [f"cf{k + 1}" for k in range(sim.n_drones)] if names is None else list(names)
         if len(names) != sim.n_drones or len(set(names)) < len(names):
             raise ConfigError(f"expected {sim.n_drones} different names, got {names}")
