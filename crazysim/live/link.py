@@ -104,10 +104,10 @@ def fly_policy(
 
 
 class TrainedPolicy:
-    """A trained policy as a function of the state of a drone, for ``fly_policy``.
+    """A trained policy as a function of the state of a drone, for ``fly_policy``:
 
-    policy, _, meta = load_policy("out/hover")            # of crazysim.train
-    fly_policy(link, TrainedPolicy(policy, meta, goal=[0, 0, 1]), 5.0, 50, meta["actions"]["level"])
+        policy, _, meta = load_policy("out/hover")            # of crazysim.train
+        fly_policy(link, TrainedPolicy(policy, meta, goal=[0, 0, 1]), 5.0, 50, meta["actions"]["level"])
     """
 
     def __init__(self, policy: Callable[[dict[str, Any]], Any], meta: Mapping[str, Any], goal: ArrayLike = (0, 0, 1)):
