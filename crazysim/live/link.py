@@ -104,10 +104,9 @@ def fly_policy(
 
 
 class TrainedPolicy:
-    """A trained policy as a function of the state of a drone, for ``fly_policy``:
+    """A trained policy as a function of the state of a drone, for ``fly_policy``.
 
-        policy, _, meta = load_policy("out/hover")            # of crazysim.train
-        fly_policy(link, TrainedPolicy(policy, meta, goal=[0, 0, 1]), 5.0, 50, meta["actions"]["level"])
+    ``crazysim.train.load_policy`` returns the policy and its ``meta``, whose actions name the level of its commands.
     """
 
     def __init__(self, policy: Callable[[dict[str, Any]], Any], meta: Mapping[str, Any], goal: ArrayLike = (0, 0, 1)):
