@@ -159,8 +159,9 @@ def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
     for segment in program.segments:
         if isinstance(segment, UnfusedStage):
             raise _refusal(segment.name, segment.error.reason)
-        if segment.scope != "drone":
-            raise _refusal(segment.stages[0], "it reads all drones of its world, but a step of one drone is exported")
+        reader = next((op.stage for op in segment.block.operations if op.name == "over_others"), segment.stages[0])
+        if segment.couples:
+            raise _refusal(reader, "it reads all drones of its world, but a step of one drone is exported")
     after: dict[Slot, Any] = {}
     for segment in program.fused_segments:
         slots = (*segment.reads, *segment.hoisted_reads)
