@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from crazysim.closing import Closing
 from crazysim.errors import ConfigError
-from crazysim.live.closing import Closing
 from crazysim.live.server import DRONE_PORT, STREAM_PORT, connect
 from crazysim.trajectories import Trajectory
 from crazysim.trajectories.files.show_trajectory import format_trajectory

@@ -14,9 +14,9 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.closing import Closing
 from crazysim.core.settings import positive
 from crazysim.errors import ConfigError
-from crazysim.live.closing import Closing
 from crazysim.live.history import History, Snapshot
 from crazysim.live.interaction import Interaction
 from crazysim.live.pace import LiveReport, Pace, Speed, undisturbed

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.drones import load_airframe
 from crazysim.errors import ConfigError
-from crazysim.live.closing import Closing
 from crazysim.live.mocap.frames import Frame
 from crazysim.live.swarm import DroneState
 

@@ -15,8 +15,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from crazysim.closing import Closing
 from crazysim.errors import ConfigError
-from crazysim.live.closing import Closing
 from crazysim.live.commands import Command, command_of
 from crazysim.live.framing import Frames, FramingError, Message, Request, ShowFile
 

@@ -14,12 +14,11 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.closing import Closing
 from crazysim.errors import ConfigError
 
 MAGIC = b"crazysim journal 1\n"
@@ -28,7 +27,7 @@ HEAD = struct.Struct("<4sQI")
 """Head of a chunk: kind, length of the content, checksum."""
 
 
-class Journal:
+class Journal(Closing):
     """A file that chunks are appended to."""
 
     path: Path
@@ -79,14 +78,6 @@ class Journal:
         rest = memoryview(content)
         while rest:
             rest = rest[os.write(self._file, rest) :]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:

@@ -11,8 +11,8 @@ import selectors
 import socket
 import threading
 
+from crazysim.closing import Closing
 from crazysim.errors import ConfigError
-from crazysim.live.closing import Closing
 from crazysim.live.crtp.device import CrtpDevice
 from crazysim.live.swarm import Swarm
 

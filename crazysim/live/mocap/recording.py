@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from crazysim.closing import Closing
 from crazysim.errors import ConfigError
-from crazysim.live.closing import Closing
 from crazysim.live.mocap.frames import Frame
 from crazysim.live.mocap.source import MocapSource, Poll
 

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from crazysim.closing import Closing
 from crazysim.errors import ConfigError
-from crazysim.live.closing import Closing
 from crazysim.live.mocap.frames import Convention, Frame, from_rpy
 from crazysim.live.paths import paths_of
 from crazysim.trajectories import Trajectory

@@ -13,9 +13,9 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from crazysim.closing import Closing
 from crazysim.drones import load_airframe
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.live.closing import Closing
 from crazysim.live.mocap.frames import from_rpy, multiply, rotate, to_rpy
 from crazysim.live.mocap.playback import Playback
 from crazysim.live.mocap.recording import MocapRecorder

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.dynamics import Dynamics
 from crazysim.effects import MotorFailure
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.live.closing import Closing
 from crazysim.live.mocap.frames import rotate, to_rpy
 from crazysim.live.mocap.reports import Reports
 from crazysim.live.swarm.commander import Commander

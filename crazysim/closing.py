@@ -1,4 +1,4 @@
-"""Connections that a ``with`` block closes."""
+"""Files and connections that a ``with`` block closes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class Closing:
     """Base of what has a ``close`` method, which is called at the end of a ``with`` block."""
 
     def close(self) -> None:
-        """Disconnect."""
+        """End it."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
