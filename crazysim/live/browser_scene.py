@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.live.mocap.frames import rotate
 from crazysim.live.picture import Picture
+from crazysim.live.scene_bodies import DRONE, MARK_RADIUS, SceneBodies, SceneBody
 from crazysim.media.trail import MIN_ALPHA, colors_of
 from crazysim.media.web import add_static, mesh_of, rgb
 from crazysim.scene.visual_geoms import VisualGeom
@@ -17,30 +19,44 @@ TRAIL_PERIOD = 0.05
 """Time between two samples of a trail, s."""
 SETPOINT_RADIUS = 0.025
 """Radius of a setpoint's sphere, m."""
-MARK_RADIUS = 0.12
-"""Radius of the sphere around a drone that touches something or is selected, m."""
+LIGHT_RADIUS = 0.05
+"""Radius of the glow around a lit drone, m."""
+NEAR = 0.02
+"""Distance from a body, per distance from the camera, at which a click still picks it."""
 WIND_SCALE = 0.1
 """Length of a wind arrow per speed, s."""
+HIDDEN = 1e-6
+"""Scale of a mark that is not shown."""
 FLOOR_GREY = 0.8
 """Grey that trails fade to, 0 to 1."""
-CONTACT_COLOR, SELECTED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
+CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
 """Colours of marks, rgb, 0 to 255."""
 
 
 class BrowserScene:
     """Nodes of one viser server that show some worlds, side by side in a grid."""
 
-    def __init__(self, server: Any, shapes: list[VisualGeom], picture: Picture, spacing: float, trail: float):
+    def __init__(
+        self,
+        server: Any,
+        shapes: list[VisualGeom],
+        bodies: SceneBodies,
+        picture: Picture,
+        spacing: float,
+        trail: float,
+    ):
         """Add all nodes.
 
         Args:
             server: Server of viser.
             shapes: Visible geoms of the scene.
+            bodies: Bodies that can be picked.
             picture: First picture.
             spacing: Distance between the origins of neighbouring worlds, m.
             trail: Duration of trails, s; 0 for none.
         """
-        self._scene = scene = server.scene
+        self._scene, self._bodies = server.scene, bodies
+        scene = server.scene
         n_worlds, n_drones = picture.drones.shape[:2]
         self.offsets = grid_offsets(n_worlds, spacing)
         self._root = scene.add_frame("/world", show_axes=False)
@@ -60,28 +76,34 @@ class BrowserScene:
                 node = scene.add_frame(f"/world/fixed/{w}/{k}", position=offset, show_axes=False)
                 add_static(scene, node.name, others, rgba)
         self._batches: list[tuple[Any, NDArray]] = []
-        for bodies in _alike(by_body):
-            self._add_bodies(np.array(bodies), by_body[bodies[0]], picture)
+        for alike in _alike(by_body):
+            self._add_bodies(np.array(alike), by_body[alike[0]], picture)
 
         colors = np.tile(colors_of(n_drones, None)[:, :3], (n_worlds, 1))
         drones = self._moved(picture.drones).reshape(-1, 3)
         self._setpoints = self._add_balls("setpoints", SETPOINT_RADIUS, picture.setpoint, rgb_of(colors), 0.8)
         self._contacts = self._add_balls("contacts", MARK_RADIUS, picture.drones, CONTACT_COLOR, 0.45)
-        self._contacts.batched_scales = np.full(len(drones), 1e-6, np.float32)
-        self._selected = scene.add_icosphere(
-            "/world/selected", radius=MARK_RADIUS, color=SELECTED_COLOR, opacity=0.25, visible=False
+        self._contacts.batched_scales = np.full(len(drones), HIDDEN, np.float32)
+        self._lights = self._add_balls("lights", LIGHT_RADIUS, picture.drones, rgb_of(0 * colors), 0.7)
+        self._lights.batched_scales = np.full(len(drones), HIDDEN, np.float32)
+        self._lit = np.zeros_like(colors)
+        self._followed = scene.add_icosphere(
+            "/world/followed", radius=MARK_RADIUS, color=FOLLOWED_COLOR, opacity=0.25, visible=False
         )
-        self._label = scene.add_label("/world/selected/name", "", position=(0, 0, MARK_RADIUS), anchor="bottom-center")
+        self._label = scene.add_label("/world/followed/name", "", anchor="bottom-center")
         self._wind = None
-        self._trail = Trails(scene, drones, colors, trail) if trail > 0 else None
-        self.visible: dict[str, bool] = dict.fromkeys(("trails", "setpoints", "contacts", "wind"), True)
+        self._tracked = bodies.tracked
+        tracked = self._moved(picture.pos[:, self._tracked]).reshape(-1, 3)
+        trail_colors = np.tile(colors_of(len(self._tracked), None)[:, :3], (n_worlds, 1))
+        self._trail = Trails(scene, tracked, trail_colors, trail) if trail > 0 else None
+        self.visible: dict[str, bool] = dict.fromkeys(("trails", "setpoints", "contacts", "wind", "lights"), True)
 
     def update(self, picture: Picture, follow: bool) -> None:
         """Show a picture.
 
         Args:
             picture: Picture.
-            follow: True to keep the selected drone in the middle: the worlds move, and the camera stays.
+            follow: True to keep the followed body in the middle: the worlds move, and the camera stays.
         """
         pos, show = self._moved(picture.pos), self.visible
         for handle, bodies in self._batches:
@@ -92,16 +114,17 @@ class BrowserScene:
             self._setpoints.visible = show["setpoints"]
             self._setpoints.batched_positions = _finite(self._moved(picture.setpoint).reshape(-1, 3))
         touching = picture.touching.ravel() & show["contacts"]
-        self._contacts.batched_scales = np.where(touching, 1.0, 1e-6).astype(np.float32)
+        self._contacts.batched_scales = np.where(touching, 1.0, HIDDEN).astype(np.float32)
         if touching.any():
             self._contacts.batched_positions = _finite(drones.reshape(-1, 3))
+        self._show_lights(drones.reshape(-1, 3), picture.lights.reshape(-1, 3) * show["lights"])
         self._show_wind(drones, picture)
         if self._trail is not None:
-            self._trail.update(picture.time, _finite(drones.reshape(-1, 3)), show["trails"])
-        self._show_selected(drones, picture, follow)
+            self._trail.update(picture.time, _finite(pos[:, self._tracked].reshape(-1, 3)), show["trails"])
+        self._show_followed(pos, picture, follow)
 
-    def pick(self, picture: Picture, origin: Any, direction: Any) -> tuple[int, int | None, NDArray | None]:
-        """Return what a ray from the camera hits: index of the world, drone or None, point of the floor or None.
+    def pick(self, picture: Picture, origin: Any, direction: Any) -> tuple[int, SceneBody | None, NDArray | None]:
+        """Return what a ray from the camera hits: index of the world, body or None, point of the floor or None.
 
         Args:
             picture: Picture that the user has seen.
@@ -110,19 +133,34 @@ class BrowserScene:
         """
         origin = np.asarray(origin, float) - np.asarray(self._root.position, float)
         direction = np.asarray(direction, float) / np.linalg.norm(direction)
-        drones = self._moved(picture.drones)
-        relative = drones - origin
-        along = relative @ direction
-        beside = np.linalg.norm(relative - along[..., None] * direction, axis=-1)
-        hit = (along > 0) & (beside < np.maximum(MARK_RADIUS, 0.02 * along))
-        if hit.any():
-            world, drone = np.unravel_index(np.where(hit, along, np.inf).argmin(), hit.shape)
-            return int(world), int(drone), None
+        beside = self._hits(picture, origin, direction)
+        if np.isfinite(beside).any():
+            world, mocap = np.unravel_index(beside.argmin(), beside.shape)
+            return int(world), self._bodies.items[self._bodies.owner[mocap]], None
         if direction[2] > -1e-6:
             return 0, None, None
         point = origin - direction * origin[2] / direction[2]
         world = int(np.linalg.norm(self.offsets - point, axis=-1).argmin())
         return world, None, point - self.offsets[world]
+
+    def _hits(self, picture: Picture, origin: NDArray, direction: NDArray) -> NDArray:
+        """Return distances of the middles of bodies from a ray that enters the box around them, m. (n, n_mocap)
+
+        They are infinite for all others. What is small or far away is easy to click, too: its box is larger.
+        """
+        start = origin - self._moved(picture.pos)
+        away = np.linalg.norm(start, axis=-1, keepdims=True)
+        low, high = self._bodies.low, self._bodies.high
+        drones = np.array([self._bodies.items[k].kind == DRONE for k in self._bodies.owner])
+        least = np.maximum(np.where(drones, MARK_RADIUS, 0.0)[:, None], NEAR * away)
+        to_body = picture.quat * (-1, -1, -1, 1)
+        begin, ray = rotate(to_body, start), rotate(to_body, np.broadcast_to(direction, start.shape))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (np.minimum(low, -least) - begin) / ray, (np.maximum(high, least) - begin) / ray
+        enter, leave = np.fmin(a, b).max(-1), np.fmax(a, b).min(-1)
+        hit = (enter > 0) & (enter <= leave) & (high > low).any(-1)
+        beside = np.linalg.norm(start - (start @ direction)[..., None] * direction, axis=-1)
+        return np.where(hit, beside, np.inf)
 
     def _add_bodies(self, bodies: NDArray, shapes: list[VisualGeom], picture: Picture) -> None:
         """Add bodies of equal geoms, one batch for each colour."""
@@ -166,17 +204,27 @@ class BrowserScene:
         self._wind.visible = self.visible["wind"]
         self._wind.points = ends
 
-    def _show_selected(self, drones: NDArray, picture: Picture, follow: bool) -> None:
+    def _show_lights(self, drones: NDArray, colors: NDArray) -> None:
+        """Show the LEDs of all drones; what has not changed is not sent. (n, 3), (n, 3)"""
+        if not np.array_equal(colors, self._lit):
+            self._lit = colors
+            self._lights.batched_colors = rgb_of(colors)
+            self._lights.batched_scales = np.where(colors.any(-1), 1.0, HIDDEN).astype(np.float32)
+        if colors.any():
+            self._lights.batched_positions = _finite(drones)
+
+    def _show_followed(self, bodies: NDArray, picture: Picture, follow: bool) -> None:
         k = None
-        if picture.selected is not None:
-            k = next((i for i, world in enumerate(picture.worlds) if world == picture.selected[0]), None)
-        self._selected.visible = k is not None
-        if k is None or picture.selected is None:
+        if picture.followed is not None:
+            k = next((i for i, world in enumerate(picture.worlds) if world == picture.followed[0]), None)
+        self._followed.visible = k is not None
+        if k is None or picture.followed is None:
             self._root.position = (0.0, 0.0, 0.0)
             return
-        pos = _finite(drones[k, picture.selected[1]])
-        self._selected.position = pos
-        self._label.text = picture.name
+        pos = _finite(bodies[k, picture.followed[1]])
+        radius = self._bodies.radius(picture.followed[1])
+        self._followed.position, self._followed.radius = pos, radius
+        self._label.text, self._label.position = picture.name, (0.0, 0.0, radius)
         self._root.position = -pos if follow else (0.0, 0.0, 0.0)
 
     def _moved(self, pos: NDArray) -> NDArray:
@@ -185,14 +233,14 @@ class BrowserScene:
 
 
 class Trails:
-    """The recent positions of all drones, as one set of line segments of constant size."""
+    """The recent positions of all bodies, as one set of line segments of constant size."""
 
     def __init__(self, scene: Any, pos: NDArray, colors: NDArray, seconds: float):
         """Begin with trails of no length.
 
         Args:
             scene: Scene of viser.
-            pos: Positions of all drones, m. (n, 3)
+            pos: Positions of all bodies, m. (n, 3)
             colors: Their colours, 0 to 1. (n, 3)
             seconds: Duration, s.
         """

@@ -125,7 +125,7 @@ class Swarm(Closing):
     # Time -----------------------------------------------------------------------------------------------------------
 
     def __call__(self, live: Any) -> None:
-        """Stage the commands in force, for a loop such as ``Live``, which has the simulation as ``live.sim``.
+        """Stage the commands in force and show the lights, for a loop such as ``Live``.
 
         Raises:
             ConfigError: If it is another simulation.
@@ -133,6 +133,7 @@ class Swarm(Closing):
         if live.sim is not self.sim:
             raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
         self.update()
+        live.lights[0] = self.colors
 
     def update(self) -> None:
         """Read the states and stage the commands in force, between two control steps."""
