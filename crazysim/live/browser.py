@@ -18,7 +18,7 @@ from crazysim.live.browser_scene import BrowserScene
 from crazysim.live.picture import PictureSource
 from crazysim.live.scene_bodies import SceneBodies
 from crazysim.live.viewer import Viewer
-from crazysim.media.web import FOV, free_port, import_viser
+from crazysim.media.web import FOV, LOCAL, free_port, import_viser
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
 
@@ -29,8 +29,6 @@ MAX_WORLDS = 64
 """Most worlds that are shown unless they are listed."""
 MARGIN = 1.0
 """Free space between neighbouring worlds, m."""
-LOCAL = ("127.0.0.1", "localhost", "::1")
-"""Addresses that other machines cannot reach."""
 
 log = logging.getLogger(__name__)
 
@@ -41,8 +39,8 @@ class Browser(Viewer):
         browser = live.show(Browser(port=8080))
         print(browser.url)
 
-    A click on a drone selects it, and one on a vehicle, load or object follows that; the panel plots any array of the data, pauses, resets, records, and has
-    the buttons and sliders of the loop. Browsers may come and go.
+    A click on a drone selects it, and one on a vehicle, load or object follows that. The panel plots any array of the
+    data, pauses, resets, records, and has the buttons and sliders of the loop. Browsers may come and go.
     """
 
     def __init__(
@@ -131,6 +129,14 @@ class Browser(Viewer):
         camera.fov, camera.look_at = np.deg2rad(FOV), (0.0, 0.0, 0.5)
         camera.position = (0.0, -0.9 * size, 0.6 * size + 0.5)
         self._panel = BrowserPanel(self._server, live, self._scene, bodies, self._follow, self._plot)
+
+        @self._server.on_client_connect
+        def _(client: Any) -> None:
+            log.info("browser %d connected at %.2f s", client.client_id, live.time)
+
+        @self._server.on_client_disconnect
+        def _(client: Any) -> None:
+            log.info("browser %d disconnected at %.2f s", client.client_id, live.time)
 
         @scene.on_click()
         def _(event: Any) -> None:

@@ -45,9 +45,7 @@ class BrowserPanel:
     plot: str
     """Quantity that is plotted; empty for none."""
 
-    def __init__(
-        self, server: Any, live: Live, scene: BrowserScene, bodies: SceneBodies, follow: bool, plot: str
-    ):
+    def __init__(self, server: Any, live: Live, scene: BrowserScene, bodies: SceneBodies, follow: bool, plot: str):
         """Add the elements.
 
         Args:
@@ -99,6 +97,8 @@ class BrowserPanel:
             self._text.content = f"**{picture.status}**"
             if picture.selected is not None and self._drone.value != picture.selected[1]:
                 self._drone.value = picture.selected[1]
+            if picture.followed is not None and self._world.value != picture.followed[0]:
+                self._world.value = picture.followed[0]
             if self._body is not None and self._body.value != picture.name:
                 self._body.value = picture.name
         plotted = (self.plot, picture.selected, len(picture.plot))
@@ -154,7 +154,9 @@ class BrowserPanel:
     def _add_drone(self, gui: Any, live: Live, bodies: SceneBodies) -> None:
         sim = live.sim
         world, drone = live.selected or (0, 0)
-        worlds = gui.add_number("world", world, min=0, max=sim.n_worlds - 1, step=1, visible=sim.n_worlds > 1)
+        self._world = worlds = gui.add_number(
+            "world", world, min=0, max=sim.n_worlds - 1, step=1, visible=sim.n_worlds > 1
+        )
         self._drone = gui.add_number("drone", drone, min=0, max=sim.n_drones - 1, step=1)
         for number in (worlds, self._drone):
 

@@ -90,7 +90,7 @@ class BrowserScene:
         self._followed = scene.add_icosphere(
             "/world/followed", radius=MARK_RADIUS, color=FOLLOWED_COLOR, opacity=0.25, visible=False
         )
-        self._label = scene.add_label("/world/followed/name", "", anchor="bottom-center")
+        self._label = scene.add_label("/world/followed/name", "", position=(0, 0, MARK_RADIUS), anchor="bottom-center")
         self._wind = None
         self._tracked = bodies.tracked
         tracked = self._moved(picture.pos[:, self._tracked]).reshape(-1, 3)
@@ -223,8 +223,10 @@ class BrowserScene:
             return
         pos = _finite(bodies[k, picture.followed[1]])
         radius = self._bodies.radius(picture.followed[1])
-        self._followed.position, self._followed.radius = pos, radius
-        self._label.text, self._label.position = picture.name, (0.0, 0.0, radius)
+        self._followed.position = pos
+        if radius != self._followed.radius:  # browsers build the sphere again for it
+            self._followed.radius, self._label.position = radius, (0.0, 0.0, radius)
+        self._label.text = picture.name
         self._root.position = -pos if follow else (0.0, 0.0, 0.0)
 
     def _moved(self, pos: NDArray) -> NDArray:

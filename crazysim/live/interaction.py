@@ -31,7 +31,7 @@ class Interaction:
     values: dict[str, float]
     """Present values of the sliders, by name."""
     selected: tuple[int, int] | None
-    """World and drone that are plotted and piloted, and followed unless ``follow`` chose another body; None for none."""
+    """World and drone that are plotted and piloted, and followed unless ``follow`` chose another; None for none."""
     lights: NDArray
     """Colours of the drones' LEDs, red, green and blue from 0 to 1, which viewers draw; zero for off.
     (n_worlds, n_drones, 3)"""

@@ -119,8 +119,11 @@ def _mocap_names(sim: Sim) -> list[tuple[str, int]]:
 
 def _parts(kinds: Sequence[str]) -> list[tuple[str, str]]:
     """Return the kinds of a plugin that are parts of another, ``cars_wheel`` of ``cars``, and that one."""
-    bases = [(kind, min((base for base in kinds if kind.startswith(f"{base}_")), key=len, default="")) for kind in kinds]
-    return [(kind, base) for kind, base in bases if base]
+    found = []
+    for kind in kinds:
+        bases = [base for base in kinds if kind.startswith(f"{base}_")]
+        found += [(kind, min(bases, key=len))] if bases else []
+    return found
 
 
 def _boxes(n: int, shapes: Sequence[VisualGeom]) -> tuple[NDArray, NDArray]:

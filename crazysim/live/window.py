@@ -47,10 +47,10 @@ class Window(Viewer):
     """Viewer in a window, ``live.show(Window())``; show several for several views.
 
     The mouse turns, moves and zooms the view. A double click on a drone selects it, one on a vehicle, load or object
-    follows that, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses, a full stop makes a single step, backspace resets,
-    tab selects the next drone, plus and minus change the speed, [ and ] turn the chosen slider, an apostrophe chooses
-    the next one, R records, escape ends the run. The window draws in a process of its own, as fast as it can, and never
-    delays the simulation.
+    follows that, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses, a full stop
+    makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [ and ] turn the
+    chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window draws in a process of
+    its own, as fast as it can, and never delays the simulation.
     """
 
     worlds: Sequence[int] = (0,)

@@ -16,7 +16,7 @@ import numpy as np
 from crazysim.errors import RenderError
 from crazysim.live.chart import Chart
 from crazysim.live.picture import Picture
-from crazysim.live.scene_bodies import SceneBodies
+from crazysim.live.scene_bodies import MARK_RADIUS, SceneBodies
 from crazysim.live.window import LENGTH
 from crazysim.media.trail import Trail, colors_of
 from crazysim.scene.overlays import Overlays
