@@ -80,7 +80,7 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
     times = np.arange(n + 1) / rate
 
     fly_chunk = compile_sampler(sim.step_fn, sim.data, _pose, CHUNK, sim.freq // rate)
-    jax.block_until_ready(_planned(show.trajectories, jnp.asarray(times)))  # compiles
+    jax.block_until_ready(planned_at(show.trajectories, jnp.asarray(times)))  # compiles
     show.lights.colors(times)
     begin = time.perf_counter()
     data = sim.data
@@ -91,7 +91,7 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
         recorded.append([np.asarray(x)[:, 0] for x in samples])
     sim.data = data
     pos, quat = (np.concatenate(parts)[: n + 1] for parts in zip(*recorded, strict=True))
-    planned = np.asarray(_planned(show.trajectories, jnp.asarray(times)))
+    planned = np.asarray(planned_at(show.trajectories, jnp.asarray(times)))
     colors = show.lights.colors(times)
     return ShowFlight(show, sim, times, pos, quat, planned, colors, time.perf_counter() - begin)
 
@@ -137,7 +137,7 @@ def _pose(data: SimData) -> tuple[Array, Array]:
 
 
 @jax.jit
-def _planned(trajectories: Trajectory, times: Array) -> Array:
+def planned_at(trajectories: Trajectory, times: Array) -> Array:
     """Return planned positions, m. (n, n_drones, 3)"""
     of_all = jax.vmap(lambda trajectory, t: trajectory.derivatives(t, 0)[0][:3], in_axes=(0, None))
     return jax.vmap(of_all, in_axes=(None, 0))(trajectories, times)

@@ -174,7 +174,9 @@ def test_cars_and_loads_are_picked_and_lights_are_drawn(viser, chromium, plain_s
             wait_for(lambda: (click(chromium, place), time.sleep(0.3), live.followed == expected)[-1])
 
         pick([3.0, -0.5, 0.08], (1, "cars", 0))
-        wait_for(lambda: "Fleet1Tenth_0" in chromium.value("document.body.innerText"))
+        wait_for(
+            lambda: chromium.value("[...document.querySelectorAll('input')].some(e => e.value === 'Fleet1Tenth_0')")
+        )
         pick([-2.0, 0.0, 1.0], (0, "load", 0))
         assert live.selected == (0, 0), "the drone stays selected"
         pick([2.0, 0.0, 1.5], (1, "drone", 0))

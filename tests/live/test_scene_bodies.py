@@ -95,6 +95,6 @@ def test_trails_follow_bodies_and_begin_again_after_a_reset():
     for k in range(5):
         trails.update(0.06 * k, np.array([[0.1 * k, 0, 0], [0, 0, 1.0]]), True)
     segments = scene.handle.points.reshape(4, 2, 2, 3)
-    np.testing.assert_allclose(segments[:, 0, :, 0].ravel(), [0, 0.1, 0.1, 0.2, 0.2, 0.3, 0.3, 0.4], atol=1e-6)
+    np.testing.assert_allclose(segments[:, 0, :, 0].ravel(), [0.1, 0.2, 0.2, 0.3, 0.3, 0.4, 0.4, 0.4], atol=1e-6)
     trails.update(0.0, np.array([[9.0, 0, 0], [0, 0, 1.0]]), True)
     np.testing.assert_allclose(scene.handle.points.reshape(4, 2, 2, 3)[:, 0, :, 0], 9.0)

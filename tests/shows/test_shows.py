@@ -14,7 +14,7 @@ from screens import screen_pixels, virtual_screen
 
 from crazysim.__main__ import main
 from crazysim.errors import ConfigError
-from crazysim.shows import collisions, film, fly, page, report, sampled_approaches, summary, tracking_rms
+from crazysim.shows import collisions, film, fly, live_show, page, report, sampled_approaches, summary, tracking_rms
 from crazysim.trajectories import Trajectory
 from crazysim.trajectories.files import Lights, Show, save_show
 
@@ -237,3 +237,26 @@ def test_command(tmp_path, capsys):
         assert main(["show", str(tmp_path / "show.skyc"), *wrong]) == 2
         assert "expected" in capsys.readouterr().err
     assert main(["show", str(tmp_path / "nowhere.skyc")]) == 2
+
+
+def test_a_live_show_has_lights():
+    """The LEDs of the show at three moments, and drones where the plan has them."""
+    seen = {}
+    with live_show(SHOW, speed="max") as live:
+        for at in (0.5, 1.5):
+            live.at(at, lambda live: seen.update({live.step: live.lights[0].copy()}))
+        live.run(SHOW.duration)
+        expected = SHOW.lights.colors([0.5, 1.5])
+        np.testing.assert_allclose([seen[50], seen[150]], expected, atol=1e-6)
+        np.testing.assert_array_equal(expected[:, 0], [[1, 0, 0], [0, 0, 1]])
+        np.testing.assert_allclose(live.sim.data.states.pos[0], [[1, 0, 1], [0, 0.02, 1], [0.5, 2, 1.5]], atol=0.1)
+        live.go_to(0.5)
+        np.testing.assert_allclose(live.lights[0], SHOW.lights.colors([live.time - 0.01])[0], atol=0.05)
+
+
+def test_the_live_command(tmp_path, capsys):
+    save_show(SHOW, tmp_path / "show.skyc")
+    main(["show", str(tmp_path / "show.skyc"), "--live", "--seconds", "0.2"])
+    assert "times real time" in capsys.readouterr().out
+    assert main(["show", str(tmp_path / "show.skyc"), "--live", "--film", str(tmp_path / "a.mp4")]) == 2
+    assert "expected --live or --film, got both" in capsys.readouterr().err
