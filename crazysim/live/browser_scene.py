@@ -19,7 +19,7 @@ TRAIL_PERIOD = 0.05
 """Time between two samples of a trail, s."""
 SETPOINT_RADIUS = 0.025
 """Radius of a setpoint's sphere, m."""
-LIGHT_RADIUS = 0.05
+LIGHT_RADIUS = 0.06
 """Radius of the glow around a lit drone, m."""
 NEAR = 0.02
 """Distance from a body, per distance from the camera, at which a click still picks it."""

@@ -31,7 +31,7 @@ DOUBLE_CLICK = 0.35
 """Longest time between the clicks of a double click, s."""
 STILL = 0.01
 """Longest way of the cursor between these, as a part of the window's size."""
-SETPOINT_RADIUS, LIGHT_RADIUS = 0.02, 0.05
+SETPOINT_RADIUS, LIGHT_RADIUS = 0.02, 0.06
 """Radius of a setpoint's sphere, and of the glow around a lit drone, m."""
 TOUCHING, FOLLOWED, AIR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25), (0.35, 0.6, 0.8, 0.9)
 """Colours of marks, rgba."""

@@ -157,14 +157,14 @@ def test_a_page_is_watched_and_used(viser, chromium, live, caplog):
 def test_cars_and_loads_are_picked_and_lights_are_drawn(viser, chromium, plain_scene):
     """Two worlds side by side, each with a drone, its load and a car."""
     sim = Sim(n_worlds=2, control="state", xml_path=plain_scene)
-    sim.add(SlungLoad(0.005, length=0.5))
-    sim.add(Cars(["Fleet1Tenth_0"], pos=(1.0, -0.5)))
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[...].set(np.array([0.0, 0.0, 1.5]))))
+    load = sim.add(SlungLoad(0.005, length=0.5))
+    sim.add(Cars(["Fleet1Tenth_0"], pos=(1.0, -0.5)))
     live = Live(sim, fps=10)
     live.paused = True
-    page = live.show(Browser(port=0, spacing=4.0, trail=0.5))
-    size = 4.0 + 2.0  # of the grid: the distance of the worlds, and 1 m of margin on both sides
+    page = live.show(Browser(port=0, spacing=3.0, trail=0.5))
+    size = 3.0 + 2.0  # of the grid: the distance of the worlds, and 1 m of margin on both sides
     with Running(live):
         chromium.call("Page.navigate", url=page.url)
         wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
@@ -173,19 +173,21 @@ def test_cars_and_loads_are_picked_and_lights_are_drawn(viser, chromium, plain_s
             place = pixel(chromium, point, size)
             wait_for(lambda: (click(chromium, place), time.sleep(0.3), live.followed == expected)[-1])
 
-        pick([3.0, -0.5, 0.08], (1, "cars", 0))
+        pick([2.5, -0.5, 0.08], (1, "cars", 0))
         wait_for(
             lambda: chromium.value("[...document.querySelectorAll('input')].some(e => e.value === 'Fleet1Tenth_0')")
         )
-        pick([-2.0, 0.0, 1.0], (0, "load", 0))
+        np.testing.assert_allclose(load.read(sim.data).pos[0, 0], [0.0, 0.0, 1.0], atol=1e-6)
+        pick([-1.5, 0.0, 1.0], (0, "load", 0))
         assert live.selected == (0, 0), "the drone stays selected"
-        pick([2.0, 0.0, 1.5], (1, "drone", 0))
+        pick([1.5, 0.0, 1.5], (1, "drone", 0))
         assert live.selected == (1, 0)
 
         # The right drone shines in magenta, and is off again.
         assert len(chromium.mask(MAGENTA)[0]) == 0
+        live.selected = None  # without the mark around it
         live.lights[1, 0] = [1.0, 0.0, 1.0]
-        place = pixel(chromium, [2.0, 0.0, 1.5], size)
+        place = pixel(chromium, [1.5, 0.0, 1.5], size)
         np.testing.assert_allclose(chromium.find(MAGENTA, place), place, atol=NEAR)
         live.lights[:] = 0.0
         wait_for(lambda: len(chromium.mask(MAGENTA)[0]) == 0)
