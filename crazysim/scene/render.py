@@ -182,4 +182,4 @@ def _leave_context() -> None:
     elif backend == "mujoco.glfw":
         import glfw
 
-        glfw.make_context_current(None)
+        glfw.make_context_current(None)  # type: ignore[arg-type]
