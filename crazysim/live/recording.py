@@ -61,7 +61,7 @@ class Recordings:
     """The recording that is being written, if there is one, and the path for the next."""
 
     last_path: Path | None
-    """Path that was asked for last."""
+    """Path that was requested last."""
     failures: int
     """Number of recordings that ended because they could not be written."""
 

@@ -81,10 +81,10 @@ class Leds:
     def color(self, colors: np.ndarray) -> None:
         """Set the colours of a world's drones; zero for off. (n_drones, 3)"""
         own = colors[self._drones]
-        lit = own.any(-1)
-        rgba, emission = self._off
+        brightest = own.max(-1, initial=0.0)
+        lit, (rgba, emission) = brightest > 0, self._off
         self._model.mat_rgba[self._materials] = np.where(lit[:, None], np.insert(own, 3, 1.0, axis=1), rgba)
-        self._model.mat_emission[self._materials] = np.where(lit, own.max(-1, initial=0.0), emission)
+        self._model.mat_emission[self._materials] = np.where(lit, brightest, emission)
 
 
 class Program:

@@ -132,7 +132,7 @@ def view_of(flight: ShowFlight, **settings: Any) -> View:
 
 
 def camera_around(points: NDArray) -> dict[str, Any]:
-    """Return the settings of a free camera that sees all points of a show. (n, n_drones, 3)"""
+    """Return the settings of a free camera with all points of a show in view. (n, n_drones, 3)"""
     low, high = points.min((0, 1)), points.max((0, 1))
     size = max(float(np.linalg.norm(high - low)), 1.0)
     return {"lookat": (low + high) / 2, "distance": ROOM * size, "azimuth": 110, "elevation": -18}
