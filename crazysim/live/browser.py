@@ -136,7 +136,8 @@ class Browser(Viewer):
 
         @self._server.on_client_disconnect
         def _(client: Any) -> None:
-            log.info("browser %d disconnected at %.2f s", client.client_id, live.time)
+            if self.is_open:
+                log.warning("browser %d disconnected at %.2f s", client.client_id, live.time)
 
         @scene.on_click()
         def _(event: Any) -> None:
