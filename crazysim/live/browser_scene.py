@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.live.browser_trails import Trails, finite_rows
 from crazysim.live.mocap.frames import rotate
 from crazysim.live.picture import Picture
 from crazysim.live.scene_bodies import DRONE, MARK_RADIUS, SceneBodies, SceneBody
-from crazysim.media.trail import MIN_ALPHA, colors_of
+from crazysim.media.trail import colors_of
 from crazysim.media.web import add_static, mesh_of, rgb
 from crazysim.scene.visual_geoms import VisualGeom
 
-TRAIL_PERIOD = 0.05
-"""Time between two samples of a trail, s."""
 SETPOINT_RADIUS = 0.025
 """Radius of a setpoint's sphere, m."""
 LIGHT_RADIUS = 0.06
@@ -27,8 +26,6 @@ WIND_SCALE = 0.1
 """Length of a wind arrow per speed, s."""
 HIDDEN = 1e-6
 """Scale of a mark that is not shown."""
-FLOOR_GREY = 0.8
-"""Grey that trails fade to, 0 to 1."""
 CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
 """Colours of marks, rgb, 0 to 255."""
 
@@ -107,20 +104,22 @@ class BrowserScene:
         """
         pos, show = self._moved(picture.pos), self.visible
         for handle, bodies in self._batches:
-            handle.batched_positions = _finite(pos[:, bodies].reshape(-1, 3))
-            handle.batched_wxyzs = _finite(np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4), (1, 0, 0, 0))
+            handle.batched_positions = finite_rows(pos[:, bodies].reshape(-1, 3))
+            handle.batched_wxyzs = finite_rows(
+                np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4), (1, 0, 0, 0)
+            )
         drones = self._moved(picture.drones)
         if self._setpoints is not None:
             self._setpoints.visible = show["setpoints"]
-            self._setpoints.batched_positions = _finite(self._moved(picture.setpoint).reshape(-1, 3))
+            self._setpoints.batched_positions = finite_rows(self._moved(picture.setpoint).reshape(-1, 3))
         touching = picture.touching.ravel() & show["contacts"]
         self._contacts.batched_scales = np.where(touching, 1.0, HIDDEN).astype(np.float32)
         if touching.any():
-            self._contacts.batched_positions = _finite(drones.reshape(-1, 3))
+            self._contacts.batched_positions = finite_rows(drones.reshape(-1, 3))
         self._show_lights(drones.reshape(-1, 3), picture.lights.reshape(-1, 3) * show["lights"])
         self._show_wind(drones, picture)
         if self._trail is not None:
-            self._trail.update(picture.time, _finite(pos[:, self._tracked].reshape(-1, 3)), show["trails"])
+            self._trail.update(picture.time, finite_rows(pos[:, self._tracked].reshape(-1, 3)), show["trails"])
         self._show_followed(pos, picture, follow)
 
     def pick(self, picture: Picture, origin: Any, direction: Any) -> tuple[int, SceneBody | None, NDArray | None]:
@@ -173,8 +172,8 @@ class BrowserScene:
             mesh = mesh_of(same)
             handle = self._scene.add_batched_meshes_simple(
                 f"/world/bodies/{bodies[0]}/{k}", np.asarray(mesh.vertices, np.float32),
-                np.asarray(mesh.faces, np.uint32), _finite(quat, (1, 0, 0, 0)), _finite(pos), batched_colors=rgb(rgba),
-                opacity=None if rgba[3] >= 1 else float(rgba[3]), lod="off", flat_shading=True, side="double",
+                np.asarray(mesh.faces, np.uint32), finite_rows(quat, (1, 0, 0, 0)), finite_rows(pos),
+                batched_colors=rgb(rgba), opacity=None if rgba[3] >= 1 else float(rgba[3]), lod="off", flat_shading=True, side="double",
             )  # fmt: skip
             self._batches.append((handle, bodies))
 
@@ -185,7 +184,7 @@ class BrowserScene:
         import trimesh
 
         ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-        points = _finite(self._moved(pos).reshape(-1, 3))
+        points = finite_rows(self._moved(pos).reshape(-1, 3))
         return self._scene.add_batched_meshes_simple(
             f"/world/{name}", np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32),
             np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)), points, batched_colors=colors, opacity=opacity, lod="off",
@@ -194,8 +193,8 @@ class BrowserScene:
     def _show_wind(self, drones: NDArray, picture: Picture) -> None:
         if not picture.wind.size:
             return
-        begin = _finite(drones.reshape(-1, 3))
-        ends = np.stack([begin, begin + WIND_SCALE * _finite(picture.wind.reshape(-1, 3))], axis=1)
+        begin = finite_rows(drones.reshape(-1, 3))
+        ends = np.stack([begin, begin + WIND_SCALE * finite_rows(picture.wind.reshape(-1, 3))], axis=1)
         ends = ends.astype(np.float32)
         if self._wind is None:
             self._wind = self._scene.add_arrows(
@@ -211,7 +210,7 @@ class BrowserScene:
             self._lights.batched_colors = rgb_of(colors)
             self._lights.batched_scales = np.where(colors.any(-1), 1.0, HIDDEN).astype(np.float32)
         if colors.any():
-            self._lights.batched_positions = _finite(drones)
+            self._lights.batched_positions = finite_rows(drones)
 
     def _show_followed(self, bodies: NDArray, picture: Picture, follow: bool) -> None:
         k = None
@@ -221,7 +220,7 @@ class BrowserScene:
         if k is None or picture.followed is None:
             self._root.position = (0.0, 0.0, 0.0)
             return
-        pos = _finite(bodies[k, picture.followed[1]])
+        pos = finite_rows(bodies[k, picture.followed[1]])
         radius = self._bodies.radius(picture.followed[1])
         self._followed.position = pos
         if radius != self._followed.radius:  # browsers build the sphere again for it
@@ -232,50 +231,6 @@ class BrowserScene:
     def _moved(self, pos: NDArray) -> NDArray:
         """Return positions of every world at the world's place in the grid."""
         return pos + self.offsets[:, None]
-
-
-class Trails:
-    """The recent positions of all bodies, as one set of line segments of constant size."""
-
-    def __init__(self, scene: Any, pos: NDArray, colors: NDArray, seconds: float):
-        """Begin with trails of no length.
-
-        Args:
-            scene: Scene of viser.
-            pos: Positions of all bodies, m. (n, 3)
-            colors: Their colours, 0 to 1. (n, 3)
-            seconds: Duration, s.
-        """
-        self._length = max(round(seconds / TRAIL_PERIOD), 1)
-        self._samples: deque[NDArray] = deque(maxlen=self._length)
-        self._last = -np.inf
-        pos = _finite(pos)
-        fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]  # towards the floor, as lines are opaque
-        shades = np.round(255 * (FLOOR_GREY - fade * (FLOOR_GREY - colors))).astype(np.uint8)
-        self._handle = scene.add_line_segments(
-            "/world/trails", self._segments(pos), np.repeat(shades.reshape(-1, 1, 3), 2, axis=1), thickness=2.0,
-            thickness_units="screen",
-        )  # fmt: skip
-
-    def update(self, time: float, pos: NDArray, visible: bool) -> None:
-        """Add a sample if one is due, and show the trails up to the present positions; a jump in time clears them."""
-        self._handle.visible = visible
-        if time < self._last:
-            self._samples.clear()
-            self._last = -np.inf
-        if time - self._last < TRAIL_PERIOD:
-            return
-        self._samples.append(pos)
-        self._last = time
-        if visible:
-            self._handle.points = self._segments(pos)
-
-    def _segments(self, pos: NDArray) -> NDArray:
-        """Return segments, oldest first, padded at the beginning. (length * n, 2, 3)"""
-        path = [*self._samples, pos]
-        path = [path[0]] * (self._length + 1 - len(path)) + path
-        points = np.stack(path[-self._length - 1 :])
-        return np.stack([points[:-1], points[1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
 
 
 def grid_offsets(n: int, spacing: float) -> NDArray:
@@ -301,9 +256,3 @@ def _alike(by_body: dict[int, list[VisualGeom]]) -> list[list[int]]:
         )
         groups[key].append(body)
     return list(groups.values())
-
-
-def _finite(values: NDArray, rest: Any = 0.0) -> NDArray:
-    """Return rows of numbers, with those that are not finite replaced."""
-    bad = ~np.isfinite(values).all(-1, keepdims=True)
-    return np.where(bad, np.asarray(rest, float), values)

@@ -6,7 +6,7 @@ import pytest
 from crazysim import Cars, Hook, Sim
 from crazysim.errors import ConfigError
 from crazysim.live import Live
-from crazysim.live.browser_scene import Trails
+from crazysim.live.browser_trails import Trails
 from crazysim.live.scene_bodies import MARK_RADIUS, SceneBodies
 from crazysim.scene.visual_geoms import visual_geoms
 
