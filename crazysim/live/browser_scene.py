@@ -173,7 +173,8 @@ class BrowserScene:
             handle = self._scene.add_batched_meshes_simple(
                 f"/world/bodies/{bodies[0]}/{k}", np.asarray(mesh.vertices, np.float32),
                 np.asarray(mesh.faces, np.uint32), finite_rows(quat, (1, 0, 0, 0)), finite_rows(pos),
-                batched_colors=rgb(rgba), opacity=None if rgba[3] >= 1 else float(rgba[3]), lod="off", flat_shading=True, side="double",
+                batched_colors=rgb(rgba), opacity=None if rgba[3] >= 1 else float(rgba[3]), lod="off",
+                flat_shading=True, side="double",
             )  # fmt: skip
             self._batches.append((handle, bodies))
 
