@@ -1,5 +1,5 @@
 // A block of W lanes is a vector, held as GCC's and Clang's vector types; what all lanes share stays a number.
-// Headers are those of C alone (-nostdinc++): reading those of C++ would take as long as reading all of this thrice.
+// The headers are those of C (-nostdinc++): reading those of C++ takes longer than reading all of this.
 #include <math.h>
 #include <pthread.h>
 #include <sched.h>
