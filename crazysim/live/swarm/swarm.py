@@ -130,7 +130,9 @@ class Swarm(Closing):
     # Time -----------------------------------------------------------------------------------------------------------
 
     def __call__(self, live: Any) -> None:
-        """Stage the commands in force and show the lights, for a loop such as ``Live``.
+        """Stage the commands in force, for a loop such as ``Live``, which has the simulation as ``live.sim``.
+
+        Viewers show the colours where the loop has ``lights``, as ``Live`` has.
 
         Raises:
             ConfigError: If it is another simulation.
@@ -138,7 +140,8 @@ class Swarm(Closing):
         if live.sim is not self.sim:
             raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
         self.update()
-        live.lights[0] = self.colors
+        if hasattr(live, "lights"):
+            live.lights[0] = self.colors
 
     def run_in(self, live: Live) -> None:
         """Let ``advance`` and ``sleep`` run a live loop, which keeps its speed and shows its viewers.
