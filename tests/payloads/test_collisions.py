@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import with_states
+from cases import broadcast_like, with_states
 from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, ContactLog, ContactResponse, Hook, SharedLoad, Sim, SlungLoad
@@ -40,8 +40,7 @@ def heavy(sim):
 
 def with_load(load, data, **changes):
     record = load.read(data)
-    new = {k: jnp.broadcast_to(jnp.asarray(v, record.vel.dtype), getattr(record, k).shape) for k, v in changes.items()}
-    return load.write(data, record.replace(**new))
+    return load.write(data, record.replace(**{k: broadcast_like(v, getattr(record, k)) for k, v in changes.items()}))
 
 
 def leave_out_drones(sim):

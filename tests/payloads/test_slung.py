@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import INTEGRATORS, with_states
+from cases import INTEGRATORS, broadcast_like, with_states
 
 from crazysim import ConfigError, Downwash, Sim, Wind, rotation
 from crazysim.payloads import SlungLoad, direction
@@ -26,8 +26,7 @@ def flying(n_worlds=1, n_drones=1, height=500.0, **kwargs):
 
 def with_load(load, data, **changes):
     record = load.read(data)
-    new = {k: jnp.broadcast_to(jnp.asarray(v, record.vel.dtype), getattr(record, k).shape) for k, v in changes.items()}
-    return load.write(data, record.replace(**new))
+    return load.write(data, record.replace(**{k: broadcast_like(v, getattr(record, k)) for k, v in changes.items()}))
 
 
 def momentum(load, data):
