@@ -71,7 +71,8 @@ def load_flat_state(
     tension, up = _norm_and_direction(pull)
     pos = [path[..., k, :] + length * up[k] for k in range(ORDER - 1)]
     force = [mass * (pos[2 + k] - g) + pull[k] for k, g in enumerate(falling[:3])]
-    now = attitude_of_thrust(*(f / mass for f in force), yaw[..., :1], yaw[..., 1:2], yaw[..., 2:])
+    thrust, rate, acc = (f / mass for f in force)
+    now = attitude_of_thrust(thrust, rate, acc, yaw[..., :1], yaw[..., 1:2], yaw[..., 2:])
     momentum = rotation.matvec(inertia, now.ang_vel)
     return LoadedState(
         pos=pos[0],
