@@ -91,9 +91,9 @@ def situations(dynamics, control, engine="auto"):
 
 @functools.cache
 def compiled(dynamics, control, engine):
-    """Return one step of the situations with its derivative."""
+    """Return steps of the situations with their derivative: on ``plain`` step by step, on others in a loop."""
     sim, data, _ = situations(dynamics, control, engine)
-    return StepAndPullback(sim.build_step_fn(), data)
+    return StepAndPullback(sim.build_step_fn(), data, 1 if engine == "plain" else N_STEPS)
 
 
 def fly(case, data, commands):
