@@ -63,9 +63,7 @@ def build(
             return [after[i] for i in written]
 
         start = [leaves[i] for i in written]
-        if isinstance(n_steps, int) and n_steps == 1:
-            out = turn(start)  # no loop, whose derivative takes twice as long to compile
-        elif isinstance(n_steps, int):
+        if isinstance(n_steps, int):
             out, _ = jax.lax.scan(lambda x, _: (turn(x), None), start, length=n_steps)
         else:
             out = jax.lax.fori_loop(0, n_steps, lambda _, x: turn(x), start)

@@ -20,10 +20,9 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
 
 @pytest.fixture(scope="module")
 def source():
-    """A kernel's source: one stage, the shortest."""
+    """A kernel's source."""
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
-    stages = {"increment_steps": sim.step_pipeline["increment_steps"]}
-    return kernel.write(Step(stages, "lanes").plan(sim.data).program, "host")
+    return kernel.write(Step(sim.step_pipeline, "lanes").plan(sim.data).program, "host")
 
 
 @pytest.fixture

@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from backward import StepAndPullback
-from cases import send
 
 from crazysim import Sim
+from crazysim.core import functional as F
 from crazysim.dynamics import first_principles
 
 WEIGHT = 0.0434 * 9.81
@@ -20,78 +19,94 @@ COMMANDS = {
     "force_torque": [1.02 * WEIGHT, 1e-5, -2e-5, 1e-6],
     "rotor_vel": [16_000.0, 16_010.0, 16_020.0, 16_005.0],
 }
-PAIRS = [("first_principles", c) for c in COMMANDS] + [
-    (d, c) for d in ("so_rpy", "so_rpy_rotor_drag") for c in ("state", "attitude")
-]
+SETTER = {c: getattr(F, f"{c}_control") for c in COMMANDS}
+
+
 N_INPUTS = 6
 """Number of inputs of a flight: five states and the command."""
-N_WORLDS = 3 * N_INPUTS
-"""For each input a world at the start, one ahead of it and one behind it."""
-N_STEPS = 100
 DIFFERENCE = 1e-6
 """Relative step of the central differences."""
 
 
-@functools.cache
-def flight(dynamics, control, engine):
-    """Return data and compiled steps with their derivative: on ``plain`` step by step, on others in a loop."""
-    sim = Sim(N_WORLDS, dynamics=dynamics, control=control, engine=engine)
-    return sim.data, StepAndPullback(sim.build_step_fn(), sim.data, 1 if engine == "plain" else N_STEPS)
+def flight(dynamics, control, engine, n_worlds, n_steps=100):
+    """Return a function from (pos, quat direction, vel, ang_vel, rotor_vel, command) of each world to a number of each.
 
-
-def with_inputs(data, x):
-    """Return the data with states and a command for every world."""
-    states = data.states.replace(**{name: jnp.asarray(x[name][:, None]) for name in x if name != "command"})
-    return send(data.replace(states=states), x["command"][:, None])
-
-
-def start_of(dynamics, control):
-    """Return states and a command of one world, by name."""
-    return {
-        "pos": np.array([0.0, 0.0, 1.0]),
-        "quat": np.array([0.02, -0.03, 0.05, 1.0]),
-        "vel": np.array([0.1, 0.2, -0.1]),
-        "ang_vel": np.array([0.1, -0.2, 0.1]),
-        "rotor_vel": np.full(4, 0.98 * (15_864.0 if dynamics == "first_principles" else WEIGHT)),
-        "command": np.array(COMMANDS[control]),
+    A start for one world comes with it.
+    """
+    sim = Sim(n_worlds, dynamics=dynamics, control=control, engine=engine)
+    step = sim.build_step_fn()
+    n = sim.data.states.rotor_vel.shape[-1]
+    hover = 15_864.0 if dynamics == "first_principles" else WEIGHT
+    start = {
+        "pos": [0.0, 0.0, 1.0],
+        "quat": [0.02, -0.03, 0.05, 1.0],
+        "vel": [0.1, 0.2, -0.1],
+        "ang_vel": [0.1, -0.2, 0.1],
+        "rotor_vel": np.full(n, 0.98 * hover),
+        "command": COMMANDS[control],
     }
 
+    def losses(x):
+        x = {name: value[:, None] for name, value in x.items()}
+        quat = x["quat"] / jnp.linalg.norm(x["quat"], axis=-1, keepdims=True)
+        states = sim.data.states.replace(quat=quat, **{k: x[k] for k in ("pos", "vel", "ang_vel", "rotor_vel")})
+        data = SETTER[control](sim.data.replace(states=states), x["command"])
+        s = step(data, n_steps).states
+        each = s.pos * jnp.array([1.0, -2.0, 3.0]) + 0.5 * s.vel**2 + s.quat[..., :3]
+        return jnp.sum(each, axis=(1, 2))
 
-@pytest.mark.parametrize(
-    ("dynamics", "control", "engine"), [(*pair, "plain") for pair in PAIRS] + [("first_principles", "attitude", "auto")]
-)
-def test_gradient_equals_central_differences(dynamics, control, engine, x64):
+    return losses, {name: np.asarray(value, float) for name, value in start.items()}
+
+
+def forward(losses, x, directions):
+    """Return the losses, and their slopes along the directions, by forward mode."""
+    return jax.jvp(losses, (x,), (directions,))
+
+
+def reverse(losses, x, directions):
+    """Return the same by reverse mode."""
+    values, pullback = jax.vjp(losses, x)
+    (gradient,) = pullback(jnp.ones_like(values))
+    return values, sum(jnp.sum(gradient[name] * directions[name], axis=-1) for name in x)
+
+
+CASES = [
+    ("first_principles", "state", "plain", reverse),
+    ("first_principles", "attitude", "plain", forward),
+    ("first_principles", "body_rate", "plain", reverse),
+    ("first_principles", "force_torque", "plain", forward),
+    ("first_principles", "rotor_vel", "plain", forward),
+    ("so_rpy", "state", "plain", reverse),
+    ("so_rpy", "attitude", "plain", forward),
+    ("so_rpy_rotor_drag", "state", "plain", reverse),
+    ("so_rpy_rotor_drag", "attitude", "plain", forward),
+    ("first_principles", "attitude", "auto", reverse),
+]
+"""Both modes go through every stage: a pipeline whose stages are all part of a longer one takes the cheaper mode."""
+
+
+@pytest.mark.parametrize(("dynamics", "control", "engine", "mode"), CASES)
+def test_gradient_equals_central_differences(dynamics, control, engine, mode, x64):
     """100 steps in float64, along a random direction in each input on its own, away from switches.
 
     A central difference with a relative step of 1e-6 is off by about 1e-12 of curvature and 1e-10 of rounding,
-    over a gradient of order one: 1e-6 leaves room for both. All inputs are compared in one flight, in their own worlds.
+    over a gradient of order one: 1e-6 leaves room for both.
+
+    Each input has three worlds: at the start, ahead of it and behind it. One program computes all.
     """
-    data, steps = flight(dynamics, control, engine)
-    start, rng = start_of(dynamics, control), np.random.default_rng(0)
+    losses, start = flight(dynamics, control, engine, n_worlds=3 * N_INPUTS)
+    rng = np.random.default_rng(0)
     x, directions = {}, {}
     for k, (name, value) in enumerate(start.items()):
-        directions[name] = np.zeros((N_WORLDS, len(value)))
-        directions[name][3 * k : 3 * k + 3] = rng.normal(size=value.shape) * np.maximum(np.abs(value), 0.1)
-        x[name] = value + DIFFERENCE * np.tile([0.0, 1.0, -1.0], N_INPUTS)[:, None] * directions[name]
-    length = np.linalg.norm(x["quat"], axis=-1, keepdims=True)
-    x["quat"] = quat = x["quat"] / length
-    along = np.sum(quat * directions["quat"], axis=-1, keepdims=True)
-    directions["quat"] = (directions["quat"] - quat * along) / length
-
-    flown = steps.fly(with_inputs(data, x), N_STEPS)
-    end = {name: np.asarray(getattr(flown[-1].states, name)) for name in ("pos", "vel", "quat")}
-    weights, vector = np.array([1.0, -2.0, 3.0]), np.array([1.0, 1.0, 1.0, 0.0])
-    losses = np.sum(end["pos"] @ weights + 0.5 * np.sum(end["vel"] ** 2, -1) + end["quat"] @ vector, axis=-1)
-    ends = {"pos": np.broadcast_to(weights, end["pos"].shape), "vel": end["vel"],
-            "quat": np.broadcast_to(vector, end["quat"].shape)}  # fmt: skip
-    gradients = steps.gradients(flown, {f"states.{name}": value for name, value in ends.items()})
-    staged = "controls.rotor_vel" if control == "rotor_vel" else f"controls.{control}.staged_cmd"
+        direction = rng.normal(size=value.shape) * np.maximum(np.abs(value), 0.1)
+        directions[name] = np.zeros((3 * len(start), len(value)))
+        directions[name][3 * k : 3 * k + 3] = direction
+        x[name] = value + DIFFERENCE * np.tile([0.0, 1.0, -1.0], len(start))[:, None] * directions[name]
+    values, slopes = (np.asarray(found) for found in jax.jit(functools.partial(mode, losses))(x, directions))
     compared = 0
     for k, name in enumerate(start):
-        gradient = gradients[staged if name == "command" else f"states.{name}"][3 * k, 0]
-        analytic = gradient @ directions[name][3 * k]
-        _, ahead, behind = losses[3 * k : 3 * k + 3]
-        numeric = (ahead - behind) / (2 * DIFFERENCE)
+        _, ahead, behind = values[3 * k : 3 * k + 3]
+        numeric, analytic = (ahead - behind) / (2 * DIFFERENCE), slopes[3 * k]
         assert np.isfinite(analytic), name
         np.testing.assert_allclose(analytic, numeric, rtol=1e-5, atol=1e-6, err_msg=name)
         compared += abs(numeric) > 1e-6
@@ -136,18 +151,21 @@ def test_at_saturation_the_gradient_is_one_side(at, x64):
     assert float(jax.grad(saturated)(outside)) == 0.0
 
 
-def test_on_the_floor_and_at_rest_gradients_are_finite(x64):
+def test_on_the_floor_and_at_rest_gradients_are_finite():
     """A drone that rests, one that hits the floor, one that hovers, one with its motors off."""
-    data, steps = flight("first_principles", "attitude", "auto")
-    x = {name: np.zeros((N_WORLDS, len(value))) for name, value in start_of("first_principles", "attitude").items()}
-    x["quat"][:, 3] = 1.0
-    x["pos"][:4, 2] = -0.001, 0.05, 1.0, 0.5
-    x["vel"][1, 2] = -1.0
-    x["command"][:4, 3] = 0.0, 0.1, WEIGHT, 0.0
-    flown = steps.fly(with_inputs(data, x), N_STEPS)
-    states = flown[-1].states
-    ends = {"pos": 2 * states.pos, "vel": states.ang_vel + 1, "ang_vel": states.vel}
-    gradients = steps.gradients(flown, {f"states.{name}": value for name, value in ends.items()})
-    for name, gradient in gradients.items():
-        assert np.all(np.isfinite(gradient)), name
-    assert np.abs(gradients["states.pos"][:4]).sum() > 0.1
+    sim = Sim(n_worlds=4, control="attitude")
+    step = sim.build_step_fn()
+
+    def loss(x):
+        pos, vel, thrust = x
+        states = sim.data.states.replace(pos=pos, vel=vel)
+        cmd = jnp.zeros((4, 1, 4)).at[:, 0, 3].set(thrust)
+        s = step(F.attitude_control(sim.data.replace(states=states), cmd), 100).states
+        return jnp.sum(s.pos**2) + jnp.sum(s.vel * s.ang_vel) + jnp.sum(s.vel)
+
+    pos = jnp.zeros((4, 1, 3)).at[:, 0, 2].set(jnp.array([-0.001, 0.05, 1.0, 0.5]))
+    vel = jnp.zeros((4, 1, 3)).at[1, 0, 2].set(-1.0)
+    gradient = jax.jit(jax.grad(loss))((pos, vel, jnp.array([0.0, 0.1, WEIGHT, 0.0])))
+    for part in gradient:
+        assert np.all(np.isfinite(part))
+    assert float(jnp.abs(gradient[0]).sum()) > 0.1

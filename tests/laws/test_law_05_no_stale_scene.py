@@ -4,8 +4,6 @@ One world more than asked is never computed, one question more than needed is ne
 the peer, contacts that stay as they were after a teleport or a rebuild, is tested here.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -40,18 +38,12 @@ def one():
     return Sim()
 
 
-@functools.cache
-def two_worlds():
-    """Return a simulation of two worlds of one drone, and a ball that a user moves."""
-    sim = Sim(n_worlds=2)
-    add_ball(sim)
-    return sim
-
-
 @pytest.fixture(scope="module")
 def two():
     """Two worlds of one drone, and a ball that a user moves."""
-    return two_worlds()
+    sim = Sim(n_worlds=2)
+    add_ball(sim)
+    return sim
 
 
 @pytest.fixture
@@ -347,12 +339,12 @@ def test_data_has_what_was_added_before_the_scene_is_compiled(monkeypatch, syncs
 
     monkeypatch.setattr(place.build, "compile_spec", count)
     assert sim.data.objects is None
-    first = sim.scene.add("box", count=2, pos=(0, 3, 1), size=(0.1, 0.1, 0.1))
+    first = sim.scene.add("gate", count=2, pos=(0, 3, 1))
     sim.spec.worldbody.add_body(name="by_hand", mocap=True, pos=[0, 0, 9]).add_geom(size=[0.1, 0, 0])
     sim.step()
     second = sim.scene.add("box", pos=(0.0, 0.0, UP), size=(4.0, 4.0, 0.2))
     objects, default = sim.data.objects, sim.default_data.objects
-    assert objects.names == default.names == ("box:0", "box:1", "box:2")
+    assert objects.names == default.names == ("gate:0", "gate:1", "box:0")
     sim.data = second.set_pose(sim.data, pos=(0.0, 0.0, 2 * UP))
     sim.attitude_control(np.zeros((2, 2, 4)))
     sim.step(2)
@@ -414,9 +406,14 @@ heights = st.tuples(st.sampled_from([0.0, 0.5, UP]), st.sampled_from([0.0, 0.5, 
 class AnyOrder(RuleBasedStateMachine):
     """Whatever is done in whatever order, contacts are those of the poses as they are, with no sync too many."""
 
+    sim = None
+    """Built once: a simulation of two worlds with a ball."""
+
     @initialize()
     def begin(self):
-        self.sim = two_worlds()
+        if AnyOrder.sim is None:
+            AnyOrder.sim = Sim(n_worlds=2)
+            add_ball(AnyOrder.sim)
         self.ball = (5.0, 5.0)
         fresh(self.sim, UP, UP)
         self.changed = False
