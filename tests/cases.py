@@ -99,11 +99,14 @@ def with_params(data, **changes):
 def with_airframes(sim, airframes):
     """Return the data with the parameters and gains of one airframe in each world, of as many rotors as the sim's."""
 
-    def stacked(shared):
-        return jax.tree.map(lambda *x: jnp.stack(x)[:, None], *shared)
+    kinds = list(dict.fromkeys(airframes))
+    which = [kinds.index(airframe) for airframe in airframes]
 
-    params = stacked([create_params(sim.dynamics, airframe) for airframe in airframes])
-    each = [SimControls.create(1, 1, sim.control, sim.dynamics, a, sim.configuration.control_freqs) for a in airframes]
+    def stacked(shared):
+        return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)[which][:, None]), *shared)
+
+    params = stacked([create_params(sim.dynamics, airframe) for airframe in kinds])
+    each = [SimControls.create(1, 1, sim.control, sim.dynamics, a, sim.configuration.control_freqs) for a in kinds]
     controls = sim.data.controls
     for name in ("state", "attitude", "body_rate", "force_torque"):
         ctrl = getattr(controls, name)

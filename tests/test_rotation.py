@@ -120,12 +120,18 @@ def test_heading_is_along_the_yaw(q, scale):
     np.testing.assert_allclose(left, [-np.sin(yaw), np.cos(yaw), 0], atol=1e-12)
 
 
+@jax.jit
+def heading_and_gradient(q):
+    """Return the heading, and the derivatives of where it points."""
+    return rot.heading(q)[0], jax.jacobian(lambda q: rot.heading(q)[0])(q)
+
+
 @pytest.mark.parametrize("length", [0.0, 1e-30, 1e-12, 2e-6, 1.0])
 def test_law_07_heading_has_finite_gradients(length):
-    q = jnp.asarray(length * np.array([0.1, -0.2, 0.3, 0.9]), jnp.float32)
-    assert np.all(np.isfinite(jax.jacobian(lambda q: rot.heading(q)[0])(q)))
+    ahead, gradient = heading_and_gradient(np.float32(length * np.array([0.1, -0.2, 0.3, 0.9])))
+    assert np.all(np.isfinite(gradient))
     if length < 1e-6:
-        np.testing.assert_array_equal(rot.heading(q)[0], [1, 0, 0])
+        np.testing.assert_array_equal(ahead, [1, 0, 0])
 
 
 def test_yaw_of_the_zero_quaternion_is_zero():
@@ -134,13 +140,23 @@ def test_yaw_of_the_zero_quaternion_is_zero():
 
 
 def test_law_07_safe_functions_have_gradient_zero_at_zero():
-    fallback = jnp.array([0.0, 0.0, 1.0])
-    assert rot.safe_norm(jnp.zeros(3)) == 0
-    np.testing.assert_array_equal(jax.grad(lambda x: rot.safe_norm(x)[0])(jnp.zeros(3)), np.zeros(3))
-    np.testing.assert_array_equal(rot.safe_normalize(jnp.zeros(3), fallback), fallback)
-    np.testing.assert_array_equal(jax.jacobian(rot.safe_normalize)(jnp.zeros(3), fallback), np.zeros((3, 3)))
-    assert rot.safe_arctan2(jnp.zeros(()), jnp.zeros(())) == 0
-    assert jax.grad(rot.safe_arctan2, argnums=(0, 1))(0.0, 0.0) == (0, 0)
+    fallback = np.array([0.0, 0.0, 1.0])
+
+    @jax.jit
+    def values_and_gradients(x, fallback, y):
+        return (
+            (rot.safe_norm(x), rot.safe_normalize(x, fallback), rot.safe_arctan2(y, y)),
+            jax.grad(lambda x: rot.safe_norm(x)[0])(x),
+            jax.jacobian(rot.safe_normalize)(x, fallback),
+            jax.grad(rot.safe_arctan2, argnums=(0, 1))(y, y),
+        )
+
+    (norm, direction, angle), of_norm, of_direction, of_angle = values_and_gradients(np.zeros(3), fallback, 0.0)
+    assert norm == angle == 0
+    np.testing.assert_array_equal(direction, fallback)
+    np.testing.assert_array_equal(of_norm, np.zeros(3))
+    np.testing.assert_array_equal(of_direction, np.zeros((3, 3)))
+    assert of_angle == (0, 0)
 
 
 @given(y=st.floats(-5, 5), x=st.floats(-5, 5))
@@ -149,7 +165,19 @@ def test_safe_arctan2_is_arctan2_elsewhere(y, x):
     assert float(rot.safe_arctan2(jnp.asarray(y), jnp.asarray(x))) == pytest.approx(np.arctan2(y, x), abs=1e-15)
 
 
-JACOBIANS = {fn.__name__: jax.jit(jax.jacobian(fn)) for fn in (rot.to_rpy, rot.yaw, rot.z_axis, rot.from_rpy)}
+@jax.jit
+@jax.vmap
+def values_and_jacobians(q):
+    """Return values and derivatives of functions of one quaternion, by name."""
+    return {fn.__name__: (fn(q), jax.jacobian(fn)(q)) for fn in (rot.to_rpy, rot.yaw, rot.z_axis)}
+
+
+@jax.jit
+def jacobians_of_small_turns(rpy, quat, rotvec):
+    """Return the derivatives of quaternions by angles and by a turn."""
+    return jax.jacobian(rot.from_rpy)(rpy), *jax.jacobian(rot.turn, (0, 1))(quat, rotvec, 1.0)
+
+
 TINY = (0.0, 1e-45, 1e-30, 1e-22, 1e-19, 1e-10, 1e-4)
 
 
@@ -158,32 +186,32 @@ TINY = (0.0, 1e-45, 1e-30, 1e-22, 1e-19, 1e-10, 1e-4)
 def test_law_07_jacobians_are_finite_at_and_next_to_90_degrees_of_pitch(tiny, dtype):
     """Law 7: squares of numbers below 1e-19 underflow in float32, and 0/0 is near."""
     half = np.sqrt(0.5)
-    for quat in ([0, half, 0, half], [0, -half, 0, half], [half, 0, half, 0], [0.5, 0.5, 0.5, 0.5], [1, 0, 0, 0]):
-        for where in range(4):
-            q = jnp.asarray(quat, dtype).at[where].add(tiny)
-            for name in ("to_rpy", "yaw", "z_axis"):
-                value = getattr(rot, name)(q)
-                assert np.all(np.isfinite(value)), name
-                assert np.all(np.isfinite(JACOBIANS[name](q))), name
+    quats = np.array([[0, half, 0, half], [0, -half, 0, half], [half, 0, half, 0], [0.5] * 4, [1, 0, 0, 0]], dtype)
+    everywhere = quats[:, None] + np.eye(4, dtype=dtype) * np.asarray(tiny, dtype)
+    for name, found in values_and_jacobians(everywhere.reshape(-1, 4)).items():
+        for x in found:
+            assert x.dtype == dtype
+            assert len(x) == 20
+            assert np.all(np.isfinite(x)), name
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("tiny", TINY)
 def test_law_07_yaw_of_a_quaternion_next_to_zero_has_finite_gradients(tiny, dtype):
     """A setpoint's quaternion may have any length, and its products underflow before it does."""
-    for quat in ([0, 0, 1, 0], [0, 0, 1, 2], [1, -1, 1, 1], [0, 0, 0, 1]):
-        q = tiny * jnp.array(quat, dtype)
-        assert np.isfinite(rot.yaw(q))
-        assert np.all(np.isfinite(JACOBIANS["yaw"](q)))
+    quats = np.array([[0, 0, 1, 0], [0, 0, 1, 2], [1, -1, 1, 1], [0, 0, 0, 1]], dtype)
+    for x in values_and_jacobians(np.resize(np.asarray(tiny, dtype) * quats, (20, 4)))["yaw"]:
+        assert np.all(np.isfinite(x))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("tiny", TINY)
 def test_law_07_jacobians_are_finite_for_tiny_rotations(tiny, dtype):
-    np.testing.assert_allclose(JACOBIANS["from_rpy"](jnp.full(3, tiny, dtype))[:3], 0.5 * np.eye(3), rtol=0, atol=1e-3)
-    quat = jnp.array([0.0, 0.0, 0.0, 1.0], dtype)
-    for argnum in (0, 1):
-        assert np.all(np.isfinite(jax.jacobian(rot.turn, argnum)(quat, jnp.full(3, tiny, dtype), 1.0)))
+    small = np.full(3, tiny, dtype)
+    of_rpy, *of_turn = jacobians_of_small_turns(small, np.array([0.0, 0.0, 0.0, 1.0], dtype), small)
+    np.testing.assert_allclose(of_rpy[:3], 0.5 * np.eye(3), rtol=0, atol=1e-3)
+    for jacobian in of_turn:
+        assert np.all(np.isfinite(jacobian))
 
 
 @given(q=unit_quats)
@@ -191,15 +219,21 @@ def test_quaternion_of_axes_gives_the_same_rotation_back(q):
     same_rotation(rot.quat_from_axes(*np.swapaxes(rot.matrix(q), -1, -2)), q)
 
 
+@jax.jit
+def quaternion_of_turned_axes(q, rotvec):
+    """Return the quaternion of the axes of a turned quaternion, and its derivatives by the turn."""
+
+    def there_and_back(rotvec):
+        axes = jnp.moveaxis(rot.matrix(rot.multiply(q, rot.turn(jnp.eye(4)[3], rotvec, 1.0))), -1, 0)
+        return rot.quat_from_axes(*axes)
+
+    return there_and_back(rotvec), jax.jacfwd(there_and_back)(rotvec)
+
+
 @pytest.mark.parametrize("q", [*np.eye(4), [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, 0.5, 0.0], [0.7, 0.7, 0.0, 1e-9]])
 def test_quaternion_of_axes_is_accurate_at_half_turns(q):
     q = np.asarray(q) / np.linalg.norm(q)
-
-    def there_and_back(rotvec):
-        axes = jnp.moveaxis(rot.matrix(rot.multiply(jnp.asarray(q), rot.turn(jnp.eye(4)[3], rotvec, 1.0))), -1, 0)
-        return rot.quat_from_axes(*axes)
-
-    back, slope = there_and_back(np.zeros(3)), jax.jacfwd(there_and_back)(np.zeros(3))
+    back, slope = quaternion_of_turned_axes(q, np.zeros(3))
     same_rotation(back, q)
     expected = np.stack([rot.multiply(back, np.append(0.5 * axis, 0.0)) for axis in np.eye(3)], axis=-1)
     np.testing.assert_allclose(slope, expected, atol=1e-12)

@@ -1,5 +1,7 @@
 """The engines against each other: one source of physics, several ways to run it."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +25,9 @@ SLOW = {"state": {"state_freq": 100}, "attitude": {"attitude_freq": 250}}
 PAIRS = [("first_principles", c.value) for c in Control] + [
     (d.value, c) for d in Dynamics if d != Dynamics.first_principles for c in ("attitude", "state")
 ]
+
+LONGEST = [("first_principles", "state"), ("first_principles", "body_rate"), ("so_rpy_rotor_drag", "state")]
+"""Pairs that have the stages of all others: every engine runs them."""
 
 
 def scattered(sim, extreme=False, dtype=np.float32):
@@ -78,7 +83,8 @@ ULPS = {"pos": 4, "quat": 8, "vel": 64, "ang_vel": 512, "rotor_vel": 512}
 def test_one_step_agrees_with_plain(dynamics, control):
     """7 worlds of 3 drones, 21 lanes: no multiple of a vector's or a block's length, so that tails are masked."""
     sim = shared_sim(n_worlds=7, n_drones=3, dynamics=dynamics, control=control, **SLOW.get(control, {}))
-    plain, fast = Step(sim.step_pipeline, "plain"), {engine: Step(sim.step_pipeline, engine) for engine in FAST}
+    engines = FAST if (dynamics, control) in LONGEST else FAST[-1:]
+    plain, fast = Step(sim.step_pipeline, "plain"), {engine: Step(sim.step_pipeline, engine) for engine in engines}
     for extreme in (False, True):
         data = scattered(sim, extreme)
         expected = plain(data, jnp.int32(1))
@@ -102,7 +108,8 @@ def test_long_runs_agree_in_float64(x64, dynamics, control, integrator):
     sim = Sim(n_worlds=3, n_drones=2, dynamics=dynamics, control=control, integrator=integrator)
     data = scattered(sim, dtype=np.float64)
     expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(200))
-    for engine in FAST:
+    # ``lanes`` runs every integrator once; of the two pipelines with rk4, XLA takes long for that with a controller.
+    for engine in FAST[-1:] if (integrator, control) == ("rk4", "attitude") else FAST:
         found = Step(sim.step_pipeline, engine)(data, jnp.int32(200))
         for name in ("pos", "quat", "vel"):
             a, b = getattr(found.states, name), getattr(expected.states, name)
@@ -220,12 +227,13 @@ def test_stages_of_the_user_mean_the_same_on_every_engine(stages, n_segments):
     """A stage of one drone or one world fuses; an undeclared one splits the step."""
     sim, data = with_stages(4, *stages)
     expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(6))
-    for engine in FAST:
+    everything = len(stages) == 3
+    for engine in FAST if everything else FAST[-1:]:
         step = Step(sim.step_pipeline, engine)
         plan = step.plan(data)
         assert plan.engine == engine
         assert len(plan.program.segments) == n_segments
-        for n in (jnp.int32(6), 6):
+        for n in (jnp.int32(6), 6) if everything else (jnp.int32(6),):
             found = step(data, n)
             for name in ("pos", "quat", "vel", "force", "torque"):
                 np.testing.assert_allclose(
@@ -311,12 +319,14 @@ def assert_gradients_equal(found, expected):
 
 
 def test_gradients_equal_those_of_plain_in_float64(x64):
-    """Reverse mode through 40 steps of the attitude controller."""
+    """Reverse mode through 40 steps of the attitude controller; forward mode, which compiles sooner, for plain."""
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
     data = scattered(sim, dtype=np.float64)
-    steps = [Step(sim.step_pipeline, engine) for engine in (FAST[-1], "plain")]
     command = data.controls.attitude.staged_cmd
-    found, expected = (jax.jit(jax.grad(lambda c, s=s: loss(s, c, data, 40)))(command) for s in steps)
+    found, expected = (
+        jax.jit(derivative(functools.partial(loss, Step(sim.step_pipeline, engine), data=data, n=40)))(command)
+        for engine, derivative in ((FAST[-1], jax.grad), ("plain", jax.jacfwd))
+    )
     assert_gradients_equal(found, expected)
 
 
@@ -328,22 +338,17 @@ def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
     data = data.replace(states=data.states.replace(pos=data.states.pos + 5.0))  # off the floor
     at = (data.controls.rotor_vel, data.params.J)
 
-    def gradients(engine):
-        step = Step(sim.step_pipeline, engine)
+    def energy(step, command, J):
+        ready = F.rotor_vel_control(data.replace(params=data.params.replace(J=J)), 1e4 * command)
+        return jnp.sum(step(ready, 40).states.ang_vel ** 2)
 
-        def energy(command, J):
-            ready = F.rotor_vel_control(data.replace(params=data.params.replace(J=J)), 1e4 * command)
-            return jnp.sum(step(ready, 40).states.ang_vel ** 2)
-
-        def both(command, J):
-            slope = jax.jvp(energy, (command, J), (command, J))[1]
-            return jax.grad(energy, (0, 1))(command, J), slope
-
-        return jax.jit(both)(1e-4 * at[0], at[1])
-
-    expected = gradients("plain")
-    assert abs(float(expected[0][1][0, 1])) > 0
-    assert_gradients_equal(gradients(FAST[-1]), expected)
+    at = 1e-4 * at[0], at[1]
+    plain, fast = (functools.partial(energy, Step(sim.step_pipeline, engine)) for engine in ("plain", FAST[-1]))
+    expected = jax.jit(jax.jacfwd(plain, (0, 1)))(*at)
+    assert abs(float(expected[1][0, 1])) > 0
+    assert_gradients_equal(jax.jit(jax.grad(fast, (0, 1)))(*at), expected)
+    slope = jax.jit(lambda *x: jax.jvp(fast, x, x)[1])(*at)
+    assert_gradients_equal(slope, sum(np.sum(gradient * x) for gradient, x in zip(expected, at, strict=True)))
 
 
 @pytest.mark.parametrize("engine", FAST)
@@ -394,9 +399,8 @@ def test_a_rollout_is_the_loop_it_stands_for():
 
 
 def test_a_rollout_has_a_gradient():
-    sim = Sim(n_worlds=1, n_drones=1, control="attitude", attitude_freq=100)
-    states = sim.data.states
-    data = sim.data.replace(states=states.replace(pos=states.pos + 0.5, rotor_vel=states.rotor_vel + 15800.0))
+    sim = Sim(n_worlds=1, n_drones=1, dynamics="so_rpy", control="attitude", attitude_freq=100)
+    data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + 0.5))
     step = sim.build_step_fn()
 
     def height(gain):

@@ -10,7 +10,7 @@ from crazysim.geometry import Shape, distance
 from crazysim.geometry.shapes import SIZES
 
 PAIRS = [(a, b) for a in ("capsule", "box") for b in ("cylinder", "ellipsoid", "mesh")] + [("box", "box")]
-N = 2000
+N = 1250
 DEEP = {("capsule", "ellipsoid"): 1e-2}
 """Tolerance of the depth of a deep overlap, m."""
 

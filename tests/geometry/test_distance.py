@@ -1,5 +1,7 @@
 """Distances compared with C MuJoCo, their gradients, and degenerate cases."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,36 @@ point_distance = jax.jit(eager_point_distance, static_argnums=0)
 
 CLOSED = ("plane", "sphere", "capsule", "box", "cylinder")
 N = 2000
+
+
+@functools.cache
+def judge_points(kind):
+    """Return a compiled function from points to distances and gradients, for all points in one call. (N, 3)"""
+
+    def total(points):
+        out = eager_point_distance(SHAPES[kind], points)
+        return jnp.sum(out), out
+
+    return jax.jit(jax.value_and_grad(total, has_aux=True))
+
+
+@functools.cache
+def judge_each(kind):
+    """Return the same for a function of one point, mapped over points."""
+    return jax.jit(jax.vmap(jax.value_and_grad(functools.partial(eager_point_distance, SHAPES[kind]))))
+
+
+def by_points(kind, points, dtype=np.float64, each=False):
+    """Return distances and gradients at up to ``N`` points, by a function of all points or of each."""
+    n = len(points)
+    with jax.enable_x64(dtype == np.float64):
+        padded = np.resize(points, (N, 3)).astype(dtype)
+        if each:
+            value, slope = judge_each(kind)(padded)
+        else:
+            (_, value), slope = judge_points(kind)(padded)
+        assert value.dtype == slope.dtype == dtype
+        return np.asarray(value)[:n], np.asarray(slope)[:n]
 
 
 def both_ways(found, expected, at_least=100):
@@ -87,33 +119,31 @@ def test_distance_to_an_ellipsoid_from_its_middle_by_hand(x64):
 @pytest.mark.parametrize("kind", SHAPES)
 def test_float32_errs_by_rounding_only(rng, kind):
     points = places(rng, N)
-    found = point_distance(SHAPES[kind], jnp.asarray(points, jnp.float32))
-    assert found.dtype == jnp.float32
-    with jax.enable_x64(True):
-        exact = np.asarray(point_distance(SHAPES[kind], np.float64(np.float32(points))))
+    found, _ = by_points(kind, points, np.float32, each=True)
+    exact, _ = by_points(kind, np.float32(points))
     size = 0.5 + np.linalg.norm(points, axis=1)
     assert np.max(np.abs(found - exact) / size) < 1e-6
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_law_01_one_drone_then_many(x64, rng, kind):
-    points = (0.5 * rng.uniform(-1, 1, (3, 4, 3))).astype(np.float32).astype(float)
-    many = point_distance(SHAPES[kind], points)
-    assert many.shape == (3, 4)
-    one = [[point_distance(SHAPES[kind], points[i, j]) for j in range(4)] for i in range(3)]
+def test_law_01_one_drone_then_many(rng, kind):
+    """All points at once and each by itself: distances and gradients."""
+    points = (0.5 * rng.uniform(-1, 1, (N, 3))).astype(np.float32).astype(float)
+    many, slopes = by_points(kind, points)
+    one, slope = by_points(kind, points, each=True)
     np.testing.assert_allclose(many, one, rtol=1e-12, atol=1e-14)
-    slope = jax.grad(lambda p: point_distance(SHAPES[kind], p))
-    mapped = jax.jit(jax.vmap(jax.vmap(slope)))(jnp.asarray(points, jnp.float32))
-    np.testing.assert_allclose(mapped, jax.vmap(jax.vmap(slope))(points), atol=1e-4)
+    np.testing.assert_allclose(slopes, slope, atol=1e-9)
+    np.testing.assert_allclose(by_points(kind, points[:12], np.float32, each=True)[1], slope[:12], atol=1e-4)
+    shape = jax.eval_shape(lambda p: eager_point_distance(SHAPES[kind], p), jnp.zeros((3, 4, 3)))
+    assert shape.shape == (3, 4)
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_law_08_gradient_equals_central_differences_and_has_length_one(x64, rng, kind):
-    shape, points, h = SHAPES[kind], places(rng, N), 1e-6
-    value = lambda p: point_distance(shape, p)  # noqa: E731
-    slope = np.asarray(jax.grad(lambda p: jnp.sum(value(p)))(points))
-    steps = h * np.eye(3)[:, None]
-    differences = np.moveaxis(np.asarray(value(points + steps) - value(points - steps)) / (2 * h), 0, -1)
+def test_law_08_gradient_equals_central_differences_and_has_length_one(rng, kind):
+    points, h = places(rng, N), 1e-6
+    _, slope = by_points(kind, points)
+    ahead, behind = ([by_points(kind, points + sign * h * axis)[0] for axis in np.eye(3)] for sign in (1, -1))
+    differences = (np.array(ahead) - np.array(behind)).T / (2 * h)
     smooth = np.abs(np.linalg.norm(differences, axis=1) - 1) < 1e-4  # across a crease they are a mean of two sides
     assert np.sum(smooth) > 0.95 * N
     np.testing.assert_allclose(slope[smooth], differences[smooth], atol=2e-5)
@@ -141,14 +171,12 @@ def special_points(shape):
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_law_07_no_nan_at_degenerate_points(kind, dtype):
-    with jax.enable_x64(dtype == np.float64):
-        points = jnp.asarray(special_points(SHAPES[kind]), dtype)
-        value, slope = jax.vmap(jax.value_and_grad(lambda p: point_distance(SHAPES[kind], p)))(points)
-        assert np.isfinite(value).all()
-        assert np.isfinite(slope).all()
-        length = np.linalg.norm(slope, axis=1)
-        assert np.all((np.abs(length - 1) < 1e-3) | (length == 0))
-        assert np.mean(length == 0) < 0.35  # the middle of a sphere, the axis of a capsule
+    value, slope = by_points(kind, special_points(SHAPES[kind]), dtype, each=True)
+    assert np.isfinite(value).all()
+    assert np.isfinite(slope).all()
+    length = np.linalg.norm(slope, axis=1)
+    assert np.all((np.abs(length - 1) < 1e-3) | (length == 0))
+    assert np.mean(length == 0) < 0.35  # the middle of a sphere, the axis of a capsule
 
 
 @given(
@@ -158,7 +186,8 @@ def test_law_07_no_nan_at_degenerate_points(kind, dtype):
 )
 def test_no_distance_changes_faster_than_its_point(kind, a, b):
     a, b = np.float32(a), np.float32(b)
-    change = abs(float(point_distance(SHAPES[kind], a) - point_distance(SHAPES[kind], b)))
+    (at_a, at_b), _ = by_points(kind, np.stack([a, b]), np.float32, each=True)
+    change = abs(float(at_a - at_b))
     assert change <= np.linalg.norm(a - b) * (1 + 1e-5) + 1e-6
 
 

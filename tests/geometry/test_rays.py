@@ -1,16 +1,40 @@
 """Rays compared with C MuJoCo, their gradients, and degenerate cases."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracle import SHAPES, places, rays, unit
 
-from crazysim.geometry import ray_distance as eager_ray_distance
-
-ray_distance = jax.jit(eager_ray_distance, static_argnums=0)
+from crazysim.geometry import ray_distance
 
 N = 4000
+
+
+@functools.cache
+def judge(kind):
+    """Return a compiled function from rays to distances, normals, gradients of the distances, and of both. (N, 3)
+
+    The gradients are those of the sum of distances of rays that hit, and of that and the sum of cubes of the normals.
+    """
+
+    def answer(origin, direction):
+        (t, normal), pullback = jax.vjp(functools.partial(ray_distance, SHAPES[kind]), origin, direction)
+        hit = jnp.isfinite(t).astype(t.dtype)
+        return t, normal, pullback((hit, jnp.zeros_like(normal))), pullback((hit, 3 * normal**2))
+
+    return jax.jit(answer)
+
+
+def by_rays(kind, origin, direction, dtype=np.float64):
+    """Return what ``judge`` does for up to ``N`` rays."""
+    n = len(origin)
+    with jax.enable_x64(dtype == np.float64):
+        found = judge(kind)(*(np.resize(x, (N, 3)).astype(dtype) for x in (origin, direction)))
+        assert {x.dtype for x in jax.tree.leaves(found)} == {np.dtype(dtype)}
+        return jax.tree.map(lambda x: np.asarray(x)[:n], found)
 
 
 def some_rays(rng, n=N):
@@ -24,9 +48,9 @@ def some_rays(rng, n=N):
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_rays_end_where_mujoco_has_it(x64, rng, kind):
+def test_rays_end_where_mujoco_has_it(rng, kind):
     origin, direction = some_rays(rng)
-    t, normal = map(np.asarray, ray_distance(SHAPES[kind], origin, direction))
+    t, normal, *_ = by_rays(kind, origin, direction)
     expected, expected_normal = rays(SHAPES[kind], origin, direction)
     hit = np.isfinite(expected)
     assert np.sum(hit) > 1000
@@ -41,9 +65,8 @@ def test_rays_end_where_mujoco_has_it(x64, rng, kind):
 def test_float32_rays_end_on_the_surface(rng, kind):
     """Rounding of an origin 10 m away is 1e-6 m; it moves the hit of a grazing ray by more."""
     origin, direction = some_rays(rng)
-    with jax.enable_x64(True):
-        exact, normal = map(np.asarray, ray_distance(SHAPES[kind], origin, direction))
-    t = np.asarray(ray_distance(SHAPES[kind], np.float32(origin), np.float32(direction))[0])
+    exact, normal, *_ = by_rays(kind, origin, direction)
+    t, *_ = by_rays(kind, origin, direction, np.float32)
     steep = np.abs(np.sum(normal * direction, axis=1)) > 0.05
     assert np.sum(steep) > 1000
     np.testing.assert_allclose(t[steep], exact[steep], atol=1e-4)
@@ -51,24 +74,21 @@ def test_float32_rays_end_on_the_surface(rng, kind):
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_law_01_one_ray_then_many(x64, rng, kind):
-    origin, direction = (x.reshape(3, 4, 3) for x in some_rays(rng, 12))
-    many = ray_distance(SHAPES[kind], origin, direction)
-    assert many[0].shape == (3, 4)
-    for i in range(3):
-        for j in range(4):
-            one = ray_distance(SHAPES[kind], origin[i, j], direction[i, j])
-            for x, y in zip(many, one, strict=True):
-                np.testing.assert_allclose(x[i, j], y, atol=1e-12)
+    """All rays at once, and a function of one ray mapped over them."""
+    rays = some_rays(rng)
+    each = jax.jit(jax.vmap(functools.partial(ray_distance, SHAPES[kind])))(*rays)
+    for x, y in zip(by_rays(kind, *rays), each, strict=False):
+        np.testing.assert_allclose(x, y, atol=1e-12)
+    shapes = jax.eval_shape(functools.partial(ray_distance, SHAPES[kind]), *(jnp.zeros((3, 4, 3)),) * 2)
+    assert [x.shape for x in shapes] == [(3, 4), (3, 4, 3)]
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_law_08_gradient_equals_central_differences(x64, rng, kind):
-    shape, h = SHAPES[kind], 1e-6
+def test_law_08_gradient_equals_central_differences(rng, kind):
+    h = 1e-6
     origin, direction = some_rays(rng)
-    t, normal = map(np.asarray, ray_distance(shape, origin, direction))
-    total = lambda o: jnp.sum(jnp.where(t < np.inf, ray_distance(shape, o, direction)[0], 0))  # noqa: E731
-    slope = np.asarray(jax.grad(total)(origin))
-    sides = np.array([[ray_distance(shape, origin + s * h * e, direction)[0] for e in np.eye(3)] for s in (1, -1)])
+    _, normal, (slope, _), _ = by_rays(kind, origin, direction)
+    sides = np.array([[by_rays(kind, origin + s * h * e, direction)[0] for e in np.eye(3)] for s in (1, -1)])
     clear = (np.abs(np.sum(normal * direction, axis=1)) > 0.05) & np.isfinite(sides).all(axis=(0, 1))
     sides = np.moveaxis(sides[:, :, clear], 1, -1)
     differences = (sides[0] - sides[1]) / (2 * h)
@@ -84,17 +104,10 @@ def test_law_07_no_nan_in_degenerate_cases(kind):
     grid = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0, 3.0]] * 3), axis=-1).reshape(-1, 3)
     ways = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
     ways = np.concatenate([unit(ways[ways.any(axis=1)]), [[1e-15, 0, 1], [1, 1e-13, 0]]])
-
-    def total(origin, direction):
-        t, normal = ray_distance(SHAPES[kind], origin, direction)
-        return jnp.sum(jnp.where(jnp.isfinite(t), t, 0.0)) + jnp.sum(normal**3)
-
-    slopes = jax.jit(jax.grad(total, (0, 1)))
     for scale in (size, size[[1, 0, 2]], size[0]):
-        origin, direction = jnp.asarray(grid * scale)[:, None], jnp.asarray(ways)[None]
-        t, normal = ray_distance(SHAPES[kind], origin, direction)
+        origin, direction = np.repeat(grid * scale, len(ways), axis=0), np.tile(ways, (len(grid), 1))
+        t, normal, _, slopes = by_rays(kind, origin, direction, np.float32)
         assert not np.isnan(t).any()
         np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), np.isfinite(t), atol=1e-5)
-        for slope in slopes(origin, direction):
-            assert slope.dtype == np.float32
+        for slope in slopes:
             assert np.isfinite(slope).all()

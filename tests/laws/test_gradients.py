@@ -1,5 +1,7 @@
 """Gradients through every command level: equal to central differences, and finite where a switch lies."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,59 +19,94 @@ COMMANDS = {
     "force_torque": [1.02 * WEIGHT, 1e-5, -2e-5, 1e-6],
     "rotor_vel": [16_000.0, 16_010.0, 16_020.0, 16_005.0],
 }
-PAIRS = [("first_principles", c) for c in COMMANDS] + [
-    (d, c) for d in ("so_rpy", "so_rpy_rotor_drag") for c in ("state", "attitude")
-]
 SETTER = {c: getattr(F, f"{c}_control") for c in COMMANDS}
 
 
-def flight(dynamics, control, engine, n_steps=100):
-    """Return a scalar function of (pos, quat direction, vel, ang_vel, rotor_vel, command), and a start for it."""
-    sim = Sim(dynamics=dynamics, control=control, engine=engine)
+N_INPUTS = 6
+"""Number of inputs of a flight: five states and the command."""
+DIFFERENCE = 1e-6
+"""Relative step of the central differences."""
+
+
+def flight(dynamics, control, engine, n_worlds, n_steps=100):
+    """Return a function from (pos, quat direction, vel, ang_vel, rotor_vel, command) of each world to a number of each.
+
+    A start for one world comes with it.
+    """
+    sim = Sim(n_worlds, dynamics=dynamics, control=control, engine=engine)
     step = sim.build_step_fn()
     n = sim.data.states.rotor_vel.shape[-1]
     hover = 15_864.0 if dynamics == "first_principles" else WEIGHT
     start = {
-        "pos": jnp.asarray([0.0, 0.0, 1.0]),
-        "quat": jnp.asarray([0.02, -0.03, 0.05, 1.0]),
-        "vel": jnp.asarray([0.1, 0.2, -0.1]),
-        "ang_vel": jnp.asarray([0.1, -0.2, 0.1]),
-        "rotor_vel": jnp.full(n, 0.98 * hover, float),  # as what is added to it, or all is compiled twice
-        "command": jnp.asarray(COMMANDS[control], dtype=float),
+        "pos": [0.0, 0.0, 1.0],
+        "quat": [0.02, -0.03, 0.05, 1.0],
+        "vel": [0.1, 0.2, -0.1],
+        "ang_vel": [0.1, -0.2, 0.1],
+        "rotor_vel": np.full(n, 0.98 * hover),
+        "command": COMMANDS[control],
     }
 
-    def loss(x):
-        quat = x["quat"] / jnp.linalg.norm(x["quat"])
-        states = sim.data.states.replace(
-            quat=quat[None, None], **{k: x[k][None, None] for k in ("pos", "vel", "ang_vel", "rotor_vel")}
-        )
-        data = SETTER[control](sim.data.replace(states=states), x["command"][None, None])
+    def losses(x):
+        x = {name: value[:, None] for name, value in x.items()}
+        quat = x["quat"] / jnp.linalg.norm(x["quat"], axis=-1, keepdims=True)
+        states = sim.data.states.replace(quat=quat, **{k: x[k] for k in ("pos", "vel", "ang_vel", "rotor_vel")})
+        data = SETTER[control](sim.data.replace(states=states), x["command"])
         s = step(data, n_steps).states
-        return (jnp.sum(s.pos * jnp.array([1.0, -2.0, 3.0])) + 0.5 * jnp.sum(s.vel**2) + jnp.sum(s.quat[..., :3])) * 1.0
+        each = s.pos * jnp.array([1.0, -2.0, 3.0]) + 0.5 * s.vel**2 + s.quat[..., :3]
+        return jnp.sum(each, axis=(1, 2))
 
-    return loss, start
+    return losses, {name: np.asarray(value, float) for name, value in start.items()}
 
 
-@pytest.mark.parametrize(
-    ("dynamics", "control", "engine"), [(*pair, "plain") for pair in PAIRS] + [("first_principles", "attitude", "auto")]
-)
-def test_gradient_equals_central_differences(dynamics, control, engine, x64):
+def forward(losses, x, directions):
+    """Return the losses, and their slopes along the directions, by forward mode."""
+    return jax.jvp(losses, (x,), (directions,))
+
+
+def reverse(losses, x, directions):
+    """Return the same by reverse mode."""
+    values, pullback = jax.vjp(losses, x)
+    (gradient,) = pullback(jnp.ones_like(values))
+    return values, sum(jnp.sum(gradient[name] * directions[name], axis=-1) for name in x)
+
+
+CASES = [
+    ("first_principles", "state", "plain", reverse),
+    ("first_principles", "attitude", "plain", forward),
+    ("first_principles", "body_rate", "plain", reverse),
+    ("first_principles", "force_torque", "plain", forward),
+    ("first_principles", "rotor_vel", "plain", forward),
+    ("so_rpy", "state", "plain", reverse),
+    ("so_rpy", "attitude", "plain", forward),
+    ("so_rpy_rotor_drag", "state", "plain", reverse),
+    ("so_rpy_rotor_drag", "attitude", "plain", forward),
+    ("first_principles", "attitude", "auto", reverse),
+]
+"""Both modes go through every stage: a pipeline whose stages are all part of a longer one takes the cheaper mode."""
+
+
+@pytest.mark.parametrize(("dynamics", "control", "engine", "mode"), CASES)
+def test_gradient_equals_central_differences(dynamics, control, engine, mode, x64):
     """100 steps in float64, along a random direction in each input on its own, away from switches.
 
     A central difference with a relative step of 1e-6 is off by about 1e-12 of curvature and 1e-10 of rounding,
     over a gradient of order one: 1e-6 leaves room for both.
+
+    Each input has three worlds: at the start, ahead of it and behind it. One program computes all.
     """
-    loss, start = flight(dynamics, control, engine)
-    both = jax.jit(jax.value_and_grad(loss))  # one program for all
-    gradient = both(start)[1]
+    losses, start = flight(dynamics, control, engine, n_worlds=3 * N_INPUTS)
     rng = np.random.default_rng(0)
+    x, directions = {}, {}
+    for k, (name, value) in enumerate(start.items()):
+        direction = rng.normal(size=value.shape) * np.maximum(np.abs(value), 0.1)
+        directions[name] = np.zeros((3 * len(start), len(value)))
+        directions[name][3 * k : 3 * k + 3] = direction
+        x[name] = value + DIFFERENCE * np.tile([0.0, 1.0, -1.0], len(start))[:, None] * directions[name]
+    values, slopes = (np.asarray(found) for found in jax.jit(functools.partial(mode, losses))(x, directions))
     compared = 0
-    for name, x in start.items():
-        direction = jnp.asarray(rng.normal(size=x.shape)) * jnp.maximum(jnp.abs(x), 0.1)
-        h = 1e-6
-        ahead, behind = (both(start | {name: x + sign * h * direction})[0] for sign in (1, -1))
-        numeric = float(ahead - behind) / (2 * h)
-        analytic = float(jnp.sum(gradient[name] * direction))
+    for k, name in enumerate(start):
+        _, ahead, behind = values[3 * k : 3 * k + 3]
+        numeric, analytic = (ahead - behind) / (2 * DIFFERENCE), slopes[3 * k]
         assert np.isfinite(analytic), name
         np.testing.assert_allclose(analytic, numeric, rtol=1e-5, atol=1e-6, err_msg=name)
         compared += abs(numeric) > 1e-6

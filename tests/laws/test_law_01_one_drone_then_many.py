@@ -117,16 +117,15 @@ def test_drones_of_a_controller_fly_as_each_does_alone(name, rng):
     Controllers that need a load or a trajectory of their own are compared in tests/control.
     """
 
-    def fly(n_worlds, n_drones, drawn):
-        sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="state", controller=name, engine="plain")
-        states = sim.data.states.replace(**{key: jnp.asarray(x, jnp.float32) for key, x in drawn.items()})
-        sim.data = sim.data.replace(states=states)
-        setpoint = np.zeros((n_worlds, n_drones, 16))
+    def fly(sim, data, drawn):
+        states = data.states.replace(**{key: jnp.asarray(x, np.float32) for key, x in drawn.items()})
+        sim.data = data.replace(states=states)
+        setpoint = np.zeros((sim.n_worlds, sim.n_drones, 16))
         setpoint[..., :3], setpoint[..., 15] = drawn["pos"] + drawn["vel"], 1.0
         setpoint[..., 12:14] = [0.6, 0.8]  # a yaw
         sim.state_control(setpoint)
         sim.step(25)
-        return sim.data.states
+        return [np.asarray(x) for x in jax.tree.leaves(sim.data.states)]
 
     quat = np.array([0, 0, 0, 1.0]) + 0.2 * rng.normal(size=(*BATCH, 4))
     drawn = {
@@ -136,10 +135,11 @@ def test_drones_of_a_controller_fly_as_each_does_alone(name, rng):
         "ang_vel": 0.5 * rng.normal(size=(*BATCH, 3)),
         "rotor_vel": rng.uniform(1.2e4, 1.6e4, (*BATCH, 4)),
     }
-    many = jax.tree.leaves(fly(*BATCH, drawn))
+    many, one = (Sim(*counts, control="state", controller=name, engine="plain") for counts in (BATCH, (1, 1)))
+    together, start = fly(many, many.data, drawn), one.data
     for i in [(0, 0), (2, 1)]:
-        alone = jax.tree.leaves(fly(1, 1, {key: x[i][None, None] for key, x in drawn.items()}))
-        for x, y in zip(many, alone, strict=True):
+        alone = fly(one, start, {key: x[i][None, None] for key, x in drawn.items()})
+        for x, y in zip(together, alone, strict=True):
             # float32 rounding, which 25 steps of feedback with gains of PWM amplify
             np.testing.assert_allclose(x[i], y[0, 0], rtol=1e-3, atol=1e-4 * max(1.0, float(np.abs(y).max())))
 

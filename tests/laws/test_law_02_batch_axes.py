@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import functools
 import inspect
 import itertools
 import re
@@ -48,21 +49,30 @@ def signature(tree):
     return jax.tree.structure(tree), [(x.shape, x.dtype) for x in jax.tree.leaves(tree)]
 
 
+def after_all_stages(sim, data):
+    """Return the data after every stage, one after the other, each batched as it is without an engine."""
+    for stage in Step(sim.step_pipeline, "plain").stages:
+        data = stage(data)
+    return data
+
+
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_a_step_keeps_every_shape_and_type(dynamics, control):
     """Law 2: whatever the numbers of worlds and drones, equal ones included, parameters shared or one per drone."""
     sim = shared_sim(dynamics=dynamics, control=control)
     # Every size for one pair; the others, whose stages are batched alike, share them out, equal numbers included.
     k = PAIRS.index((dynamics, control))
-    sizes = EQUAL + UNEQUAL if k == 0 else [EQUAL[k % 4], UNEQUAL[k % 12]]
-    for engine in ENGINES[:3] if k == 0 else ("plain", "lanes"):
-        step = Step(sim.step_pipeline, engine)
-        for n_worlds, n_drones in sizes if engine == "plain" else sizes[:2]:
-            data = resized(sim, n_worlds, n_drones)
-            if (n_worlds + n_drones) % 2 == 0:
-                data = per_drone(data)
-            after = jax.eval_shape(lambda d, step=step: step(d, 1), data)
-            assert signature(after) == signature(data), (engine, n_worlds, n_drones)
+    equal, unequal = EQUAL[(k + 1) % 4], UNEQUAL[k % 12]
+    cases = [("plain", *unequal), ("lanes", *equal), *([("auto", *equal), ("lanes", *unequal)] if k == 0 else [])]
+    cases += [("stages", *size) for size in (SIZES if k == 0 else (equal, unequal))]
+    steps = {engine: functools.partial(Step(sim.step_pipeline, engine), n_steps=1) for engine in ENGINES[:3]}
+    steps["stages"] = functools.partial(after_all_stages, sim)
+    for name, n_worlds, n_drones in cases:
+        data = resized(sim, n_worlds, n_drones)
+        if (n_worlds + n_drones) % 2 == 0:
+            data = per_drone(data)
+        after = jax.eval_shape(steps[name], data)
+        assert signature(after) == signature(data), (name, n_worlds, n_drones)
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
