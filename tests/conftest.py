@@ -13,6 +13,13 @@ os.environ.update(compiling.environment(os.environ))
 # A program's operations do not carry the lines of Python that made them: writing it takes less time.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
+CACHE = Path(__file__).parents[1] / ".cache" / "jax"
+"""Folder of what was compiled once, in any worker, run, or process that a test starts."""
+os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE)
+# Small programs too: reading takes half the time of compiling.
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+
 import jax
 import numpy as np
 import pytest
@@ -21,12 +28,6 @@ from hypothesis import HealthCheck, settings
 from crazysim.engine import cuda
 
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
-
-# What was compiled once, in any worker or run, is kept, small programs too: reading takes half the time of compiling.
-CACHE = Path(__file__).parents[1] / ".cache" / "jax"
-jax.config.update("jax_compilation_cache_dir", str(CACHE))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 # Compilation inside an example must not count as slowness, and CI must not depend on luck.
 settings.register_profile(

@@ -8,6 +8,7 @@ q of the rod, its next two derivatives give q' and q'', the drone is at ``x = x_
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
+from crazysim.eager import compiled
 
 ORDER = 6
 """Highest derivative of the load's path that is needed."""
@@ -47,6 +49,12 @@ class LoadedState(NamedTuple):
     """Torque, body frame, N m. (..., 3)"""
 
 
+def _rate(fn: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """Return the derivative of a function of time; ``jacfwd`` would map over the axes of the argument as well."""
+    return lambda t: jax.jvp(fn, (t,), (jnp.ones_like(t),))[1]
+
+
+@compiled()
 def load_flat_state(
     path: Array, yaw: Array, mass: Array, load_mass: Array, length: Array, inertia: Array, gravity_vec: Array
 ) -> LoadedState:
@@ -82,8 +90,8 @@ def load_flat_state(
     def pos(t: Array) -> Array:
         return derivatives(0, t) + length * pull(t) / jnp.linalg.norm(pull(t))
 
-    velocity = jax.jacfwd(pos)
-    acceleration = jax.jacfwd(velocity)
+    velocity = _rate(pos)
+    acceleration = _rate(velocity)
 
     def force(t: Array) -> Array:
         return mass * (acceleration(t) - gravity_vec) + pull(t)
@@ -97,14 +105,14 @@ def load_flat_state(
         y = y / jnp.linalg.norm(y)
         return jnp.stack([rotation.cross(y, z), y, z], axis=-1)
 
-    def ang_vel(t: Array) -> Array:
-        """Return the angular velocity of ``R' = R [w]``."""
-        rot = attitude(t)
-        turned = jnp.sum(rot[:, :, None] * jax.jacfwd(attitude)(t)[:, None, :], axis=0)
-        return jnp.stack([turned[2, 1], turned[0, 2], turned[1, 0]])
+    def ang_vel(t: Array) -> tuple[Array, Array]:
+        """Return the angular velocity of ``R' = R [w]``, and R."""
+        rot, rot_rate = jax.jvp(attitude, (t,), (jnp.ones_like(t),))
+        turned = jnp.sum(rot[:, :, None] * rot_rate[:, None, :], axis=0)
+        return jnp.stack([turned[2, 1], turned[0, 2], turned[1, 0]]), rot
 
     now = jnp.zeros((), path.dtype)
-    rot, w, w_rate = attitude(now), ang_vel(now), jax.jacfwd(ang_vel)(now)
+    w, w_rate, rot = jax.jvp(ang_vel, (now,), (jnp.ones_like(now),), has_aux=True)
     tension = jnp.linalg.norm(pull(now))[None]
     offset = path[0] - pos(now)
     torque = rotation.matvec(inertia, w_rate) + rotation.cross(w, rotation.matvec(inertia, w))
