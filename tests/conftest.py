@@ -13,12 +13,8 @@ os.environ.update(compiling.environment(os.environ))
 # A program's operations do not carry the lines of Python that made them: writing it takes less time.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
-CACHE = Path(__file__).parents[1] / ".cache" / "jax"
-"""Folder of what was compiled once, in any worker, run, or process that a test starts."""
-os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE)
-# Small programs too: reading takes half the time of compiling.
-os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
-os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+# What was compiled once is kept, in any worker, any run, and any process that a test starts.
+os.environ.update(compiling.cache())
 
 import jax
 import numpy as np
