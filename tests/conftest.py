@@ -13,9 +13,6 @@ os.environ.update(compiling.environment(os.environ))
 # A program's operations do not carry the lines of Python that made them: writing it takes less time.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
-# What was compiled once is kept, in any worker, any run, and any process that a test starts.
-os.environ.update(compiling.cache())
-
 import jax
 import numpy as np
 import pytest
@@ -24,6 +21,12 @@ from hypothesis import HealthCheck, settings
 from crazysim.engine import cuda
 
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
+
+# What was compiled once is kept, in any worker, any run, and any process that a test starts.
+os.environ.update(compiling.cache())
+jax.config.update("jax_compilation_cache_dir", str(compiling.CACHE))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 # Compilation inside an example must not count as slowness, and CI must not depend on luck.
 settings.register_profile(
