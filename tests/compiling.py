@@ -19,7 +19,7 @@ CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 
 
 def cache() -> dict[str, str]:
-    """Return variables for processes that keep all programs, small ones too: reading takes half the time of compiling."""
+    """Return variables that make processes keep all programs, small ones too: reading takes half the time."""
     return {
         "JAX_COMPILATION_CACHE_DIR": str(CACHE),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
