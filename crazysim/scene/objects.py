@@ -97,11 +97,11 @@ class Handle:
 
     def _with_rows(self, old: Array, what: str, value: Any, mask: Any) -> Array:
         value = as_poses(value, what, len(self), old.shape[-1], old.shape[0] if old.ndim == 4 else None)
-        return _with_rows(old, value, None if mask is None else jnp.asarray(mask), self.rows, what == "quat")
+        return _moved(old, value, None if mask is None else jnp.asarray(mask), self.rows, what == "quat")
 
 
 @compiled("numbers", "is_quat")
-def _with_rows(old: Array, value: Array, mask: Array | None, numbers: tuple[int, ...], is_quat: bool) -> Array:
+def _moved(old: Array, value: Array, mask: Array | None, numbers: tuple[int, ...], is_quat: bool) -> Array:
     """Return poses or velocities of all objects with other rows; quaternions are normalised."""
     n, size = len(numbers), old.shape[-1]
     value = jnp.asarray(value, old.dtype)
@@ -117,7 +117,7 @@ def _with_rows(old: Array, value: Array, mask: Array | None, numbers: tuple[int,
 @compiled("numbers")
 def _rows(old: Array, numbers: tuple[int, ...]) -> Array:
     """Return positions or attitudes of some objects. (n, k), or (n_worlds, n, k) for all worlds"""
-    return jnp.stack([(old if old.ndim == 2 else old[:, 0])[..., k, :] for k in numbers], axis=-2)
+    return (old if old.ndim == 2 else old[:, 0])[..., np.array(numbers), :]
 
 
 def as_poses(value: Any, what: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
