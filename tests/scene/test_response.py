@@ -153,7 +153,7 @@ def test_flights_with_bounces_lose_what_they_have(between, rng):
         vel=2 * rng.normal(size=(n, 1, 3)),
     )
     mass, energy = float(sim.data.params.mass[0]), []
-    for _ in range(100):
+    for _ in range(200):
         energy.append(kinetic(sim.data)[:, 0] + mass * GRAVITY * np.asarray(sim.data.states.pos)[:, 0, 2])
         sim.step(5)
     energy = np.array(energy)
