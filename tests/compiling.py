@@ -4,6 +4,7 @@ import shutil
 import sys
 from collections.abc import Mapping
 from importlib.metadata import version
+from pathlib import Path
 
 HAS_EMITTERS = version("jaxlib").startswith("0.10.")
 """True where XLA has an option for the fusion of loops; later versions refuse it."""
@@ -11,6 +12,19 @@ HAS_EMITTERS = version("jaxlib").startswith("0.10.")
 
 QUICK = "-Og -fira-algorithm=priority -fira-region=one"
 """Options of g++ that take 0.6 of the time that -O1 takes, and as little as -O0, whose kernels are slow."""
+
+
+CACHE = Path(__file__).parents[1] / ".cache" / "jax"
+"""Folder of compiled programs and kernels."""
+
+
+def cache() -> dict[str, str]:
+    """Return variables that make processes keep all programs, small ones too: reading takes half the time."""
+    return {
+        "JAX_COMPILATION_CACHE_DIR": str(CACHE),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
 
 
 def options(emitters: bool = False) -> dict[str, bool | int]:

@@ -22,9 +22,9 @@ from crazysim.engine import cuda
 
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
 
-# What was compiled once, in any worker or run, is kept, small programs too: reading takes half the time of compiling.
-CACHE = Path(__file__).parents[1] / ".cache" / "jax"
-jax.config.update("jax_compilation_cache_dir", str(CACHE))
+# What was compiled once is kept, in any worker, any run, and any process that a test starts.
+os.environ.update(compiling.cache())
+jax.config.update("jax_compilation_cache_dir", str(compiling.CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
+from crazysim.eager import compiled
 from crazysim.pytree import PyTree, leaf
 
 
@@ -33,6 +34,7 @@ class Setpoint(PyTree):
     yaw_acc: Array = leaf("drone", 1)
     """Second derivative of the yaw, rad/s^2. (..., 1)"""
 
+    @compiled()
     def command(self) -> Array:
         """Return the state command: position, velocity, acceleration, quaternion of the yaw, body rates. (..., 16)
 

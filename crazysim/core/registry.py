@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterator, Mapping
+import functools
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -17,6 +18,7 @@ from crazysim.core.pipeline import Pipeline, insert_fn_before
 from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.population import Population
 from crazysim.core.stage import Axes, over_drones, over_worlds
+from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import PyTree, n_batch_axes
 
@@ -44,6 +46,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._sim = sim
         self._installed: dict[str, _Installed] = {}
         self._placing: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
+        self._observing: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
 
     def __getitem__(self, name: str) -> Plugin:
         """Return a plugin.
@@ -161,15 +164,10 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the observations of all plugins, as ``"plugin.name"``. (n_worlds, n_drones, k) each"""
-
-        def of_one(one: SimData) -> dict[str, Array]:
-            return {f"{p.name}.{key}": x for p in self.values() for key, x in p.observations(one).items()}
-
-        leaves, axes = jax.tree.leaves(data), Axes(data)
-        worlds = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]
-        of_drones = over_drones(of_one)
-        of_world = [x[:, 0] if scope == "world" else x for scope, x in zip(axes.scopes, leaves, strict=True)]
-        return jax.vmap(lambda values: of_drones(axes.treedef.unflatten(values)), (worlds,))(of_world)
+        plugins = tuple(self.values())
+        if [*map(id, plugins)] != [*map(id, self._observing[0])]:
+            self._observing = plugins, compiled()(functools.partial(_observations, plugins))
+        return self._observing[1](data)
 
     def placed(self, data: SimData) -> SimData:
         """Return the data with the plugins' objects of the scene at their poses, unless these are recorded ones."""
@@ -312,3 +310,18 @@ def _continued(record: PyTree | None, before: PyTree | None) -> PyTree | None:
 
 def _signature(tree: Any) -> Any:
     return jax.tree.structure(tree), [(jnp.shape(x), jnp.result_type(x)) for x in jax.tree.leaves(tree)]
+
+
+def _no_observations(_data: SimData) -> dict[str, Array]:
+    return {}
+
+
+def _observations(plugins: Sequence[Plugin], data: SimData) -> dict[str, Array]:
+    def of_one(one: SimData) -> dict[str, Array]:
+        return {f"{p.name}.{key}": x for p in plugins for key, x in p.observations(one).items()}
+
+    leaves, axes = jax.tree.leaves(data), Axes(data)
+    worlds = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]
+    of_drones = over_drones(of_one)
+    of_world = [x[:, 0] if scope == "world" else x for scope, x in zip(axes.scopes, leaves, strict=True)]
+    return jax.vmap(lambda values: of_drones(axes.treedef.unflatten(values)), (worlds,))(of_world)

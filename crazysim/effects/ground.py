@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
+from crazysim.eager import compiled
 from crazysim.geometry.heightfield import FAR, surface
 from crazysim.pytree import PyTree, leaf, static
 
@@ -57,6 +58,7 @@ class TerrainData(PyTree):
         return jnp.where(inside, gap, FAR) if self.floor else gap, normal
 
 
+@compiled()
 def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
     """Return height and normal of the ground at a place, whose z does not count; flat and zero without terrain.
 

@@ -12,6 +12,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData, SimState
 from crazysim.core.plugin import Simulation
+from crazysim.eager import compiled
 from crazysim.effects.core import Exposed
 from crazysim.effects.ground import ground_height
 from crazysim.effects.wind import wind_at
@@ -134,6 +135,7 @@ def on_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> tuple
     return jnp.concatenate([pos[..., :2], jnp.maximum(height, clearance)], axis=-1), vel
 
 
+@compiled("is_cable")
 def hanging(s: SimState, attach: Array | None, length: Array, clearance: Array, is_cable: bool) -> tuple[Array, Array]:
     """Return position and velocity of a load that hangs at rest below its drone, or rests on the floor.
 
@@ -155,6 +157,7 @@ def hanging(s: SimState, attach: Array | None, length: Array, clearance: Array, 
     return top + offset, vel
 
 
+@compiled("name")
 def direction(data: SimData, name: str = "load") -> tuple[Array, Array]:
     """Return the unit vector from attachment to load, world frame, and its rate, 1/s; of one drone or of all. (..., 3)
 

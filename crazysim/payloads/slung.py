@@ -161,17 +161,17 @@ def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, 
     rest, drag = check_parameter(sim, "size", clearance, low=0.0), optional("drag", low=0.0)
     if plugin.in_scene:
         add_to_scene(
-            sim, plugin.name, plugin.size, plugin.rgba, float(jnp.max(length)), sim.n_drones,
+            sim, plugin.name, plugin.size, plugin.rgba, float(np.max(length)), sim.n_drones,
             CABLE_SEGMENTS if is_cable else 1, ring,
         )  # fmt: skip
     states = sim.data.states
     pos, vel = hanging(states, attach, length, rest, is_cable)
     return LoadData(
         pos=pos,
-        vel=vel + jnp.zeros_like(states.vel),
+        vel=jnp.asarray(np.broadcast_to(vel, states.vel.shape)),
         air_vel=None if drag is None else zeros(sim, 3),
         wind_vel=None if drag is None else zeros(sim, 3),
-        attached=jnp.ones(states.pos.shape[:2], bool),
+        attached=jnp.asarray(np.ones(states.pos.shape[:2], bool)),
         mass=check("mass", low=0.0),
         length=length,
         attach=attach,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -179,7 +180,12 @@ def make_data(mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device) -> mj
     """
     with _limits_of_mjx():
         one = mjx.put_data(mj_model, mujoco.MjData(mj_model), device=device)
-    return jax.tree.map(lambda x: jnp.repeat(x[None], n_worlds, axis=0), one)
+    return _repeated(one, n_worlds)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _repeated(one: mjx.Data, n: int) -> mjx.Data:
+    return jax.tree.map(lambda x: jnp.repeat(x[None], n, axis=0), one)
 
 
 @contextlib.contextmanager

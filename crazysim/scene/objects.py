@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import Objects, SimData
 from crazysim.core.settings import positive
+from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.pytree import select_worlds
+from crazysim.pytree import floating, select_worlds
 from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -81,8 +82,7 @@ class Handle:
     def pose(self, data: SimData) -> tuple[Array, Array]:
         """Return positions, m (n_worlds, n, 3), and attitudes, xyzw (n_worlds, n, 4)."""
         objects = self._objects(data)
-        pos, quat = (x[..., self.rows, :] for x in (objects.pos, objects.quat))
-        return (pos, quat) if pos.ndim == 2 else (pos[:, 0], quat[:, 0])
+        return _rows(objects.pos, self.rows), _rows(objects.quat, self.rows)
 
     def _objects(self, data: SimData) -> Objects:
         if not self.movable:
@@ -96,18 +96,31 @@ class Handle:
         return data.objects  # type: ignore[return-value]
 
     def _with_rows(self, old: Array, what: str, value: Any, mask: Any) -> Array:
-        n, size = len(self), old.shape[-1]
-        value = as_poses(value, what, n, size, old.shape[0] if old.ndim == 4 else None).astype(old.dtype)
-        if what == "quat":
-            value = value * jax.lax.rsqrt(jnp.sum(value**2, axis=-1, keepdims=True))
-        value = jnp.broadcast_to(value[:, None] if value.ndim == 3 else value, (*old.shape[:-2], n, size))
-        rows = [old[..., k, :] for k in range(old.shape[-2])]
-        for i, k in enumerate(self.rows):
-            rows[k] = value[..., i, :]
-        return select_worlds(None if mask is None else jnp.asarray(mask), jnp.stack(rows, axis=-2), old)
+        value = as_poses(value, what, len(self), old.shape[-1], old.shape[0] if old.ndim == 4 else None)
+        return _moved(old, value, None if mask is None else jnp.asarray(mask), self.rows, what == "quat")
 
 
-def as_poses(value: Any, what: str, n: int, size: int, n_worlds: int | None) -> Array:
+@compiled("numbers", "is_quat")
+def _moved(old: Array, value: Array, mask: Array | None, numbers: tuple[int, ...], is_quat: bool) -> Array:
+    """Return poses or velocities of all objects with other rows; quaternions are normalised."""
+    n, size = len(numbers), old.shape[-1]
+    value = jnp.asarray(value, old.dtype)
+    if is_quat:
+        value = value * jax.lax.rsqrt(jnp.sum(value**2, axis=-1, keepdims=True))
+    value = jnp.broadcast_to(value[:, None] if value.ndim == 3 else value, (*old.shape[:-2], n, size))
+    rows = [old[..., k, :] for k in range(old.shape[-2])]
+    for i, k in enumerate(numbers):
+        rows[k] = value[..., i, :]
+    return select_worlds(mask, jnp.stack(rows, axis=-2), old)
+
+
+@compiled("numbers")
+def _rows(old: Array, numbers: tuple[int, ...]) -> Array:
+    """Return positions or attitudes of some objects. (n, k), or (n_worlds, n, k) for all worlds"""
+    return (old if old.ndim == 2 else old[:, 0])[..., np.array(numbers), :]
+
+
+def as_poses(value: Any, what: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
     """Return positions, attitudes or velocities of ``n`` objects, checked. (size,), (n, size) or (n_worlds, n, size)
 
     Raises:
@@ -126,7 +139,7 @@ def as_poses(value: Any, what: str, n: int, size: int, n_worlds: int | None) -> 
             f"expected finite numbers for {what}, not all zero in a quaternion, got "
             f"{np.array2string(host, threshold=8)}"
         )
-    return jnp.asarray(value if host is None else host)
+    return value if host is None else host
 
 
 class SceneObjects:
@@ -186,15 +199,13 @@ class SceneObjects:
         """
         if not self._initial:
             return None
-        pos, quat = (jnp.asarray(np.concatenate(xs, axis=1), float)[:, None] for xs in zip(*self._initial, strict=True))
-        vel = jnp.zeros_like(pos)
+        pos, quat = (np.concatenate(xs, axis=1)[:, None] for xs in zip(*self._initial, strict=True))
+        poses = pos, quat, np.zeros_like(pos)
         if before is not None:
-            n = len(before.names)
-            pos, quat, vel = (
-                jnp.concatenate([old.astype(new.dtype), new[..., n:, :]], axis=-2)
-                for old, new in ((before.pos, pos), (before.quat, quat), (before.vel, vel))
-            )
-        return Objects(pos, quat, vel, jnp.asarray(mocap_ids, jnp.int32), self.movable)
+            n, old = len(before.names), (before.pos, before.quat, before.vel)
+            poses = tuple(np.concatenate([x, new[..., n:, :]], axis=-2) for x, new in zip(old, poses, strict=True))
+        pos, quat, vel = (jnp.asarray(np.asarray(x, floating())) for x in poses)
+        return Objects(pos, quat, vel, jnp.asarray(np.asarray(mocap_ids, np.int32)), self.movable)
 
 
 def add_bodies(

@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array, lax
 
 from crazysim.control.setpoint import Setpoint
+from crazysim.eager import compiled
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, floating, leaf
 
@@ -90,6 +91,7 @@ class Trajectory(PyTree):
         """Time from the start to the end, s. (...)"""
         return self.ends[..., -1]
 
+    @compiled()
     def evaluate(self, t: Any) -> Setpoint:
         """Return the setpoint of one trajectory at one time, with derivatives up to snap.
 

@@ -14,12 +14,12 @@ from crazysim import functional as F
 
 N_FLIGHTS, SECONDS, RATE = 8, 3.0, 100  # samples and commands per second
 NOISE = {"pos": 1e-3, "quat": 2e-3, "ang_vel": 2e-2}  # m, 1, rad/s
-SPEEDS = jnp.array([12e3, 16e3, 20e3])  # rpm; the values at these speeds define a parabola
+SPEEDS = np.array([12e3, 16e3, 20e3])  # rpm; the values at these speeds define a parabola
 ROUNDS = 8
 NAMES = ["mass [g]", "Jxx [1e-6 kg m^2]", "Jyy [1e-6 kg m^2]", "Jzz [1e-6 kg m^2]"]
 NAMES += [f"thrust at {speed / 1e3:.0f} krpm [mN]" for speed in SPEEDS]
 UNITS = np.array([1e-3, 1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3])
-TRUE_OVER_DATA_SHEET = jnp.array([1.08, 1.15, 0.9, 1.1, 0.96, 0.95, 0.94])
+TRUE_OVER_DATA_SHEET = np.array([1.08, 1.15, 0.9, 1.1, 0.96, 0.95, 0.94])
 
 
 def physical(params) -> jax.Array:
@@ -64,25 +64,23 @@ def main() -> dict[str, tuple[float, float, float]]:
         drone = start.replace(params=with_physical(start.params, ratio * data_sheet))
         return jax.lax.scan(sample, drone, cmds)[1]
 
-    flight = jax.jit(fly)(TRUE_OVER_DATA_SHEET)
-    log = {name: x + NOISE[name] * rng.normal(size=x.shape) for name, x in flight.items()}
+    flight = jax.jit(fly)(np.float32(TRUE_OVER_DATA_SHEET))
+    log = {name: np.float32(x + NOISE[name] * rng.normal(size=x.shape)) for name, x in jax.device_get(flight).items()}
 
     def misfit(ratio: jax.Array) -> jax.Array:
         """Return the residuals of simulation and log, in units of the noise."""
         return jnp.concatenate([((x - log[name]) / NOISE[name]).ravel() for name, x in fly(ratio).items()])
 
-    jacobian = jax.jit(lambda ratio: (misfit(ratio), jax.jacfwd(misfit)(ratio)))
-    ratio = jnp.ones_like(data_sheet)
+    jacobian = jax.jit(jax.jacfwd(lambda ratio: (misfit(ratio),) * 2, has_aux=True))
+    ratio = np.ones(len(NAMES), np.float32)
     for i in range(ROUNDS):
-        r, slope = jacobian(ratio)
-        print(f"iteration {i}: the misfit is {jnp.sqrt(jnp.mean(r**2)):8.3f} times the noise")
-        ratio = ratio - jnp.linalg.lstsq(slope, r)[0]
+        slope, r = jax.device_get(jacobian(ratio))
+        print(f"iteration {i}: the misfit is {np.sqrt(np.mean(r**2)):8.3f} times the noise")
+        ratio = ratio - np.linalg.lstsq(slope, r, rcond=None)[0]
 
-    sigma = jnp.linalg.norm(
-        jnp.linalg.inv(jnp.linalg.qr(slope, mode="r")), axis=1
-    )  # standard deviations due to the noise
-    found, true, sigma = (np.asarray(x * data_sheet) / UNITS for x in (ratio, TRUE_OVER_DATA_SHEET, sigma))
+    sigma = np.linalg.norm(np.linalg.inv(np.linalg.qr(slope, mode="r")), axis=1)  # standard deviations due to the noise
     sheet = np.asarray(data_sheet) / UNITS
+    found, true, sigma = (x * sheet for x in (ratio, TRUE_OVER_DATA_SHEET, sigma))
     print(f"\n{'':22} data sheet     found  +- sigma      true     error")
     for name, a, b, s, c in zip(NAMES, sheet, found, sigma, true, strict=True):
         print(f"{name:22} {a:10.3f} {b:9.3f} +- {s:5.3f} {c:9.3f} {100 * (b / c - 1):+8.2f} %")

@@ -67,7 +67,7 @@ def test_poses_are_those_that_mujoco_has(course, rng):
     model = sim.mj_model
     for world in range(3):
         sim.scene.sync(sim.data, world)
-        for found in (sim.mj_data, jax.tree.map(lambda x, w=world: x[w], sim.mjx_data)):
+        for found in (sim.mj_data, jax.tree.map(lambda x, w=world: np.asarray(x)[w], sim.mjx_data)):
             for k in range(2):
                 body = model.body(f"gate:{k}").id
                 np.testing.assert_allclose(found.xpos[body], pos[world, k], atol=1e-6)

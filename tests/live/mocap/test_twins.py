@@ -46,6 +46,22 @@ def sim():
     return Sim(n_worlds=2, n_drones=1, control="state")
 
 
+def meeting(source, *settings):
+    """Return drones that measure and hit boxes which the poses of a source move, and the plugins that do so."""
+    sim = Sim(n_worlds=2, n_drones=1, control="state")
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos + np.array([0, 0, 1.0])))
+    twins = Twins(sim, source, {"cf": BOX}, ["cf1", "cf2"], *settings)
+    rays = sim.add(RangeFinder(directions=[(1, 0, 0)]))
+    return sim, twins, rays, sim.add(ContactResponse())
+
+
+@pytest.fixture(scope="module")
+def step():
+    """Return the step of every such simulation, which is compiled once."""
+    return meeting(Given())[0].build_step_fn()
+
+
 def test_names_take_the_longest_prefix():
     twins = {"cf": Twin(), "cf_hook": BOX, "bb1": Twin.drone("bumblebee")}
     assert twin_of("cf_hook3", twins) is BOX
@@ -171,20 +187,15 @@ def test_a_source_in_simulated_time_begins_again_after_a_reset(sim):
     assert not twins.reports.latest
 
 
-def test_simulated_drones_measure_report_and_hit_a_real_one():
-    sim = Sim(n_worlds=1, n_drones=1, control="state")
-    states = sim.data.states
-    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0)))
+def test_simulated_drones_measure_report_and_hit_a_real_one(step):
     source = Given()
-    twins = Twins(sim, source, {"cf": BOX}, ["cf1"])
-    rays = sim.add(RangeFinder(directions=[(1, 0, 0)]))
-    response = sim.add(ContactResponse())
-    command = np.zeros((1, 1, 16))
+    sim, twins, rays, response = meeting(source)
+    command = np.zeros((2, 1, 16))
     command[..., 2] = 1.0
     sim.state_control(command)
     source.send(cf1=(1.1, 0, 1))
     twins.update(sim)
-    sim.step(5)
+    sim.data = step(sim.data, 5)
     np.testing.assert_allclose(rays.read(sim.data).distance, 1.0, atol=0.01)
     assert not sim.contact_report(twins.handles["cf1"]).objects.any()
     hit, touched = 0.0, False
@@ -192,7 +203,7 @@ def test_simulated_drones_measure_report_and_hit_a_real_one():
         source.send(cf1=(1.1 - 0.01 * k, 0, 1))
         twins.update(sim)
         for _ in range(5):
-            sim.step()
+            sim.data = step(sim.data, 1)
             hit = min(hit, float(response.read(sim.data).impulse[0, 0, 0]))
         touched |= bool(sim.contact_report(twins.handles["cf1"]).objects.any())
     assert touched
@@ -228,7 +239,7 @@ def test_discovery_lists_names_that_have_a_twin():
         assert discover(source, {"cf": BOX}, 0.3) == ("cf1",)
 
 
-def test_a_recorded_stream_gives_the_same_run_bit_for_bit(tmp_path):
+def test_a_recorded_stream_gives_the_same_run_bit_for_bit(tmp_path, step):
     """A thread sends in real time, so that frames arrive between any two steps; the replay repeats all of it."""
 
     def bodies(t):
@@ -236,20 +247,16 @@ def test_a_recorded_stream_gives_the_same_run_bit_for_bit(tmp_path):
         return {"cf1": ((near, 0, 1.0), from_rpy([0, 0, t])), "cf2": ((0, near, 1.2), LEVEL)}
 
     def run(source, record=None):
-        sim = Sim(n_worlds=2, n_drones=2, control="state")
-        states = sim.data.states
-        sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0)))
-        twins = Twins(sim, source, {"cf": Twin.drone()}, ["cf1", "cf2"], Rules(stalled=0.01), record)
-        sim.add(ContactResponse())
-        command = np.zeros((2, 2, 16))
+        sim, twins, *_ = meeting(source, Rules(stalled=0.01), record)
+        command = np.zeros((2, 1, 16))
         command[..., 2] = 1.0
         found = []
         with twins:
             for _ in range(60):
                 twins.update(sim)
-                command[..., :2] = 0.1 * np.asarray(sim.data.objects.pos)[:, 0, :2, :2]
+                command[:, 0, :2] = 0.1 * np.asarray(sim.data.objects.pos)[:, 0, [0, 1], :2].sum(axis=1)
                 sim.state_control(command)
-                sim.step(5)
+                sim.data = step(sim.data, 5)
                 found.append([np.asarray(x) for x in (sim.data.states.pos, sim.data.states.quat, sim.data.objects.vel)])
         return found, twins
 

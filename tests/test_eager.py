@@ -1,0 +1,48 @@
+"""Functions that are compiled as a whole outside of compiled code, and part of the code around them inside."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim.eager import compiled
+
+
+@pytest.fixture
+def traced():
+    """Return a function, and the list of types of its arguments in each run of its Python code."""
+    found = []
+
+    @compiled("is_turned")
+    def rotated(x, table, is_turned=False):
+        """Return a product."""
+        found.append((type(x), type(table)))
+        y = x @ table
+        return -y if is_turned else y
+
+    return rotated, found
+
+
+def test_calls_with_arrays_run_one_program(traced):
+    rotated, found = traced
+    x, table = np.ones(3, np.float32), np.diag([1.0, 2.0, 3.0]).astype(np.float32)
+    for scale in (1.0, 2.0, 3.0):
+        np.testing.assert_allclose(rotated(scale * x, table), scale * np.array([1, 2, 3]))
+    assert len(found) == 1
+    assert all(issubclass(kind, jax.core.Tracer) for kind in found[0])
+    np.testing.assert_allclose(rotated(x, table, is_turned=True), [-1, -2, -3])
+    assert len(found) == 2
+
+
+def test_within_compiled_code_constants_remain_constants(traced):
+    rotated, found = traced
+    table = np.eye(3, dtype=np.float32)
+    jaxpr = jax.make_jaxpr(lambda x: rotated(x, table))(jnp.ones(3))
+    assert found[0][1] is np.ndarray
+    assert {eqn.primitive.name for eqn in jaxpr.eqns} == {"dot_general"}
+    np.testing.assert_allclose(jax.grad(lambda x: rotated(x, table).sum())(jnp.ones(3)), 1.0)
+
+
+def test_it_keeps_name_and_docstring(traced):
+    assert traced[0].__name__ == "rotated"
+    assert traced[0].__doc__ == "Return a product."
