@@ -27,7 +27,7 @@ def fly(sim, n_steps=STEPS):
 
 
 def build(control, dynamics="first_principles"):
-    sim = Sim(n_worlds=3, n_drones=2, control=control, dynamics=dynamics, state_freq=500, engine="interpret")
+    sim = Sim(n_worlds=3, n_drones=2, control=control, dynamics=dynamics, state_freq=500)
     sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=0.9 * hover_rotor_state(sim.data))
     sim.build_default_data()
     return sim

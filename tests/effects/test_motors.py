@@ -7,13 +7,12 @@ import pytest
 from cases import hover_rotor_state, with_states
 
 from crazysim import ConfigError, MotorFailure, Sim
-from crazysim.engine import Step
 
 DT = 1 / 500
 
 
 def build(n_worlds=3, n_drones=2, **kwargs):
-    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", rng_key=1, engine="interpret")
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", rng_key=1)
     sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=hover_rotor_state(sim.data))
     sim.build_default_data()
     sim.add(MotorFailure(**kwargs))
@@ -110,7 +109,7 @@ def test_rotors_fail_when_told(weak):
 
 def test_the_gradient_with_respect_to_effectiveness_is_the_thrust(weak):
     """dv_z / de_i = dt thrust_i / m: a fault can be identified by descent."""
-    step = Step(weak.step_pipeline, "plain")
+    step = weak.build_step_fn()
 
     def climb(e):
         data = weak.data.replace(plugins={"motors": weak.data.plugins["motors"].replace(effectiveness=e)})
