@@ -179,7 +179,7 @@ class Push(Plugin):
 
 def test_an_inner_vmap_and_an_influence_may_reduce():
     """RK4 evaluates an influence four times a step, each time at the places of that time."""
-    for n_drones, engines in ((3, ["plain", *ENGINES[1:]]), (9, ENGINES)):
+    for n_drones, engines in ((3, ["plain", *ENGINES]), (9, ENGINES[1:])):
         sim = Sim(n_worlds=2, n_drones=n_drones, control="rotor_vel", integrator="rk4")
         sim.data = with_states(sim.data, pos=random_places(2, n_drones), vel=random_places(2, n_drones, 1) - [0, 0, 2])
         sim.add(Push())

@@ -92,7 +92,7 @@ def test_every_effect_is_here_and_sorted():
 
 def test_off_nothing_is_there_and_without_strength_nothing_changes():
     """At settings that do nothing a flight is the plain one, but for the rounding of what is fused differently."""
-    plain, idle = hovering(), hovering()
+    plain, idle = hovering(engine="interpret"), hovering(engine="interpret")
     stages = list(plain.step_pipeline)
     switch_on(idle, IDLE)
     assert set(idle.step_pipeline) - set(stages) == {"battery", "latency"}, "nothing runs that has nothing to do"

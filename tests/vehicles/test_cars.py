@@ -153,7 +153,7 @@ def test_external_forces_move_a_car():
 
 def test_bicycles_are_driven_by_a_torque():
     """The acceleration is the torque over the radius, over mass and rotating inertia."""
-    sim = Sim(engine="interpret")
+    sim = Sim(control="rotor_vel")
     bikes = sim.add(Bicycles(2, in_scene=False))
     assert bikes.names == ("Bicycle_0", "Bicycle_1")
     sim.data = bikes.commanded(sim.data, np.full((1, 2, 2), [0.01, 0.3]))
