@@ -55,7 +55,7 @@ class Tracer:
     """Stages as jaxprs; a stage that is met again, with leaves of the same shapes and types, is not traced again."""
 
     def __init__(self) -> None:
-        """Take nothing: stages follow."""
+        """Begin without any stage."""
         self._found: dict[Any, TracedStage] = {}
 
     def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:
