@@ -108,6 +108,9 @@ def _add_show(commands: Any) -> None:
     show.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any free port")
     show.add_argument("--host", default="127.0.0.1", help="address of the page; 0.0.0.0 to accept other machines")
     show.add_argument("--window", action="store_true", help="play the show in a window")
+    show.add_argument(
+        "--live", action="store_true", help="fly in real time while --window or --browser shows it, without figures"
+    )
     show.add_argument("--report", type=Path, metavar="FILE", help="figures to write, .json")
     show.add_argument("--seconds", type=float, help="duration of the flight, s; by default that of the show")
     show.add_argument("--fps", type=float, default=25.0, help="frames per second of the film")
@@ -221,6 +224,7 @@ def _show(options: argparse.Namespace) -> None:
     from crazysim.errors import ConfigError
     from crazysim.progress import progress
     from crazysim.shows import film, fly, page, report, summary
+    from crazysim.shows.live_show import run_live
     from crazysim.shows.view import play
     from crazysim.trajectories.files import load_show
 
@@ -231,6 +235,9 @@ def _show(options: argparse.Namespace) -> None:
             raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
     show = load_show(options.file)
     given = {name: getattr(options, name) for name in ("drone", "controller") if getattr(options, name) is not None}
+    if options.live:
+        run_live(show, options, device=options.device, **given)
+        return
     flight = fly(show, options.seconds, progress, device=options.device, **given)
     figures = report(flight)
     print(summary(flight, figures))

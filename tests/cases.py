@@ -81,8 +81,14 @@ def command_in_force(data):
 def with_states(data, **changes):
     """Return the data with other states, broadcast to every drone and cast."""
     states = data.states
-    new = {k: jnp.broadcast_to(jnp.asarray(v, states.pos.dtype), getattr(states, k).shape) for k, v in changes.items()}
-    return data.replace(states=states.replace(**new))
+    return data.replace(states=states.replace(**{k: broadcast_like(v, getattr(states, k)) for k, v in changes.items()}))
+
+
+def broadcast_like(value, like):
+    """Return an array of the shape and the type of another; NumPy's are broadcast without a compiled call."""
+    if isinstance(value, jax.Array):
+        return jnp.broadcast_to(value.astype(like.dtype), like.shape)
+    return jnp.asarray(np.broadcast_to(np.asarray(value, like.dtype), like.shape))
 
 
 def with_params(data, **changes):

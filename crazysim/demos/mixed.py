@@ -21,7 +21,7 @@ from crazysim.scene.terrain import Terrain
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Follow, Trajectory, figure_eight, lissajous
 from crazysim.vehicles import Cars, PathLQR
-from crazysim.vehicles.cars import CarData
+from crazysim.vehicles.car_data import CarData
 
 DRONES = ("cf21B_500", "cf21B_500", "bumblebee")
 """Airframes of the drones."""

@@ -42,16 +42,21 @@ class Grid(NamedTuple):
         values = np.asarray(self.values, np.float64)
         core = () if k is None else (k,)
         if values.ndim != 3 + len(core) or values.shape[3:] != core or min(values.shape) < 1:
+            what = "one number" if k is None else f"{k} numbers"
             shape = f"(n_x, n_y, n_z{', ' if core else ''}{', '.join(map(str, core))})"
-            raise ConfigError(f"expected {name} as values of shape {shape}, got {values.shape}")
+            raise ConfigError(
+                f"expected {name} as values of shape {shape}, got {values.shape}. Give each node of the grid {what}."
+            )
         origin, spacing = np.asarray(self.origin, np.float64), np.asarray(self.spacing, np.float64)
         if origin.shape != (3,) or spacing.shape not in ((), (3,)) or not np.all(spacing > 0):
             raise ConfigError(
                 f"expected {name} with an origin of shape (3,) and a positive spacing of shape () or (3,), m, got "
-                f"{self.origin!r} and {self.spacing!r}"
+                f"{self.origin!r} and {self.spacing!r}. Use origin=(0, 0, 0) and spacing=0.5, for example."
             )
         if not all(np.all(np.isfinite(x)) for x in (values, origin, spacing)):
-            raise ConfigError(f"expected finite numbers in {name}, got NaN or infinity")
+            raise ConfigError(
+                f"expected finite numbers in {name}, got NaN or infinity. Fill the gaps, with zeros for example."
+            )
         return Grid(values, origin, np.broadcast_to(spacing, (3,)))
 
 
@@ -120,11 +125,16 @@ def load_wind_grid(path: str | Path) -> Grid:
         columns = [f"{kind}:{k}" for kind in ("Points", "U") for k in range(3)]
         missing = [name for name in columns if name not in names]
         if missing:
-            raise ConfigError(f"expected columns {', '.join(columns)} in {str(path)!r}, got none named {missing[0]!r}")
+            raise ConfigError(
+                f"expected columns {', '.join(columns)} in {str(path)!r}, got none named {missing[0]!r}. Export points "
+                f"and the vector U from ParaView, or rename the columns."
+            )
         try:
             table = np.loadtxt(file, delimiter=",", usecols=[names.index(name) for name in columns], ndmin=2)
         except ValueError as error:
-            raise ConfigError(f"expected numbers in the columns of {str(path)!r}, got: {error}") from error
+            raise ConfigError(
+                f"expected numbers in the columns of {str(path)!r}, got: {error}. Correct or remove that row."
+            ) from error
     axes, places = zip(*(_nodes(table[:, k]) for k in range(3)), strict=True)
     shape = tuple(map(len, axes))
     values = np.full((*shape, 3), np.nan)
@@ -132,13 +142,16 @@ def load_wind_grid(path: str | Path) -> Grid:
     if len(table) != np.prod(shape) or np.isnan(values).any():
         raise ConfigError(
             f"expected one row for each of the {' x '.join(map(str, shape))} nodes of a regular grid in {str(path)!r}, "
-            f"got {len(table)} rows"
+            f"got {len(table)} rows. Resample the flow to an image in ParaView before the export."
         )
     spacing = []
     for axis in axes:
         steps = np.diff(axis) if len(axis) > 1 else np.ones(1)
         if np.ptp(steps) > UNEVEN * steps.mean():
-            raise ConfigError(f"expected nodes at equal distances in {str(path)!r}, got {steps.min()} to {steps.max()}")
+            raise ConfigError(
+                f"expected nodes at equal distances in {str(path)!r}, got {steps.min()} to {steps.max()} m. Resample "
+                f"the flow to an image in ParaView before the export."
+            )
         spacing.append(float(steps.mean()))
     return Grid(values, tuple(float(axis[0]) for axis in axes), tuple(spacing))
 

@@ -16,8 +16,9 @@ from crazysim.errors import ConfigError, RenderError
 from crazysim.live.browser_panel import BrowserPanel
 from crazysim.live.browser_scene import BrowserScene
 from crazysim.live.picture import PictureSource
+from crazysim.live.scene_bodies import SceneBodies
 from crazysim.live.viewer import Viewer
-from crazysim.media.web import FOV, free_port, import_viser
+from crazysim.media.web import FOV, LOCAL, free_port, import_viser
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
 
@@ -28,8 +29,6 @@ MAX_WORLDS = 64
 """Most worlds that are shown unless they are listed."""
 MARGIN = 1.0
 """Free space between neighbouring worlds, m."""
-LOCAL = ("127.0.0.1", "localhost", "::1")
-"""Addresses that other machines cannot reach."""
 
 log = logging.getLogger(__name__)
 
@@ -40,8 +39,8 @@ class Browser(Viewer):
         browser = live.show(Browser(port=8080))
         print(browser.url)
 
-    Clicking on a drone selects it; the panel follows it, plots any array of the data, pauses, resets, records, and has
-    the buttons and sliders of the loop. Browsers may come and go.
+    A click on a drone selects it, and one on a vehicle, load or object follows that. The panel plots any array of the
+    data, pauses, resets, records, and has the buttons and sliders of the loop. Browsers may come and go.
     """
 
     def __init__(
@@ -67,7 +66,7 @@ class Browser(Viewer):
             trail: Duration of trails, s; 0 for none.
             contacts: True to mark drones that touch something, which is computed for every picture.
             wind: True to draw the wind at every drone.
-            follow: True to keep the selected drone in the middle at first.
+            follow: True to keep the followed body in the middle at first.
             plot: Quantity plotted at first.
 
         Raises:
@@ -111,31 +110,41 @@ class Browser(Viewer):
         if self._host not in LOCAL:
             log.warning("listening at %s:%d: every machine of that network can watch and command the simulation",
                         self._host, self._port)  # fmt: skip
-        self._source = PictureSource(sim, worlds.tolist(), self._contacts, self._wind)
+        sim.scene.compile_if_edited()
+        sim.sync(int(worlds[0]))
+        shapes = visual_geoms(sim.mj_model, sim.mj_data)
+        bodies = SceneBodies(sim, shapes)
+        self._source = PictureSource(sim, bodies, worlds.tolist(), self._contacts, self._wind)
         self._picture = self._source.take(live)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
             self._server = viser.ViserServer(host=self._host, port=self._port, label="crazysim", verbose=False)
         scene = self._server.scene
         scene.set_up_direction("+z")
-        sim.scene.compile_if_edited()
-        sim.sync(int(worlds[0]))
-        shapes = visual_geoms(sim.mj_model, sim.mj_data)
         drones = self._picture.drones
         extent = float(np.nanmax(np.ptp(drones, axis=1)[..., :2])) + 2 * MARGIN
         spacing = extent if self._spacing is None else self._spacing
-        self._scene = BrowserScene(self._server, shapes, self._picture, spacing, self._trail)
+        self._scene = BrowserScene(self._server, shapes, bodies, self._picture, spacing, self._trail)
         camera = self._server.initial_camera
         size = max(np.ptp(self._scene.offsets[:, :2], axis=0).max() + extent, 2.0)
         camera.fov, camera.look_at = np.deg2rad(FOV), (0.0, 0.0, 0.5)
         camera.position = (0.0, -0.9 * size, 0.6 * size + 0.5)
-        self._panel = BrowserPanel(self._server, live, self._scene, self._follow, self._plot)
+        self._panel = BrowserPanel(self._server, live, self._scene, bodies, self._follow, self._plot)
+
+        @self._server.on_client_connect
+        def _(client: Any) -> None:
+            log.info("browser %d connected at %.2f s", client.client_id, live.time)
+
+        @self._server.on_client_disconnect
+        def _(client: Any) -> None:
+            if self.is_open:
+                log.warning("browser %d disconnected at %.2f s", client.client_id, live.time)
 
         @scene.on_click()
         def _(event: Any) -> None:
-            world, drone, point = self._scene.pick(self._picture, event.ray_origin, event.ray_direction)
+            world, body, point = self._scene.pick(self._picture, event.ray_origin, event.ray_direction)
             number = int(self._picture.worlds[world])
-            if drone is not None:
-                live.post(lambda live: live.select(number, drone))
+            if body is not None:
+                live.post(lambda live: live.follow(number, body.kind, body.index))
             elif point is not None:
                 live.post(lambda live: live.click(number, point))
 

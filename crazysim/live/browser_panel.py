@@ -9,6 +9,7 @@ import numpy as np
 
 from crazysim.live.browser_scene import BrowserScene
 from crazysim.live.picture import Picture, quantities
+from crazysim.live.scene_bodies import DRONE, SceneBodies
 from crazysim.live.viewer import Slider
 
 if TYPE_CHECKING:
@@ -40,17 +41,18 @@ class BrowserPanel:
     """Panel of one server, which all its browsers share."""
 
     follow: bool
-    """True to keep the selected drone in the middle."""
+    """True to keep the followed body in the middle."""
     plot: str
     """Quantity that is plotted; empty for none."""
 
-    def __init__(self, server: Any, live: Live, scene: BrowserScene, follow: bool, plot: str):
+    def __init__(self, server: Any, live: Live, scene: BrowserScene, bodies: SceneBodies, follow: bool, plot: str):
         """Add the elements.
 
         Args:
             server: Server of viser.
             live: Loop, whose buttons and sliders the panel shows.
             scene: Scene, whose layers the panel switches.
+            bodies: Bodies that can be followed.
             follow: Initial value.
             plot: Initial value.
         """
@@ -67,7 +69,7 @@ class BrowserPanel:
         with gui.add_folder("Time"):
             self._add_time(gui, live)
         with gui.add_folder("Drone"):
-            self._add_drone(gui, live)
+            self._add_drone(gui, live, bodies)
         if live.controls:
             with gui.add_folder("Controls"):
                 for control in live.controls:
@@ -95,6 +97,10 @@ class BrowserPanel:
             self._text.content = f"**{picture.status}**"
             if picture.selected is not None and self._drone.value != picture.selected[1]:
                 self._drone.value = picture.selected[1]
+            if picture.followed is not None and self._world.value != picture.followed[0]:
+                self._world.value = picture.followed[0]
+            if self._body is not None and self._body.value != picture.name:
+                self._body.value = picture.name
         plotted = (self.plot, picture.selected, len(picture.plot))
         if plotted != self._plotted or (self._samples and picture.time < self._samples[-1][0]):
             self._plotted = plotted
@@ -145,10 +151,12 @@ class BrowserPanel:
         to = gui.add_number("go to, s", 0.0, min=0.0, step=0.1)
         _post(gui.add_button("Go"), live, lambda live: live.go_to(float(to.value)))
 
-    def _add_drone(self, gui: Any, live: Live) -> None:
+    def _add_drone(self, gui: Any, live: Live, bodies: SceneBodies) -> None:
         sim = live.sim
         world, drone = live.selected or (0, 0)
-        worlds = gui.add_number("world", world, min=0, max=sim.n_worlds - 1, step=1, visible=sim.n_worlds > 1)
+        self._world = worlds = gui.add_number(
+            "world", world, min=0, max=sim.n_worlds - 1, step=1, visible=sim.n_worlds > 1
+        )
         self._drone = gui.add_number("drone", drone, min=0, max=sim.n_drones - 1, step=1)
         for number in (worlds, self._drone):
 
@@ -158,6 +166,9 @@ class BrowserPanel:
                     chosen = int(worlds.value), int(self._drone.value)
                     live.post(lambda live: live.select(*chosen))
 
+        self._body = None
+        if any(body.kind != DRONE for body in bodies.items):
+            self._add_body(gui, live, worlds, bodies)
         follow = gui.add_checkbox("follow", self.follow)
 
         @follow.on_update
@@ -166,6 +177,18 @@ class BrowserPanel:
 
         for name, (key, hotkey) in KEYS.items():
             self._add_key(gui, live, name, key, hotkey)
+
+    def _add_body(self, gui: Any, live: Live, worlds: Any, bodies: SceneBodies) -> None:
+        """Add the choice of the followed body, which may be a vehicle, a load or an object."""
+        named = {body.name: body for body in bodies.items}
+        self._body = choice = gui.add_dropdown("body", ("", *named))
+
+        @choice.on_update
+        def _(event: Any) -> None:
+            body = named.get(choice.value)
+            if event.client is not None and body is not None:  # a change by a user
+                world = int(worlds.value)
+                live.post(lambda live: live.follow(world, body.kind, body.index))
 
     def _add_key(self, gui: Any, live: Live, name: str, key: str, hotkey: str) -> None:
         """Add a hotkey that holds a key of the loop for a moment."""

@@ -2,45 +2,58 @@
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.live.browser_trails import Trails, finite_rows
+from crazysim.live.mocap.frames import rotate
 from crazysim.live.picture import Picture
-from crazysim.media.trail import MIN_ALPHA, colors_of
+from crazysim.live.scene_bodies import DRONE, MARK_RADIUS, SceneBodies, SceneBody
+from crazysim.media.trail import colors_of
 from crazysim.media.web import add_static, mesh_of, rgb
 from crazysim.scene.visual_geoms import VisualGeom
 
-TRAIL_PERIOD = 0.05
-"""Time between two samples of a trail, s."""
 SETPOINT_RADIUS = 0.025
 """Radius of a setpoint's sphere, m."""
-MARK_RADIUS = 0.12
-"""Radius of the sphere around a drone that touches something or is selected, m."""
+LIGHT_RADIUS = 0.06
+"""Radius of the glow around a lit drone, m."""
+NEAR = 0.02
+"""Distance from a body, per distance from the camera, at which a click still picks it."""
 WIND_SCALE = 0.1
 """Length of a wind arrow per speed, s."""
-FLOOR_GREY = 0.8
-"""Grey that trails fade to, 0 to 1."""
-CONTACT_COLOR, SELECTED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
+HIDDEN = 1e-6
+"""Scale of a mark that is not shown."""
+CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
 """Colours of marks, rgb, 0 to 255."""
 
 
 class BrowserScene:
     """Nodes of one viser server that show some worlds, side by side in a grid."""
 
-    def __init__(self, server: Any, shapes: list[VisualGeom], picture: Picture, spacing: float, trail: float):
+    def __init__(
+        self,
+        server: Any,
+        shapes: list[VisualGeom],
+        bodies: SceneBodies,
+        picture: Picture,
+        spacing: float,
+        trail: float,
+    ):
         """Add all nodes.
 
         Args:
             server: Server of viser.
             shapes: Visible geoms of the scene.
+            bodies: Bodies that can be picked.
             picture: First picture.
             spacing: Distance between the origins of neighbouring worlds, m.
             trail: Duration of trails, s; 0 for none.
         """
-        self._scene = scene = server.scene
+        self._scene, self._bodies = server.scene, bodies
+        scene = server.scene
         n_worlds, n_drones = picture.drones.shape[:2]
         self.offsets = grid_offsets(n_worlds, spacing)
         self._root = scene.add_frame("/world", show_axes=False)
@@ -60,48 +73,57 @@ class BrowserScene:
                 node = scene.add_frame(f"/world/fixed/{w}/{k}", position=offset, show_axes=False)
                 add_static(scene, node.name, others, rgba)
         self._batches: list[tuple[Any, NDArray]] = []
-        for bodies in _alike(by_body):
-            self._add_bodies(np.array(bodies), by_body[bodies[0]], picture)
+        for alike in _alike(by_body):
+            self._add_bodies(np.array(alike), by_body[alike[0]], picture)
 
         colors = np.tile(colors_of(n_drones, None)[:, :3], (n_worlds, 1))
         drones = self._moved(picture.drones).reshape(-1, 3)
         self._setpoints = self._add_balls("setpoints", SETPOINT_RADIUS, picture.setpoint, rgb_of(colors), 0.8)
         self._contacts = self._add_balls("contacts", MARK_RADIUS, picture.drones, CONTACT_COLOR, 0.45)
-        self._contacts.batched_scales = np.full(len(drones), 1e-6, np.float32)
-        self._selected = scene.add_icosphere(
-            "/world/selected", radius=MARK_RADIUS, color=SELECTED_COLOR, opacity=0.25, visible=False
+        self._contacts.batched_scales = np.full(len(drones), HIDDEN, np.float32)
+        self._lights = self._add_balls("lights", LIGHT_RADIUS, picture.drones, rgb_of(0 * colors), 0.7)
+        self._lights.batched_scales = np.full(len(drones), HIDDEN, np.float32)
+        self._lit = np.zeros_like(colors)
+        self._followed = scene.add_icosphere(
+            "/world/followed", radius=MARK_RADIUS, color=FOLLOWED_COLOR, opacity=0.25, visible=False
         )
-        self._label = scene.add_label("/world/selected/name", "", position=(0, 0, MARK_RADIUS), anchor="bottom-center")
+        self._label = scene.add_label("/world/followed/name", "", position=(0, 0, MARK_RADIUS), anchor="bottom-center")
         self._wind = None
-        self._trail = Trails(scene, drones, colors, trail) if trail > 0 else None
-        self.visible: dict[str, bool] = dict.fromkeys(("trails", "setpoints", "contacts", "wind"), True)
+        self._tracked = bodies.tracked
+        tracked = self._moved(picture.pos[:, self._tracked]).reshape(-1, 3)
+        trail_colors = np.tile(colors_of(len(self._tracked), None)[:, :3], (n_worlds, 1))
+        self._trail = Trails(scene, tracked, trail_colors, trail) if trail > 0 else None
+        self.visible: dict[str, bool] = dict.fromkeys(("trails", "setpoints", "contacts", "wind", "lights"), True)
 
     def update(self, picture: Picture, follow: bool) -> None:
         """Show a picture.
 
         Args:
             picture: Picture.
-            follow: True to keep the selected drone in the middle: the worlds move, and the camera stays.
+            follow: True to keep the followed body in the middle: the worlds move, and the camera stays.
         """
         pos, show = self._moved(picture.pos), self.visible
         for handle, bodies in self._batches:
-            handle.batched_positions = _finite(pos[:, bodies].reshape(-1, 3))
-            handle.batched_wxyzs = _finite(np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4), (1, 0, 0, 0))
+            handle.batched_positions = finite_rows(pos[:, bodies].reshape(-1, 3))
+            handle.batched_wxyzs = finite_rows(
+                np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4), (1, 0, 0, 0)
+            )
         drones = self._moved(picture.drones)
         if self._setpoints is not None:
             self._setpoints.visible = show["setpoints"]
-            self._setpoints.batched_positions = _finite(self._moved(picture.setpoint).reshape(-1, 3))
+            self._setpoints.batched_positions = finite_rows(self._moved(picture.setpoint).reshape(-1, 3))
         touching = picture.touching.ravel() & show["contacts"]
-        self._contacts.batched_scales = np.where(touching, 1.0, 1e-6).astype(np.float32)
+        self._contacts.batched_scales = np.where(touching, 1.0, HIDDEN).astype(np.float32)
         if touching.any():
-            self._contacts.batched_positions = _finite(drones.reshape(-1, 3))
+            self._contacts.batched_positions = finite_rows(drones.reshape(-1, 3))
+        self._show_lights(drones.reshape(-1, 3), picture.lights.reshape(-1, 3) * show["lights"])
         self._show_wind(drones, picture)
         if self._trail is not None:
-            self._trail.update(picture.time, _finite(drones.reshape(-1, 3)), show["trails"])
-        self._show_selected(drones, picture, follow)
+            self._trail.update(picture.time, finite_rows(pos[:, self._tracked].reshape(-1, 3)), show["trails"])
+        self._show_followed(pos, picture, follow)
 
-    def pick(self, picture: Picture, origin: Any, direction: Any) -> tuple[int, int | None, NDArray | None]:
-        """Return what a ray from the camera hits: index of the world, drone or None, point of the floor or None.
+    def pick(self, picture: Picture, origin: Any, direction: Any) -> tuple[int, SceneBody | None, NDArray | None]:
+        """Return what a ray from the camera hits: index of the world, body or None, point of the floor or None.
 
         Args:
             picture: Picture that the user has seen.
@@ -110,19 +132,34 @@ class BrowserScene:
         """
         origin = np.asarray(origin, float) - np.asarray(self._root.position, float)
         direction = np.asarray(direction, float) / np.linalg.norm(direction)
-        drones = self._moved(picture.drones)
-        relative = drones - origin
-        along = relative @ direction
-        beside = np.linalg.norm(relative - along[..., None] * direction, axis=-1)
-        hit = (along > 0) & (beside < np.maximum(MARK_RADIUS, 0.02 * along))
-        if hit.any():
-            world, drone = np.unravel_index(np.where(hit, along, np.inf).argmin(), hit.shape)
-            return int(world), int(drone), None
+        beside = self._hits(picture, origin, direction)
+        if np.isfinite(beside).any():
+            world, mocap = np.unravel_index(beside.argmin(), beside.shape)
+            return int(world), self._bodies.items[self._bodies.owner[mocap]], None
         if direction[2] > -1e-6:
             return 0, None, None
         point = origin - direction * origin[2] / direction[2]
         world = int(np.linalg.norm(self.offsets - point, axis=-1).argmin())
         return world, None, point - self.offsets[world]
+
+    def _hits(self, picture: Picture, origin: NDArray, direction: NDArray) -> NDArray:
+        """Return distances of the middles of bodies from a ray that enters the box around them, m. (n, n_mocap)
+
+        They are infinite for all others. What is small or far away is easy to click, too: its box is larger.
+        """
+        start = origin - self._moved(picture.pos)
+        away = np.linalg.norm(start, axis=-1, keepdims=True)
+        low, high = self._bodies.low, self._bodies.high
+        drones = np.array([self._bodies.items[k].kind == DRONE for k in self._bodies.owner])
+        least = np.maximum(np.where(drones, MARK_RADIUS, 0.0)[:, None], NEAR * away)
+        to_body = picture.quat * (-1, -1, -1, 1)
+        begin, ray = rotate(to_body, start), rotate(to_body, np.broadcast_to(direction, start.shape))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (np.minimum(low, -least) - begin) / ray, (np.maximum(high, least) - begin) / ray
+        enter, leave = np.fmin(a, b).max(-1), np.fmax(a, b).min(-1)
+        hit = (enter > 0) & (enter <= leave) & (high > low).any(-1)
+        beside = np.linalg.norm(start - (start @ direction)[..., None] * direction, axis=-1)
+        return np.where(hit, beside, np.inf)
 
     def _add_bodies(self, bodies: NDArray, shapes: list[VisualGeom], picture: Picture) -> None:
         """Add bodies of equal geoms, one batch for each colour."""
@@ -135,8 +172,9 @@ class BrowserScene:
             mesh = mesh_of(same)
             handle = self._scene.add_batched_meshes_simple(
                 f"/world/bodies/{bodies[0]}/{k}", np.asarray(mesh.vertices, np.float32),
-                np.asarray(mesh.faces, np.uint32), _finite(quat, (1, 0, 0, 0)), _finite(pos), batched_colors=rgb(rgba),
-                opacity=None if rgba[3] >= 1 else float(rgba[3]), lod="off", flat_shading=True, side="double",
+                np.asarray(mesh.faces, np.uint32), finite_rows(quat, (1, 0, 0, 0)), finite_rows(pos),
+                batched_colors=rgb(rgba), opacity=None if rgba[3] >= 1 else float(rgba[3]), lod="off",
+                flat_shading=True, side="double",
             )  # fmt: skip
             self._batches.append((handle, bodies))
 
@@ -147,7 +185,7 @@ class BrowserScene:
         import trimesh
 
         ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-        points = _finite(self._moved(pos).reshape(-1, 3))
+        points = finite_rows(self._moved(pos).reshape(-1, 3))
         return self._scene.add_batched_meshes_simple(
             f"/world/{name}", np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32),
             np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)), points, batched_colors=colors, opacity=opacity, lod="off",
@@ -156,8 +194,8 @@ class BrowserScene:
     def _show_wind(self, drones: NDArray, picture: Picture) -> None:
         if not picture.wind.size:
             return
-        begin = _finite(drones.reshape(-1, 3))
-        ends = np.stack([begin, begin + WIND_SCALE * _finite(picture.wind.reshape(-1, 3))], axis=1)
+        begin = finite_rows(drones.reshape(-1, 3))
+        ends = np.stack([begin, begin + WIND_SCALE * finite_rows(picture.wind.reshape(-1, 3))], axis=1)
         ends = ends.astype(np.float32)
         if self._wind is None:
             self._wind = self._scene.add_arrows(
@@ -166,66 +204,34 @@ class BrowserScene:
         self._wind.visible = self.visible["wind"]
         self._wind.points = ends
 
-    def _show_selected(self, drones: NDArray, picture: Picture, follow: bool) -> None:
+    def _show_lights(self, drones: NDArray, colors: NDArray) -> None:
+        """Show the LEDs of all drones; what has not changed is not sent. (n, 3), (n, 3)"""
+        if not np.array_equal(colors, self._lit):
+            self._lit = colors
+            self._lights.batched_colors = rgb_of(colors)
+            self._lights.batched_scales = np.where(colors.any(-1), 1.0, HIDDEN).astype(np.float32)
+        if colors.any():
+            self._lights.batched_positions = finite_rows(drones)
+
+    def _show_followed(self, bodies: NDArray, picture: Picture, follow: bool) -> None:
         k = None
-        if picture.selected is not None:
-            k = next((i for i, world in enumerate(picture.worlds) if world == picture.selected[0]), None)
-        self._selected.visible = k is not None
-        if k is None or picture.selected is None:
+        if picture.followed is not None:
+            k = next((i for i, world in enumerate(picture.worlds) if world == picture.followed[0]), None)
+        self._followed.visible = k is not None
+        if k is None or picture.followed is None:
             self._root.position = (0.0, 0.0, 0.0)
             return
-        pos = _finite(drones[k, picture.selected[1]])
-        self._selected.position = pos
+        pos = finite_rows(bodies[k, picture.followed[1]])
+        radius = self._bodies.radius(picture.followed[1])
+        self._followed.position = pos
+        if radius != self._followed.radius:  # browsers build the sphere again for it
+            self._followed.radius, self._label.position = radius, (0.0, 0.0, radius)
         self._label.text = picture.name
         self._root.position = -pos if follow else (0.0, 0.0, 0.0)
 
     def _moved(self, pos: NDArray) -> NDArray:
         """Return positions of every world at the world's place in the grid."""
         return pos + self.offsets[:, None]
-
-
-class Trails:
-    """The recent positions of all drones, as one set of line segments of constant size."""
-
-    def __init__(self, scene: Any, pos: NDArray, colors: NDArray, seconds: float):
-        """Begin with trails of no length.
-
-        Args:
-            scene: Scene of viser.
-            pos: Positions of all drones, m. (n, 3)
-            colors: Their colours, 0 to 1. (n, 3)
-            seconds: Duration, s.
-        """
-        self._length = max(round(seconds / TRAIL_PERIOD), 1)
-        self._samples: deque[NDArray] = deque(maxlen=self._length)
-        self._last = -np.inf
-        pos = _finite(pos)
-        fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]  # towards the floor, as lines are opaque
-        shades = np.round(255 * (FLOOR_GREY - fade * (FLOOR_GREY - colors))).astype(np.uint8)
-        self._handle = scene.add_line_segments(
-            "/world/trails", self._segments(pos), np.repeat(shades.reshape(-1, 1, 3), 2, axis=1), thickness=2.0,
-            thickness_units="screen",
-        )  # fmt: skip
-
-    def update(self, time: float, pos: NDArray, visible: bool) -> None:
-        """Add a sample if one is due, and show the trails up to the present positions; a jump in time clears them."""
-        self._handle.visible = visible
-        if time < self._last:
-            self._samples.clear()
-            self._last = -np.inf
-        if time - self._last < TRAIL_PERIOD:
-            return
-        self._samples.append(pos)
-        self._last = time
-        if visible:
-            self._handle.points = self._segments(pos)
-
-    def _segments(self, pos: NDArray) -> NDArray:
-        """Return segments, oldest first, padded at the beginning. (length * n, 2, 3)"""
-        path = [*self._samples, pos]
-        path = [path[0]] * (self._length + 1 - len(path)) + path
-        points = np.stack(path[-self._length - 1 :])
-        return np.stack([points[:-1], points[1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
 
 
 def grid_offsets(n: int, spacing: float) -> NDArray:
@@ -251,9 +257,3 @@ def _alike(by_body: dict[int, list[VisualGeom]]) -> list[list[int]]:
         )
         groups[key].append(body)
     return list(groups.values())
-
-
-def _finite(values: NDArray, rest: Any = 0.0) -> NDArray:
-    """Return rows of numbers, with those that are not finite replaced."""
-    bad = ~np.isfinite(values).all(-1, keepdims=True)
-    return np.where(bad, np.asarray(rest, float), values)

@@ -14,7 +14,7 @@ from crazysim.errors import ConfigError
 from crazysim.live.commands import Command, Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
 from crazysim.live.paths import Path
 from crazysim.sim.sim import Sim
-from crazysim.trajectories import Follow, Trajectory, hover, line
+from crazysim.trajectories import Follow, Lights, Trajectory, hover, line
 
 SPEED = 0.5
 """Mean speed of take-off and landing, m/s."""
@@ -76,6 +76,8 @@ class Fleet:
         self._uploaded: list[Trajectory | None] = [None] * sim.n_drones
         self._untouched = [True] * sim.n_drones
         self.parameters = [{} for _ in range(sim.n_drones)]
+        self._lights: Lights | None = None
+        self._show_start: float | None = None
         drones = np.arange(sim.n_drones)[None]
         self.follow = Follow(
             self._active, index=drones, start=np.zeros((1, sim.n_drones)), n_slots=sim.n_drones,
@@ -102,9 +104,18 @@ class Fleet:
     def reset(self) -> None:
         """Let every drone hover where it is again, as after ``sim.reset()``; trajectories that it received stay."""
         self._untouched = [True] * self.sim.n_drones
+        self._show_start = None
         for drone, pos in enumerate(np.asarray(self.sim.data.states.pos[0], float)):
             self._fly(drone, _hover(np.append(pos, 0.0)))
             self._untouched[drone] = self._uploaded[drone] is None
+
+    def colors(self) -> NDArray:
+        """Return the present colours of the LEDs, those of the received show once it has started. (n_drones, 3)"""
+        found = np.zeros((self.sim.n_drones, 3))
+        if self._lights is not None and self._show_start is not None:
+            shown = self._lights.colors([self._now() - self._show_start])[0]
+            found[: len(shown)] = shown
+        return found
 
     def setpoint(self, drone: int) -> NDArray:
         """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
@@ -123,12 +134,14 @@ class Fleet:
                 self._check(trajectory)
             for drone, trajectory in enumerate(received):
                 self._receive(drone, trajectory)
+            self._lights, self._show_start = show.lights, None
         elif isinstance(command, StartShow):
             drones = [i for i, trajectory in enumerate(self._uploaded) if trajectory is not None]
             if not drones:
                 raise ConfigError("expected trajectories to start, got none. Upload some first.")
             for drone in drones:
                 self._start(drone, relative=False)
+            self._show_start = self._now()
         else:
             if isinstance(command, Upload):
                 self._check(command.trajectory)

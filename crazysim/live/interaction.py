@@ -1,4 +1,4 @@
-"""Interaction with a live simulation: keys, buttons, sliders, clicks and the selection of a drone."""
+"""Interaction with a live simulation: keys, buttons, sliders, clicks, the selected drone and the followed body."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.live.keyboard import Keyboard
+from crazysim.live.scene_bodies import DRONE, SceneBodies
 from crazysim.live.viewer import Button, Control, Slider
 from crazysim.sim.sim import Sim
 
@@ -30,7 +31,10 @@ class Interaction:
     values: dict[str, float]
     """Present values of the sliders, by name."""
     selected: tuple[int, int] | None
-    """World and drone that are followed, plotted and piloted; None for none."""
+    """World and drone that are plotted and piloted, and followed unless ``follow`` chose another; None for none."""
+    lights: NDArray
+    """Colours of the drones' LEDs, red, green and blue from 0 to 1, which viewers draw; zero for off.
+    (n_worlds, n_drones, 3)"""
     quantities: dict[str, Callable[[Live], Any]]
     """Further quantities that viewers can plot: by name, functions of the loop that return numbers. (k,)"""
     on_click: Callable[[Live, int, NDArray], Any] | None
@@ -41,6 +45,8 @@ class Interaction:
         self.sim = sim
         self.keyboard, self.controls, self.values, self.quantities = Keyboard(), [], {}, {}
         self.selected, self.on_click = (0, 0), None
+        self.lights = np.zeros((sim.n_worlds, sim.n_drones, 3))
+        self._followed: tuple[int, str, int] | None = None
         self._slider = 0
         self._posted: deque[Callable[[Live], Any]] = deque()
         for key, call in BINDINGS.items():
@@ -113,7 +119,34 @@ class Interaction:
                 f"expected a world below {self.sim.n_worlds} and a drone below {self.sim.n_drones}, got "
                 f"{world!r} and {drone!r}"
             )
-        self.selected = (int(world), int(drone))
+        self.selected, self._followed = (int(world), int(drone)), None
+
+    @property
+    def followed(self) -> tuple[int, str, int] | None:
+        """World, kind and index of the body that viewers mark and follow: the selected drone, or that of ``follow``."""
+        if self._followed is not None or self.selected is None:
+            return self._followed
+        return self.selected[0], DRONE, self.selected[1]
+
+    def follow(self, world: int, kind: str, index: int) -> None:
+        """Let viewers mark and follow a body, as a click on it does; a drone is selected, too.
+
+        Args:
+            world: Index of the world.
+            kind: ``"drone"``, or the name of the objects in the scene: ``"cars"``, ``"load"`` or that of a handle.
+            index: Number among those of its kind.
+
+        Raises:
+            ConfigError: If it does not exist.
+        """
+        if kind == DRONE:
+            self.select(world, index)
+            return
+        if world not in range(self.sim.n_worlds):
+            raise ConfigError(f"expected a world below {self.sim.n_worlds}, got {world!r}")
+        self.sim.scene.compile_if_edited()
+        SceneBodies(self.sim).find(kind, index)
+        self._followed = int(world), kind, int(index)
 
     def click(self, world: int, point: NDArray) -> None:
         """Call ``on_click``, if it is set, as viewers do for a click on the ground.

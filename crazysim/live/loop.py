@@ -21,10 +21,11 @@ from crazysim.live.history import History, Snapshot
 from crazysim.live.interaction import Interaction
 from crazysim.live.pace import LiveReport, Pace, Speed, undisturbed
 from crazysim.live.process import Event, OnError, Process, RateLimit, period_of
-from crazysim.live.recording import LiveRecording
+from crazysim.live.recording import Recordings
 from crazysim.live.report import make_report
 from crazysim.live.staging import StagedCommands
 from crazysim.live.viewer import Viewer
+from crazysim.live.viewers import Viewers
 from crazysim.sim.sim import Sim
 
 SLICE = 0.01
@@ -86,19 +87,17 @@ class Live(Interaction, Closing):
         self.n_substeps = sim.freq // control_freq
         self.step = round(float(sim.time[0, 0]) * control_freq)
         self.flown = 0
-        self._dt, self._fps = 1.0 / control_freq, float(fps)
+        self._dt = 1.0 / control_freq
         self._pace = Pace(self._dt, speed)
         self._commands = StagedCommands(sim)
         self._history = History(positive("n_snapshots", n_snapshots))
         self._snapshot_steps = max(round(snapshot_s * control_freq), 1)
         self._processes: list[Process] = []
         self._events: dict[int, list[Event]] = defaultdict(list)
-        self._viewers: list[Viewer] = []
-        self._recording: LiveRecording | None = None
-        self._path: Path | None = None
+        self._viewers = Viewers(fps)
+        self._recordings = Recordings()
         self._paused = self._stopped = self._in_step = False
-        self._pictures = self._failures = 0
-        self._next_picture = 0.0
+        self._refused = 0
         self._factor = (time.perf_counter(), 0, 0.0)
         self._may_warn = RateLimit()
 
@@ -204,8 +203,7 @@ class Live(Interaction, Closing):
         Raises:
             RenderError: If this machine cannot show it, or a port is in use.
         """
-        viewer.open(self)
-        self._viewers.append(viewer)
+        self._viewers.open(self, viewer)
         return viewer
 
     # Recording ------------------------------------------------------------------------------------------------------
@@ -223,29 +221,23 @@ class Live(Interaction, Closing):
         Raises:
             ConfigError: If the file cannot be created, or the rate is invalid.
         """
-        period = period_of(freq, self.control_freq, "recording")
-        self.stop_recording()
-        self._recording, self._path = LiveRecording(self.sim, path, period), Path(path)
-        self._recording.add(self)
-        return self._recording.path
+        return self._recordings.start(self, path, period_of(freq, self.control_freq, "recording"))
 
     @property
     def is_recording(self) -> bool:
         """True while a recording is being written."""
-        return self._recording is not None
+        return self._recordings.is_open
 
     def stop_recording(self) -> None:
         """Finish the recording, if there is one."""
-        if self._recording is not None:
-            self._recording.close()
-            self._recording = None
+        self._recordings.close()
 
     def toggle_recording(self) -> None:
         """Start a recording with the name of the last one, or finish the present one."""
-        if self._recording is not None:
+        if self.is_recording:
             self.stop_recording()
         else:
-            self.record(self._path or "flight.journal")
+            self.record(self._recordings.last_path or "flight.journal")
 
     # Running --------------------------------------------------------------------------------------------------------
 
@@ -264,21 +256,21 @@ class Live(Interaction, Closing):
         self._stopped = False
         self._warm_up()
         self._pace = Pace(self._dt, self._pace.speed)
-        first, pictures, paused_s, begin = self.flown, self._pictures, 0.0, time.perf_counter()
+        first, pictures, paused_s, begin = self.flown, self._viewers.n_pictures, 0.0, time.perf_counter()
         with undisturbed(), contextlib.suppress(KeyboardInterrupt):
             while not self._stopped and (end is None or self.flown < end):
                 paused_s += self._turn()
         jax.block_until_ready(self.sim.data.states.pos)
         wall = time.perf_counter() - begin - paused_s
         simulated = (self.flown - first) * self._dt
-        return make_report(self._pace, self._processes, simulated, wall, self._pictures - pictures, self._failures)
+        failures = self._refused + self._viewers.failures + self._recordings.failures
+        drawn = self._viewers.n_pictures - pictures
+        return make_report(self._pace, self._processes, simulated, wall, drawn, failures)
 
     def close(self) -> None:
         """Finish the recording and close the viewers."""
-        self.stop_recording()
-        for viewer in self._viewers:
-            viewer.close()
-        self._viewers.clear()
+        self._recordings.close()
+        self._viewers.close()
 
     @property
     def status(self) -> str:
@@ -293,18 +285,19 @@ class Live(Interaction, Closing):
 
     def _turn(self) -> float:
         """Do what is due, or sleep; return the time spent in a pause, s."""
+        viewers = self._viewers
         self._run_posted()
         if self._stopped:
             return 0.0
         if self._paused:
             begin = time.perf_counter()
-            self._draw(self._next_picture)
+            viewers.draw(self, viewers.next_at)
             time.sleep(SLICE)
             return time.perf_counter() - begin
         wait = self._pace.due_in()
         if wait > 0:
-            if not self._draw(self._next_picture):
-                until_picture = self._next_picture - time.perf_counter() if self._viewers else SLICE
+            if not viewers.draw(self, viewers.next_at):
+                until_picture = viewers.next_at - time.perf_counter() if viewers else SLICE
                 time.sleep(max(min(wait, until_picture, SLICE), 0.0))
             return 0.0
         late = self._pace.begin(self.time)
@@ -312,7 +305,7 @@ class Live(Interaction, Closing):
             log.warning("real time missed at %.2f s: %.0f ms late", self.time, 1e3 * late)
         self._control_step()
         # A picture waits for a moment without work, but not longer than the one after it.
-        self._draw(self._next_picture + (0.0 if self.speed == "max" else 1.0 / self._fps))
+        viewers.draw(self, viewers.next_at + (0.0 if self.speed == "max" else viewers.period))
         return 0.0
 
     def _control_step(self) -> None:
@@ -332,33 +325,7 @@ class Live(Interaction, Closing):
             self._in_step = False
         self.step += 1
         self.flown += 1
-        if self._recording is not None and not self._recording.add(self):
-            self._failures += 1
-            self.stop_recording()
-
-    def _draw(self, due: float) -> bool:
-        """Send a picture to every viewer if the time has come, and return True if it has."""
-        now = time.perf_counter()
-        if not self._viewers or now < due:
-            return False
-        self._next_picture = max(self._next_picture + 1.0 / self._fps, now - 1.0 / self._fps)
-        self._update_viewers()
-        return True
-
-    def _update_viewers(self) -> None:
-        for viewer in list(self._viewers):
-            try:
-                if viewer.is_open:
-                    viewer.update(self)
-                    continue
-            except Exception as error:
-                self._failures += 1
-                log.warning("%s failed at %.2f s and is closed: %s", type(viewer).__name__, self.time, error)
-            self._viewers.remove(viewer)
-            viewer.close()
-            if not self._viewers:
-                self.stop()
-        self._pictures += bool(self._viewers)
+        self._recordings.add(self)
 
     def _run_posted(self) -> None:
         try:
@@ -366,7 +333,7 @@ class Live(Interaction, Closing):
             while self._posted:
                 self._posted.popleft()(self)
         except ConfigError as error:
-            self._failures += 1
+            self._refused += 1
             log.warning("refused at %.2f s: %s", self.time, error)
 
     def _between_steps(self, call: Callable[[Live], Any]) -> None:
@@ -413,5 +380,5 @@ class Live(Interaction, Closing):
         self.sim.step(self.n_substeps)
         jax.block_until_ready(self.sim.data.states.pos)
         self.sim.data = data
-        self._update_viewers()
-        self._next_picture = time.perf_counter()
+        self._viewers.update(self)
+        self._viewers.next_at = time.perf_counter()

@@ -15,6 +15,7 @@ from crazysim.core.data import SimData
 from crazysim.core.stage import over_drones, over_worlds
 from crazysim.effects.wind import WindData
 from crazysim.effects.wind_field import WindFieldData
+from crazysim.live.scene_bodies import SceneBodies
 from crazysim.media.poses import mocap_poses
 from crazysim.pytree import has_members, scopes
 from crazysim.sim.sim import Sim
@@ -45,10 +46,14 @@ class Picture:
     """True where a drone touches something. (n, n_drones)"""
     wind: NDArray
     """Velocity of the air at every drone, world frame, m/s; no drones without wind. (n, n_drones or 0, 3)"""
+    lights: NDArray
+    """Colours of the drones' LEDs, 0 to 1; zero for off. (n, n_drones, 3)"""
     selected: tuple[int, int] | None
     """Selected world and drone; None for none."""
+    followed: tuple[int, int] | None
+    """World and mocap id of the followed body; None for none."""
     name: str
-    """Name of the selected drone; empty for none."""
+    """Name of the followed body; empty for none."""
     controls: tuple[str, ...]
     """Buttons and sliders of the loop, for viewers without a panel."""
     plot: NDArray
@@ -58,16 +63,18 @@ class Picture:
 class PictureSource:
     """Source of the pictures of one viewer."""
 
-    def __init__(self, sim: Sim, worlds: Sequence[int], contacts: bool, wind: bool):
+    def __init__(self, sim: Sim, bodies: SceneBodies, worlds: Sequence[int], contacts: bool, wind: bool):
         """Prepare; functions are compiled at the first picture.
 
         Args:
             sim: Simulation.
+            bodies: Bodies that can be followed.
             worlds: Indices of the worlds to show.
             contacts: True to compute which drones touch something.
             wind: True to compute the wind at every drone, where there is wind.
         """
         self._sim, self._worlds = sim, np.asarray(worlds)
+        self._bodies = {(body.kind, body.index): body for body in bodies.items}
         self._contacts, self._wind = contacts, wind
         self._wind_fn = jax.jit(over_worlds(over_drones(_air)))
 
@@ -93,21 +100,24 @@ class PictureSource:
         if plot and live.selected is not None:
             own = live.quantities.get(plot)
             values = quantity(data, plot, *live.selected) if own is None else np.ravel(np.asarray(own(live), float))
-        name = "" if live.selected is None else sim.drone_names[live.selected[1]]
+        followed = live.followed
+        body = None if followed is None else self._bodies.get(followed[1:])
         return Picture(
-            worlds,
-            live.time,
-            live.status,
-            pos,
-            quat,
-            drones,
-            setpoint,
-            touching,
-            air,
-            live.selected,
-            name,
-            live.control_lines,
-            values,
+            worlds=worlds,
+            time=live.time,
+            status=live.status,
+            pos=pos,
+            quat=quat,
+            drones=drones,
+            setpoint=setpoint,
+            touching=touching,
+            wind=air,
+            lights=np.clip(live.lights[worlds], 0.0, 1.0),
+            selected=live.selected,
+            followed=None if body is None or followed is None else (followed[0], body.mocap),
+            name="" if body is None else body.name,
+            controls=live.control_lines,
+            plot=values,
         )
 
 

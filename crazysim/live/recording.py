@@ -57,6 +57,53 @@ class LiveRecording:
         self._recorder.close()
 
 
+class Recordings:
+    """The recording that is being written, if there is one, and the path for the next."""
+
+    last_path: Path | None
+    """Path that was requested last."""
+    failures: int
+    """Number of recordings that ended because they could not be written."""
+
+    def __init__(self) -> None:
+        """Begin without a recording."""
+        self.last_path, self.failures = None, 0
+        self._open: LiveRecording | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """True while a recording is being written."""
+        return self._open is not None
+
+    def start(self, live: Live, path: str | Path, period: int) -> Path:
+        """Finish the present recording, begin another, and return its path.
+
+        Args:
+            live: Loop.
+            path: Path; numbered if it exists.
+            period: Control steps from one sample to the next.
+
+        Raises:
+            ConfigError: If it cannot be created.
+        """
+        self.close()
+        self._open, self.last_path = LiveRecording(live.sim, path, period), Path(path)
+        self._open.add(live)
+        return self._open.path
+
+    def add(self, live: Live) -> None:
+        """Write a sample if one is due; a recording that cannot be written ends, and the flight does not."""
+        if self._open is not None and not self._open.add(live):
+            self.failures += 1
+            self.close()
+
+    def close(self) -> None:
+        """Finish the recording, if there is one."""
+        if self._open is not None:
+            self._open.close()
+            self._open = None
+
+
 def free_path(path: Path) -> Path:
     """Return a path, or one with a number behind its name, that does not exist."""
     numbered = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in count(2))

@@ -19,8 +19,9 @@ class RemoteCommands:
         self._fleet, self._queue = fleet, queue
 
     def __call__(self, live: Live) -> None:
-        """Carry out the commands that have arrived since the last call."""
+        """Carry out the commands that have arrived since the last call, and show the lights of a show."""
         self._fleet.apply(self._queue.commands())
+        live.lights[0] = self._fleet.colors()
 
     def reset(self, live: Live) -> None:
         """Let the drones hover where a reset, or a jump in time, has put them."""

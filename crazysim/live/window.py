@@ -22,9 +22,11 @@ import numpy as np
 import crazysim
 from crazysim.errors import ConfigError, RenderError
 from crazysim.live.picture import Picture, PictureSource, quantities
+from crazysim.live.scene_bodies import SceneBodies
 from crazysim.live.viewer import Viewer
 from crazysim.media.worlds import world_indices
 from crazysim.scene.render import camera_id, require_size
+from crazysim.scene.visual_geoms import visual_geoms
 from crazysim.scene.window import require_screen
 
 if TYPE_CHECKING:
@@ -44,11 +46,11 @@ log = logging.getLogger(__name__)
 class Window(Viewer):
     """Viewer in a window, ``live.show(Window())``; show several for several views.
 
-    The mouse turns, moves and zooms the view. A double click on a drone selects it, one on the ground calls
-    ``live.on_click``. Keys go to ``live.keyboard``: space pauses, a full stop makes a single step, backspace resets,
-    tab selects the next drone, plus and minus change the speed, [ and ] turn the chosen slider, an apostrophe chooses
-    the next one, R records, escape ends the run. The window draws in a process of its own, as fast as it can, and never
-    delays the simulation.
+    The mouse turns, moves and zooms the view. A double click on a drone selects it, one on a vehicle, load or object
+    follows that, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses, a full stop
+    makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [ and ] turn the
+    chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window draws in a process of
+    its own, as fast as it can, and never delays the simulation.
     """
 
     worlds: Sequence[int] = (0,)
@@ -62,7 +64,7 @@ class Window(Viewer):
     cam_config: dict[str, Any] | None = None
     """Settings of the free camera at first: lookat, distance, azimuth, elevation."""
     follow: bool = False
-    """True to let the free camera look at the selected drone."""
+    """True to let the free camera look at the followed body."""
     trail: float = 2.0
     """Duration of trails, s; 0 for none."""
     setpoints: bool = True
@@ -101,15 +103,17 @@ class Window(Viewer):
         camera_id(sim.mj_model, self.camera)
         if self.plot and self.plot not in (known := [*live.quantities, *quantities(sim)]):
             raise ConfigError(f"expected a quantity to plot, one of {', '.join(known)}, got {self.plot!r}")
-        self._source = PictureSource(sim, worlds, self.contacts, self.wind)
+        sim.scene.compile_if_edited()
+        sim.sync(worlds[0])
+        bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
+        self._source = PictureSource(sim, bodies, worlds, self.contacts, self.wind)
         path = os.pathsep.join([str(Path(crazysim.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
         self._process = process = subprocess.Popen(
             [sys.executable, "-m", "crazysim.live.window_program"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": path},
         )  # fmt: skip
         settings = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        drones = np.asarray(sim.data.core.drone_mocap_ids).tolist()
-        _send(process, {"model": model_bytes(sim.mj_model), "drones": drones, "settings": settings})
+        _send(process, {"model": model_bytes(sim.mj_model), "bodies": bodies, "settings": settings})
         ready = threading.Event()
         threading.Thread(target=self._listen, args=(live, process, ready), daemon=True).start()
         if not ready.wait(START) or not self.is_open:
@@ -162,8 +166,8 @@ class Window(Viewer):
                 live.keyboard.press(*values)
             elif kind == "release":
                 live.keyboard.release(*values)
-            elif kind == "select":
-                live.post(lambda live, chosen=values: live.select(*chosen))
+            elif kind == "follow":
+                live.post(lambda live, chosen=values: live.follow(*chosen))
             elif kind == "click":
                 live.post(lambda live, where=values: live.click(where[0], np.array(where[1])))
         process.stdout.close()

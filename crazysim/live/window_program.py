@@ -16,6 +16,7 @@ import numpy as np
 from crazysim.errors import RenderError
 from crazysim.live.chart import Chart
 from crazysim.live.picture import Picture
+from crazysim.live.scene_bodies import MARK_RADIUS, SceneBodies
 from crazysim.live.window import LENGTH
 from crazysim.media.trail import Trail, colors_of
 from crazysim.scene.overlays import Overlays
@@ -30,10 +31,12 @@ DOUBLE_CLICK = 0.35
 """Longest time between the clicks of a double click, s."""
 STILL = 0.01
 """Longest way of the cursor between these, as a part of the window's size."""
-MARK_RADIUS, SETPOINT_RADIUS = 0.12, 0.02
-"""Radius of the sphere around a marked drone, and of a setpoint, m."""
-TOUCHING, SELECTED, AIR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25), (0.35, 0.6, 0.8, 0.9)
+SETPOINT_RADIUS, LIGHT_RADIUS = 0.02, 0.06
+"""Radius of a setpoint's sphere, and of the glow around a lit drone, m."""
+TOUCHING, FOLLOWED, AIR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25), (0.35, 0.6, 0.8, 0.9)
 """Colours of marks, rgba."""
+LEDS = ("led_top", "led_bot")
+"""Materials of the LEDs of a drone."""
 WIND_SCALE = 0.1
 """Length of a wind line per speed, s."""
 
@@ -64,23 +67,44 @@ def read_message(stream: BinaryIO) -> Any:
     return pickle.loads(content) if len(content) == length else None
 
 
+class Leds:
+    """Materials of the drones' LEDs in a model."""
+
+    def __init__(self, model: mujoco.MjModel):
+        """Find the materials that airframes have: ``led_top:0``, ``led_bot:0``, ..."""
+        self._model = model
+        names = [model.material(k).name.partition(":") for k in range(model.nmat)]
+        leds = [(k, int(drone)) for k, (kind, _, drone) in enumerate(names) if kind in LEDS and drone.isdigit()]
+        self._materials, self._drones = np.array(leds, int).reshape(-1, 2).T
+        self._off = model.mat_rgba[self._materials].copy(), model.mat_emission[self._materials].copy()
+
+    def color(self, colors: np.ndarray) -> None:
+        """Set the colours of a world's drones; zero for off. (n_drones, 3)"""
+        own = colors[self._drones]
+        brightest = own.max(-1, initial=0.0)
+        lit, (rgba, emission) = brightest > 0, self._off
+        self._model.mat_rgba[self._materials] = np.where(lit[:, None], np.insert(own, 3, 1.0, axis=1), rgba)
+        self._model.mat_emission[self._materials] = np.where(lit, brightest, emission)
+
+
 class Program:
     """Window, model and what is drawn into it."""
 
-    def __init__(self, model: mujoco.MjModel, drones: list[int], settings: dict[str, Any], out: Any):
+    def __init__(self, model: mujoco.MjModel, bodies: SceneBodies, settings: dict[str, Any], out: Any):
         """Open the window.
 
         Args:
             model: Compiled scene.
-            drones: Mocap ids of the drones.
+            bodies: Bodies that can be followed.
             settings: Fields of ``crazysim.live.Window``.
             out: Stream for what the user does.
 
         Raises:
             RenderError: If it cannot be opened.
         """
-        self._model, self._data, self._drones, self._settings = model, mujoco.MjData(model), drones, settings
+        self._model, self._data, self._bodies, self._settings = model, mujoco.MjData(model), bodies, settings
         self._out = out
+        self._tracked, self._leds = bodies.tracked, Leds(model)
         self._trail = Trail(settings["trail"]) if settings["trail"] > 0 else None
         self._overlays = Overlays(limit=100_000)
         self._camera = mujoco.MjvCamera()
@@ -107,7 +131,7 @@ class Program:
                 time.sleep(IDLE)
                 continue
             if picture is not shown and self._trail is not None:
-                self._trail.add(np.full(len(picture.worlds), picture.time), picture.drones)
+                self._trail.add(np.full(len(picture.worlds), picture.time), picture.pos[:, self._tracked])
             if picture is not shown:
                 self._chart.add(picture)
             shown, drawn = picture, now
@@ -116,9 +140,9 @@ class Program:
 
     def draw(self, picture: Picture) -> None:
         """Draw a picture, and report a double click."""
-        if self._settings["follow"] and picture.selected is not None and picture.selected[0] in picture.worlds:
-            k = picture.worlds.tolist().index(picture.selected[0])
-            point = picture.drones[k, picture.selected[1]]
+        if self._settings["follow"] and picture.followed is not None and picture.followed[0] in picture.worlds:
+            k = picture.worlds.tolist().index(picture.followed[0])
+            point = picture.pos[k, picture.followed[1]]
             if np.isfinite(point).all():
                 self.window.look_at(point)
         n, settings = len(picture.worlds), self._settings
@@ -145,10 +169,14 @@ class Program:
         for pos, air in zip(drones, picture.wind[k], strict=False):
             if air.any():
                 overlays.capsule(pos, pos + WIND_SCALE * air, 0.006, AIR, cylinder=True)
-        if picture.selected is not None and picture.selected[0] == picture.worlds[k]:
-            place = drones[picture.selected[1]]
-            overlays.points(place[None], SELECTED, MARK_RADIUS)
-            overlays.label(_ascii(picture.name), place + [0.0, 0.0, MARK_RADIUS])
+        self._leds.color(picture.lights[k])
+        lit = picture.lights[k].any(-1)
+        if lit.any():
+            overlays.points(drones[lit], np.insert(picture.lights[k, lit], 3, 0.6, axis=1), LIGHT_RADIUS, emission=1.0)
+        if picture.followed is not None and picture.followed[0] == picture.worlds[k]:
+            place, radius = picture.pos[k, picture.followed[1]], self._bodies.radius(picture.followed[1])
+            overlays.points(place[None], FOLLOWED, radius)
+            overlays.label(_ascii(picture.name), place + [0.0, 0.0, radius])
         text = picture.status if k == 0 else ""
         if len(picture.worlds) > 1:
             text = f"world {picture.worlds[k]}\n{text}".strip()
@@ -170,7 +198,7 @@ class Program:
         return double
 
     def _report(self, picture: Picture, hit: tuple[int, int, np.ndarray] | None) -> None:
-        """Write which drone, or which point, was clicked."""
+        """Write which body, or which point, was clicked."""
         if hit is None:
             return
         k, geom, point = hit
@@ -178,8 +206,9 @@ class Program:
         while body and self._model.body_mocapid[body] < 0:
             body = int(self._model.body_parentid[body])
         mocap, world = int(self._model.body_mocapid[body]), int(picture.worlds[k])
-        if mocap in self._drones:
-            self._say("select", world, self._drones.index(mocap))
+        if mocap >= 0:
+            followed = self._bodies.items[self._bodies.owner[mocap]]
+            self._say("follow", world, followed.kind, followed.index)
         else:
             self._say("click", world, point.tolist())
 
@@ -206,7 +235,7 @@ def main() -> int:
         return 1
     model = mujoco.MjModel.from_binary_path("scene.mjb", {"scene.mjb": start["model"]})
     try:
-        program = Program(model, start["drones"], start["settings"], out)
+        program = Program(model, start["bodies"], start["settings"], out)
     except RenderError as error:
         print(error, file=sys.stderr)
         return 2

@@ -100,5 +100,7 @@ class Trail:
         if len(path) < 2:
             return
         fade = np.linspace(MIN_ALPHA, 1.0, len(path) - 1)[:, None] ** [0, 0, 0, 1]
-        for drone, color in enumerate(colors_of(path.shape[1], rgba)):
+        moved = (np.ptp(path, axis=0) > 0).any(-1)
+        for drone in np.flatnonzero(moved):
+            color = colors_of(path.shape[1], rgba)[drone]
             overlays.line(path[:, drone], color * fade, 1.0, width)

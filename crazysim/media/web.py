@@ -24,6 +24,8 @@ PLANE_SIZE = 20.0
 """Half size of infinite planes, m."""
 LIGHT_RADIUS = 0.03
 """Radius of a light, m."""
+LOCAL = ("127.0.0.1", "localhost", "::1")
+"""Addresses that other machines cannot reach."""
 FOV = 50.0
 """Initial vertical field of view, degrees."""
 
@@ -131,6 +133,8 @@ def serve_page(html: str, port: int = 8080, host: str = "127.0.0.1") -> None:
     """
     with server_of(html, port, host) as server:
         print(f"serving the flight at http://{host}:{server.server_port}; stop with Ctrl-C", flush=True)
+        if host not in LOCAL:
+            print("every machine of that network can watch", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             server.serve_forever()
 

@@ -8,13 +8,14 @@ q of the rod, its next two derivatives give q' and q'', the drone is at ``x = x_
 
 from __future__ import annotations
 
+from math import comb
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
+from crazysim.control.flatness import attitude_of_thrust
 
 ORDER = 6
 """Highest derivative of the load's path that is needed."""
@@ -52,9 +53,9 @@ def load_flat_state(
 ) -> LoadedState:
     """Return states and inputs with which a drone carries a point load along a path.
 
-    The rod is attached at the drone's centre of mass. Time derivatives are taken by differentiating the equations
-    along the Taylor polynomial of the path. A load in free fall has no tension and no direction; there the results are
-    not finite.
+    The rod is attached at the drone's centre of mass. ``control.flatness.attitude_of_thrust`` has the rules for
+    attitudes that are not determined. A load in free fall has no tension and no direction; there the results are not
+    finite.
 
     Args:
         path: Position of the load and its time derivatives up to the sixth, world frame, m, m/s, ... (..., 7, 3)
@@ -65,59 +66,44 @@ def load_flat_state(
         inertia: Inertia of the drone, body frame, kg m^2. (3, 3)
         gravity_vec: Gravitational acceleration, world frame, m/s^2. (3,)
     """
-    if path.ndim > 2:
-        return jax.vmap(lambda p, y: load_flat_state(p, y, mass, load_mass, length, inertia, gravity_vec))(path, yaw)
-
-    def derivatives(order: int, t: Array) -> Array:
-        """Return a derivative of the path as a function of the time from now."""
-        total, factor = jnp.zeros_like(path[0]), 1.0
-        for k in range(ORDER - order + 1):
-            factor = factor / k if k else factor
-            total = total + path[order + k] * factor * t**k
-        return total
-
-    def pull(t: Array) -> Array:
-        return load_mass * (derivatives(2, t) - gravity_vec)
-
-    def pos(t: Array) -> Array:
-        return derivatives(0, t) + length * pull(t) / jnp.linalg.norm(pull(t))
-
-    velocity = jax.jacfwd(pos)
-    acceleration = jax.jacfwd(velocity)
-
-    def force(t: Array) -> Array:
-        return mass * (acceleration(t) - gravity_vec) + pull(t)
-
-    def attitude(t: Array) -> Array:
-        """Return the rotation matrix whose z axis is along the thrust and whose x axis has the heading."""
-        heading = yaw[0] + yaw[1] * t + yaw[2] * t * t / 2
-        z = force(t) / jnp.linalg.norm(force(t))
-        ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading), jnp.zeros_like(t)])
-        y = rotation.cross(z, ahead)
-        y = y / jnp.linalg.norm(y)
-        return jnp.stack([rotation.cross(y, z), y, z], axis=-1)
-
-    def ang_vel(t: Array) -> Array:
-        """Return the angular velocity of ``R' = R [w]``."""
-        rot = attitude(t)
-        turned = jnp.sum(rot[:, :, None] * jax.jacfwd(attitude)(t)[:, None, :], axis=0)
-        return jnp.stack([turned[2, 1], turned[0, 2], turned[1, 0]])
-
-    now = jnp.zeros((), path.dtype)
-    rot, w, w_rate = attitude(now), ang_vel(now), jax.jacfwd(ang_vel)(now)
-    tension = jnp.linalg.norm(pull(now))[None]
-    offset = path[0] - pos(now)
-    torque = rotation.matvec(inertia, w_rate) + rotation.cross(w, rotation.matvec(inertia, w))
+    falling = [gravity_vec, 0.0, 0.0, 0.0, 0.0]
+    pull = [load_mass * (path[..., 2 + k, :] - g) for k, g in enumerate(falling)]
+    tension, up = _norm_and_direction(pull)
+    pos = [path[..., k, :] + length * up[k] for k in range(ORDER - 1)]
+    force = [mass * (pos[2 + k] - g) + pull[k] for k, g in enumerate(falling[:3])]
+    thrust, rate, acc = (f / mass for f in force)
+    now = attitude_of_thrust(thrust, rate, acc, yaw[..., :1], yaw[..., 1:2], yaw[..., 2:])
+    momentum = rotation.matvec(inertia, now.ang_vel)
     return LoadedState(
-        pos=pos(now),
-        vel=velocity(now),
-        acc=acceleration(now),
-        direction=offset / length,
-        direction_rate=(path[1] - velocity(now)) / length,
-        quat=rotation.quat_from_axes(rot[:, 0], rot[:, 1], rot[:, 2]),
-        ang_vel=w,
-        ang_acc=w_rate,
+        pos=pos[0],
+        vel=pos[1],
+        acc=pos[2],
+        direction=-up[0],
+        direction_rate=-up[1],
+        quat=rotation.quat_from_axes(*(now.matrix[..., k] for k in range(3))),
+        ang_vel=now.ang_vel,
+        ang_acc=now.ang_acc,
         tension=tension,
-        thrust=jnp.linalg.norm(force(now))[None],
-        torque=torque,
+        thrust=jnp.linalg.norm(force[0], axis=-1, keepdims=True),
+        torque=rotation.matvec(inertia, now.ang_acc) + rotation.cross(now.ang_vel, momentum),
     )
+
+
+def _norm_and_direction(vector: list[Array]) -> tuple[Array, list[Array]]:
+    """Return the norm of a vector (..., 1), and the unit vector along it with its time derivatives, (..., 3) each.
+
+    From the derivatives of ``norm norm = vector . vector`` and ``norm direction = vector`` by Leibniz' rule, solved
+    for the highest derivative.
+
+    Args:
+        vector: The vector and its time derivatives. (..., 3) each
+    """
+    norms: list[Array] = [jnp.linalg.norm(vector[0], axis=-1, keepdims=True)]
+    directions = [vector[0] / norms[0]]
+    for n in range(1, len(vector)):
+        square = sum(comb(n, k) * rotation.dot(vector[k], vector[n - k]) for k in range(n + 1))
+        square = square - sum(comb(n, k) * norms[k] * norms[n - k] for k in range(1, n))
+        norms.append(square / (2 * norms[0]))
+        rest = vector[n] - sum(comb(n, k) * norms[k] * directions[n - k] for k in range(1, n + 1))
+        directions.append(rest / norms[0])
+    return norms[0], directions

@@ -74,13 +74,13 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
     end = show.duration if seconds is None else min(float(seconds), show.duration)
     if not np.isfinite(end) or end <= 0:
         raise ConfigError(f"expected a positive duration of the flight, s, got {seconds!r}")
-    sim = _at_start(show, settings)
+    sim = at_start(show, settings)
     rate = _rate(sim.freq, end, show.n_drones)
     n = max(int(np.ceil(end * rate - 1e-6)), 1)
     times = np.arange(n + 1) / rate
 
     fly_chunk = compile_sampler(sim.step_fn, sim.data, _pose, CHUNK, sim.freq // rate)
-    jax.block_until_ready(_planned(show.trajectories, jnp.asarray(times)))  # compiles
+    jax.block_until_ready(planned_at(show.trajectories, jnp.asarray(times)))  # compiles
     show.lights.colors(times)
     begin = time.perf_counter()
     data = sim.data
@@ -91,12 +91,12 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
         recorded.append([np.asarray(x)[:, 0] for x in samples])
     sim.data = data
     pos, quat = (np.concatenate(parts)[: n + 1] for parts in zip(*recorded, strict=True))
-    planned = np.asarray(_planned(show.trajectories, jnp.asarray(times)))
+    planned = np.asarray(planned_at(show.trajectories, jnp.asarray(times)))
     colors = show.lights.colors(times)
     return ShowFlight(show, sim, times, pos, quat, planned, colors, time.perf_counter() - begin)
 
 
-def _at_start(show: Show, settings: dict[str, Any]) -> Sim:
+def at_start(show: Show, settings: dict[str, Any]) -> Sim:
     """Return a simulation of one world whose drones hover where their trajectories begin."""
     sim = Sim(n_worlds=1, n_drones=show.n_drones, control="state", **settings)
     sim.add(Follow(show.trajectories, index=np.arange(show.n_drones)[None], visible=False))
@@ -137,7 +137,7 @@ def _pose(data: SimData) -> tuple[Array, Array]:
 
 
 @jax.jit
-def _planned(trajectories: Trajectory, times: Array) -> Array:
+def planned_at(trajectories: Trajectory, times: Array) -> Array:
     """Return planned positions, m. (n, n_drones, 3)"""
     of_all = jax.vmap(lambda trajectory, t: trajectory.derivatives(t, 0)[0][:3], in_axes=(0, None))
     return jax.vmap(of_all, in_axes=(None, 0))(trajectories, times)

@@ -23,6 +23,8 @@ GLOW = 0.006
 """Radius of the glow around a light, as a fraction of the size of the show."""
 MIN_GLOW = 0.03
 """Least radius of that glow, m."""
+ROOM = 1.2
+"""Distance of the camera, as a multiple of the size of the show."""
 SHOWN = 0.7
 """Time for which a collision is marked, s."""
 RED = (1.0, 0.1, 0.1, 0.55)
@@ -106,9 +108,8 @@ def view_of(flight: ShowFlight, **settings: Any) -> View:
         flight: Flight.
         settings: Settings of ``crazysim.media.View`` that replace the defaults.
     """
-    low, high = flight.planned.min((0, 1)), flight.planned.max((0, 1))
-    size = max(float(np.linalg.norm(high - low)), 1.0)
-    camera = {"lookat": (low + high) / 2, "distance": 1.2 * size, "azimuth": 110, "elevation": -18}
+    camera = camera_around(flight.planned)
+    size = camera["distance"] / ROOM
     marks = collisions(flight)
     lit = _lit(flight.sim)
 
@@ -128,6 +129,13 @@ def view_of(flight: ShowFlight, **settings: Any) -> View:
 
     defaults = {"width": 1280, "height": 720, "cam_config": camera, "text": "{time:.1f} s", "draw": draw}
     return View(**(defaults | settings))
+
+
+def camera_around(points: NDArray) -> dict[str, Any]:
+    """Return the settings of a free camera with all points of a show in view. (n, n_drones, 3)"""
+    low, high = points.min((0, 1)), points.max((0, 1))
+    size = max(float(np.linalg.norm(high - low)), 1.0)
+    return {"lookat": (low + high) / 2, "distance": ROOM * size, "azimuth": 110, "elevation": -18}
 
 
 def color_leds(sim: Sim, materials: tuple[str, ...], colors: NDArray) -> None:

@@ -1,6 +1,7 @@
 """Ground vehicles: cars, bicycles and trailers, paths on the ground, and controllers that follow them."""
 
-from crazysim.vehicles.cars import Bicycles, CarData, Cars
+from crazysim.vehicles.car_data import CarData
+from crazysim.vehicles.cars import Bicycles, Cars
 from crazysim.vehicles.commonroad import CommonRoadParams, CommonRoadState, commonroad_single_track
 from crazysim.vehicles.following import PathController, PathState, PurePursuit, Stanley
 from crazysim.vehicles.kinematic import kinematic

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
@@ -20,16 +19,17 @@ from crazysim.core.stage import Stage, tick
 from crazysim.dynamics.core import GRAVITY
 from crazysim.effects.ground import TerrainData, ground_at
 from crazysim.errors import ConfigError
-from crazysim.pytree import Members, PyTree, floating, leaf
+from crazysim.pytree import PyTree, floating
 from crazysim.trajectories import Trajectory
-from crazysim.vehicles import appearance
+from crazysim.vehicles import appearance, starts
+from crazysim.vehicles.car_data import CarData
 from crazysim.vehicles.following import PathController, PurePursuit, motor_reference, path_state
 from crazysim.vehicles.kinematic import kinematic
 from crazysim.vehicles.model import VehicleModel, load_vehicle
 from crazysim.vehicles.parameters import CarParams
 from crazysim.vehicles.path import Path
 from crazysim.vehicles.single_track import single_track
-from crazysim.vehicles.state import CarState, tilted, to_body, to_world
+from crazysim.vehicles.state import to_body
 
 CONTROL_FREQ = 50
 """Default rate of the controllers, Hz, lowered to the next divisor of the simulation's rate."""
@@ -37,85 +37,6 @@ SPEED_GAIN = 4.0
 """Acceleration over the error of speed at the command level ``speed``, 1/s."""
 SETTLING = 0.02
 """Time in which height and tilt of a car follow the ground, s: that of stiff springs."""
-GAP = 1.0
-"""Distance of neighbours that start in a row, m."""
-
-
-class CarData(Members):
-    """States, commands and parameters of the cars of a population."""
-
-    pos: Array = leaf("member", 1)
-    """Position of the centre of mass, world frame, m. (n_worlds, n_members, 3)"""
-    yaw: Array = leaf("member", 1)
-    """Heading, rad, not wrapped. (n_worlds, n_members, 1)"""
-    body_vel: Array = leaf("member", 1)
-    """Forward and left velocity of the centre of mass, body frame, m/s. (n_worlds, n_members, 2)"""
-    yaw_rate: Array = leaf("member", 1)
-    """Rate of the heading, rad/s. (n_worlds, n_members, 1)"""
-    normal: Array = leaf("member", 1)
-    """Unit normal of the ground below, upwards, world frame; it follows terrain within ``SETTLING``.
-    (n_worlds, n_members, 3)"""
-    steer: Array = leaf("member", 1)
-    """Steering angle in the middle of the front axle, rad, positive to the left. (n_worlds, n_members, 1)"""
-    distance: Array = leaf("member", 1)
-    """Distance that the wheels rolled, m; backwards it decreases. (n_worlds, n_members, 1)"""
-    joints: Array | None = leaf("member", 1)
-    """Headings of the trailer's drawbar and deck, rad, not wrapped; None without trailers. (n_worlds, n_members, 2)"""
-    command: Array = leaf("member", 1)
-    """Command: motor reference, 1, or speed, m/s, by the command level, and steering angle, rad.
-    (n_worlds, n_members, 2)"""
-    applied: Array | None = leaf("member", 1)
-    """Motor reference and steering angle, rad, of the last tick of the controller; None at the level ``drive``, where
-    they are the command. (n_worlds, n_members, 2)"""
-    force: Array = leaf("member", 1)
-    """External force on the centre of mass, world frame, N; kept until it is changed. (n_worlds, n_members, 3)"""
-    torque: Array = leaf("member", 1)
-    """External torque, world frame, N m, of which z acts; kept until it is changed. (n_worlds, n_members, 3)"""
-    params: CarParams
-    """Parameters of the dynamics."""
-    path: Path | None
-    """Paths; None for cars that follow none."""
-    index: Array | None = leaf("parameter", 1, (1,))
-    """Number of the path that a car follows. (1,)"""
-    start: Array | None = leaf("parameter", 1, (1,))
-    """Time of the world at which a car is at the start of its path, s. (1,)"""
-    arc: Array | None = leaf("member", 1)
-    """Arc length of the car's projection on its path, m. (n_worlds, n_members, 1)"""
-    memory: Any
-    """Memory of the path controller."""
-    gains: Any
-    """Gains of the path controller."""
-
-    @property
-    def state(self) -> CarState:
-        """State of the dynamics."""
-        return CarState(**{name: getattr(self, name) for name in CarState._fields})
-
-    @property
-    def quat(self) -> Array:
-        """Attitude, body to world, xyzw. (n_worlds, n_members, 4)"""
-        return tilted(self.yaw, self.normal)
-
-    @property
-    def vel(self) -> Array:
-        """Velocity of the centre of mass, world frame, m/s. (n_worlds, n_members, 3)"""
-        level = to_world(self.yaw, self.body_vel)
-        return jnp.concatenate([level, jnp.zeros_like(self.yaw)], axis=-1)
-
-    @property
-    def ang_vel(self) -> Array:
-        """Angular velocity, body frame, rad/s. (n_worlds, n_members, 3)"""
-        zero = jnp.zeros_like(self.yaw_rate)
-        return jnp.concatenate([zero, zero, self.yaw_rate], axis=-1)
-
-    def with_vel(self, vel: Array, ang_vel: Array) -> CarData:
-        """Return the record with other velocities of cars, of which those on the ground count.
-
-        Args:
-            vel: Velocity of the centre of mass, world frame, m/s. (..., 3)
-            ang_vel: Angular velocity, rad/s. (..., 3)
-        """
-        return self.replace(body_vel=to_body(self.yaw, vel[..., :2]), yaw_rate=ang_vel[..., 2:])
 
 
 class Cars(Population):
@@ -198,20 +119,21 @@ class Cars(Population):
         paths, follows = self._paths(), self.follows
         index = start = arc = gains = memory = None
         params = CarParams.create(vehicle, freq, self.trailer)
-        pos, yaw = _row(self.n_members), np.zeros((self.n_members, 1))
+        pos, yaw = starts.in_a_row(self.n_members), np.zeros((self.n_members, 1))
         if paths is not None and follows is not None:
             follows.check(vehicle, paths)
-            index = _numbers("index", self._indices(paths), counts, paths.n_paths)
-            start = _numbers("start", self._starts(paths, index), counts)
-            pos, yaw, arc = _on_path(paths, index, start, counts)
+            index = starts.numbers("index", self._indices(paths), counts, paths.n_paths)
+            given = starts.spread(paths, index, self.n_members) if self.start is None else self.start
+            start = starts.numbers("start", given, counts)
+            pos, yaw, arc = starts.on_path(paths, index, start, counts)
             gains, memory = follows.gains(vehicle, params, self.rate_in(freq)), follows.memory()
         if self.pos is not None:
-            pos = _places("pos", self.pos, counts, (2,))
+            pos = starts.places("pos", self.pos, counts, (2,))
         if self.yaw is not None:
-            yaw = _places("yaw", np.asarray(self.yaw, float)[..., None], counts, (1,))
+            yaw = starts.places("yaw", np.asarray(self.yaw, float)[..., None], counts, (1,))
         pos, yaw = (np.broadcast_to(x, (*counts, x.shape[-1])) for x in (pos, yaw))
         if arc is not None and self.pos is not None:
-            arc = _projected(paths, index, pos, arc)
+            arc = starts.projected(paths, index, pos, arc)
         height, normal = ground_at(sim.data, jnp.asarray(np.concatenate([pos, pos[..., :1]], axis=-1), floating()))
         z = np.asarray(height) + vehicle.number("wheels.radius")
         zero = np.zeros((*counts, 1))
@@ -329,85 +251,6 @@ class Cars(Population):
 
     def _indices(self, paths: Path) -> Any:
         return np.arange(self.n_members) % paths.n_paths if self.index is None else self.index
-
-    def _starts(self, paths: Path, index: NDArray[Any]) -> Any:
-        """Return the starts: as given, or at equal intervals on a closed path of several cars."""
-        if self.start is not None:
-            return self.start
-        own = np.broadcast_to(index.reshape(-1)[: self.n_members], (self.n_members,))
-        starts = np.zeros(self.n_members)
-        for path in np.unique(own):
-            cars = np.flatnonzero(own == path)
-            if np.asarray(paths.closed)[path]:
-                starts[cars] = -np.arange(len(cars)) / len(cars) * float(paths.duration[path])
-        return starts
-
-
-def _row(n: int) -> NDArray[Any]:
-    """Return places in a row along y around the origin. (n, 2)"""
-    return np.stack([np.zeros(n), GAP * (np.arange(n) - (n - 1) / 2)], axis=1)
-
-
-def _places(name: str, value: Any, counts: tuple[int, int], core: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return a value for all cars, or for each. (..., *core)
-
-    Raises:
-        ConfigError: If it has another shape or is not finite.
-    """
-    array = np.asarray(value, float)
-    shapes = [core, (counts[1], *core), (*counts, *core)]
-    if array.shape not in shapes or not np.all(np.isfinite(array)):
-        raise ConfigError(
-            f"expected {name} as finite numbers of shape {' or '.join(map(str, shapes))} = (n_worlds, n_members, ...), "
-            f"got shape {array.shape}"
-        )
-    return array
-
-
-def _numbers(name: str, value: Any, counts: tuple[int, int], n: int | None = None) -> NDArray[Any]:
-    """Return a number for all cars, (1,), or for each, (n_worlds, n_members, 1); whole numbers below n if it is given.
-
-    Raises:
-        ConfigError: If it has another shape or an invalid value.
-    """
-    array = np.asarray(value)
-    whole = n is None or (array.dtype.kind in "iu" and np.all((array >= 0) & (array < n)))
-    if array.shape not in ((), counts[1:], counts) or array.dtype.kind not in "iuf" or not whole:
-        what = "a number" if n is None else f"a whole number from 0 to {n - 1}"
-        raise ConfigError(
-            f"expected {name} as {what} for all cars, or for each, {counts[1:]} or {counts} = (n_worlds, n_members), "
-            f"got {value!r}"
-        )
-    if not np.all(np.isfinite(array)):
-        raise ConfigError(f"expected {name} to be finite, got {value!r}")
-    array = array.astype(floating() if n is None else np.int32)
-    return array[None] if array.ndim == 0 else np.array(np.broadcast_to(array, counts))[..., None]
-
-
-def _on_path(
-    paths: Path, index: NDArray[Any], start: NDArray[Any], counts: tuple[int, int]
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return positions (..., 2), headings (..., 1) and arc lengths (..., 1) of cars on their paths at time zero."""
-    index, start = (np.broadcast_to(x, (*counts, 1)) for x in (index, start))
-    pos, yaw, arc = np.zeros((*counts, 2)), np.zeros((*counts, 1)), np.zeros((*counts, 1))
-    found: dict[tuple[int, float], tuple[Any, ...]] = {}
-    for at in np.ndindex(counts):
-        key = int(index[at][0]), float(start[at][0])
-        if key not in found:
-            found[key] = paths.at_time(*key)
-        pos[at], yaw[at], arc[at] = found[key]
-    return pos, yaw, arc
-
-
-def _projected(paths: Any, index: Any, pos: NDArray[Any], arc: NDArray[Any]) -> NDArray[Any]:
-    """Return the arc lengths next to positions, in the round of a reference. (n_worlds, n_members, 1)"""
-    index, found = np.broadcast_to(index, arc.shape), np.empty_like(arc)
-    for at in np.ndindex(arc.shape[:2]):
-        k = int(index[at][0])
-        nearest, length = paths.nearest(k, pos[at]), float(paths.length[k])
-        rounds = round((float(arc[at][0]) - nearest) / length) if paths.closed[k] else 0
-        found[at] = nearest + rounds * length
-    return found
 
 
 def _for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTree | None:

@@ -113,9 +113,14 @@ class Path(PyTree):
         """
         xy = np.asarray(points, float)
         if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < 3 or not np.all(np.isfinite(xy)):
-            raise ConfigError(f"expected at least three points (n_points, 2), finite, got shape {xy.shape}")
+            raise ConfigError(
+                f"expected at least three points (n_points, 2), finite, got shape {xy.shape}. Use "
+                f"Path.of_points([(0, 0), (1, 0), (2, 1)])."
+            )
         if not np.isfinite(speed) or speed == 0:
-            raise ConfigError(f"expected a speed other than zero, m/s, got {speed!r}")
+            raise ConfigError(
+                f"expected a speed other than zero, m/s, got {speed!r}. Use speed=1.0, or a negative one to reverse."
+            )
         if closed:
             xy = xy[np.arange(-REPEATED, len(xy) + REPEATED + 1) % len(xy)]
         chords = np.hypot(*np.diff(xy, axis=0).T)
@@ -146,7 +151,7 @@ class Path(PyTree):
             ConfigError: If there is none.
         """
         if not paths:
-            raise ConfigError("expected at least one path, got none")
+            raise ConfigError("expected at least one path, got none. Use Path.stack([Path.of_points(points)]).")
         n = max(path.n_pieces for path in paths)
         padded = []
         for path in paths:
@@ -299,7 +304,10 @@ def _of_curve(
     """
     arc = _arc_length(times, rate)
     if not arc[-1] > 1e-3:
-        raise ConfigError("expected a path of some length on the ground, got one that stays where it is")
+        raise ConfigError(
+            "expected a path of some length on the ground, got one that stays where it is. Leave path out, and command "
+            "the cars, to let them stand."
+        )
     moving = np.flatnonzero(rate > 1e-3 * rate.max())
     if len(moving) != moving[-1] - moving[0] + 1:
         stop = times[moving[0] + np.argmax(np.diff(moving) > 1)]
@@ -312,7 +320,8 @@ def _of_curve(
     pos, vel, acc = curve(nodes, 0), curve(inner, 1), curve(inner, 2)
     if closed and not np.allclose(pos[0], pos[-1], atol=1e-3):
         raise ConfigError(
-            f"expected a closed path that ends at its start, got a gap of {np.hypot(*(pos[0] - pos[-1])):.3g} m"
+            f"expected a closed path that ends at its start, got a gap of {np.hypot(*(pos[0] - pos[-1])):.3g} m. Let "
+            f"the trajectory end where it starts, or not repeat."
         )
     size = np.hypot(*vel.T)[:, None]
     tangent = vel / size

@@ -1,5 +1,7 @@
 """Sequences of states and commands that drive the firmware's controllers into their limits, and our laws on them."""
 
+import functools
+import json
 from types import SimpleNamespace
 
 import jax
@@ -70,9 +72,21 @@ def reference(make, mode, states, commands):
     return np.swapaxes(np.array(flown), 0, 1)
 
 
+MOST_TICKS, MOST_DRONES = 400, 10
+"""Size of the program of a law; shorter and smaller flights are padded."""
+
+
 def law(controller, mode, states, commands, drone="cf2x_L250"):
     """Return the PWM of the motors by a controller of crazysim, in the precision of JAX. (n_ticks, n, 4)"""
-    return np.asarray(jax.jit(lambda s, c: law_of(controller, mode, s, c, drone))(states, commands))
+    n_ticks, n = states.shape[:2]
+    padding = ((0, MOST_TICKS - n_ticks), (0, MOST_DRONES - n), (0, 0))
+    out = _compiled(controller, mode, json.dumps(drone))(*(np.pad(x, padding, mode="edge") for x in (states, commands)))
+    return np.asarray(out)[:n_ticks, :n]
+
+
+@functools.cache
+def _compiled(controller, mode, drone):
+    return jax.jit(lambda states, commands: law_of(controller, mode, states, commands, json.loads(drone)))
 
 
 def law_of(controller, mode, states, commands, drone="cf2x_L250"):

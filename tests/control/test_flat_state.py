@@ -32,6 +32,8 @@ def at(curve, t):
 
 
 state_at = jax.jit(lambda curve, t: flat_state(at(curve, t), MASS, INERTIA))
+state_of = jax.jit(lambda setpoint: flat_state(setpoint, MASS, INERTIA))
+setpoint_at = jax.jit(at)
 three = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 
 
@@ -45,9 +47,9 @@ three = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 def test_motion_obeys_newton_and_euler(amplitude, rate, phase, yaw, t):
     curve = (amplitude, rate, phase, yaw)
     before, now, after = (jax.tree.map(np.array, state_at(curve, t + h)) for h in (-STEP, 0.0, STEP))
-    acc = at(curve, t).acc
-    np.testing.assert_allclose(now.thrust * rotation.z_axis(now.quat) / MASS + GRAVITY, acc, atol=1e-12)
-    yaw = float(at(curve, t).yaw[0])
+    here = jax.tree.map(np.asarray, setpoint_at(curve, t))
+    np.testing.assert_allclose(now.thrust * rotation.z_axis(now.quat) / MASS + GRAVITY, here.acc, atol=1e-12)
+    yaw = here.yaw[0]
     x_axis, y_axis, _ = Rotation.from_quat(now.quat).as_matrix().T
     ahead = np.array([np.cos(yaw), np.sin(yaw), 0])
     np.testing.assert_allclose(y_axis @ ahead, 0.0, atol=1e-12)
@@ -64,8 +66,8 @@ def test_motion_obeys_newton_and_euler(amplitude, rate, phase, yaw, t):
 
 
 def test_hover_takes_the_weight_and_no_torque():
-    hover = Setpoint(*[jnp.zeros(3)] * 5, *[jnp.zeros(1)] * 3)
-    state = flat_state(hover, MASS, INERTIA)
+    hover = Setpoint(*[np.zeros(3)] * 5, *[np.zeros(1)] * 3)
+    state = state_of(hover)
     np.testing.assert_allclose(state.thrust, [0.5 * 9.81])
     np.testing.assert_allclose(np.abs(state.quat), [0, 0, 0, 1])
     np.testing.assert_array_equal(state.torque, np.zeros(3))
@@ -76,13 +78,13 @@ def test_law_01_and_07_many_setpoints_free_fall_and_finite_gradients():
     accs = np.array([[0, 0, 0], [0, 0, -9.81], [9.81, 0, -9.81], [0, 0, -30.0], [1.0, 2.0, 3.0]])
     one = np.ones((5, 1))
     setpoints = Setpoint(*[np.ones((5, 3))] * 2, accs, *[np.ones((5, 3))] * 2, 0 * one, one, one)
-    together = flat_state(setpoints, MASS, INERTIA)
+    together = state_of(setpoints)
     for k in range(5):
-        alone = flat_state(jax.tree.map(lambda x, k=k: x[k], setpoints), MASS, INERTIA)
+        alone = state_of(jax.tree.map(lambda x, k=k: x[k], setpoints))
         for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
             np.testing.assert_allclose(a, b[k], atol=1e-12)
 
     def total(setpoint):
         return sum(jnp.sum(x) for x in jax.tree.leaves(flat_state(setpoint, MASS, INERTIA)))
 
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves((together, jax.grad(total)(setpoints))))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((together, jax.jit(jax.grad(total))(setpoints))))

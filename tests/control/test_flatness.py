@@ -13,6 +13,7 @@ from crazysim.control.flatness import attitude_of_thrust
 pytestmark = pytest.mark.usefixtures("x64")
 
 attitude = jax.jit(attitude_of_thrust)
+slopes = jax.jit(jax.jacrev(attitude_of_thrust, argnums=(0, 1, 2, 3)))
 angles = st.floats(-3.0, 3.0)
 
 
@@ -20,15 +21,22 @@ def vee(a):
     return np.array([a[2, 1], a[0, 2], a[1, 0]])
 
 
-def of_motion(f, yaw):
-    """Return the attitude of quadratic motions, each a value, a rate and an acceleration, as a function of time."""
+@jax.jit
+def derivatives(f, yaw):
+    """Return the first two derivatives of the rotation matrix by jax.jvp.
 
-    def at(t):
+    Thrust and heading are quadratic motions, each a value, a rate and an acceleration.
+    """
+
+    def matrix(t):
         thrust = [f[0] + f[1] * t + f[2] * t**2 / 2, f[1] + f[2] * t, f[2]]
         heading = [yaw[0] + yaw[1] * t + yaw[2] * t**2 / 2, yaw[1] + yaw[2] * t, yaw[2]]
-        return attitude_of_thrust(*thrust, *(jnp.reshape(x, (1,)) for x in heading))
+        return attitude_of_thrust(*thrust, *(jnp.reshape(x, (1,)) for x in heading)).matrix
 
-    return at
+    def rate(t):
+        return jax.jvp(matrix, (t,), (1.0,))[1]
+
+    return jax.jvp(rate, (0.0,), (1.0,))
 
 
 @example(f=(np.array([3.0, -2, 1]), np.array([4.0, 5, 6]), np.array([7.0, -8, 9])), yaw=(0.5, 1.0, -2.0), up=1.0)
@@ -40,14 +48,9 @@ def of_motion(f, yaw):
 def test_rates_are_the_derivatives_of_the_attitude(f, yaw, up):
     """Differentiated once and twice by jax.jvp: R' = R w^ and R'' = R (w^ w^ + a^), upside down too."""
     f = (f[0] + np.array([0, 0, up * 12.0]), *f[1:])
-    at = of_motion([jnp.asarray(x) for x in f], yaw)
-
-    def rate(t):
-        return jax.jvp(lambda t: at(t).matrix, (t,), (1.0,))[1]
-
     now = attitude(*f, *(np.array([x]) for x in yaw))
-    matrix, first = np.asarray(now.matrix), np.asarray(rate(0.0))
-    second = np.asarray(jax.jvp(rate, (0.0,), (1.0,))[1])
+    first, second = (np.asarray(x) for x in derivatives(f, yaw))
+    matrix = np.asarray(now.matrix)
     np.testing.assert_allclose(now.ang_vel, vee(matrix.T @ first), atol=1e-9 * (1 + np.abs(first).max()))
     skew = matrix.T @ first
     np.testing.assert_allclose(
@@ -74,5 +77,5 @@ def test_singular_directions_give_rotations_and_finite_gradients(thrust):
     now = attitude(thrust, other, other, np.zeros(1), one, one)
     np.testing.assert_allclose(now.matrix.T @ now.matrix, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(now.matrix), 1.0)
-    slopes = jax.jit(jax.jacrev(attitude_of_thrust, argnums=(0, 1, 2, 3)))(thrust, other, other, np.zeros(1), one, one)
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves((now, slopes)))
+    gradient = slopes(thrust, other, other, np.zeros(1), one, one)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((now, gradient)))

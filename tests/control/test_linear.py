@@ -1,7 +1,6 @@
 """The rigid-body models that controllers are designed on, and their linearisation."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import vectors
@@ -16,6 +15,12 @@ MASS, J, LOAD, LENGTH = np.array([0.605]), np.diag([1.5e-3, 1.45e-3, 2.66e-3]), 
 GRAVITY = np.array([0, 0, -9.81])
 drone = jax.jit(lambda x, u: drone_derivative(x, u, MASS, J, GRAVITY))
 load = jax.jit(lambda x, u: load_derivative(x, u, MASS, J, GRAVITY, LOAD, LENGTH))
+
+
+rod = jax.jit(lambda angles, rates: jax.jvp(rod_direction, (angles,), (rates,)))
+angles_of_rod = jax.jit(rod_angles)
+slopes_of_rod = jax.jit(jax.jacrev(rod_angles, argnums=(0, 1)))
+linear = jax.jit(lambda x, u: linearize(load, x, u))
 
 
 def advanced(f, x, u, dt, n):
@@ -39,7 +44,7 @@ def test_euler_angles_turn_as_the_matrix_does(rpy, ang_vel):
 
 def energy(x):
     v, rates = x[3:6], x[14:16]
-    q, q_rate = jax.jvp(rod_direction, (jnp.asarray(x[12:14]),), (jnp.asarray(rates),))
+    q, q_rate = (np.asarray(value) for value in rod(x[12:14], rates))
     v_load, z_load = v + LENGTH * q_rate, x[2] + LENGTH * q[2]
     kinetic = 0.5 * MASS * v @ v + 0.5 * LOAD * v_load @ v_load
     return float((kinetic + 9.81 * (MASS * x[2] + LOAD * z_load))[0])
@@ -55,7 +60,7 @@ def test_drone_and_load_keep_energy_and_the_height_of_free_fall():
     def centre(x):
         return (MASS * x[:3] + LOAD * (x[:3] + LENGTH * np.asarray(rod_direction(x[12:14])))) / (MASS + LOAD)
 
-    slope = jax.jvp(rod_direction, (jnp.asarray(x[12:14]),), (jnp.asarray(x[14:16]),))[1]
+    slope = rod(x[12:14], x[14:16])[1]
     start_vel = (MASS * x[3:6] + LOAD * (x[3:6] + LENGTH * np.asarray(slope))) / (MASS + LOAD)
     np.testing.assert_allclose(centre(after), centre(x) + 0.5 * start_vel + 0.125 * GRAVITY, atol=1e-8)
     assert np.abs(after[12:14] - x[12:14]).max() > 0.3
@@ -70,7 +75,7 @@ def test_a_load_off_the_centre_keeps_energy_and_momentum():
 
     def kept(x):
         turn = Rotation.from_euler("ZYX", x[8:5:-1])
-        q, q_rate = jax.jvp(rod_direction, (jnp.asarray(x[12:14]),), (jnp.asarray(x[14:16]),))
+        q, q_rate = rod(x[12:14], x[14:16])
         pos = x[:3] + turn.apply(attach) + LENGTH * np.asarray(q)
         vel = x[3:6] + turn.apply(np.cross(x[9:12], attach)) + LENGTH * np.asarray(q_rate)
         spin = turn.apply(J @ x[9:12])
@@ -80,13 +85,14 @@ def test_a_load_off_the_centre_keeps_energy_and_momentum():
 
     after = advanced(off, x, np.zeros(4), 1e-3, 300)
     np.testing.assert_allclose(kept(after), kept(x), rtol=1e-8, atol=1e-10)
-    centred = load_derivative(x, np.array([7.0, 0.01, -0.02, 0.003]), MASS, J, GRAVITY, LOAD, LENGTH, np.zeros(3))
-    np.testing.assert_allclose(centred, load(x, np.array([7.0, 0.01, -0.02, 0.003])), rtol=1e-10)
+    u = np.array([7.0, 0.01, -0.02, 0.003])
+    centred = jax.jit(load_derivative)(x, u, MASS, J, GRAVITY, LOAD, LENGTH, np.zeros(3))
+    np.testing.assert_allclose(centred, load(x, u), rtol=1e-10)
 
 
 def test_a_small_swing_has_the_period_of_a_pendulum_on_a_free_body():
     """Thrust equal to the weight: w^2 = (g / L)(m + m_L) / m, by hand from the linearised equations."""
-    A, _ = linearize(load, np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0]))
+    A, _ = linear(np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0]))
     frequency = np.sqrt(9.81 / 0.4 * 0.655 / 0.605)
     np.testing.assert_allclose(A[14, 12], -(frequency**2), rtol=1e-12)
     np.testing.assert_allclose(A[15, 13], -(frequency**2), rtol=1e-12)
@@ -94,7 +100,7 @@ def test_a_small_swing_has_the_period_of_a_pendulum_on_a_free_body():
 
 def test_linearisation_with_load_as_the_lab():
     """The facts on AIMotionLab-Virtual, section 2.4."""
-    A, B = linearize(load, np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0]))
+    A, B = (np.asarray(x) for x in linear(np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0])))
     assert round(float(A[3, 7]), 4) == 10.6207
     assert round(float(A[3, 13]), 4) == -0.8107
     assert round(float(A[14, 6]), 4) == 26.5519
@@ -104,19 +110,18 @@ def test_linearisation_with_load_as_the_lab():
 
 def test_without_a_load_mass_the_drone_is_the_bare_one():
     x, u = np.linspace(-0.3, 0.4, 16), np.array([7.0, 0.01, -0.02, 0.003])
-    bare = load_derivative(x, u, MASS, J, GRAVITY, np.zeros(1), LENGTH)[:12]
+    bare = jax.jit(load_derivative)(x, u, MASS, J, GRAVITY, np.zeros(1), LENGTH)[:12]
     np.testing.assert_allclose(bare, drone(x[:12], u), rtol=1e-12)
 
 
 @given(angles=vectors(2, 1.4), rates=vectors(2, 5.0))
 def test_rod_angles_are_the_inverse_of_the_direction(angles, rates):
-    q, q_rate = jax.jvp(rod_direction, (angles,), (rates,))
-    found, found_rates = rod_angles(q, q_rate)
+    found, found_rates = angles_of_rod(*rod(angles, rates))
     np.testing.assert_allclose(found, angles, atol=1e-9)
     np.testing.assert_allclose(found_rates, rates, atol=1e-9 * (1 + np.abs(rates).max()))
 
 
 @pytest.mark.parametrize("direction", [[0, 1.0, 0], [0, -1.0, 0], [0, 0, 1.0]])
 def test_level_and_upright_rods_have_finite_angles_and_gradients(direction):
-    slopes = jax.jacrev(rod_angles, argnums=(0, 1))(jnp.asarray(direction), jnp.asarray([0.1, 0.2, 0.3]))
+    slopes = slopes_of_rod(np.asarray(direction), np.array([0.1, 0.2, 0.3]))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes))

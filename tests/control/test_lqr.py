@@ -62,7 +62,7 @@ def test_gain_with_load_as_the_lab():
         args = (params.mass, params.J, params.gravity_vec, params.load_mass, params.length)
         return load_derivative(x, u, *args)
 
-    A, B = linearize(model, np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0]))
+    A, B = jax.jit(lambda x, u: linearize(model, x, u))(np.zeros(16), np.array([0.655 * 9.81, 0, 0, 0]))
     closed = np.eye(16) + 0.01 * A - 0.01 * B @ gain
     assert round(float(np.abs(np.linalg.eigvals(closed)).max()), 5) == 0.99168
 
@@ -121,7 +121,7 @@ def test_setpoints_of_a_trajectory_are_finite():
 @pytest.fixture(scope="module")
 def knots():
     times = np.arange(50) * 0.1
-    return jax.vmap(lambda t: setpoint_of(figure_eight, t))(times)
+    return jax.jit(jax.vmap(lambda t: setpoint_of(figure_eight, t)))(times)
 
 
 @pytest.mark.usefixtures("x64")
@@ -158,12 +158,12 @@ def test_error_dynamics_are_those_of_the_drone(knots):
 @pytest.mark.usefixtures("x64")
 def test_gains_along_a_hover_are_those_of_hover():
     p = LQRParams.create(load_airframe("bumblebee"), 500)
-    still = jax.vmap(lambda t: setpoint_of(hover, t))(np.arange(4) * 0.1)
+    still = jax.jit(jax.vmap(lambda t: setpoint_of(hover, t)))(np.arange(4) * 0.1)
     Q, R = np.diag(LAB_Q).astype(float), np.diag(LAB_R).astype(float)
     gains = jax.jit(tracking_gains, static_argnames="substeps")(
         still, 0.1, np.asarray(p.mass), np.asarray(p.J), np.zeros((3, 3)), Q, R, substeps=2000
     )
-    expected = hover_gain(np.asarray(p.mass), np.asarray(p.J), Q, R)
+    expected = jax.jit(hover_gain)(np.asarray(p.mass), np.asarray(p.J), Q, R)
     np.testing.assert_allclose(gains[0], expected, atol=5e-3 * np.abs(expected).max())
 
 
@@ -210,7 +210,7 @@ def test_heading_turns_the_gain():
         zero, none = jnp.zeros(3), jnp.zeros(1)
         sp = Setpoint(nose, zero, zero, zero, zero, jnp.array([yaw]), none, none)
         quat = jnp.asarray(Rotation.from_euler("z", yaw).as_quat(), jnp.float32)
-        wrench = np.asarray(lqr_control(zero, quat, zero, zero, sp, params=p))
+        wrench = np.asarray(jax.jit(lqr_control)(zero, quat, zero, zero, sp, params=p))
         assert wrench[2] > 1e-3
         np.testing.assert_allclose(wrench[[1, 3]], 0, atol=1e-6)
 
@@ -237,15 +237,16 @@ def fly_with_load(load_mass, length, seconds, freq=500):
         load = Record(pos=x[:3] + length * q, vel=x[3:6] + length * q_rate)
         data = Record(states=states, plugins={"load": load})
         u, memory = controller.update(data, setpoint_of(figure_eight, k / freq), memory, p)
-        for _ in range(n):
-            x = x + dt * deriv(x + dt / 2 * deriv(x, u), u)
+        x = jax.lax.fori_loop(0, n, lambda _, x: x + dt * deriv(x + dt / 2 * deriv(x, u), u), x)
         return (x, memory), (x[:3] + length * rod_direction(x[12:14]), setpoint_of(figure_eight, (k + 1) / freq).pos)
 
-    reference, rod, rod_rate = load_reference(setpoint_of(figure_eight, jnp.float32(0)), p)
-    start = [reference.pos, reference.vel, jnp.zeros(6), *rod_angles(rod, rod_rate), reference.wrench]
-    steps = jnp.arange(seconds * freq, dtype=jnp.float32)
-    _, out = jax.jit(lambda c: jax.lax.scan(tick, c, steps))((jnp.concatenate(start), memory))
-    return [np.asarray(x) for x in out]
+    @jax.jit
+    def flown(steps):
+        reference, rod, rod_rate = load_reference(setpoint_of(figure_eight, jnp.float32(0)), p)
+        start = [reference.pos, reference.vel, jnp.zeros(6), *rod_angles(rod, rod_rate), reference.wrench]
+        return jax.lax.scan(tick, (jnp.concatenate(start), memory), steps)[1]
+
+    return [np.asarray(x) for x in flown(np.arange(seconds * freq, dtype=np.float32))]
 
 
 @pytest.mark.parametrize(("load_mass", "length", "freq"), [(0.05, 0.4, 500), (0.2, 0.57, 100)])
@@ -260,8 +261,9 @@ def test_load_gain_at_zero_load_and_any_rod_is_that_of_the_drone():
     """Without weights on the rod, which then moves nothing."""
     J, mass, none = np.diag([1.5e-3, 1.45e-3, 2.66e-3]), np.array([0.605]), np.zeros(1)
     Q = np.diag([*LAB_Q, 1e-9, 1e-9, 1e-9, 1e-9])
-    gain = load_gain(mass, J, none, np.array([0.4]), 1e-4, 1e-4 * Q, 1e-4 * np.diag(LAB_R).astype(float))
-    np.testing.assert_allclose(gain[:, :12], hover_gain(mass, J, np.diag(LAB_Q) * 1.0, np.diag(LAB_R) * 1.0), atol=0.02)
+    gain = jax.jit(load_gain)(mass, J, none, np.array([0.4]), 1e-4, 1e-4 * Q, 1e-4 * np.diag(LAB_R).astype(float))
+    expected = jax.jit(hover_gain)(mass, J, np.diag(LAB_Q) * 1.0, np.diag(LAB_R) * 1.0)
+    np.testing.assert_allclose(gain[:, :12], expected, atol=0.02)
 
 
 def test_setpoints_of_the_drone_leave_it_where_they_say():
@@ -270,7 +272,8 @@ def test_setpoints_of_the_drone_leave_it_where_they_say():
     zero, down, none = jnp.zeros(3), jnp.array([0, 0, -1.0]), jnp.zeros(1)
     sp = Setpoint(zero, zero, zero, zero, zero, none, none, none)
     state = (zero, jnp.array([0, 0, 0, 1.0]), zero, zero, down, zero)
-    wrench = load_lqr_control(*state, sp, params=p, target="drone")
+    control = jax.jit(load_lqr_control, static_argnames="target")
+    wrench = control(*state, sp, params=p, target="drone")
     np.testing.assert_allclose(wrench, [0.705 * 9.81, 0, 0, 0], rtol=1e-6)
     above = (jnp.array([0, 0, 0.4]), *state[1:])
-    np.testing.assert_allclose(load_lqr_control(*above, sp, params=p), [0.705 * 9.81, 0, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(control(*above, sp, params=p), [0.705 * 9.81, 0, 0, 0], rtol=1e-6)

@@ -14,6 +14,7 @@ SOLVERS = {
     "continuous": (jax.jit(solve_continuous), scipy.linalg.solve_continuous_are),
     "discrete": (jax.jit(solve_discrete), scipy.linalg.solve_discrete_are),
 }
+GAINS = {gain: jax.jit(gain) for gain in (gain_continuous, gain_discrete)}
 SIZES = [(2, 1), (4, 2), (12, 4), (16, 4)]
 
 
@@ -62,7 +63,8 @@ def test_gradients_of_gains(gain):
 def test_a_double_integrator_by_hand():
     """Position weight 1, input weight 1: K = (1, sqrt(2)), the damping ratio of 0.707 that every textbook has."""
     A, B = np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]])
-    np.testing.assert_allclose(gain_continuous(A, B, np.diag([1.0, 0]), np.eye(1)), [[1, np.sqrt(2)]], rtol=1e-12)
+    K = GAINS[gain_continuous](A, B, np.diag([1.0, 0]), np.eye(1))
+    np.testing.assert_allclose(K, [[1, np.sqrt(2)]], rtol=1e-12)
 
 
 UNSOLVABLE = {
@@ -78,7 +80,7 @@ def test_without_a_solution_it_is_nan_and_the_host_raises(case):
     continuous, discrete, B, Q = UNSOLVABLE[case]
     B = np.asarray(B, float)
     for gain, A in ((gain_continuous, continuous), (gain_discrete, discrete)):
-        K = jax.jit(gain)(A, B, Q, np.eye(B.shape[1]))
+        K = GAINS[gain](A, B, Q, np.eye(B.shape[1]))
         assert np.isnan(K).all()
         with pytest.raises(ConfigError, match="stabilising solution"):
             check_gain(K)
@@ -86,5 +88,5 @@ def test_without_a_solution_it_is_nan_and_the_host_raises(case):
 
 def test_a_slow_closed_loop_is_solved():
     """A mode of 1e-3 of the fastest, stable by a weight of 1e-6."""
-    K = gain_continuous(*(np.asarray(x, np.float32) for x in ([[0]], [[1]], [[1e-6]], [[1]])))
+    K = GAINS[gain_continuous](*(np.asarray(x, np.float32) for x in ([[0]], [[1]], [[1e-6]], [[1]])))
     np.testing.assert_allclose(K, [[1e-3]], rtol=1e-4)

@@ -104,15 +104,15 @@ def test_fault_02_a_zero_quaternion_means_yaw_zero():
     np.testing.assert_array_equal(answer(setpoint(pos=(0.1, 0.2, 0.3), quat=(0, 0, 0, 0)))[0], expected)
 
 
+@jax.jit
+@functools.partial(jax.value_and_grad, argnums=(0, 1))
+def total(cmd, pos, p):
+    return jnp.sum(state2attitude(pos, jnp.asarray(LEVEL), jnp.zeros(3), cmd, jnp.zeros(3), 100, params=p)[0])
+
+
 @pytest.mark.parametrize("acc", [(0, 0, -9.81), (5, 0, -9.81), (0, 0, -20)])
 @pytest.mark.parametrize("quat", [(0, 0, 0, 1), (0, 0, 0, 0)])
 def test_law_07_values_and_gradients_are_finite_where_the_force_vanishes_or_points_along_the_heading(acc, quat):
-    cmd = jnp.asarray(setpoint(acc=acc, quat=quat))
-    p = params(mass=[0.04])
-
-    def total(cmd, pos):
-        return jnp.sum(state2attitude(pos, jnp.asarray(LEVEL), jnp.zeros(3), cmd, jnp.zeros(3), 100, params=p)[0])
-
-    value, gradients = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))(cmd, jnp.zeros(3))
+    value, gradients = total(setpoint(acc=acc, quat=quat), np.zeros(3), params(mass=[0.04]))
     assert np.isfinite(value)
     assert all(np.all(np.isfinite(g)) for g in gradients)

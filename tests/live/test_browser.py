@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from browsing import NEAR, start_browser, wait_for
 
-from crazysim import Wind
+from crazysim import SlungLoad, Wind
 from crazysim.errors import ConfigError, RenderError
 from crazysim.live import Browser, Live, Pilot
 from crazysim.live.browser_scene import grid_offsets
 from crazysim.live.picture import PictureSource, quantities, quantity
+from crazysim.live.scene_bodies import SceneBodies
 from crazysim.media.web import FOV
 from crazysim.sim import Sim
 from crazysim.vehicles import Cars
@@ -95,7 +96,7 @@ SIZE = 4.0
 """Extent of the worlds of these tests, m: 2 m between the drones, and 1 m of margin on both sides."""
 
 
-def test_a_page_is_watched_and_used(viser, chromium, live):
+def test_a_page_is_watched_and_used(viser, chromium, live, caplog):
     pilot, clicked, values = Pilot(), [], []
     live.add(pilot)
     live.on_click = lambda live, world, point: clicked.append((world, point))
@@ -140,15 +141,56 @@ def test_a_page_is_watched_and_used(viser, chromium, live):
         press(chromium, "pause")
         wait_for(lambda: live.paused)
 
-        # The browser leaves and comes back; the loop does not care.
-        chromium.call("Page.navigate", url="about:blank")
-        wait_for(lambda: page.n_clients == 0)
+        # The browser leaves, which is reported, and comes back; the loop does not care.
+        with caplog.at_level(logging.INFO):
+            chromium.call("Page.navigate", url="about:blank")
+            wait_for(lambda: page.n_clients == 0 and "disconnected" in caplog.text)
+        assert f"browser 0 disconnected at {live.time:.2f} s" in caplog.text
         press_again = live.step
         live.post(lambda live: live.advance(5))
         wait_for(lambda: live.step == press_again + 5)
         chromium.call("Page.navigate", url=page.url)
         wait_for(lambda: page.n_clients == 1 and len(chromium.mask(MAGENTA)[0]) > 40, 120)
     assert not page.is_open
+
+
+def test_cars_and_loads_are_picked_and_lights_are_drawn(viser, chromium, plain_scene):
+    """Two worlds side by side, each with a drone, its load and a car."""
+    sim = Sim(n_worlds=2, control="state", xml_path=plain_scene)
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[...].set(np.array([0.0, 0.0, 1.5]))))
+    load = sim.add(SlungLoad(0.005, length=0.5))
+    sim.add(Cars(["Fleet1Tenth_0"], pos=(1.0, -0.5)))
+    live = Live(sim, fps=10)
+    live.paused = True
+    page = live.show(Browser(port=0, spacing=3.0, trail=0.5))
+    size = 3.0 + 2.0  # of the grid: the distance of the worlds, and 1 m of margin on both sides
+    with Running(live):
+        chromium.call("Page.navigate", url=page.url)
+        wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
+
+        def pick(point, expected):
+            place = pixel(chromium, point, size)
+            wait_for(lambda: (click(chromium, place), time.sleep(0.3), live.followed == expected)[-1])
+
+        pick([2.5, -0.5, 0.08], (1, "cars", 0))
+        wait_for(
+            lambda: chromium.value("[...document.querySelectorAll('input')].some(e => e.value === 'Fleet1Tenth_0')")
+        )
+        np.testing.assert_allclose(load.read(sim.data).pos[0, 0], [0.0, 0.0, 1.0], atol=1e-6)
+        pick([-1.5, 0.0, 1.0], (0, "load", 0))
+        assert live.selected == (0, 0), "the drone stays selected"
+        pick([1.5, 0.0, 1.5], (1, "drone", 0))
+        assert live.selected == (1, 0)
+
+        # The right drone shines in magenta, and is off again.
+        assert len(chromium.mask(MAGENTA)[0]) == 0
+        live.selected = None  # without the mark around it
+        live.lights[1, 0] = [1.0, 0.0, 1.0]
+        place = pixel(chromium, [1.5, 0.0, 1.5], size)
+        np.testing.assert_allclose(chromium.find(MAGENTA, place), place, atol=NEAR)
+        live.lights[:] = 0.0
+        wait_for(lambda: len(chromium.mask(MAGENTA)[0]) == 0)
 
 
 def test_a_port_in_use_is_named(viser, live, caplog):
@@ -191,7 +233,10 @@ def test_a_picture_has_what_is_drawn():
     live._commands.stage()
     live.select(1, 0)
     live.quantities["double"] = lambda live: 2.0
-    source = PictureSource(sim, [1, 2], contacts=True, wind=True)
+    live.lights[1] = [[2.0, 0.5, 0.0], [0.0, 0.0, 0.0]]
+    sim.scene.compile_if_edited()
+    bodies = SceneBodies(sim)
+    source = PictureSource(sim, bodies, [1, 2], contacts=True, wind=True)
     picture = source.take(live, "states.pos")
     np.testing.assert_allclose(picture.drones[0, 0], [0.3, 0.2, 1.0], atol=1e-6)
     np.testing.assert_allclose(picture.pos[:, np.asarray(sim.data.core.drone_mocap_ids)], picture.drones)
@@ -203,6 +248,14 @@ def test_a_picture_has_what_is_drawn():
     np.testing.assert_allclose(source.take(live, "double").plot, [2.0])
     assert "0.00 s" in picture.status
     assert picture.name == sim.drone_names[0]
+    np.testing.assert_allclose(picture.lights[0], [[1.0, 0.5, 0.0], [0.0, 0.0, 0.0]])
+    live.follow(2, "ball", 0)
+    picture = source.take(live, "states.pos")
+    assert (picture.followed, picture.name) == ((2, bodies.find("ball", 0).mocap), "ball")
+    assert picture.selected == (1, 0)
+    np.testing.assert_allclose(picture.plot, [0.3, 0.2, 1.0], atol=1e-6)  # of the selected drone
+    live.select(1, 0)
+    assert source.take(live).followed == (1, bodies.find("drone", 0).mocap)
     assert {"states.pos", "states.rotor_vel", "controls.state.cmd", "core.steps"} <= set(quantities(sim))
     np.testing.assert_allclose(quantity(sim.data, "states.pos", 2, 1)[2], 5.0)
     with pytest.raises(KeyError):

@@ -7,6 +7,7 @@ import pytest
 
 from crazysim import Sim
 from crazysim.errors import ConfigError
+from crazysim.live import Live, Viewer
 from crazysim.live.crazyflie_py import Crazyswarm, use
 from crazysim.live.crazyflie_py.uav_trajectory import Trajectory
 from crazysim.live.swarm import Swarm
@@ -162,3 +163,45 @@ def test_wrong_files(tmp_path):
         Trajectory().loadcsv(csv(tmp_path / "b.csv", [0.0], [0.0]))
     with pytest.raises(ConfigError, match="got 0 pieces"):
         Trajectory().path()
+
+
+class Lamp(Viewer):
+    """A viewer that keeps what it has shown of the lights."""
+
+    is_open = True
+
+    def __init__(self):
+        self.seen = []
+
+    def open(self, live):
+        pass
+
+    def update(self, live):
+        self.seen.append(live.lights[0].copy())
+
+    def close(self):
+        pass
+
+
+def test_scripts_advance_a_live_loop_whose_viewers_show_the_lights():
+    swarm = Swarm(Sim(n_drones=2, control="state"))
+    with Live(swarm.sim, speed="max") as live:
+        lamp = live.show(Lamp())
+        swarm.run_in(live)
+        script = Crazyswarm(swarm)
+        cfs, clock = script.allcfs.crazyflies, script.timeHelper
+        cfs[0].setLEDColor(1.0, 0.5, 0.0)
+        script.allcfs.takeoff(targetHeight=1.0, duration=2.0)
+        clock.sleep(3.0)
+        cfs[0].setParam("ring.solidRed", 0)
+        cfs[0].setParam("ring.solidGreen", 255)
+        clock.sleep(0.5)
+        clock.sleep(0.0)
+        np.testing.assert_allclose(cfs[1].position()[2], 1.0, atol=OFFSET + 0.05)
+        assert clock.time() == pytest.approx(3.5)
+        assert live.time == pytest.approx(3.5)
+    assert len(lamp.seen) > 5
+    np.testing.assert_allclose(lamp.seen[1], [[1.0, 0.5, 0.0], [0, 0, 0]])
+    np.testing.assert_allclose(live.lights[0], [[0.0, 1.0, 0.0], [0, 0, 0]])
+    with pytest.raises(ConfigError, match="loop of the swarm's simulation"):
+        swarm.run_in(Live(Sim(control="state")))

@@ -30,6 +30,7 @@ def line(begin, end, seconds=2.0):
     return Trajectory.of_pieces([seconds], c / seconds ** np.arange(8))
 
 
+RED, BLUE, OFF = (1, 0, 0), (0, 0, 1), (0, 0, 0)
 SETTLED = 0.12
 """Distance from the setpoint 2 s after a move, m: the integral of the default controller, wound up on the floor, decays
 slowly."""
@@ -90,13 +91,27 @@ def test_flight_by_commands(sim):
 
 def test_show_by_commands(sim):
     lines = [line((k, 0, 0.5), (k, 1, 1.0)) for k in range(2)]
-    show = Show(("a", "b"), Trajectory.stack(lines), Lights.stack([Lights.constant()] * 2))
+    show = Show(("a", "b"), Trajectory.stack(lines), Lights.stack([Lights.of_pieces([0, 1], [RED, BLUE])] * 2))
     fleet = Fleet(sim, max_pieces=8)
     assert fleet.apply([StartShow()]) == 0  # nothing to start
     fleet.apply([LoadShow(show)])
     np.testing.assert_allclose(pos(sim)[:2], [[0, 0, 0.5], [1, 0, 0.5]])  # as the lab's simulator does
     sim.step(250)
+    np.testing.assert_array_equal(fleet.colors(), np.zeros((3, 3)))  # the show has not started
     assert fleet.apply([StartShow()]) == 1
+    np.testing.assert_array_equal(fleet.colors(), [RED, RED, OFF])
+    sim.step(600)
+    np.testing.assert_array_equal(fleet.colors(), [BLUE, BLUE, OFF])  # 1.2 s later
+    fleet.reset()
+    np.testing.assert_array_equal(fleet.colors(), np.zeros((3, 3)))
+
+
+def test_show_flies_by_commands(sim):
+    lines = [line((k, 0, 0.5), (k, 1, 1.0)) for k in range(2)]
+    fleet = Fleet(sim, max_pieces=8)
+    fleet.apply([LoadShow(Show(("a", "b"), Trajectory.stack(lines), Lights.stack([Lights.constant()] * 2)))])
+    sim.step(250)
+    fleet.apply([StartShow()])
     np.testing.assert_allclose(fleet.setpoint(0)[:3], [0, 0, 0.5])
     sim.step(1500)
     np.testing.assert_allclose(pos(sim)[:2], [[0, 1, 1], [1, 1, 1]], atol=SETTLED)

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import textwrap
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,10 @@ from screens import screen_pixels, virtual_screen
 
 from crazysim.errors import ConfigError, RenderError
 from crazysim.live import Live, Window
+from crazysim.live.scene_bodies import SceneBodies
+from crazysim.live.window_program import Leds, Program
 from crazysim.sim import Sim
+from crazysim.vehicles import Cars
 
 
 @pytest.fixture(scope="module")
@@ -114,3 +118,39 @@ def test_a_screen_that_cannot_be_reached_is_refused(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":54321")
     with Live(Sim()) as live, pytest.raises(RenderError, match="can open a window"):
         live.show(Window())
+
+
+def test_leds_have_the_colours_of_the_picture():
+    model = Sim(n_drones=2).mj_model
+    before = model.mat_rgba.copy()
+    leds = Leds(model)
+    leds.color(np.array([[0.0, 0.0, 0.0], [0.2, 0.6, 0.0]]))
+    for name in ("led_top", "led_bot"):
+        np.testing.assert_allclose(model.material(f"{name}:1").rgba, [0.2, 0.6, 0.0, 1.0])
+        assert model.material(f"{name}:1").emission[0] == pytest.approx(0.6)
+    changed = np.flatnonzero((model.mat_rgba != before).any(-1))
+    assert {model.material(int(k)).name for k in changed} == {"led_top:1", "led_bot:1"}
+    leds.color(np.zeros((2, 3)))
+    np.testing.assert_array_equal(model.mat_rgba, before)
+
+
+def test_a_double_click_reports_the_body_below_it():
+    """A wheel is its car, and what does not move is the ground."""
+    sim = Sim(n_drones=2, control="state")
+    sim.add(Cars(2))
+    sim.scene.compile_if_edited()
+    program, said = Program.__new__(Program), []
+    program._model, program._bodies = sim.mj_model, SceneBodies(sim)
+    program._say = lambda *message: said.append(message)
+    picture = SimpleNamespace(worlds=np.array([3, 5]))
+
+    def geom_of(body):
+        return int(sim.mj_model.body_geomadr[sim.mj_model.body(body).id])
+
+    for body in ("cars_wheel:7", "cars:0", "drone:1"):
+        program._report(picture, (1, geom_of(body), np.zeros(3)))
+    program._report(picture, (0, geom_of("world"), np.array([1.0, 2.0, 0.0])))
+    program._report(picture, None)
+    assert said == [
+        ("follow", 5, "cars", 1), ("follow", 5, "cars", 0), ("follow", 5, "drone", 1), ("click", 3, [1.0, 2.0, 0.0]),
+    ]  # fmt: skip

@@ -315,10 +315,12 @@ def test_commands_of_the_network_and_resets():
         live.at(0.1, lambda live: queue._put(TakeOff(None, 0.5)) if live.flown < 50 else None)
         live.run(3.0)
         np.testing.assert_allclose(sim.data.states.pos[0, :, 2], 0.5, atol=0.15)
+        live.lights[:] = 1.0
         live.reset()
         live.run(1.0)
         assert np.asarray(sim.data.states.pos[0, :, 2]).max() < 0.15
         np.testing.assert_allclose(fleet.setpoint(0)[:3], [-0.5, -0.5, 0], atol=1e-6)
+        np.testing.assert_array_equal(live.lights, 0.0)  # of a fleet without a show
 
 
 def test_other_command_levels(live):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from crazysim import Sim
-from crazysim.live import FunctionSource, Live, RealTimeSource, Swarm, ThreadSource, Twin, Twins
+from crazysim.live import FunctionSource, Live, MocapSource, RealTimeSource, Swarm, ThreadSource, Twin, Twins
+from crazysim.live.mocap import Frame, Poll
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
@@ -51,3 +52,58 @@ def test_the_loop_drives_twins_and_swarms_and_waits_for_no_source():
     assert "2.0" in str(report)
     for part in twins:
         part.close()
+
+
+class Hostile(MocapSource):
+    """A source that does, each once and at a time of its own, everything that a source should not do."""
+
+    name, simulated = "hostile", True
+
+    def poll(self, step, freq):
+        now = step / freq
+        stamp, names, pos = now, ("a", "b"), np.array([[0.1 * now, 3, 1], [0, 4, 1]])
+        match round(100 * now):
+            case 50:
+                stamp = now - 0.01  # repeats
+            case 60:
+                stamp = now - 0.05  # goes back in time
+            case 70:
+                pos[0, 0] += 5.0  # jumps
+            case 80:
+                pos[1, 2] = np.nan
+            case 90:
+                stamp = np.nan
+            case 100:
+                names = ("a", "ghost")  # nobody knows
+            case 110:
+                names = ("b", "b")
+            case k if k >= 120:
+                return Poll(now, [])  # stops
+        return Poll(now, [Frame(stamp, names, pos, np.tile(LEVEL, (2, 1)), now)])
+
+
+def test_everything_that_a_source_does_wrong_is_reported_by_name_and_time(caplog):
+    """And the rest continues: drones hold their setpoints, and bodies that are measured well follow."""
+    sim = Sim(n_drones=1, control="state")
+    sim.scene.add("box", "wall", pos=[5, 5, 0])
+    twins = Twins(sim, Hostile(), {"": Twin("box", {"size": (0.1, 0.1, 0.1)})}, ["a", "b"])
+    xs = []
+    with Live(sim, control_freq=100, speed="max") as live:
+        live.command[..., 2] = 1.0
+        live.add(twins, on_error="report")
+        live.add(lambda _: xs.append(twins.pose("a")[0][0]))
+        report = live.run(seconds=2.0)
+    assert report.steps == 200
+    assert report.failures == 0
+    found = [(r.kind, r.name, round(r.time, 2)) for r in twins.reports.latest if r.kind not in ("dropped", "late")]
+    assert found == [
+        ("repeated", "hostile", 0.49), ("backwards", "hostile", 0.55), ("jumped", "a", 0.70),
+        ("invalid", "b", 0.80), ("invalid", "hostile", 0.90), ("unknown", "ghost", 1.00),
+        ("duplicate", "b", 1.10), ("stalled", "hostile", 1.40),
+    ]  # fmt: skip
+    for kind, name, at in found:
+        assert f"{name} {kind} at {at:.3f} s" in caplog.text
+    np.testing.assert_allclose(xs[119], 0.119, atol=1e-6)
+    assert np.abs(np.diff(xs)).max() < 0.01, "no jump and no NaN reaches the scene"
+    np.testing.assert_allclose(xs[-1], 0.119, atol=1e-6)  # it stays where it was seen last
+    np.testing.assert_allclose(sim.data.states.pos[0, 0, 2], 1.0, atol=0.2)  # it has just risen there

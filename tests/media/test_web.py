@@ -13,7 +13,8 @@ import pytest
 from browsing import NEAR, Browser, start_browser, wait_for
 
 from crazysim.__main__ import main
-from crazysim.media import Recorder
+from crazysim.errors import RenderError
+from crazysim.media import Recorder, web
 from crazysim.media.web import FOV, camera_of, page
 from crazysim.sim import Sim
 
@@ -153,3 +154,33 @@ def test_without_viser_the_extra_is_named(flight, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ImportError, match=r"pip install 'crazysim\[web\]'"):
         page(flight)
+
+
+class Served:
+    """A stand-in for a server of pages that ends at once."""
+
+    server_port = 8123
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def serve_forever(self):
+        raise KeyboardInterrupt
+
+
+def test_a_served_page_says_who_can_watch(monkeypatch, capsys):
+    monkeypatch.setattr(web, "server_of", lambda html, port, host: Served())
+    web.serve_page("", 0)
+    assert capsys.readouterr().out == "serving the flight at http://127.0.0.1:8123; stop with Ctrl-C\n"
+    web.serve_page("", 0, "0.0.0.0")
+    assert "every machine of that network can watch" in capsys.readouterr().out
+
+
+def test_a_port_in_use_is_named():
+    with web.server_of("", 0) as server:
+        assert server.server_address[0] == "127.0.0.1"
+        with pytest.raises(RenderError, match=f"expected a free address, got 127.0.0.1:{server.server_port}"):
+            web.server_of("", server.server_port)

@@ -1,3 +1,4 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -6,15 +7,18 @@ from hypothesis import strategies as st
 from scipy.interpolate import BPoly, CubicSpline, make_interp_spline
 
 from crazysim import ConfigError
-from crazysim.trajectories import of_bezier, spline
+from crazysim.trajectories import Trajectory, of_bezier, spline
 
 RNG = np.random.default_rng(5)
 TIMES = np.array([0.0, 0.7, 1.0, 2.5, 3.1, 4.0])
 POINTS = RNG.normal(size=(6, 3))
 
 
+evaluate = jax.jit(jax.vmap(Trajectory.evaluate, in_axes=(None, 0)))
+
+
 def positions(trajectory, times):
-    return np.stack([trajectory.evaluate(t).pos for t in times])
+    return evaluate(trajectory, times).pos
 
 
 @pytest.mark.parametrize("degree", [3, 5, 7])
@@ -24,9 +28,9 @@ def test_a_spline_at_rest_is_that_of_scipy(degree, x64):
     trajectory = spline(TIMES, POINTS, degree)
     times = np.linspace(0, 4, 23)
     np.testing.assert_allclose(positions(trajectory, times), expected(times), atol=1e-9)
-    setpoint = trajectory.evaluate(1.7)
+    setpoint = evaluate(trajectory, times)
     for k, value in enumerate([setpoint.vel, setpoint.acc, setpoint.jerk], start=1):
-        np.testing.assert_allclose(value, expected.derivative(k)(1.7), rtol=1e-7)
+        np.testing.assert_allclose(value[10], expected.derivative(k)(times[10]), rtol=1e-7)
 
 
 def test_a_natural_spline_is_that_of_scipy(x64):
@@ -38,14 +42,13 @@ def test_a_natural_spline_is_that_of_scipy(x64):
 @pytest.mark.parametrize("start", [-2.0, 5.0])
 def test_the_first_time_is_the_start(start):
     trajectory = spline(TIMES + start, POINTS)
-    np.testing.assert_allclose(trajectory.evaluate(0.7).pos, POINTS[1], atol=1e-5)
+    np.testing.assert_allclose(positions(trajectory, np.array([0.7])), POINTS[1:2], atol=1e-5)
     assert float(trajectory.duration) == 4.0
 
 
 def test_yaw_turns_the_shorter_way(x64):
     trajectory = spline([0.0, 1.0], [[0, 0, 1], [1, 0, 1]], 3, yaw=[3.0, -3.0])
-    np.testing.assert_allclose(trajectory.evaluate(1.0).yaw, [2 * np.pi - 3.0])
-    np.testing.assert_allclose(trajectory.evaluate(0.5).yaw, [np.pi])
+    np.testing.assert_allclose(evaluate(trajectory, np.array([1.0, 0.5])).yaw, [[2 * np.pi - 3.0], [np.pi]])
 
 
 @given(
@@ -57,15 +60,16 @@ def test_bezier_curves_are_those_of_scipy(counts, n_axes, seed):
     rng = np.random.default_rng(seed)
     curves = [rng.uniform(-3, 3, (count, n_axes)) for count in counts]
     ends = np.cumsum(rng.uniform(0.1, 3.0, len(counts)))
-    trajectory = of_bezier(ends, curves)
-    for curve, begin, end in zip(curves, np.concatenate([[0.0], ends[:-1]]), ends, strict=True):
-        t = begin + 0.4 * (end - begin)
+    begins = np.concatenate([[0.0], ends[:-1]])
+    times = begins + 0.4 * (ends - begins)
+    padded = Trajectory.stack([of_bezier(ends, curves), of_bezier(np.arange(1.0, 5.0), [np.ones((8, 4))] * 4)])
+    setpoints = evaluate(jax.tree.map(lambda x: x[0], padded), np.resize(times, 4))
+    values = np.concatenate([setpoints.pos, setpoints.yaw], axis=1)[:, :n_axes]
+    rates = np.concatenate([setpoints.vel, setpoints.yaw_rate], axis=1)[:, :n_axes]
+    for k, (curve, begin, end) in enumerate(zip(curves, begins, ends, strict=True)):
         expected = BPoly(curve[:, None], [begin, end])
-        setpoint = trajectory.evaluate(t)
-        value = np.concatenate([setpoint.pos, setpoint.yaw])[:n_axes]
-        np.testing.assert_allclose(value, expected(t), atol=2e-5)
-        rate = np.concatenate([setpoint.vel, setpoint.yaw_rate])[:n_axes]
-        np.testing.assert_allclose(rate * (end - begin), expected(t, 1) * (end - begin), atol=5e-4)
+        np.testing.assert_allclose(values[k], expected(times[k]), atol=2e-5)
+        np.testing.assert_allclose(rates[k] * (end - begin), expected(times[k], 1) * (end - begin), atol=5e-4)
 
 
 def test_bezier_without_yaw_faces_along_x():

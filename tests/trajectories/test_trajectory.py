@@ -18,6 +18,8 @@ pytestmark = pytest.mark.usefixtures("x64")
 DERIVATIVES = ("pos", "vel", "acc", "jerk", "snap")
 YAW = ("yaw", "yaw_rate", "yaw_acc")
 evaluate = jax.jit(jax.vmap(Trajectory.evaluate, in_axes=(None, 0)))
+at = jax.jit(Trajectory.evaluate)
+slopes_at = jax.jit(jax.jacfwd(Trajectory.evaluate, argnums=1))
 
 
 def random_pieces(n_pieces=5, degree=7, seed=0):
@@ -116,8 +118,7 @@ def test_moving_turns_and_shifts_positions_and_turns_derivatives(traced):
 @given(t=st.floats(-5, 20), repeats=st.booleans())
 def test_each_derivative_is_the_gradient_of_the_one_before(t, repeats):
     trajectory = Trajectory.of_pieces(*random_pieces(), repeats=repeats)
-    s = trajectory.evaluate(t)
-    slopes = jax.jacfwd(trajectory.evaluate)(jnp.asarray(t))
+    s, slopes = at(trajectory, t), slopes_at(trajectory, t)
     for low, high in [*pairwise(DERIVATIVES), *pairwise(YAW)]:
         np.testing.assert_allclose(getattr(slopes, low), getattr(s, high), rtol=1e-9, atol=1e-9)
 
@@ -125,7 +126,7 @@ def test_each_derivative_is_the_gradient_of_the_one_before(t, repeats):
 def test_it_is_linear_in_its_coefficients_and_has_their_gradient():
     durations, c = random_pieces()
     trajectory = Trajectory.of_pieces(durations, c)
-    grad = jax.grad(lambda c: trajectory.replace(coefficients=c).evaluate(durations[0] + 0.1).pos[1])(
+    grad = jax.jit(jax.grad(lambda c: trajectory.replace(coefficients=c).evaluate(durations[0] + 0.1).pos[1]))(
         jnp.asarray(trajectory.coefficients)
     )
     expected = np.zeros_like(c)
@@ -143,7 +144,7 @@ def test_float32_keeps_a_minute_of_long_pieces_to_a_hundredth_of_a_millimetre():
     with jax.enable_x64(False):
         trajectory = Trajectory.of_pieces([t_end], c)
         assert trajectory.coefficients.dtype == np.float32
-        s = jax.vmap(trajectory.evaluate)(t.astype(np.float32))
+        s = jax.jit(jax.vmap(trajectory.evaluate))(t.astype(np.float32))
         assert s.snap.dtype == np.float32
         np.testing.assert_allclose(s.pos, exact, atol=1e-5)
 
@@ -177,7 +178,7 @@ def test_coefficients_that_are_not_finite_are_refused():
 def test_derivatives_up_to_an_order_are_those_of_the_setpoint(order):
     trajectory = Trajectory.of_pieces(*random_pieces(n_pieces=20))
     times = np.linspace(-0.5, float(trajectory.duration) + 0.5, 60)
-    found = jax.vmap(lambda t: jnp.stack(trajectory.derivatives(t, order)))(times)
+    found = np.asarray(jax.jit(jax.vmap(lambda t: jnp.stack(trajectory.derivatives(t, order))))(times))
     setpoints = evaluate(trajectory, times)
     assert found.shape == (60, order + 1, 4)
     for k in range(order + 1):

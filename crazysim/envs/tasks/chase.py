@@ -20,7 +20,7 @@ from crazysim.envs.tasks.touch_down import Landing, TouchDown, not_yet
 from crazysim.errors import ConfigError
 from crazysim.sim.sim import Sim
 from crazysim.vehicles import Cars
-from crazysim.vehicles.cars import CarData
+from crazysim.vehicles.car_data import CarData
 from crazysim.vehicles.model import load_vehicle
 
 CARS, VEHICLE = "cars", "f1tenth_ros"

@@ -23,7 +23,7 @@ from crazysim.payloads import Hook
 from crazysim.pytree import leaf
 from crazysim.sim.sim import Sim
 from crazysim.vehicles import Cars
-from crazysim.vehicles.cars import CarData
+from crazysim.vehicles.car_data import CarData
 from crazysim.vehicles.model import load_vehicle
 from crazysim.vehicles.state import to_world
 from crazysim.vehicles.trailer import trailer_axles

@@ -43,7 +43,8 @@ class Frame:
             quat = np.array([q for _, q in bodies.values()], float).reshape(len(bodies), 4)
         except (TypeError, ValueError) as error:
             raise ConfigError(
-                f"expected a position of 3 and an attitude of 4 numbers for each body, got {error}"
+                f"expected a position of 3 and an attitude of 4 numbers for each body, got {error}. Use "
+                f"{{'cf1': ((x, y, z), (qx, qy, qz, qw))}}."
             ) from None
         return Frame(float(stamp), tuple(bodies), pos, quat, float(stamp if received is None else received))
 
@@ -67,7 +68,8 @@ class Convention:
         if self.up not in ("y", "z") or self.quat not in ("xyzw", "wxyz") or not 0 < self.unit < np.inf:
             raise ConfigError(
                 f"expected up as 'y' or 'z', quat as 'xyzw' or 'wxyz' and a positive unit, got {self.up!r}, "
-                f"{self.quat!r} and {self.unit!r}"
+                f"{self.quat!r} and {self.unit!r}. Use Convention('y', 'xyzw', 0.001) for millimetres with y up, for "
+                f"example."
             )
 
     def to_world(self, pos: Any, quat: Any) -> tuple[NDArray, NDArray]:

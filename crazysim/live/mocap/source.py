@@ -84,7 +84,7 @@ class FunctionSource(MocapSource):
             ConfigError: If the rate is not positive.
         """
         if not 0 < freq < np.inf:
-            raise ConfigError(f"expected a positive number of frames per second, got {freq!r}")
+            raise ConfigError(f"expected a positive number of frames per second, got {freq!r}. Use freq=120.")
         self.name, self.freq = name, float(freq)
         self._function, self._convention, self._next = function, convention or Convention(), 0
 
@@ -118,7 +118,10 @@ def show_source(
     given = paths_of(trajectories)
     names = [f"vcf{k}" for k in range(len(given))] if names is None else list(names)
     if len(names) != len(given) or len(set(names)) < len(names):
-        raise ConfigError(f"expected {len(given)} different names, one for each trajectory, got {names}")
+        raise ConfigError(
+            f"expected {len(given)} different names, one for each trajectory, got {names}. Leave them out for vcf0, "
+            f"vcf1, ..."
+        )
 
     def bodies(stamp: float) -> dict[str, tuple[Any, Any]]:
         points = [path.at(stamp) for path in given]

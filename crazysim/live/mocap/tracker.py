@@ -73,7 +73,7 @@ class Tracker:
             ConfigError: If a name is there twice.
         """
         if len(set(names)) < len(names):
-            raise ConfigError(f"expected different names, got {list(names)}")
+            raise ConfigError(f"expected different names, got {list(names)}. List each body once.")
         n = len(names)
         self.names, self.rules, self.source = tuple(names), rules or Rules(), source
         self.reports = Reports()

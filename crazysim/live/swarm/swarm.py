@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +20,9 @@ from crazysim.live.mocap.frames import rotate, to_rpy
 from crazysim.live.mocap.reports import Reports
 from crazysim.live.swarm.commander import Commander
 from crazysim.sim.sim import Sim
+
+if TYPE_CHECKING:
+    from crazysim.live.loop import Live
 
 GRAVITY = 9.81
 """Standard acceleration of accelerometers' readings, m/s^2."""
@@ -55,7 +58,8 @@ class Swarm(Closing):
         swarm.advance(3.0)
 
     Commands come from other threads or from the same one; ``lock`` protects them. The simulation advances by
-    ``advance``, by ``start`` in real time, or by a loop that calls the swarm, such as ``Live.add(swarm)``.
+    ``advance``, by ``start`` in real time, by a loop that calls the swarm, such as ``Live.add(swarm)``, or by a loop
+    that ``advance`` runs, after ``run_in(live)``.
     """
 
     reports: Reports
@@ -92,6 +96,7 @@ class Swarm(Closing):
         self._home = np.asarray(sim.data.states.pos[0], float)
         self._thread: threading.Thread | None = None
         self._stopped = threading.Event()
+        self._live: Live | None = None
         self._read()
         self._write()
 
@@ -127,12 +132,27 @@ class Swarm(Closing):
     def __call__(self, live: Any) -> None:
         """Stage the commands in force, for a loop such as ``Live``, which has the simulation as ``live.sim``.
 
+        Viewers show the colours where the loop has ``lights``, as ``Live`` has.
+
         Raises:
             ConfigError: If it is another simulation.
         """
         if live.sim is not self.sim:
             raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
         self.update()
+        if hasattr(live, "lights"):
+            live.lights[0] = self.colors
+
+    def run_in(self, live: Live) -> None:
+        """Let ``advance`` and ``sleep`` run a live loop, which keeps its speed and shows its viewers.
+
+        Raises:
+            ConfigError: If it is the loop of another simulation.
+        """
+        if live.sim is not self.sim:
+            raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
+        live.add(self, name="swarm")
+        self._live = live
 
     def update(self) -> None:
         """Read the states and stage the commands in force, between two control steps."""
@@ -143,16 +163,20 @@ class Swarm(Closing):
                 listener()
 
     def advance(self, seconds: float) -> None:
-        """Advance by a number of control steps, as many as reach a time, s, as fast as possible.
+        """Advance by a number of control steps, as many as reach a time, s, as fast as possible or by ``run_in``.
 
         Raises:
             ConfigError: If a thread advances the simulation.
         """
         if self._thread is not None:
             raise ConfigError("expected a swarm that no thread advances, got a running one. Use sleep.")
-        for _ in range(max(round(seconds * self.sim.freq / self._period), 0)):
-            self.update()
-            self.sim.step(self._period)
+        if self._live is not None:
+            if seconds > 0:
+                self._live.run(seconds)
+        else:
+            for _ in range(max(round(seconds * self.sim.freq / self._period), 0)):
+                self.update()
+                self.sim.step(self._period)
         with self.lock:
             self._read()
 

@@ -1,0 +1,66 @@
+"""Trails in a browser: the recent positions of bodies, as one set of line segments."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.media.trail import MIN_ALPHA
+
+TRAIL_PERIOD = 0.05
+"""Time between two samples of a trail, s."""
+FLOOR_GREY = 0.8
+"""Grey that trails fade to, 0 to 1."""
+
+
+class Trails:
+    """The recent positions of all bodies, as one set of line segments of constant size."""
+
+    def __init__(self, scene: Any, pos: NDArray, colors: NDArray, seconds: float):
+        """Begin with trails of no length.
+
+        Args:
+            scene: Scene of viser.
+            pos: Positions of all bodies, m. (n, 3)
+            colors: Their colours, 0 to 1. (n, 3)
+            seconds: Duration, s.
+        """
+        self._length = max(round(seconds / TRAIL_PERIOD), 1)
+        self._samples: deque[NDArray] = deque(maxlen=self._length)
+        self._last = -np.inf
+        pos = finite_rows(pos)
+        fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]  # towards the floor, as lines are opaque
+        shades = np.round(255 * (FLOOR_GREY - fade * (FLOOR_GREY - colors))).astype(np.uint8)
+        self._handle = scene.add_line_segments(
+            "/world/trails", self._segments(pos), np.repeat(shades.reshape(-1, 1, 3), 2, axis=1), thickness=2.0,
+            thickness_units="screen",
+        )  # fmt: skip
+
+    def update(self, time: float, pos: NDArray, visible: bool) -> None:
+        """Add a sample if one is due, and show the trails up to the present positions; a jump in time clears them."""
+        self._handle.visible = visible
+        if time < self._last:
+            self._samples.clear()
+            self._last = -np.inf
+        if time - self._last < TRAIL_PERIOD:
+            return
+        self._samples.append(pos)
+        self._last = time
+        if visible:
+            self._handle.points = self._segments(pos)
+
+    def _segments(self, pos: NDArray) -> NDArray:
+        """Return segments, oldest first, padded at the beginning. (length * n, 2, 3)"""
+        path = [*self._samples, pos]
+        path = [path[0]] * (self._length + 1 - len(path)) + path
+        points = np.stack(path[-self._length - 1 :])
+        return np.stack([points[:-1], points[1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
+
+
+def finite_rows(values: NDArray, rest: Any = 0.0) -> NDArray:
+    """Return rows of numbers, with those that are not finite replaced."""
+    bad = ~np.isfinite(values).all(-1, keepdims=True)
+    return np.where(bad, np.asarray(rest, float), values)

@@ -1,0 +1,77 @@
+"""Light shows in a live simulation, with lights."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from crazysim.errors import ConfigError
+from crazysim.live.browser import Browser
+from crazysim.live.loop import Live
+from crazysim.live.pace import Speed
+from crazysim.live.window import Window
+from crazysim.shows.flight import at_start, planned_at
+from crazysim.shows.view import camera_around
+from crazysim.trajectories.files.show import Show
+
+if TYPE_CHECKING:
+    from argparse import Namespace
+
+
+LIGHT_FREQ = 50
+"""Rate at which the LEDs change, Hz."""
+
+
+class ShowLights:
+    """Process that lights the drones' LEDs as a show has them: ``live.add(ShowLights(show))``."""
+
+    def __init__(self, show: Show):
+        """Take the lights of a show, whose first drone is the simulation's first."""
+        self._lights, self._n = show.lights, show.n_drones
+
+    def __call__(self, live: Live) -> None:
+        """Set the colours of this moment, the same in all worlds."""
+        live.lights[:, : self._n] = self._lights.colors([live.time])[0]
+
+
+def live_show(show: Show, speed: Speed = 1.0, **settings: Any) -> Live:
+    """Return a live simulation of a show; ``show`` a viewer and ``run`` it.
+
+        with live_show(load_show("my_show.skyc")) as live:
+            live.show(Browser())
+            live.run()
+
+    Args:
+        show: Show, whose drones start hovering at the first points of their trajectories.
+        speed: Simulated seconds per second, or ``"max"``.
+        settings: Further settings of ``Sim``, such as ``drone`` and ``controller``.
+
+    Raises:
+        ConfigError: If a setting is invalid.
+    """
+    sim = at_start(show, settings)
+    live = Live(sim, speed=speed)
+    live.add(ShowLights(show), freq=LIGHT_FREQ, name="lights")
+    return live
+
+
+def run_live(show: Show, options: Namespace, **settings: Any) -> None:
+    """Run ``crazysim show --live``, and print the figures.
+
+    Raises:
+        ConfigError: If a setting is invalid, or a file is to be written.
+        RenderError: If this machine cannot show a viewer, or a port is in use.
+    """
+    written = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
+    if written is not None:
+        raise ConfigError(f"expected --live or --{written}, got both. Leave one out.")
+    with live_show(show, **settings) as live:
+        if options.window:
+            planned = planned_at(show.trajectories, jnp.linspace(0.0, show.duration, 50))
+            live.show(Window(cam_config=camera_around(np.asarray(planned))))
+        if options.browser:
+            print(f"open {live.show(Browser(options.port, options.host)).url}; stop with Ctrl-C", flush=True)
+        seconds = show.duration if options.seconds is None else min(options.seconds, show.duration)
+        print(live.run(seconds))
