@@ -11,6 +11,7 @@ from crazysim.engine import passes
 from crazysim.engine.layout import as_rows, pack_shared
 from crazysim.engine.lower_stages import Zeros, lower_stages
 from crazysim.engine.program import Program
+from crazysim.engine.tracing import Tracer
 
 
 def build_program(
@@ -24,6 +25,7 @@ def build_program(
     rows: Callable[[list[int]], list[int]] | None = None,
     population: str = "drone",
     pack: bool = True,
+    tracer: Tracer | None = None,
 ) -> Program:
     """Return the program of a step, ready for an engine.
 
@@ -38,8 +40,9 @@ def build_program(
         rows: From the leaves that are written to those that are stored as rows of one number of all drones each.
         population: Population whose members are computed side by side.
         pack: True to read shared numbers from one leaf.
+        tracer: Traces the stages; None for a new one.
     """
-    program = lower_stages(stages, data, zeros, watched, first, last, scratch, population)
+    program = lower_stages(stages, data, zeros, watched, first, last, scratch, population, tracer)
     then: list[passes.Pass] = [passes.fuse, passes.join_ticks, passes.hoist, *([pack_shared] if pack else [])]
     if rows is not None:
         stored = functools.partial(as_rows, select=rows)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 
 from crazysim.core.stage import Axes, Stage
-from crazysim.engine.tracing import TracedStage
+from crazysim.engine.tracing import TracedStage, Tracer
 from crazysim.pytree import has_members
 
 
@@ -36,7 +36,7 @@ class _Access(NamedTuple):
         return self.read | self.written
 
 
-def independent(stages: Sequence[Stage], data: Any) -> list[Group]:
+def independent(stages: Sequence[Stage], data: Any, tracer: Tracer) -> list[Group]:
     """Return the groups of populations that do not depend on each other, that of the drones first.
 
     Two stages depend on each other if one reads or writes what the other writes. Stages of worlds alone, such as the
@@ -45,11 +45,12 @@ def independent(stages: Sequence[Stage], data: Any) -> list[Group]:
     Args:
         stages: Stages of a step, in order.
         data: Data of the simulation, or its shapes and types.
+        tracer: Traces the stages.
     """
     axes, leaves = Axes(data), jax.tree.leaves(data)
     if all(scope == "drone" or not has_members(scope) for scope in axes.scopes):
         return [Group("drone", tuple(stages), None)]
-    access = [_access(stage, axes, leaves) for stage in stages]
+    access = [_access(tracer(stage, axes, leaves), stage, axes) for stage in stages]
     clocks = _clocks(access, axes)
     members = {scope: x.shape[1] for scope, x in zip(axes.scopes, leaves, strict=True) if has_members(scope)}
     parts = _components([k for k in range(len(stages)) if k not in clocks], access)
@@ -68,8 +69,7 @@ def independent(stages: Sequence[Stage], data: Any) -> list[Group]:
     return groups
 
 
-def _access(stage: Stage, axes: Axes, leaves: Sequence[Any]) -> _Access:
-    traced = TracedStage(stage, axes, leaves)
+def _access(traced: TracedStage, stage: Stage, axes: Axes) -> _Access:
     populations = {axes.scopes[i] for i in traced.written if has_members(axes.scopes[i])}
     populations |= {stage.scope} if stage.scope in axes.scopes and has_members(stage.scope) else set()
     return _Access(frozenset(traced.used), frozenset(traced.written), frozenset(populations))

@@ -17,7 +17,7 @@ from crazysim.engine.ir import Builder, Element, Value, constant, prune
 from crazysim.engine.lower import Elements, Entry, Lowering, as_elements, inputs, scalars
 from crazysim.engine.program import TABLE, Leaf, Phase, Program, Segment, Slot, UnfusedStage
 from crazysim.engine.relative import RelativeAxes, viewed
-from crazysim.engine.tracing import TracedStage
+from crazysim.engine.tracing import TracedStage, Tracer
 from crazysim.jaxcompat import equations, is_key
 
 MAX_UNROLLED_DRONES = 8
@@ -36,6 +36,7 @@ def lower_stages(
     last: Sequence[Stage] = (),
     scratch: Collection[int] = (),
     population: str = "drone",
+    tracer: Tracer | None = None,
 ) -> Program:
     """Return the program of a step, each stage a segment of its own.
 
@@ -50,7 +51,9 @@ def lower_stages(
         last: Stages that run once, after the last step.
         scratch: Leaves that only carry numbers from one stage to another; what is written there is not kept.
         population: Population whose members are computed side by side; below they are called drones.
+        tracer: Traces the stages; None for a new one.
     """
+    tracer = tracer or Tracer()
     axes = RelativeAxes(data, population)
     leaves = viewed(axes.views, jax.tree.leaves(data))
     zeros = zeros or {}
@@ -58,7 +61,7 @@ def lower_stages(
     segments = []
     phases: dict[Phase, Sequence[Stage]] = {"first": first, "each": stages, "last": last}
     for phase, some in phases.items():
-        segments += [_lower_stage(axes.stage(stage), phase, axes, leaves, zeros, n_drones) for stage in some]
+        segments += [_lower_stage(axes.stage(stage), phase, axes, leaves, zeros, n_drones, tracer) for stage in some]
     described = tuple([
         Leaf(name, scope, tuple(x.shape), x.dtype)
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
@@ -75,12 +78,18 @@ def lower_stages(
 
 
 def _lower_stage(
-    stage: Stage, phase: Phase, axes: RelativeAxes, leaves: Sequence[Any], zeros: Zeros, n_drones: int
+    stage: Stage,
+    phase: Phase,
+    axes: RelativeAxes,
+    leaves: Sequence[Any],
+    zeros: Zeros,
+    n_drones: int,
+    tracer: Tracer,
 ) -> Segment | UnfusedStage:
     try:
         if stage.scope == "batch":
             raise LimitError("it is not declared for one drone or one world")
-        traced = TracedStage(stage, axes, leaves)
+        traced = tracer(stage, axes, leaves)
         # Where no leaf of a drone takes part, every drone can do it for its world.
         of_drones = any(axes.scopes[i] == "drone" for i in (*traced.used, *traced.written))
         scope: Literal["drone", "world"] = "world" if stage.scope == "world" and of_drones else "drone"

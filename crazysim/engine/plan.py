@@ -33,6 +33,7 @@ from crazysim.engine.flat import Zeros
 from crazysim.engine.groups import Group, independent
 from crazysim.engine.program import Program
 from crazysim.engine.relative import on_data
+from crazysim.engine.tracing import Tracer
 from crazysim.errors import ConfigError
 from crazysim.pytree import n_batch_axes, scopes
 
@@ -132,9 +133,12 @@ class Planner(NamedTuple):
         kinds = jax.tree.leaves(scopes(data))
         # Zeros that a caller found earlier may belong to a parameter that was shared then and is one per drone now.
         known = {i: some for i, some in zeros if kinds[i] == "shared"}
-        groups = independent(self.stages, data)
+        tracer = Tracer()
+        groups = independent(self.stages, data, tracer)
         programs = tuple([
-            build_program(group.stages, data, known, _watched, population=group.population, pack=k == 0)
+            build_program(
+                group.stages, data, known, _watched, population=group.population, pack=k == 0, tracer=tracer
+            )
             for k, group in enumerate(groups)
         ])  # fmt: skip
         split = [stage for program in programs for stage in program.unfused_stages]

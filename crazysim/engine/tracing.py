@@ -51,6 +51,22 @@ class TracedStage:
             dump.write(f"{stage.__name__}.jaxpr", f"{self.fn}\n" + (f"\nwhen\n{self.when}\n" if has_mask else ""))
 
 
+class Tracer:
+    """Stages as jaxprs; a stage that is met again, with leaves of the same shapes and types, is not traced again."""
+
+    def __init__(self) -> None:
+        """Begin without any stage."""
+        self._found: dict[Any, TracedStage] = {}
+
+    def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:
+        """Return ``TracedStage`` of the same arguments."""
+        shapes = tuple([(x.shape, x.dtype) for x in axes.of_one(list(leaves), stage.scope)])
+        key = (stage.fn, stage.when, axes.treedef, shapes)
+        if key not in self._found:
+            self._found[key] = TracedStage(stage, axes, leaves)
+        return self._found[key]
+
+
 def _used(jaxpr: jaxcompat.ClosedJaxpr) -> set[int]:
     inner = jaxpr.jaxpr
     used = {v for eqn in inner.eqns for v in eqn.invars if not isinstance(v, jaxcompat.Literal)}

@@ -5,6 +5,7 @@ They are the corners of the box, and the points of its upper and lower plate tha
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Collection
 from itertools import product
 from typing import Any, NamedTuple
@@ -171,18 +172,28 @@ def _nearest(
     """
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
-    def gap_at(move: Array, turned: Array) -> Array:
+    def pose(move: Array, turned: Array) -> tuple[Array, Array]:
         q = rotation.turn(quat, turned, 1.0, normalize=False)
-        at = into(pos + move + rotation.rotate(q, middle), True)
         columns = [into(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
-        return distance(shape, geom.shape, at, jnp.stack(columns, axis=-1))
+        return into(pos + move + rotation.rotate(q, middle), True), jnp.stack(columns, axis=-1)
 
-    gap, pull = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
-    force, torque = pull(jnp.ones_like(gap))
+    at, pull_back = jax.vjp(pose, jnp.zeros_like(pos), jnp.zeros_like(pos))
+    gap, slopes = _distance_and_slopes(shape, geom.shape, *at)
+    force, torque = pull_back(slopes)
     normal = rotation.rotate_inverse(quat, force)
     reach = jnp.sum(jnp.abs(normal) * jnp.asarray(shape.size, pos.dtype), axis=-1, keepdims=True)
     point = rotation.cross(normal, torque) - reach * normal
     return ContactPoints(gap, normal, point, jnp.broadcast_to(vel, normal.shape))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
+def _distance_and_slopes(shape: Shape, other: Shape, pos: Array, rot: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Return ``distance`` and its gradients with respect to position and rotation matrix.
+
+    Traced once for both plates and all geoms of one shape, such as the wheels of cars.
+    """
+    gap, pull_back = jax.vjp(lambda pos, rot: distance(shape, other, pos, rot), pos, rot)
+    return gap, pull_back(jnp.ones_like(gap))
 
 
 def _frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Callable | None]:

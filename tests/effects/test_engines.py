@@ -44,7 +44,7 @@ def test_every_effect_is_fused(sim):
 def test_effects_mean_the_same_on_every_engine(sim):
     """20 steps, rounding grown by the controller's gains; random numbers are the same bits everywhere."""
     expected = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(20))
-    still = Step(Sim(n_worlds=3, n_drones=2, control="attitude", drone="cf2x_L250").step_pipeline, "plain")(
+    still = Step(Sim(n_worlds=3, n_drones=2, control="attitude", drone="cf2x_L250").step_pipeline, "interpret")(
         sim.data, jnp.int32(20)
     )
     assert float(jnp.abs(expected.states.vel - still.states.vel).max()) > 1e-3

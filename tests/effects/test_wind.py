@@ -14,7 +14,7 @@ DT = 1 / 500
 
 
 def build(velocity=(0.0, 0.0, 0.0), n_worlds=2, n_drones=2, **kwargs):
-    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", rng_key=3)
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", rng_key=3, engine="interpret")
     sim.data = with_states(sim.data, pos=[0, 0, 10.0])
     sim.build_default_data()
     sim.add(Wind(velocity, **kwargs))

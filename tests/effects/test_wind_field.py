@@ -15,8 +15,8 @@ SHEAR = Grid(np.array([[[[0.0, 0, 0], [4.0, 0, 2.0]]]]), (0, 0, 1.0), 2.0)
 """Wind along x and up that grows linearly from zero at 1 m to (4, 0, 2) m/s at 3 m."""
 
 
-def build(field=SHEAR, n_worlds=2, n_drones=2, **kwargs):
-    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", rng_key=3)
+def build(field=SHEAR, n_worlds=2, n_drones=2, engine="interpret", **kwargs):
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", rng_key=3, engine=engine)
     sim.data = with_states(sim.data, pos=[0, 0, 2.0])
     sim.build_default_data()
     sim.add(WindField(field, **kwargs))
@@ -25,7 +25,7 @@ def build(field=SHEAR, n_worlds=2, n_drones=2, **kwargs):
 
 def test_the_field_pushes_as_a_steady_wind_of_the_same_velocity():
     """Half way up the shear the air moves with (2, 0, 1) m/s."""
-    field, steady = build(), Sim(n_worlds=2, n_drones=2, control="rotor_vel")
+    field, steady = build(), Sim(n_worlds=2, n_drones=2, control="rotor_vel", engine="interpret")
     steady.data = with_states(steady.data, pos=[0, 0, 2.0])
     steady.add(Wind((2.0, 0.0, 1.0)))
     for sim in (field, steady):
@@ -83,7 +83,9 @@ def test_the_air_at_loads_counts_for_loads():
 @pytest.mark.parametrize("largest", [10**6, 1])
 def test_engines_agree_whether_the_table_is_fused_or_not(monkeypatch, largest, rng):
     monkeypatch.setattr(wind_field, "LARGEST_FUSED", largest)
-    sim = build(Grid(rng.normal(size=(6, 5, 4, 3)), (-1, -1, 0), 1.0), n_worlds=3, spread=(0.5, 0.5, 0.5))
+    sim = build(
+        Grid(rng.normal(size=(6, 5, 4, 3)), (-1, -1, 0), 1.0), n_worlds=3, engine="auto", spread=(0.5, 0.5, 0.5)
+    )
     alone = [stage.name for stage in sim.step_fn.plan(sim.data).program.unfused_stages] if largest == 1 else []
     assert alone == (["wind_field"] if largest == 1 else [])
     plain = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(20))
@@ -93,7 +95,7 @@ def test_engines_agree_whether_the_table_is_fused_or_not(monkeypatch, largest, r
 
 
 def test_law_08_gradients_of_a_flight_equal_central_differences(x64, rng):
-    sim = build(Grid(rng.normal(size=(6, 6, 6, 3)), (-1, -1, 0), 0.8), n_worlds=1, n_drones=1)
+    sim = build(Grid(rng.normal(size=(6, 6, 6, 3)), (-1, -1, 0), 0.8), n_worlds=1, n_drones=1, engine="plain")
     step = sim.build_step_fn()
 
     def end(pos):
@@ -108,7 +110,7 @@ def test_law_08_gradients_of_a_flight_equal_central_differences(x64, rng):
 
 
 def test_other_velocities_compile_nothing():
-    sim = build()
+    sim = build(engine="auto")
     sim.step()
     sim.replace(WindField(Grid(2 * SHEAR.values, SHEAR.origin, SHEAR.spacing)))
     sim.step()
