@@ -8,12 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import LEVELS, trees_equal
-from env_cases import compiled, entries, kind, obs_of, of_worlds, one_step_to_go, quick, random_action
+from env_cases import compiled, entries, interpreted, kind, obs_of, of_worlds, one_step_to_go, quick, random_action
 from gymnasium.vector.utils import batch_space
 
 from crazysim.dynamics import first_principles
-from crazysim.engine import interpret
-from crazysim.engine.relative import on_data
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
 from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.spawn import flying
@@ -40,9 +38,10 @@ def begun(env):
     return env.reset(jax.random.key(0))
 
 
-@pytest.fixture(scope="module")
-def flown(env):
-    """10,000 random steps of four worlds in one scan, new episodes as they end: the last state, and all results."""
+@functools.cache
+def flight(name):
+    """Return the last state and all results of 10,000 random steps of four worlds, with new episodes as they end."""
+    env = compiled(name, N_WORLDS)
     auto = AutoReset(EpisodeStatistics(env.env))
 
     def step(state, key):
@@ -55,6 +54,11 @@ def flown(env):
 
     state, results = fly(jax.random.key(1))
     return state, jax.tree.map(np.asarray, results)
+
+
+@pytest.fixture(scope="module")
+def flown(name):
+    return flight(name)
 
 
 def test_shapes_and_types_are_those_of_the_spaces(env, begun):
@@ -114,6 +118,12 @@ def test_the_same_seed_gives_the_same_numbers(env, begun):
 
 def test_gymnasium_makes_it_and_the_number_of_worlds_changes_nothing(name, env, begun):
     """Law 10 again, through Gymnasium's front door."""
+    env.step(begun, jnp.zeros_like(begun.action))  # compiled before
+    with interpreted():
+        _steps_like_those_of_more_worlds(name, env, begun)
+
+
+def _steps_like_those_of_more_worlds(name, env, begun):
     vec = gymnasium.make_vec(TASKS[name].id, num_envs=2)
     assert isinstance(vec.unwrapped, DroneVectorEnv)
     assert (vec.spec.id, vec.num_envs) == (TASKS[name].id, 2)
@@ -174,9 +184,8 @@ def test_episodes_end_in_time_and_are_counted(env, flown):
 def test_one_program_is_the_whole_step(env, begun):
     """Actions, physics, task and new episodes, lowered for one world and interpreted, equal the unfused step."""
     auto = AutoReset(env, "SameStep")
-    fused = FusedEnvStep(env.env, auto.policy, begun, begun.action)
-    program = fused._run.program
-    fused._run._run = on_data(program, lambda leaves, n_steps: interpret.steps(program, leaves, n_steps))
+    with interpreted():
+        fused = FusedEnvStep(env.env, auto.policy, begun, begun.action)
     before, action = one_step_to_go(env, begun, ENDS), random_action(begun)
     found, expected = fused(before, jnp.asarray(action)), auto.step(before, action)
     assert kind(found)[0] == kind(expected)[0]
