@@ -13,7 +13,8 @@ from cases import as_numbers
 
 from crazysim.engine import fused, interpret
 from crazysim.envs import TASKS, make
-from crazysim.envs.wrappers import Wrapper
+from crazysim.envs.env import select_states
+from crazysim.envs.wrappers import Wrapper, autoreset
 from crazysim.pytree import map_batched
 
 quick = functools.partial(jax.jit, compiler_options=compiling.options(emitters=True))
@@ -32,8 +33,15 @@ class Compiled(Wrapper):
         super().__init__(env)
         self.traces = collections.Counter()
         """Number of times that Python ran each of the functions."""
-        for name in ("reset", "restart", "step", "begin"):
+        for name in ("reset", "restart", "step"):
             setattr(self, name, quick(self._counted(name, getattr(env, name))))
+
+    def begin(self, state):
+        """Return the state with new episodes in all worlds, by the program of ``restart``."""
+        added = {name: x for name, x in state.info.items() if name == "final_obs"}
+        own = {name: x for name, x in state.info.items() if name not in added}
+        new = self.restart(state.replace(info=own), np.ones(len(state.terminated), bool))
+        return new.replace(info=new.info | added)
 
     def _counted(self, name, fn):
         def counted(*args):
@@ -41,6 +49,14 @@ class Compiled(Wrapper):
             return fn(*args)
 
         return counted
+
+
+@pytest.fixture(scope="module")
+def compiled_select():
+    """Compile the choice between a state and that of a new episode, for steps that are not compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(autoreset, "select_states", quick(select_states))
+        yield
 
 
 @functools.cache

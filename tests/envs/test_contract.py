@@ -8,7 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import LEVELS, trees_equal
-from env_cases import compiled, entries, interpreted, kind, obs_of, of_worlds, one_step_to_go, quick, random_action
+from env_cases import (
+    compiled,
+    compiled_select,
+    entries,
+    interpreted,
+    kind,
+    obs_of,
+    of_worlds,
+    one_step_to_go,
+    quick,
+    random_action,
+)
 from gymnasium.vector.utils import batch_space
 
 from crazysim.dynamics import first_principles
@@ -17,6 +28,7 @@ from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.hover import Hover
 
+pytestmark = pytest.mark.usefixtures("compiled_select")
 N_WORLDS, N_STEPS = 4, 10_000
 ENDS = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
@@ -118,33 +130,31 @@ def test_the_same_seed_gives_the_same_numbers(env, begun):
 
 def test_gymnasium_makes_it_and_the_number_of_worlds_changes_nothing(name, env, begun):
     """Law 10 again, through Gymnasium's front door."""
-    env.step(begun, jnp.zeros_like(begun.action))  # compiled before
     with interpreted():
-        _steps_like_those_of_more_worlds(name, env, begun)
-
-
-def _steps_like_those_of_more_worlds(name, env, begun):
-    vec = gymnasium.make_vec(TASKS[name].id, num_envs=2)
+        vec = gymnasium.make_vec(TASKS[name].id, num_envs=2)
+        obs, info = vec.reset(seed=0)
     assert isinstance(vec.unwrapped, DroneVectorEnv)
     assert (vec.spec.id, vec.num_envs) == (TASKS[name].id, 2)
     assert vec.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
     assert vec.observation_space == batch_space(vec.single_observation_space, 2)
     assert vec.action_space == batch_space(vec.single_action_space, 2)
-    obs, info = vec.reset(seed=0)
-    state, worlds = begun, np.arange(2)
+    state, worlds, atol = begun, np.arange(2), 1e-5
     vec.action_space.seed(3)
     for _ in range(4):
         assert {k: np.asarray(x) for k, x in obs.items()} in vec.observation_space
         for which, x in state.obs.items():
-            np.testing.assert_allclose(obs[which], x[worlds].reshape(obs[which].shape), rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(info["error"].ravel(), state.info["error"][worlds].ravel(), rtol=1e-4, atol=1e-5)
+            x = np.asarray(x)[worlds].reshape(obs[which].shape)
+            np.testing.assert_allclose(obs[which], x, rtol=1e-4, atol=atol)
+        error = np.asarray(state.info["error"])[worlds]
+        np.testing.assert_allclose(info["error"].ravel(), error.ravel(), rtol=1e-4, atol=atol)
         action = vec.action_space.sample()
         obs, reward, terminated, truncated, info = vec.step(action)
         assert (reward.shape, reward.dtype, terminated.dtype, truncated.dtype) == ((2,), np.float32, bool, bool)
         state = env.step(state, np.concatenate([action, action]).reshape(state.action.shape))
         if state.done.any():  # there the two part: the vector environment begins a new episode
             break
-        np.testing.assert_allclose(reward, state.reward[worlds].mean(axis=1), rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(reward, np.asarray(state.reward)[worlds].mean(axis=1), rtol=1e-3, atol=1e-4)
+        atol = 1e-4  # one of them contracts products and sums, and loads on links amplify that
     vec.close()
 
 
@@ -187,7 +197,7 @@ def test_one_program_is_the_whole_step(env, begun):
     with interpreted():
         fused = FusedEnvStep(env.env, auto.policy, begun, begun.action)
     before, action = one_step_to_go(env, begun, ENDS), random_action(begun)
-    found, expected = fused(before, jnp.asarray(action)), auto.step(before, action)
+    found, expected = quick(fused)(before, jnp.asarray(action)), auto.step(before, action)
     assert kind(found)[0] == kind(expected)[0]
     pairs = zip(jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(expected), strict=True)
     for (path, x), y in pairs:
