@@ -13,8 +13,7 @@ from cases import as_numbers
 
 from crazysim.engine import fused, interpret
 from crazysim.envs import TASKS, make
-from crazysim.envs.env import select_states
-from crazysim.envs.wrappers import Wrapper, autoreset
+from crazysim.envs.wrappers import Wrapper
 from crazysim.pytree import map_batched
 
 quick = functools.partial(jax.jit, compiler_options=compiling.options(emitters=True))
@@ -49,14 +48,6 @@ class Compiled(Wrapper):
             return fn(*args)
 
         return counted
-
-
-@pytest.fixture(scope="module")
-def compiled_select():
-    """Compile the choice between a state and that of a new episode, for steps that are not compiled."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(autoreset, "select_states", quick(select_states))
-        yield
 
 
 @functools.cache

@@ -10,7 +10,6 @@ import pytest
 from cases import LEVELS, trees_equal
 from env_cases import (
     compiled,
-    compiled_select,
     entries,
     interpreted,
     kind,
@@ -24,14 +23,23 @@ from gymnasium.vector.utils import batch_space
 
 from crazysim.dynamics import first_principles
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
+from crazysim.envs.env import select_states
 from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.hover import Hover
+from crazysim.envs.wrappers import autoreset
 
-pytestmark = pytest.mark.usefixtures("compiled_select")
 N_WORLDS, N_STEPS = 4, 10_000
 ENDS = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_select():
+    """Compile the choice between a state and that of a new episode, for steps that are not compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(autoreset, "select_states", quick(select_states))
+        yield
 
 
 @pytest.fixture(scope="module", params=entries())
