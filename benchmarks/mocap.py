@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -28,7 +29,8 @@ def main() -> None:
     measure(args.objects, args.freq, args.seconds)
 
 
-def measure(n_objects: int, freq: float, seconds: float) -> None:
+def circling_bodies(n_objects: int) -> Callable[[float], dict]:
+    """Return a function of time, s, that gives the poses of objects that circle, each around a place of its own."""
     phases = np.arange(n_objects)
 
     def bodies(t: float) -> dict:
@@ -37,6 +39,12 @@ def measure(n_objects: int, freq: float, seconds: float) -> None:
         quat = (0.0, 0.0, np.sin(half), np.cos(half))
         return {f"cf{k}": ((*p, 1.0), quat) for k, p in enumerate(xy.tolist())}
 
+    return bodies
+
+
+def measure(n_objects: int, freq: float, seconds: float) -> None:
+    """Print the line of one run."""
+    bodies = circling_bodies(n_objects)
     sim = Sim(n_drones=4, control="state")
     source = RealTimeSource(FunctionSource(bodies, freq))
     twins = Twins(sim, source, {"cf": Twin.drone()}, [f"cf{k}" for k in range(n_objects)])

@@ -330,9 +330,9 @@ def _host(pointers: Sequence[str], body: str, in_memory: bool) -> str:
     sizes = "int64_t n_lanes, int n_steps, int n_samples"
     if in_memory:
         block = f"static void advance_world(World& w, int64_t begin, {sizes}, {arguments}) {{\n"
-        each = f"""    World* const w = static_cast<World*>(std::aligned_alloc(64, (sizeof(World) + 63) / 64 * 64));
+        each = f"""    World* const w = static_cast<World*>(aligned_alloc(64, (sizeof(World) + 63) / 64 * 64));
     for (int64_t first = begin; first < end; first += GROUP) advance_world(*w, first, {call});
-    std::free(w);"""
+    free(w);"""
     else:
         block = f"""static void advance_block(int64_t first, {sizes}, {arguments}) {{
   const int n_active = n_lanes - first < LANES ? int(n_lanes - first) : LANES;

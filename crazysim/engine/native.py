@@ -27,7 +27,7 @@ from crazysim.errors import ConfigError
 from crazysim.version import __version__
 
 FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-shared",
-         "-fPIC", "-fvisibility=hidden", "-pthread", "-w")  # fmt: skip
+         "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
 """Options of the compiler, before those of the variable CXXFLAGS. Products and sums may be contracted; no option
 assumes that there is no NaN."""
 

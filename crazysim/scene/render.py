@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco.rendering.classic import gl_context
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, RenderError, UnknownNameError
@@ -51,6 +52,14 @@ class Viewer:
             self._windows[0].draw(self._data, cam, overlays, width, height)
             return None
         renderer = self._renderer(width, height)
+        try:
+            return self._draw(renderer, mode, cam, overlays)
+        finally:
+            _leave_context()
+
+    def _draw(
+        self, renderer: mujoco.Renderer, mode: str, cam: mujoco.MjvCamera, overlays: Overlays
+    ) -> NDArray | tuple[NDArray, NDArray]:
         # Twice: MuJoCo centres infinite planes on the camera of the previous update.
         renderer.update_scene(self._data, camera=cam)
         renderer.update_scene(self._data, camera=cam)
@@ -157,3 +166,20 @@ def _free(renderers: dict[tuple[int, int], mujoco.Renderer], windows: list[Windo
         holder.close()
     renderers.clear()
     windows.clear()
+
+
+def _leave_context() -> None:
+    """Leave no context current in this thread.
+
+    One that is current can be used and freed by no other thread, not even after this thread has ended; and garbage is
+    collected in any thread.
+    """
+    backend = gl_context.GLContext.__module__
+    if backend == "mujoco.egl":
+        from OpenGL import EGL
+
+        EGL.eglReleaseThread()
+    elif backend == "mujoco.glfw":
+        import glfw
+
+        glfw.make_context_current(None)  # type: ignore[arg-type]

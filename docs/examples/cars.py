@@ -3,15 +3,14 @@
 import jax
 import numpy as np
 
-from crazysim import Cars, Sim
+from crazysim import Cars, Sim, vehicles
 from crazysim.trajectories import figure_eight
-from crazysim.vehicles import PathLQR
 
 
 def main(picture=False):
     sim = Sim(n_worlds=2)
     path = figure_eight(6.0, 2.0, period=14.0)
-    cars = sim.add(Cars(2, vehicle="aiml_head", path=path, controller=PathLQR(), trailer=True))
+    cars = sim.add(Cars(2, vehicle="aiml_head", path=path, controller=vehicles.PathLQR(), trailer=True))
     sim.step(3000)
     car = cars.read(sim.data)
     paths, pos = car.path, car.pos[0, :, :2]

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from crazysim import Sim
+from crazysim import Sim, dynamics
 from crazysim import functional as F
-from crazysim.dynamics import hover_rotor_vel
 
 N_FLIGHTS, SECONDS, RATE = 8, 3.0, 100  # samples and commands per second
 NOISE = {"pos": 1e-3, "quat": 2e-3, "ang_vel": 2e-2}  # m, 1, rad/s
@@ -52,7 +51,7 @@ def main() -> dict[str, tuple[float, float, float]]:
     data_sheet = physical(sim.data.params)
     cmds = commands(9.81 * float(data_sheet[0]), rng)
     states = sim.data.states
-    rotor_vel = jnp.broadcast_to(hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
+    rotor_vel = jnp.broadcast_to(dynamics.hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
     start = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(20.0), rotor_vel=rotor_vel))
 
     def fly(ratio: jax.Array) -> dict[str, jax.Array]:

@@ -6,9 +6,8 @@ The gradient goes through 250 physics steps: attitude controller, allocation, ro
 import jax
 import jax.numpy as jnp
 
-from crazysim import Sim
+from crazysim import Sim, dynamics
 from crazysim import functional as F
-from crazysim.dynamics import hover_rotor_vel
 
 N_THRUSTS, HELD = 25, 10  # 25 thrusts, each held for 10 steps of 2 ms
 RISE = 0.2  # m
@@ -21,7 +20,7 @@ def main() -> None:
     weight = 9.81 * sim.data.params.mass[0]
     # The flight starts in hover and above the floor, because a drone whose rotors are at rest falls first.
     states = sim.data.states
-    rotor_vel = jnp.broadcast_to(hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
+    rotor_vel = jnp.broadcast_to(dynamics.hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
     start = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0), rotor_vel=rotor_vel))
 
     def cost(thrusts: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:

@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from crazysim import Sim
+from crazysim import Sim, dynamics
 from crazysim.core import drone_keys, select_worlds
-from crazysim.dynamics import hover_rotor_vel
 
 
 def randomize_motors(data, default_data, mask=None, spread=0.0):
@@ -29,7 +28,7 @@ def main() -> None:
     sim = Sim(n_worlds=64, control="state", rng_key=3)
     states, setpoint = sim.data.states, np.zeros((sim.n_worlds, 1, 16))
     setpoint[..., 2] = 1.0
-    rotor_vel = jnp.broadcast_to(hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
+    rotor_vel = jnp.broadcast_to(dynamics.hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0), rotor_vel=rotor_vel))
     sim.build_default_data()
 

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from crazysim import Sim
+from crazysim import Sim, dynamics
 from crazysim.core import append_fn, drone_keys, select_worlds
-from crazysim.dynamics import hover_rotor_vel
 
 
 def randomize_inertia(data, default_data, mask=None):
@@ -28,7 +27,7 @@ def main() -> None:
     append_fn(sim.reset_pipeline, randomize_inertia)
     sim.reset()
     states = sim.data.states
-    rotor_vel = jnp.broadcast_to(hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
+    rotor_vel = jnp.broadcast_to(dynamics.hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(2.0), rotor_vel=rotor_vel))
 
     cmd = np.zeros((sim.n_worlds, 1, 4))

@@ -1,9 +1,11 @@
 """Images: what they contain, where, at which distance, and of which world."""
 
 import os
+import queue
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 
 import jax
@@ -467,6 +469,25 @@ def test_without_opengl_an_image_is_refused_in_one_line(monkeypatch):
     with pytest.raises(RenderError, match="MUJOCO_GL=egl and install libegl1") as caught:
         sim.render("rgb_array")
     assert "\n" not in str(caught.value)
+
+
+def test_any_thread_draws_and_frees_what_another_has_drawn_with(opengl, plain_scene):
+    """Garbage, too, is collected in any thread, while the one that drew still runs."""
+    sim, end = Sim(xml_path=plain_scene), threading.Event()
+    images = queue.Queue()
+
+    def draw():
+        images.put(sim.render(**SHOT))
+        end.wait(60)
+
+    thread = threading.Thread(target=draw)
+    thread.start()
+    try:
+        np.testing.assert_array_equal(images.get(timeout=60), sim.render(**SHOT))
+        sim.close()
+    finally:
+        end.set()
+        thread.join()
 
 
 def test_a_program_that_forgets_to_close_ends_well(opengl):

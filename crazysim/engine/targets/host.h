@@ -1,20 +1,19 @@
 // A block of W lanes is a vector, held as GCC's and Clang's vector types; what all lanes share stays a number.
+// The headers are those of C (-nostdinc++): reading those of C++ takes longer than reading all of this.
+#include <math.h>
 #include <pthread.h>
 #include <sched.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
 #include <unistd.h>
-
-#include <cmath>
-#include <cstdint>
-#include <cstdlib>
-#include <cstring>
-#include <type_traits>
 
 #include "xla/ffi/api/c_api.h"
 
 #define FN static inline __attribute__((always_inline))
 #define RSQRTF(x) (1.0f / sqrtf(x))
-static inline float bits_to_float(unsigned x) { float y; std::memcpy(&y, &x, 4); return y; }
-static inline unsigned bits_of_float(float x) { unsigned y; std::memcpy(&y, &x, 4); return y; }
+static inline float bits_to_float(unsigned x) { float y; memcpy(&y, &x, 4); return y; }
+static inline unsigned bits_of_float(float x) { unsigned y; memcpy(&y, &x, 4); return y; }
 #define BITS_F32(x) bits_to_float(x)
 #define BITS_U32(x) bits_of_float(x)
 #include "scalar.h"
@@ -55,6 +54,10 @@ typedef vec<int64_t>::type i64v;
 struct b1v { i32v m; };  // all bits set where true
 template <> struct vec<b1> { typedef b1v type; };
 
+template <bool> struct only_if {};
+template <> struct only_if<true> { typedef void type; };
+template <bool condition> using only_if_t = typename only_if<condition>::type;
+
 // How a type is lifted to lanes, and what one lane of it is.
 template <class T> struct is_lanes { static const bool value = false; };
 template <> struct is_lanes<f32v> { static const bool value = true; typedef f32 one; };
@@ -68,7 +71,7 @@ FN f64v lift(f64 x) { return x - f64v{}; }
 FN i32v lift(i32 x) { return i32v{} + x; }
 FN u32v lift(u32 x) { return u32v{} + x; }
 FN b1v lift(b1 x) { return {i32v{} - i32(x)}; }
-template <class V, class = std::enable_if_t<is_lanes<V>::value>> FN V lift(V x) { return x; }
+template <class V, class = only_if_t<is_lanes<V>::value>> FN V lift(V x) { return x; }
 template <class T> FN f32v f32_lanes(T x) { return lift(x); }
 template <class T> FN f64v f64_lanes(T x) { return lift(x); }
 template <class T> FN i32v i32_lanes(T x) { return lift(x); }
@@ -79,7 +82,7 @@ FN i32v numbers() { i32v x; for (int i = 0; i < W; ++i) x[i] = i; return x; }
 // A number of the drone with number d of the same world.
 template <class V> FN V of_drone(V x, int d) {
   if (GROUP == 1) return x;
-  typename std::conditional<sizeof(x[0]) == 8, i64v, i32v>::type from;
+  decltype(x == x) from;
   for (int i = 0; i < W; ++i) { const int j = i / GROUP * GROUP + d; from[i] = j < W ? j : W - 1; }
 #if defined(__clang__)
   V y;
@@ -100,8 +103,8 @@ FN b1v mask(i64v m) { return {__builtin_convertvector(m, i32v)}; }
 FN b1 any(b1 x) { return x; }
 FN b1 any(b1v x) { i32 sum = 0; for (int i = 0; i < W; ++i) sum |= x.m[i]; return sum != 0; }
 
-#define LANES1(A) template <class A, class = std::enable_if_t<is_lanes<A>::value>> FN
-#define LANES2(A, B) template <class A, class B, class = std::enable_if_t<any_lanes<A, B>::value>> FN
+#define LANES1(A) template <class A, class = only_if_t<is_lanes<A>::value>> FN
+#define LANES2(A, B) template <class A, class B, class = only_if_t<any_lanes<A, B>::value>> FN
 #define OPERATOR(NAME, OP) LANES2(A, B) auto NAME##_(A a, B b) { return lift(a) OP lift(b); }
 OPERATOR(add, +) OPERATOR(sub, -) OPERATOR(mul, *)
 #define COMPARE(NAME, OP) LANES2(A, B) b1v NAME##_(A a, B b) { return mask(lift(a) OP lift(b)); }
@@ -123,31 +126,31 @@ FN i32v pick(b1v w, i32v no, i32v yes) { return w.m ? yes : no; }
 FN u32v pick(b1v w, u32v no, u32v yes) { return w.m ? yes : no; }
 FN f64v pick(b1v w, f64v no, f64v yes) { return __builtin_convertvector(w.m, i64v) ? yes : no; }
 FN b1v pick(b1v w, b1v no, b1v yes) { return {(w.m & yes.m) | (~w.m & no.m)}; }
-template <class C, class A, class B, class = std::enable_if_t<any_lanes<C, A, B>::value>>
+template <class C, class A, class B, class = only_if_t<any_lanes<C, A, B>::value>>
 FN auto select_n_(C which, A no, B yes) { return pick(lift(which), lift(no), lift(yes)); }
 LANES2(A, B) auto max_(A a, B b) { return select_n_(or_(gt_(a, b), ne_(a, a)), b, a); }
 LANES2(A, B) auto min_(A a, B b) { return select_n_(or_(lt_(a, b), ne_(a, a)), b, a); }
 LANES2(A, B) auto at_least(A x, B low) { return select_n_(lt_(x, low), x, low); }
 LANES2(A, B) auto at_most(A x, B high) { return select_n_(gt_(x, high), x, high); }
-template <class A, class B, class C, class = std::enable_if_t<any_lanes<A, B, C>::value>>
+template <class A, class B, class C, class = only_if_t<any_lanes<A, B, C>::value>>
 FN auto clamp_(A low, B x, C high) { return min_(max_(x, low), high); }
 
 // One lane after the other, in a form that compilers turn into vector instructions where there are any.
 template <class R, class F, class V> FN R each(F f, V x) {
   typename is_lanes<V>::one a[W];
   typename is_lanes<R>::one r[W];
-  std::memcpy(a, &x, sizeof(x));
+  memcpy(a, &x, sizeof(x));
   for (int i = 0; i < W; ++i) r[i] = f(a[i]);
   R out;
-  std::memcpy(&out, r, sizeof(out));
+  memcpy(&out, r, sizeof(out));
   return out;
 }
 template <class F, class V> FN V each2(F f, V x, V y) {
   typename is_lanes<V>::one a[W], b[W];
-  std::memcpy(a, &x, sizeof(x));
-  std::memcpy(b, &y, sizeof(y));
+  memcpy(a, &x, sizeof(x));
+  memcpy(b, &y, sizeof(y));
   for (int i = 0; i < W; ++i) a[i] = f(a[i], b[i]);
-  std::memcpy(&x, a, sizeof(x));
+  memcpy(&x, a, sizeof(x));
   return x;
 }
 #define EACH(NAME) LANES1(V) V NAME##_(V x) { typedef typename is_lanes<V>::one T; return each<V>([](T t) { return NAME##_(t); }, x); }
@@ -218,8 +221,7 @@ FN f32v atan2_(f32v y, f32v x) {
   return (f32v)((i32v)r | sign);
 }
 FN f64v atan2_(f64v y, f64v x) { return each2([](f64 s, f64 t) { return atan2_(s, t); }, y, x); }
-template <class A, class B, class = std::enable_if_t<any_lanes<A, B>::value>, class = std::enable_if_t<!std::is_same<A, B>::value>>
-FN auto atan2_(A y, B x) { return atan2_(lift(y), lift(x)); }
+LANES2(A, B) auto atan2_(A y, B x) { return atan2_(lift(y), lift(x)); }
 
 FN f32v to_f32(f32v x) { return x; }
 FN f32v to_f32(f64v x) { return __builtin_convertvector(x, f32v); }
@@ -274,13 +276,13 @@ template <int SIZE, int DRONES> FN void store(b1* p, int64_t first, int n, int k
 template <class T> FN typename vec<T>::type load_row(const T* p, int n) {
   typename vec<T>::type x;
   if (n < LANES) load_each(x, p, 1, 1, 0, n);
-  else if (LANES == W) std::memcpy(&x, p, sizeof(x));
+  else if (LANES == W) memcpy(&x, p, sizeof(x));
   else for (int i = 0; i < W; ++i) x[i] = p[i < LANES ? i : LANES - 1];
   return x;
 }
 FN b1v load_row(const b1* p, int n) { i32v x; load_each(x, p, 1, 1, 0, n); return {-x}; }
 template <class T, class V> FN void store_row(T* p, int n, V x) {
-  if (n < W) store_each(p, 1, 1, 0, n, x); else std::memcpy(p, &x, sizeof(x));
+  if (n < W) store_each(p, 1, 1, 0, n, x); else memcpy(p, &x, sizeof(x));
 }
 FN void store_row(b1* p, int n, b1v x) { store_each(p, 1, 1, 0, n, -x.m); }
 #define LOAD_ROW(p, k) load_row(p + (k) * n_lanes + first, n_active)
@@ -303,7 +305,7 @@ FN b1v lookup(const b1* p, i32v index, i32 k) {
 }
 FN four<f32> lookup_four(const f32* p, i32 index, i32 k) {
   four<f32> r;
-  std::memcpy(&r, p + index + k, sizeof(r));
+  memcpy(&r, p + index + k, sizeof(r));
   return r;
 }
 // Rows of four numbers are loaded whole and transposed, four at a time.
@@ -319,17 +321,17 @@ FN four<f32v> lookup_four(const f32* p, i32v index, i32 k) {
   typedef i32 i32x4 __attribute__((vector_size(16)));
   for (; i + 4 <= W; i += 4) {
     f32x4 r[4];
-    for (int j = 0; j < 4; ++j) std::memcpy(&r[j], p + index[i + j] + k, 16);
+    for (int j = 0; j < 4; ++j) memcpy(&r[j], p + index[i + j] + k, 16);
     const f32x4 a = __builtin_shuffle(r[0], r[1], i32x4{0, 4, 1, 5}), b = __builtin_shuffle(r[2], r[3], i32x4{0, 4, 1, 5});
     const f32x4 c = __builtin_shuffle(r[0], r[1], i32x4{2, 6, 3, 7}), d = __builtin_shuffle(r[2], r[3], i32x4{2, 6, 3, 7});
     const f32x4 out[4] = {__builtin_shuffle(a, b, i32x4{0, 1, 4, 5}), __builtin_shuffle(a, b, i32x4{2, 3, 6, 7}),
                           __builtin_shuffle(c, d, i32x4{0, 1, 4, 5}), __builtin_shuffle(c, d, i32x4{2, 3, 6, 7})};
-    for (int j = 0; j < 4; ++j) std::memcpy(&columns[j][i], &out[j], 16);
+    for (int j = 0; j < 4; ++j) memcpy(&columns[j][i], &out[j], 16);
   }
 #endif
   for (; i < W; ++i) for (int j = 0; j < 4; ++j) columns[j][i] = p[index[i] + k + j];
   four<f32v> r;
-  std::memcpy(&r, columns, sizeof(r));
+  memcpy(&r, columns, sizeof(r));
   return r;
 }
 

@@ -16,11 +16,11 @@ from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import between, draw, within
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, not_yet
 from crazysim.envs.tasks.core import install_rules, pick, state_of, with_record
 from crazysim.errors import ConfigError
 from crazysim.payloads import Hook
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import leaf
 from crazysim.sim.sim import Sim
 from crazysim.vehicles import Cars
 from crazysim.vehicles.cars import CarData
@@ -47,29 +47,17 @@ GOAL = ((-1.0, -1.0, 0.8), (1.0, 1.0, 1.3))
 """Lowest and highest goal of a load from its car's first place, m."""
 DROPPED = 0.15
 """Height of a ring below which a load that was taken counts as dropped, m: it hangs lower than the trailer."""
-SLOW = 0.2
-"""Largest speed of a load that is delivered, m/s."""
 
 
-class Delivery(PyTree):
-    """Goal of each load, and the outcome of its flight."""
+class TrailerDelivery(Delivery):
+    """Goal of each load, whether the hook has it, and the outcome of its flight."""
 
-    goal: Array = leaf("drone", 1)
-    """Goal of the load's ring, m. (n_worlds, n_drones, 3)"""
-    to_go_before: Array = leaf("drone", 0)
-    """Distance that hook and load have to travel to the goal before this environment step, m. (n_worlds, n_drones)"""
     taken: Array = leaf("drone", 0)
     """True from the time at which the hook takes the load off the trailer. (n_worlds, n_drones)"""
-    steps_there: Array = leaf("drone", 0)
-    """Physics steps that the load has been at its goal without a break. (n_worlds, n_drones)"""
-    delivered: Array = leaf("drone", 0)
-    """True where the load has stayed at its goal for long enough. (n_worlds, n_drones)"""
-    crashed: Array = leaf("drone", 0)
-    """True where the drone has left its part of the arena, or dropped the load. (n_worlds, n_drones)"""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deliver(Task):
+class Deliver(BringLoad):
     """Pick up a load from a moving trailer with a hook, and hold it at a goal.
 
     Behind a car that drives straight on or in circles, a trailer carries a load with a ring. A drone starts in flight
@@ -81,7 +69,7 @@ class Deliver(Task):
     """
 
     name = "deliver"
-    Record = Delivery
+    Record = TrailerDelivery
 
     mass: float = 0.008
     """Mass of the load, kg."""
@@ -91,10 +79,6 @@ class Deliver(Task):
     """Largest speed of a car, m/s; the smallest is 0.3 times that."""
     seconds: float = 8.0
     """Length of an episode, s."""
-    tolerance: float = 0.1
-    """Distance of the load from its goal below which it counts as there, m."""
-    hold: float = 0.5
-    """Time that the load must stay there, s."""
 
     def __post_init__(self) -> None:
         """Check the settings.
@@ -115,26 +99,21 @@ class Deliver(Task):
         rings = np.broadcast_to(np.pad(places, ((0, 0), (0, 1))), (sim.n_worlds, sim.n_drones, 3))
         hook: dict[str, Any] = {"hook_mass": HOOK_MASS, "damping": DAMPING, "reach": REACH, "max_speed": MAX_SPEED}
         sim.add(Hook(self.mass, length=self.length, size=SIZE, ring=RING, load_at=rings, **hook))
-        enough = round(self.hold * sim.freq)
 
         @stage("drone")
         def judge(data: SimData) -> SimData:
             """Move a load that waits with its trailer; note what is taken and delivered, and a crash."""
-            own, load = delivery_of(data), data.plugins["load"]
-            taken = own.taken | load.attached
+            load = data.plugins["load"]
+            taken = delivery_of(data).taken | load.attached
             ring = pick(rings_of(data.plugins[CARS]), data.core.drone_id)
             vel = jnp.where(taken, load.vel, data.core.freq * (ring - load.pos))
             load = load.replace(pos=jnp.where(taken, load.pos, ring), vel=vel)
             data = data.replace(plugins=data.plugins | {"load": load})
-            crashed = own.crashed | beyond(data) | (taken & (load.pos[2] < DROPPED))
-            steps = jnp.where(self.at_goal(data) & ~crashed, own.steps_there + 1, 0)
-            delivered = own.delivered | (steps >= enough)
-            new = own.replace(taken=taken, crashed=crashed, steps_there=steps, delivered=delivered)
-            return with_record(data, new)
+            crashed = beyond(data) | (taken & (load.pos[2] < DROPPED))
+            return with_record(data, self.judged(data, crashed).replace(taken=taken))
 
-        pos, no = sim.data.states.pos, jnp.zeros((sim.n_worlds, sim.n_drones), bool)
-        zero = jnp.zeros_like(pos[..., 0])
-        install_rules(sim, Delivery(jnp.zeros_like(pos), zero, no, no.astype(jnp.int32), no, no), judge)
+        not_taken = jnp.zeros((sim.n_worlds, sim.n_drones), bool)
+        install_rules(sim, TrailerDelivery(**not_yet(sim.data), taken=not_taken), judge)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, loads on their trailers, drones in flight above, and goals."""
@@ -165,19 +144,10 @@ class Deliver(Task):
         goal = between(x["goal"], *np.array(GOAL)) + middle_of(data)
         return with_record(data, delivery_of(data).replace(goal=goal))
 
-    def before_step(self, data: SimData) -> SimData:
-        """Note the way to go."""
-        return with_record(data, delivery_of(data).replace(to_go_before=self.to_go(data)))
-
     def to_go(self, data: SimData) -> Array:
         """Return the way of the hook to the load, and of the load to its goal, m. (...)"""
         load = data.plugins["load"]
         return rotation.safe_norm(load.pos - load.tip_pos)[..., 0] + self.error(data)
-
-    def at_goal(self, data: SimData) -> Array:
-        """Return true where a load is near its goal and slow. (...)"""
-        vel = data.plugins["load"].vel
-        return (rotation.dot(vel, vel)[..., 0] < SLOW**2) & (self.error(data) < self.tolerance)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, and hook, load and goal relative to it.
@@ -210,36 +180,14 @@ class Deliver(Task):
             "crash": -5.0 * own.crashed,
         }
 
-    def terminated(self, data: SimData) -> Array:
-        """Return true where a drone has crashed."""
-        return jnp.any(delivery_of(data).crashed)
-
-    def error(self, data: SimData) -> Array:
-        """Return the distance of the load's ring from its goal, m."""
-        return rotation.safe_norm(delivery_of(data).goal - data.plugins["load"].pos)[..., 0]
-
     def info(self, data: SimData) -> dict[str, Array]:
         """Return which loads are taken and delivered, and which drones have crashed."""
-        own = delivery_of(data)
-        return {"taken": own.taken, "delivered": own.delivered, "crashed": own.crashed}
+        return {"taken": delivery_of(data).taken} | super().info(data)
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
         return {"lookat": (0, 0, 0.6), "distance": 5.5, "elevation": -20}
-
-    def target(self, data: SimData) -> Array:
-        """Return the goal of the load's ring, m."""
-        return delivery_of(data).goal
-
-    def succeeded(self, data: SimData) -> Array:
-        """Return which loads have been delivered."""
-        return delivery_of(data).delivered
-
-
-def delivery_of(data: SimData) -> Delivery:
-    """Return the task's record."""
-    return data.plugins[NAME]
 
 
 def rings_of(car: CarData) -> Array:

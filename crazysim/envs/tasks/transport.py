@@ -16,11 +16,11 @@ from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import between, draw, within
 from crazysim.envs.spawn import flying
-from crazysim.envs.task import NAME, Task
+from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, not_yet
 from crazysim.envs.tasks.core import install_rules, pick, state_of, with_record
 from crazysim.errors import ConfigError
 from crazysim.payloads import SlungLoad, direction, load_pos, load_vel
-from crazysim.pytree import PyTree, leaf, static
+from crazysim.pytree import static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
@@ -42,29 +42,17 @@ RADIUS = 0.03
 """Radius of a load, m."""
 ROOM = 0.25
 """Smallest height of the opening above the length of the link, m: the drone and its load hang in it together."""
-SLOW = 0.2
-"""Largest speed of a load that is delivered, m/s."""
 
 
-class Delivery(PyTree):
-    """Goal of each load, and the outcome of its flight."""
+class GateDelivery(Delivery):
+    """Goal of each load, its gate, and the outcome of its flight."""
 
-    goal: Array = leaf("drone", 1)
-    """Goal of the load, m. (n_worlds, n_drones, 3)"""
-    to_go_before: Array = leaf("drone", 0)
-    """Way of the load to its goal before this environment step, m. (n_worlds, n_drones)"""
-    steps_there: Array = leaf("drone", 0)
-    """Physics steps that the load has been at its goal without a break. (n_worlds, n_drones)"""
-    delivered: Array = leaf("drone", 0)
-    """True where the load has stayed at its goal for long enough. (n_worlds, n_drones)"""
-    crashed: Array = leaf("drone", 0)
-    """True where drone or load has touched something, missed the gate, or left its lane. (n_worlds, n_drones)"""
     gates: Handle = static()
     """Handle of the gates, one per drone."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Transport(Task):
+class Transport(BringLoad):
     """Carry a load on a rod or cable through a gate, and hold it at a goal behind it.
 
     A drone starts in flight with a swinging load. The gate stands in a lane of its own; drone and load must pass its
@@ -74,7 +62,7 @@ class Transport(Task):
     """
 
     name = "transport"
-    Record = Delivery
+    Record = GateDelivery
 
     mass: float = 0.01
     """Mass of the load, kg."""
@@ -89,10 +77,6 @@ class Transport(Task):
     rad/s."""
     seconds: float = 6.0
     """Length of an episode, s."""
-    tolerance: float = 0.1
-    """Distance of the load from its goal below which it counts as there, m."""
-    hold: float = 0.5
-    """Time that the load must stay there, s."""
 
     def __post_init__(self) -> None:
         """Check the settings.
@@ -114,20 +98,13 @@ class Transport(Task):
         middle = lanes(sim.n_drones) + np.mean(GATE, axis=0)
         gates = sim.scene.add("gate", count=sim.n_drones, pos=middle, width=self.opening, height=self.opening, bar=BAR)
         contacts = sim.scene.contact_fn([gates], drones=False)
-        enough = round(self.hold * sim.freq)
 
         @stage("drone")
         def judge(data: SimData) -> SimData:
             """Note a crash, and a load that stays at its goal."""
-            own = delivery_of(data)
-            crashed = own.crashed | contacts(data).any | self.misses(data) | out_of_lane(data)
-            steps = jnp.where(self.at_goal(data) & ~crashed, own.steps_there + 1, 0)
-            delivered = own.delivered | (steps >= enough)
-            return with_record(data, own.replace(crashed=crashed, steps_there=steps, delivered=delivered))
+            return with_record(data, self.judged(data, contacts(data).any | self.misses(data) | out_of_lane(data)))
 
-        pos, no = sim.data.states.pos, jnp.zeros((sim.n_worlds, sim.n_drones), bool)
-        record = Delivery(jnp.zeros_like(pos), jnp.zeros_like(pos[..., 0]), no.astype(jnp.int32), no, no, gates)
-        install_rules(sim, record, judge)
+        install_rules(sim, GateDelivery(**not_yet(sim.data), gates=gates), judge)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight with swinging loads before the gates, and goals behind them."""
@@ -161,10 +138,6 @@ class Transport(Task):
         load = load.replace(pos=s.pos + self.length * link, vel=s.vel + self.length * turning)
         return data.replace(plugins=data.plugins | {"load": load})
 
-    def before_step(self, data: SimData) -> SimData:
-        """Note the way to go."""
-        return with_record(data, delivery_of(data).replace(to_go_before=self.to_go(data)))
-
     def to_go(self, data: SimData) -> Array:
         """Return the way of the load to its goal, before the gate by way of its opening, m. (...)
 
@@ -190,9 +163,7 @@ class Transport(Task):
 
     def at_goal(self, data: SimData) -> Array:
         """Return true where a load is near its goal, slow, and behind the gate. (...)"""
-        vel = load_vel(data)
-        slow = rotation.dot(vel, vel)[..., 0] < SLOW**2
-        return is_behind(load_pos(data), *gate_of(data)) & slow & (self.error(data) < self.tolerance)
+        return is_behind(load_pos(data), *gate_of(data)) & super().at_goal(data)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, and load, gate and goal relative to it.
@@ -228,37 +199,15 @@ class Transport(Task):
             "crash": -10.0 * own.crashed,
         }
 
-    def terminated(self, data: SimData) -> Array:
-        """Return true where a drone has crashed."""
-        return jnp.any(delivery_of(data).crashed)
-
-    def error(self, data: SimData) -> Array:
-        """Return the distance of the load from its goal, m."""
-        return rotation.safe_norm(delivery_of(data).goal - load_pos(data))[..., 0]
-
     def info(self, data: SimData) -> dict[str, Array]:
         """Return which loads are behind the gate and delivered, and which drones have crashed."""
-        own = delivery_of(data)
         behind = is_behind(load_pos(data), *gate_of(data))
-        return {"passed": behind & ~own.crashed, "delivered": own.delivered, "crashed": own.crashed}
+        return {"passed": behind & ~delivery_of(data).crashed} | super().info(data)
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
         return {"lookat": (0, 0, 1.1), "distance": 5.0, "azimuth": 60, "elevation": -20}
-
-    def target(self, data: SimData) -> Array:
-        """Return the goal of the load, m."""
-        return delivery_of(data).goal
-
-    def succeeded(self, data: SimData) -> Array:
-        """Return which loads have been delivered."""
-        return delivery_of(data).delivered
-
-
-def delivery_of(data: SimData) -> Delivery:
-    """Return the task's record."""
-    return data.plugins[NAME]
 
 
 def lanes(n_drones: int) -> np.ndarray:

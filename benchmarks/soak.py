@@ -1,0 +1,119 @@
+"""Everything of a live simulation at once for a long time: memory, lateness of control steps, lost frames.
+
+    python benchmarks/soak.py [--seconds 3600] [--drones 30] [--objects 50]
+
+Drones circle in real time while motion capture sends 240 frames a second, 50 pictures a second are sent to a client of
+the page, and poses are recorded. One JSON line has the memory after the first tenth of the time and at its end, MB,
+and its growth per hour as a line is fitted to what lies between, MB/h. The first tenth is left out: in it compiled
+programs and the snapshots of the last minute find their place. Linux only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+from live import read
+from measure import digits, report
+from mocap import circling_bodies
+
+from crazysim import Sim
+from crazysim.live import Browser, FunctionSource, Live, RealTimeSource, Twin, Twins
+from crazysim.live.program import Circles
+
+FREQ = 240.0
+"""Frames per second of motion capture, Hz."""
+WARM_UP = 0.1
+"""Part of the time that is left out of the line fitted to the memory."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=3600.0, help="time to run, s")
+    parser.add_argument("--drones", type=int, default=30)
+    parser.add_argument("--objects", type=int, default=50, help="number of tracked objects")
+    args = parser.parse_args()
+    measure(args.seconds, args.drones, args.objects)
+
+
+def measure(seconds: float, n_drones: int, n_objects: int) -> None:
+    """Run, and print the figures."""
+    sim = Sim(n_drones=n_drones, control="state", freq=500)
+    source = RealTimeSource(FunctionSource(circling_bodies(n_objects), FREQ))
+    names = [f"cf{k}" for k in range(n_objects)]
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Twins(sim, source, {"cf": Twin.drone()}, names) as twins,
+        Live(sim, control_freq=100) as live,
+        Memory(period_s=min(10.0, seconds / 100)) as memory,
+    ):
+        live.add(Circles(live, piloted=False), name="circles")
+        live.add(twins, on_error="report")
+        path = live.record(Path(folder) / "flight.journal")
+        page = live.show(Browser(port=0))
+        threading.Thread(target=read, args=(page.url,), daemon=True).start()
+        source.start()
+        result = live.run(seconds)
+        recorded = path.stat().st_size
+    at, used = memory.samples(WARM_UP * seconds)
+    report(
+        "cpu",
+        benchmark="soak",
+        n_drones=n_drones,
+        n_objects=n_objects,
+        seconds=seconds,
+        factor=digits(result.factor),
+        memory_mb=[round(used[0]), round(used[-1])],
+        growth_mb_per_hour=digits(3600 * np.polyfit(at, used, 1)[0]),
+        frames=twins.tracker.n_frames,
+        frames_lost=twins.reports.count("overrun"),
+        pictures_per_s=digits(result.pictures / result.wall_s),
+        recorded_mb=digits(1e-6 * recorded),
+        late=result.late,
+        lateness_999_ms=digits(1e3 * result.lateness_999),
+        worst_ms=digits(1e3 * result.worst),
+        lost_s=digits(result.lost_s),
+        failures=result.failures,
+    )
+
+
+class Memory:
+    """Memory of this process over time, read by a thread."""
+
+    def __init__(self, period_s: float):
+        """Prepare.
+
+        Args:
+            period_s: Time between two readings, s.
+        """
+        self._period_s, self._readings, self._ended = period_s, [], threading.Event()
+
+    def __enter__(self) -> Memory:
+        """Begin to read."""
+        self._begin = time.monotonic()
+        threading.Thread(target=self._read, daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop reading."""
+        self._ended.set()
+
+    def samples(self, after: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return times, s, and memory, MB, of the readings after a time, s."""
+        at, used = np.asarray(self._readings).T
+        return at[at >= after], used[at >= after]
+
+    def _read(self) -> None:
+        size = os.sysconf("SC_PAGE_SIZE")
+        while not self._ended.wait(self._period_s):
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            self._readings.append((time.monotonic() - self._begin, 1e-6 * pages * size))
+
+
+if __name__ == "__main__":
+    main()
