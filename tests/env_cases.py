@@ -1,6 +1,7 @@
 """What tests of environments share: environments compiled once, states near an episode's end, parts of a state."""
 
 import collections
+import contextlib
 import functools
 
 import compiling
@@ -8,7 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import as_numbers
 
+from crazysim.engine import fused, interpret
 from crazysim.envs import TASKS, make
 from crazysim.envs.wrappers import Wrapper
 from crazysim.pytree import map_batched
@@ -29,8 +32,15 @@ class Compiled(Wrapper):
         super().__init__(env)
         self.traces = collections.Counter()
         """Number of times that Python ran each of the functions."""
-        for name in ("reset", "restart", "step", "begin"):
+        for name in ("reset", "restart", "step"):
             setattr(self, name, quick(self._counted(name, getattr(env, name))))
+
+    def begin(self, state):
+        """Return the state with new episodes in all worlds, by the program of ``restart``."""
+        added = {name: x for name, x in state.info.items() if name == "final_obs"}
+        own = {name: x for name, x in state.info.items() if name not in added}
+        new = self.restart(state.replace(info=own), np.ones(len(state.terminated), bool))
+        return new.replace(info=new.info | added)
 
     def _counted(self, name, fn):
         def counted(*args):
@@ -66,14 +76,26 @@ def kind(tree):
 
 def of_worlds(state, mask, but=()):
     """Return the part of a state that belongs to some worlds, without some of its fields."""
-    data = map_batched(lambda x: x[mask], state.data)
+    data = map_batched(lambda x: as_numbers(x)[mask], state.data)
     rest = {name: x for name, x in vars(state).items() if name not in ("data", *but)}
-    return data, jax.tree.map(lambda x: x[mask], rest)
+    return data, jax.tree.map(lambda x: as_numbers(x)[mask], rest)
 
 
 def obs_of(state, mask):
     """Return what is observed of some worlds."""
-    return jax.tree.map(lambda x: x[mask], state.obs)
+    return jax.tree.map(lambda x: as_numbers(x)[mask], state.obs)
+
+
+@contextlib.contextmanager
+def interpreted():
+    """Interpret, within the context, what would be compiled to a kernel: the programs are the same."""
+
+    def build(program, *_):
+        return lambda leaves, n_steps: interpret.steps(program, leaves, n_steps)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fused, "build", build)
+        yield
 
 
 def entries(classes_once=False):

@@ -183,7 +183,7 @@ def test_our_side_of_the_contest_runs_without_the_peer():
 def test_a_gradient_is_timed_like_a_flight(benchmarks):
     import contestant
 
-    case = {"control": "attitude", "n_worlds": 2, "n_steps": 3, "engine": "lanes"}
+    case = {"control": "attitude", "dynamics": "so_rpy", "n_worlds": 2, "n_steps": 3, "engine": "lanes"}
     gradient = contestant.build("crazysim", "gradient", case, "cpu")
     assert gradient.seconds() > 0
     gradient.require_flying()

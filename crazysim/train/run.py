@@ -218,13 +218,14 @@ def train(
             f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
             f"with --out"
         )
-    shapes = jax.eval_shape(lambda k: algorithm.init(env, hyperparameters, k), key)
+    init = jax.jit(algorithm.init, static_argnums=(0, 1))
+    shapes = init.eval_shape(env, hyperparameters, key)
 
     def start() -> tuple[Any, dict[str, float]]:
         if resume:
             learner = jax.device_put(checkpoint.load(path, shapes), base.sim.device)
         else:
-            learner = jax.jit(lambda k: algorithm.init(env, hyperparameters, k))(jax.device_put(key, base.sim.device))
+            learner = init(env, hyperparameters, jax.device_put(key, base.sim.device))
         return learner, evaluate(eval_env, learner.as_policy())
 
     def compile_iteration() -> tuple[Any, float]:

@@ -8,20 +8,38 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import LEVELS, trees_equal
-from env_cases import compiled, entries, kind, obs_of, of_worlds, one_step_to_go, quick, random_action
+from env_cases import (
+    compiled,
+    entries,
+    interpreted,
+    kind,
+    obs_of,
+    of_worlds,
+    one_step_to_go,
+    quick,
+    random_action,
+)
 from gymnasium.vector.utils import batch_space
 
 from crazysim.dynamics import first_principles
-from crazysim.engine import interpret
-from crazysim.engine.relative import on_data
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
+from crazysim.envs.env import select_states
 from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.hover import Hover
+from crazysim.envs.wrappers import autoreset
 
 N_WORLDS, N_STEPS = 4, 10_000
 ENDS = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_select():
+    """Compile the choice between a state and that of a new episode, for steps that are not compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(autoreset, "select_states", quick(select_states))
+        yield
 
 
 @pytest.fixture(scope="module", params=entries())
@@ -40,9 +58,10 @@ def begun(env):
     return env.reset(jax.random.key(0))
 
 
-@pytest.fixture(scope="module")
-def flown(env):
-    """10,000 random steps of four worlds in one scan, new episodes as they end: the last state, and all results."""
+@functools.cache
+def flight(name):
+    """Return the last state and all results of 10,000 random steps of four worlds, with new episodes as they end."""
+    env = compiled(name, N_WORLDS)
     auto = AutoReset(EpisodeStatistics(env.env))
 
     def step(state, key):
@@ -55,6 +74,11 @@ def flown(env):
 
     state, results = fly(jax.random.key(1))
     return state, jax.tree.map(np.asarray, results)
+
+
+@pytest.fixture(scope="module")
+def flown(name):
+    return flight(name)
 
 
 def test_shapes_and_types_are_those_of_the_spaces(env, begun):
@@ -115,26 +139,28 @@ def test_the_same_seed_gives_the_same_numbers(env, begun):
 def test_gymnasium_makes_it_and_the_number_of_worlds_changes_nothing(name, env, begun):
     """Law 10 again, through Gymnasium's front door."""
     vec = gymnasium.make_vec(TASKS[name].id, num_envs=2)
+    obs, info = vec.reset(seed=0)
     assert isinstance(vec.unwrapped, DroneVectorEnv)
     assert (vec.spec.id, vec.num_envs) == (TASKS[name].id, 2)
     assert vec.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
     assert vec.observation_space == batch_space(vec.single_observation_space, 2)
     assert vec.action_space == batch_space(vec.single_action_space, 2)
-    obs, info = vec.reset(seed=0)
     state, worlds = begun, np.arange(2)
     vec.action_space.seed(3)
     for _ in range(4):
         assert {k: np.asarray(x) for k, x in obs.items()} in vec.observation_space
         for which, x in state.obs.items():
-            np.testing.assert_allclose(obs[which], x[worlds].reshape(obs[which].shape), rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(info["error"].ravel(), state.info["error"][worlds].ravel(), rtol=1e-4, atol=1e-5)
+            x = np.asarray(x)[worlds].reshape(obs[which].shape)
+            np.testing.assert_allclose(obs[which], x, rtol=1e-4, atol=1e-5)
+        error = np.asarray(state.info["error"])[worlds]
+        np.testing.assert_allclose(info["error"].ravel(), error.ravel(), rtol=1e-4, atol=1e-5)
         action = vec.action_space.sample()
         obs, reward, terminated, truncated, info = vec.step(action)
         assert (reward.shape, reward.dtype, terminated.dtype, truncated.dtype) == ((2,), np.float32, bool, bool)
         state = env.step(state, np.concatenate([action, action]).reshape(state.action.shape))
         if state.done.any():  # there the two part: the vector environment begins a new episode
             break
-        np.testing.assert_allclose(reward, state.reward[worlds].mean(axis=1), rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(reward, np.asarray(state.reward)[worlds].mean(axis=1), rtol=1e-3, atol=1e-4)
     vec.close()
 
 
@@ -174,11 +200,10 @@ def test_episodes_end_in_time_and_are_counted(env, flown):
 def test_one_program_is_the_whole_step(env, begun):
     """Actions, physics, task and new episodes, lowered for one world and interpreted, equal the unfused step."""
     auto = AutoReset(env, "SameStep")
-    fused = FusedEnvStep(env.env, auto.policy, begun, begun.action)
-    program = fused._run.program
-    fused._run._run = on_data(program, lambda leaves, n_steps: interpret.steps(program, leaves, n_steps))
+    with interpreted():
+        fused = FusedEnvStep(env.env, auto.policy, begun, begun.action)
     before, action = one_step_to_go(env, begun, ENDS), random_action(begun)
-    found, expected = fused(before, jnp.asarray(action)), auto.step(before, action)
+    found, expected = quick(fused)(before, jnp.asarray(action)), auto.step(before, action)
     assert kind(found)[0] == kind(expected)[0]
     pairs = zip(jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(expected), strict=True)
     for (path, x), y in pairs:
