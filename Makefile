@@ -21,11 +21,12 @@ test: $(VENV)/installed
 	$(RUN) -m pytest -n 2 --dist loadgroup --no-loadscope-reorder $(TESTS)
 
 # Physics, control, geometry, data, and the engine on its interpreter: what compiles little.
-FAST = tests/control tests/dynamics tests/drones tests/geometry tests/core/test_data.py tests/core/test_pipeline.py \
-  tests/core/test_random.py tests/core/test_functional.py $(addprefix tests/engine/test_,ir.py simplify.py passes.py \
-  interpret.py rules.py symbolic.py plan.py jaxcompat.py) tests/envs/test_task.py tests/envs/test_actions.py \
-  tests/laws/test_law_03_functional_core.py tests/laws/test_law_09_wrong_input.py tests/test_pytree.py \
-  tests/test_rotation.py tests/test_prose.py tests/test_package.py
+FAST = $(addprefix tests/control/test_,allocation.py attitude.py flat_state.py flatness.py setpoint.py state.py) \
+  tests/dynamics tests/drones $(addprefix tests/geometry/test_,heightfield.py manifold.py rays.py shapes.py) \
+  $(addprefix tests/core/test_,data.py pipeline.py random.py functional.py) $(addprefix tests/engine/test_,ir.py \
+  simplify.py passes.py interpret.py rules.py symbolic.py plan.py) tests/envs/test_task.py tests/envs/test_actions.py \
+  tests/laws/test_law_03_functional_core.py tests/laws/test_law_09_wrong_input.py tests/test_jaxcompat.py \
+  tests/test_pytree.py tests/test_rotation.py tests/test_prose.py tests/test_package.py
 
 test-fast: $(VENV)/installed
 	$(RUN) -m pytest -n 2 --dist loadgroup --no-loadscope-reorder $(FAST)

@@ -72,3 +72,11 @@ def test_the_readme_begins_with_what_it_is_and_is_not():
     lines = (ROOT / "README.md").read_text().split("\n## ")[0]
     assert "drone simulator" in lines
     assert "not the firmware-in-the-loop simulator of the same name" in lines.replace("\n", " ")
+
+
+def test_the_fast_tests_exist():
+    """A file that was moved would end ``make test-fast`` before its first test."""
+    commands = subprocess.run(["make", "-n", "test-fast"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    paths = [word for word in commands.split() if word.startswith("tests/")]
+    assert len(paths) > 20
+    assert [path for path in paths if not (ROOT / path).exists()] == []
