@@ -1,11 +1,11 @@
-"""Everything of a live simulation at once for a long time: memory, lateness of control steps, lost frames.
+"""All parts of a live simulation together for a long time: memory, lateness of control steps, lost frames.
 
     python benchmarks/soak.py [--seconds 3600] [--drones 30] [--objects 50]
 
 Drones circle in real time while motion capture sends 240 frames a second, 50 pictures a second are sent to a client of
-the page, and poses are recorded. One JSON line has the memory after the first tenth of the time and at its end, MB,
-and its growth per hour as a line is fitted to what lies between, MB/h. The first tenth is left out: in it compiled
-programs and the snapshots of the last minute find their place. Linux only.
+the page, and poses are recorded. The program prints one JSON line. ``memory_mb`` is the memory after a tenth of the
+time and at the end, MB; ``growth_mb_per_hour`` is the slope of a line fitted to all readings between, MB/h. The first
+tenth is left out, because programs are compiled and the snapshots of the last minute fill in it. Linux only.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from crazysim.live.program import Circles
 FREQ = 240.0
 """Frames per second of motion capture, Hz."""
 WARM_UP = 0.1
-"""Part of the time that is left out of the line fitted to the memory."""
+"""Fraction of the time at the beginning whose memory readings are left out."""
 
 
 def main() -> None:
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def measure(seconds: float, n_drones: int, n_objects: int) -> None:
-    """Run, and print the figures."""
+    """Run for a time, s, and print the figures."""
     sim = Sim(n_drones=n_drones, control="state", freq=500)
     source = RealTimeSource(FunctionSource(circling_bodies(n_objects), FREQ))
     names = [f"cf{k}" for k in range(n_objects)]
@@ -104,7 +104,7 @@ class Memory:
         self._ended.set()
 
     def samples(self, after: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return times, s, and memory, MB, of the readings after a time, s."""
+        """Return times since the beginning, s, and memory, MB, of the readings after a time, s. (n,), (n,)"""
         at, used = np.asarray(self._readings).T
         return at[at >= after], used[at >= after]
 

@@ -109,7 +109,9 @@ def _add_show(commands: Any) -> None:
     show.add_argument("--host", default="127.0.0.1", help="address of the page; 0.0.0.0 to accept other machines")
     show.add_argument("--window", action="store_true", help="play the show in a window")
     show.add_argument(
-        "--live", action="store_true", help="fly in real time while --window or --browser shows it, without figures"
+        "--live",
+        action="store_true",
+        help="fly in real time while --window or --browser shows it; no report of distances",
     )
     show.add_argument("--report", type=Path, metavar="FILE", help="figures to write, .json")
     show.add_argument("--seconds", type=float, help="duration of the flight, s; by default that of the show")

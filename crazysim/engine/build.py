@@ -40,7 +40,7 @@ def build_program(
         rows: From the leaves that are written to those that are stored as rows of one number of all drones each.
         population: Population whose members are computed side by side.
         pack: True to read shared numbers from one leaf.
-        tracer: Traces the stages; None for a new one.
+        tracer: Cache of traced stages; None for a new one.
     """
     program = lower_stages(stages, data, zeros, watched, first, last, scratch, population, tracer)
     then: list[passes.Pass] = [passes.fuse, passes.join_ticks, passes.hoist, *([pack_shared] if pack else [])]

@@ -45,7 +45,7 @@ def independent(stages: Sequence[Stage], data: Any, tracer: Tracer) -> list[Grou
     Args:
         stages: Stages of a step, in order.
         data: Data of the simulation, or its shapes and types.
-        tracer: Traces the stages.
+        tracer: Cache of traced stages.
     """
     axes, leaves = Axes(data), jax.tree.leaves(data)
     if all(scope == "drone" or not has_members(scope) for scope in axes.scopes):

@@ -51,7 +51,7 @@ def lower_stages(
         last: Stages that run once, after the last step.
         scratch: Leaves that only carry numbers from one stage to another; what is written there is not kept.
         population: Population whose members are computed side by side; below they are called drones.
-        tracer: Traces the stages; None for a new one.
+        tracer: Cache of traced stages; None for a new one.
     """
     tracer = tracer or Tracer()
     axes = RelativeAxes(data, population)

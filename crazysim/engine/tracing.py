@@ -52,14 +52,14 @@ class TracedStage:
 
 
 class Tracer:
-    """Stages as jaxprs; a stage that is met again, with leaves of the same shapes and types, is not traced again."""
+    """Cache of traced stages: each is traced once for leaves of the same shapes and types."""
 
     def __init__(self) -> None:
-        """Begin without any stage."""
+        """Begin with an empty cache."""
         self._found: dict[Any, TracedStage] = {}
 
     def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:
-        """Return ``TracedStage`` of the same arguments."""
+        """Return ``TracedStage(stage, axes, leaves)``, traced now or before."""
         shapes = tuple([(x.shape, x.dtype) for x in axes.of_one(list(leaves), stage.scope)])
         key = (stage.fn, stage.when, axes.treedef, shapes)
         if key not in self._found:

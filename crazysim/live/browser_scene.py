@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from crazysim.live.browser_trails import Trails, finite_rows
 from crazysim.live.mocap.frames import rotate
-from crazysim.live.picture import Picture
+from crazysim.live.picture import LIGHT_RADIUS, WIND_SCALE, Picture
 from crazysim.live.scene_bodies import DRONE, MARK_RADIUS, SceneBodies, SceneBody
 from crazysim.media.trail import colors_of
 from crazysim.media.web import add_static, mesh_of, rgb
@@ -18,12 +18,8 @@ from crazysim.scene.visual_geoms import VisualGeom
 
 SETPOINT_RADIUS = 0.025
 """Radius of a setpoint's sphere, m."""
-LIGHT_RADIUS = 0.06
-"""Radius of the glow around a lit drone, m."""
 NEAR = 0.02
-"""Distance from a body, per distance from the camera, at which a click still picks it."""
-WIND_SCALE = 0.1
-"""Length of a wind arrow per speed, s."""
+"""Smallest half size of what a click picks, as a multiple of the distance from the camera."""
 HIDDEN = 1e-6
 """Scale of a mark that is not shown."""
 CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
@@ -123,7 +119,7 @@ class BrowserScene:
         self._show_followed(pos, picture, follow)
 
     def pick(self, picture: Picture, origin: Any, direction: Any) -> tuple[int, SceneBody | None, NDArray | None]:
-        """Return what a ray from the camera hits: index of the world, body or None, point of the floor or None.
+        """Return index of the world, body or None, and point of the floor, m, or None, that a ray from the camera hits.
 
         Args:
             picture: Picture that the user has seen.
@@ -143,9 +139,15 @@ class BrowserScene:
         return world, None, point - self.offsets[world]
 
     def _hits(self, picture: Picture, origin: NDArray, direction: NDArray) -> NDArray:
-        """Return distances of the middles of bodies from a ray that enters the box around them, m. (n, n_mocap)
+        """Return the distance between a ray and the origin of each body whose box it enters, m. (n, n_mocap)
 
-        They are infinite for all others. What is small or far away is easy to click, too: its box is larger.
+        The distance is infinite for other bodies. Boxes of small and distant bodies are enlarged, so that they are easy
+        to click.
+
+        Args:
+            picture: Picture that the user has seen.
+            origin: Start of the ray, frame of the grid of worlds, m. (3,)
+            direction: Unit vector. (3,)
         """
         start = origin - self._moved(picture.pos)
         away = np.linalg.norm(start, axis=-1, keepdims=True)
@@ -205,7 +207,12 @@ class BrowserScene:
         self._wind.points = ends
 
     def _show_lights(self, drones: NDArray, colors: NDArray) -> None:
-        """Show the LEDs of all drones; what has not changed is not sent. (n, 3), (n, 3)"""
+        """Show the LEDs of all drones; colours are sent only when they change.
+
+        Args:
+            drones: Positions, m. (n, 3)
+            colors: Colours, 0 to 1; zero for off. (n, 3)
+        """
         if not np.array_equal(colors, self._lit):
             self._lit = colors
             self._lights.batched_colors = rgb_of(colors)

@@ -23,6 +23,11 @@ from crazysim.sim.sim import Sim
 if TYPE_CHECKING:
     from crazysim.live.loop import Live
 
+LIGHT_RADIUS = 0.06
+"""Radius of the glow around a lit drone, m."""
+WIND_SCALE = 0.1
+"""Length of a wind arrow per speed, s."""
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:
@@ -41,11 +46,11 @@ class Picture:
     drones: NDArray
     """Positions of the drones, world frame, m. (n, n_drones, 3)"""
     setpoint: NDArray
-    """Positions of state commands, m; no drones with other commands. (n, n_drones or 0, 3)"""
+    """Positions of state commands, world frame, m; empty at other command levels. (n, n_drones or 0, 3)"""
     touching: NDArray
     """True where a drone touches something. (n, n_drones)"""
     wind: NDArray
-    """Velocity of the air at every drone, world frame, m/s; no drones without wind. (n, n_drones or 0, 3)"""
+    """Velocity of the air at every drone, world frame, m/s; empty without wind. (n, n_drones or 0, 3)"""
     lights: NDArray
     """Colours of the drones' LEDs, 0 to 1; zero for off. (n, n_drones, 3)"""
     selected: tuple[int, int] | None

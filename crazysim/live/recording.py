@@ -39,7 +39,7 @@ class LiveRecording:
         self._begin: int | None = None
 
     def add(self, live: Live) -> bool:
-        """Write a sample if one is due, and return False if that is impossible, for example for want of space."""
+        """Write a sample if one is due, and return False if it cannot be written, as on a full disk."""
         if self._begin is None:
             self._begin = live.flown
         flown = live.flown - self._begin
@@ -58,10 +58,10 @@ class LiveRecording:
 
 
 class Recordings:
-    """The recording that is being written, if there is one, and the path for the next."""
+    """The recording that is being written, if there is one, and the path that was requested last."""
 
     last_path: Path | None
-    """Path that was requested last."""
+    """Path that was requested last; None before the first recording."""
     failures: int
     """Number of recordings that ended because they could not be written."""
 
@@ -92,7 +92,7 @@ class Recordings:
         return self._open.path
 
     def add(self, live: Live) -> None:
-        """Write a sample if one is due; a recording that cannot be written ends, and the flight does not."""
+        """Write a sample if one is due; a recording that cannot be written ends, and the flight continues."""
         if self._open is not None and not self._open.add(live):
             self.failures += 1
             self.close()

@@ -17,9 +17,9 @@ from crazysim.sim.sim import Sim
 DRONE = "drone"
 """Kind of drones."""
 MARK_RADIUS = 0.12
-"""Radius of the sphere around a marked drone, and the least one of other bodies, m."""
+"""Radius of the sphere around a marked drone, and the smallest around other bodies, m."""
 MAX_TRAILS = 256
-"""Most bodies of a world that have trails; drones always have."""
+"""Number of bodies of a world up to which all have trails; above it only the drones have."""
 
 
 class SceneBody(NamedTuple):
@@ -41,11 +41,11 @@ class SceneBodies:
     items: tuple[SceneBody, ...]
     """Bodies, drones first."""
     owner: NDArray
-    """Number, among ``items``, of the body that each mocap body is or belongs to, as a wheel to its car. (n_mocap,)"""
+    """Index into ``items`` for each mocap body: the body itself, or, for a part such as a wheel, its car. (n_mocap,)"""
     low: NDArray
-    """Least coordinates of the visible geoms of each mocap body, in its frame, m. (n_mocap, 3)"""
+    """Lower corner of the box around the visible geoms of each mocap body, body frame, m. (n_mocap, 3)"""
     high: NDArray
-    """Greatest coordinates. (n_mocap, 3)"""
+    """Upper corner of that box, body frame, m. (n_mocap, 3)"""
 
     def __init__(self, sim: Sim, shapes: Sequence[VisualGeom] = ()):
         """Find the bodies of a compiled scene.
@@ -83,13 +83,21 @@ class SceneBodies:
         return np.array(drones + (others if len(self.items) <= MAX_TRAILS else []), int)
 
     def radius(self, mocap: int) -> float:
-        """Return the radius of the mark around a body, m."""
+        """Return the radius of the mark around a body, m.
+
+        Args:
+            mocap: Mocap id of the body.
+        """
         if self.items[self.owner[mocap]].kind == DRONE:
             return MARK_RADIUS
         return max(MARK_RADIUS, float(np.linalg.norm(np.maximum(-self.low[mocap], self.high[mocap]))))
 
     def find(self, kind: str, index: int) -> SceneBody:
         """Return a body.
+
+        Args:
+            kind: Kind, see ``SceneBody``.
+            index: Number among those of its kind.
 
         Raises:
             ConfigError: If there is none.

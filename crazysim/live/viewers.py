@@ -1,4 +1,4 @@
-"""The viewers of a live simulation, and the times at which they get pictures."""
+"""The open viewers of a live simulation, and the rate of their pictures."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ log = logging.getLogger(__name__)
 
 
 class Viewers:
-    """Open viewers, which get pictures at one rate; one that fails is closed, and the others continue."""
+    """Open viewers, which get pictures at one rate; a viewer that fails is closed, and the others continue."""
+
+    period: float
+    """Time between two pictures, s."""
 
     n_pictures: int
-    """Number of pictures so far."""
+    """Number of pictures sent so far; one sent to several viewers counts once."""
     failures: int
     """Number of viewers that failed."""
     next_at: float
@@ -49,7 +52,12 @@ class Viewers:
         self._open.append(viewer)
 
     def draw(self, live: Live, due: float) -> bool:
-        """Send a picture to every viewer if a time has come, and return True if it has."""
+        """Send a picture to every viewer if it is due, and return True if it was.
+
+        Args:
+            live: Loop.
+            due: Time from which a picture is sent, s, by ``time.perf_counter``.
+        """
         now = time.perf_counter()
         if not self._open or now < due:
             return False
@@ -58,7 +66,7 @@ class Viewers:
         return True
 
     def update(self, live: Live) -> None:
-        """Send a picture to every viewer, and stop the loop with the last one."""
+        """Send a picture to every viewer, remove those that are closed or fail, and stop the loop when none is left."""
         for viewer in list(self._open):
             try:
                 if viewer.is_open:
@@ -67,7 +75,7 @@ class Viewers:
             except Exception as error:
                 self.failures += 1
                 log.warning("%s failed at %.2f s and is closed: %s", type(viewer).__name__, live.time, error)
-            self._open.remove(viewer)
+            self._open = [other for other in self._open if other is not viewer]  # viewers can be equal
             viewer.close()
             if not self._open:
                 live.stop()

@@ -13,9 +13,10 @@ from typing import Any, BinaryIO
 import mujoco
 import numpy as np
 
+from crazysim.drones.body import LED_MATERIALS
 from crazysim.errors import RenderError
 from crazysim.live.chart import Chart
-from crazysim.live.picture import Picture
+from crazysim.live.picture import LIGHT_RADIUS, WIND_SCALE, Picture
 from crazysim.live.scene_bodies import MARK_RADIUS, SceneBodies
 from crazysim.live.window import LENGTH
 from crazysim.media.trail import Trail, colors_of
@@ -31,14 +32,10 @@ DOUBLE_CLICK = 0.35
 """Longest time between the clicks of a double click, s."""
 STILL = 0.01
 """Longest way of the cursor between these, as a part of the window's size."""
-SETPOINT_RADIUS, LIGHT_RADIUS = 0.02, 0.06
-"""Radius of a setpoint's sphere, and of the glow around a lit drone, m."""
+SETPOINT_RADIUS = 0.02
+"""Radius of a setpoint's sphere, m."""
 TOUCHING, FOLLOWED, AIR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25), (0.35, 0.6, 0.8, 0.9)
 """Colours of marks, rgba."""
-LEDS = ("led_top", "led_bot")
-"""Materials of the LEDs of a drone."""
-WIND_SCALE = 0.1
-"""Length of a wind line per speed, s."""
 
 
 class Inbox:
@@ -74,12 +71,14 @@ class Leds:
         """Find the materials that airframes have: ``led_top:0``, ``led_bot:0``, ..."""
         self._model = model
         names = [model.material(k).name.partition(":") for k in range(model.nmat)]
-        leds = [(k, int(drone)) for k, (kind, _, drone) in enumerate(names) if kind in LEDS and drone.isdigit()]
+        leds = [
+            (k, int(drone)) for k, (kind, _, drone) in enumerate(names) if kind in LED_MATERIALS and drone.isdigit()
+        ]
         self._materials, self._drones = np.array(leds, int).reshape(-1, 2).T
         self._off = model.mat_rgba[self._materials].copy(), model.mat_emission[self._materials].copy()
 
     def color(self, colors: np.ndarray) -> None:
-        """Set the colours of a world's drones; zero for off. (n_drones, 3)"""
+        """Set the colours of the drones of one world, 0 to 1; zero for off. (n_drones, 3)"""
         own = colors[self._drones]
         brightest = own.max(-1, initial=0.0)
         lit, (rgba, emission) = brightest > 0, self._off

@@ -101,6 +101,6 @@ class Trail:
             return
         fade = np.linspace(MIN_ALPHA, 1.0, len(path) - 1)[:, None] ** [0, 0, 0, 1]
         moved = (np.ptp(path, axis=0) > 0).any(-1)
+        colors = colors_of(path.shape[1], rgba)
         for drone in np.flatnonzero(moved):
-            color = colors_of(path.shape[1], rgba)[drone]
-            overlays.line(path[:, drone], color * fade, 1.0, width)
+            overlays.line(path[:, drone], colors[drone] * fade, 1.0, width)

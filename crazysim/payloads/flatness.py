@@ -55,8 +55,8 @@ def load_flat_state(
 ) -> LoadedState:
     """Return states and inputs with which a drone carries a point load along a path.
 
-    The rod is attached at the drone's centre of mass. ``control.flatness.attitude_of_thrust`` has the rules for
-    attitudes that are not determined. A load in free fall has no tension and no direction; there the results are not
+    The rod is attached at the drone's centre of mass. ``control.flatness.attitude_of_thrust`` defines the attitudes that
+    thrust and yaw do not determine. A load in free fall has no tension and no direction; there the results are not
     finite.
 
     Args:
@@ -92,10 +92,10 @@ def load_flat_state(
 
 
 def _norm_and_direction(vector: list[Array]) -> tuple[Array, list[Array]]:
-    """Return the norm of a vector (..., 1), and the unit vector along it with its time derivatives, (..., 3) each.
+    """Return the norm of a vector, (..., 1), and the unit vector along it with its time derivatives, (..., 3) each.
 
-    From the derivatives of ``norm norm = vector . vector`` and ``norm direction = vector`` by Leibniz' rule, solved
-    for the highest derivative.
+    The equations ``norm norm = vector . vector`` and ``norm direction = vector`` are differentiated by Leibniz' rule
+    and solved for the highest derivatives.
 
     Args:
         vector: The vector and its time derivatives. (..., 3) each

@@ -188,9 +188,15 @@ def _nearest(
 
 @functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
 def _distance_and_slopes(shape: Shape, other: Shape, pos: Array, rot: Array) -> tuple[Array, tuple[Array, Array]]:
-    """Return ``distance`` and its gradients with respect to position and rotation matrix.
+    """Return ``distance``, m, (...), and its gradients with respect to position and rotation matrix.
 
-    Traced once for both plates and all geoms of one shape, such as the wheels of cars.
+    It is traced only once for both plates and all geoms of one shape, such as the wheels of cars.
+
+    Args:
+        shape: Shape of the plate.
+        other: Shape of the geom.
+        pos: Position of the plate, frame of the geom, m. (..., 3)
+        rot: Rotation matrix from the plate to the geom. (..., 3, 3)
     """
     gap, pull_back = jax.vjp(lambda pos, rot: distance(shape, other, pos, rot), pos, rot)
     return gap, pull_back(jnp.ones_like(gap))

@@ -102,7 +102,7 @@ class Handle:
 
 @compiled("numbers", "is_quat")
 def _moved(old: Array, value: Array, mask: Array | None, numbers: tuple[int, ...], is_quat: bool) -> Array:
-    """Return poses or velocities of all objects with other rows; quaternions are normalised."""
+    """Return positions, attitudes or velocities of all objects with some rows replaced; attitudes are normalised."""
     n, size = len(numbers), old.shape[-1]
     value = jnp.asarray(value, old.dtype)
     if is_quat:

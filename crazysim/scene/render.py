@@ -169,10 +169,10 @@ def _free(renderers: dict[tuple[int, int], mujoco.Renderer], windows: list[Windo
 
 
 def _leave_context() -> None:
-    """Leave no context current in this thread.
+    """Release the OpenGL context that is current in this thread.
 
-    One that is current can be used and freed by no other thread, not even after this thread has ended; and garbage is
-    collected in any thread.
+    While a context is current in one thread, and even after that thread has ended, no other thread can use or free it.
+    Renderers are freed by the garbage collector, which runs in any thread.
     """
     backend = gl_context.GLContext.__module__
     if backend == "mujoco.egl":

@@ -1,4 +1,4 @@
-"""Light shows in a live simulation, with lights."""
+"""Light shows in a live simulation."""
 
 from __future__ import annotations
 
@@ -25,14 +25,18 @@ LIGHT_FREQ = 50
 
 
 class ShowLights:
-    """Process that lights the drones' LEDs as a show has them: ``live.add(ShowLights(show))``."""
+    """Process that sets the LEDs of drones to the colours of a show: ``live.add(ShowLights(show))``."""
 
     def __init__(self, show: Show):
-        """Take the lights of a show, whose first drone is the simulation's first."""
+        """Take the lights of a show; its k-th drone is the simulation's k-th.
+
+        Args:
+            show: Show, which begins when the simulated time is zero.
+        """
         self._lights, self._n = show.lights, show.n_drones
 
     def __call__(self, live: Live) -> None:
-        """Set the colours of this moment, the same in all worlds."""
+        """Set the colours at the present time, equal in all worlds."""
         live.lights[:, : self._n] = self._lights.colors([live.time])[0]
 
 
@@ -58,7 +62,7 @@ def live_show(show: Show, speed: Speed = 1.0, **settings: Any) -> Live:
 
 
 def run_live(show: Show, options: Namespace, **settings: Any) -> None:
-    """Run ``crazysim show --live``, and print the figures.
+    """Run ``crazysim show --live``, and print the report of the loop.
 
     Raises:
         ConfigError: If a setting is invalid, or a file is to be written.
@@ -66,7 +70,7 @@ def run_live(show: Show, options: Namespace, **settings: Any) -> None:
     """
     written = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
     if written is not None:
-        raise ConfigError(f"expected --live or --{written}, got both. Leave one out.")
+        raise ConfigError(f"expected --live or --{written}, got both. Leave one of them out.")
     with live_show(show, **settings) as live:
         if options.window:
             planned = planned_at(show.trajectories, jnp.linspace(0.0, show.duration, 50))

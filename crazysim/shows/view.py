@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.drones.body import LED_MATERIALS
 from crazysim.errors import ConfigError
 from crazysim.media import Film, Flight, View, flight_of, web
 from crazysim.media.recording import put
@@ -166,9 +167,10 @@ def darken(sim: Sim) -> None:
 
 
 def _lit(sim: Sim) -> tuple[str, ...]:
-    """Return the LEDs that the airframe has."""
-    names = ("led_top", "led_bot")
-    return tuple(x for x in names if mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{x}:0") >= 0)
+    """Return the materials of the LEDs that the airframe has."""
+    return tuple(
+        x for x in LED_MATERIALS if mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{x}:0") >= 0
+    )
 
 
 def _ascii(text: str) -> str:

@@ -48,9 +48,9 @@ class CarData(Members):
     path: Path | None
     """Paths; None for cars that follow none."""
     index: Array | None = leaf("parameter", 1, (1,))
-    """Number of the path that a car follows. (1,)"""
+    """Index of the path that a car follows. (1,)"""
     start: Array | None = leaf("parameter", 1, (1,))
-    """Time of the world at which a car is at the start of its path, s. (1,)"""
+    """Simulated time at which a car is at the start of its path, s. (1,)"""
     arc: Array | None = leaf("member", 1)
     """Arc length of the car's projection on its path, m. (n_worlds, n_members, 1)"""
     memory: Any
@@ -81,10 +81,10 @@ class CarData(Members):
         return jnp.concatenate([zero, zero, self.yaw_rate], axis=-1)
 
     def with_vel(self, vel: Array, ang_vel: Array) -> CarData:
-        """Return the record with other velocities of cars, of which those on the ground count.
+        """Return the record with other velocities; only the horizontal velocity and the yaw rate are used.
 
         Args:
             vel: Velocity of the centre of mass, world frame, m/s. (..., 3)
-            ang_vel: Angular velocity, rad/s. (..., 3)
+            ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         """
         return self.replace(body_vel=to_body(self.yaw, vel[..., :2]), yaw_rate=ang_vel[..., 2:])

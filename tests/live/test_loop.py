@@ -238,6 +238,24 @@ def test_a_broken_viewer_is_closed_and_named(live, caplog):
     assert "no light" in caplog.text
 
 
+class Equal(Counter):
+    """A viewer that equals every other, as two windows with the same settings do."""
+
+    def __eq__(self, other):
+        return True
+
+    __hash__ = None
+
+
+def test_of_two_equal_viewers_only_the_closed_one_is_removed(live):
+    live.speed = 1.0
+    open_one, closed_one = live.show(Equal()), live.show(Equal(until=2))
+    live.run(0.3)
+    assert closed_one.closed
+    assert not open_one.closed
+    assert open_one.n > 4
+
+
 def test_missed_real_time_is_reported(live, caplog):
     live.speed = 1.0
     live.at(0.1, lambda live: time.sleep(0.4))

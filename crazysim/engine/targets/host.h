@@ -1,5 +1,5 @@
 // A block of W lanes is a vector, held as GCC's and Clang's vector types; what all lanes share stays a number.
-// The headers are those of C (-nostdinc++): reading those of C++ takes longer than reading all of this.
+// Only C headers are included (-nostdinc++): parsing those of C++ would take longer than parsing the rest.
 #include <math.h>
 #include <pthread.h>
 #include <sched.h>
@@ -54,6 +54,7 @@ typedef vec<int64_t>::type i64v;
 struct b1v { i32v m; };  // all bits set where true
 template <> struct vec<b1> { typedef b1v type; };
 
+// std::enable_if_t, which is in a header of C++.
 template <bool> struct only_if {};
 template <> struct only_if<true> { typedef void type; };
 template <bool condition> using only_if_t = typename only_if<condition>::type;

@@ -1,4 +1,4 @@
-"""Bringing a load to a goal: the outcome, the way to go, and success."""
+"""Bringing a load to a goal: remaining way, outcome and success, shared by ``deliver`` and ``transport``."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Delivery(PyTree):
     """Goal of each load, and the outcome of its flight."""
 
     goal: Array = leaf("drone", 1)
-    """Goal of the load, m. (n_worlds, n_drones, 3)"""
+    """Goal of the load, world frame, m. (n_worlds, n_drones, 3)"""
     to_go_before: Array = leaf("drone", 0)
-    """Way to go before this environment step, m. (n_worlds, n_drones)"""
+    """Remaining way, ``to_go``, at the beginning of this environment step, m. (n_worlds, n_drones)"""
     steps_there: Array = leaf("drone", 0)
-    """Physics steps that the load has been at its goal without a break. (n_worlds, n_drones)"""
+    """Number of physics steps for which the load has been at its goal without a break. (n_worlds, n_drones)"""
     delivered: Array = leaf("drone", 0)
-    """True where the load has stayed at its goal for long enough. (n_worlds, n_drones)"""
+    """True where the load has stayed at its goal for ``hold`` seconds. (n_worlds, n_drones)"""
     crashed: Array = leaf("drone", 0)
     """True where the drone has crashed, as the task defines it. (n_worlds, n_drones)"""
 
@@ -39,23 +39,23 @@ class BringLoad(Task):
     """Base of tasks in which every drone brings a load of its own to a goal and holds it there.
 
     Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``to_go``, ``observe`` and ``rewards``. Their
-    ``install`` adds the load, whose plugin is named ``load``, and a stage of one drone that writes what ``judged``
-    returns. An episode ends when a drone crashes.
+    ``install`` adds the load, whose plugin is named ``load``, and a stage of one drone that stores the record of
+    ``judged``. An episode ends when a drone crashes.
     """
 
     Record = Delivery
 
     tolerance: float = 0.1
-    """Distance of the load from its goal below which it counts as there, m."""
+    """Largest distance of a load at its goal, m."""
     hold: float = 0.5
-    """Time that the load must stay there, s."""
+    """Time for which the load must stay at its goal, s."""
 
     def to_go(self, data: SimData) -> Array:
-        """Return the length of the way that is left, m. (...)"""
+        """Return the length of the remaining way, m. (...)"""
         raise NotImplementedError(self._undefined("to_go(data)"))
 
     def judged(self, data: SimData, crashed: Array) -> Any:
-        """Return the record after a physics step: crashes until now, and whether the load has been delivered.
+        """Return the record after a physics step, with crashes and deliveries up to now.
 
         Args:
             data: Simulation.
@@ -68,43 +68,43 @@ class BringLoad(Task):
         return own.replace(crashed=crashed, steps_there=steps, delivered=delivered)
 
     def before_step(self, data: SimData) -> SimData:
-        """Note the way to go."""
+        """Store the remaining way."""
         return with_record(data, delivery_of(data).replace(to_go_before=self.to_go(data)))
 
     def at_goal(self, data: SimData) -> Array:
-        """Return true where a load is near its goal and slow. (...)"""
+        """Return True where a load is near its goal and slow. (...)"""
         vel = load_vel(data)
         return (rotation.dot(vel, vel)[..., 0] < SLOW**2) & (self.error(data) < self.tolerance)
 
     def terminated(self, data: SimData) -> Array:
-        """Return true where a drone has crashed."""
+        """Return True in worlds where a drone has crashed. ()"""
         return jnp.any(delivery_of(data).crashed)
 
     def error(self, data: SimData) -> Array:
-        """Return the distance of the load from its goal, m."""
+        """Return the distance of the load from its goal, m. (...)"""
         return rotation.safe_norm(delivery_of(data).goal - load_pos(data))[..., 0]
 
     def info(self, data: SimData) -> dict[str, Array]:
-        """Return which loads are delivered, and which drones have crashed."""
+        """Return masks of delivered loads and crashed drones. (...)"""
         own = delivery_of(data)
         return {"delivered": own.delivered, "crashed": own.crashed}
 
     def target(self, data: SimData) -> Array:
-        """Return the goal of the load, m."""
+        """Return the goal of the load, world frame, m. (..., 3)"""
         return delivery_of(data).goal
 
     def succeeded(self, data: SimData) -> Array:
-        """Return which loads have been delivered."""
+        """Return True where a load has been delivered. (...)"""
         return delivery_of(data).delivered
 
 
 def delivery_of(data: SimData) -> Any:
-    """Return the task's record."""
+    """Return the task's ``Delivery``, or the subclass of it that the task uses."""
     return data.plugins[NAME]
 
 
 def not_yet(data: SimData) -> dict[str, Array]:
-    """Return the fields of ``Delivery`` for loads under way, of all worlds."""
+    """Return the fields of ``Delivery`` at the start: nothing is delivered, and no drone has crashed. All worlds."""
     pos = data.states.pos
     zero, no = jnp.zeros_like(pos[..., 0]), jnp.zeros(pos.shape[:2], bool)
     return {

@@ -137,22 +137,24 @@ class Swarm(Closing):
         Raises:
             ConfigError: If it is another simulation.
         """
-        if live.sim is not self.sim:
-            raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
+        self._check_loop(live)
         self.update()
         if hasattr(live, "lights"):
             live.lights[0] = self.colors
 
     def run_in(self, live: Live) -> None:
-        """Let ``advance`` and ``sleep`` run a live loop, which keeps its speed and shows its viewers.
+        """Let ``advance`` and ``sleep`` run a live loop, with its speed and its viewers.
 
         Raises:
             ConfigError: If it is the loop of another simulation.
         """
-        if live.sim is not self.sim:
-            raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
+        self._check_loop(live)
         live.add(self, name="swarm")
         self._live = live
+
+    def _check_loop(self, live: Any) -> None:
+        if live.sim is not self.sim:
+            raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
 
     def update(self) -> None:
         """Read the states and stage the commands in force, between two control steps."""
@@ -163,7 +165,7 @@ class Swarm(Closing):
                 listener()
 
     def advance(self, seconds: float) -> None:
-        """Advance by a number of control steps, as many as reach a time, s, as fast as possible or by ``run_in``.
+        """Advance by a time, s, rounded to control steps: as fast as possible, or at the speed of the ``run_in`` loop.
 
         Raises:
             ConfigError: If a thread advances the simulation.
