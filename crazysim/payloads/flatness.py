@@ -55,7 +55,7 @@ def load_flat_state(
 ) -> LoadedState:
     """Return states and inputs with which a drone carries a point load along a path.
 
-    The rod is attached at the drone's centre of mass. ``control.flatness.attitude_of_thrust`` defines the attitudes that
+    The rod is attached at the drone's centre of mass. ``control.flatness.attitude_of_thrust`` defines attitudes that
     thrust and yaw do not determine. A load in free fall has no tension and no direction; there the results are not
     finite.
 
