@@ -1,4 +1,4 @@
-"""Trails in a browser: the recent positions of bodies, as one set of line segments."""
+"""Trails in a browser, drawn as one set of line segments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Trails:
     """The recent positions of all bodies, as one set of line segments of constant size."""
 
     def __init__(self, scene: Any, pos: NDArray, colors: NDArray, seconds: float):
-        """Begin with trails of no length.
+        """Begin with trails of length zero.
 
         Args:
             scene: Scene of viser.
@@ -61,6 +61,6 @@ class Trails:
 
 
 def finite_rows(values: NDArray, rest: Any = 0.0) -> NDArray:
-    """Return rows of numbers, with those that are not finite replaced."""
+    """Return rows of numbers, (..., k), with rows that are not finite replaced by ``rest``, () or (k,)."""
     bad = ~np.isfinite(values).all(-1, keepdims=True)
     return np.where(bad, np.asarray(rest, float), values)

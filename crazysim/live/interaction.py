@@ -72,7 +72,7 @@ class Interaction:
         self.values[name] = float(value)
 
     def set_value(self, name: str, value: float) -> None:
-        """Move a slider, within its limits, and call its function.
+        """Move a slider, clipped to its limits, and call its function.
 
         Raises:
             ConfigError: If there is no such slider, or the value is not finite.
@@ -129,7 +129,7 @@ class Interaction:
         return self.selected[0], DRONE, self.selected[1]
 
     def follow(self, world: int, kind: str, index: int) -> None:
-        """Let viewers mark and follow a body, as a click on it does; a drone is selected, too.
+        """Let viewers mark and follow a body, as a click on it does. A drone becomes the selected drone as well.
 
         Args:
             world: Index of the world.

@@ -304,7 +304,7 @@ class Live(Interaction, Closing):
         if late > ALARM and self._may_warn():
             log.warning("real time missed at %.2f s: %.0f ms late", self.time, 1e3 * late)
         self._control_step()
-        # A picture waits for a moment without work, but not longer than the one after it.
+        # At real-time speeds a picture waits for idle time, but at most until the next picture is due.
         viewers.draw(self, viewers.next_at + (0.0 if self.speed == "max" else viewers.period))
         return 0.0
 

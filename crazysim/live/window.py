@@ -48,7 +48,7 @@ class Window(Viewer):
 
     The mouse turns, moves and zooms the view. A double click on a drone selects it, one on a vehicle, load or object
     follows that, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses, a full stop
-    makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [ and ] turn the
+    makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [ and ] move the
     chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window draws in a process of
     its own, as fast as it can, and never delays the simulation.
     """
@@ -144,7 +144,7 @@ class Window(Viewer):
             process.wait()
 
     def _write(self, process: subprocess.Popen[bytes]) -> None:
-        """Write the latest picture to the process whenever that has taken the one before."""
+        """Write the latest picture to the process whenever it has read the previous one."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._next is not None or self._process is not process)
@@ -157,7 +157,7 @@ class Window(Viewer):
                 return  # the window was closed
 
     def _listen(self, live: Live, process: subprocess.Popen[bytes], ready: threading.Event) -> None:
-        """Pass on what the user does in the window."""
+        """Pass the actions of the user in the window to the loop."""
         for line in process.stdout:
             kind, *values = json.loads(line)
             if kind == "ready":

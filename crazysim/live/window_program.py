@@ -25,13 +25,13 @@ from crazysim.scene.render import camera_id
 from crazysim.scene.window import Window
 
 IDLE = 0.005
-"""Time after which input is looked for again, s."""
+"""Time between two looks for a new picture, s."""
 REDRAW = 0.03
-"""Longest time between two drawings, s, so that the mouse is followed without new pictures."""
+"""Longest time between two drawings, s: the mouse moves the view even when no new picture arrives."""
 DOUBLE_CLICK = 0.35
 """Longest time between the clicks of a double click, s."""
 STILL = 0.01
-"""Longest way of the cursor between these, as a part of the window's size."""
+"""Largest movement of the cursor between these clicks, as a fraction of the window's size."""
 SETPOINT_RADIUS = 0.02
 """Radius of a setpoint's sphere, m."""
 TOUCHING, FOLLOWED, AIR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25), (0.35, 0.6, 0.8, 0.9)
@@ -96,7 +96,7 @@ class Program:
             model: Compiled scene.
             bodies: Bodies that can be followed.
             settings: Fields of ``crazysim.live.Window``.
-            out: Stream for what the user does.
+            out: Stream to which the actions of the user are written.
 
         Raises:
             RenderError: If it cannot be opened.
