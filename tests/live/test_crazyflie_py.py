@@ -205,3 +205,13 @@ def test_scripts_advance_a_live_loop_whose_viewers_show_the_lights():
     np.testing.assert_allclose(live.lights[0], [[0.0, 1.0, 0.0], [0, 0, 0]])
     with pytest.raises(ConfigError, match="loop of the swarm's simulation"):
         swarm.run_in(Live(Sim(control="state")))
+
+
+def test_one_of_thread_and_live_loop_advances_a_swarm():
+    swarm = Swarm(Sim(control="state"))
+    with Live(swarm.sim, speed="max") as live:
+        with swarm.start(), pytest.raises(ConfigError, match="no thread advances"):
+            swarm.run_in(live)
+        swarm.run_in(live)
+        with pytest.raises(ConfigError, match="Use advance or sleep"):
+            swarm.start()

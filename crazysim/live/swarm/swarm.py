@@ -146,9 +146,11 @@ class Swarm(Closing):
         """Let ``advance`` and ``sleep`` run a live loop, with its speed and its viewers.
 
         Raises:
-            ConfigError: If it is the loop of another simulation.
+            ConfigError: If it is the loop of another simulation, or a thread advances the simulation.
         """
         self._check_loop(live)
+        if self._thread is not None:
+            raise ConfigError("expected a swarm that no thread advances, got a running one. Call close first.")
         live.add(self, name="swarm")
         self._live = live
 
@@ -192,7 +194,13 @@ class Swarm(Closing):
             time.sleep(0.001)
 
     def start(self, speed: float = 1.0) -> Swarm:
-        """Advance in a thread, in real time or at another speed, and return the swarm."""
+        """Advance in a thread, in real time or at another speed, and return the swarm.
+
+        Raises:
+            ConfigError: If a live loop advances the simulation.
+        """
+        if self._live is not None:
+            raise ConfigError("expected a swarm without a live loop, got one after run_in. Use advance or sleep.")
         self._stopped.clear()
         self._thread = threading.Thread(target=self._run, args=(speed,), name="swarm", daemon=True)
         self._thread.start()
