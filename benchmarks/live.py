@@ -48,9 +48,7 @@ def measure(case: str, n_drones: int, seconds: float) -> None:
         if case == "recorded":
             live.record(Path(stack.enter_context(tempfile.TemporaryDirectory())) / "flight.journal")
         if case == "pictures":
-            page = live.show(Browser(port=0))
-            client = threading.Thread(target=read, args=(page.url,), daemon=True)
-            client.start()
+            show_to_client(live)
         live.run(1.0)
         result = live.run(seconds)
     report(
@@ -65,6 +63,12 @@ def measure(case: str, n_drones: int, seconds: float) -> None:
         lateness_999_ms=digits(1e3 * result.lateness_999),
         worst_ms=digits(1e3 * result.worst),
     )
+
+
+def show_to_client(live: Live) -> None:
+    """Show a simulation in a page that one client reads in a thread."""
+    page = live.show(Browser(port=0))
+    threading.Thread(target=read, args=(page.url,), daemon=True).start()
 
 
 def read(url: str) -> Any:

@@ -18,12 +18,12 @@ import time
 from pathlib import Path
 
 import numpy as np
-from live import read
+from live import show_to_client
 from measure import digits, report
 from mocap import circling_bodies
 
 from crazysim import Sim
-from crazysim.live import Browser, FunctionSource, Live, RealTimeSource, Twin, Twins
+from crazysim.live import FunctionSource, Live, RealTimeSource, Twin, Twins
 from crazysim.live.program import Circles
 
 FREQ = 240.0
@@ -55,8 +55,7 @@ def measure(seconds: float, n_drones: int, n_objects: int) -> None:
         live.add(Circles(live, piloted=False), name="circles")
         live.add(twins, on_error="report")
         path = live.record(Path(folder) / "flight.journal")
-        page = live.show(Browser(port=0))
-        threading.Thread(target=read, args=(page.url,), daemon=True).start()
+        show_to_client(live)
         source.start()
         result = live.run(seconds)
         recorded = path.stat().st_size

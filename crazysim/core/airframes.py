@@ -45,11 +45,9 @@ def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: i
             f"expected {n_drones} airframes, one for each drone, got {len(drone)}. Use Sim(n_drones={len(drone)}), or "
             f"one airframe for all."
         )
-    loaded: dict[Any, Airframe] = {}
-    for source in drone:
-        key = str(source) if isinstance(source, (str, Path)) else id(source)
-        loaded[key] = loaded[key] if key in loaded else load_airframe(source)
-    return tuple([loaded[str(source) if isinstance(source, (str, Path)) else id(source)] for source in drone])
+    keys = [str(source) if isinstance(source, (str, Path)) else id(source) for source in drone]
+    loaded = {key: load_airframe(source) for key, source in dict(zip(keys, drone, strict=True)).items()}
+    return tuple([loaded[key] for key in keys])
 
 
 def is_list(drone: Any) -> TypeGuard[Sequence[AirframeSource]]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.live.mocap.frames import rotate
 from crazysim.scene.visual_geoms import VisualGeom
 from crazysim.sim.sim import Sim
 
@@ -139,9 +140,7 @@ def _boxes(n: int, shapes: Sequence[VisualGeom]) -> tuple[NDArray, NDArray]:
     low, high = np.full((n, 3), np.inf), np.full((n, 3), -np.inf)
     for shape in shapes:
         if shape.mocap >= 0 and shape.kind != "plane":
-            axes = np.zeros(9)
-            mujoco.mju_quat2Mat(axes, np.roll(shape.quat, 1))
-            points = shape.pos + _corners(shape) @ axes.reshape(3, 3).T
+            points = shape.pos + rotate(shape.quat, _corners(shape))
             low[shape.mocap] = np.minimum(low[shape.mocap], points.min(0))
             high[shape.mocap] = np.maximum(high[shape.mocap], points.max(0))
     empty = ~np.isfinite(low).all(-1)
