@@ -56,15 +56,15 @@ class Tracer:
 
     def __init__(self) -> None:
         """Begin with an empty cache."""
-        self._found: dict[Any, TracedStage] = {}
+        self._found: dict[Any, tuple[Stage, TracedStage]] = {}  # the stage keeps its functions, whose ids are keys
 
     def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:
         """Return ``TracedStage(stage, axes, leaves)``, traced now or before."""
         shapes = tuple([(x.shape, x.dtype) for x in axes.of_one(list(leaves), stage.scope)])
-        key = (stage.fn, stage.when, axes.treedef, shapes)
+        key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
         if key not in self._found:
-            self._found[key] = TracedStage(stage, axes, leaves)
-        return self._found[key]
+            self._found[key] = stage, TracedStage(stage, axes, leaves)
+        return self._found[key][1]
 
 
 def _used(jaxpr: jaxcompat.ClosedJaxpr) -> set[int]:

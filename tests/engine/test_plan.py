@@ -1,5 +1,6 @@
 """Planning a step: everything an engine can refuse is refused there, said once, and never hides a bug."""
 
+import dataclasses
 import re
 
 import jax
@@ -10,7 +11,7 @@ from cases import shared_sim
 
 from crazysim import ConfigError, Sim
 from crazysim.core.pipeline import append_fn, insert_fn_before
-from crazysim.core.stage import stage
+from crazysim.core.stage import Stage, stage
 from crazysim.engine import Step, explain, kernel, lanes, native
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.lower import RULES
@@ -239,3 +240,18 @@ def test_explaining_runs_nothing_unless_asked_to_measure():
     assert step._cache_size() == 0
     assert "cost of the split, measured: a step takes" in sim.explain(measure=True)
     assert step._cache_size() == 1
+
+
+@dataclasses.dataclass
+class Push:
+    """A stage's function with settings, which are compared by value, so that it has no hash."""
+
+    force: float
+
+    def __call__(self, data):
+        return data.replace(states=data.states.replace(force=self.force + 0 * data.states.pos))
+
+
+def test_callable_objects_without_a_hash_are_planned(sim):
+    plan = Step(pipeline(sim, Stage(Push(0.01), "drone", name="push")), "lanes", strict=True).plan(sim.data)
+    assert "push" in {name for segment in plan.program.segments for name in segment.stages}
