@@ -1,6 +1,5 @@
 """How the tests compile: without optimisation, which takes half the time, and in one MLIR context."""
 
-import functools
 import shutil
 import sys
 from collections.abc import Mapping
@@ -33,10 +32,14 @@ def share_mlir_context() -> None:
 
     JAX makes a context for each program, with all dialects, which takes 4 ms and 1.2 MB. One for all keeps the names
     and types of every program, which is little for the tests, and would be too much for a process that runs for weeks.
+    A program that is written while another one is gets a context of its own.
     """
+    from jax.extend.mlir import ir
     from jax._src.interpreters import mlir
 
-    mlir.make_ir_context = functools.cache(mlir.make_ir_context)
+    make, shared = mlir.make_ir_context, mlir.make_ir_context()
+
+    mlir.make_ir_context = lambda: shared if ir.Context.current is None else make()
 
 
 def options(emitters: bool = False) -> dict[str, bool | int]:

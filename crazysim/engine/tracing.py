@@ -27,7 +27,6 @@ class TracedStage:
         """Shapes and types of all leaves, as the stage receives them."""
         self.written: list[int] = []
         """Leaves that it writes: the outputs of ``fn``."""
-        has_mask = False
 
         def apply(values: list[Any]) -> list[Any]:
             after = stage.fn(axes.treedef.unflatten(values))
@@ -35,20 +34,21 @@ class TracedStage:
             new = jax.tree.leaves(after)
             return [new[i] for i in self.written]
 
-        def condition(values: list[Any]) -> Any:
-            nonlocal has_mask
+        def condition(values: list[Any]) -> list[Any]:
             mask = stage.when(axes.treedef.unflatten(values)) if stage.when is not None else None
-            has_mask = mask is not None
-            return mask if has_mask else 0
+            return [] if mask is None else [mask]
 
-        fn, when = jax.make_jaxpr(apply)(self.avals), jax.make_jaxpr(condition)(self.avals)
-        used = _used(fn) | (_used(when) if has_mask else set())
+        fn = jax.make_jaxpr(apply)(self.avals)
+        when = jax.make_jaxpr(condition)(self.avals) if stage.when is not None else None
+        if when is not None and not when.jaxpr.outvars:  # it acts at every step
+            when = None
+        used = _used(fn) | (_used(when) if when is not None else set())
         self.used = sorted(used)
         """Leaves that it reads: the inputs of ``fn`` and ``when``."""
         self.fn = jaxcompat.with_inputs(fn, self.used)
-        self.when = jaxcompat.with_inputs(when, self.used) if has_mask else None
+        self.when = jaxcompat.with_inputs(when, self.used) if when is not None else None
         if dump.enabled():
-            dump.write(f"{stage.__name__}.jaxpr", f"{self.fn}\n" + (f"\nwhen\n{self.when}\n" if has_mask else ""))
+            dump.write(f"{stage.__name__}.jaxpr", f"{self.fn}\n" + (f"\nwhen\n{self.when}\n" if self.when else ""))
 
 
 class Tracer:
