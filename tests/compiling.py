@@ -34,8 +34,8 @@ def share_mlir_context() -> None:
     and types of every program, which is little for the tests, and would be too much for a process that runs for weeks.
     A program that is written while another one is gets a context of its own.
     """
-    from jax.extend.mlir import ir
     from jax._src.interpreters import mlir
+    from jax.extend.mlir import ir
 
     make, shared = mlir.make_ir_context, mlir.make_ir_context()
 

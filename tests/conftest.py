@@ -13,8 +13,6 @@ os.environ.update(compiling.environment(os.environ))
 # A program's operations do not carry the lines of Python that made them: writing it takes less time.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
-gc.disable()  # see pytest_collection_finish
-
 import jax
 import numpy as np
 import pytest
@@ -22,6 +20,7 @@ from hypothesis import HealthCheck, settings
 
 from crazysim.engine import cuda
 
+gc.disable()  # see pytest_collection_finish
 compiling.share_mlir_context()
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
 

@@ -15,7 +15,7 @@ from jax import Array
 
 from crazysim.core.stage import with_leaves
 from crazysim.engine import lanes, ops
-from crazysim.engine.ir import Block, Element, Operation, Value
+from crazysim.engine.ir import Block, Operation, Value
 from crazysim.engine.program import Program
 from crazysim.jaxcompat import is_key
 
