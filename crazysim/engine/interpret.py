@@ -17,6 +17,7 @@ from jax import Array
 from crazysim.engine import lanes, ops
 from crazysim.engine.ir import Block, Element, Operation, Value
 from crazysim.engine.program import Program
+from crazysim.jaxcompat import is_key
 
 Env = dict[Value, np.ndarray]
 """Arrays by the values that they are."""
@@ -138,5 +139,12 @@ def _of_arrays(block: Block, shape: tuple[int, ...], *inputs: Any) -> list[np.nd
 
 
 def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-    """Return what ``lanes.steps`` does, every block interpreted; stages that are not fused run in XLA."""
-    return lanes.steps(program, leaves, n_steps, call)
+    """Return what ``lanes.steps`` does, every block interpreted.
+
+    Under a trace the blocks become callbacks, and stages that are not fused run in XLA. Otherwise, all is computed by
+    NumPy at once, and the results are NumPy's arrays.
+    """
+    traced = any(isinstance(x, jax.core.Tracer) for x in (*leaves, n_steps))
+    if traced or not program.fused:
+        return lanes.steps(program, leaves, n_steps, call)
+    return lanes.steps(program, [x if x is None or is_key(x) else np.asarray(x) for x in leaves], n_steps, run, np)

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
@@ -28,15 +29,16 @@ Execute = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
 class Lanes:
     """Leaves of all drones, each as an array or as lanes, in the form that was last used."""
 
-    def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run):
+    def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run, xp: Any = jnp):
         """Hold leaves as arrays.
 
         Args:
             program: The program.
             leaves: Leaves of all worlds; None for one that is written before it is read.
             execute: Runs the blocks.
+            xp: Module of the arrays, ``jax.numpy`` or ``numpy``.
         """
-        self.program, self.execute = program, execute
+        self.program, self.execute, self.xp = program, execute, xp
         self.n_worlds, self.n_drones = batch(program, leaves)
         self.arrays: dict[int, Any] = dict(enumerate(leaves))
         self.lanes: dict[Slot, Any] = {}
@@ -64,7 +66,7 @@ class Lanes:
         """Write a number of every drone."""
         if slot not in self.lanes:
             self._split(slot[0])
-        self.lanes[slot] = jnp.broadcast_to(value, self.shape)
+        self.lanes[slot] = self.xp.broadcast_to(value, self.shape)
         self.arrays.pop(slot[0], None)
 
     def array(self, leaf: int) -> Any:
@@ -72,13 +74,13 @@ class Lanes:
         if leaf not in self.arrays:
             example = self.program.leaves[leaf]
             items = [self.lanes[leaf, k] for k in range(example.size)]
-            self.arrays[leaf] = jnp.stack(items) if example.rows_of else self._stacked(leaf, items)
+            self.arrays[leaf] = self.xp.stack(items) if example.rows_of else self._stacked(leaf, items)
         return self.arrays[leaf]
 
     def _stacked(self, leaf: int, items: list[Any]) -> Any:
         example, key = self.program.leaves[leaf], is_key(self.program.leaves[leaf])
         shape = (*example.shape[2:], 2) if key else example.shape[2:]
-        array = jnp.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *shape)
+        array = self.xp.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *shape)
         array = jax.random.wrap_key_data(array) if key else array
         return array[:, :1] if example.scope == "world" else array
 
@@ -92,12 +94,12 @@ class Lanes:
         x, example = self.arrays[leaf], self.program.leaves[leaf]
         size = example.size
         if example.rows_of or x is None:  # what is not given is written before it is read
-            self.lanes.update(((leaf, k), jnp.zeros(self.shape) if x is None else x[k]) for k in range(size))
+            zeros = self.xp.zeros(self.shape, example.number) if x is None else None
+            self.lanes.update(((leaf, k), zeros if x is None else x[k]) for k in range(size))
             return
-        if is_key(x):
-            x = jax.random.key_data(x)
+        x = self.xp.asarray(jax.random.key_data(x) if is_key(x) else x)
         if example.scope == "world":
-            x = jnp.broadcast_to(x, (self.n_worlds, self.n_drones, *x.shape[2:]))
+            x = self.xp.broadcast_to(x, (self.n_worlds, self.n_drones, *x.shape[2:]))
         batch = self.shape if example.scope in ("drone", "world") else ()
         x = x.reshape(*batch, size)
         self.lanes.update(((leaf, k), x[..., k]) for k in range(size))
@@ -162,7 +164,7 @@ def _run_worlds(segment: Segment, lanes: Lanes) -> None:
     outs = lanes.execute(segment.block, [of_world(slot) for slot in segment.reads], shape[:1])
     new: dict[Slot, dict[int, Array]] = {}
     for (leaf, k), value in zip(segment.writes, outs, strict=True):
-        value = jnp.broadcast_to(value, shape[:1])
+        value = lanes.xp.broadcast_to(value, shape[:1])
         if leaves[leaf].scope == "drone":
             drone, k = divmod(k, leaves[leaf].size)
             new.setdefault((leaf, k), {})[drone] = value
@@ -170,9 +172,9 @@ def _run_worlds(segment: Segment, lanes: Lanes) -> None:
             new[leaf, k] = dict.fromkeys(range(lanes.n_drones), value)
     for slot, columns in new.items():
         old = lanes.get(slot)
-        old = jnp.broadcast_to(old, lanes.shape).reshape(shape)
+        old = lanes.xp.broadcast_to(old, lanes.shape).reshape(shape)
         rows = [columns.get(d, old[:, d]) for d in range(lanes.n_drones)]
-        lanes.set(slot, jnp.stack(rows, axis=-1).reshape(lanes.shape))
+        lanes.set(slot, lanes.xp.stack(rows, axis=-1).reshape(lanes.shape))
 
 
 def _run_unfused(stage: UnfusedStage, lanes: Lanes) -> None:
@@ -182,7 +184,7 @@ def _run_unfused(stage: UnfusedStage, lanes: Lanes) -> None:
 
 
 def steps(
-    program: Program, leaves: list[Any], n_steps: int | Array, execute: Execute = xla.run
+    program: Program, leaves: list[Any], n_steps: int | Array, execute: Execute = xla.run, xp: Any = jnp
 ) -> tuple[list[Any], Array]:
     """Return the written leaves after some steps, and which worlds are flagged as not finite. (n_worlds, 1)
 
@@ -193,8 +195,9 @@ def steps(
         leaves: Leaves of all worlds.
         n_steps: Number of steps.
         execute: Runs the blocks.
+        xp: Module of the arrays, ``jax.numpy`` or ``numpy``; with ``numpy`` nothing is compiled.
     """
-    start = Lanes(program, leaves, execute)
+    start = Lanes(program, leaves, execute, xp)
     constants = prepare(program, start)
     each = program.of("each")
     by_array = sorted({i for s in each if isinstance(s, UnfusedStage) for i in s.written})
@@ -214,12 +217,15 @@ def steps(
             lanes.set_array(leaf, value)
         return lanes
 
-    carry = ([jnp.broadcast_to(start.get(slot), start.shape) for slot in by_lanes],
+    carry = ([xp.broadcast_to(start.get(slot), start.shape) for slot in by_lanes],
              [start.array(leaf) for leaf in by_array])  # fmt: skip
     for segment in fused:  # what is only read is split into lanes once, outside the loop
         for slot in program.per_drone(segment, segment.reads):
             start.get(slot)
-    if isinstance(n_steps, int):
+    if xp is np:
+        for _ in range(int(n_steps)):
+            carry = turn(carry)
+    elif isinstance(n_steps, int):
         carry = repeat(turn, carry, n_steps)
     else:
         carry = jax.lax.fori_loop(0, n_steps, lambda _, c: turn(c), carry)
@@ -253,7 +259,7 @@ def nonfinite(program: Program, lanes: Lanes) -> Array:
     """Return True for worlds that were flagged before, or have a watched number that is not finite. (n_worlds, 1)"""
     check = program.check
     if check is None:
-        return jnp.zeros((lanes.n_worlds, 1), bool)
+        return lanes.xp.zeros((lanes.n_worlds, 1), bool)
     (flagged,) = lanes.execute(check.block, [lanes.get(slot) for slot in check.reads], lanes.shape)
-    flagged = jnp.broadcast_to(flagged, lanes.shape).reshape(lanes.n_worlds, lanes.n_drones)
-    return jnp.any(flagged, axis=1, keepdims=True)
+    flagged = lanes.xp.broadcast_to(flagged, lanes.shape).reshape(lanes.n_worlds, lanes.n_drones)
+    return lanes.xp.any(flagged, axis=1, keepdims=True)
