@@ -252,7 +252,7 @@ def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
     inner = math.isqrt(n)
     outer = jax.checkpoint(lambda c: turns(c, inner), prevent_cse=False)
     carry, _ = jax.lax.scan(lambda c, _: (outer(c), None), carry, length=n // inner)
-    return turns(carry, n % inner)
+    return turns(carry, n % inner) if n % inner else carry
 
 
 def nonfinite(program: Program, lanes: Lanes) -> Array:
