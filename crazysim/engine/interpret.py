@@ -47,19 +47,25 @@ def run(
     """
     env = dict(env or {})
     given = [np.asarray(x, v.dtype) for x, v in zip(inputs, block.inputs, strict=True)]
-    lanes_of = (x if v.size else np.broadcast_to(x, shape) for x, v in zip(given, block.inputs, strict=True))
+    lanes_of = (x if v.size else _spread(x, shape) for x, v in zip(given, block.inputs, strict=True))
     env.update(zip(block.inputs, lanes_of, strict=True))
     with np.errstate(all="ignore"):
         for op in block.operations:
-            results = _apply(op, [_get(env, x, shape) for x in op.args], shape, env)
+            results = _apply(op, [_get(env, x) for x in op.args], shape, env)
             env.update(zip(op.results, results, strict=True))
             if observe is not None:
-                observe(op, results)
-    return [_get(env, x, shape) for x in block.outputs]
+                observe(op, [x if x.ndim else _spread(x, shape) for x in results])
+    return [_spread(_get(env, x), shape) for x in block.outputs]
 
 
-def _get(env: Env, x: Element, shape: tuple[int, ...]) -> np.ndarray:
-    return env[x] if isinstance(x, Value) else np.broadcast_to(np.asarray(x), shape)
+def _get(env: Env, x: Element) -> np.ndarray:
+    """Return a value, or a constant as an array without axes."""
+    return env[x] if isinstance(x, Value) else np.asarray(x)
+
+
+def _spread(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a number of the lanes, or of all of them, for each lane; broadcasting takes as long as an operation."""
+    return x if x.shape == shape else np.broadcast_to(x, shape)
 
 
 def _apply(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: Env) -> list[np.ndarray]:
@@ -104,7 +110,7 @@ def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], 
     combine: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
     found = [np.full(shape, ops.neutral(name, x.dtype)) for name, x in zip(op.param("reduce"), op.results, strict=True)]
     for j in range(n):
-        other = [np.repeat(x.reshape(-1, n)[:, j], n) for x in args]
+        other = [np.repeat(_spread(x, shape).reshape(-1, n)[:, j], n) for x in args]
         new = run(op.blocks[0], [*other, own == j], shape, env)
         found = [fn(x, y) for fn, x, y in zip(combine, found, new, strict=True)]
     return found

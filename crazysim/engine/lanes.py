@@ -66,7 +66,7 @@ class Lanes:
         """Write a number of every drone."""
         if slot not in self.lanes:
             self._split(slot[0])
-        self.lanes[slot] = self.xp.broadcast_to(value, self.shape)
+        self.lanes[slot] = value if np.shape(value) == self.shape else self.xp.broadcast_to(value, self.shape)
         self.arrays.pop(slot[0], None)
 
     def array(self, leaf: int) -> Any:

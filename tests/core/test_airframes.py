@@ -221,7 +221,7 @@ def test_a_mixed_fleet_is_drawn():
 
 
 def test_drones_of_a_mixed_fleet_stand_on_the_floor():
-    sim = Sim(1, drone=("cf21B_500", "bumblebee"), engine="interpret")
+    sim = Sim(1, drone=("cf21B_500", "bumblebee"), engine="plain")
     sim.add(cs.ContactResponse())
     sim.data = with_states(sim.data, pos=[[[0.0, 0.0, 0.1], [1.0, 0.0, 0.1]]])
     sim.step(250)
