@@ -258,7 +258,7 @@ def _write_segment(
 
 
 def _deferred(program: Program) -> set[Slot]:
-    """Return the numbers that only stages below the step rate, or only the check behind the loop, use and none changes.
+    """Return the numbers that only stages below the step rate, or only the check behind the loop, use, and none changes.
 
     They are loaded there, and take no register in between.
     """
