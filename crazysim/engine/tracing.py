@@ -93,8 +93,10 @@ def _is_built_in(stage: Stage) -> bool:
 
 
 def _traced_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
-    """Return a traced stage from the cache of this process."""
-    key = (stage.fn, stage.when, axes.treedef, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)
+    """Return a traced stage from the cache of this process; the numbers of worlds and drones do not matter to it."""
+    data = axes.treedef.unflatten(leaves)
+    kind = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))
+    key = (stage.fn, stage.when, kind, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)
     if key not in _BUILT_IN:
         if len(_BUILT_IN) >= MOST:
             _BUILT_IN.clear()
