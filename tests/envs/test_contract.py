@@ -16,7 +16,6 @@ from env_cases import (
     obs_of,
     of_worlds,
     one_step_to_go,
-    quick,
     random_action,
 )
 from gymnasium.vector.utils import batch_space
@@ -38,7 +37,7 @@ ENDS = np.array([True, False, True, False])
 def compiled_select():
     """Compile the choice between a state and that of a new episode, for steps that are not compiled."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(autoreset, "select_states", quick(select_states))
+        patch.setattr(autoreset, "select_states", jax.jit(select_states))
         yield
 
 
@@ -68,7 +67,7 @@ def flight(name):
         state = auto.step(state, jax.random.uniform(key, state.action.shape, minval=-1.2, maxval=1.2))
         return state, (state.obs, state.reward, state.terminated, state.truncated, state.info)
 
-    @quick
+    @jax.jit
     def fly(key):
         return jax.lax.scan(step, auto.reset(key), jax.random.split(key, N_STEPS))
 
@@ -203,7 +202,7 @@ def test_one_program_is_the_whole_step(env, begun):
     with interpreted():
         fused = FusedEnvStep(env.env, auto.policy, begun, begun.action)
     before, action = one_step_to_go(env, begun, ENDS), random_action(begun)
-    found, expected = quick(fused)(before, jnp.asarray(action)), auto.step(before, action)
+    found, expected = jax.jit(fused)(before, jnp.asarray(action)), auto.step(before, action)
     assert kind(found)[0] == kind(expected)[0]
     pairs = zip(jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(expected), strict=True)
     for (path, x), y in pairs:
@@ -290,7 +289,7 @@ def test_the_gradient_of_the_reward_is_finite(name, begun, flown):
     """
     env = make(name, N_WORLDS, freq=500, engine="plain")
 
-    @quick
+    @jax.jit
     @jax.grad
     def slope(wrt, state):
         action, states = wrt
@@ -320,7 +319,7 @@ def at_rest(control):
 def test_a_zero_action_hovers(control):
     env = at_rest(control)
 
-    @quick
+    @jax.jit
     def fly(key):
         state = env.reset(key)
 
