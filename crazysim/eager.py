@@ -27,12 +27,13 @@ def compiled(*static: str) -> Callable[[F], F]:
 
         @functools.wraps(fn)
         def call(*args: Any, **kwargs: Any) -> Any:
-            return (fn if _traced((args, kwargs)) else jitted)(*args, **kwargs)
+            return (fn if is_traced((args, kwargs)) else jitted)(*args, **kwargs)
 
         return call  # type: ignore[return-value]
 
     return decorate
 
 
-def _traced(values: Sequence[Any]) -> bool:
+def is_traced(values: Sequence[Any]) -> bool:
+    """Return True where one of the leaves is traced: within ``jit``, ``grad`` or a stage of the engine."""
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))
