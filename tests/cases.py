@@ -88,7 +88,7 @@ def broadcast_like(value, like):
     """Return an array of the shape and the type of another; NumPy's are broadcast without a compiled call."""
     if isinstance(value, jax.Array):
         return jnp.broadcast_to(value.astype(like.dtype), like.shape)
-    return jnp.asarray(np.broadcast_to(np.asarray(value, like.dtype), like.shape))
+    return jax.device_put(np.array(np.broadcast_to(np.asarray(value, like.dtype), like.shape)))
 
 
 def with_params(data, **changes):
@@ -103,7 +103,7 @@ def with_airframes(sim, airframes):
     which = [kinds.index(airframe) for airframe in airframes]
 
     def stacked(shared):
-        return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)[which][:, None]), *shared)
+        return jax.tree.map(lambda *x: jax.device_put(np.stack(x)[which][:, None]), *shared)
 
     params = stacked([create_params(sim.dynamics, airframe) for airframe in kinds])
     each = [SimControls.create(1, 1, sim.control, sim.dynamics, a, sim.configuration.control_freqs) for a in kinds]
@@ -174,8 +174,8 @@ def trees_equal(a, b):
 
 def as_numbers(x):
     """Return a leaf on the host, random keys as their data."""
-    x = jnp.asarray(x)
-    return np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+    is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(x) if is_key else x)
 
 
 @functools.cache

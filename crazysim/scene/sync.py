@@ -12,6 +12,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import SimData
+from crazysim.eager import compiled, to_host
 from crazysim.scene import mjx
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
@@ -70,6 +71,7 @@ def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
     )
 
 
+@compiled()
 def with_poses_of(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     """Return poses of bodies and joints in some worlds, with those of drones and handles as the data have them.
 
@@ -103,9 +105,13 @@ def sync_one_world(
         mj_data: State to write.
     """
     mj_data.mocap_pos[:], mj_data.mocap_quat[:], mj_data.qpos[:] = poses
-    for ids, pos, quat in _poses(data):
-        mj_data.mocap_pos[np.asarray(ids)] = pos[world]
-        mj_data.mocap_quat[np.asarray(ids)] = np.roll(quat[world], 1, axis=-1)
+    states, objects = data.states, data.objects
+    owned = [(data.core.drone_mocap_ids, to_host(states.pos, world), to_host(states.quat, world))]
+    if objects is not None:
+        owned.append((objects.mocap_ids, to_host(objects.pos, world)[0], to_host(objects.quat, world)[0]))
+    for ids, pos, quat in owned:
+        mj_data.mocap_pos[np.asarray(ids)] = pos
+        mj_data.mocap_quat[np.asarray(ids)] = np.roll(quat, 1, axis=-1)
     mujoco.mj_kinematics(mj_model, mj_data)
     mujoco.mj_comPos(mj_model, mj_data)
     mujoco.mj_camlight(mj_model, mj_data)
