@@ -160,7 +160,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
     flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
 
     def of_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], np.ndarray]:
-        return _steps(program, with_leaves([None] * len(leaves), given, map(np.asarray, values)), int(n_steps))
+        return _steps(program, with_leaves([None] * len(leaves), given, [np.asarray(x) for x in values]), int(n_steps))
 
     values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in given]
     if any(isinstance(x, jax.core.Tracer) for x in (n_steps, *values)):
