@@ -55,7 +55,7 @@ def lower_stages(
     """
     tracer = tracer or Tracer()
     axes = RelativeAxes(data, population)
-    leaves = viewed(axes.views, jax.tree.leaves(data))
+    leaves = viewed(axes.views, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(data)])
     zeros = zeros or {}
     n_drones = next(x.shape[1] for x, scope in zip(leaves, axes.scopes, strict=True) if scope == "drone")
     segments = []
