@@ -1,4 +1,4 @@
-"""Compilation of pure functions that are called outside of compiled code."""
+"""Work outside of compiled code that compiles little: one program for a pure function, none for arrays of numbers."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
+import numpy as np
+from jax import Array
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -32,6 +34,16 @@ def compiled(*static: str) -> Callable[[F], F]:
         return call  # type: ignore[return-value]
 
     return decorate
+
+
+def as_array(values: Any, dtype: Any) -> Array:
+    """Return a copy of numbers on the host as an array on the device; ``jnp.asarray`` compiles a program per shape.
+
+    Args:
+        values: Numbers, lists or NumPy arrays.
+        dtype: Type of the array; of 32 bits unless JAX is set to 64.
+    """
+    return jax.device_put(np.array(values, dtype))
 
 
 def _traced(values: Sequence[Any]) -> bool:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -14,6 +13,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.random import world_key
 from crazysim.core.stage import Stage
+from crazysim.eager import as_array
 from crazysim.effects.core import Exposed, require_drag, with_moving_air, zeros
 from crazysim.effects.grid import LARGEST_FUSED, Grid, interpolate
 from crazysim.errors import ConfigError
@@ -78,9 +78,9 @@ class WindField(Plugin):
         dtype = sim.data.states.pos.dtype
         spread = None if self.spread is None else check_parameter(sim, "spread", self.spread, (3,), 0.0)
         return WindFieldData(
-            field=jnp.asarray(grid.values, dtype),
-            origin=jnp.asarray(grid.origin, dtype),
-            spacing=jnp.asarray(grid.spacing, dtype),
+            field=as_array(grid.values, dtype),
+            origin=as_array(grid.origin, dtype),
+            spacing=as_array(grid.spacing, dtype),
             offset=check_parameter(sim, "offset", self.offset, (3,)),
             scale=check_parameter(sim, "scale", self.scale),
             spread=spread,

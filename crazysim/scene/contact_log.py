@@ -12,6 +12,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.stage import Stage, StageScope
 from crazysim.deprecation import renamed, warn_renamed
+from crazysim.eager import as_array
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, static
 from crazysim.scene.placement import placed_by
@@ -59,10 +60,10 @@ class ContactLog(Plugin):
             raise ConfigError("expected something to check for contacts, got nothing. Use floor, drones or objects.")
         shape = (sim.n_worlds, sim.n_drones)
         return ContactLogData(
-            floor=jnp.zeros(shape, bool),
-            objects=jnp.zeros((*shape, len(names)), bool),
-            drones=jnp.zeros(shape, bool),
-            first=jnp.full(shape, -1, jnp.int32),
+            floor=as_array(np.zeros(shape), bool),
+            objects=as_array(np.zeros((*shape, len(names))), bool),
+            drones=as_array(np.zeros(shape), bool),
+            first=as_array(np.full(shape, -1), np.int32),
             object_names=names,
         )
 

@@ -14,6 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
 from crazysim.core.stages import FLOOR
+from crazysim.eager import as_array
 from crazysim.effects.core import zeros
 from crazysim.effects.grid import LARGEST_FUSED
 from crazysim.effects.ground import TerrainData, ground_height
@@ -52,9 +53,9 @@ class Terrain(Plugin):
         heights, size, pos = self._checked(sim)
         dtype = sim.data.states.pos.dtype
         record = TerrainData(
-            heights=jnp.asarray(heights, dtype),
-            middle=jnp.asarray(pos, dtype),
-            half=jnp.asarray(size / 2, dtype),
+            heights=as_array(heights, dtype),
+            middle=as_array(pos, dtype),
+            half=as_array(size / 2, dtype),
             below=zeros(sim, 1),
             floor=self.floor,
         )
