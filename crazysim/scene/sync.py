@@ -98,12 +98,6 @@ def _with_poses(owned: Any, worlds: Array, mocap_pos: Array, mocap_quat: Array) 
     return mocap_pos, mocap_quat
 
 
-@compiled()
-def of_worlds(arrays: Any, worlds: Any) -> Any:
-    """Return the rows of one world, or of some worlds, of a tree of arrays."""
-    return jax.tree.map(lambda x: x[worlds], arrays)
-
-
 def sync_one_world(
     data: SimData,
     world: int,
