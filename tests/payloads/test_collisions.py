@@ -256,7 +256,9 @@ def test_a_report_has_empty_hooks():
     sim.data = with_load(hook, sim.data, tip_pos=tip)
     report = sim.contact_report(floor=False, drones=False)
     assert report.object_names == ("load:0", "load:1", "load_hook:0", "load_hook:1")
-    np.testing.assert_array_equal(np.asarray(report.objects)[0], [[False, False, False, True], [False, False, True, False]])
+    np.testing.assert_array_equal(
+        np.asarray(report.objects)[0], [[False, False, False, True], [False, False, True, False]]
+    )
 
 
 def test_a_wall_that_stops_a_load_holds_back_the_drone():
