@@ -188,7 +188,7 @@ def test_rays_in_a_step_meet_loads_where_they_are_now(engine):
     sim = Sim(n_worlds=2, control="rotor_vel", engine=engine)
     load = sim.add(SlungLoad(mass=0.005, length=0.5, size=0.1))
     sim.add(RangeFinder([[0, 0, -1], [1, 0, 0]], max_range=3.0))
-    sim.sync()
+    sim.sync(0)
     placed(sim, [[[0, 0, 2]], [[5, 5, 2]]])
     sim.data = load.hang(sim.data)
     sim.step()
