@@ -7,6 +7,7 @@ import pytest
 from cases import shared_sim
 from jax.extend.random import threefry2x32_p
 
+from crazysim import Sim
 from crazysim.core.stage import as_stages, stage
 from crazysim.engine import fused, interpret, lanes, native
 from crazysim.engine.build import build_program
@@ -71,6 +72,19 @@ def test_vmap_is_a_loop(step):
     one = jax.jit(lambda x: interpret.steps(program, [*leaves[:i], x, *leaves[i + 1 :]], 2)[0])(many[1])
     for x, y in zip(run(many), one, strict=True):
         np.testing.assert_array_equal(x[1], y)
+
+
+def test_outside_of_a_trace_nothing_is_compiled():
+    """Results are those of the callback inside of one, and on the device of the data."""
+    sim = Sim(n_worlds=2, control="rotor_vel", engine="interpret", device="cpu:1")
+    sim.rotor_vel_control(np.full((2, 1, 4), 1.7e4))
+    found = sim.step_fn(sim.data, jnp.int32(3))
+    assert sim.step_fn._cache_size() == 0
+    assert found.states.pos.devices() == sim.data.states.pos.devices() == {jax.devices("cpu")[1]}
+    inside = jax.jit(lambda data: sim.step_fn(data, jnp.int32(3)))(sim.data)
+    for x, y in zip(jax.tree.leaves(found.states), jax.tree.leaves(inside.states), strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert not np.array_equal(found.states.rotor_vel, sim.data.states.rotor_vel)
 
 
 # Leaves --------------------------------------------------------------------------------------------------------------
