@@ -174,8 +174,8 @@ def trees_equal(a, b):
 
 def as_numbers(x):
     """Return a leaf on the host, random keys as their data."""
-    x = jnp.asarray(x)
-    return np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+    is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(x) if is_key else x)
 
 
 @functools.cache

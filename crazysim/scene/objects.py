@@ -204,8 +204,9 @@ class SceneObjects:
         if before is not None:
             n, old = len(before.names), (before.pos, before.quat, before.vel)
             poses = tuple(np.concatenate([x, new[..., n:, :]], axis=-2) for x, new in zip(old, poses, strict=True))
-        pos, quat, vel = (jnp.asarray(np.asarray(x, floating())) for x in poses)
-        return Objects(pos, quat, vel, jnp.asarray(np.asarray(mocap_ids, np.int32)), self.movable)
+        arrays = (*(np.asarray(x, floating()) for x in poses), np.asarray(mocap_ids, np.int32))
+        pos, quat, vel, ids = jax.device_put(arrays)
+        return Objects(pos, quat, vel, ids, self.movable)
 
 
 def add_bodies(
