@@ -43,7 +43,7 @@ def share_mlir_context() -> None:
 
 
 def options() -> dict[str, bool | int]:
-    """Return XLA's options: no optimisation, and none of its emitters of fused loops, which take three times as long."""
+    """Return XLA's options: no optimisation, and no emitters of fused loops, which take three times as long."""
     always = {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1}
     return always | ({"xla_cpu_use_fusion_emitters": False} if HAS_EMITTERS else {})
 
