@@ -199,7 +199,7 @@ def test_what_comes_before_a_reset_is_refused():
 
 @pytest.mark.usefixtures("opengl")
 def test_pictures_show_the_drone_as_it_is():
-    env = gymnasium.make_vec(ID, num_envs=3, render_mode="rgb_array", max_episode_steps=7, engine="interpret")
+    env = gymnasium.make_vec(ID, num_envs=3, render_mode="rgb_array", max_episode_steps=7)
     assert env.metadata["render_fps"] == 50
     assert env.unwrapped.env.max_steps == 7
     env.reset(seed=0)
