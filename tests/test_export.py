@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import INTEGRATORS, PAIRS, hover_command, hover_rotor_state
+from cases import INTEGRATORS, PAIRS, by_stages, hover_command, hover_rotor_state
 
 from crazysim import Battery, Downwash, Sim
 from crazysim.core.pipeline import append_fn, insert_fn_before
-from crazysim.core.stage import Axes, as_stages, stage
+from crazysim.core.stage import Axes, stage
 from crazysim.export import STATES, to_casadi
 
 pytestmark = pytest.mark.usefixtures("casadi", "x64")
@@ -63,20 +63,9 @@ def on_host(data):
     return jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else np.asarray(x), data)
 
 
-def reference(sim):
-    """Return the function of one step of all drones, stage after stage."""
-
-    def step(data):
-        for fn in as_stages(sim.step_pipeline):
-            data = fn(data)
-        return data
-
-    return step
-
-
 def compare(sim, step, data):
     """Compare the exported step with the reference, drone by drone, each field to 1e-12 of its size."""
-    after = on_host(jax.jit(reference(sim))(data))
+    after = on_host(jax.jit(by_stages(sim), static_argnums=1)(data, 1))
     for world in range(sim.n_worlds):
         for drone in range(sim.n_drones):
             place = world, drone
@@ -111,7 +100,7 @@ def test_the_exported_step_is_the_step(dynamics, control, integrator):
 def test_the_jacobian_is_that_of_jax(dynamics, control, integrator):
     """At a state away from switches, in x and u."""
     sim = Sim(dynamics=dynamics, control=control, integrator=integrator)
-    exported, step = to_casadi(sim), reference(sim)
+    exported, step = to_casadi(sim), by_stages(sim)
     rng = np.random.default_rng(1)
     x = exported.x.of(sim.data) + 0.05 * rng.normal(size=len(exported.x))
     x[exported.x["states.pos"]] = [0.1, 0.2, 1.0]
@@ -122,7 +111,7 @@ def test_the_jacobian_is_that_of_jax(dynamics, control, integrator):
     def advance(x, u):
         changes = {name: x[exported.x[name]] for name in exported.x.sizes} | {next(iter(exported.u.sizes)): u}
         data = with_fields(sim.data, {name: value[None, None] for name, value in changes.items()})
-        return jnp.concatenate([value[0, 0] for value in fields(step(data), exported.x.sizes)])
+        return jnp.concatenate([value[0, 0] for value in fields(step(data, 1), exported.x.sizes)])
 
     expected = jax.jit(jax.jacfwd(advance, argnums=(0, 1)))(x, u)
     found = exported.function.jacobian()(x, u, 0)

@@ -76,7 +76,8 @@ def load(path: str | Path, like: T) -> T:
             )
         for name, x in named:
             is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-            value = jax.random.wrap_key_data(jnp.asarray(file[name])) if is_key else jnp.asarray(file[name])
+            value = jax.device_put(file[name])
+            value = jax.random.wrap_key_data(value) if is_key else value
             if value.shape != x.shape or value.dtype != x.dtype:
                 raise ConfigError(
                     f"expected {name} in {path} as {x.dtype} {x.shape}, got {value.dtype} {value.shape}; use the "

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim.envs.env import Env
@@ -77,16 +78,17 @@ def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None)
     """
     compiled: Any = policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
     flight = fly(env, compiled, jax.random.key(HELD_OUT) if key is None else key)
-    last = max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
-    over = flight["over"][-1]
-    settled = jnp.all(flight["error"][-last:] < env.task.tolerance, axis=0) & ~over[:, None]
-    if "succeeded" in flight:
-        last, settled = 1, flight["succeeded"]
-    crashed = over & ~jnp.all(settled, axis=-1)
-    error = jnp.where(crashed[None, :, None], jnp.nan, flight["error"][-last:])
+    by_task = "succeeded" in flight
+    last = 1 if by_task else max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
+    flight = jax.device_get(flight | {"error": flight["error"][-last:], "over": flight["over"][-1]})
+    error, over = flight["error"], flight["over"]
+    settled = flight["succeeded"] if by_task else np.all(error < env.task.tolerance, axis=0) & ~over[:, None]
+    crashed = over & ~np.all(settled, axis=-1)
+    error = error[:, ~crashed]
+    error = error[~np.isnan(error)]
     return {
         "success": float(settled.mean()),
         "crashed": float(crashed.mean()),
-        "error": float(jnp.nanmean(error)),
+        "error": float(error.mean()) if error.size else float("nan"),
         "reward": float(flight["reward"].mean()),
     }

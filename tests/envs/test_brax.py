@@ -80,7 +80,7 @@ def test_keys_of_any_kind_are_the_same_seed(env, reset):
 
 def test_steps_return_the_same_kind_of_state(env, reset, flown):
     state = reset(jax.random.key(0))
-    first = jax.tree.map(lambda x: x[0], flown)
+    first = jax.eval_shape(lambda states: jax.tree.map(lambda x: x[0], states), flown)
     assert kind(first) == kind(state)
 
 
@@ -101,8 +101,8 @@ def test_episodes_end_and_begin_as_brax_wraps_them(flown):
 
 
 def test_the_step_is_that_of_the_environment(functional, env, reset, flown):
-    state = functional.reset(jax.random.key(0))
-    state = jax.jit(functional.step)(state, jnp.full(state.action.shape, 0.1))
+    state = reset(jax.random.key(0)).pipeline_state
+    state = jax.jit(functional.step)(state, np.full(state.action.shape, 0.1, np.float32))
     np.testing.assert_allclose(flown.obs[0], flatten(state.obs).reshape(N_WORLDS, -1), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(flown.reward[0], state.reward.mean(axis=1), rtol=1e-5)
     np.testing.assert_allclose(flown.metrics["error"][0], state.info["error"].mean(axis=1), rtol=1e-5)

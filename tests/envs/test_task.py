@@ -56,15 +56,19 @@ def test_the_total_of_terms_is_their_sum_in_order():
 
 def test_named_draws_are_parts_of_one_draw():
     key = jax.random.wrap_key_data(jnp.array([1, 2], jnp.uint32))
-    x = draw(key, 3, start=2, yaw=1, pose=(2, 2))
+
+    @jax.jit
+    def drawn(key):
+        others = draw(key, turn=1, places=(2, 3)), draw(key, turn=1, places=(2, 3), more=4)
+        return draw(key, 3, start=2, yaw=1, pose=(2, 2)), uniform(key, 3, 7), *others
+
+    x, row, world, more = jax.device_get(drawn(key))
     assert {name: v.shape for name, v in x.items()} == {"start": (3, 2), "yaw": (3, 1), "pose": (3, 2, 2)}
-    row = uniform(key, 3, 7)
     np.testing.assert_array_equal(x["start"], row[:, :2])
     np.testing.assert_array_equal(x["yaw"], row[:, 2:3])
     np.testing.assert_array_equal(x["pose"], row[:, 3:].reshape(3, 2, 2))
-    world = draw(key, turn=1, places=(2, 3))
-    np.testing.assert_array_equal(world["turn"], draw(key, turn=1, places=(2, 3), more=4)["turn"])
-    np.testing.assert_array_equal(world["places"], draw(key, turn=1, places=(2, 3), more=4)["places"])
+    np.testing.assert_array_equal(world["turn"], more["turn"])
+    np.testing.assert_array_equal(world["places"], more["places"])
 
 
 def test_draws_are_uniform_and_scaled():

@@ -35,9 +35,9 @@ CASES = {
 """One world each."""
 
 
-def environment(n_worlds, n_drones=1, **options):
-    """Return an environment."""
-    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude")
+def environment(n_worlds, n_drones=1, engine="interpret", **options):
+    """Return an environment; a few steps are interpreted, as compiling them would take longer."""
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="attitude", engine=engine)
     race = task.Race(**options)
     race.install(sim)
     return DroneEnv(sim, race)
@@ -313,7 +313,7 @@ def test_a_given_track_is_flown_and_judged():
     track = Track(
         gates_pos=[(-1, 0, 1), (0.0, 0, 1)], gates_rpy=[(0, 0, 0)] * 2, obstacles_pos=[(1, 1, 1.5)], start=(-2, 0, 1)
     )
-    env = environment(3, track=track, seconds=1.2)
+    env = environment(3, engine="auto", track=track, seconds=1.2)
 
     class Thrown(task.Race):
         """Start in flight towards the gates; the third world away from them."""

@@ -236,13 +236,13 @@ def test_numpy_users_go_through_gymnasiums_wrappers(envs):
 
 
 def test_several_drones_have_an_axis_and_share_their_mean_reward():
-    env = make_vector("hover", 2, n_drones=3)
-    assert env.single_action_space.shape == (3, 4)
-    assert env.single_observation_space["pos"].shape == (3, 3)
+    env = make_vector("hover", 3, n_drones=2)
+    assert env.single_action_space.shape == (2, 4)
+    assert env.single_observation_space["pos"].shape == (2, 3)
     obs, _ = env.reset(seed=0)
     assert jax.tree.map(np.asarray, obs) in env.observation_space
     _, reward, terminated, _, info = env.step(env.action_space.sample())
-    assert (reward.shape, terminated.shape, info["error"].shape) == ((2,), (2,), (2, 3))
-    np.testing.assert_allclose(reward, env.state.reward.mean(axis=1), rtol=1e-6)
-    with pytest.raises(ValueError, match=r"expected actions of shape \(2, 3, 4\)"):
-        env.step(np.zeros((2, 4)))
+    assert (reward.shape, terminated.shape, info["error"].shape) == ((3,), (3,), (3, 2))
+    np.testing.assert_allclose(reward, np.asarray(env.state.reward).mean(axis=1), rtol=1e-6)
+    with pytest.raises(ValueError, match=r"expected actions of shape \(3, 2, 4\)"):
+        env.step(np.zeros((3, 4)))

@@ -134,13 +134,13 @@ class Restless(Hover):
 
 def test_the_terms_of_a_reward_add_up_to_it(env):
     wrapped = RewardTerms(DroneEnv(env.sim, Restless()))
-    state = wrapped.reset(jax.random.key(0))
+    state = jax.jit(wrapped.reset)(jax.random.key(0))
     names = {"reward proximity", "reward spin", "reward action_rate", "reward crash", "reward first"}
     assert names <= set(state.info)
     assert not any(state.info[name].any() for name in names)
     action = random_action(state)
     action[1] = np.nan
-    after = wrapped.step(state, action)
+    after = jax.device_get(jax.jit(wrapped.step)(state, action))
     total = sum(after.info[name] for name in sorted(names))
     np.testing.assert_allclose(total, after.reward, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(after.info["reward first"][:, 0], [3, 0, 3, 3])
@@ -362,7 +362,7 @@ def test_only_worlds_that_begin_anew_are_randomised_anew(randomized, heavy):
 
 def test_randomisation_does_not_depend_on_the_number_of_worlds(heavy):
     """Law 10."""
-    two = Randomize(make("hover", 2), heavier, params=("mass",)).reset(jax.random.key(0))
+    two = jax.jit(Randomize(make("hover", 2), heavier, params=("mass",)).reset)(jax.random.key(0))
     np.testing.assert_allclose(two.data.params.mass, heavy.data.params.mass[:2], rtol=1e-6)
 
 
@@ -382,4 +382,4 @@ def test_what_cannot_be_randomised_is_refused(env):
     with pytest.raises(ConfigError, match=r"expected parameters of first_principles, mass.* got colour"):
         Randomize(env.env, heavier, params=("mass", "colour"))
     with pytest.raises(ConfigError, match=r"params.mass cannot be randomised: all worlds share it.*params="):
-        Randomize(env.env, heavier).reset(jax.random.key(0))
+        jax.eval_shape(Randomize(env.env, heavier).reset, jax.random.key(0))

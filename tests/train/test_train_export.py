@@ -46,7 +46,8 @@ def flights(meta, policy):
     x[0] = 1e6
     ends = np.cumsum(list(meta["observations"].values()))[:-1]
     named = dict(zip(meta["observations"], np.split(x, ends, axis=-1), strict=True))
-    actions = np.asarray(policy({name: jnp.asarray(v) for name, v in reversed(named.items())}))
+    act = jax.jit(lambda policy, obs: policy({name: obs[name] for name in reversed(named)}))
+    actions = np.asarray(act(policy, named))
     assert 0.3 < np.abs(actions).mean() < 0.95  # neither zero nor saturated
     return x, actions
 
