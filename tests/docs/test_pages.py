@@ -6,9 +6,22 @@ from pathlib import Path
 import pytest
 from drawing import draw_coarsely
 
+from crazysim.engine import Step
+
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+INTERPRETED = "<!-- interpreted -->\n"
+"""In front of a block whose simulations take their first steps there, and so few that compiling them takes longer."""
+
+
+PLAN = Step._plan
+
+
+def interpreted(step, *data):
+    """Plan a step for the interpreter, where the page chooses no engine."""
+    step.engine = "interpret" if step.engine == "auto" else step.engine
+    return PLAN(step, *data)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -23,7 +36,10 @@ def test_page_runs(page, tmp_path, monkeypatch, opengl):
     for block in BLOCK.finditer(text):
         # Blank lines in front, so that a traceback shows the line of the page.
         code = "\n" * text[: block.start()].count("\n") + "\n" + block.group(1)
-        exec(compile(code, str(page), "exec"), namespace)
+        with monkeypatch.context() as patch:
+            if text.endswith(INTERPRETED, 0, block.start()):
+                patch.setattr(Step, "_plan", interpreted)
+            exec(compile(code, str(page), "exec"), namespace)
 
 
 SCENE_PAGES = ("docs/concepts/scene.md", "docs/guides/obstacles.md", "docs/guides/pictures.md")
