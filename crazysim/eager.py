@@ -1,4 +1,4 @@
-"""Compilation of pure functions that are called outside of compiled code."""
+"""Work outside of compiled code that compiles little: one program for a pure function, none for arrays of numbers."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ class Radar(Plugin):
         """Draw the lobes."""
         if not self.visible:
             return
-        detected = np.any(np.asarray(self.detects(sim.data)[world]), axis=0).reshape(-1)
+        detected = np.any(np.asarray(self.detects(sim.data))[world], axis=0).reshape(-1)
         record = self.read(sim.data)
         for k, pos in enumerate(np.asarray(record.pos, np.float64)):
             shape = (float(x[k]) for x in (record.size, record.exponent, record.height_scale, record.tilt))
@@ -124,6 +124,7 @@ class Radar(Plugin):
                 sim.scene.renderer.overlays.line(pos + curve, ALARM if detected[k] else CLEAR, 2.0, 2.0)
 
 
+@compiled()
 def lobe_margin(offset: Array, size: Array, exponent: Array, height_scale: Array, tilt: Array) -> Array:
     """Return the depth of a place within a radar's lobe along the normal to its axis, m, negative outside. (...)
 

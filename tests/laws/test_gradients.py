@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import by_stages
 
 from crazysim import Sim, load_airframe
 from crazysim.core import functional as F
@@ -33,8 +34,8 @@ def flight(dynamics, control, engine, n_worlds, n_steps=100):
 
     A start for one world comes with it.
     """
-    sim = Sim(n_worlds, dynamics=dynamics, control=control, engine=engine)
-    step = sim.build_step_fn()
+    sim = Sim(n_worlds, dynamics=dynamics, control=control, engine="plain" if engine == "stages" else engine)
+    step = by_stages(sim) if engine == "stages" else sim.build_step_fn()
     n = sim.data.states.rotor_vel.shape[-1]
     hover = 15_864.0 if dynamics == "first_principles" else WEIGHT
     start = {
@@ -73,17 +74,17 @@ def reverse(losses, x, directions):
 CASES = [
     ("first_principles", "state", "plain", reverse),
     ("first_principles", "attitude", "plain", forward),
-    ("first_principles", "body_rate", "plain", forward),
-    ("first_principles", "force_torque", "plain", forward),
-    ("first_principles", "rotor_vel", "plain", forward),
-    ("so_rpy", "state", "plain", forward),
-    ("so_rpy", "attitude", "plain", forward),
-    ("so_rpy_rotor_drag", "state", "plain", forward),
-    ("so_rpy_rotor_drag", "attitude", "plain", forward),
+    ("first_principles", "body_rate", "stages", forward),
+    ("first_principles", "force_torque", "stages", forward),
+    ("first_principles", "rotor_vel", "stages", forward),
+    ("so_rpy", "state", "stages", forward),
+    ("so_rpy", "attitude", "stages", forward),
+    ("so_rpy_rotor_drag", "state", "stages", forward),
+    ("so_rpy_rotor_drag", "attitude", "stages", forward),
     ("first_principles", "attitude", "auto", reverse),
 ]
-"""Both modes for a long pipeline and for the engine; otherwise the one that compiles sooner: the slopes of physics and
-controllers are defined forwards alone, and JAX transposes them."""
+"""Both modes for a long pipeline and for engines; otherwise the stages as they are written, forwards, which compiles
+sooner: the slopes of physics and controllers are defined forwards alone, and JAX transposes them."""
 
 
 @pytest.mark.parametrize(("dynamics", "control", "engine", "mode"), CASES)
@@ -157,8 +158,8 @@ def test_at_saturation_the_gradient_is_one_side(at, x64):
 
 def test_on_the_floor_and_at_rest_gradients_are_finite():
     """A drone that rests, one that hits the floor, one that hovers, one with its motors off."""
-    sim = Sim(n_worlds=4, control="attitude", engine="plain")
-    step = sim.build_step_fn()
+    sim = Sim(n_worlds=4, control="attitude")
+    step = by_stages(sim)
 
     def loss(x):
         pos, vel, thrust = x

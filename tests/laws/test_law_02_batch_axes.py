@@ -64,7 +64,7 @@ def test_a_step_keeps_every_shape_and_type(dynamics, control):
     k = PAIRS.index((dynamics, control))
     equal, unequal = EQUAL[(k + 1) % 4], UNEQUAL[k % 12]
     cases = [("plain", *unequal), ("lanes", *equal), *([("auto", *equal), ("lanes", *unequal)] if k == 0 else [])]
-    cases += [("stages", *size) for size in (SIZES if k == 0 else (equal, unequal))]
+    cases += [("stages", *size) for size in (SIZES if k == 0 else (equal,))]  # "plain" runs the stages, too
     steps = {engine: functools.partial(Step(sim.step_pipeline, engine), n_steps=1) for engine in ENGINES[:3]}
     steps["stages"] = functools.partial(after_all_stages, sim)
     for name, n_worlds, n_drones in cases:
