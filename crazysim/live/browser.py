@@ -111,7 +111,7 @@ class Browser(Viewer):
             log.warning("listening at %s:%d: every machine of that network can watch and command the simulation",
                         self._host, self._port)  # fmt: skip
         sim.scene.compile_if_edited()
-        sim.sync(int(worlds[0]))
+        sim.scene.sync_one(sim.plugins.placed(sim.data), int(worlds[0]))
         shapes = visual_geoms(sim.mj_model, sim.mj_data)
         bodies = SceneBodies(sim, shapes)
         self._source = PictureSource(sim, bodies, worlds.tolist(), self._contacts, self._wind)

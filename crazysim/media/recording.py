@@ -232,7 +232,7 @@ def _body_ids(sim: Sim) -> NDArray:
 def _scene(sim: Sim, worlds: NDArray) -> dict[str, Any]:
     """Return the fields of a flight that do not change with time."""
     ids = _body_ids(sim)
-    sim.sync(worlds[0])
+    sim.scene.sync_one(sim.plugins.placed(sim.data), worlds[0])
     return {
         "worlds": worlds,
         "drone_ids": np.asarray(sim.data.core.drone_mocap_ids),

@@ -226,8 +226,13 @@ class Scene(PureQueries):
             data = self._mjx.sync(data)
             self._synced = True
         if world is not None:
-            sync_one_world(data, world, self._mjx.poses(world), self._mj_model, self._mj_data)
+            self.sync_one(data, world)
         return data
+
+    def sync_one(self, data: SimData, world: int) -> None:
+        """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used."""
+        self.compile_if_edited()
+        sync_one_world(data, world, self._mjx.poses(world), self._mj_model, self._mj_data)
 
     # Contact slots and images -----------------------------------------------------------------------------------------
 

@@ -30,6 +30,8 @@ SHOWN = 0.7
 """Time for which a collision is marked, s."""
 RED = (1.0, 0.1, 0.1, 0.55)
 """Colour of a mark."""
+FPS = 60.0
+"""Most images per second of a window."""
 NIGHT_LIGHT = 0.1
 """Brightest light at night, 0 to 1."""
 NIGHT_SKY = (8, 10, 24)
@@ -81,8 +83,10 @@ def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
         camera.show(sim)
         start = time.perf_counter()  # opening the window can take longer than a short show
         while sim.viewer.has_window and (now := speed * (time.perf_counter() - start)) < flight.duration:
+            shown = time.perf_counter()
             put(sim, recorded, now)
             camera.show(sim)
+            time.sleep(max(shown + 1 / FPS - time.perf_counter(), 0.0))
     finally:
         sim.data = data
 

@@ -14,7 +14,7 @@ from crazysim import Cars, SharedLoad, Sim, vehicles
 from crazysim.live import FunctionSource, Live, ReplaySource, Twin, Twins
 from crazysim.trajectories import figure_eight
 
-SECONDS = 8.0
+SECONDS = 5.0
 
 
 def real_flight(t):

@@ -6,9 +6,27 @@ from pathlib import Path
 import pytest
 from drawing import draw_coarsely
 
+from crazysim.engine import Step
+
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+ENGINE = re.compile(r"<!-- engine: (\w+) -->\n$")
+"""In front of a block: engine of steps that are first taken there, as the fused one takes longer to compile.
+
+The interpreter takes few steps, and the derivatives of ``plain`` compile soonest.
+"""
+PLAN = Step._plan
+
+
+def plan_for(engine):
+    """Return ``Step._plan`` for an engine, where the page chooses none."""
+
+    def plan(step, *data):
+        step.engine = engine if step.engine == "auto" else step.engine
+        return PLAN(step, *data)
+
+    return plan
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -23,7 +41,10 @@ def test_page_runs(page, tmp_path, monkeypatch, opengl):
     for block in BLOCK.finditer(text):
         # Blank lines in front, so that a traceback shows the line of the page.
         code = "\n" * text[: block.start()].count("\n") + "\n" + block.group(1)
-        exec(compile(code, str(page), "exec"), namespace)
+        with monkeypatch.context() as patch:
+            if engine := ENGINE.search(text, 0, block.start()):
+                patch.setattr(Step, "_plan", plan_for(engine[1]))
+            exec(compile(code, str(page), "exec"), namespace)
 
 
 SCENE_PAGES = ("docs/concepts/scene.md", "docs/guides/obstacles.md", "docs/guides/pictures.md")

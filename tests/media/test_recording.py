@@ -9,6 +9,7 @@ from crazysim import SlungLoad
 from crazysim.errors import ConfigError
 from crazysim.media import Flight, Recorder, View, flight_of
 from crazysim.media.recording import put
+from crazysim.scene.mjx_scene import MjxScene
 from crazysim.sim import Sim
 
 ROLL = np.array([[0, 0, 0, 1.0], [0.6, 0, 0, 0.8]])
@@ -262,3 +263,11 @@ def test_invalid_files_are_refused(flight, tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(ConfigError, match=r"expected a recorded flight, got .*other\.npz"):
         Flight.load(tmp_path / "other.npz")
+
+
+def test_a_recording_does_without_mjx(monkeypatch):
+    """Importing and compiling it takes seconds."""
+    monkeypatch.setattr(MjxScene, "sync", None)
+    recorder = Recorder(Sim())
+    recorder.add()
+    assert recorder.flight().pos.shape == (1, 1, 1, 3)

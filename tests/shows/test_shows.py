@@ -80,8 +80,7 @@ PLAYED = """
 import sys
 from crazysim.__main__ import main
 from crazysim.scene.window import Window
-from crazysim.shows import fly
-from crazysim.shows.view import play
+from crazysim.shows import fly, view
 from crazysim.trajectories.files import load_show
 
 opened, frames = Window.__init__, []
@@ -91,6 +90,7 @@ def open_coarse(self, model, *settings):
     opened(self, model, *settings)
 
 Window.__init__ = open_coarse
+view.FPS = 10.0
 
 def close(sim, world):
     frames.append(sim.time)
@@ -99,7 +99,7 @@ def close(sim, world):
         window._glfw.set_window_should_close(window._window, True)
 
 assert main(["show", sys.argv[1], "--window"]) == 0
-play(fly(load_show(sys.argv[1])), speed=0.0015, draw=close, width=64, height=48)
+view.play(fly(load_show(sys.argv[1])), speed=0.0015, draw=close, width=64, height=48)
 print("frames", len(frames))
 """
 

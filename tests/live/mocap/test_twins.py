@@ -209,7 +209,7 @@ def test_simulated_drones_measure_report_and_hit_a_real_one(step):
         touched |= bool(sim.contact_report(twins.handles["cf1"]).objects.any())
     assert touched
     assert hit < -0.001  # pushed along -x, N s
-    assert float(sim.data.states.pos[0, 0, 0]) < -0.05
+    assert float(sim.data.states.pos[0, 0, 0]) < -0.02  # it slides off a ball
 
 
 def test_simulated_drones_avoid_a_real_one(sim):
