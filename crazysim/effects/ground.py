@@ -25,6 +25,7 @@ class TerrainData(PyTree):
     floor: bool = static()
     """True where a flat floor at z = 0 surrounds the terrain; False where its border extends outwards without end."""
 
+    @compiled()
     def surface_at(self, pos: Array) -> tuple[Array, Array]:
         """Return height and normal of the ground at a place, whose z does not count.
 
