@@ -1,4 +1,4 @@
-"""Compilation of pure functions that are called outside of compiled code."""
+"""Work outside of compiled code that compiles little: one program for a pure function, none for arrays of numbers."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
+import numpy as np
+from numpy.typing import NDArray
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -27,12 +29,19 @@ def compiled(*static: str) -> Callable[[F], F]:
 
         @functools.wraps(fn)
         def call(*args: Any, **kwargs: Any) -> Any:
-            return (fn if _traced((args, kwargs)) else jitted)(*args, **kwargs)
+            return (fn if is_traced((args, kwargs)) else jitted)(*args, **kwargs)
 
         return call  # type: ignore[return-value]
 
     return decorate
 
 
-def _traced(values: Sequence[Any]) -> bool:
+def to_host(x: Any, rows: Any) -> NDArray:
+    """Return ``x[rows]`` on the host; rows of an array of the CPU are read there, without a compiled call."""
+    on_cpu = not isinstance(x, jax.Array) or all(device.platform == "cpu" for device in x.devices())
+    return np.asarray(x)[rows] if on_cpu else np.asarray(x[rows])
+
+
+def is_traced(values: Sequence[Any]) -> bool:
+    """Return True where one of the leaves is traced: within ``jit``, ``grad`` or a stage of the engine."""
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))

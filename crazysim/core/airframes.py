@@ -75,7 +75,8 @@ def airframe_of(airframes: Airframes) -> Airframe:
 
 def n_rotors_of(airframes: Airframes) -> int:
     """Return the largest number of rotors."""
-    return max(airframe.n_rotors for airframe in as_airframes(airframes))
+    kinds = {id(airframe): airframe for airframe in as_airframes(airframes)}  # thousands of drones have a few kinds
+    return max(airframe.n_rotors for airframe in kinds.values())
 
 
 def prefix_of(airframe: Airframe) -> str:

@@ -10,7 +10,6 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Protocol, dataclass_transform
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -18,7 +17,7 @@ from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.pytree import PyTree
+from crazysim.pytree import PyTree, on_device
 
 
 class Simulation(Protocol):
@@ -148,7 +147,7 @@ def check_parameter(
         bounds = "positive" if positive else f"from {low} to {high}"
         raise ConfigError(f"expected {name} to be finite and {bounds}, got {value!r}")
     dtype = sim.data.states.pos.dtype if dtype is None else dtype
-    return jnp.asarray(np.broadcast_to(array, core) if is_shared else array, dtype)
+    return on_device(np.broadcast_to(array, core) if is_shared else array, dtype)
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(parameter, dataclasses.field))

@@ -13,6 +13,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter,
 from crazysim.core.stage import stage
 from crazysim.deprecation import warn_renamed
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
+from crazysim.eager import compiled
 from crazysim.effects.core import controls_of, per_drone, require_rotors, zeros
 from crazysim.pytree import PyTree, leaf, static
 
@@ -143,6 +144,7 @@ def add(sim: Simulation, capacity: Any, resistance: Any, n_cells: int = 1, effic
     sim.add(Battery(capacity, resistance, n_cells, efficiency, base_power, full_speed_voltage, charge))
 
 
+@compiled("n_cells")
 def open_circuit_voltage(charge: Array, n_cells: int) -> Array:
     """Return the open-circuit voltage of lithium-polymer cells in series, V.
 

@@ -16,7 +16,7 @@ from crazysim.core.stage import Stage, as_stages, stage
 from crazysim.deprecation import warn_renamed
 from crazysim.effects.core import controls_of
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 
 
 class LatencyData(PyTree):
@@ -93,7 +93,8 @@ class Latency(Plugin):
                 f"{self.max_delay!r}"
             )
         steps, command = check_parameter(sim, "delay", delay, (1,), 0, longest, jnp.int32), _sent(data)
-        return LatencyData(steps, jnp.repeat(command[..., None, :], int(longest) + 1, axis=-2), command)
+        queue = np.repeat(np.asarray(command)[..., None, :], int(longest) + 1, axis=-2)
+        return LatencyData(steps, on_device(queue, command.dtype), command)
 
 
 def add(sim: Simulation, delay: Any, max_delay: int | None = None) -> None:

@@ -201,12 +201,10 @@ def _launch(
     """Return what a kernel writes: leaves, the worlds that are flagged, and samples."""
     source, launch = compiled
     n_worlds, n_drones = lanes.batch(program, leaves)
-    n_lanes = n_worlds * n_drones
 
     def shape(i: int, *before: int) -> jax.ShapeDtypeStruct:
-        leaf = program.leaves[i]
-        of_leaf = (program.rows[i], n_lanes) if i in program.rows else (n_worlds, *leaf.shape[1:])
-        return jax.ShapeDtypeStruct((*before, *of_leaf, *([2] if jaxcompat.is_key(leaf) else [])), leaf.number)
+        x = lanes.shape_of(program, i, n_worlds)
+        return jax.ShapeDtypeStruct((*before, *x.shape), x.dtype)
 
     def as_keys(i: int, x: Array) -> Array:
         return jax.random.wrap_key_data(x) if jaxcompat.is_key(program.leaves[i]) else x
@@ -214,7 +212,7 @@ def _launch(
     flags = [] if program.check is None else [jax.ShapeDtypeStruct((n_worlds, n_drones), np.bool_)]
     samples = [shape(i, n_samples) for i in source.samples]
     inputs = [_as_numbers(leaves[i]) for i in source.inputs]
-    out = launch(n_lanes, counts, inputs, [*(shape(i) for i in source.outputs), *flags, *samples])
+    out = launch(n_worlds * n_drones, counts, inputs, [*(shape(i) for i in source.outputs), *flags, *samples])
     n = len(source.outputs)
     written = [as_keys(i, x) for i, x in zip(source.outputs, out[:n], strict=True)]
     kept = [as_keys(i, x) for i, x in zip(source.samples, out[n + len(flags) :], strict=True)]

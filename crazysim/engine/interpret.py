@@ -6,7 +6,6 @@ and ``Sim(engine="interpret")`` steps with it.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,9 +13,11 @@ import jax
 import numpy as np
 from jax import Array
 
+from crazysim.core.stage import with_leaves
 from crazysim.engine import lanes, ops
-from crazysim.engine.ir import Block, Element, Operation, Value
+from crazysim.engine.ir import Block, Operation, Value
 from crazysim.engine.program import Program
+from crazysim.jaxcompat import is_key
 
 Env = dict[Value, np.ndarray]
 """Arrays by the values that they are."""
@@ -50,18 +51,33 @@ def run(
     env.update(zip(block.inputs, lanes_of, strict=True))
     with np.errstate(all="ignore"):
         for op in block.operations:
-            results = _apply(op, [_get(env, x, shape) for x in op.args], shape, env)
+            args = [env[x] if isinstance(x, Value) else x for x in op.args]
+            row = ops.TABLE[op.name]
+            results = _structured(op, args, shape, env) if row.structured else [_number(op, row.numpy, args)]
             env.update(zip(op.results, results, strict=True))
             if observe is not None:
                 observe(op, results)
-    return [_get(env, x, shape) for x in block.outputs]
+    return [_spread(env[x] if isinstance(x, Value) else x, shape) for x in block.outputs]
 
 
-def _get(env: Env, x: Element, shape: tuple[int, ...]) -> np.ndarray:
-    return env[x] if isinstance(x, Value) else np.broadcast_to(np.asarray(x), shape)
+def _spread(x: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a number of the lanes, or of all of them, for each lane; broadcasting takes as long as an operation."""
+    return x if np.shape(x) == shape else np.broadcast_to(x, shape)
 
 
-def _apply(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: Env) -> list[np.ndarray]:
+def _number(op: Operation, numpy: Callable[..., Any] | None, args: Sequence[Any]) -> Any:
+    """Return the result of an operation that has one: of the lanes' shape, or a scalar."""
+    if numpy is None:
+        raise RuntimeError(f"operation {op.name!r} has no NumPy function; give it one in ops.TABLE")
+    params = dict(op.params)
+    if op.name in ("convert_element_type", "bitcast_convert_type"):
+        params["dtype"] = op.dtype
+    x = numpy(*args, **params)
+    return x if x.dtype == op.dtype else np.asarray(x).astype(op.dtype)
+
+
+def _structured(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    """Return the results of an operation that runs blocks, looks something up, or has several results."""
     match op.name:
         case "barrier":
             return []
@@ -88,12 +104,7 @@ def _apply(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: E
             return [args[0][args[1] + op.param("offset")]]
         case "threefry2x32":
             return list(threefry2x32(*args))
-    numpy, params = ops.TABLE[op.name].numpy, dict(op.params)
-    if op.name in ("convert_element_type", "bitcast_convert_type"):
-        params["dtype"] = op.dtype
-    if numpy is None:
-        raise RuntimeError(f"operation {op.name!r} has no NumPy function; give it one in ops.TABLE")
-    return [np.asarray(numpy(*args, **params)).astype(op.dtype, copy=False)]
+    raise RuntimeError(f"operation {op.name!r} is structured, and the interpreter does not know it")
 
 
 def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: Env) -> list[np.ndarray]:
@@ -103,7 +114,7 @@ def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], 
     combine: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
     found = [np.full(shape, ops.neutral(name, x.dtype)) for name, x in zip(op.param("reduce"), op.results, strict=True)]
     for j in range(n):
-        other = [np.repeat(x.reshape(-1, n)[:, j], n) for x in args]
+        other = [np.repeat(np.broadcast_to(x, shape).reshape(-1, n)[:, j], n) for x in args]
         new = run(op.blocks[0], [*other, own == j], shape, env)
         found = [fn(x, y) for fn, x, y in zip(combine, found, new, strict=True)]
     return found
@@ -129,14 +140,42 @@ def threefry2x32(k0: np.ndarray, k1: np.ndarray, x0: np.ndarray, x1: np.ndarray)
 def call(block: Block, inputs: Sequence[Any], shape: tuple[int, ...]) -> list[Array]:
     """Return what ``run`` does, inside a function that JAX traces or compiles; it has no derivative."""
     results = [jax.ShapeDtypeStruct(shape, x.dtype) for x in block.outputs]
-    fn = functools.partial(_of_arrays, block, shape)
-    return list(jax.pure_callback(fn, results, *inputs, vmap_method="sequential"))
 
+    def of_arrays(*inputs: Any) -> list[np.ndarray]:
+        return [np.array(x) for x in run(block, [np.asarray(x) for x in inputs], shape)]
 
-def _of_arrays(block: Block, shape: tuple[int, ...], *inputs: Any) -> list[np.ndarray]:
-    return [np.array(x) for x in run(block, [np.asarray(x) for x in inputs], shape)]
+    return list(jax.pure_callback(of_arrays, results, *inputs, vmap_method="sequential"))
 
 
 def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-    """Return what ``lanes.steps`` does, every block interpreted; stages that are not fused run in XLA."""
-    return lanes.steps(program, leaves, n_steps, call)
+    """Return what ``lanes.steps`` does, all in NumPy: at once, or in a callback where arguments are traced.
+
+    If stages are not fused, only blocks are interpreted, and the rest runs in XLA.
+    """
+    if not program.fused:
+        return lanes.steps(program, leaves, n_steps, call)
+    n_worlds, _ = lanes.batch(program, leaves)
+    given = [i for i, x in enumerate(leaves) if x is not None]
+    written = [lanes.shape_of(program, i, n_worlds) for i in program.written]
+    flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
+
+    def of_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], np.ndarray]:
+        return _steps(program, with_leaves([None] * len(leaves), given, [np.asarray(x) for x in values]), int(n_steps))
+
+    values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in given]
+    if any(isinstance(x, jax.core.Tracer) for x in (n_steps, *values)):
+        out, flags = jax.pure_callback(of_arrays, (written, flagged), n_steps, *values, vmap_method="sequential")
+    else:
+        out, flags = of_arrays(n_steps, *values)
+    keys = [is_key(program.leaves[i]) for i in program.written]
+    return [jax.random.wrap_key_data(x) if key else x for x, key in zip(out, keys, strict=True)], flags
+
+
+def _steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.ndarray], np.ndarray]:
+    now = lanes.Lanes(program, leaves, run, np)
+    constants = lanes.prepare(program, now)
+    for _ in range(n_steps):
+        lanes.run(program, now, "each", constants)
+    flagged = lanes.nonfinite(program, now)
+    lanes.run(program, now, "last", {})
+    return [np.ascontiguousarray(now.array(i)) for i in program.written], flagged

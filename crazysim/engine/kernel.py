@@ -91,6 +91,7 @@ def write(program: Program, target: str, samples: Sequence[int] = ()) -> Kernel:
     slots = dict.fromkeys([*inside, *written, *checked, *stored])
     loaded = _loaded(program)
     inputs = needed(program)
+    deferred = _deferred(program)
 
     names = {slot: f"x{slot[0]}_{slot[1]}" for slot in slots}
     depth = 1 + exchange.depth
@@ -98,7 +99,7 @@ def write(program: Program, target: str, samples: Sequence[int] = ()) -> Kernel:
     for slot in shared:
         if slot[1] == TABLE:
             names[slot] = f"p{slot[0]}"
-        elif slot in stored or not _is_deferred(program, slot):
+        elif slot in stored or slot not in deferred:
             writer.line(f"const auto {names[slot]} = {_load(program, slot)};", 1)
         else:
             names[slot] = _load(program, slot)
@@ -110,7 +111,7 @@ def write(program: Program, target: str, samples: Sequence[int] = ()) -> Kernel:
         if slot in written:
             start = access if slot in loaded else f"{kind}(0)"
             names[slot] = exchange.variable(writer, names[slot], kind, f"{kind}_lanes({start})", depth)
-        elif slot not in stored and _is_deferred(program, slot):
+        elif slot not in stored and slot in deferred:
             names[slot] = access
         else:
             names[slot] = exchange.keep(writer, names[slot], kind, access, depth)
@@ -256,26 +257,22 @@ def _write_segment(
             writer.line(f"{name} = {kind}_lanes({new});", depth)
 
 
-def _is_deferred(program: Program, slot: Slot) -> bool:
-    """Return True where only stages below the step rate, or the check behind the loop, use a number that never changes.
+def _deferred(program: Program) -> set[Slot]:
+    """Return the numbers that only stages below the step rate use, or only the check behind the loop.
 
-    It is loaded there, and takes no register in between.
+    If none changes them, they are loaded there, and take no register in between.
     """
-    check = program.check
-    in_check = check is not None and slot in check.reads
-    in_blocks = False
+    in_blocks: set[Slot] = set()
+    always: set[Slot] = set()
     for segment in program.fused_segments:
-        if slot in segment.hoisted_reads:
-            return False
         block = segment.block
         now = {x for op in block.operations for x in op.args} | set(block.outputs)
         now = now.union(*(x.uses() for op in block.operations if op.name == "over_others" for x in op.blocks))
-        for x, read in zip(block.inputs, program.per_drone(segment, segment.reads), strict=False):
-            if read == slot:
-                if segment.scope == "world" or x in now:
-                    return False
-                in_blocks = True
-    return in_blocks != in_check
+        always.update(segment.hoisted_reads)
+        for x, slot in zip(block.inputs, program.per_drone(segment, segment.reads), strict=False):
+            (always if segment.scope == "world" or x in now else in_blocks).add(slot)
+    in_check = set(program.check.reads) if program.check is not None else set()
+    return (in_blocks ^ in_check) - always
 
 
 def _type(program: Program, leaf: int) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
@@ -28,15 +29,16 @@ Execute = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
 class Lanes:
     """Leaves of all drones, each as an array or as lanes, in the form that was last used."""
 
-    def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run):
+    def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run, library: Any = jnp):
         """Hold leaves as arrays.
 
         Args:
             program: The program.
             leaves: Leaves of all worlds; None for one that is written before it is read.
             execute: Runs the blocks.
+            library: Library of the arrays: ``jax.numpy``, or ``numpy``, where random keys are 32-bit integers.
         """
-        self.program, self.execute = program, execute
+        self.program, self.execute, self.library = program, execute, library
         self.n_worlds, self.n_drones = batch(program, leaves)
         self.arrays: dict[int, Any] = dict(enumerate(leaves))
         self.lanes: dict[Slot, Any] = {}
@@ -64,7 +66,7 @@ class Lanes:
         """Write a number of every drone."""
         if slot not in self.lanes:
             self._split(slot[0])
-        self.lanes[slot] = jnp.broadcast_to(value, self.shape)
+        self.lanes[slot] = value if np.shape(value) == self.shape else self.library.broadcast_to(value, self.shape)
         self.arrays.pop(slot[0], None)
 
     def array(self, leaf: int) -> Any:
@@ -72,14 +74,14 @@ class Lanes:
         if leaf not in self.arrays:
             example = self.program.leaves[leaf]
             items = [self.lanes[leaf, k] for k in range(example.size)]
-            self.arrays[leaf] = jnp.stack(items) if example.rows_of else self._stacked(leaf, items)
+            self.arrays[leaf] = self.library.stack(items) if example.rows_of else self._stacked(leaf, items)
         return self.arrays[leaf]
 
     def _stacked(self, leaf: int, items: list[Any]) -> Any:
         example, key = self.program.leaves[leaf], is_key(self.program.leaves[leaf])
         shape = (*example.shape[2:], 2) if key else example.shape[2:]
-        array = jnp.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *shape)
-        array = jax.random.wrap_key_data(array) if key else array
+        array = self.library.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *shape)
+        array = jax.random.wrap_key_data(array) if key and self.library is jnp else array
         return array[:, :1] if example.scope == "world" else array
 
     def set_array(self, leaf: int, value: Any) -> None:
@@ -92,12 +94,12 @@ class Lanes:
         x, example = self.arrays[leaf], self.program.leaves[leaf]
         size = example.size
         if example.rows_of or x is None:  # what is not given is written before it is read
-            self.lanes.update(((leaf, k), jnp.zeros(self.shape) if x is None else x[k]) for k in range(size))
+            self.lanes.update(((leaf, k), self.library.zeros(self.shape) if x is None else x[k]) for k in range(size))
             return
         if is_key(x):
             x = jax.random.key_data(x)
         if example.scope == "world":
-            x = jnp.broadcast_to(x, (self.n_worlds, self.n_drones, *x.shape[2:]))
+            x = self.library.broadcast_to(x, (self.n_worlds, self.n_drones, *x.shape[2:]))
         batch = self.shape if example.scope in ("drone", "world") else ()
         x = x.reshape(*batch, size)
         self.lanes.update(((leaf, k), x[..., k]) for k in range(size))
@@ -111,6 +113,15 @@ def batch(program: Program, leaves: list[Any]) -> tuple[int, int]:
         if leaf.scope == "drone" and x is not None and not leaf.rows_of
     )
     return leaves[drone].shape[0], leaves[drone].shape[1]
+
+
+def shape_of(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct:
+    """Return shape and type of a leaf of all worlds that a program writes; of random keys those of their integers."""
+    example = program.leaves[leaf]
+    of_leaf = (n_worlds, *example.shape[1:])
+    if leaf in program.rows:
+        of_leaf = (program.rows[leaf], n_worlds * program.n_drones)
+    return jax.ShapeDtypeStruct((*of_leaf, *([2] if is_key(example) else [])), example.number)
 
 
 LONG = 256
@@ -149,7 +160,7 @@ def _run_drones(segment: Segment, lanes: Lanes, constants: Sequence[Any]) -> Non
 
 def _run_worlds(segment: Segment, lanes: Lanes) -> None:
     """Run a segment of worlds: a drone's numbers are those of its world, at its place."""
-    leaves, shape = lanes.program.leaves, (lanes.n_worlds, lanes.n_drones)
+    leaves, shape, library = lanes.program.leaves, (lanes.n_worlds, lanes.n_drones), lanes.library
 
     def of_world(slot: Slot) -> Any:
         leaf, k = slot
@@ -157,12 +168,12 @@ def _run_worlds(segment: Segment, lanes: Lanes) -> None:
             drone, k = divmod(k, leaves[leaf].size)
             return lanes.get((leaf, k)).reshape(shape)[:, drone]
         value = lanes.get(slot)
-        return value.reshape(shape)[:, 0] if jnp.ndim(value) and k != TABLE else value
+        return value.reshape(shape)[:, 0] if library.ndim(value) and k != TABLE else value
 
     outs = lanes.execute(segment.block, [of_world(slot) for slot in segment.reads], shape[:1])
     new: dict[Slot, dict[int, Array]] = {}
     for (leaf, k), value in zip(segment.writes, outs, strict=True):
-        value = jnp.broadcast_to(value, shape[:1])
+        value = library.broadcast_to(value, shape[:1])
         if leaves[leaf].scope == "drone":
             drone, k = divmod(k, leaves[leaf].size)
             new.setdefault((leaf, k), {})[drone] = value
@@ -170,9 +181,9 @@ def _run_worlds(segment: Segment, lanes: Lanes) -> None:
             new[leaf, k] = dict.fromkeys(range(lanes.n_drones), value)
     for slot, columns in new.items():
         old = lanes.get(slot)
-        old = jnp.broadcast_to(old, lanes.shape).reshape(shape)
+        old = library.broadcast_to(old, lanes.shape).reshape(shape)
         rows = [columns.get(d, old[:, d]) for d in range(lanes.n_drones)]
-        lanes.set(slot, jnp.stack(rows, axis=-1).reshape(lanes.shape))
+        lanes.set(slot, library.stack(rows, axis=-1).reshape(lanes.shape))
 
 
 def _run_unfused(stage: UnfusedStage, lanes: Lanes) -> None:
@@ -246,14 +257,14 @@ def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
     inner = math.isqrt(n)
     outer = jax.checkpoint(lambda c: turns(c, inner), prevent_cse=False)
     carry, _ = jax.lax.scan(lambda c, _: (outer(c), None), carry, length=n // inner)
-    return turns(carry, n % inner)
+    return turns(carry, n % inner) if n % inner else carry
 
 
 def nonfinite(program: Program, lanes: Lanes) -> Array:
     """Return True for worlds that were flagged before, or have a watched number that is not finite. (n_worlds, 1)"""
     check = program.check
     if check is None:
-        return jnp.zeros((lanes.n_worlds, 1), bool)
+        return lanes.library.zeros((lanes.n_worlds, 1), bool)
     (flagged,) = lanes.execute(check.block, [lanes.get(slot) for slot in check.reads], lanes.shape)
-    flagged = jnp.broadcast_to(flagged, lanes.shape).reshape(lanes.n_worlds, lanes.n_drones)
-    return jnp.any(flagged, axis=1, keepdims=True)
+    flagged = lanes.library.broadcast_to(flagged, lanes.shape).reshape(lanes.n_worlds, lanes.n_drones)
+    return flagged.any(axis=1, keepdims=True)

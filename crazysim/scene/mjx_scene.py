@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
 from crazysim.core.sharding import place_scene, put
+from crazysim.eager import to_host
 from crazysim.errors import ConfigError
 from crazysim.scene import build, contacts, mjx
 from crazysim.scene.sync import sync_sim2mjx
@@ -71,22 +72,26 @@ class MjxScene:
         data, self._data = sync_sim2mjx(data, self.data, self.model)
         return data
 
-    def poses(self, worlds: Any = slice(None)) -> tuple[Any, Any, Any]:
+    def poses(self, worlds: Any = None) -> tuple[Any, Any, Any]:
         """Return poses of some worlds at the last sync, or as the model has them while nothing is allocated.
 
         Args:
-            worlds: Index, indices or slice.
+            worlds: Index or indices; None for all.
 
         Returns:
             Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), and joint positions (n, n_qpos).
         """
         if self._data is not None:
-            return self._data.mocap_pos[worlds], self._data.mocap_quat[worlds], self._data.qpos[worlds]
+            pos, quat, qpos = self._data.mocap_pos, self._data.mocap_quat, self._data.qpos
+            if worlds is None:
+                return pos, quat, qpos
+            return to_host(pos, worlds), to_host(quat, worlds), to_host(qpos, worlds)
         if self._rest is None:
             rest = mujoco.MjData(self._mj_model)
             each = (rest.mocap_pos, rest.mocap_quat, self._mj_model.qpos0)
             self._rest = tuple(np.array(x) for x in each)
-        pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[worlds] for x in self._rest)
+        chosen = slice(None) if worlds is None else worlds
+        pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[chosen] for x in self._rest)
         return pos, quat, qpos
 
     @property

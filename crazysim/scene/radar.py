@@ -14,9 +14,10 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
+from crazysim.eager import compiled
 from crazysim.effects.core import zeros
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.rotation import safe_clip, safe_norm
 
 CLEAR, ALARM = (0.25, 0.6, 0.9, 1.0), (0.95, 0.2, 0.15, 1.0)
@@ -41,6 +42,7 @@ class RadarData(PyTree):
     exposure: Array = leaf("drone", 1)
     """Time that a drone has been within each lobe since the last reset, s. (n_worlds, n_drones, n_radars)"""
 
+    @compiled()
     def margin_at(self, pos: Array) -> Array:
         """Return the depth of a place within each lobe, m, negative outside; see ``lobe_margin``. (..., n_radars)"""
         offset = pos[..., None, :] - self.pos
@@ -88,8 +90,8 @@ class Radar(Plugin):
             if not np.isfinite(value).all() or np.any(value < low) or np.any(value > high):
                 bounds = "positive" if low > 0 else f"from {low:.4g} to {high:.4g}"
                 raise ConfigError(f"expected {name} to be finite and {bounds}, got {getattr(self, name)!r}")
-            found[name] = jnp.asarray(np.broadcast_to(value, len(pos)), dtype)
-        return RadarData(pos=jnp.asarray(pos, dtype), **found, exposure=zeros(sim, len(pos)))
+            found[name] = on_device(np.broadcast_to(value, len(pos)), dtype)
+        return RadarData(pos=on_device(pos, dtype), **found, exposure=zeros(sim, len(pos)))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that counts the time within the lobes."""
@@ -114,7 +116,7 @@ class Radar(Plugin):
         """Draw the lobes."""
         if not self.visible:
             return
-        detected = np.any(np.asarray(self.detects(sim.data)[world]), axis=0).reshape(-1)
+        detected = np.any(np.asarray(self.detects(sim.data))[world], axis=0).reshape(-1)
         record = self.read(sim.data)
         for k, pos in enumerate(np.asarray(record.pos, np.float64)):
             shape = (float(x[k]) for x in (record.size, record.exponent, record.height_scale, record.tilt))
@@ -122,6 +124,7 @@ class Radar(Plugin):
                 sim.scene.renderer.overlays.line(pos + curve, ALARM if detected[k] else CLEAR, 2.0, 2.0)
 
 
+@compiled()
 def lobe_margin(offset: Array, size: Array, exponent: Array, height_scale: Array, tilt: Array) -> Array:
     """Return the depth of a place within a radar's lobe along the normal to its axis, m, negative outside. (...)
 

@@ -16,7 +16,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
 from crazysim.deprecation import renamed, warn_renamed
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.placement import place, placed_by
 from crazysim.scene.rays import cast
@@ -75,8 +75,8 @@ class RangeFinder(Plugin):
         self._period(sim)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         far = float(self.max_range)
-        distance = jnp.full((sim.n_worlds, sim.n_drones, len(rays)), far)
-        return RangeFinderData(distance, jnp.asarray(rays, float), jnp.asarray(far))
+        distance = np.full((sim.n_worlds, sim.n_drones, len(rays)), far)
+        return RangeFinderData(on_device(distance), on_device(rays), on_device(far))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that measures, of one drone, or of one world if drones or loads are to be measured."""

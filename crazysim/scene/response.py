@@ -21,7 +21,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
 from crazysim.deprecation import warn_renamed
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.scene.contact_points import Surface, contact_points, is_ground, surfaces_of
 from crazysim.scene.drone_boxes import Boxes, boxes_of, of_kind
 from crazysim.scene.impulse import Material, after_contact, inertia_matrix
@@ -77,12 +77,11 @@ class ContactResponse(Plugin):
         dt = 1 / sim.data.core.freq
         if self.softness < 2 * dt:
             raise ConfigError(f"expected softness to be two steps at least, {2 * dt:.4g} s, got {self.softness} s")
-        ones = jnp.ones(1)
         return ContactResponseData(
-            friction=self.friction * ones,
-            restitution=self.restitution * ones,
-            softness=self.softness * ones,
-            impulse=jnp.zeros((sim.n_worlds, sim.n_drones, 3)),
+            friction=on_device([self.friction]),
+            restitution=on_device([self.restitution]),
+            softness=on_device([self.softness]),
+            impulse=on_device(np.zeros((sim.n_worlds, sim.n_drones, 3))),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

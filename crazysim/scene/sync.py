@@ -12,6 +12,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import SimData
+from crazysim.eager import compiled, to_host
 from crazysim.scene import mjx
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
@@ -51,8 +52,14 @@ def _poses(data: SimData) -> list[tuple[Any, Any, Any]]:
     """Return mocap ids, positions and attitudes of drones and of objects with handles."""
     owned = [(data.core.drone_mocap_ids, data.states.pos, data.states.quat)]
     if data.objects is not None:
-        owned.append((data.objects.mocap_ids, data.objects.pos[:, 0], data.objects.quat[:, 0]))
+        owned.append((data.objects.mocap_ids, *_without_axis(data.objects.pos, data.objects.quat)))
     return owned
+
+
+@compiled()
+def _without_axis(*arrays: Array) -> tuple[Array, ...]:
+    """Return arrays of objects without the axis of drones. (n_worlds, n, k)"""
+    return tuple(x[:, 0] for x in arrays)
 
 
 def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
@@ -70,6 +77,7 @@ def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
     )
 
 
+@compiled()
 def with_poses_of(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     """Return poses of bodies and joints in some worlds, with those of drones and handles as the data have them.
 
@@ -78,11 +86,16 @@ def with_poses_of(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Arr
         worlds: Indices of worlds. (n,)
         poses: Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), joint positions (n, n_qpos).
     """
-    mocap_pos, mocap_quat, qpos = map(jnp.asarray, poses)
-    for ids, pos, quat in _poses(data):
+    return (*_with_poses(_poses(data), worlds, *poses[:2]), jnp.asarray(poses[2]))
+
+
+@compiled()
+def _with_poses(owned: Any, worlds: Array, mocap_pos: Array, mocap_quat: Array) -> tuple[Array, Array]:
+    mocap_pos, mocap_quat = jnp.asarray(mocap_pos), jnp.asarray(mocap_quat)
+    for ids, pos, quat in owned:
         mocap_pos = mocap_pos.at[:, ids].set(pos[worlds])
         mocap_quat = mocap_quat.at[:, ids].set(jnp.roll(quat[worlds], 1, axis=-1))
-    return mocap_pos, mocap_quat, qpos
+    return mocap_pos, mocap_quat
 
 
 def sync_one_world(
@@ -103,9 +116,13 @@ def sync_one_world(
         mj_data: State to write.
     """
     mj_data.mocap_pos[:], mj_data.mocap_quat[:], mj_data.qpos[:] = poses
-    for ids, pos, quat in _poses(data):
-        mj_data.mocap_pos[np.asarray(ids)] = pos[world]
-        mj_data.mocap_quat[np.asarray(ids)] = np.roll(quat[world], 1, axis=-1)
+    states, objects = data.states, data.objects
+    owned = [(data.core.drone_mocap_ids, to_host(states.pos, world), to_host(states.quat, world))]
+    if objects is not None:
+        owned.append((objects.mocap_ids, to_host(objects.pos, world)[0], to_host(objects.quat, world)[0]))
+    for ids, pos, quat in owned:
+        mj_data.mocap_pos[np.asarray(ids)] = pos
+        mj_data.mocap_quat[np.asarray(ids)] = np.roll(quat, 1, axis=-1)
     mujoco.mj_kinematics(mj_model, mj_data)
     mujoco.mj_comPos(mj_model, mj_data)
     mujoco.mj_camlight(mj_model, mj_data)

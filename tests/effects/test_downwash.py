@@ -1,5 +1,7 @@
 """Downwash: a value worked out by hand, the laws of a jet, and who blows at whom."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,9 +37,12 @@ def air(sim):
     return np.asarray(blow(sim, sim.data), np.float64)
 
 
+compiled = functools.cache(jax.jit)
+
+
 def blow(sim, data):
     """Return the velocity of the air at the drones. (n_worlds, n_drones, 3)"""
-    return jax.jit(sim.step_pipeline["downwash"])(data).plugins["downwash"].air_vel
+    return np.asarray(compiled(sim.step_pipeline["downwash"])(data).plugins["downwash"].air_vel)
 
 
 def by_hand(below, off, thrust=0.0434 * 9.81):
@@ -71,12 +76,12 @@ def test_the_jet_leaves_against_the_thrust(air):
 
 def test_the_jet_carries_the_momentum_that_the_thrust_needs():
     """rho times the integral of u^2 over a level plane is T, at every depth; B and S as measured give 4 % less."""
-    r = jnp.linspace(0, 3, 20001)[:, None]
+    r = np.linspace(0, 3, 20001, dtype=np.float32)[:, None]
+    one = [np.float32([x]) for x in (0.426, 0.0778, 1.225)]
     for depth in (0.3, 1.0, 2.0):
-        apart = jnp.concatenate([r, 0 * r, 0 * r - depth], axis=-1)
-        one = [jnp.array([x]) for x in (0.426, 0.0778, 1.225)]
-        u = np.asarray(downwash.jet(apart, jnp.array([0, 0, 1.0]), *one), np.float64)[:, 0]
-        flux = 1.225 * 2 * np.pi * np.trapezoid(u**2 * np.asarray(r[:, 0]), r[:, 0])
+        apart = np.concatenate([r, 0 * r, 0 * r - np.float32(depth)], axis=-1)
+        u = np.asarray(jax.jit(downwash.jet)(apart, np.float32([0, 0, 1.0]), *one), np.float64)[:, 0]
+        flux = 1.225 * 2 * np.pi * np.trapezoid(u**2 * r[:, 0], r[:, 0])
         assert 0.95 < flux / 0.426 < 0.965
 
 
@@ -86,7 +91,7 @@ def test_the_lower_drone_is_pushed_down_by_its_drag_and_the_users_force_stays(si
     sim.data = with_states(before, force=[0.1, 0, 0])
     sim.rotor_vel_control(np.asarray(before.states.rotor_vel))
     sim.step()
-    states = sim.data.states
+    states = jax.device_get(sim.data.states)
     sim.data = before
     fall = 0.002 * 0.02477 / 0.0434 * by_hand(0.5, 0.0)
     np.testing.assert_allclose(states.vel[0, 1, 2], -fall, rtol=5e-4)  # four digits; float32 hover to 1e-7 m/s^2 g dt
@@ -118,17 +123,17 @@ def test_law_07_gradients_are_finite_where_drones_coincide_and_rotors_stand(sim)
         data = sim.step_pipeline["downwash"](sim.data.replace(states=states))
         return jnp.sum(data.plugins["downwash"].air_vel ** 2)
 
-    s = sim.data.states
+    s, slopes = jax.device_get(sim.data.states), jax.jit(jax.grad(total, (0, 1, 2)))
     for rotor_vel in (s.rotor_vel, 0 * s.rotor_vel):
-        for g in jax.jit(jax.grad(total, (0, 1, 2)))(s.pos, rotor_vel, s.quat):
+        for g in slopes(s.pos, rotor_vel, s.quat):
             assert np.isfinite(g).all()
 
 
 def test_law_07_above_the_drone_the_virtual_origin_does_no_harm():
     """Where the distance to the virtual origin is exactly zero, a formula of the far field would divide by it."""
     one = [jnp.array([x]) for x in (0.4, 0.125, 1.225)]
-    apart = jnp.array([0.1, 0.0, downwash.DECAY * 0.125])  # a power of two: the product is exact
-    value, gradient = jax.value_and_grad(lambda x: downwash.jet(x, jnp.array([0, 0, 1.0]), *one)[0])(apart)
+    apart = np.float32([0.1, 0.0, downwash.DECAY * 0.125])  # a power of two: the product is exact
+    value, gradient = jax.jit(jax.value_and_grad(lambda x: downwash.jet(x, jnp.array([0, 0, 1.0]), *one)[0]))(apart)
     assert value == 0
     np.testing.assert_array_equal(gradient, 0.0)
 

@@ -38,7 +38,7 @@ def test_a_failed_rotor_gives_no_thrust_and_a_weak_one_its_fraction(weak):
     """One step from hover: v = g dt (mean effectiveness - 1), and J w' = the torque of what is left."""
     sim, before = weak, weak.data
     sim.step()
-    states, sim.data = sim.data.states, before
+    states, sim.data = jax.device_get(sim.data.states), before
     e = left(sim)
     np.testing.assert_allclose(states.vel[..., 2], 9.81 * DT * (e.mean(axis=-1) - 1), rtol=1e-5, atol=1e-7)  # float32
     p, speed = before.params, np.asarray(before.states.rotor_vel, np.float64)
@@ -59,11 +59,12 @@ def test_a_drone_without_rotors_falls_like_a_stone(weak):
     """Free fall of explicit Euler with linear drag, whatever its rotors still turn; commands are left alone."""
     sim, before = weak, weak.data
     sim.step(100)
-    states, controls, sim.data = sim.data.states, sim.data.controls, before
+    states, controls, sim.data = *jax.device_get((sim.data.states, sim.data.controls)), before
     keep = 1 - 0.02477138502714662 / 0.0434 * DT
     fall = -9.81 * DT * (1 - keep**100) / (1 - keep)
     np.testing.assert_allclose(states.vel[0, 0, 2], fall, rtol=1e-5)  # float32 over 100 steps
-    assert states.rotor_vel[0, 0].max() < 0.2 * before.states.rotor_vel[0, 0].min(), "failed rotors run down"
+    first = np.asarray(before.states.rotor_vel)[0, 0]
+    assert states.rotor_vel[0, 0].max() < 0.2 * first.min(), "failed rotors run down"
     np.testing.assert_array_equal(controls.rotor_vel, before.controls.rotor_vel)
     np.testing.assert_allclose(states.vel[2], 0.0, atol=1e-4)  # at full strength it hovers, in float32
 
@@ -115,7 +116,7 @@ def test_the_gradient_with_respect_to_effectiveness_is_the_thrust(weak):
         data = weak.data.replace(plugins={"motors": weak.data.plugins["motors"].replace(effectiveness=e)})
         return jnp.sum(step(data, 1).states.vel[..., 2])
 
-    gradient = jax.grad(climb)(jnp.full((3, 2, 4), 0.8))
+    gradient = jax.jit(jax.grad(climb))(np.full((3, 2, 4), 0.8, np.float32))
     np.testing.assert_allclose(gradient, np.full((3, 2, 4), DT * 9.81 / 4), rtol=1e-5)
 
 

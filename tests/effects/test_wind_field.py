@@ -30,9 +30,9 @@ def test_the_field_pushes_as_a_steady_wind_of_the_same_velocity():
     steady.add(Wind((2.0, 0.0, 1.0)))
     for sim in (field, steady):
         sim.step()
-    assert float(steady.data.states.vel[0, 0, 0]) > 1e-4
+    assert float(np.asarray(steady.data.states.vel)[0, 0, 0]) > 1e-4
     np.testing.assert_allclose(field.data.states.vel, steady.data.states.vel, rtol=1e-6)
-    np.testing.assert_allclose(field.data.plugins["wind_field"].air_vel[1, 1], [2, 0, 1])
+    np.testing.assert_allclose(np.asarray(field.data.plugins["wind_field"].air_vel)[1, 1], [2, 0, 1])
 
 
 def test_offset_scale_and_outside():
@@ -67,17 +67,17 @@ def test_the_air_at_loads_counts_for_loads():
     sim.data = with_states(sim.data, pos=[0, 0, 3.0])
     load = sim.add(SlungLoad(0.01, 1.6, drag=0.05))
     sim.step()
-    np.testing.assert_allclose(load.read(sim.data).wind_vel[0, 0], [0.8, 0, 0.4], rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(load.read(sim.data).wind_vel)[0, 0], [0.8, 0, 0.4], rtol=1e-5)
     still = build(Grid(np.zeros((1, 1, 1, 3))))
     still.data = with_states(still.data, pos=[0, 0, 3.0])
     still.add(SlungLoad(0.01, 1.6, drag=0.05))
     still.step()
     # implicit: dt b / (m + dt b) of the air's velocity
-    push = load.read(sim.data).vel - still.data.plugins["load"].vel
+    push = np.asarray(load.read(sim.data).vel) - np.asarray(still.data.plugins["load"].vel)
     np.testing.assert_allclose(push[..., 0], 0.8 * 0.05 / 500 / (0.01 + 0.05 / 500), rtol=0.02)  # the cable's pull too
     sim.remove("wind_field")
     sim.step()
-    assert float(jnp.abs(load.read(sim.data).vel[..., 0]).max()) < float(push[..., 0].max()), "no wind remains"
+    assert np.abs(np.asarray(load.read(sim.data).vel)[..., 0]).max() < push[..., 0].max(), "no wind remains"
 
 
 @pytest.mark.parametrize("largest", [10**6, 1])
@@ -91,20 +91,22 @@ def test_engines_agree_whether_the_table_is_fused_or_not(monkeypatch, largest, r
     plain = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(20))
     sim.step(20)
     np.testing.assert_allclose(sim.data.states.vel, plain.states.vel, rtol=1e-5, atol=1e-6)  # float32
-    assert float(jnp.abs(plain.plugins["wind_field"].air_vel).min()) > 0
+    assert np.abs(np.asarray(plain.plugins["wind_field"].air_vel)).min() > 0
 
 
 def test_law_08_gradients_of_a_flight_equal_central_differences(x64, rng):
     sim = build(Grid(rng.normal(size=(6, 6, 6, 3)), (-1, -1, 0), 0.8), n_worlds=1, n_drones=1, engine="plain")
     step = sim.build_step_fn()
 
+    @jax.jit
+    @jax.value_and_grad
     def end(pos):
         states = sim.data.states.replace(pos=pos)
-        return jnp.sum(step(sim.data.replace(states=states), 20).states.vel * jnp.asarray([1.0, 2.0, 3.0]))
+        return jnp.sum(step(sim.data.replace(states=states), 20).states.vel * np.array([1.0, 2.0, 3.0]))
 
-    at, h = jnp.asarray([[[0.31, -0.22, 2.13]]]), 1e-5
-    found = jax.grad(end)(at)
-    central = [(end(at + h * e) - end(at - h * e)) / (2 * h) for e in jnp.eye(3)]
+    at, h = np.array([[[0.31, -0.22, 2.13]]]), 1e-5
+    found = np.asarray(end(at)[1])
+    central = [float(end(at + h * e)[0] - end(at - h * e)[0]) / (2 * h) for e in np.eye(3)]
     assert np.abs(central).max() > 1e-3
     np.testing.assert_allclose(found[0, 0], central, rtol=1e-5, atol=1e-9)
 
@@ -115,7 +117,8 @@ def test_other_velocities_compile_nothing():
     sim.replace(WindField(Grid(2 * SHEAR.values, SHEAR.origin, SHEAR.spacing)))
     sim.step()
     assert sim.step_fn._cache_size() == 1
-    np.testing.assert_allclose(sim.data.plugins["wind_field"].air_vel[0, 0], [4, 0, 2], rtol=1e-4)
+    air_vel = np.asarray(sim.data.plugins["wind_field"].air_vel)
+    np.testing.assert_allclose(air_vel[0, 0], [4, 0, 2], rtol=1e-4)
 
 
 @pytest.mark.parametrize("kwargs, message", [

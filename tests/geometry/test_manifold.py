@@ -5,24 +5,42 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from oracle import rotations, unit
 
-from crazysim import rotation
+from crazysim.geometry import manifold
 from crazysim.geometry.heightfield import FAR
-from crazysim.geometry.manifold import ball_on_box, balls, boxes
 
 HALF_A, HALF_B = (0.1, 0.05, 0.08), (0.12, 0.2, 0.06)
-EYE = np.eye(3)
+EYE, ZERO = np.eye(3), np.zeros(3)
+N = 500
+"""Pairs in each call, so that each function is compiled once for all tests."""
 
 
 def poses(rng, n):
-    quat = rng.normal(size=(2, n, 4))
-    rot = np.asarray(rotation.matrix(jnp.asarray(quat / np.linalg.norm(quat, axis=-1, keepdims=True))))
-    return rng.uniform(-0.25, 0.25, size=(n, 3)), rot[0], rot[1]
+    rot = rotations(unit(rng.normal(size=(2 * n, 4))))
+    return rng.uniform(-0.25, 0.25, size=(n, 3)), rot[:n], rot[n:]
+
+
+def of_pairs(fn, *cores):
+    """Return a function of one pair, of arrays of these shapes, as one of a pair or of up to ``N`` pairs."""
+    compiled = jax.jit(jax.vmap(fn))
+
+    def call(*args):
+        args = [np.asarray(x, np.float32) for x in args]
+        batch = np.broadcast_shapes(*(x.shape[: x.ndim - len(core)] for x, core in zip(args, cores, strict=True)))
+        n = max(batch, default=1)
+        rows = [np.resize(np.broadcast_to(x, (n, *core)), (N, *core)) for x, core in zip(args, cores, strict=True)]
+        return jax.tree.map(lambda x: np.asarray(x)[:n] if batch else np.asarray(x)[0], compiled(*rows))
+
+    return call
+
+
+boxes = of_pairs(manifold.boxes, *[(3,), (3,), (3, 3)] * 2)
+ball_on_box = of_pairs(manifold.ball_on_box, (), (3,), (3,), (3,), (3, 3))
 
 
 def all_boxes(pos, rot_a, rot_b):
-    a, b = jnp.asarray(HALF_A), jnp.asarray(HALF_B)
-    return jax.jit(jax.vmap(lambda p, r, s: boxes(a, p, r, b, jnp.zeros(3), s)))(pos, rot_a, rot_b)
+    return boxes(HALF_A, pos, rot_a, HALF_B, ZERO, rot_b)
 
 
 def least_overlap(pos, rot_a, rot_b):
@@ -41,7 +59,7 @@ def least_overlap(pos, rot_a, rot_b):
 def test_boxes_overlap_where_no_axis_separates_them(rng):
     """The deepest point is as deep as the least overlap, or for faces preferred to edges a little deeper."""
     pos, rot_a, rot_b = poses(rng, 500)
-    gap = np.asarray(all_boxes(pos, rot_a, rot_b).gap).min(axis=1)
+    gap = all_boxes(pos, rot_a, rot_b).gap.min(axis=1)
     exact = np.array([least_overlap(*x) for x in zip(pos, rot_a, rot_b, strict=True)])
     touching = exact < 0
     assert 50 < touching.sum() < 450
@@ -51,11 +69,11 @@ def test_boxes_overlap_where_no_axis_separates_them(rng):
 
 
 def test_a_box_on_a_box_rests_on_the_corners_of_their_overlap():
-    found = boxes(*map(jnp.asarray, (HALF_A, [0.03, 0.02, 0.139], EYE, (0.12, 0.2, 0.06), [0, 0, 0.0], EYE)))
-    near = np.asarray(found.gap) < 1
-    points = np.asarray(found.point)[near]
-    np.testing.assert_allclose(np.asarray(found.gap)[near], -0.001, atol=1e-6)
-    np.testing.assert_allclose(np.asarray(found.normal)[near], np.tile([0, 0, 1.0], (near.sum(), 1)), atol=1e-6)
+    found = boxes(HALF_A, [0.03, 0.02, 0.139], EYE, HALF_B, ZERO, EYE)
+    near = found.gap < 1
+    points = found.point[near]
+    np.testing.assert_allclose(found.gap[near], -0.001, atol=1e-6)
+    np.testing.assert_allclose(found.normal[near], np.tile([0, 0, 1.0], (near.sum(), 1)), atol=1e-6)
     expected = [(x, y) for x in (-0.07, 0.12) for y in (-0.03, 0.07)]
     np.testing.assert_allclose(sorted(points[:, :2].round(4).tolist()), expected, atol=1e-4)
     np.testing.assert_allclose(points[:, 2], 0.0595, atol=1e-6)
@@ -63,25 +81,22 @@ def test_a_box_on_a_box_rests_on_the_corners_of_their_overlap():
 
 @pytest.mark.parametrize("above", [True, False])
 def test_a_small_box_on_a_large_one_rests_on_its_four_corners_once_each(above):
-    small, large = (
-        (jnp.asarray((0.05, 0.04, 0.03)), jnp.asarray([0.1, 0.0, 0.089])),
-        (jnp.asarray(HALF_B), jnp.zeros(3)),
-    )
+    small, large = ((0.05, 0.04, 0.03), [0.1, 0.0, 0.089]), (HALF_B, ZERO)
     first, second = (small, large) if above else (large, small)
-    found = boxes(*first, jnp.eye(3), *second, jnp.eye(3))
-    points = np.asarray(found.point)[np.asarray(found.gap) < 1]
+    found = boxes(*first, EYE, *second, EYE)
+    points = found.point[found.gap < 1]
     expected = [(x, y) for x in (0.05, 0.12) for y in (-0.04, 0.04)]  # cut at the edge of the large one, at 0.12
     np.testing.assert_allclose(sorted(points[:, :2].round(4).tolist()), expected, atol=1e-4)
 
 
 def test_edges_that_cross_touch_at_one_point():
     """Two long bars turned by 45 degrees about their axes, one along x above one along y."""
-    half = jnp.asarray([1.0, 0.1, 0.1])
-    about_x = rotation.matrix(jnp.asarray([np.sin(np.pi / 8), 0, 0, np.cos(np.pi / 8)]))
-    along_y = jnp.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ about_x
+    half = [1.0, 0.1, 0.1]
+    about_x = rotations([[np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0]])[0]
+    along_y = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ about_x
     height = 2 * 0.1 * np.sqrt(2) - 0.004
-    found = boxes(half, jnp.asarray([0.2, 0.3, height]), about_x, half, jnp.zeros(3), along_y)
-    near = np.flatnonzero(np.asarray(found.gap) < 1)
+    found = boxes(half, [0.2, 0.3, height], about_x, half, ZERO, along_y)
+    near = np.flatnonzero(found.gap < 1)
     assert near.tolist() == [12]
     np.testing.assert_allclose(found.gap[12], -0.004, atol=1e-5)
     np.testing.assert_allclose(found.normal[12], [0, 0, 1], atol=1e-5)
@@ -90,13 +105,12 @@ def test_edges_that_cross_touch_at_one_point():
 
 def test_the_order_of_two_boxes_only_turns_the_normal(rng):
     pos, rot_a, rot_b = poses(rng, 50)
-    a, b = jnp.asarray(HALF_A), jnp.asarray(HALF_B)
-    other = jax.vmap(lambda p, r, s: boxes(b, jnp.zeros(3), s, a, p, r))(pos, rot_a, rot_b)
+    other = boxes(HALF_B, ZERO, rot_b, HALF_A, pos, rot_a)
     found = all_boxes(pos, rot_a, rot_b)
     np.testing.assert_allclose(found.gap.min(axis=1), other.gap.min(axis=1), atol=1e-5)
     deepest = np.argmin(found.gap, axis=1), np.argmin(other.gap, axis=1)
     rows = np.arange(50)
-    touching = np.asarray(found.gap.min(axis=1)) < 0
+    touching = found.gap.min(axis=1) < 0
     np.testing.assert_allclose(
         found.normal[rows, deepest[0]][touching], -other.normal[rows, deepest[1]][touching], atol=1e-4
     )
@@ -109,7 +123,7 @@ def test_the_order_of_two_boxes_only_turns_the_normal(rng):
     ([-0.11, 0.0, 0.0], -0.01 - 0.05, [-1, 0, 0]),
 ])  # fmt: skip
 def test_a_ball_on_a_box_by_hand(centre, gap, normal):
-    found = ball_on_box(jnp.asarray(0.05), jnp.asarray(centre), jnp.asarray(HALF_B), jnp.zeros(3), jnp.eye(3))
+    found = ball_on_box(0.05, centre, HALF_B, ZERO, EYE)
     np.testing.assert_allclose(found.gap, [gap], atol=1e-6)
     np.testing.assert_allclose(found.normal[0], normal, atol=1e-5)
 
@@ -121,28 +135,27 @@ def test_gaps_are_those_of_mujoco(rng):
         <body><freejoint/><geom type="box" size="0.12 0.2 0.06"/></body></worldbody></mujoco>""")
     data = mujoco.MjData(model)
     pos, _, rot = poses(rng, 40)
-    for p, r in zip(1.5 * pos, rot, strict=True):
+    pos *= 1.5
+    found = ball_on_box(0.05, pos, HALF_B, ZERO, rot)
+    for p, r, gap in zip(pos, rot, found.gap[:, 0], strict=True):
         data.qpos[:3], data.qpos[7:10] = p, 0
         mujoco.mju_mat2Quat(data.qpos[10:14], r.ravel())
         mujoco.mj_kinematics(model, data)
         expected = mujoco.mj_geomDistance(model, data, 0, 1, 10.0, None)
-        found = ball_on_box(jnp.asarray(0.05), jnp.asarray(p), jnp.asarray(HALF_B), jnp.zeros(3), jnp.asarray(r))
-        np.testing.assert_allclose(found.gap[0], expected, atol=2e-6)
+        np.testing.assert_allclose(gap, expected, atol=2e-6)
 
 
 def test_law_07_values_and_gradients_are_finite(rng):
     """Also for boxes that coincide, share an axis, or lie far away."""
-    a, b = jnp.asarray(HALF_A), jnp.asarray(HALF_B)
     pos, rot_a, rot_b = poses(rng, 30)
     pos = np.concatenate([pos, [[0, 0, 0], [0, 0, 0.14], [1e4, 0, 0]]])
     rot_a, rot_b = (np.concatenate([r, np.tile(EYE, (3, 1, 1))]) for r in (rot_a, rot_b))
 
     def total(p, r, s):
-        found = boxes(a, p, r, b, jnp.zeros(3), s)
+        found = manifold.boxes(jnp.asarray(HALF_A), p, r, jnp.asarray(HALF_B), jnp.zeros(3), s)
         return jnp.sum(jnp.where(found.gap < FAR, found.gap, 0.0)) + jnp.sum(found.normal) + jnp.sum(found.point)
 
-    for x in jax.vmap(jax.value_and_grad(total, argnums=(0, 1)))(pos, rot_a, rot_b):
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(x))
-    value, slope = jax.value_and_grad(lambda p: jnp.sum(balls(0.1, p, 0.1, jnp.zeros(3)).gap))(jnp.zeros(3))
-    assert np.isfinite(value)
-    assert np.isfinite(slope).all()
+    of_boxes = jax.jit(jax.vmap(jax.value_and_grad(total, argnums=(0, 1))))(pos, rot_a, rot_b)
+    of_balls = jax.jit(jax.value_and_grad(lambda p: jnp.sum(manifold.balls(0.1, p, 0.1, jnp.zeros(3)).gap)))(ZERO)
+    for leaf in jax.tree.leaves((of_boxes, of_balls)):
+        assert np.isfinite(leaf).all()

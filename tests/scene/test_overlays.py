@@ -1,6 +1,5 @@
 """Overlays: drawn with their colours at their positions, in one image only."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import ABOVE, FOVY
@@ -27,7 +26,7 @@ RED, GREEN, BLUE = ([1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1])
 def sim(opengl, plain_scene):
     """Two worlds of two drones near a camera that looks straight down on a plain floor."""
     sim = Sim(n_worlds=2, n_drones=2, xml_path=plain_scene)
-    pos = jnp.broadcast_to(jnp.asarray(DRONES), (2, 2, 3))
+    pos = np.tile(np.float32(DRONES), (2, 1, 1))
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     yield sim
     sim.close()
@@ -246,7 +245,7 @@ def test_colours_may_be_one_for_each_drone(sim):
 
 def test_the_lower_led_is_visible_from_below(opengl):
     sim = Sim(n_worlds=2)
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.full((2, 1, 3), 1.0)))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.ones((2, 1, 3), np.float32)))
     shot = {"mode": "rgb_array", "width": 256, "height": 192}
     counts = {}
     for side, elevation in (("above", -60), ("below", 60)):

@@ -8,7 +8,6 @@ import textwrap
 import threading
 import time
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ SHOT = {"mode": "rgb_array", "camera": "down", "width": WIDTH, "height": HEIGHT}
 
 
 def place(sim, pos):
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos, jnp.float32)))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.float32(pos)))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +92,7 @@ def test_a_drone_that_rolled_shows_its_side(sim, empty):
 
     def widths(quat_xyzw):
         states = sim.data.states
-        sim.data = sim.data.replace(states=states.replace(quat=jnp.broadcast_to(jnp.asarray(quat_xyzw), (2, 1, 4))))
+        sim.data = sim.data.replace(states=states.replace(quat=np.tile(np.float32(quat_xyzw), (2, 1, 1))))
         rows, columns = np.nonzero(difference(sim.render(**SHOT), empty))
         return np.ptp(rows), np.ptp(columns)
 
@@ -124,7 +123,9 @@ def test_a_body_that_a_user_moved_is_drawn_where_it_is(opengl):
     assert abs(where(0) - 32) < 1
     assert not sim.scene.is_allocated
     k = sim.mj_model.body("ball").mocapid.item()
-    sim.mjx_data = sim.mjx_data.replace(mocap_pos=sim.mjx_data.mocap_pos.at[:, k, 0].set(jnp.array([-0.8, 0.8])))
+    mocap_pos = np.array(sim.mjx_data.mocap_pos)
+    mocap_pos[:, k, 0] = -0.8, 0.8
+    sim.mjx_data = sim.mjx_data.replace(mocap_pos=mocap_pos)
     assert where(0) < 25
     assert where(1) > 39
     sim.close()
@@ -162,7 +163,7 @@ def test_the_onboard_camera_turns_with_the_drone(sim):
     assert ahead[-1].max() < 1.0, "the floor is near below the horizon"
     assert ahead[0].min() > 10.0, "there is nothing above it"
     states = sim.data.states
-    down = jnp.broadcast_to(jnp.asarray([0, np.sqrt(0.5), 0, np.sqrt(0.5)]), (2, 1, 4))
+    down = np.tile(np.float32([0, np.sqrt(0.5), 0, np.sqrt(0.5)]), (2, 1, 1))
     sim.data = sim.data.replace(states=states.replace(quat=down))
     depth = sim.render(**shot)
     sim.data = sim.data.replace(states=states)
@@ -198,7 +199,7 @@ def test_many_sizes_follow_each_other(sim):
 def test_a_second_simulation_draws_beside_the_first(sim):
     """Two simulations draw in turns, each its own drones; a closed one can draw again."""
     before = sim.render(**SHOT)
-    other = Sim(n_worlds=1, n_drones=3)
+    other = Sim(n_worlds=2, n_drones=3)
     shot = {"mode": "rgb_array", "camera": "track_cam:2", "width": WIDTH, "height": HEIGHT}
     picture = other.render(**shot)
     np.testing.assert_array_equal(sim.render(**SHOT), before)
@@ -430,7 +431,7 @@ PRINTED = textwrap.dedent("""
     assert check(sim.data, pos.at[0, 1].set([0.0, 0.0, 0.1])).sum() > contacts.sum()
     sim.close()
     print("done")
-""").replace("BOX", BOX)
+""").replace("BOX", BOX.replace('type="box"', 'type="box" contype="0"'))  # XLA takes 3 s for a box against a box
 
 
 def test_code_written_for_the_peer_runs_as_printed(screen, opengl):
@@ -471,7 +472,7 @@ def test_without_opengl_an_image_is_refused_in_one_line(monkeypatch):
 
 def test_any_thread_draws_and_frees_what_another_has_drawn_with(opengl, plain_scene):
     """Garbage, too, is collected in any thread, while the one that drew still runs."""
-    sim, end = Sim(xml_path=plain_scene), threading.Event()
+    sim, end = Sim(n_worlds=2, xml_path=plain_scene), threading.Event()
     images = queue.Queue()
 
     def draw():

@@ -38,31 +38,34 @@ def sim():
     rng = np.random.default_rng(3)
     pos, quat = rng.normal(size=(3, 2, 3)), rng.normal(size=(3, 2, 4))
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos), quat=jnp.asarray(quat)))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.float32(pos), quat=np.float32(quat)))
     turned = rng.normal(size=(3, 4))
     turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
     tower = sim.mj_model.body("tower").mocapid.item()
-    sim.mjx_data = sim.mjx_data.replace(
-        mocap_pos=sim.mjx_data.mocap_pos.at[:, tower].set(rng.normal(size=(3, 3))),
-        mocap_quat=sim.mjx_data.mocap_quat.at[:, tower].set(turned),
-    )
+    mocap_pos, mocap_quat = np.array(sim.mjx_data.mocap_pos), np.array(sim.mjx_data.mocap_quat)
+    mocap_pos[:, tower], mocap_quat[:, tower] = rng.normal(size=(3, 3)), turned
+    sim.mjx_data = sim.mjx_data.replace(mocap_pos=mocap_pos, mocap_quat=mocap_quat)
     return sim
 
 
 @pytest.fixture(scope="module")
 def synced(sim):
-    return sync_sim2mjx(sim.data, sim.mjx_data, sim.mjx_model)
+    """The data and, on the host, the scene after a sync."""
+    data, mjx_data = sync_sim2mjx(sim.data, sim.mjx_data, sim.mjx_model)
+    return data, jax.device_get(mjx_data)
 
 
 def reference(sim, world):
     """Return the world as C MuJoCo computes it from poses that are written here, one by one."""
     data = mujoco.MjData(sim.mj_model)
+    pos, quat = np.asarray(sim.data.states.pos)[world], np.asarray(sim.data.states.quat)[world]
     for i in range(sim.n_drones):
         k = sim.mj_model.body(f"drone:{i}").mocapid.item()
-        x, y, z, w = np.asarray(sim.data.states.quat[world, i])
-        data.mocap_pos[k], data.mocap_quat[k] = sim.data.states.pos[world, i], (w, x, y, z)
+        x, y, z, w = quat[i]
+        data.mocap_pos[k], data.mocap_quat[k] = pos[i], (w, x, y, z)
     k = sim.mj_model.body("tower").mocapid.item()
-    data.mocap_pos[k], data.mocap_quat[k] = sim.mjx_data.mocap_pos[world, k], sim.mjx_data.mocap_quat[world, k]
+    data.mocap_pos[k] = np.asarray(sim.mjx_data.mocap_pos)[world, k]
+    data.mocap_quat[k] = np.asarray(sim.mjx_data.mocap_quat)[world, k]
     mujoco.mj_kinematics(sim.mj_model, data)
     mujoco.mj_comPos(sim.mj_model, data)
     mujoco.mj_camlight(sim.mj_model, data)
@@ -75,7 +78,7 @@ def test_every_transform_is_that_of_c_mujoco(sim, synced, world):
     _, mjx_data = synced
     expected = reference(sim, world)
     for name in DERIVED:
-        found = np.asarray(getattr(mjx_data, name)[world]).reshape(getattr(expected, name).shape)
+        found = getattr(mjx_data, name)[world].reshape(getattr(expected, name).shape)
         np.testing.assert_allclose(found, getattr(expected, name), atol=2e-6, err_msg=name)
 
 
@@ -84,8 +87,7 @@ def test_a_world_to_be_drawn_is_that_of_c_mujoco(sim, world):
     """The sync of one world for an image gives the same poses, and the lights, without MJX."""
     expected = reference(sim, world)
     data = mujoco.MjData(sim.mj_model)
-    mjx_data = sim.mjx_data
-    poses = (mjx_data.mocap_pos[world], mjx_data.mocap_quat[world], mjx_data.qpos[world])
+    poses = tuple(np.asarray(getattr(sim.mjx_data, name))[world] for name in ("mocap_pos", "mocap_quat", "qpos"))
     sync_one_world(sim.data, world, poses, sim.mj_model, data)
     for name in (*DERIVED, "light_xpos", "light_xdir"):
         np.testing.assert_allclose(getattr(data, name), getattr(expected, name), atol=1e-6, err_msg=name)
@@ -95,8 +97,9 @@ def test_only_what_the_simulation_owns_is_written(sim, synced):
     """Poses of bodies that a user attached stay as they were; so do positions and speeds of joints."""
     _, mjx_data = synced
     tower = sim.mj_model.body("tower").mocapid.item()
-    np.testing.assert_array_equal(mjx_data.mocap_pos[:, tower], sim.mjx_data.mocap_pos[:, tower])
-    np.testing.assert_array_equal(mjx_data.mocap_quat[:, tower], sim.mjx_data.mocap_quat[:, tower])
+    for name in ("mocap_pos", "mocap_quat"):
+        before = np.asarray(getattr(sim.mjx_data, name))[:, tower]
+        np.testing.assert_array_equal(getattr(mjx_data, name)[:, tower], before)
     for name in ("qpos", "qvel", "ctrl", "time", "act", "xfrc_applied"):
         np.testing.assert_array_equal(getattr(mjx_data, name), getattr(sim.mjx_data, name), err_msg=name)
 
@@ -123,7 +126,7 @@ def test_a_sync_works_within_transformations(sim, synced):
     (data, _), dist = twice(sim.data, sim.mjx_data)
     assert bool(data.core.mjx_synced)
     for k in range(2):
-        np.testing.assert_allclose(dist[k], synced[1]._impl.contact.dist, atol=1e-6)
+        np.testing.assert_allclose(np.asarray(dist)[k], synced[1]._impl.contact.dist, atol=1e-6)
 
 
 def test_syncs_compile_once(sim):
