@@ -126,7 +126,7 @@ def test_a_free_load_slides_on_a_pad_as_friction_has_it():
 
 
 def test_a_moving_object_pushes_a_load():
-    sim = weightless(flying())
+    sim = weightless(flying(engine="interpret"))
     load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
     ball = sim.scene.add("sphere", radius=0.1)
     sim.add(ContactResponse(restitution=0.0, friction=0.0))

@@ -113,7 +113,7 @@ def test_without_mass_the_drone_flies_as_without_load(integrator):
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_cable_that_becomes_taut(integrator, x64):
     """The impulse of two masses along the line, with and without a bounce: speeds as worked out by hand."""
-    sim, restitution = flying(2, integrator=integrator), np.array([0.0, 0.6])
+    sim, restitution = flying(2, integrator=integrator, engine="interpret"), np.array([0.0, 0.6])
     load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=restitution[:, None], in_scene=False))
     start = np.asarray(sim.data.states.pos)
     sim.data = with_load(load, sim.data, pos=start + [0, 0, -0.35], vel=(0.0, 0.0, -1.0))
@@ -300,7 +300,7 @@ def test_wind_and_downwash_push_the_load():
 
 
 def test_loads_are_objects_of_the_scene():
-    sim = flying(2, 2, height=1.0)
+    sim = flying(2, 2, height=1.0, engine="interpret")
     load = sim.add(SlungLoad(mass=0.05, cable=True, size=0.05))
     pos = np.asarray(load.read(sim.data).pos).copy()
     pos[1, 0] = np.asarray(sim.data.states.pos)[1, 1]  # into the other drone
@@ -333,7 +333,7 @@ def test_law_09_wrong_settings_are_errors():
 
 
 def test_other_numbers_compile_nothing():
-    sim = flying()
+    sim = flying(engine="interpret")
     load = sim.add(SlungLoad(mass=0.1, in_scene=False))
     sim.step()
     before = sim.step_fn
