@@ -44,11 +44,13 @@ class Setpoint(PyTree):
         quat = [zeros, jnp.sin(self.yaw / 2), jnp.cos(self.yaw / 2)]
         return jnp.concatenate([self.pos, self.vel, self.acc, *quat, zeros, self.yaw_rate], axis=-1)
 
+    @compiled()
     def feedforward(self) -> Array:
         """Return what the state command lacks: jerk, snap, yaw rate, second derivative of the yaw. (..., 8)"""
         return jnp.concatenate([self.jerk, self.snap, self.yaw_rate, self.yaw_acc], axis=-1)
 
     @staticmethod
+    @compiled()
     def of_command(cmd: Array, feedforward: Array | None = None) -> Setpoint:
         """Return the setpoint of a state command.
 

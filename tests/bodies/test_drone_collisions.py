@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-from cases import with_states
+from cases import with_params, with_states
 
 from crazysim import ConfigError, DroneCollisions, Sim
 
 
-def build(n_worlds=2, n_drones=2, **kwargs):
-    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel")
-    params = sim.data.params
-    sim.data = sim.data.replace(params=params.replace(drag_matrix=0 * params.drag_matrix))
+def build(n_worlds=2, n_drones=2, engine="auto", **kwargs):
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", engine=engine)
+    sim.data = with_params(sim.data, drag_matrix=0 * np.asarray(sim.data.params.drag_matrix))
     sim.data = with_states(sim.data, pos=np.array([[0.2 * i, 0.0, 20.0] for i in range(n_drones)]))
     sim.build_default_data()
     return sim, sim.add(DroneCollisions(**kwargs))
@@ -43,7 +42,7 @@ def test_momentum_is_kept_in_an_oblique_impact_of_three():
 
 
 def test_resets_clear_the_impulses():
-    sim, plugin = build(softness=0.01)
+    sim, plugin = build(engine="interpret", softness=0.01)
     sim.data = with_states(sim.data, pos=np.array([[0, 0, 20.0], [0.02, 0, 20.0]]))
     sim.step(2)
     assert np.abs(np.asarray(plugin.read(sim.data).impulse)).max() > 0

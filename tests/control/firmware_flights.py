@@ -1,7 +1,6 @@
 """Sequences of states and commands that drive the firmware's controllers into their limits, and our laws on them."""
 
 import functools
-import json
 from types import SimpleNamespace
 
 import jax
@@ -80,20 +79,31 @@ def law(controller, mode, states, commands, drone="cf2x_L250"):
     """Return the PWM of the motors by a controller of crazysim, in the precision of JAX. (n_ticks, n, 4)"""
     n_ticks, n = states.shape[:2]
     padding = ((0, MOST_TICKS - n_ticks), (0, MOST_DRONES - n), (0, 0))
-    out = _compiled(controller, mode, json.dumps(drone))(*(np.pad(x, padding, mode="edge") for x in (states, commands)))
+    numbers = numbers_of(controller, drone)
+    out = _compiled(controller, mode)(numbers, *(np.pad(x, padding, mode="edge") for x in (states, commands)))
     return np.asarray(out)[:n_ticks, :n]
 
 
 @functools.cache
-def _compiled(controller, mode, drone):
-    return jax.jit(lambda states, commands: law_of(controller, mode, states, commands, json.loads(drone)))
+def _compiled(controller, mode):
+    return jax.jit(functools.partial(_flown, controller, mode))
+
+
+def numbers_of(controller, drone):
+    """Return parameters and memory of a controller for an airframe, N of full PWM, and the curve of the thrust."""
+    airframe = load_airframe(drone)
+    newton = 4 * float(airframe.value("rotors.thrust_max")) / 65535
+    return controller.params(airframe), controller.memory(airframe), newton, airframe.value("rotors.thrust_curve")[None]
 
 
 def law_of(controller, mode, states, commands, drone="cf2x_L250"):
     """Return the same as ``law``, traceable."""
-    airframe = load_airframe(drone)
-    params, rest = controller.params(airframe), jax.tree.map(jnp.asarray, controller.memory(airframe))
-    newton = 4 * float(airframe.value("rotors.thrust_max")) / 65535
+    return _flown(controller, mode, numbers_of(controller, drone), states, commands)
+
+
+def _flown(controller, mode, numbers, states, commands):
+    params, rest, newton, thrust_curve = numbers
+    rest = jax.tree.map(jnp.asarray, rest)
     if mode != "state":
         commands = commands * jnp.asarray([1, 1, 1, newton], commands.dtype)
 
@@ -107,7 +117,7 @@ def law_of(controller, mode, states, commands, drone="cf2x_L250"):
             after = controller.outer(data, command, memory, params)
             memory = jax.tree.map(lambda new, old: jnp.where(k % POSITION_EVERY == 0, new, old), after, memory)
         rotor_vel, memory = controller.update(data, command, memory, params)
-        thrust = jnp.where(rotor_vel > 0, curve(rotor_vel, airframe.value("rotors.thrust_curve")[None]), 0.0)
+        thrust = jnp.where(rotor_vel > 0, curve(rotor_vel, thrust_curve), 0.0)
         return memory, 4 * thrust / newton
 
     def fly(states, commands):

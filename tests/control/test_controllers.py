@@ -135,7 +135,7 @@ def test_a_controller_fires_at_its_rate_and_resets_per_world():
 
 
 def test_feedforward_reaches_the_controller():
-    sim = Sim(WORLDS, DRONES, control="state", controller=Towards())
+    sim = Sim(WORLDS, DRONES, control="state", controller=Towards(), engine="interpret")
     cmd = setpoint_of(sim)
     cmd[..., 15] = 0.7
     sim.state_control(cmd)

@@ -29,14 +29,6 @@ def weightless(sim):
     return sim
 
 
-@pytest.fixture
-def float64():
-    """Run a test in float64 in all threads: the interpreter is called from one of XLA's."""
-    jax.config.update("jax_enable_x64", True)
-    yield
-    jax.config.update("jax_enable_x64", False)
-
-
 def heavy(sim):
     """Make the drones so heavy that loads do not move them, and hold them up."""
     sim.data = with_params(sim.data, mass=np.full(1, 1e9, np.float32))
@@ -126,7 +118,7 @@ def test_a_free_load_slides_on_a_pad_as_friction_has_it():
 
 
 def test_a_moving_object_pushes_a_load():
-    sim = weightless(flying())
+    sim = weightless(flying(engine="interpret"))
     load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
     ball = sim.scene.add("sphere", radius=0.1)
     sim.add(ContactResponse(restitution=0.0, friction=0.0))
@@ -155,7 +147,7 @@ def energy(load, data, mass):
 
 
 @pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
-def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, float64, rng):
+def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, x64, rng):
     """Loose loads against two drones, from all sides: of the contact stage alone, momentum exactly, energy no more."""
     n = 60
     sim = weightless(flying(n, 2))
@@ -177,7 +169,7 @@ def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, float64, rng):
     assert hits.sum() > 20
 
 
-def test_a_load_hits_a_drone_head_on(float64):
+def test_a_load_hits_a_drone_head_on(x64):
     """From below along the centre line: the speeds of two bodies with restitution, by hand."""
     sim = weightless(flying(n_drones=2, engine="interpret"))
     load = sim.add(SlungLoad(mass=0.2, size=RADIUS))
@@ -192,7 +184,7 @@ def test_a_load_hits_a_drone_head_on(float64):
     np.testing.assert_allclose(np.asarray(load.read(sim.data).vel)[0, :, 2], drone - 1.0, rtol=1e-6)
 
 
-def test_two_loads_head_on(float64):
+def test_two_loads_head_on(x64):
     """Of different mass, loose, along the line between them: the speeds of two bodies with restitution, by hand."""
     sim = weightless(flying(n_drones=2, engine="interpret"))
     load = sim.add(SlungLoad(mass=[[0.1, 0.3]], size=RADIUS))
@@ -206,7 +198,7 @@ def test_two_loads_head_on(float64):
 
 
 @pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
-def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(size, float64, rng):
+def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(size, x64, rng):
     """Three loose loads and three empty hooks in a heap: of the contact stage alone; energy is not gained."""
     n = 60
     sim = weightless(flying(n, 3))

@@ -11,8 +11,8 @@ SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "st
 CORNERS = np.array([[0.3, 0.3, 5.0], [-0.3, 0.3, 5.0], [-0.3, -0.3, 5.0], [0.3, -0.3, 5.0]])
 
 
-def carrying(n_drones, integrator, **settings):
-    sim = Sim(1, n_drones, **SETTINGS, integrator=integrator)
+def carrying(n_drones, integrator, engine="fused", **settings):
+    sim = Sim(1, n_drones, **SETTINGS | {"engine": engine}, integrator=integrator)
     sim.data = with_states(sim.data, pos=CORNERS[:n_drones])
     return sim, sim.add(SharedLoad(**{"in_scene": False, "mass": 0.3} | settings))
 
@@ -57,7 +57,7 @@ def test_four_drones_share_the_weight_and_keep_momentum(integrator, cable, x64):
 
 def test_cables_go_slack_and_drones_let_go(x64):
     """Two drones hold the load; a third, which comes nearer, pulls nothing, and one that lets go neither."""
-    sim, load = carrying(3, "symplectic_euler")
+    sim, load = carrying(3, "symplectic_euler", "interpret")
     lower = np.array(CORNERS[:3])
     lower[2] = [0.0, 0.0, 4.5]
     sim.data = load.release(with_states(sim.data, pos=lower), [[True, False, False]])
@@ -70,7 +70,7 @@ def test_cables_go_slack_and_drones_let_go(x64):
 
 def test_where_gravity_differs_the_load_falls_with_the_mean(x64):
     """Whatever the order of the drones."""
-    sim, load = carrying(2, "symplectic_euler")
+    sim, load = carrying(2, "symplectic_euler", "interpret")
     gravity = np.zeros((1, 2, 3))
     gravity[0, :, 2] = [-8.0, -10.0]
     sim.data = with_params(sim.data, gravity_vec=gravity)

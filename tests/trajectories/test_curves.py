@@ -9,7 +9,12 @@ from crazysim.trajectories import Trajectory, circle, figure_eight, helix, hover
 
 pytestmark = pytest.mark.usefixtures("x64")
 
-evaluate = jax.jit(jax.vmap(Trajectory.evaluate, in_axes=(None, 0)))
+on_device = jax.jit(jax.vmap(Trajectory.evaluate, in_axes=(None, 0)))
+
+
+def evaluate(trajectory, t):
+    """Return the setpoints at some times as NumPy arrays."""
+    return jax.tree.map(np.asarray, on_device(trajectory, t))
 
 
 def check(trajectory, curve, duration, scale=1.0):

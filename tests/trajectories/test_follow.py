@@ -93,7 +93,7 @@ def test_every_engine_flies_what_plain_flies(engine):
 
 
 def test_uploads_are_flown_and_nothing_is_compiled_again():
-    sim = build(engine="interpret")
+    sim = build()
     plugin = sim.add(Follow([EIGHT, UP], n_slots=4, max_pieces=20))
     sim.step(5)
     plan, size = sim.step_fn.plan(sim.data), _compiled(sim)

@@ -14,7 +14,12 @@ TIMES = np.array([0.0, 0.7, 1.0, 2.5, 3.1, 4.0])
 POINTS = RNG.normal(size=(6, 3))
 
 
-evaluate = jax.jit(jax.vmap(Trajectory.evaluate, in_axes=(None, 0)))
+on_device = jax.jit(jax.vmap(Trajectory.evaluate, in_axes=(None, 0)))
+
+
+def evaluate(trajectory, t):
+    """Return the setpoints at some times as NumPy arrays."""
+    return jax.tree.map(np.asarray, on_device(trajectory, t))
 
 
 def positions(trajectory, times):
