@@ -130,13 +130,13 @@ class Member:
 
 
 @compiled()
-def _row(x: Array, index: Array) -> Array:
+def _row(x: Array, index: Array | int) -> Array:
     """Return the row of one drone or member. (n_worlds, ...)"""
     return x[:, index]
 
 
 @compiled()
-def _with_row(x: Array, index: Array, value: Array) -> Array:
+def _with_row(x: Array, index: Array | int, value: Any) -> Array:
     """Return rows with that of one drone or member replaced. (n_worlds, n, ...)"""
     return x.at[:, index].set(value)
 
