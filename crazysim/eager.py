@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax import Array
+from numpy.typing import NDArray
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -29,22 +29,19 @@ def compiled(*static: str) -> Callable[[F], F]:
 
         @functools.wraps(fn)
         def call(*args: Any, **kwargs: Any) -> Any:
-            return (fn if _traced((args, kwargs)) else jitted)(*args, **kwargs)
+            return (fn if is_traced((args, kwargs)) else jitted)(*args, **kwargs)
 
         return call  # type: ignore[return-value]
 
     return decorate
 
 
-def as_array(values: Any, dtype: Any) -> Array:
-    """Return a copy of numbers on the host as an array on the device; ``jnp.asarray`` compiles a program per shape.
-
-    Args:
-        values: Numbers, lists or NumPy arrays.
-        dtype: Type of the array; of 32 bits unless JAX is set to 64.
-    """
-    return jax.device_put(np.array(values, dtype))
+def to_host(x: Any, rows: Any) -> NDArray:
+    """Return ``x[rows]`` on the host; rows of an array of the CPU are read there, without a compiled call."""
+    on_cpu = not isinstance(x, jax.Array) or all(device.platform == "cpu" for device in x.devices())
+    return np.asarray(x)[rows] if on_cpu else np.asarray(x[rows])
 
 
-def _traced(values: Sequence[Any]) -> bool:
+def is_traced(values: Sequence[Any]) -> bool:
+    """Return True where one of the leaves is traced: within ``jit``, ``grad`` or a stage of the engine."""
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))

@@ -271,6 +271,14 @@ def as_parameter(value: Any) -> Any:
     return np.atleast_1d(np.asarray(value, floating()))
 
 
+def on_device(value: Any, dtype: Any = None) -> jax.Array:
+    """Return numbers of the host as an array of the device, of floating dtype by default; it needs no compilation.
+
+    ``jnp.asarray`` compiles a program for each shape.
+    """
+    return jax.device_put(np.array(value, dtype or floating()))
+
+
 def of_host(value: Any, *shape: int, dtype: Any = None) -> Any:
     """Return a value broadcast to a shape as a NumPy array, of floating dtype by default; it needs no compilation."""
     return np.array(np.broadcast_to(value, shape), dtype or floating())

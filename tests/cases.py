@@ -12,6 +12,8 @@ from crazysim import Sim, load_airframe
 from crazysim.core import functional as F
 from crazysim.core.controls import SimControls
 from crazysim.core.data import create_params
+from crazysim.core.stage import as_stages
+from crazysim.core.stages import finite
 from crazysim.dynamics import first_principles
 
 FITTED = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
@@ -88,7 +90,7 @@ def broadcast_like(value, like):
     """Return an array of the shape and the type of another; NumPy's are broadcast without a compiled call."""
     if isinstance(value, jax.Array):
         return jnp.broadcast_to(value.astype(like.dtype), like.shape)
-    return jnp.asarray(np.broadcast_to(np.asarray(value, like.dtype), like.shape))
+    return jax.device_put(np.array(np.broadcast_to(np.asarray(value, like.dtype), like.shape)))
 
 
 def with_params(data, **changes):
@@ -103,7 +105,7 @@ def with_airframes(sim, airframes):
     which = [kinds.index(airframe) for airframe in airframes]
 
     def stacked(shared):
-        return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)[which][:, None]), *shared)
+        return jax.tree.map(lambda *x: jax.device_put(np.stack(x)[which][:, None]), *shared)
 
     params = stacked([create_params(sim.dynamics, airframe) for airframe in kinds])
     each = [SimControls.create(1, 1, sim.control, sim.dynamics, a, sim.configuration.control_freqs) for a in kinds]
@@ -174,8 +176,24 @@ def trees_equal(a, b):
 
 def as_numbers(x):
     """Return a leaf on the host, random keys as their data."""
-    x = jnp.asarray(x)
-    return np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+    is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(x) if is_key else x)
+
+
+def by_stages(sim):
+    """Return a step without an engine: the stages as they are written, whose derivative compiles fastest."""
+    stages = as_stages(sim.step_pipeline)
+
+    def step(data, n_steps):
+        def once(data, _):
+            for stage in stages:
+                data = stage(data)
+            return data, None
+
+        data, _ = jax.lax.scan(once, data, length=n_steps)
+        return data.replace(core=data.core.replace(nonfinite=data.core.nonfinite | ~finite(data)))
+
+    return step
 
 
 @functools.cache

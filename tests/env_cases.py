@@ -4,7 +4,6 @@ import collections
 import contextlib
 import functools
 
-import compiling
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,9 +14,6 @@ from crazysim.engine import fused, interpret
 from crazysim.envs import TASKS, make
 from crazysim.envs.wrappers import Wrapper
 from crazysim.pytree import map_batched
-
-quick = functools.partial(jax.jit, compiler_options=compiling.options(emitters=True))
-"""``jax.jit`` that compiles in half the time, and rounds alike for any number of worlds."""
 
 
 class Compiled(Wrapper):
@@ -33,7 +29,7 @@ class Compiled(Wrapper):
         self.traces = collections.Counter()
         """Number of times that Python ran each of the functions."""
         for name in ("reset", "restart", "step"):
-            setattr(self, name, quick(self._counted(name, getattr(env, name))))
+            setattr(self, name, jax.jit(self._counted(name, getattr(env, name))))
 
     def begin(self, state):
         """Return the state with new episodes in all worlds, by the program of ``restart``."""

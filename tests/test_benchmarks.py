@@ -172,10 +172,9 @@ def test_the_work_of_a_step_is_what_its_data_and_stages_say(benchmarks):
     assert limits.work(Sim(control="rotor_vel", integrator="rk4", engine="lanes"))[0] > 3 * each_step
 
 
-def test_our_side_of_the_contest_runs_without_the_peer():
+def test_our_side_of_the_contest_runs_without_the_peer(run):
     arguments = ["--only", "swarm", "--batch-worlds", "2", "--swarm", "3", "--engine", "lanes", "--repeats", "1"]
-    command = [sys.executable, BENCHMARKS / "versus_crazyflow.py", *arguments]
-    (line,) = lines_of(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    (line,) = run("versus_crazyflow.py", *arguments)
     assert line["ratio"] > 0
     assert (line["n_worlds"], line["n_drones"]) == (2, 3)
 

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from drawing import draw_coarsely
 from imageio_ffmpeg import get_ffmpeg_exe
 
 from crazysim.__main__ import COMMANDS, main
@@ -46,8 +47,9 @@ def test_a_demo_has_a_name(capsys, monkeypatch):
     assert all(name in message for name in DEMOS)
 
 
-def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
+def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, monkeypatch, opengl):
     """A second of 8 worlds of 4 drones: figures are printed and both files are pictures of something."""
+    draw_coarsely(monkeypatch)
     assert main(["demo", "--worlds", "8", "--seconds", "1", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     for word in ("compile time", "steps per second", "tracking error", "contacts"):

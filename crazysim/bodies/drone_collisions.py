@@ -20,7 +20,7 @@ from crazysim.core.stage import Stage, over_worlds
 from crazysim.effects.core import zeros
 from crazysim.errors import ConfigError
 from crazysim.geometry.manifold import N_OF_BOXES
-from crazysim.pytree import PyTree, leaf, of_host
+from crazysim.pytree import PyTree, leaf, on_device
 
 
 class DroneCollisionsData(PyTree):
@@ -69,11 +69,11 @@ class DroneCollisions(Plugin):
             )
         n_contacts = N_OF_BOXES * n * (n - 1) // 2
         return DroneCollisionsData(
-            friction=jnp.full(1, float(self.friction)),
-            restitution=jnp.full(1, float(self.restitution)),
+            friction=on_device([self.friction]),
+            restitution=on_device([self.restitution]),
             impulse=zeros(sim, 3),
-            press=jnp.asarray(of_host(0.0, sim.n_worlds, 1, n_contacts)),
-            drag=jnp.asarray(of_host(0.0, sim.n_worlds, 1, n_contacts, 3)),
+            press=on_device(np.zeros((sim.n_worlds, 1, n_contacts))),
+            drag=on_device(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

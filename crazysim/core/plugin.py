@@ -16,9 +16,8 @@ from jax import Array
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
 from crazysim.drones import Airframe
-from crazysim.eager import as_array
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.pytree import PyTree
+from crazysim.pytree import PyTree, on_device
 
 
 class Simulation(Protocol):
@@ -148,7 +147,7 @@ def check_parameter(
         bounds = "positive" if positive else f"from {low} to {high}"
         raise ConfigError(f"expected {name} to be finite and {bounds}, got {value!r}")
     dtype = sim.data.states.pos.dtype if dtype is None else dtype
-    return as_array(np.broadcast_to(array, core) if is_shared else array, dtype)
+    return on_device(np.broadcast_to(array, core) if is_shared else array, dtype)
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(parameter, dataclasses.field))

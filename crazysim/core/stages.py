@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -185,7 +185,7 @@ def first_principles_derivative(data: SimData) -> SimStateDeriv:
 
 def first_principles_euler_derivative(data: SimData) -> SimStateDeriv:
     """Return the derivative of every drone from first principles for an Euler step, stable at any body rate."""
-    dynamics = partial(first_principles.dynamics, dt=1 / data.core.freq)
+    dynamics = functools.partial(first_principles.dynamics, dt=1 / data.core.freq)
     return _derivative(data, dynamics, _controls(data).rotor_vel)
 
 
@@ -202,6 +202,7 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
     return SimStateDeriv(vel=vel, ang_vel=s.ang_vel, acc=acc, ang_acc=ang_acc, rotor_acc=rotor_acc)
 
 
+@functools.cache
 def held_on_floor(deriv_fn: DerivFn) -> DerivFn:
     """Return a derivative in which a drone that stands on the floor and does not lift off neither slides nor turns.
 

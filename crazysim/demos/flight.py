@@ -16,6 +16,7 @@ from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.demos.common import FPS, frames_of
 from crazysim.dynamics import first_principles
+from crazysim.eager import compiled
 from crazysim.errors import RenderError
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.trail import COLORS
@@ -100,7 +101,7 @@ def build(n_worlds: int, n_drones: int, device: str) -> Sim:
     places = offset + [[-0.6 * WIDTH, 0, 0], [0.6 * WIDTH, 0, 0]]
     sim.scene.add("pole", count=2, pos=places, height=2.0, radius=POLE_RADIUS)
 
-    start = reference(jnp.zeros((n_worlds, 1)), n_drones)
+    start = reference(np.zeros((n_worlds, 1), np.float32), n_drones)
     rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(sim.data.params), (n_worlds, n_drones, 4))
     states = sim.data.states.replace(pos=start[..., :3], vel=start[..., 3:6], rotor_vel=rotor_vel)
     sim.data = sim.data.replace(states=states)
@@ -113,6 +114,7 @@ def touches(sim: Sim) -> np.ndarray:
     return np.asarray(sim.contact_report(floor=False, drones=False).objects)
 
 
+@compiled("n_drones")
 def reference(time: Array, n_drones: int) -> Array:
     """Return the setpoint of every drone: figure eights offset by a quarter of a period and by 0.25 m in height.
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.control import LoadLQR
+from crazysim.control import LoadLQR, Setpoint
 from crazysim.core.data import SimData
 from crazysim.demos.common import FPS, FilmedFlight, frames_of
 from crazysim.envs.spawn import flying
@@ -106,20 +106,28 @@ def build(n_worlds: int, device: str) -> Sim:
         time = share * float(path.duration)
         settings = {"path": path, "controller": PathLQR(), "start": -time[:, None], "trailer": name == "towing"}
         cars = sim.add(Cars([f"Fleet1Tenth_{number}"], name=name, **settings))
-        speed = jnp.linalg.norm(jax.vmap(path.evaluate)(jnp.asarray(time)).vel, axis=-1)
         car = cars.read(sim.data)
-        sim.data = cars.write(sim.data, car.replace(body_vel=car.body_vel.at[:, 0, 0].set(speed)))
+        body_vel = np.array(car.body_vel)
+        body_vel[:, 0, 0] = np.linalg.norm(jax.device_get(_evaluate(path, time)).vel, axis=-1)
+        sim.data = cars.write(sim.data, car.replace(body_vel=body_vel))
     paths = flown()
     times = [share * float(path.duration) for path in paths]
-    at = [jax.vmap(path.evaluate)(jnp.asarray(time)) for path, time in zip(paths, times, strict=True)]
-    pos, vel = (jnp.stack([getattr(x, name) for x in at], axis=1) for name in ("pos", "vel"))
-    sim.data = flying(sim.data, pos.at[:, 2, 2].add(LENGTH), vel=vel)
+    at = [jax.device_get(_evaluate(path, time)) for path, time in zip(paths, times, strict=True)]
+    pos, vel = (np.stack([getattr(x, name) for x in at], axis=1) for name in ("pos", "vel"))
+    pos[:, 2, 2] += LENGTH
+    sim.data = jax.jit(flying)(sim.data, pos, vel=vel)
     mass = np.broadcast_to([0.0, 0.0, LOAD], (n_worlds, len(DRONES)))
     load = sim.add(SlungLoad(mass=mass, length=LENGTH, size=(0.12, 0.12, 0.08)))
     sim.data = load.write(sim.data, load.read(sim.data).replace(vel=vel))
     sim.add(Follow(paths, start=-np.stack(times, axis=1), visible=False))
     sim.build_default_data()
     return sim
+
+
+@jax.jit
+def _evaluate(path: Trajectory, times: Array) -> Setpoint:
+    """Return the setpoints of a path at some times, s. (n, ...)"""
+    return jax.vmap(path.evaluate)(times)
 
 
 def hills() -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -66,13 +67,16 @@ class Airframe:
         Raises:
             ConfigError: If the value is missing or has another shape.
         """
-        paths = dict(_values(self.tables))
-        if path not in paths:
-            raise ConfigError(f"airframe {self.name!r} has no value {path!r}. {_remedy(path, paths)}")
-        value = paths[path]
+        if path not in self._by_path:
+            raise ConfigError(f"airframe {self.name!r} has no value {path!r}. {_remedy(path, self._by_path)}")
+        value = self._by_path[path]
         if shape is not None and value.shape != shape:
             raise ConfigError(f"airframe {self.name!r}: expected {path} of shape {shape}, got {value.shape}")
         return value
+
+    @functools.cached_property
+    def _by_path(self) -> dict[str, NDArray[np.float64]]:
+        return dict(_values(self.tables))
 
     @property
     def n_rotors(self) -> int:
@@ -161,9 +165,14 @@ def _read(source: str | Path) -> tuple[str, str, dict[str, Any]]:
             f"got {str(source)!r}, and no file of that path exists"
         )
     try:
-        return path.stem, f" in {path}", tomllib.loads(path.read_text(encoding="utf-8"))
+        return path.stem, f" in {path}", _parsed(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path} is not valid TOML: {error}; see {GUIDE} for the format") from error
+
+
+@functools.lru_cache(maxsize=32)
+def _parsed(text: str) -> dict[str, Any]:
+    return tomllib.loads(text)
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

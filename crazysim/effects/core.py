@@ -14,9 +14,8 @@ from crazysim.core.stage import Stage
 from crazysim.deprecation import renamed, warn_renamed
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.drag import drag_force
-from crazysim.eager import as_array
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 
 
 class Exposed(PyTree):
@@ -78,13 +77,12 @@ def controls_of(data: SimData) -> Any:
 
 def per_drone(sim: Simulation, value: Array) -> Array:
     """Return a parameter with one entry per drone. (n_worlds, n_drones, *core)"""
-    value = np.asarray(value)
-    return as_array(np.broadcast_to(value, (*sim.data.states.pos.shape[:2], value.shape[-1])), value.dtype)
+    return on_device(np.broadcast_to(value, (*sim.data.states.pos.shape[:2], value.shape[-1])), value.dtype)
 
 
 def zeros(sim: Simulation, n: int) -> Array:
     """Return zeros for every drone, of the states' type. (n_worlds, n_drones, n)"""
-    return as_array(np.zeros((*sim.data.states.pos.shape[:2], n)), sim.data.states.pos.dtype)
+    return on_device(np.zeros((*sim.data.states.pos.shape[:2], n)), sim.data.states.pos.dtype)
 
 
 def install(

@@ -18,9 +18,8 @@ from crazysim.core.stage import stage
 from crazysim.deprecation import warn_renamed
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve
-from crazysim.eager import as_array
 from crazysim.effects.core import Exposed, require_drag, with_moving_air, zeros
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 
 DECAY, SPREAD = 5.8, 0.094
 """Velocity decay constant B and spreading rate S of a round turbulent jet, 1 (Hussein, Capp and George 1994; Pope,
@@ -99,7 +98,7 @@ def stream_diameter(sim: Simulation, radius: Array) -> Array:
     """Return the diameter of the contracted stream of drones with propellers of a radius, m. (1,) or one per drone"""
     factor = np.sqrt(2 * of_airframes(sim, lambda airframe: airframe.n_rotors))
     factor = factor[..., None] if factor.ndim else factor
-    return as_array(factor * np.asarray(radius), radius.dtype)
+    return on_device(factor * np.asarray(radius), radius.dtype)
 
 
 def jet(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density: Array) -> Array:

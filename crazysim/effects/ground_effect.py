@@ -13,10 +13,9 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, check_parameter, of_airframes, parameter
 from crazysim.deprecation import warn_renamed
 from crazysim.drones import Airframe
-from crazysim.eager import as_array
 from crazysim.effects.core import require_rotors
 from crazysim.effects.ground import ground_below
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 
 
 class GroundEffectData(PyTree):
@@ -48,7 +47,7 @@ class GroundEffect(Plugin):
             own = airframe.value("rotors.position")
             return np.pad(own, [(0, n_rotors - len(own)), (0, 0)])  # missing rotors have no thrust
 
-        return GroundEffectData(radius, as_array(of_airframes(sim, places), radius.dtype))
+        return GroundEffectData(radius, on_device(of_airframes(sim, places), radius.dtype))
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the thrust curves at the height of each rotor."""

@@ -14,10 +14,9 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import Stage, as_stages, stage
 from crazysim.deprecation import warn_renamed
-from crazysim.eager import as_array
 from crazysim.effects.core import controls_of
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 
 
 class LatencyData(PyTree):
@@ -95,7 +94,7 @@ class Latency(Plugin):
             )
         steps, command = check_parameter(sim, "delay", delay, (1,), 0, longest, jnp.int32), _sent(data)
         queue = np.repeat(np.asarray(command)[..., None, :], int(longest) + 1, axis=-2)
-        return LatencyData(steps, as_array(queue, command.dtype), command)
+        return LatencyData(steps, on_device(queue, command.dtype), command)
 
 
 def add(sim: Simulation, delay: Any, max_delay: int | None = None) -> None:

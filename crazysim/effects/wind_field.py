@@ -13,11 +13,10 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.random import world_key
 from crazysim.core.stage import Stage
-from crazysim.eager import as_array
 from crazysim.effects.core import Exposed, require_drag, with_moving_air, zeros
 from crazysim.effects.grid import LARGEST_FUSED, Grid, interpolate
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 
 
 class WindFieldData(PyTree):
@@ -78,9 +77,9 @@ class WindField(Plugin):
         dtype = sim.data.states.pos.dtype
         spread = None if self.spread is None else check_parameter(sim, "spread", self.spread, (3,), 0.0)
         return WindFieldData(
-            field=as_array(grid.values, dtype),
-            origin=as_array(grid.origin, dtype),
-            spacing=as_array(grid.spacing, dtype),
+            field=on_device(grid.values, dtype),
+            origin=on_device(grid.origin, dtype),
+            spacing=on_device(grid.spacing, dtype),
             offset=check_parameter(sim, "offset", self.offset, (3,)),
             scale=check_parameter(sim, "scale", self.scale),
             spread=spread,

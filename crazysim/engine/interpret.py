@@ -15,7 +15,7 @@ from jax import Array
 
 from crazysim.core.stage import with_leaves
 from crazysim.engine import lanes, ops
-from crazysim.engine.ir import Block, Element, Operation, Value
+from crazysim.engine.ir import Block, Operation, Value
 from crazysim.engine.program import Program
 from crazysim.jaxcompat import is_key
 
@@ -57,7 +57,12 @@ def run(
             env.update(zip(op.results, results, strict=True))
             if observe is not None:
                 observe(op, results)
-    return [np.broadcast_to(env[x] if isinstance(x, Value) else x, shape) for x in block.outputs]
+    return [_spread(env[x] if isinstance(x, Value) else x, shape) for x in block.outputs]
+
+
+def _spread(x: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a number of the lanes, or of all of them, for each lane; broadcasting takes as long as an operation."""
+    return x if np.shape(x) == shape else np.broadcast_to(x, shape)
 
 
 def _number(op: Operation, numpy: Callable[..., Any] | None, args: Sequence[Any]) -> Any:
@@ -143,7 +148,7 @@ def call(block: Block, inputs: Sequence[Any], shape: tuple[int, ...]) -> list[Ar
 
 
 def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-    """Return what ``lanes.steps`` does, all in NumPy.
+    """Return what ``lanes.steps`` does, all in NumPy: at once, or in a callback where arguments are traced.
 
     If stages are not fused, only blocks are interpreted, and the rest runs in XLA.
     """
@@ -155,10 +160,13 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
     flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
 
     def of_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], np.ndarray]:
-        return _steps(program, with_leaves([None] * len(leaves), given, map(np.asarray, values)), int(n_steps))
+        return _steps(program, with_leaves([None] * len(leaves), given, [np.asarray(x) for x in values]), int(n_steps))
 
     values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in given]
-    out, flags = jax.pure_callback(of_arrays, (written, flagged), n_steps, *values, vmap_method="sequential")
+    if any(isinstance(x, jax.core.Tracer) for x in (n_steps, *values)):
+        out, flags = jax.pure_callback(of_arrays, (written, flagged), n_steps, *values, vmap_method="sequential")
+    else:
+        out, flags = of_arrays(n_steps, *values)
     keys = [is_key(program.leaves[i]) for i in program.written]
     return [jax.random.wrap_key_data(x) if key else x for x, key in zip(out, keys, strict=True)], flags
 

@@ -258,9 +258,9 @@ def _write_segment(
 
 
 def _deferred(program: Program) -> set[Slot]:
-    """Return the numbers that only stages below the step rate, or only the check behind the loop, use, and none changes.
+    """Return the numbers that only stages below the step rate use, or only the check behind the loop.
 
-    They are loaded there, and take no register in between.
+    If none changes them, they are loaded there, and take no register in between.
     """
     in_blocks: set[Slot] = set()
     always: set[Slot] = set()

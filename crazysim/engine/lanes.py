@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
@@ -65,7 +66,7 @@ class Lanes:
         """Write a number of every drone."""
         if slot not in self.lanes:
             self._split(slot[0])
-        self.lanes[slot] = self.library.broadcast_to(value, self.shape)
+        self.lanes[slot] = value if np.shape(value) == self.shape else self.library.broadcast_to(value, self.shape)
         self.arrays.pop(slot[0], None)
 
     def array(self, leaf: int) -> Any:
@@ -256,7 +257,7 @@ def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
     inner = math.isqrt(n)
     outer = jax.checkpoint(lambda c: turns(c, inner), prevent_cse=False)
     carry, _ = jax.lax.scan(lambda c, _: (outer(c), None), carry, length=n // inner)
-    return turns(carry, n % inner)
+    return turns(carry, n % inner) if n % inner else carry
 
 
 def nonfinite(program: Program, lanes: Lanes) -> Array:

@@ -99,9 +99,15 @@ def _lower_stage(
         if max(others, default=0) > MAX_UNROLLED_DRONES:
             raise LimitError(f"other populations are unrolled for at most {MAX_UNROLLED_DRONES} members")
         shared = [i for i in traced.used if axes.scopes[i] == "shared" and not is_key(traced.avals[i])]
-        return _segment(stage, scope, phase, traced, zeros, shared, n_drones if scope == "drone" else 0)
+        known = {i: zeros[i] for i in traced.used if i in zeros}
+        n_members = n_drones if scope == "drone" else 0
+        key = (stage.__name__, scope, phase, n_members, frozenset(known.items()))
+        if key not in traced.segments:
+            traced.segments[key] = _segment(stage, scope, phase, traced, known, shared, n_members)
+        return traced.segments[key]
     except UnsupportedError as error:
         traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)
+        traced.dump(stage.__name__)
         why = error.located(stage=stage.__name__)
         return UnfusedStage(stage.__name__, phase, traced.fn, tuple(traced.used), tuple(traced.written), why)
 

@@ -14,11 +14,11 @@ Everything that an engine can refuse it refuses here, before the first step. The
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 from jax.sharding import PartitionSpec
 
@@ -68,6 +68,8 @@ class Plan(NamedTuple):
     """The compiled step, for a number of steps that is an array."""
     static: Callable[..., Any]
     """The same for a number of steps that is a Python number, which can be differentiated in reverse."""
+    direct: Callable[..., Any] | None = None
+    """The same without a compiler, for calls with arrays; None where there is none."""
 
     @property
     def program(self) -> Program | None:
@@ -105,7 +107,8 @@ class Planner(NamedTuple):
             return self._plain(data, "it was chosen")
         try:
             plan, problems = self._fast(data, zeros)
-            trace(plan)
+            if plan.direct is None:
+                trace(plan)
         except (ConfigError, MemoryError):
             raise
         except Exception as error:
@@ -206,7 +209,9 @@ class Planner(NamedTuple):
 
         if programs and self.location.mesh is not None:
             advance = self._over_mesh(advance, data, everything, written)
-        return Plan(engine, why, programs, self.location, read, packed, written, synced, *_jitted(advance))
+        plan = Plan(engine, why, programs, self.location, read, packed, written, synced, *_jitted(advance))
+        direct = engine == "interpret" and self.location.mesh is None and all(p.fused for p in programs)
+        return plan._replace(direct=_on_host(advance)) if direct else plan
 
     def _over_mesh(
         self, advance: Callable[..., Any], data: SimData, inputs: Sequence[int], outputs: Sequence[int]
@@ -254,6 +259,17 @@ def _jitted(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[.
     return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
 
+def _on_host(advance: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of arrays that computes in NumPy, with results on the device of its arguments."""
+
+    def direct(values: list[Any], n_steps: int | Array) -> list[Any]:
+        committed = next((x for x in values if getattr(x, "committed", False)), None)
+        device = None if committed is None else next(iter(committed.devices()))
+        return jax.device_put(advance(values, n_steps), device)
+
+    return direct
+
+
 def _together(
     groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Steps]
 ) -> tuple[Steps, tuple[int, ...]]:
@@ -271,7 +287,7 @@ def _together(
             out, flagged = run(leaves[: len(program.leaves)], n_steps)
             new |= {i: x for i, x in zip(program.written, out, strict=True) if own is None or i in own}
             flags.append(flagged)
-        return [new[i] for i in written], functools.reduce(jnp.logical_or, flags)
+        return [new[i] for i in written], functools.reduce(operator.or_, flags)
 
     return run_all, tuple(written)
 

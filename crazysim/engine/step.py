@@ -96,8 +96,10 @@ class Step:
     def advance(self, flat: FlatData, n_steps: int | Array) -> FlatData:
         """Return the data some steps later, still flattened."""
         plan = flat.plan
-        step = plan.static if isinstance(n_steps, int) else plan.dynamic
-        out = step(flat.inputs(), n_steps)
+        step, inputs = plan.static if isinstance(n_steps, int) else plan.dynamic, flat.inputs()
+        if plan.direct is not None and not any(isinstance(x, jax.core.Tracer) for x in (*inputs, n_steps)):
+            step = plan.direct
+        out = step(inputs, n_steps)
         leaves = with_leaves(flat.leaves, plan.written, out)
         leaves[plan.synced] = self._false(leaves[plan.synced])
         return FlatData(leaves, flat.treedef, plan, flat.packed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,7 +28,6 @@ class TracedStage:
         """Shapes and types of all leaves, as the stage receives them."""
         self.written: list[int] = []
         """Leaves that it writes: the outputs of ``fn``."""
-        has_mask = False
 
         def apply(values: list[Any]) -> list[Any]:
             after = stage.fn(axes.treedef.unflatten(values))
@@ -35,20 +35,26 @@ class TracedStage:
             new = jax.tree.leaves(after)
             return [new[i] for i in self.written]
 
-        def condition(values: list[Any]) -> Any:
-            nonlocal has_mask
+        def condition(values: list[Any]) -> list[Any]:
             mask = stage.when(axes.treedef.unflatten(values)) if stage.when is not None else None
-            has_mask = mask is not None
-            return mask if has_mask else 0
+            return [] if mask is None else [mask]
 
-        fn, when = jax.make_jaxpr(apply)(self.avals), jax.make_jaxpr(condition)(self.avals)
-        used = _used(fn) | (_used(when) if has_mask else set())
+        fn = jax.make_jaxpr(apply)(self.avals)
+        when = jax.make_jaxpr(condition)(self.avals) if stage.when is not None else None
+        if when is not None and not when.jaxpr.outvars:  # it acts at every step
+            when = None
+        used = _used(fn) | (_used(when) if when is not None else set())
         self.used = sorted(used)
         """Leaves that it reads: the inputs of ``fn`` and ``when``."""
         self.fn = jaxcompat.with_inputs(fn, self.used)
-        self.when = jaxcompat.with_inputs(when, self.used) if has_mask else None
+        self.when = jaxcompat.with_inputs(when, self.used) if when is not None else None
+        self.segments: dict[Any, Any] = {}
+        """Segments that it was lowered to, by what they depend on besides."""
+
+    def dump(self, name: str) -> None:
+        """Write the jaxprs to the folder of dumps, if there is one."""
         if dump.enabled():
-            dump.write(f"{stage.__name__}.jaxpr", f"{self.fn}\n" + (f"\nwhen\n{self.when}\n" if has_mask else ""))
+            dump.write(f"{name}.jaxpr", f"{self.fn}\n" + (f"\nwhen\n{self.when}\n" if self.when else ""))
 
 
 class Tracer:
@@ -63,8 +69,39 @@ class Tracer:
         shapes = tuple([(x.shape, x.dtype) for x in axes.of_one(list(leaves), stage.scope)])
         key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
         if key not in self._found:
-            self._found[key] = stage, TracedStage(stage, axes, leaves)
+            if _is_built_in(stage):
+                traced = _traced_once(stage, axes, leaves, shapes)
+            else:
+                traced = TracedStage(stage, axes, leaves)
+            traced.dump(stage.__name__)
+            self._found[key] = stage, traced
         return self._found[key][1]
+
+
+_BUILT_IN: dict[Any, TracedStage] = {}
+"""Traced stages of the package itself, for all simulations of this process."""
+MOST = 256
+"""Number of them that are kept."""
+
+
+def _is_built_in(stage: Stage) -> bool:
+    """Return whether a stage is a function of the package itself, which always does the same.
+
+    What a user's function does may change with what it refers to.
+    """
+    return stage.batched and not inspect.ismethod(stage.fn)
+
+
+def _traced_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
+    """Return a traced stage from the cache of this process; the numbers of worlds and drones do not matter to it."""
+    data = axes.treedef.unflatten(leaves)
+    kind = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))
+    key = (stage.fn, stage.when, kind, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)
+    if key not in _BUILT_IN:
+        if len(_BUILT_IN) >= MOST:
+            _BUILT_IN.clear()
+        _BUILT_IN[key] = TracedStage(stage, axes, leaves)
+    return _BUILT_IN[key]
 
 
 def _used(jaxpr: jaxcompat.ClosedJaxpr) -> set[int]:

@@ -6,9 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from jax import Array
 from numpy.typing import NDArray
 
+from crazysim.eager import to_host
 from crazysim.errors import ConfigError
 from crazysim.media.flight import SAMPLE, SCENE, Flight, pack_sample, pack_scene
 from crazysim.media.journal import Journal
@@ -156,8 +159,8 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
     body_pos, body_quat = _bodies(sim, indices)
     return Flight(
         time=dt * np.arange(n),
-        pos=np.asarray(states.pos[:, indices], float),
-        quat=np.asarray(states.quat[:, indices], float),
+        pos=np.asarray(to_host(states.pos, (slice(None), indices)), float),
+        quat=np.asarray(to_host(states.quat, (slice(None), indices)), float),
         body_pos=np.broadcast_to(body_pos, (n, *body_pos.shape)),
         body_quat=np.broadcast_to(body_quat, (n, *body_quat.shape)),
         setpoint=np.zeros((n, len(indices), 0, 3)),
@@ -188,21 +191,23 @@ def put(sim: Sim, flight: Flight, time: float) -> None:
             f"got {found[0]} and {found[1]}"
         )
     now, data = flight.at(time), sim.data
-    states = data.states.replace(
-        pos=data.states.pos.at[worlds].set(now["pos"]), quat=data.states.quat.at[worlds].set(now["quat"])
-    )
-    core = data.core.replace(steps=data.core.steps.at[worlds].set(round(time * sim.freq)))
     controls, objects = data.controls, data.objects
+    old = {"pos": data.states.pos, "quat": data.states.quat, "steps": data.core.steps}
+    new = {"pos": now["pos"], "quat": now["quat"], "steps": np.full((len(worlds), 1), round(time * sim.freq))}
     if controls.state is not None and now["setpoint"].size:
-        setpoint = controls.state.staged_cmd.at[worlds, :, :3].set(now["setpoint"])
-        controls = controls.replace(state=controls.state.replace(staged_cmd=setpoint))
+        old["setpoint"], new["setpoint"] = controls.state.staged_cmd, now["setpoint"]
     if objects is not None:
         columns = np.searchsorted(flight.body_ids, np.asarray(objects.mocap_ids))
-        objects = objects.replace(
-            pos=objects.pos.at[worlds, 0].set(now["body_pos"][:, columns]),
-            quat=objects.quat.at[worlds, 0].set(now["body_quat"][:, columns]),
-            recorded=any(plugin.places for plugin in sim.plugins.values()),
-        )
+        old |= {"body_pos": objects.pos, "body_quat": objects.quat}
+        new |= {name: now[name][:, None, columns] for name in ("body_pos", "body_quat")}
+    put = _with_worlds(old, worlds, new)
+    states = data.states.replace(pos=put["pos"], quat=put["quat"])
+    core = data.core.replace(steps=put["steps"])
+    if "setpoint" in put:
+        controls = controls.replace(state=controls.state.replace(staged_cmd=put["setpoint"]))
+    if objects is not None:
+        recorded = any(plugin.places for plugin in sim.plugins.values())
+        objects = objects.replace(pos=put["body_pos"], quat=put["body_quat"], recorded=recorded)
     sim.data = data.replace(states=states, core=core, controls=controls, objects=objects)
     body_pos, body_quat = _bodies(sim, worlds)
     if not (np.allclose(body_pos, now["body_pos"], atol=1e-6) and np.allclose(body_quat, now["body_quat"], atol=1e-6)):
@@ -211,6 +216,12 @@ def put(sim: Sim, flight: Flight, time: float) -> None:
             mocap_pos=sim.mjx_data.mocap_pos.at[ids].set(now["body_pos"]),
             mocap_quat=sim.mjx_data.mocap_quat.at[ids].set(np.roll(now["body_quat"], 1, axis=-1)),
         )
+
+
+@jax.jit
+def _with_worlds(old: dict[str, Array], worlds: Array, new: dict[str, Array]) -> dict[str, Array]:
+    """Return arrays with other numbers in some worlds; the first ones of the last axis if there are fewer."""
+    return {name: x.at[worlds, ..., : new[name].shape[-1]].set(new[name]) for name, x in old.items()}
 
 
 def _body_ids(sim: Sim) -> NDArray:

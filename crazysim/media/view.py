@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.settings import positive
 from crazysim.deprecation import warn_renamed
+from crazysim.eager import to_host
 from crazysim.errors import ConfigError
 from crazysim.media.trail import Trail, colors_of
 from crazysim.media.worlds import world_indices
@@ -157,7 +158,10 @@ class View:
         worlds = world_indices(sim, self.worlds)
         if self.follow is not None and self.follow not in range(sim.n_drones):
             raise ConfigError(f"expected a drone from 0 to {sim.n_drones - 1} to follow, got {self.follow!r}")
-        time, pos = np.asarray(sim.time[worlds, 0], float), np.asarray(sim.data.states.pos[worlds], float)
+        time, pos = (
+            np.asarray(to_host(sim.time, worlds)[:, 0], float),
+            np.asarray(to_host(sim.data.states.pos, worlds), float),
+        )
         if self._trail is not None:
             self._trail.add(time, pos)
         return time, pos

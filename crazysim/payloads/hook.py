@@ -28,7 +28,7 @@ from crazysim.payloads.core import (
 )
 from crazysim.payloads.link import TINY, Link, couple, end_relative_motion, relative
 from crazysim.payloads.slung import load_record, place_loads, upward
-from crazysim.pytree import leaf, select_worlds
+from crazysim.pytree import leaf, on_device, select_worlds
 from crazysim.rotation import dot
 
 
@@ -118,15 +118,17 @@ class Hook(Colliding, Plugin):
         tip_pos, tip_vel = load.pos, load.vel
         if self.load_at is not None:
             at = check_parameter(sim, "load_at", self.load_at, (3,))
-            pos = jnp.broadcast_to(at, load.pos.shape)
-            pos = pos.at[..., 2].set(jnp.maximum(pos[..., 2], load.clearance[..., 0]))
-            values |= {"pos": pos, "vel": jnp.zeros_like(pos), "attached": jnp.zeros_like(load.attached)}
-            tip_pos, tip_vel = hanging(sim.data.states, load.attach, load.length, jnp.zeros_like(load.clearance), False)
+            pos = np.array(np.broadcast_to(at, load.pos.shape))
+            pos[..., 2] = np.maximum(pos[..., 2], np.asarray(load.clearance)[..., 0])
+            vel, attached = np.zeros_like(pos), np.zeros(load.attached.shape, bool)
+            values |= {"pos": on_device(pos), "vel": on_device(vel), "attached": on_device(attached, bool)}
+            no_clearance = np.zeros_like(load.clearance)
+            tip_pos, tip_vel = hanging(sim.data.states, load.attach, load.length, no_clearance, False)
         return HookData(
             **values,
-            tip_pos=jnp.array(tip_pos),
-            tip_vel=jnp.array(tip_vel),
-            grip=jnp.array(values["attached"]),
+            tip_pos=on_device(tip_pos),
+            tip_vel=on_device(tip_vel),
+            grip=on_device(values["attached"], bool),
             hook_mass=check("hook_mass"),
             reach=check("reach"),
             max_speed=check("max_speed"),

@@ -21,7 +21,7 @@ from crazysim.errors import ConfigError
 from crazysim.payloads.body import Colliding
 from crazysim.payloads.jet_table import JetTable
 from crazysim.payloads.panels import panels_of
-from crazysim.pytree import PyTree, leaf, static
+from crazysim.pytree import PyTree, leaf, on_device, static
 
 PANELS_PER_LENGTH = 2
 """Panels along the longest edge of a load by default."""
@@ -94,7 +94,7 @@ class RotorJet(Plugin):
 
         def shared(name: str) -> Array | None:
             value = getattr(table, name, None)
-            return None if value is None else jnp.asarray(value, dtype)
+            return None if value is None else on_device(value, dtype)
 
         return RotorJetData(
             force=zeros(sim, 3),

@@ -19,7 +19,7 @@ from crazysim.geometry.linear import solve
 from crazysim.payloads.body import LoadBody, rest_height
 from crazysim.payloads.core import CABLE_SEGMENTS, PointLoad, add_to_scene, integrator_of, pieces, placed, turned_z
 from crazysim.payloads.link import BAND, PULL, Pull, acceleration_at, relative
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 
 SOFT = 1e-6
 """Summand of the matrix of tensions, 1, without which four rods at one load would have no unique tensions."""
@@ -106,7 +106,7 @@ class SharedLoad(PointLoad, Plugin):
         return SharedLoadData(
             pos=jnp.concatenate([mean[..., :2], height], axis=-1),
             vel=s.vel.mean(axis=1, keepdims=True),
-            attached=jnp.ones(s.pos.shape[:2], bool),
+            attached=on_device(np.ones(s.pos.shape[:2]), bool),
             mass=scalars["mass"],
             length=length,
             attach=attach if np.any(np.asarray(attach)) else None,

@@ -28,7 +28,7 @@ from crazysim.payloads.core import (
     turned_z,
 )
 from crazysim.payloads.link import Link, couple, end_relative_motion, relative
-from crazysim.pytree import select_worlds
+from crazysim.pytree import on_device, select_worlds
 
 OUT_OF_SIGHT = 1000.0
 """Depth at which loads are that do not exist, m."""
@@ -168,10 +168,10 @@ def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, 
     pos, vel = hanging(states, attach, length, rest, is_cable)
     return LoadData(
         pos=pos,
-        vel=jnp.asarray(np.broadcast_to(vel, states.vel.shape)),
+        vel=on_device(np.broadcast_to(vel, states.vel.shape)),
         air_vel=None if drag is None else zeros(sim, 3),
         wind_vel=None if drag is None else zeros(sim, 3),
-        attached=jnp.asarray(np.ones(states.pos.shape[:2], bool)),
+        attached=on_device(np.ones(states.pos.shape[:2]), bool),
         mass=check("mass", low=0.0),
         length=length,
         attach=attach,

@@ -12,9 +12,8 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.stage import Stage, StageScope
 from crazysim.deprecation import renamed, warn_renamed
-from crazysim.eager import as_array
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, static
+from crazysim.pytree import PyTree, leaf, on_device, static
 from crazysim.scene.placement import placed_by
 from crazysim.scene.report import ContactReport, Objects, choose
 
@@ -60,10 +59,10 @@ class ContactLog(Plugin):
             raise ConfigError("expected something to check for contacts, got nothing. Use floor, drones or objects.")
         shape = (sim.n_worlds, sim.n_drones)
         return ContactLogData(
-            floor=as_array(np.zeros(shape), bool),
-            objects=as_array(np.zeros((*shape, len(names))), bool),
-            drones=as_array(np.zeros(shape), bool),
-            first=as_array(np.full(shape, -1), np.int32),
+            floor=on_device(np.zeros(shape), bool),
+            objects=on_device(np.zeros((*shape, len(names))), bool),
+            drones=on_device(np.zeros(shape), bool),
+            first=on_device(np.full(shape, -1), np.int32),
             object_names=names,
         )
 

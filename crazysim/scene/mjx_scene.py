@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
 from crazysim.core.sharding import place_scene, put
+from crazysim.eager import to_host
 from crazysim.errors import ConfigError
 from crazysim.scene import build, contacts, mjx
-from crazysim.scene.sync import of_worlds, sync_sim2mjx
+from crazysim.scene.sync import sync_sim2mjx
 
 
 class MjxScene:
@@ -81,8 +82,10 @@ class MjxScene:
             Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), and joint positions (n, n_qpos).
         """
         if self._data is not None:
-            poses = self._data.mocap_pos, self._data.mocap_quat, self._data.qpos
-            return poses if worlds is None else of_worlds(poses, worlds)
+            pos, quat, qpos = self._data.mocap_pos, self._data.mocap_quat, self._data.qpos
+            if worlds is None:
+                return pos, quat, qpos
+            return to_host(pos, worlds), to_host(quat, worlds), to_host(qpos, worlds)
         if self._rest is None:
             rest = mujoco.MjData(self._mj_model)
             each = (rest.mocap_pos, rest.mocap_quat, self._mj_model.qpos0)

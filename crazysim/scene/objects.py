@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import Objects, SimData
 from crazysim.core.settings import positive
-from crazysim.eager import as_array, compiled
+from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.pytree import floating, select_worlds
+from crazysim.pytree import on_device, select_worlds
 from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -204,8 +204,8 @@ class SceneObjects:
         if before is not None:
             n, old = len(before.names), (before.pos, before.quat, before.vel)
             poses = tuple(np.concatenate([x, new[..., n:, :]], axis=-2) for x, new in zip(old, poses, strict=True))
-        pos, quat, vel = (as_array(x, floating()) for x in poses)
-        return Objects(pos, quat, vel, as_array(mocap_ids, np.int32), self.movable)
+        pos, quat, vel = (on_device(x) for x in poses)
+        return Objects(pos, quat, vel, on_device(mocap_ids, np.int32), self.movable)
 
 
 def add_bodies(

@@ -14,10 +14,10 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
-from crazysim.eager import as_array, compiled
+from crazysim.eager import compiled
 from crazysim.effects.core import zeros
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.rotation import safe_clip, safe_norm
 
 CLEAR, ALARM = (0.25, 0.6, 0.9, 1.0), (0.95, 0.2, 0.15, 1.0)
@@ -90,8 +90,8 @@ class Radar(Plugin):
             if not np.isfinite(value).all() or np.any(value < low) or np.any(value > high):
                 bounds = "positive" if low > 0 else f"from {low:.4g} to {high:.4g}"
                 raise ConfigError(f"expected {name} to be finite and {bounds}, got {getattr(self, name)!r}")
-            found[name] = as_array(np.broadcast_to(value, len(pos)), dtype)
-        return RadarData(pos=as_array(pos, dtype), **found, exposure=zeros(sim, len(pos)))
+            found[name] = on_device(np.broadcast_to(value, len(pos)), dtype)
+        return RadarData(pos=on_device(pos, dtype), **found, exposure=zeros(sim, len(pos)))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that counts the time within the lobes."""

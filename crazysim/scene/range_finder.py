@@ -15,9 +15,8 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
 from crazysim.deprecation import renamed, warn_renamed
-from crazysim.eager import as_array
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, floating, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.placement import place, placed_by
 from crazysim.scene.rays import cast
@@ -76,8 +75,8 @@ class RangeFinder(Plugin):
         self._period(sim)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         far = float(self.max_range)
-        shape = sim.n_worlds, sim.n_drones, len(rays)
-        return RangeFinderData(*(as_array(x, floating()) for x in (np.full(shape, far), rays, far)))
+        distance = np.full((sim.n_worlds, sim.n_drones, len(rays)), far)
+        return RangeFinderData(on_device(distance), on_device(rays), on_device(far))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that measures, of one drone, or of one world if drones or loads are to be measured."""

@@ -20,9 +20,8 @@ from crazysim.core.data import SimData, SimState
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
 from crazysim.deprecation import warn_renamed
-from crazysim.eager import as_array
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, floating, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.scene.contact_points import Surface, contact_points, is_ground, surfaces_of
 from crazysim.scene.drone_boxes import Boxes, boxes_of, of_kind
 from crazysim.scene.impulse import Material, after_contact, inertia_matrix
@@ -79,10 +78,10 @@ class ContactResponse(Plugin):
         if self.softness < 2 * dt:
             raise ConfigError(f"expected softness to be two steps at least, {2 * dt:.4g} s, got {self.softness} s")
         return ContactResponseData(
-            friction=as_array([self.friction], floating()),
-            restitution=as_array([self.restitution], floating()),
-            softness=as_array([self.softness], floating()),
-            impulse=as_array(np.zeros((sim.n_worlds, sim.n_drones, 3)), floating()),
+            friction=on_device([self.friction]),
+            restitution=on_device([self.restitution]),
+            softness=on_device([self.softness]),
+            impulse=on_device(np.zeros((sim.n_worlds, sim.n_drones, 3))),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

@@ -12,7 +12,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import SimData
-from crazysim.eager import compiled
+from crazysim.eager import compiled, to_host
 from crazysim.scene import mjx
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
@@ -77,6 +77,7 @@ def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
     )
 
 
+@compiled()
 def with_poses_of(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     """Return poses of bodies and joints in some worlds, with those of drones and handles as the data have them.
 
@@ -97,12 +98,6 @@ def _with_poses(owned: Any, worlds: Array, mocap_pos: Array, mocap_quat: Array) 
     return mocap_pos, mocap_quat
 
 
-@compiled()
-def of_worlds(arrays: Any, worlds: Any) -> Any:
-    """Return the rows of one world, or of some worlds, of a tree of arrays."""
-    return jax.tree.map(lambda x: x[worlds], arrays)
-
-
 def sync_one_world(
     data: SimData,
     world: int,
@@ -121,10 +116,13 @@ def sync_one_world(
         mj_data: State to write.
     """
     mj_data.mocap_pos[:], mj_data.mocap_quat[:], mj_data.qpos[:] = poses
-    ids, *rows = zip(*_poses(data), strict=True)
-    for number, pos, quat in zip(ids, *jax.device_get(of_worlds(rows, world)), strict=True):
-        mj_data.mocap_pos[np.asarray(number)] = pos
-        mj_data.mocap_quat[np.asarray(number)] = np.roll(quat, 1, axis=-1)
+    states, objects = data.states, data.objects
+    owned = [(data.core.drone_mocap_ids, to_host(states.pos, world), to_host(states.quat, world))]
+    if objects is not None:
+        owned.append((objects.mocap_ids, to_host(objects.pos, world)[0], to_host(objects.quat, world)[0]))
+    for ids, pos, quat in owned:
+        mj_data.mocap_pos[np.asarray(ids)] = pos
+        mj_data.mocap_quat[np.asarray(ids)] = np.roll(quat, 1, axis=-1)
     mujoco.mj_kinematics(mj_model, mj_data)
     mujoco.mj_comPos(mj_model, mj_data)
     mujoco.mj_camlight(mj_model, mj_data)

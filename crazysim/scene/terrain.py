@@ -14,11 +14,11 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
 from crazysim.core.stages import FLOOR
-from crazysim.eager import as_array
 from crazysim.effects.core import zeros
 from crazysim.effects.grid import LARGEST_FUSED
 from crazysim.effects.ground import TerrainData, ground_height
 from crazysim.errors import ConfigError
+from crazysim.pytree import on_device
 from crazysim.scene.response import ContactResponse
 
 DEPTH = 1.0
@@ -53,9 +53,9 @@ class Terrain(Plugin):
         heights, size, pos = self._checked(sim)
         dtype = sim.data.states.pos.dtype
         record = TerrainData(
-            heights=as_array(heights, dtype),
-            middle=as_array(pos, dtype),
-            half=as_array(size / 2, dtype),
+            heights=on_device(heights, dtype),
+            middle=on_device(pos, dtype),
+            half=on_device(size / 2, dtype),
             below=zeros(sim, 1),
             floor=self.floor,
         )

@@ -13,6 +13,7 @@ from jax import Array
 from crazysim.core import functional as F
 from crazysim.core.data import SimData, command_shape
 from crazysim.core.population import Population
+from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class Member:
         value: Any = None if field.startswith("_") else getattr(self._record(), field, None)
         if np.ndim(value) < 2:
             raise AttributeError(f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}.")
-        return value[:, self.index]
+        return _row(value, self.index)
 
     def set(self, **values: Any) -> None:
         """Write fields of the record, such as ``pos``, in all worlds: (...), or (n_worlds, ...) for each.
@@ -86,7 +87,7 @@ class Member:
         before = getattr(level.state, "staged_feedforward", None)
         if before is not None:  # that of the other drones stays
             state = after.controls.state
-            own = before.at[:, self.index].set(state.staged_feedforward[:, self.index])
+            own = _with_row(before, self.index, _row(state.staged_feedforward, self.index))
             after = after.replace(controls=after.controls.replace(state=state.replace(staged_feedforward=own)))
         sim.data = after
 
@@ -107,7 +108,7 @@ class Member:
             value = np.asarray(value, x.dtype)
             if not np.all(np.isfinite(value)):
                 raise ValueError(f"expected finite numbers as {what}, got NaN or infinity. Check its computation.")
-        return x.at[:, self.index].set(value)
+        return _with_row(x, self.index, value)
 
     def _record(self) -> Any:
         data = self._sim.data
@@ -126,6 +127,18 @@ class Member:
     def __repr__(self) -> str:
         """Return name, population and index."""
         return f"<{self.name}: {self.population} {self.index}>"
+
+
+@compiled()
+def _row(x: Array, index: Array) -> Array:
+    """Return the row of one drone or member. (n_worlds, ...)"""
+    return x[:, index]
+
+
+@compiled()
+def _with_row(x: Array, index: Array, value: Array) -> Array:
+    """Return rows with that of one drone or member replaced. (n_worlds, n, ...)"""
+    return x.at[:, index].set(value)
 
 
 def find_member(sim: Sim, name: Any) -> Member:

@@ -17,6 +17,7 @@ from crazysim.core.settings import positive
 from crazysim.core.stage import Stage
 from crazysim.dynamics.core import GRAVITY
 from crazysim.dynamics.parameters import rotor_vel_limits
+from crazysim.eager import is_traced
 from crazysim.engine import Step
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, floating, leaf, n_batch_axes, scopes
@@ -166,7 +167,7 @@ class MPPI:
         self._step = Step(pipeline, c.engine, c.device.platform, device=c.device)
         self._device = c.device
         self._memory = jax.device_put(self.init(sim.n_worlds, sim.n_drones), c.device)
-        self._jitted = jax.jit(self.plan)
+        self._jitted = jax.jit(self._plan)
 
     def init(self, n_worlds: int, n_drones: int) -> MPPIMemory:
         """Return the memory before the first command: plans that hover."""
@@ -196,7 +197,7 @@ class MPPI:
         return command
 
     def plan(self, memory: MPPIMemory, data: SimData, setpoint: Setpoint) -> tuple[Array, MPPIMemory]:
-        """Return the command of every drone and the memory for the next call; pure.
+        """Return the command of every drone and the memory for the next call; pure, and one compiled call.
 
         Args:
             memory: From ``init``, or from the last call.
@@ -206,6 +207,10 @@ class MPPI:
         Returns:
             Command of the simulation's level (n_worlds, n_drones, k); the memory.
         """
+        arguments = (memory, data, setpoint)
+        return (self._plan if is_traced(arguments) else self._jitted)(*arguments)
+
+    def _plan(self, memory: MPPIMemory, data: SimData, setpoint: Setpoint) -> tuple[Array, MPPIMemory]:
         key, plan = jax.random.fold_in(self._key, memory.count), memory.plan
         n_worlds, n_drones = plan.shape[:2]
         shape = (n_worlds, self.samples, *plan.shape[1:])

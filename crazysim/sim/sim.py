@@ -25,10 +25,10 @@ from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_
 from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameters import rotor_vel_limits
-from crazysim.eager import as_array
 from crazysim.engine import Stepper, explain
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
+from crazysim.pytree import on_device
 from crazysim.scene.queries import SceneQueries
 from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
@@ -247,7 +247,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self._default_data = self._stepper.place(self._with_scene(self._default_data))
 
     def _with_scene(self, data: SimData) -> SimData:
-        ids = as_array(self._scene.drone_mocap_ids, np.int32)
+        ids = on_device(self._scene.drone_mocap_ids, np.int32)
         return data.replace(core=data.core.replace(drone_mocap_ids=ids), objects=self._scene.objects(data.objects))
 
     @property

@@ -19,8 +19,8 @@ NEAR = 0.05
 """Part of the range of the samples by which one may lie below the largest and still be refined."""
 N_SECTIONS = 40
 """Golden sections: they shorten two intervals to 1e-10 of a piece."""
-CHUNK = 4096
-"""Number of times at which rates are computed at once, so that one compilation serves all."""
+CHUNKS = (64, 4096)
+"""Numbers of times at which rates are computed at once, few or many, so that two compilations serve all."""
 PIECES = 2048
 """Number of pieces that are sampled at once, which bounds the memory."""
 
@@ -51,10 +51,12 @@ def _body_rate(pos: Floats, vel: Floats, acc: Floats, jerk: Floats) -> Floats:
     """Return the size of the angular velocity of a drone that flies these derivatives exactly."""
     columns = (_specific_thrust(acc), jerk[..., :3], pos[..., 3:], vel[..., 3:])
     rows = np.concatenate(columns, axis=-1).reshape(-1, 8)
-    padded = np.zeros((-(-len(rows) // CHUNK) * CHUNK, 8))
+    few, many = CHUNKS
+    chunk = few if len(rows) <= few else many
+    padded = np.zeros((-(-len(rows) // chunk) * chunk, 8))
     padded[: len(rows)] = rows
     with jax.enable_x64(True):
-        rates = [np.asarray(_compiled_body_rate(padded[k : k + CHUNK])) for k in range(0, len(padded), CHUNK)]
+        rates = [np.asarray(_compiled_body_rate(padded[k : k + chunk])) for k in range(0, len(padded), chunk)]
     return np.concatenate(rates)[: len(rows)].reshape(acc.shape[:-1])
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.eager import compiled
 from crazysim.pytree import Members, leaf
 from crazysim.vehicles.parameters import CarParams
 from crazysim.vehicles.path import Path
@@ -71,14 +72,12 @@ class CarData(Members):
     @property
     def vel(self) -> Array:
         """Velocity of the centre of mass, world frame, m/s. (n_worlds, n_members, 3)"""
-        level = to_world(self.yaw, self.body_vel)
-        return jnp.concatenate([level, jnp.zeros_like(self.yaw)], axis=-1)
+        return _level_vel(self.yaw, self.body_vel)
 
     @property
     def ang_vel(self) -> Array:
         """Angular velocity, body frame, rad/s. (n_worlds, n_members, 3)"""
-        zero = jnp.zeros_like(self.yaw_rate)
-        return jnp.concatenate([zero, zero, self.yaw_rate], axis=-1)
+        return _about_z(self.yaw_rate)
 
     def with_vel(self, vel: Array, ang_vel: Array) -> CarData:
         """Return the record with other velocities; only the horizontal velocity and the yaw rate are used.
@@ -88,3 +87,15 @@ class CarData(Members):
             ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         """
         return self.replace(body_vel=to_body(self.yaw, vel[..., :2]), yaw_rate=ang_vel[..., 2:])
+
+
+@compiled()
+def _level_vel(yaw: Array, body_vel: Array) -> Array:
+    level = to_world(yaw, body_vel)
+    return jnp.concatenate([level, jnp.zeros_like(yaw)], axis=-1)
+
+
+@compiled()
+def _about_z(yaw_rate: Array) -> Array:
+    zero = jnp.zeros_like(yaw_rate)
+    return jnp.concatenate([zero, zero, yaw_rate], axis=-1)

@@ -19,7 +19,7 @@ from crazysim.core.stage import Stage, tick
 from crazysim.dynamics.core import GRAVITY
 from crazysim.effects.ground import TerrainData, ground_at
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, floating
+from crazysim.pytree import PyTree, on_device
 from crazysim.trajectories import Trajectory
 from crazysim.vehicles import appearance, starts
 from crazysim.vehicles.car_data import CarData
@@ -134,7 +134,7 @@ class Cars(Population):
         pos, yaw = (np.broadcast_to(x, (*counts, x.shape[-1])) for x in (pos, yaw))
         if arc is not None and self.pos is not None:
             arc = starts.projected(paths, index, pos, arc)
-        height, normal = ground_at(sim.data, jnp.asarray(np.concatenate([pos, pos[..., :1]], axis=-1), floating()))
+        height, normal = ground_at(sim.data, on_device(np.concatenate([pos, pos[..., :1]], axis=-1)))
         z = np.asarray(height) + vehicle.number("wheels.radius")
         zero = np.zeros((*counts, 1))
         two, three = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -268,9 +269,8 @@ class Path(PyTree):
             index: Number of the path.
             start: Time at which the vehicle is at the start of the path, s.
         """
-        arc, _ = self.time_reference(index, jnp.asarray(-start, floating()))
-        point = self.at(index, arc[0])
-        x, y = np.asarray(point.tangent, float) * (-1 if self.speeds[index, 0] < 0 else 1)
+        point, arc = jax.device_get(_point_at_time(self, np.int32(index), np.asarray(-start, floating())))
+        x, y = np.asarray(point.tangent, float) * (-1 if np.asarray(self.speeds)[index, 0] < 0 else 1)
         return np.asarray(point.pos, float), float(np.arctan2(y, x)), float(arc[0])
 
     def _locate(self, index: Any, s: Array) -> tuple[Array, Array]:
@@ -280,6 +280,13 @@ class Path(PyTree):
         local = jnp.where(_take(self.closed, index), wrapped, safe_clip(s, 0.0, length)) / spacing
         piece = safe_clip(lax.floor(local), 0.0, lax.floor(length / spacing - 0.5))
         return piece.astype(jnp.int32), local - piece
+
+
+@jax.jit
+def _point_at_time(path: Path, index: Array, t: Array) -> tuple[PathPoint, Array]:
+    """Return a point at a time since the start, s, and its arc length, m (1,)."""
+    arc, _ = path.time_reference(index, t)
+    return path.at(index, arc[0]), arc
 
 
 def _of_curve(

@@ -80,11 +80,12 @@ def test_a_drone_that_tracks_gets_the_wrench_of_its_motion():
     """On a figure eight, without drag: thrust and torque of Newton and Euler, J w' + w x J w."""
     from crazysim.control.flatness import attitude_of_thrust
 
-    p = GeometricParams.create(load_airframe("bumblebee"), 500)
+    p, attitude = GeometricParams.create(load_airframe("bumblebee"), 500), jax.jit(attitude_of_thrust)
+    on_the_eight = jax.jit(functools.partial(setpoint_of, figure_eight))
     for t in (0.3, 1.0, 2.2):
-        sp = setpoint_of(figure_eight, t)
+        sp = jax.tree.map(np.asarray, on_the_eight(t))
         gravity = np.array([0, 0, 9.81])
-        now = attitude_of_thrust(sp.acc + gravity, sp.jerk, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
+        now = jax.tree.map(np.asarray, attitude(sp.acc + gravity, sp.jerk, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc))
         quat = Rotation.from_matrix(now.matrix).as_quat()
         wrench = np.asarray(control(sp.pos, quat, sp.vel, now.ang_vel, sp, params=p))
         momentum = p.J @ now.ang_vel

@@ -28,10 +28,11 @@ def test_the_filter_is_that_of_scipy():
 
 
 def test_a_filter_in_its_steady_state_stays_there():
-    x, c = jnp.array([3.0, -1.0]), jnp.asarray(butterworth(12.0, 500.0))
-    y, state = filtered(x, steady(x, c), c)
+    x, c = np.float32([3.0, -1.0]), np.float32(butterworth(12.0, 500.0))
+    rest = jax.jit(steady)(x, c)
+    y, state = jax.jit(filtered)(x, rest, c)
     np.testing.assert_allclose(y, x, rtol=1e-5)
-    np.testing.assert_allclose(state, steady(x, c), rtol=1e-5)
+    np.testing.assert_allclose(state, rest, rtol=1e-5)
 
 
 @functools.cache
@@ -52,12 +53,13 @@ def memory():
 
 def test_a_return_to_the_controller_starts_its_filter_anew():
     controller, airframe = INDI(), load_airframe("bumblebee")
-    params, setpoint = controller.params(airframe), setpoint_of(hover, jnp.float32(0))
-    rotor_vel = jnp.full(4, 8000.0)
-    state = {"pos": jnp.zeros(3), "quat": jnp.eye(4)[3], "vel": jnp.array([1.0, 0.0, 0.0]), "ang_vel": jnp.zeros(3)}
+    params, setpoint = controller.params(airframe), jax.jit(lambda t: setpoint_of(hover, t))(np.float32(0))
+    rotor_vel = np.full(4, 8000.0, np.float32)
+    state = {"pos": [0, 0, 0], "quat": [0, 0, 0, 1], "vel": [1.0, 0.0, 0.0], "ang_vel": [0, 0, 0]}
+    state = {name: jnp.asarray(np.float32(value)) for name, value in state.items()}
     data = SimpleNamespace(states=SimpleNamespace(**state, rotor_vel=rotor_vel))
-    stale = INDIMemory(jnp.array([-2.0, 0.0, 0.0]), jnp.ones(3), jnp.full(24, 9.0), jnp.ones(1))
-    back = controller.take_over(data, setpoint, stale, params, rotor_vel)
+    stale = INDIMemory(*map(np.float32, ([-2.0, 0.0, 0.0], np.ones(3), np.full(24, 9.0), np.ones(1))))
+    back = jax.jit(lambda memory: controller.take_over(data, setpoint, memory, params, rotor_vel))(stale)
     update = jax.jit(lambda memory: controller.update(data, setpoint, memory, params)[0])
     first = np.asarray(update(memory()))
     np.testing.assert_array_equal(update(back), first)

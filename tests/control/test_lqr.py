@@ -94,6 +94,10 @@ def test_wrong_weights(case):
         LQR(**settings).params(load_airframe("bumblebee"))
 
 
+def a_setpoint():
+    return Setpoint(*[np.zeros(3)] * 5, *[np.zeros(1)] * 3)
+
+
 def test_a_trajectory_is_needed_along_a_trajectory():
     with pytest.raises(ConfigError, match="setpoints of one drone"):
         Sim(control="state", controller="tracking_lqr")
@@ -103,13 +107,13 @@ def test_a_trajectory_is_needed_along_a_trajectory():
     "shape, dt, got", [((), 0.1, r"shape \(3,\) and 0.1"), ((4,), np.nan, r"shape \(4, 3\) and nan")]
 )
 def test_a_trajectory_has_one_leading_axis_and_a_time(shape, dt, got):
-    setpoints = jax.tree.map(lambda x: np.broadcast_to(x, (*shape, *x.shape)), setpoint_of(figure_eight, 0.0))
+    setpoints = jax.tree.map(lambda x: np.broadcast_to(x, (*shape, *x.shape)), a_setpoint())
     with pytest.raises(ConfigError, match=f"got positions of {got}"):
         TrackingLQR(setpoints=setpoints, dt=dt).params(load_airframe("bumblebee"))
 
 
 def test_setpoints_of_a_trajectory_are_finite():
-    setpoints = jax.tree.map(lambda x: np.zeros((4, *x.shape)), setpoint_of(figure_eight, 0.0))
+    setpoints = jax.tree.map(lambda x: np.zeros((4, *x.shape)), a_setpoint())
     setpoints = setpoints.replace(jerk=np.full((4, 3), np.nan), yaw=np.full((4, 1), np.inf))
     with pytest.raises(ConfigError, match=r"expected finite setpoints, got NaN or infinity in jerk, yaw\. Evaluate"):
         TrackingLQR(setpoints=setpoints, dt=0.1).params(load_airframe("bumblebee"))
@@ -127,17 +131,16 @@ def knots():
 @pytest.mark.usefixtures("x64")
 def test_error_dynamics_are_those_of_the_drone(knots):
     """By differences: reference and disturbed drone both fly 1e-5 s, and the errors compare."""
-    p = LQRParams.create(load_airframe("bumblebee"), 500)
-    p = jax.tree.map(jnp.asarray, p)
-    sp = jax.tree.map(lambda x: jnp.asarray(x[7], jnp.float64), knots)
-    sp = sp.replace(yaw_rate=jnp.array([0.7]), yaw_acc=jnp.array([-0.4]))
-    reference = reference_of(sp, p)
+    p = jax.tree.map(np.asarray, LQRParams.create(load_airframe("bumblebee"), 500))
+    sp = jax.tree.map(lambda x: np.asarray(x, np.float64)[7], knots)
+    sp = sp.replace(yaw_rate=np.array([0.7]), yaw_acc=np.array([-0.4]))
+    reference = jax.tree.map(np.asarray, jax.jit(reference_of)(sp, p))
     w = reference.ang_vel
     ang_acc = np.linalg.solve(p.J, reference.wrench[1:] - np.cross(w, p.J @ w))
     size, h = 1e-5, 1e-5
     rng = np.random.default_rng(4)
     error, extra = size * rng.normal(size=12), size * rng.normal(size=4)
-    slope = error_derivative(error, extra, reference, ang_acc, p.mass, p.J)
+    slope = jax.jit(error_derivative)(error, extra, reference, ang_acc, p.mass, p.J)
 
     def flown(matrix, ang_vel, vel, pos, wrench):
         turned = matrix @ Rotation.from_rotvec(h * np.array(ang_vel)).as_matrix()
@@ -151,7 +154,7 @@ def test_error_dynamics_are_those_of_the_drone(knots):
     later = flown(target, np.asarray(w), reference.vel, reference.pos, reference.wrench)
     moved = reference._replace(pos=later[3], vel=later[2], matrix=later[0], ang_vel=later[1])
     quat = Rotation.from_matrix(np.array(after[0])).as_quat()
-    found = state_error(after[3], quat, after[2], after[1], moved)
+    found = jax.jit(state_error)(after[3], quat, after[2], after[1], moved)
     np.testing.assert_allclose((found - error) / h / size, slope / size, atol=2e-2)
 
 
@@ -170,7 +173,7 @@ def test_gains_along_a_hover_are_those_of_hover():
 def test_the_table_is_interpolated_and_held():
     gains = np.arange(3.0)[:, None, None] * np.ones((4, 12))
     for time, expected in ((-1, 0), (0.05, 0.5), (0.1, 1), (0.17, 1.7), (9, 2)):
-        np.testing.assert_allclose(gain_at(jnp.asarray(time), gains, 0.1), expected, rtol=1e-6)
+        np.testing.assert_allclose(jax.jit(gain_at)(np.float32(time), gains, 0.1), expected, rtol=1e-6)
 
 
 # Flights ----------------------------------------------------------------------------------------------------------
@@ -206,10 +209,10 @@ def test_heading_turns_the_gain():
     """Behind its setpoint along its nose, the drone pitches down to go there, whatever its yaw."""
     p = LQRParams.create(load_airframe("bumblebee"), 500)
     for yaw in (0.0, 1.0, -2.5):
-        nose = jnp.array([np.cos(yaw), np.sin(yaw), 0.0])
-        zero, none = jnp.zeros(3), jnp.zeros(1)
-        sp = Setpoint(nose, zero, zero, zero, zero, jnp.array([yaw]), none, none)
-        quat = jnp.asarray(Rotation.from_euler("z", yaw).as_quat(), jnp.float32)
+        nose = np.float32([np.cos(yaw), np.sin(yaw), 0.0])
+        zero, none = np.zeros(3, np.float32), np.zeros(1, np.float32)
+        sp = Setpoint(nose, zero, zero, zero, zero, np.float32([yaw]), none, none)
+        quat = np.float32(Rotation.from_euler("z", yaw).as_quat())
         wrench = np.asarray(jax.jit(lqr_control)(zero, quat, zero, zero, sp, params=p))
         assert wrench[2] > 1e-3
         np.testing.assert_allclose(wrench[[1, 3]], 0, atol=1e-6)
@@ -269,11 +272,11 @@ def test_load_gain_at_zero_load_and_any_rod_is_that_of_the_drone():
 def test_setpoints_of_the_drone_leave_it_where_they_say():
     """At rest below its setpoint nothing turns; the load hangs, and the thrust carries both."""
     p = LoadLQRParams.create(load_airframe("bumblebee"), 500, 0.1, 0.4)
-    zero, down, none = jnp.zeros(3), jnp.array([0, 0, -1.0]), jnp.zeros(1)
+    zero, down, none = np.zeros(3, np.float32), np.float32([0, 0, -1.0]), np.zeros(1, np.float32)
     sp = Setpoint(zero, zero, zero, zero, zero, none, none, none)
-    state = (zero, jnp.array([0, 0, 0, 1.0]), zero, zero, down, zero)
+    state = (zero, np.float32([0, 0, 0, 1.0]), zero, zero, down, zero)
     control = jax.jit(load_lqr_control, static_argnames="target")
     wrench = control(*state, sp, params=p, target="drone")
     np.testing.assert_allclose(wrench, [0.705 * 9.81, 0, 0, 0], rtol=1e-6)
-    above = (jnp.array([0, 0, 0.4]), *state[1:])
+    above = (np.float32([0, 0, 0.4]), *state[1:])
     np.testing.assert_allclose(control(*above, sp, params=p), [0.705 * 9.81, 0, 0, 0], rtol=1e-6)

@@ -40,8 +40,8 @@ def fly(data, freq, n_steps, integrator, deriv_fn):
 
 
 def flown(data, integrator, deriv_fn=first_principles_derivative):
-    n_steps = jnp.asarray(STEPS)[None, :, None]
-    return fly(data, n_steps / DURATION, n_steps, Integrator(integrator), deriv_fn)
+    n_steps = STEPS[None, :, None]
+    return jax.device_get(fly(data, n_steps / DURATION, n_steps, Integrator(integrator), deriv_fn))
 
 
 def slope(errors):
@@ -52,10 +52,10 @@ def slope(errors):
 
 
 def prepared(data, params=None, **states):
-    new = {k: jnp.broadcast_to(jnp.asarray(v, float), getattr(data.states, k).shape) for k, v in states.items()}
+    new = {k: np.broadcast_to(np.asarray(v, float), getattr(data.states, k).shape) for k, v in states.items()}
     p = data.params
-    params = {k: jnp.asarray(v, float) for k, v in (params or {}).items()}
-    nothing = {"drag_matrix": 0 * p.drag_matrix, "rpm2thrust": 0 * p.rpm2thrust, "rpm2torque": 0 * p.rpm2torque}
+    params = {k: np.asarray(v, float) for k, v in (params or {}).items()}
+    nothing = {k: np.zeros_like(getattr(p, k)) for k in ("drag_matrix", "rpm2thrust", "rpm2torque")}
     return data.replace(states=data.states.replace(**new), params=p.replace(**(nothing | params)))
 
 
@@ -129,16 +129,17 @@ def test_law_08_order_of_rotor_speed(integrator, data, x64):
     """Spin-up with a linear lag a: r(t) = c (1 - exp(-a t))."""
     lag = {"rotor_dyn_coef": [[8.0, 0.0, 8.0, 0.0]]}
     start = prepared(data, lag, pos=[0, 0, 10])
-    start = start.replace(controls=start.controls.replace(rotor_vel=jnp.full((1, 3, 4), 1000.0)))
+    start = start.replace(controls=start.controls.replace(rotor_vel=np.full((1, 3, 4), 1000.0)))
     errors = flown(start, integrator).rotor_vel[0, :, 0] - 1000 * (1 - np.exp(-8 * DURATION))
     assert abs(slope(np.abs(errors)) - integrator.order) < 0.3
 
 
 def test_symplectic_euler_moves_with_the_new_velocities_and_euler_with_the_old(data, x64):
     start = prepared(data, pos=[0, 0, 10], vel=[1, 0, 0], ang_vel=[0, 0, 1])
-    start = start.replace(states=start.states.replace(force=jnp.full((1, 3, 3), 0.0434)))
+    start = start.replace(states=start.states.replace(force=np.full((1, 3, 3), 0.0434)))
     dt, deriv_fn = 1 / 500, first_principles_derivative
-    old, new = INTEGRATORS["euler"](start, deriv_fn).states, INTEGRATORS["symplectic_euler"](start, deriv_fn).states
+    both = jax.jit(lambda data: [INTEGRATORS[name](data, deriv_fn).states for name in ("euler", "symplectic_euler")])
+    old, new = jax.device_get(both(start))
     acc = np.array([1.0, 1.0, 1.0 - 9.81])
     np.testing.assert_allclose(old.pos[0, 0], [dt, 0, 10], rtol=1e-14)
     np.testing.assert_allclose(new.pos[0, 0], np.array([dt, 0, 10]) + dt * dt * acc, rtol=1e-14)
@@ -146,13 +147,16 @@ def test_symplectic_euler_moves_with_the_new_velocities_and_euler_with_the_old(d
 
 
 def test_integrators_leave_everything_but_the_states_alone(data, x64):
-    for integrate in INTEGRATORS.values():
-        after = integrate(data, first_principles_derivative)
-        assert after.controls is data.controls
-        assert after.params is data.params
-        assert after.core is data.core
-        assert after.states.force is data.states.force
-        assert isinstance(after.states, SimState)
+    def check(data):
+        for integrate in INTEGRATORS.values():
+            after = integrate(data, first_principles_derivative)
+            assert after.controls is data.controls
+            assert after.params is data.params
+            assert after.core is data.core
+            assert after.states.force is data.states.force
+            assert isinstance(after.states, SimState)
+
+    jax.eval_shape(check, data)
 
 
 def test_orders_are_those_that_are_promised():

@@ -59,7 +59,8 @@ class Wake(Plugin):
     name: str = "wake"
 
     def record(self, sim):
-        return WakeData(jnp.zeros_like(sim.data.states.pos), self.rate * jnp.ones(1, sim.data.states.pos.dtype))
+        pos = sim.data.states.pos
+        return WakeData(np.zeros(pos.shape, pos.dtype), np.full(1, self.rate, pos.dtype))
 
     def influence(self, data):
         force = data.states.force - self.strength * self.read(data).vel
@@ -76,7 +77,7 @@ class Wake(Plugin):
 @partial(jax.jit, static_argnames="integrator")
 def fly(data, integrator):
     """Return drones that each take another number of steps for the same time, under drag-free first principles."""
-    n_steps = jnp.asarray(STEPS)[None, :, None]
+    n_steps = STEPS[None, :, None]
     integrate = Integration(INTEGRATORS[integrator], first_principles_derivative, (Wake(),))
 
     def step(k, now):
@@ -86,7 +87,7 @@ def fly(data, integrator):
         new = integrate(data.replace(states=states, plugins=plugins, core=core))
         return jax.tree.map(lambda a, b: jnp.where(k < n_steps, a, b), (new.states, new.plugins["wake"].vel), now)
 
-    return jax.lax.fori_loop(0, jnp.max(n_steps), step, (data.states, data.plugins["wake"].vel))
+    return jax.lax.fori_loop(0, n_steps.max(), step, (data.states, data.plugins["wake"].vel))
 
 
 @pytest.mark.parametrize("integrator", list(Integrator))
@@ -95,7 +96,8 @@ def test_law_08_states_of_a_plugin_keep_the_order_of_the_integrator(integrator, 
     sim = Sim(n_drones=3, control="rotor_vel")
     sim.add(Wake())
     p, v0 = sim.data.params, np.array([3.0, -2.0, 5.0])
-    still = p.replace(drag_matrix=0 * p.drag_matrix, rpm2thrust=0 * p.rpm2thrust, rpm2torque=0 * p.rpm2torque)
+    names = ("drag_matrix", "rpm2thrust", "rpm2torque")
+    still = p.replace(**{name: np.zeros_like(getattr(p, name)) for name in names})
     data = with_states(sim.data, pos=[0, 0, 10.0], vel=v0).replace(params=still)
     states, wake_vel = fly(data, integrator)
     system = np.array([[0, 1, 0, 0], [0, 0, -0.8 / float(p.mass[0]), 1], [0, 1, -6.0, 0], [0, 0, 0, 0]])
@@ -124,13 +126,13 @@ def fly_on(sim, n_steps=20):
 
 @pytest.mark.parametrize("integrator", list(Integrator))
 def test_states_of_a_plugin_are_the_same_on_every_engine(integrator):
-    """All engines with the scheme that evaluates a derivative most often; the tests above are of "plain"."""
+    """All engines with one scheme; the interpreter and kernels with all of them; the tests above are of "plain"."""
     sim = hovering(integrator=integrator, control="rotor_vel")
     sim.add(Wake())
     assert "not fused" not in sim.explain()
     expected = Step(sim.step_pipeline, "interpret")(sim.data, jnp.int32(20))
     assert np.abs(expected.plugins["wake"].vel).max() > 1e-4
-    for engine in [*(["plain", "lanes"] if integrator == "rk4" else []), *(["fused"] if native.compiler() else [])]:
+    for engine in [*(["plain", "lanes"] if integrator == "euler" else []), *(["fused"] if native.compiler() else [])]:
         found = Step(sim.step_pipeline, engine)(sim.data, jnp.int32(20))
         # float32 over 20 steps
         np.testing.assert_allclose(found.plugins["wake"].vel, expected.plugins["wake"].vel, rtol=1e-4, atol=2e-6)
@@ -216,7 +218,7 @@ def test_replace_changes_numbers_without_compiling_and_keeps_states():
     fly_on(sim, 60)
     assert sim.step_fn._cache_size() == n
     # after 7 time constants the lagging velocity is the drone's over the rate, which changes by some 10% meanwhile
-    np.testing.assert_allclose(sim.data.plugins["wake"].vel, sim.data.states.vel / 60, rtol=0.3, atol=3e-5)
+    np.testing.assert_allclose(sim.data.plugins["wake"].vel, np.asarray(sim.data.states.vel) / 60, rtol=0.3, atol=3e-5)
 
 
 def test_replace_changes_the_step_where_it_must():
@@ -291,7 +293,7 @@ def test_observations_are_those_of_each_drone():
     found = sim.plugins.observations(sim.data)
     assert set(found) == {"wake.vel", "wake.height", "battery.voltage", "battery.charge"}
     np.testing.assert_array_equal(found["wake.vel"], sim.data.plugins["wake"].vel)
-    np.testing.assert_array_equal(found["wake.height"], sim.data.states.pos[..., 2:])
+    np.testing.assert_array_equal(found["wake.height"], np.asarray(sim.data.states.pos)[..., 2:])
     np.testing.assert_array_equal(found["battery.voltage"], sim.data.plugins["battery"].voltage)
 
 
@@ -346,7 +348,7 @@ def test_law_01_methods_get_one_drone():
     for engine in ("plain", "lanes"):
         sim = Sim(n_worlds=3, n_drones=2, engine=engine)
         sim.add(Probe())
-        sim.step()
+        assert sim.step_fn.plan(sim.data).engine == engine
     sim.plugins.observations(sim.data)
     assert set(shapes) == {((3,), ())}
 
@@ -362,12 +364,12 @@ def test_a_plugin_of_functions():
     def push(data):
         return data.replace(states=data.states.replace(force=data.states.force + jnp.array([0, 0, 1.0])))
 
-    record = WakeData(jnp.zeros((2, 1, 3)), jnp.ones(1))
+    record = WakeData(np.zeros((2, 1, 3), np.float32), np.ones(1, np.float32))
     sim.add(FunctionPlugin("count", record, [Placement(count, before="increment_steps")], push))
     sim.step(3)
     np.testing.assert_array_equal(sim.data.plugins["count"].vel, 3.0)
     # less the drag, which takes 0.57 per s
-    np.testing.assert_allclose(sim.data.states.vel[..., 2], 3 * 0.002 * (1.0 / MASS - 9.81), rtol=2e-3)
+    np.testing.assert_allclose(np.asarray(sim.data.states.vel)[..., 2], 3 * 0.002 * (1.0 / MASS - 9.81), rtol=2e-3)
     sim.reset()
     np.testing.assert_array_equal(sim.data.plugins["count"].vel, 0.0)
 
@@ -400,7 +402,7 @@ def test_law_09_what_cannot_be_added_replaced_or_removed(act, error, words):
     sim = Sim()
     sim.add(Wind((1.0, 0, 0)))
     sim.add(Latency(2))
-    sim.data = sim.data.replace(plugins=sim.data.plugins | {"mine": WakeData(jnp.zeros((1, 1, 3)), jnp.ones(1))})
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {"mine": WakeData(np.zeros((1, 1, 3)), np.ones(1))})
     stages, names = list(sim.step_pipeline), list(sim.plugins)
     with pytest.raises(error, match=words):
         act(sim)

@@ -45,7 +45,7 @@ def drawn_motors(data, default_data, mask=None):
 
 def build(*reset_stages, control="rotor_vel"):
     """Return hovering drones whose parameters were drawn by the stages, and their step."""
-    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control=control, rng_key=5)
+    sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control=control, rng_key=5, engine="interpret")
     sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=hover_rotor_state(sim.data))
     nominal = sim.build_default_data()
     for stage in reset_stages:

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from drawing import draw_coarsely
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -13,6 +14,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_page_runs(page, tmp_path, monkeypatch, opengl):
     monkeypatch.chdir(tmp_path)
+    draw_coarsely(monkeypatch)
     text = page.read_text()
     for package, sign in (("casadi", "import casadi"), ("viser", "from crazysim.media import web")):
         if sign in text:

@@ -246,13 +246,13 @@ def given():
     x[..., 3] = x[..., 1]
     special = rng.choice([np.nan, np.inf, -np.inf, 0.5, -2.0, 0.0], (*shape, 6))
     return Given(
-        x=jnp.asarray(x, jnp.float32),
-        m=jnp.asarray(rng.normal(size=(*shape, 3, 3)), jnp.float32),
-        big=jnp.asarray(rng.normal(size=(*shape, 6, 6)), jnp.float32),
-        i=jnp.asarray(rng.integers(-2, 9, (*shape, 4)), jnp.int32),
-        u=jnp.asarray(rng.integers(0, 2**32, (*shape, 3), dtype=np.uint32)),
-        table=jnp.asarray(rng.normal(size=8), jnp.float32),
-        nan=jnp.asarray(special, jnp.float32),
+        x=np.float32(x),
+        m=np.float32(rng.normal(size=(*shape, 3, 3))),
+        big=np.float32(rng.normal(size=(*shape, 6, 6))),
+        i=rng.integers(-2, 9, (*shape, 4)).astype(np.int32),
+        u=rng.integers(0, 2**32, (*shape, 3), dtype=np.uint32),
+        table=np.float32(rng.normal(size=8)),
+        nan=np.float32(special),
     )
 
 

@@ -1,12 +1,13 @@
 """Reads and writes at known and computed places give on every engine what they give on ``plain``, or are refused."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from fuzz import Case, Fuzzer
 from programs import Program
 
-from crazysim import Sim
+from crazysim import PyTree, Sim, leaf
 from crazysim.core.stage import stage
 from crazysim.engine import Step, native
 from crazysim.errors import EngineWarning
@@ -24,36 +25,44 @@ def fuzzer():
     return Fuzzer(0)
 
 
-def result(sim, fn, engine):
-    """Return what a function of a zero vector gives in a stage of one drone, for every drone."""
+class Written(PyTree):
+    """Results of all functions."""
 
-    @stage("drone")
-    def write(data):
-        return data.replace(states=data.states.replace(vel=fn(jnp.zeros_like(data.states.pos), data.core.steps)))
+    rows: jax.Array = leaf("drone", 2)
+    """A vector for each function. (n_worlds, n_drones, k, 3)"""
 
-    return np.asarray(Step({"write": write}, engine)(sim.data).states.vel)
+
+WRITES = [
+    (lambda x, k: (x + 1).at[:2].apply(lambda v: 2 * v), [2, 2, 1]),
+    (lambda x, k: (x + 1).at[2].apply(lambda v: 2 * v), [1, 1, 2]),
+    (lambda x, k: (x + 1).at[k + 1].apply(lambda v: 3 * v), [1, 3, 1]),
+    (lambda x, k: (x + 1).at[jnp.array([0, 0])].apply(lambda v: 2 * v), [4, 1, 1]),
+    (lambda x, k: x.at[2].set(k + 5.0), [0, 0, 5]),
+    (lambda x, k: x.at[2].add(k + 5.0), [0, 0, 5]),
+    (lambda x, k: x.at[k + 1].set(k + 5.0), [0, 5, 0]),
+    (lambda x, k: x.at[k + 3].set(k + 5.0), [0, 0, 0]),
+    (lambda x, k: x.at[k + 3].set(k + 5.0, mode="clip"), [0, 0, 5]),
+    (lambda x, k: x.at[k - 1].set(k + 5.0), [0, 0, 5]),
+    (lambda x, k: x.at[jnp.array([0, 1])].set(x[:2] + 4 + k), [4, 4, 0]),
+    (lambda x, k: (x + 3).at[jnp.array([0, 0])].min(jnp.array([2.0, 1.0]) + k), [1, 3, 3]),
+]
+"""Functions of a zero vector and the number of the step, which is zero, and their results."""
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize(
-    ("fn", "expected"),
-    [
-        (lambda x, k: (x + 1).at[:2].apply(lambda v: 2 * v), [2, 2, 1]),
-        (lambda x, k: (x + 1).at[2].apply(lambda v: 2 * v), [1, 1, 2]),
-        (lambda x, k: (x + 1).at[k + 1].apply(lambda v: 3 * v), [1, 3, 1]),
-        (lambda x, k: (x + 1).at[jnp.array([0, 0])].apply(lambda v: 2 * v), [4, 1, 1]),
-        (lambda x, k: x.at[2].set(k + 5.0), [0, 0, 5]),
-        (lambda x, k: x.at[2].add(k + 5.0), [0, 0, 5]),
-        (lambda x, k: x.at[k + 1].set(k + 5.0), [0, 5, 0]),
-        (lambda x, k: x.at[k + 3].set(k + 5.0), [0, 0, 0]),
-        (lambda x, k: x.at[k + 3].set(k + 5.0, mode="clip"), [0, 0, 5]),
-        (lambda x, k: x.at[k - 1].set(k + 5.0), [0, 0, 5]),
-        (lambda x, k: x.at[jnp.array([0, 1])].set(x[:2] + 4 + k), [4, 4, 0]),
-        (lambda x, k: (x + 3).at[jnp.array([0, 0])].min(jnp.array([2.0, 1.0]) + k), [1, 3, 3]),
-    ],
-)
-def test_writes_at_places(sim, engine, fn, expected):
-    np.testing.assert_array_equal(result(sim, fn, engine), np.broadcast_to(np.float32(expected), (2, 2, 3)))
+def test_writes_at_places(sim, engine):
+    """All functions are lines of one stage of a drone."""
+
+    @stage("drone")
+    def write(data):
+        rows = [fn(jnp.zeros_like(data.states.pos), data.core.steps) for fn, _ in WRITES]
+        return data.replace(plugins={"written": Written(jnp.stack(rows))})
+
+    expected = np.float32([row for _, row in WRITES])
+    data = sim.data.replace(plugins={"written": Written(np.full((2, 2, *expected.shape), -1, np.float32))})
+    found = np.asarray(Step({"write": write}, engine, strict=True)(data).plugins["written"].rows)
+    for k, row in enumerate(expected):
+        np.testing.assert_array_equal(found[:, :, k], np.broadcast_to(row, (2, 2, 3)), err_msg=f"function {k}")
 
 
 WINDOW = "lax.ScatterDimensionNumbers((1,), (), (0,))"

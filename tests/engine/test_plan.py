@@ -12,7 +12,7 @@ from cases import shared_sim
 from crazysim import ConfigError, Sim
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.core.stage import Stage, stage
-from crazysim.engine import Step, explain, kernel, lanes, native
+from crazysim.engine import Step, explain, kernel, lanes, native, tracing
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.lower import RULES
 from crazysim.errors import EngineWarning
@@ -255,3 +255,32 @@ class Push:
 def test_callable_objects_without_a_hash_are_planned(sim):
     plan = Step(pipeline(sim, Stage(Push(0.01), "drone", name="push")), "lanes", strict=True).plan(sim.data)
     assert "push" in {name for segment in plan.program.segments for name in segment.stages}
+
+
+@stage("drone")
+def lift(data):
+    """Push upwards."""
+    return data.replace(states=data.states.replace(force=data.states.force + jnp.asarray([0.0, 0.0, 1e-3])))
+
+
+def test_stages_of_the_package_are_traced_once_in_a_process(sim, monkeypatch, tmp_path):
+    """Whatever the number of worlds; a user's stage is traced for every simulation, since it may have changed."""
+    traced = []
+
+    class Counted(tracing.TracedStage):
+        def __init__(self, stage, *args):
+            traced.append(stage.__name__)
+            super().__init__(stage, *args)
+
+    monkeypatch.setattr(tracing, "TracedStage", Counted)
+    plans = []
+    for n_worlds in (3, 4):
+        monkeypatch.setenv("CRAZYSIM_DUMP", str(tmp_path / str(n_worlds)))
+        data = shared_sim(n_worlds=n_worlds, n_drones=2, control="rotor_vel").data
+        plans.append(Step(pipeline(sim, lift), "lanes").plan(data))
+    stages = {name for segment in plans[1].program.segments for name in segment.stages}
+    assert {"lift", "integration", "clip_floor_pos"} <= stages
+    assert traced.count("lift") == 2
+    assert traced.count("integration") <= 1
+    dumps = [{path.name.split("-")[-1] for path in (tmp_path / n).glob("*.jaxpr")} for n in ("3", "4")]
+    assert dumps[0] == dumps[1] == {f"{name}.jaxpr" for name in stages}

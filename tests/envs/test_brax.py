@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from env_cases import kind, quick
+from env_cases import kind
 
 from crazysim import ConfigError
 from crazysim.envs import AutoReset, make
@@ -27,14 +27,14 @@ def env(functional):
 
 @pytest.fixture(scope="module")
 def reset(env):
-    return quick(env.reset)
+    return jax.jit(env.reset)
 
 
 @pytest.fixture(scope="module")
 def flown(env, reset):
     """A scan over more than two episodes: the states from the first one on."""
 
-    @quick
+    @jax.jit
     def fly(state):
         def step(state, _):
             state = env.step(state, jnp.full((N_WORLDS, env.action_size), 0.1))
@@ -102,7 +102,7 @@ def test_episodes_end_and_begin_as_brax_wraps_them(flown):
 
 def test_the_step_is_that_of_the_environment(functional, env, reset, flown):
     state = functional.reset(jax.random.key(0))
-    state = quick(functional.step)(state, jnp.full(state.action.shape, 0.1))
+    state = jax.jit(functional.step)(state, jnp.full(state.action.shape, 0.1))
     np.testing.assert_allclose(flown.obs[0], flatten(state.obs).reshape(N_WORLDS, -1), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(flown.reward[0], state.reward.mean(axis=1), rtol=1e-5)
     np.testing.assert_allclose(flown.metrics["error"][0], state.info["error"].mean(axis=1), rtol=1e-5)
@@ -113,7 +113,7 @@ def test_what_wrappers_add_is_kept(env, reset):
     state = reset(jax.random.key(0))
     state.metrics["reward"] = state.reward
     state.info["eval_metrics"] = {"mine": jnp.ones(N_WORLDS)}
-    after = quick(env.step)(state, jnp.zeros((N_WORLDS, env.action_size)))
+    after = jax.jit(env.step)(state, jnp.zeros((N_WORLDS, env.action_size)))
     assert set(after.metrics) == {"error", "reward"}
     np.testing.assert_array_equal(after.info["eval_metrics"]["mine"], np.ones(N_WORLDS))
 

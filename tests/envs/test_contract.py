@@ -1,6 +1,7 @@
 """What every task promises, by the name it is registered under: a new one is tested as soon as it is there."""
 
 import functools
+from typing import NamedTuple
 
 import gymnasium
 import jax
@@ -11,12 +12,10 @@ from cases import LEVELS, trees_equal
 from env_cases import (
     compiled,
     entries,
-    interpreted,
     kind,
     obs_of,
     of_worlds,
     one_step_to_go,
-    quick,
     random_action,
 )
 from gymnasium.vector.utils import batch_space
@@ -25,11 +24,16 @@ from crazysim.dynamics import first_principles
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
 from crazysim.envs.env import select_states
 from crazysim.envs.fused_step import FusedEnvStep
+from crazysim.envs.phases import act, all_worlds, observe
 from crazysim.envs.spawn import flying
+from crazysim.envs.state import EnvState, bare
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import autoreset
+from crazysim.pytree import map_batched
 
-N_WORLDS, N_STEPS = 4, 10_000
+N_WORLDS = 4
+N_FLYING, N_STEPS = 32, 1250
+"""Worlds and environment steps of the random flight: 40,000 steps, and at least two episodes in each world."""
 ENDS = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
 
@@ -38,7 +42,7 @@ ENDS = np.array([True, False, True, False])
 def compiled_select():
     """Compile the choice between a state and that of a new episode, for steps that are not compiled."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(autoreset, "select_states", quick(select_states))
+        patch.setattr(autoreset, "select_states", jax.jit(select_states))
         yield
 
 
@@ -58,22 +62,38 @@ def begun(env):
     return env.reset(jax.random.key(0))
 
 
+class Flight(NamedTuple):
+    """A random flight of many worlds, with new episodes as they end."""
+
+    env: DroneVectorEnv
+    """The environment that flew."""
+    start: tuple
+    """Observations and info of the reset with seed 0."""
+    actions: np.ndarray
+    """Actions, some of them beyond the limits. (N_STEPS, *action_space.shape)"""
+    results: tuple
+    """Results of all steps, stacked: observations, reward, terminated, truncated, info. (N_STEPS, N_FLYING, ...)"""
+    end: EnvState
+    """The last state."""
+
+
+@functools.cache
+def vector(name):
+    """Return what Gymnasium makes of a task."""
+    return gymnasium.make_vec(TASKS[name].id, num_envs=N_FLYING)
+
+
 @functools.cache
 def flight(name):
-    """Return the last state and all results of 10,000 random steps of four worlds, with new episodes as they end."""
-    env = compiled(name, N_WORLDS)
-    auto = AutoReset(EpisodeStatistics(env.env))
-
-    def step(state, key):
-        state = auto.step(state, jax.random.uniform(key, state.action.shape, minval=-1.2, maxval=1.2))
-        return state, (state.obs, state.reward, state.terminated, state.truncated, state.info)
-
-    @quick
-    def fly(key):
-        return jax.lax.scan(step, auto.reset(key), jax.random.split(key, N_STEPS))
-
-    state, results = fly(jax.random.key(1))
-    return state, jax.tree.map(np.asarray, results)
+    """Return a random flight with new episodes as they end. Its steps are one kernel."""
+    vec = DroneVectorEnv(EpisodeStatistics(vector(name).unwrapped.env.env), "SameStep")
+    obs, info = vec.reset(seed=0)
+    actions = np.random.default_rng(1).uniform(-1.2, 1.2, (N_STEPS, *vec.action_space.shape)).astype(np.float32)
+    steps = [vec.step(action) for action in actions]
+    structure = jax.tree.structure(steps[0])
+    columns = zip(*(jax.tree.leaves(step) for step in steps), strict=True)
+    results = structure.unflatten([np.stack([np.asarray(x) for x in column]) for column in columns])
+    return Flight(vec, (obs, info), actions, results, vec.state)
 
 
 @pytest.fixture(scope="module")
@@ -81,8 +101,14 @@ def flown(name):
     return flight(name)
 
 
-def test_shapes_and_types_are_those_of_the_spaces(env, begun):
-    spaces = DroneVectorEnv(env.env)
+def first_worlds(state, n=N_WORLDS):
+    """Return the state of the first worlds, on the host."""
+    state = map_batched(lambda x: np.asarray(x)[:n], state)
+    return state.replace(data=state.data.replace(core=state.data.core.replace(n_worlds=n)))
+
+
+def test_shapes_and_types_are_those_of_the_spaces(name, env, begun):
+    spaces = vector(name)
     single = env.sim.n_drones == 1
     for state in (begun, env.step(begun, random_action(begun))):
         assert set(state.obs) == set(spaces.single_observation_space.spaces)
@@ -136,43 +162,42 @@ def test_the_same_seed_gives_the_same_numbers(env, begun):
     assert trees_equal(of_worlds(some_anew, ~ENDS), of_worlds(begun, ~ENDS))
 
 
-def test_gymnasium_makes_it_and_the_number_of_worlds_changes_nothing(name, env, begun):
-    """Law 10 again, through Gymnasium's front door."""
-    vec = gymnasium.make_vec(TASKS[name].id, num_envs=2)
-    obs, info = vec.reset(seed=0)
+def test_gymnasium_makes_it(name):
+    vec = vector(name)
     assert isinstance(vec.unwrapped, DroneVectorEnv)
-    assert (vec.spec.id, vec.num_envs) == (TASKS[name].id, 2)
+    assert (vec.spec.id, vec.num_envs) == (TASKS[name].id, N_FLYING)
     assert vec.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
-    assert vec.observation_space == batch_space(vec.single_observation_space, 2)
-    assert vec.action_space == batch_space(vec.single_action_space, 2)
-    state, worlds = begun, np.arange(2)
-    vec.action_space.seed(3)
-    for _ in range(4):
-        assert {k: np.asarray(x) for k, x in obs.items()} in vec.observation_space
+    assert vec.observation_space == batch_space(vec.single_observation_space, N_FLYING)
+    assert vec.action_space == batch_space(vec.single_action_space, N_FLYING)
+
+
+def test_the_number_of_worlds_changes_nothing(env, begun, flown):
+    """Law 10 again: the first of many worlds fly as a few do."""
+    (obs, info), state = flown.start, begun
+    for step in range(4):
+        assert {k: np.asarray(x) for k, x in obs.items()} in flown.env.observation_space
         for which, x in state.obs.items():
-            x = np.asarray(x)[worlds].reshape(obs[which].shape)
-            np.testing.assert_allclose(obs[which], x, rtol=1e-4, atol=1e-5)
-        error = np.asarray(state.info["error"])[worlds]
-        np.testing.assert_allclose(info["error"].ravel(), error.ravel(), rtol=1e-4, atol=1e-5)
-        action = vec.action_space.sample()
-        obs, reward, terminated, truncated, info = vec.step(action)
-        assert (reward.shape, reward.dtype, terminated.dtype, truncated.dtype) == ((2,), np.float32, bool, bool)
-        state = env.step(state, np.concatenate([action, action]).reshape(state.action.shape))
+            found = np.asarray(obs[which])[:N_WORLDS]
+            np.testing.assert_allclose(found, np.reshape(x, found.shape), rtol=1e-4, atol=1e-5)
+        error = np.asarray(info["error"])[:N_WORLDS]
+        np.testing.assert_allclose(error.ravel(), np.ravel(state.info["error"]), rtol=1e-4, atol=1e-5)
+        obs, reward, terminated, truncated, info = jax.tree.map(lambda x: x[step], flown.results)  # noqa: B023
+        assert (reward.shape, reward.dtype) == ((N_FLYING,), np.float32)
+        assert terminated.dtype == truncated.dtype == bool
+        state = env.step(state, flown.actions[step][:N_WORLDS].reshape(state.action.shape))
         if state.done.any():  # there the two part: the vector environment begins a new episode
             break
-        np.testing.assert_allclose(reward, np.asarray(state.reward)[worlds].mean(axis=1), rtol=1e-3, atol=1e-4)
-    vec.close()
+        np.testing.assert_allclose(reward[:N_WORLDS], np.asarray(state.reward).mean(axis=1), rtol=1e-3, atol=1e-4)
 
 
-def test_random_steps_are_finite_and_within_the_spaces(env, flown):
-    _, (obs, reward, _, _, info) = flown
-    space = DroneVectorEnv(env.env).single_observation_space
+def test_random_steps_are_finite_and_within_the_spaces(flown):
+    obs, reward, _, _, info = flown.results
+    space = flown.env.single_observation_space
     for which, x in obs.items():
-        assert x.shape[0] == N_STEPS
+        assert x.shape[:2] == (N_STEPS, N_FLYING)
         assert np.isfinite(x).all(), which
         assert np.isfinite(info["final_obs"][which]).all(), which
         low, high = space[which].low, space[which].high
-        x = x.reshape(N_STEPS, N_WORLDS, *low.shape)
         assert (x >= low).all(), which
         assert (x <= high).all(), which
     assert np.isfinite(reward).all()
@@ -182,34 +207,45 @@ def test_random_steps_are_finite_and_within_the_spaces(env, flown):
 
 def test_episodes_end_in_time_and_are_counted(env, flown):
     """Law 4: the time is over after ``max_steps`` steps, and never else."""
-    _, (_, reward, terminated, truncated, info) = flown
+    _, reward, terminated, truncated, info = flown.results
     done = terminated | truncated
-    assert done.any(axis=0).all(), "10,000 random steps end an episode in every world"
-    for world in range(N_WORLDS):
+    assert done.any(axis=0).all(), "1,250 random steps end an episode in every world"
+    returns = info["episode_return"].reshape(N_STEPS, N_FLYING, -1).mean(axis=-1)
+    for world in range(N_FLYING):
         ends = np.flatnonzero(done[:, world])
         lengths = np.diff(ends, prepend=-1)
         assert lengths.max() <= env.max_steps
         np.testing.assert_array_equal(truncated[ends, world], lengths == env.max_steps)
         np.testing.assert_array_equal(info["episode_length"][ends, world], lengths)
         assert not info["episode_length"][~done[:, world], world].any()
-        sums = np.add.reduceat(reward[: ends[-1] + 1, world], np.concatenate([[0], ends[:-1] + 1]), axis=0)
-        np.testing.assert_allclose(info["episode_return"][ends, world], sums, rtol=1e-3, atol=1e-3)
+        sums = np.add.reduceat(reward[: ends[-1] + 1, world], np.concatenate([[0], ends[:-1] + 1]))
+        np.testing.assert_allclose(returns[ends, world], sums, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", entries(classes_once=True), indirect=True)
-def test_one_program_is_the_whole_step(env, begun):
-    """Actions, physics, task and new episodes, lowered for one world and interpreted, equal the unfused step."""
-    auto = AutoReset(env, "SameStep")
-    with interpreted():
-        fused = FusedEnvStep(env.env, auto.policy, begun, begun.action)
-    before, action = one_step_to_go(env, begun, ENDS), random_action(begun)
-    found, expected = quick(fused)(before, jnp.asarray(action)), auto.step(before, action)
-    assert kind(found)[0] == kind(expected)[0]
-    pairs = zip(jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(expected), strict=True)
-    for (path, x), y in pairs:
-        assert (x.shape, x.dtype) == (y.shape, y.dtype), path
+def test_one_program_is_the_whole_step(env, begun, flown):
+    """Actions, physics, task and new episodes as one kernel equal the unfused step, where random flight leads."""
+    vec, auto = flown.env, AutoReset(env, "SameStep")
+    before = one_step_to_go(env, flown.end, np.resize(ENDS, N_FLYING))
+    packed = vec.env.fused_step(bare(before).replace(obs={}), before.action, packed=True)
+    assert isinstance(packed, FusedEnvStep), packed
+    vec._stepper.state = before
+    obs, reward, terminated, truncated, info = vec.step(flown.actions[0])
+    end = first_worlds(vec.state.replace(info={}))
+    found = {"data": end.data, "action": end.action}
+    info = {name: info[name] for name in begun.info} | {"final_obs": info["final_obs"]}
+    outputs = {"obs": obs, "reward": reward, "terminated": terminated, "truncated": truncated, "info": info}
+    found |= jax.tree.map(lambda x: np.asarray(x)[:N_WORLDS], outputs)
+
+    before = first_worlds(before.replace(info={}, memory={})).replace(info=begun.info)
+    after = auto.step(before, flown.actions[0][:N_WORLDS].reshape(begun.action.shape))
+    np.testing.assert_array_equal(after.done, ENDS | np.asarray(after.terminated))
+    expected = {name: getattr(after, name) for name in found} | {"reward": np.asarray(after.reward).mean(axis=1)}
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for (path, x), y in zip(jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(expected), strict=True):
+        where = jax.tree_util.keystr(path)
+        assert x.dtype == y.dtype, where
         if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
-            np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4, err_msg=jax.tree_util.keystr(path))
+            np.testing.assert_allclose(x, np.reshape(y, x.shape), rtol=1e-4, atol=1e-4, err_msg=where)
 
 
 def test_next_step_begins_with_the_step_after_the_last(env, begun):
@@ -283,24 +319,27 @@ def test_a_world_that_is_lost_ends_alone(env, begun):
 
 
 @pytest.mark.parametrize("name", entries(classes_once=True), indirect=True)
-def test_the_gradient_of_the_reward_is_finite(name, begun, flown):
+def test_the_gradient_of_the_reward_is_finite(env, begun, flown):
     """Law 7, for actions and states, at the beginning of an episode and where random flight leads.
 
-    One physics step and little optimisation: what is differentiated here is the task; the engine has tests of its own.
+    One physics step, stage by stage: what is differentiated here is the task; the engine has tests of its own.
     """
-    env = make(name, N_WORLDS, freq=500, engine="plain")
 
-    @quick
+    @jax.jit
     @jax.grad
     def slope(wrt, state):
         action, states = wrt
-        return env.step(state.replace(data=state.data.replace(states=states)), action).reward.sum()
+        state, action = act(env.env, state.replace(data=state.data.replace(states=states)), action, all_worlds)
+        data = state.data
+        for stage in env.env.stages:
+            data = stage(data)
+        return observe(env.env, state.replace(data=data), action, all_worlds).reward.sum()
 
-    end = flown[0].replace(memory={}, info=begun.info)
+    end = first_worlds(flown.end.replace(info={}, memory={})).replace(info=begun.info)
     for state in (begun, end):
-        grads = slope((jnp.full(state.action.shape, 0.1), state.data.states), state)
+        grads = slope((np.full(state.action.shape, 0.1, np.float32), state.data.states), state)
         assert all(np.isfinite(g).all() for g in jax.tree.leaves(grads))
-        assert any(g.any() for g in jax.tree.leaves(grads))
+        assert any(np.any(g) for g in jax.tree.leaves(grads))
 
 
 class AtRest(Hover):
@@ -320,7 +359,7 @@ def at_rest(control):
 def test_a_zero_action_hovers(control):
     env = at_rest(control)
 
-    @quick
+    @jax.jit
     def fly(key):
         state = env.reset(key)
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import trees_equal
-from env_cases import compiled, of_worlds, one_step_to_go, quick, random_action
+from env_cases import compiled, of_worlds, one_step_to_go, random_action
 
 from crazysim import ConfigError
 from crazysim.core.stage import over_worlds
@@ -245,7 +245,7 @@ def test_given_statistics_stay(env):
 def test_noise_is_as_large_as_said_and_reproducible(env):
     std = {"pos": 0.1, "vel": 0.01}
     wrapped = ObservationNoise(env, std)
-    noisy, plain = quick(over_worlds(wrapped._noisy)), env.reset(jax.random.key(0))
+    noisy, plain = jax.jit(over_worlds(wrapped._noisy)), env.reset(jax.random.key(0))
     seen = {name: [] for name in plain.obs}
     for state in (plain, *steps(env, plain, 60)):
         obs = noisy(state.obs, state.data)
@@ -330,7 +330,7 @@ def randomized(env):
 
 @pytest.fixture(scope="module")
 def heavy(randomized):
-    return quick(randomized.reset)(jax.random.key(0))
+    return jax.jit(randomized.reset)(jax.random.key(0))
 
 
 def test_randomised_parameters_are_one_per_drone(env, heavy):
@@ -344,7 +344,7 @@ def test_randomised_parameters_are_one_per_drone(env, heavy):
 
 def test_a_heavy_drone_sinks_under_the_action_that_hovers(env, randomized, heavy):
     """Its acceleration is that of the weight which the thrust of the nominal drone leaves."""
-    step = quick(randomized.step)
+    step = jax.jit(randomized.step)
     level = heavy.data.states.quat.at[:].set(jnp.array([0.0, 0, 0, 1]))
     still = jnp.zeros_like(heavy.data.states.vel)
     hover = jnp.broadcast_to(hover_rotors(env.sim.data.params), heavy.data.states.rotor_vel.shape)
@@ -355,7 +355,7 @@ def test_a_heavy_drone_sinks_under_the_action_that_hovers(env, randomized, heavy
 
 
 def test_only_worlds_that_begin_anew_are_randomised_anew(randomized, heavy):
-    new = quick(randomized.restart)(heavy, jnp.asarray(FIRST))
+    new = jax.jit(randomized.restart)(heavy, jnp.asarray(FIRST))
     assert new.data.params.mass[0] != heavy.data.params.mass[0]
     assert trees_equal(of_worlds(new, ~FIRST), of_worlds(heavy, ~FIRST))
 
@@ -372,7 +372,7 @@ def test_observations_and_errors_are_those_of_what_was_drawn(env):
     def lifted(data, key):
         return data.replace(states=data.states.replace(pos=data.states.pos + jnp.array([0.0, 0.0, 0.5])))
 
-    state = quick(Randomize(env.env, lifted).reset)(jax.random.key(0))
+    state = jax.jit(Randomize(env.env, lifted).reset)(jax.random.key(0))
     np.testing.assert_array_equal(state.obs["pos"], state.data.states.pos)
     distance = np.linalg.norm(state.obs["difference_to_goal"], axis=-1)
     np.testing.assert_allclose(state.info["error"], distance, rtol=1e-5)

@@ -43,7 +43,7 @@ def run(step, data, n_steps):
 @pytest.mark.parametrize("dynamics", FITTED)
 def test_fault_01_attitude_freq_holds_for_fitted_dynamics(dynamics):
     """At 50 Hz in 500 a command is taken over every tenth step; the peer took it at once."""
-    sim = Sim(dynamics=dynamics, attitude_freq=50)
+    sim = Sim(dynamics=dynamics, attitude_freq=50, engine="interpret")
     hover = hover_thrust(sim.data)
     first, second = np.array([[[0.1, 0, 0, hover]]]), np.array([[[-0.2, 0, 0.3, hover]]])
     sim.data = with_states(sim.data, pos=[0, 0, 1.0])

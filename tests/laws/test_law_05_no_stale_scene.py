@@ -71,14 +71,16 @@ def add_ball(sim):
 
 def at_height(data, *heights):
     """Return the data with every world's drones at a height of its own."""
-    pos = data.states.pos.at[..., 2].set(jnp.asarray(heights)[:, None])
+    pos = np.array(data.states.pos)
+    pos[..., 2] = np.reshape(heights, (-1, 1))
     return data.replace(states=data.states.replace(pos=pos))
 
 
 def ball_at(sim, *heights):
     """Return the scene with the ball at another height in every world."""
     ids = sim.mj_model.body("ball").mocapid.item()
-    mocap_pos = sim.mjx_data.mocap_pos.at[:, ids].set(jnp.asarray([[0, 0, z] for z in heights]))
+    mocap_pos = np.array(sim.mjx_data.mocap_pos)
+    mocap_pos[:, ids] = [[0, 0, z] for z in heights]
     return sim.mjx_data.replace(mocap_pos=mocap_pos)
 
 

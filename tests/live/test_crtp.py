@@ -29,12 +29,12 @@ def swarm():
 
 
 @pytest.fixture
-def running(swarm):
-    """Return the swarm on the floor, advanced by a thread at three times real time."""
+def running(swarm, request):
+    """Return the swarm on the floor, advanced by a thread at a multiple of real time."""
     swarm.sim.reset()
     swarm.advance(0.02)
     swarm.reports.latest.clear()
-    with swarm.start(speed=3.0):
+    with swarm.start(speed=getattr(request, "param", 8.0)):
         yield swarm
 
 
@@ -44,26 +44,21 @@ def uri(running):
     remove_cflib_driver(running)
 
 
-def rest(seconds):
-    """Let simulated time pass, s."""
-    time.sleep(seconds / 3.0)
-
-
 def test_the_high_level_commander(running, uri):
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
     with SyncCrazyflie(uri) as scf:
         commander = scf.cf.high_level_commander
         commander.takeoff(0.8, 1.5)
-        rest(2.5)
+        running.sleep(2.5)
         assert running.state(0).pos[2] == pytest.approx(0.8, abs=OFFSET)
         commander.go_to(0.4, 0.0, 0.0, np.pi / 2, 1.5, relative=True)
-        rest(2.5)
+        running.sleep(2.5)
         np.testing.assert_allclose(running.state(0).pos[:2], [-0.1, -0.5], atol=0.05)
         assert running.state(0).rpy[2] == pytest.approx(np.pi / 2, abs=0.05)
         assert scf.cf.supervisor.hl_traj_finished
         commander.land(0.0, 1.5)
-        rest(2.5)
+        running.sleep(2.5)
         assert running.state(0).pos[2] < 0.02
         assert not scf.cf.supervisor.is_flying
 
@@ -135,14 +130,15 @@ def test_uploaded_trajectories(running, uri, compressed):
         commander = scf.cf.high_level_commander
         commander.define_trajectory(1, 0x40, 1, type=int(compressed))
         commander.takeoff(0.6, 1.5)
-        rest(2.0)
+        running.sleep(2.0)
         commander.start_trajectory(1, 1.0, relative_position=True)
-        rest(2.5)
+        running.sleep(2.5)
         np.testing.assert_allclose(running.state(0).pos[:2], [0.1, -0.5], atol=0.05)
         commander.stop()
     assert not running.reports.latest
 
 
+@pytest.mark.parametrize("running", [4.0], indirect=True)  # a stream must not be late
 def test_motion_commander_and_streamed_setpoints(running, uri):
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
@@ -150,19 +146,19 @@ def test_motion_commander_and_streamed_setpoints(running, uri):
         commander = scf.cf.commander
         for _ in range(20):
             commander.send_position_setpoint(-0.5, -0.5, 0.7, 0.0)
-            rest(0.1)
+            running.sleep(0.1)
         assert running.state(0).pos[2] == pytest.approx(0.7, abs=OFFSET)
         for _ in range(10):
             commander.send_hover_setpoint(0.3, 0.0, 0.0, 0.7)
-            rest(0.1)
+            running.sleep(0.1)
         assert running.state(0).pos[0] > -0.45
         yaw = running.state(0).rpy[2]
         for _ in range(10):
             commander.send_velocity_world_setpoint(0.0, 0.0, 0.0, 45.0)
-            rest(0.1)
+            running.sleep(0.1)
         assert running.state(0).rpy[2] > yaw + 0.2  # positive turns to the left
         commander.send_stop_setpoint()
-        rest(0.5)
+        running.sleep(0.5)
         assert not running["cf1"].motors_on
 
 
@@ -178,12 +174,12 @@ def test_udp_needs_no_change_but_the_uri(running):
             assert all(address.startswith("udp://127.0.0.1:") for address in server.uris)
             with CfSwarm(set(server.uris), factory=CachedCfFactory(rw_cache=None)) as drones:
                 drones.parallel_safe(lambda scf: scf.cf.high_level_commander.takeoff(0.6, 1.5))
-                rest(2.5)
+                running.sleep(2.5)
                 positions = drones.get_estimated_positions()
                 for k, address in enumerate(server.uris):
                     np.testing.assert_allclose(positions[address], running.state(k).pos, atol=0.1)
                     assert running.state(k).pos[2] > 0.4
-            rest(2.0)
+            running.sleep(2.0)
             assert running.state(0).pos[2] < 0.1  # cflib stops the motors when it disconnects
     finally:
         cflib.crtp.CLASSES.clear()

@@ -30,9 +30,10 @@ WATCHED = textwrap.dedent("""
     from crazysim.live import Live, Window
 
     sim = Sim(n_worlds=2, n_drones=1, control="state")
+    sim.spec.visual.quality.shadowsize = sim.spec.visual.quality.offsamples = 0  # drawn sooner without a GPU
     pos = np.array([[[0.0, 0.0, 1.0]], [[0.3, 0.0, 1.0]]])
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
-    live = Live(sim)
+    live = Live(sim, fps=10)
     live.selected = None
     live.paused = True
     camera = {"lookat": [0, 0, 1], "distance": 2.0, "azimuth": 90, "elevation": -90}

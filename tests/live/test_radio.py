@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:cflib", "ign
 def swarm_of(control, **settings):
     sim = Sim(control=control, drone="cf21B_500", **settings)
     states = sim.data.states
-    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0)))
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos + np.array([0.0, 0.0, 1.0])))
     return Swarm(sim, ["cf1"])
 
 
@@ -179,7 +179,7 @@ def test_trained_policies_get_their_observations():
 
 def test_observations_over_a_link_equal_those_of_the_task():
     env = make("hover", 1)
-    step = env.reset(jax.random.key(3))
+    step = jax.jit(env.reset)(jax.random.key(3))
     states, seen = step.data.states, {}
     values = [np.asarray(x[0, 0], float) for x in (states.pos, states.quat, states.vel, states.ang_vel)]
     goal = values[0] + np.asarray(step.obs["difference_to_goal"])[0, 0]

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import broadcast_like, with_states
+from cases import broadcast_like, with_params, with_states
 from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, ContactLog, ContactResponse, Hook, SharedLoad, Sim, SlungLoad
@@ -19,22 +19,27 @@ def flying(n_worlds=1, n_drones=1, height=3.0, **kwargs):
     """Return drones at a height, without drag and with motors off."""
     options = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused"} | kwargs
     sim = Sim(n_worlds, n_drones, **options)
-    params = sim.data.params
-    sim.data = sim.data.replace(params=params.replace(drag_matrix=0 * params.drag_matrix))
+    sim.data = with_params(sim.data, drag_matrix=0 * np.asarray(sim.data.params.drag_matrix))
     sim.data = with_states(sim.data, pos=np.asarray(sim.data.states.pos) + [0, 0, height])
     return sim
 
 
 def weightless(sim):
-    params = sim.data.params
-    sim.data = sim.data.replace(params=params.replace(gravity_vec=0 * params.gravity_vec))
+    sim.data = with_params(sim.data, gravity_vec=0 * np.asarray(sim.data.params.gravity_vec))
     return sim
+
+
+@pytest.fixture
+def float64():
+    """Run a test in float64 in all threads: the interpreter is called from one of XLA's."""
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", False)
 
 
 def heavy(sim):
     """Make the drones so heavy that loads do not move them, and hold them up."""
-    params = sim.data.params
-    sim.data = sim.data.replace(params=params.replace(mass=jnp.full(1, 1e9)))
+    sim.data = with_params(sim.data, mass=np.full(1, 1e9, np.float32))
     sim.data = with_states(sim.data, force=np.array([0, 0, 9.81e9]))
 
 
@@ -51,7 +56,7 @@ def leave_out_drones(sim):
 
 def of_load(load, sim):
     record = load.read(sim.data)
-    return np.asarray(record.pos[..., 0, :]), np.asarray(record.vel[..., 0, :])
+    return np.asarray(record.pos)[..., 0, :], np.asarray(record.vel)[..., 0, :]
 
 
 OBSTACLES = {
@@ -75,7 +80,7 @@ def test_a_swing_ends_at_an_obstacle_with_the_restitution():
     response = sim.add(ContactResponse(friction=0.0))
     leave_out_drones(sim)
     restitution = np.tile([0.0, 0.5, 0.8], 3)
-    record = response.read(sim.data).replace(restitution=jnp.asarray(restitution, jnp.float32)[:, None, None])
+    record = response.read(sim.data).replace(restitution=restitution[:, None, None].astype(np.float32))
     angle = 0.5
     sim.data = response.write(sim.data, record)
     sim.data = with_load(load, sim.data, pos=[-LENGTH * np.sin(angle), 0, 3 - LENGTH * np.cos(angle)])
@@ -150,13 +155,13 @@ def energy(load, data, mass):
 
 
 @pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
-def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, x64, rng):
+def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, float64, rng):
     """Loose loads against two drones, from all sides: of the contact stage alone, momentum exactly, energy no more."""
     n = 60
-    sim = weightless(flying(n, 2, engine="plain"))
+    sim = weightless(flying(n, 2))
     load = sim.add(SlungLoad(mass=0.2, size=size))
     sim.add(ContactResponse(restitution=0.7, friction=0.5))
-    step = Step({"hit": sim.step_pipeline["contact_response_of_load_and_drones"]}, "plain")
+    step = Step({"hit": sim.step_pipeline["contact_response_of_load_and_drones"]}, "interpret")
     quat = rng.normal(size=(n, 2, 4))
     data = with_states(
         load.release(sim.data), vel=rng.normal(size=(n, 2, 3)), ang_vel=3 * rng.normal(size=(n, 2, 3)),
@@ -164,7 +169,7 @@ def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, x64, rng):
     )  # fmt: skip
     at = np.asarray(data.states.pos) + rng.uniform(-0.12, 0.12, (n, 2, 3))
     before = with_load(load, data, pos=at, vel=2 * rng.normal(size=(n, 2, 3)))
-    after = step(before, jnp.int32(1))
+    after = step(before, np.int32(1))
     for old, new in zip(momentum(load, before, 0.2), momentum(load, after, 0.2), strict=True):
         np.testing.assert_allclose(new, old, atol=1e-12)
     assert (energy(load, after, 0.2) < energy(load, before, 0.2) + 0.5 * (0.2 + 0.605) * 0.25**2).all()
@@ -172,50 +177,50 @@ def test_law_08_a_load_that_hits_a_drone_keeps_momentum(size, x64, rng):
     assert hits.sum() > 20
 
 
-def test_a_load_hits_a_drone_head_on(x64):
+def test_a_load_hits_a_drone_head_on(float64):
     """From below along the centre line: the speeds of two bodies with restitution, by hand."""
-    sim = weightless(flying(n_drones=2, engine="lanes"))  # kernels have no loops in int64
+    sim = weightless(flying(n_drones=2, engine="interpret"))
     load = sim.add(SlungLoad(mass=0.2, size=RADIUS))
     sim.add(ContactResponse(restitution=0.5, friction=0.0))
     leave_out_drones(sim)
     below = np.asarray(sim.data.states.pos)[:, ::-1] + [0, 0, -0.2]  # each below the other's drone
     sim.data = with_load(load, load.release(sim.data), pos=below, vel=[0, 0, 2.0])
-    sim.step(100)
+    sim.step(50)
     mass = float(sim.data.params.mass[0])
     drone = 2.0 * 0.2 * 1.5 / (mass + 0.2)
-    np.testing.assert_allclose(sim.data.states.vel[0, :, 2], drone, rtol=1e-6)
-    np.testing.assert_allclose(load.read(sim.data).vel[0, :, 2], drone - 1.0, rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(sim.data.states.vel)[0, :, 2], drone, rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(load.read(sim.data).vel)[0, :, 2], drone - 1.0, rtol=1e-6)
 
 
-def test_two_loads_head_on(x64):
+def test_two_loads_head_on(float64):
     """Of different mass, loose, along the line between them: the speeds of two bodies with restitution, by hand."""
-    sim = weightless(flying(n_drones=2, engine="lanes"))
+    sim = weightless(flying(n_drones=2, engine="interpret"))
     load = sim.add(SlungLoad(mass=[[0.1, 0.3]], size=RADIUS))
     sim.add(ContactResponse(restitution=0.5, friction=0.0))
     leave_out_drones(sim)
-    at = [[[0, 0, 1.0], [0.2, 0, 1.0]]]
+    at = [[[0, 0, 1.0], [0.1, 0, 1.0]]]
     sim.data = with_load(load, load.release(sim.data), pos=at, vel=[[[2.0, 0, 0], [0, 0, 0]]])
-    sim.step(150)
+    sim.step(25)
     after = 2.0 * 0.1 * 1.5 / 0.4
-    np.testing.assert_allclose(load.read(sim.data).vel[0], [[after - 1.0, 0, 0], [after, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(np.asarray(load.read(sim.data).vel)[0], [[after - 1.0, 0, 0], [after, 0, 0]], atol=1e-9)
 
 
 @pytest.mark.parametrize("size", [RADIUS, (0.06, 0.08, 0.05)])
-def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(size, x64, rng):
+def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(size, float64, rng):
     """Three loose loads and three empty hooks in a heap: of the contact stage alone; energy is not gained."""
     n = 60
-    sim = weightless(flying(n, 3, engine="plain"))
+    sim = weightless(flying(n, 3))
     each = np.broadcast_to([0.1, 0.2, 0.3], (n, 3))
     hook = sim.add(Hook(mass=each, hook_mass=0.05, size=size, ring=0.1, load_at=[0, 0, 1.0]))
     sim.add(ContactResponse(restitution=0.7, friction=0.5))
-    step = Step({"hit": sim.step_pipeline["contact_response_between_load"]}, "plain")
+    step = Step({"hit": sim.step_pipeline["contact_response_between_load"]}, "interpret")
     mass = np.array([0.1, 0.2, 0.3, 0.05, 0.05, 0.05])[:, None]
     state = {name: rng.normal(size=(n, 3, 3)) for name in ("vel", "tip_vel")}
     heap = np.array([0, 0, 3.0])
     pos = heap + rng.uniform(-0.08, 0.08, (n, 3, 3))
     tip = heap + rng.uniform(-0.08, 0.08, (n, 3, 3))
     data = with_load(hook, sim.data, pos=pos + [0, 0, 0.1], tip_pos=tip, **state)
-    records = (hook.read(x) for x in (data, step(data, jnp.int32(1))))
+    records = (hook.read(x) for x in (data, step(data, np.int32(1))))
     old, new = (np.concatenate([x.vel, x.tip_vel], axis=1) for x in records)
     np.testing.assert_allclose((mass * new).sum(1), (mass * old).sum(1), atol=1e-12)
     assert (np.sum(mass * new**2, axis=(1, 2)) < np.sum(mass * old**2, axis=(1, 2)) + mass.sum() * 0.25**2).all()
@@ -226,21 +231,21 @@ def test_law_08_loads_and_hooks_that_hit_each_other_keep_momentum(size, x64, rng
 
 def test_an_empty_hook_stops_at_an_obstacle_and_pushes_a_load():
     """It swings into a box 1 cm before it, and in the other world into a load of its own mass, both at its height."""
-    sim = weightless(flying(2, strict=True))
-    sim.data = sim.data.replace(params=sim.data.params.replace(mass=jnp.full(1, 1e9)))
+    sim = weightless(flying(2, strict=True, engine="interpret"))
+    sim.data = with_params(sim.data, mass=np.full(1, 1e9, np.float32))
     hook = sim.add(Hook(mass=0.1, hook_mass=0.1, damping=0.0, size=RADIUS, ring=0.01, load_at=[0, 0, 1.0]))
     box = sim.scene.add("box", pos=[5, 0, 0], size=(0.1, 1.0, 1.0))
     sim.add(ContactResponse(restitution=0.5, friction=0.0))
+    leave_out_drones(sim)
     tip = np.asarray(sim.data.states.pos) - [0, 0, 0.4]
     sim.data = box.set_pose(sim.data, [[tip[0, 0] + [0.0245 + 0.05 + 0.01, 0, 0]], [[9, 9, 9]]])
     sim.data = with_load(hook, sim.data, tip_pos=tip, tip_vel=[1.0, 0, 0], reach=0.001)
-    record = hook.read(sim.data)
-    pos = jnp.asarray(tip).at[0].set(5.0).at[1].add(jnp.array([0.0245 + RADIUS + 0.01, 0, 0.021 + 0.01]))
-    sim.data = hook.write(sim.data, record.replace(pos=pos.astype(record.pos.dtype)))
+    pos = np.stack([np.full((1, 3), 5.0), tip[1] + [0.0245 + RADIUS + 0.01, 0, 0.021 + 0.01]])
+    sim.data = with_load(hook, sim.data, pos=pos)
     sim.step(10)
     record = hook.read(sim.data)
-    np.testing.assert_allclose(record.tip_vel[:, 0, 0], [-0.5, 0.25], atol=0.01)
-    np.testing.assert_allclose(record.vel[:, 0, 0], [0.0, 0.75], atol=0.01)
+    np.testing.assert_allclose(np.asarray(record.tip_vel)[:, 0, 0], [-0.5, 0.25], atol=0.01)
+    np.testing.assert_allclose(np.asarray(record.vel)[:, 0, 0], [0.0, 0.75], atol=0.01)
     assert "not fused" not in sim.explain()
 
 
@@ -251,7 +256,9 @@ def test_a_report_has_empty_hooks():
     sim.data = with_load(hook, sim.data, tip_pos=tip)
     report = sim.contact_report(floor=False, drones=False)
     assert report.object_names == ("load:0", "load:1", "load_hook:0", "load_hook:1")
-    np.testing.assert_array_equal(report.objects[0], [[False, False, False, True], [False, False, True, False]])
+    np.testing.assert_array_equal(
+        np.asarray(report.objects)[0], [[False, False, False, True], [False, False, True, False]]
+    )
 
 
 def test_a_wall_that_stops_a_load_holds_back_the_drone():
@@ -264,8 +271,9 @@ def test_a_wall_that_stops_a_load_holds_back_the_drone():
     start = np.asarray(sim.data.states.pos)
     sim.data = with_load(load, with_states(sim.data, vel=[0.5, 0, 0]), pos=start + [LENGTH, 0, 0], vel=[0.5, 0, 0])
     sim.step(100)
-    assert np.abs(sim.data.states.vel[0, 0, 0]) < 0.27  # an overlap is pushed out at 0.25 m/s at most
-    assert float(sim.data.states.pos[0, 0, 0] - start[0, 0, 0]) < 0.015
+    pos, vel = np.asarray(sim.data.states.pos), np.asarray(sim.data.states.vel)
+    assert np.abs(vel[0, 0, 0]) < 0.27  # an overlap is pushed out at 0.25 m/s at most
+    assert pos[0, 0, 0] - start[0, 0, 0] < 0.015
 
 
 def test_shared_loads_and_hooks_collide():
@@ -277,19 +285,17 @@ def test_shared_loads_and_hooks_collide():
     leave_out_drones(sim)
     sim.data = with_load(load, load.release(sim.data), vel=[1.0, 0, 0])
     sim.step(80)
-    np.testing.assert_allclose(load.read(sim.data).vel[0, 0], [-0.5, 0, 0], atol=0.01)
+    np.testing.assert_allclose(np.asarray(load.read(sim.data).vel)[0, 0], [-0.5, 0, 0], atol=0.01)
 
     sim = weightless(flying())
     hook = sim.add(Hook(mass=0.2, damping=0.0, size=RADIUS, ring=0.05))
-    record = hook.read(sim.data)
-    sim.scene.add("sphere", pos=np.asarray(record.pos)[0, 0] + [0.2, 0, -0.05], radius=0.1)
+    sim.scene.add("sphere", pos=np.asarray(hook.read(sim.data).pos)[0, 0] + [0.2, 0, -0.05], radius=0.1)
     sim.add(ContactResponse(restitution=0.5, friction=0.0))
     leave_out_drones(sim)
-    sim.data = hook.write(sim.data, record.replace(vel=record.vel + jnp.array([1.0, 0, 0]), tip_vel=record.vel + 1.0))
-    sim.data = with_load(hook, sim.data, tip_vel=[1.0, 0, 0])
+    sim.data = with_load(hook, sim.data, vel=[1.0, 0, 0], tip_vel=[1.0, 0, 0])
     sim.step(60)
     record = hook.read(sim.data)
-    assert record.vel[0, 0, 0] < -0.2
+    assert np.asarray(record.vel)[0, 0, 0] < -0.2
     np.testing.assert_array_equal(record.tip_vel, record.vel)
 
 
@@ -310,9 +316,9 @@ def test_the_log_has_the_step_in_which_a_load_touches():
     assert record.object_names == ("load:0", "load:1", "sphere:0")
     np.testing.assert_array_equal(np.asarray(record.objects)[0], [[False, True, False], [True, False, False]])
     assert np.abs(np.asarray(record.first) - first).max() <= 1
-    sim.data = pole.set_pose(sim.data, sim.data.states.pos[:, :1])
+    sim.data = pole.set_pose(sim.data, np.asarray(sim.data.states.pos)[:, :1])
     sim.step()
-    assert bool(log.read(sim.data).objects[0, 0, 2])
+    assert np.asarray(log.read(sim.data).objects)[0, 0, 2]
 
 
 def test_a_report_in_a_stage_needs_a_world():
@@ -320,9 +326,9 @@ def test_a_report_in_a_stage_needs_a_world():
     load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
     sim.data = with_load(load, sim.data, pos=sim.data.states.pos)
     contacts = sim.scene.contact_fn(floor=False, drones=False)
-    assert bool(jax.jit(contacts)(sim.data).objects[0, 0, 0])
+    assert np.asarray(jax.jit(contacts)(sim.data).objects)[0, 0, 0]
     with pytest.raises(ConfigError, match="expected the data of a world, got those of one drone"):
-        contacts(jax.tree.map(lambda x: x, sim.data.replace(states=jax.tree.map(lambda x: x[0, 0], sim.data.states))))
+        contacts(sim.data.replace(states=jax.tree.map(lambda x: np.asarray(x)[0, 0], sim.data.states)))
 
 
 def test_law_01_all_engines_agree():
@@ -333,11 +339,10 @@ def test_law_01_all_engines_agree():
     vel = np.array([[[2.0, 0, 0], [-1.5, 0.2, 0]], [[0, 3.0, 0.5], [1.0, 1.0, 4.0]]])
     sim.data = with_load(load, sim.data, vel=vel)
     sim.rotor_vel_control(np.full((2, 2, 4), 13000.0))
-    assert "not fused" not in sim.explain()
     leave_out_drones(sim)
     ends = {}
     for engine in ("plain", "lanes", "fused"):
-        data = Step(sim.step_pipeline, engine, strict=True)(sim.data, jnp.int32(60))
+        data = Step(sim.step_pipeline, engine, strict=True)(sim.data, np.int32(60))
         ends[engine] = np.concatenate([data.states.pos, load.read(data).pos, load.read(data).vel], axis=-1)
     for engine in ("lanes", "fused"):
         np.testing.assert_allclose(ends[engine], ends["plain"], atol=2e-3)
@@ -346,7 +351,7 @@ def test_law_01_all_engines_agree():
 def test_law_07_no_nan(rng):
     """Loads in drones, in obstacles, in the floor, without mass, at any speed."""
     n = 12
-    sim = flying(n, 2, height=0.3)
+    sim = flying(n, 2, height=0.3, strict=True)
     load = sim.add(SlungLoad(mass=np.linspace(0, 0.3, 2 * n).reshape(n, 2), cable=True, size=RADIUS))
     sim.scene.add("box", pos=[0.3, 0, 0.2], size=(0.2, 0.2, 0.4))
     sim.add(ContactResponse())
@@ -360,32 +365,41 @@ def test_law_07_no_nan(rng):
 
 
 def test_the_bounce_has_gradients(x64):
-    """Of the load's speed after a bounce by its speed before, and of the drone's after a hit; no NaN anywhere."""
-    sim = weightless(flying(n_drones=2, engine="plain"))
+    """Of a drone's speed after a load's hit, by the load's speed before, through one step.
+
+    No NaN in gradients by any state: in the first world of a hit; in the others of loads in their drones, far away, and
+    in the middle of an obstacle.
+    """
+    sim = weightless(flying(4, 2, engine="plain"))
     load = sim.add(SlungLoad(mass=0.2, size=RADIUS))
     sim.scene.add("sphere", pos=[5, 0, 3], radius=0.1)
     sim.add(ContactResponse(restitution=0.5, friction=0.3))
     of_loads = [name for name in sim.step_pipeline if name.startswith("contact_response_")]
     assert len(of_loads) == 3
-    step = Step({name: sim.step_pipeline[name] for name in ("integration", *of_loads)}, "plain")
-    below = np.asarray(sim.data.states.pos)[:, ::-1] + [0.01, 0, -0.06]
-    data = with_load(load, load.release(sim.data), pos=below, vel=[0, 0, 1.0])
+    stages = [sim.step_pipeline[name] for name in ("integration", *of_loads)]
+    pos = np.array(sim.data.states.pos)[:, ::-1]
+    pos[0] += [0.01, 0, -0.06]
+    pos[2, :, 1] += 2.0
+    pos[3] = [5, 0, 3]
+    data = with_load(load, load.release(sim.data), pos=pos, vel=[0, 0, 1.0])
 
     def lifted(speed, states, record):
         moved = with_load(load, load.write(data.replace(states=states), record), vel=np.array([0.1, 0, 1.0]) * speed)
-        return step(moved, 20).states.vel[0, 0, 2]
+        for stage in stages:
+            moved = stage(moved)
+        return jnp.sum(moved.states.vel[..., 2]), moved.states.vel[0, 0, 2]
 
-    slopes = jax.jit(jax.value_and_grad(lifted, argnums=(0, 1, 2), allow_int=True))
+    slopes = jax.jit(jax.value_and_grad(lifted, argnums=(0, 1, 2), allow_int=True, has_aux=True))
     found = [slopes(speed, data.states, load.read(data)) for speed in (2.0, 2.001, 1.999)]
-    (_, (slope, *gradient)), (above, _), (lower, _) = found
+    ((_, now), (slope, *gradient)), ((above, _), _), ((lower, _), _) = found
     np.testing.assert_allclose(slope, (above - lower) / 0.002, rtol=1e-4)
-    assert slope > 0.1
+    assert now > 0.1
     for x in jax.tree.leaves(gradient):
         assert x.dtype == jax.dtypes.float0 or np.isfinite(x).all()
 
 
 def test_removing_the_load_leaves_the_response():
-    sim = flying(height=1.0)
+    sim = flying(height=1.0, engine="interpret")
     load = sim.add(SlungLoad(mass=0.1, size=RADIUS))
     sim.scene.add("sphere", pos=[5, 0, 3], radius=0.1)
     sim.add(ContactResponse())

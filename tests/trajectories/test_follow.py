@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import with_states
 
 from crazysim import ConfigError, Sim
 from crazysim.engine import Step, native
@@ -20,9 +21,7 @@ evaluate = jax.jit(Trajectory.evaluate)
 
 def build(n_worlds=N_WORLDS, n_drones=N_DRONES, **settings):
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="state", **settings)
-    states = sim.data.states
-    pos = 0.3 * states.pos + jnp.asarray([0, 0, 1.0])
-    sim.data = sim.data.replace(states=states.replace(pos=pos, rotor_vel=states.rotor_vel + 14000.0))
+    sim.data = with_states(sim.data, pos=0.3 * np.asarray(sim.data.states.pos) + [0, 0, 1.0], rotor_vel=14000.0)
     sim.build_default_data()
     return sim
 
@@ -67,16 +66,18 @@ def test_a_drone_waits_for_its_start_and_stays_at_the_end(flown):
     sim = build()
     sim.add(Follow(UP, rate=4.0))
     sim.step(200)
-    np.testing.assert_allclose(sim.data.controls.state.cmd[0, 0, :9], [0, 1, 2, 0, 0, 0, 0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(sim.data.controls.state.cmd)[0, 0, :9], [0, 1, 2, 0, 0, 0, 0, 0, 0], atol=1e-6
+    )
 
 
 def test_drones_follow(flown):
     sim = build(n_worlds=1, n_drones=1)
     sim.add(Follow(helix(0.3, 0.2, 2, period=3.0, height=1.0)))
     sim.step(1500)
-    error = sim.plugins.observations(sim.data)["follow.pos_error"]
+    error = np.asarray(sim.plugins.observations(sim.data)["follow.pos_error"])
     s = evaluate(helix(0.3, 0.2, 2, period=3.0, height=1.0), 3.0)
-    np.testing.assert_allclose(error[0, 0], s.pos - sim.data.states.pos[0, 0], atol=1e-5)
+    np.testing.assert_allclose(error[0, 0], np.asarray(s.pos) - np.asarray(sim.data.states.pos)[0, 0], atol=1e-5)
     assert np.linalg.norm(error) < 0.1
     assert sim.plugins.observations(sim.data)["follow.vel_error"].shape == (1, 1, 3)
 
@@ -86,13 +87,13 @@ def test_every_engine_flies_what_plain_flies(engine):
     sim = build()
     sim.add(Follow([EIGHT, UP], start=START, rate=RATE, n_slots=6, max_pieces=20))
     assert sim.step_fn.plan(sim.data).program.fused
-    found, plain = (Step(sim.step_pipeline, e)(sim.data, jnp.int32(60)) for e in (engine, "plain"))
+    found, plain = (Step(sim.step_pipeline, e)(sim.data, np.int32(60)) for e in (engine, "plain"))
     np.testing.assert_allclose(found.states.pos, plain.states.pos, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(found.controls.state.cmd, plain.controls.state.cmd, rtol=1e-4, atol=1e-4)
 
 
 def test_uploads_are_flown_and_nothing_is_compiled_again():
-    sim = build()
+    sim = build(engine="interpret")
     plugin = sim.add(Follow([EIGHT, UP], n_slots=4, max_pieces=20))
     sim.step(5)
     plan, size = sim.step_fn.plan(sim.data), _compiled(sim)
@@ -104,23 +105,21 @@ def test_uploads_are_flown_and_nothing_is_compiled_again():
     assert sim.step_fn.plan(sim.data) is plan
     assert _compiled(sim) == size
     s = evaluate(other, 15 / 500)
-    np.testing.assert_allclose(sim.data.controls.state.cmd[:, 1, :3], np.tile(s.pos, (3, 1)), atol=1e-6)
-    np.testing.assert_allclose(
-        sim.data.controls.state.cmd[:, 0], np.tile(evaluate(EIGHT, 15 / 500).command(), (3, 1)),
-        rtol=1e-5, atol=2e-5,
-    )  # fmt: skip
+    cmd, eight = np.asarray(sim.data.controls.state.cmd), jax.tree.map(np.asarray, evaluate(EIGHT, 15 / 500))
+    np.testing.assert_allclose(cmd[:, 1, :3], np.tile(s.pos, (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(cmd[:, 0], np.tile(eight.command(), (3, 1)), rtol=1e-5, atol=2e-5)
 
 
 def test_coefficients_that_are_zero_in_all_trajectories_are_not_read():
     level = Trajectory(EIGHT.ends, EIGHT.coefficients * (np.arange(4) < 2)[:, None] * np.ones(8), EIGHT.repeats)
     lookups = {}
     for name, one, settings in (("level", level, {}), ("room", level, {"n_slots": 1}), ("turned", UP, {})):
-        sim = build()
+        sim = build(engine="interpret")
         plugin = sim.add(Follow(one, **settings))
         lookups[name] = _lookups(sim)
         sim.step(20)
-        expected = evaluate(one, 15 / 500).command()
-        np.testing.assert_allclose(sim.data.controls.state.cmd[0, 0], expected, rtol=1e-5, atol=2e-5)
+        expected = jax.tree.map(np.asarray, evaluate(one, 15 / 500)).command()
+        np.testing.assert_allclose(np.asarray(sim.data.controls.state.cmd)[0, 0], expected, rtol=1e-5, atol=2e-5)
         if name == "level":
             assert plugin.read(sim.data).degrees == (7, 7, -1, -1)
             with pytest.raises(ConfigError, match="degrees of x, y, z and yaw"):
@@ -143,11 +142,12 @@ def test_resets_restore_slots_starts_and_indices():
     before = sim.data.plugins["follow"]
     plugin.upload(sim, 0, hover())
     record = sim.data.plugins["follow"]
-    sim.data = plugin.write(sim.data, record.replace(start=record.start + 1, index=0 * record.index))
+    later, first = np.asarray(record.start) + 1, np.zeros_like(record.index)
+    sim.data = plugin.write(sim.data, record.replace(start=jnp.asarray(later), index=jnp.asarray(first)))
     sim.reset(np.array([True, False, False]))
     masked = sim.data.plugins["follow"]
-    np.testing.assert_allclose(masked.start[..., 0], START + [[0], [1], [1]])
-    np.testing.assert_array_equal(masked.index[..., 0], [[0, 1], [0, 0], [0, 0]])
+    np.testing.assert_allclose(np.asarray(masked.start)[..., 0], START + [[0], [1], [1]])
+    np.testing.assert_array_equal(np.asarray(masked.index)[..., 0], [[0, 1], [0, 0], [0, 0]])
     sim.reset()
     after = sim.data.plugins["follow"]
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
@@ -159,22 +159,23 @@ def test_drones_are_given_other_starts_and_rates():
     plugin = sim.add(Follow([EIGHT, UP], start=START))
     plugin.assign(sim, start=2.0, rate=RATE)
     record = sim.data.plugins["follow"]
-    np.testing.assert_allclose(record.start[..., 0], np.full((3, 2), 2.0))
-    np.testing.assert_allclose(record.rate[..., 0], RATE)
-    np.testing.assert_array_equal(record.index[..., 0], [[0, 1]] * 3)
+    start, rate, index = (np.asarray(x)[..., 0] for x in (record.start, record.rate, record.index))
+    np.testing.assert_allclose(start, np.full((3, 2), 2.0))
+    np.testing.assert_allclose(rate, RATE)
+    np.testing.assert_array_equal(index, [[0, 1]] * 3)
     with pytest.raises(ConfigError, match="index"):
         plugin.assign(sim, index=2)
 
 
 def test_settings_change_without_compiling():
-    sim = build()
+    sim = build(engine="interpret")
     plugin = sim.add(Follow([EIGHT, UP], start=START, rate=1.0))
     sim.step(5)
     plan = sim.step_fn.plan(sim.data)
     sim.replace(dataclasses.replace(plugin, start=START + 1, rate=2.0))
     sim.step(5)
     assert sim.step_fn.plan(sim.data) is plan
-    np.testing.assert_allclose(sim.data.plugins["follow"].start[..., 0], START + 1)
+    np.testing.assert_allclose(np.asarray(sim.data.plugins["follow"].start)[..., 0], START + 1)
 
 
 def test_trajectories_have_gradients_through_the_step():

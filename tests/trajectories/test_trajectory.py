@@ -57,7 +57,7 @@ def test_where_two_pieces_meet_the_later_one_counts():
 def test_before_the_start_and_after_the_end_it_is_at_rest():
     durations, c = random_pieces()
     trajectory, end = Trajectory.of_pieces(durations, c), durations.sum()
-    s = evaluate(trajectory, np.array([-1e9, -1e-9, end + 1e-9, 1e9]))
+    s = jax.tree.map(np.asarray, evaluate(trajectory, np.array([-1e9, -1e-9, end + 1e-9, 1e9])))
     first, last = (oracle(durations, c, np.array([t]), 0)[0] for t in (0, end))
     np.testing.assert_allclose(np.concatenate([s.pos, s.yaw], 1), [first, first, last, last], rtol=1e-9)
     for name in ("vel", "acc", "jerk", "snap", "yaw_rate", "yaw_acc"):
@@ -83,7 +83,8 @@ def test_stacked_ones_are_the_same_as_alone_within_and_beyond_their_ends():
     for k, (trajectory, (durations, _)) in enumerate(zip(alone, pieces, strict=True)):
         end = durations.sum()
         t = np.concatenate([np.linspace(-1, end + 2, 50), [end, np.nextafter(end, 0), np.nextafter(end, 9e9)]])
-        one, many = evaluate(trajectory, t), evaluate(jax.tree.map(lambda x, k=k: x[k], stacked), t)
+        of_stacked = jax.tree.map(lambda x, k=k: np.asarray(x)[k], stacked)
+        one, many = (jax.tree.map(np.asarray, evaluate(x, t)) for x in (trajectory, of_stacked))
         inside = (t < end - 1e-9) | (t > end + 1e-9) | (k == 1)  # at the end itself padding is already at rest
         for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
             np.testing.assert_allclose(x[inside], y[inside], atol=1e-9)
@@ -106,7 +107,7 @@ def test_moving_turns_and_shifts_positions_and_turns_derivatives(traced):
     trajectory, offset, yaw = Trajectory.of_pieces(durations, c), np.array([1.0, -2.0, 3.0]), 0.7
     move = jax.jit(Trajectory.moved) if traced else Trajectory.moved
     t = np.linspace(-0.3, durations.sum() + 0.3, 30)
-    before, after = evaluate(trajectory, t), evaluate(move(trajectory, offset, yaw), t)
+    before, after = (jax.tree.map(np.asarray, evaluate(x, t)) for x in (trajectory, move(trajectory, offset, yaw)))
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     np.testing.assert_allclose(after.pos, before.pos @ turn.T + offset, atol=1e-9)
     np.testing.assert_allclose(after.yaw, before.yaw + yaw, atol=1e-12)

@@ -8,7 +8,6 @@ model, and the single-track model with tyres so stiff that they do not slip eith
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from articulated import WHEELS, Articulated
@@ -27,19 +26,19 @@ def vehicle(friction=2.5, armature=0.05):
 def ours(model, command, duration, speed=0.0, trailer=False, **changes):
     """Return the states of our vehicle at 1000 Hz, by Euler's method."""
     car = CarParams.create(vehicle(), 1000, trailer)
-    car = car.replace(stiffness=jnp.full(2, STIFF), slip_speed=jnp.full(1, 0.2)).replace(**changes)
-    start = CarState.at_rest(jnp.zeros(3), jnp.zeros(1), trailer)
-    start = start._replace(body_vel=jnp.array([speed, 0.0]))
+    car = car.replace(stiffness=np.full(2, STIFF), slip_speed=np.full(1, 0.2)).replace(**changes)
+    start = CarState.at_rest(np.zeros(3, np.float32), np.zeros(1, np.float32), trailer)
+    start = start._replace(body_vel=np.array([speed, 0.0]))
+    return jax.tree.map(np.asarray, _path(model, start, np.array(command), car, round(1000 * duration)))
 
-    @jax.jit
-    def run(start):
-        def step(s, _):
-            s = jax.tree.map(lambda a, b: a + b / 1000, s, model(s, jnp.asarray(command), car))
-            return s, s
 
-        return jax.lax.scan(step, start, length=round(1000 * duration))[1]
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def _path(model, start, command, car, n_steps):
+    def step(s, _):
+        s = jax.tree.map(lambda a, b: a + b / 1000, s, model(s, command, car))
+        return s, s
 
-    return run(start)
+    return jax.lax.scan(step, start, length=n_steps)[1]
 
 
 @pytest.mark.parametrize(("reference", "steer"), [(0.1, 0.2), (0.2, 0.1), (0.2, 0.3), (0.3, -0.2)])
@@ -92,7 +91,7 @@ def test_braking_with_the_motors(torque):
         car.torque(torque)
         car.step()
     # Our drive without damping and friction of its own: its force is the torque.
-    path = ours(single_track, [4 * torque / 0.052388, 0.0], 3.5, speed, drive=jnp.array([1.0, 0.0, 0.0]))
+    path = ours(single_track, [4 * torque / 0.052388, 0.0], 3.5, speed, drive=np.array([1.0, 0.0, 0.0]))
     stop = int(np.argmax(np.asarray(path.body_vel)[:, 0] < 0.3))
     assert float(path.pos[stop, 0]) == pytest.approx(car.pos[0] - start, rel=5e-3)
     assert stop / 1000 == pytest.approx(car.time - begin, rel=5e-3)
@@ -113,7 +112,7 @@ def test_braking_with_locked_wheels():
         car.step()
     params = CarParams.create(slippery, 1000)
     path = ours(single_track, [-1e4, 0.0], 1.0, speed, grip=params.grip, towed_mass=params.towed_mass,
-                drive=jnp.array([1.0, 0.0, 0.0]), drive_max=jnp.full(1, np.inf))  # fmt: skip
+                drive=np.array([1.0, 0.0, 0.0]), drive_max=np.full(1, np.inf))  # fmt: skip
     stop = int(np.argmax(np.asarray(path.body_vel)[:, 0] < 0.3))
     assert float(path.pos[stop, 0]) == pytest.approx(car.pos[0] - start, rel=0.02)
     assert float(path.pos[stop, 0]) == pytest.approx((speed**2 - 0.3**2) / (2 * 0.3 * 9.81), rel=0.01)

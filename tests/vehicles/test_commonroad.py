@@ -1,7 +1,6 @@
 """The model of the F1TENTH gym, against numbers of the gym itself."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -56,6 +55,9 @@ GYM = [
 ]
 
 
+gym_rates, own_rates = jax.jit(commonroad_single_track), jax.jit(single_track)
+
+
 def state_of(x) -> CommonRoadState:
     x = np.asarray(x, jax.dtypes.canonicalize_dtype(float))
     return CommonRoadState(x[..., :2], *(x[..., k : k + 1] for k in range(2, 7)))
@@ -64,16 +66,16 @@ def state_of(x) -> CommonRoadState:
 def test_derivatives_are_those_of_the_gym():
     with jax.enable_x64(True):
         x, u, expected = (np.array(column, float) for column in zip(*GYM, strict=True))
-        rate = commonroad_single_track(state_of(x), jnp.asarray(u), CommonRoadParams.create())
+        rate = gym_rates(state_of(x), u, CommonRoadParams.create())
         np.testing.assert_allclose(np.concatenate(rate, axis=-1), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_batch_equals_one():
     x, u, _ = (np.array(column, float) for column in zip(*GYM, strict=True))
-    params, rates = CommonRoadParams.create(), jax.jit(commonroad_single_track)
-    many = [np.asarray(a) for a in rates(state_of(x), np.float32(u), params)]
+    params = CommonRoadParams.create()
+    many = [np.asarray(a) for a in gym_rates(state_of(x), np.float32(u), params)]
     for i in range(len(x)):
-        for a, b in zip(many, rates(state_of(x[i]), np.float32(u[i]), params), strict=True):
+        for a, b in zip(many, gym_rates(state_of(x[i]), np.float32(u[i]), params), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-6)  # XLA rounds a batch in another order
 
 
@@ -81,28 +83,28 @@ def test_batch_equals_one():
 def test_single_track_tends_to_the_gym_at_small_angles(seed):
     """Both are the same model to first order in slip, steering angle and yaw rate: the difference is of order three."""
     with jax.enable_x64(True):
-        gym = CommonRoadParams.create()
+        gym = jax.tree.map(np.asarray, CommonRoadParams.create())
         g, (front, rear) = 9.81, np.asarray(gym.arms)
         loads = gym.mass * g * np.array([rear, front]) / (front + rear)
         car = CarParams(
             mass=gym.mass, yaw_inertia=gym.yaw_inertia, front=gym.arms[:1], rear=gym.arms[1:],
-            stiffness=gym.friction * gym.stiffness * loads, grip=jnp.full(2, jnp.inf), drive=jnp.array([1.0, 0, 0]),
-            drive_max=jnp.array([jnp.inf]), front_share=jnp.zeros(1), rolling=jnp.zeros(2), towed_mass=jnp.zeros(1),
-            steer_max=jnp.ones(1), steer_rate_max=jnp.ones(1), steer_bandwidth=jnp.ones(1), slip_speed=jnp.zeros(1),
+            stiffness=gym.friction * gym.stiffness * loads, grip=np.full(2, np.inf), drive=np.array([1.0, 0, 0]),
+            drive_max=np.array([np.inf]), front_share=np.zeros(1), rolling=np.zeros(2), towed_mass=np.zeros(1),
+            steer_max=np.ones(1), steer_rate_max=np.ones(1), steer_bandwidth=np.ones(1), slip_speed=np.zeros(1),
             trailer=None,
         )  # fmt: skip
         slip, steer, yaw_rate = np.random.default_rng(seed).uniform(-1, 1, 3)
         speed, sizes, errors = 4.0, 0.1 * 0.5 ** np.arange(4), []
         for size in sizes:
-            b, d, w = (jnp.array([size * x]) for x in (slip, steer, 4 * yaw_rate))
-            zero = jnp.zeros(1)
-            theirs = commonroad_single_track(
-                CommonRoadState(jnp.zeros(2), d, zero + speed, zero, w, b), jnp.zeros(2), gym
-            )
-            vel = speed * jnp.concatenate([jnp.cos(b), jnp.sin(b)])
-            ours = single_track(CarState(jnp.zeros(3), zero, vel, w, d, zero), jnp.zeros(2), car)
+            b, d, w = (np.array([size * x]) for x in (slip, steer, 4 * yaw_rate))
+            zero = np.zeros(1)
+            vel = speed * np.concatenate([np.cos(b), np.sin(b)])
+            gym_state = CommonRoadState(np.zeros(2), d, zero + speed, zero, w, b)
+            theirs = jax.tree.map(np.asarray, gym_rates(gym_state, np.zeros(2), gym))
+            own_state = CarState(np.zeros(3), zero, vel, w, d, zero)
+            ours = jax.tree.map(np.asarray, own_rates(own_state, np.zeros(2), car))
             # Rate of the angle of a velocity (x, y): (x y' - y x') / (x^2 + y^2).
             turn = (vel[0] * ours.body_vel[1] - vel[1] * ours.body_vel[0]) / speed**2
-            errors.append([float(ours.yaw_rate[0] - theirs.yaw_rate[0]), float(turn - theirs.slip[0])])
+            errors.append([ours.yaw_rate[0] - theirs.yaw_rate[0], turn - theirs.slip[0]])
         slopes = np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
         assert np.all(slopes > 2.7), (slopes, errors)

@@ -16,8 +16,13 @@ SQUARE = [(0, 0), (2, 0), (2, 2), (0, 2)]
 
 
 def along(path, n=200, index=0):
-    s = np.linspace(0.0, float(path.length[index]), n).astype(np.float32)
-    return s, jax.vmap(lambda x: path.at(index, x))(s)
+    s = np.linspace(0.0, np.asarray(path.length)[index], n).astype(np.float32)
+    return s, jax.tree.map(np.asarray, points_at(path, index, s))
+
+
+@jax.jit
+def points_at(path, index, s):
+    return jax.vmap(lambda x: path.at(index, x))(s)
 
 
 def test_a_circle_is_a_circle():
@@ -78,7 +83,7 @@ def test_projection_finds_the_nearest_point(trajectory):
 def test_projection_has_gradients():
     """Moving along a straight path moves the projection as much; across it, not at all."""
     path = Path.of_trajectory(line((0, 0, 0), (4, 0, 0), duration=4.0))
-    slope = jax.grad(lambda pos: path.project(0, pos, jnp.float32(1.0)))(jnp.array([1.2, 0.3]))
+    slope = jax.jit(jax.grad(lambda pos: path.project(0, pos, np.float32(1.0))))(np.float32([1.2, 0.3]))
     np.testing.assert_allclose(slope, [1.0, 0.0], atol=1e-3)
 
 

@@ -59,9 +59,38 @@ def move_many(eqn: Any, args: list[Elements], fixed: Sequence[Any] = ()) -> list
     for x in args:
         numbers.append(np.arange(len(elements), len(elements) + x.size, dtype=np.int32).reshape(x.shape))
         elements.extend(x.reshape(-1))
-    params = {"fill_value": 0} if eqn.primitive.name == "gather" else {}  # never used: all places are inside
-    places = run_now(eqn, [*numbers, *fixed], **params)
+    places = _places(eqn, [*numbers, *fixed])
     return [as_elements([elements[i] for i in p.reshape(-1)], p.shape) for p in places]
+
+
+def _places(eqn: Any, args: list[Any]) -> list[np.ndarray]:
+    """Return where the elements of the results come from: the primitive's results for indices."""
+    p, x = eqn.params, args[0]
+    match eqn.primitive.name:
+        case "split":
+            return np.split(x, np.cumsum(p["sizes"])[:-1], p["axis"])
+        case "unstack":
+            return list(np.moveaxis(x, p["axis"], 0))
+        case "rev":
+            return [np.flip(x, p["dimensions"])]
+        case "pad":
+            return [_padded(x, args[1], p["padding_config"])]
+        case "gather":
+            return run_now(eqn, args, fill_value=0)  # never used: all places are inside
+    return run_now(eqn, args)
+
+
+def _padded(x: np.ndarray, value: np.ndarray, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
+    """Return an array padded before, behind and between its elements; a negative number removes some."""
+    for axis, (low, high, interior) in enumerate(config):
+        n = x.shape[axis]
+        length = max(low + n + max(n - 1, 0) * interior + high, 0)
+        places = low + np.arange(n) * (interior + 1)
+        inside = (places >= 0) & (places < length)
+        padded = np.full((length, *np.delete(x.shape, axis)), value)
+        padded[places[inside]] = np.moveaxis(x, axis, 0)[inside]
+        x = np.moveaxis(padded, 0, axis)
+    return x
 
 
 def run_now(eqn: Any, args: Sequence[Any], **params: Any) -> list[np.ndarray]:

@@ -13,7 +13,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.scene.objects import Handle
 
 
@@ -71,11 +71,11 @@ class Playback(Plugin):
         vel[-1] = 0.0
         dtype = sim.data.states.pos.dtype
         return PlaybackData(
-            pos=jnp.asarray(pos, dtype),
-            quat=jnp.asarray(quat, dtype),
-            vel=jnp.asarray(vel, dtype),
-            freq=jnp.asarray(self.freq, dtype),
-            start=jnp.asarray(np.broadcast_to(start, sim.n_worlds)[:, None], dtype),
+            pos=on_device(pos, dtype),
+            quat=on_device(quat, dtype),
+            vel=on_device(vel, dtype),
+            freq=on_device(self.freq, dtype),
+            start=on_device(np.broadcast_to(start, sim.n_worlds)[:, None], dtype),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

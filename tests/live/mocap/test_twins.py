@@ -24,6 +24,7 @@ from crazysim.live.mocap.frames import from_rpy, rotate
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 BOX = Twin("box", {"size": (0.2, 0.2, 0.2)})
+BALL = Twin("sphere", {"radius": 0.1})
 
 
 class Given(MocapSource):
@@ -47,11 +48,11 @@ def sim():
 
 
 def meeting(source, *settings):
-    """Return drones that measure and hit boxes which the poses of a source move, and the plugins that do so."""
+    """Return drones that measure and hit balls which the poses of a source move, and the plugins that do so."""
     sim = Sim(n_worlds=2, n_drones=1, control="state")
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(pos=states.pos + np.array([0, 0, 1.0])))
-    twins = Twins(sim, source, {"cf": BOX}, ["cf1", "cf2"], *settings)
+    twins = Twins(sim, source, {"cf": BALL}, ["cf1", "cf2"], *settings)
     rays = sim.add(RangeFinder(directions=[(1, 0, 0)]))
     return sim, twins, rays, sim.add(ContactResponse())
 
