@@ -256,8 +256,8 @@ def test_law_07_values_and_gradients_are_finite(every):
     data, stages = sim.data, as_stages(sim.step_pipeline)
 
     def step(data, _):
-        for stage in stages:
-            data = stage(data)
+        for apply in stages:
+            data = apply(data)
         return data, None
 
     def total(floats):

@@ -100,8 +100,8 @@ def test_law_08_gradients_of_a_flight_equal_central_differences(x64, rng):
     stages = as_stages(sim.step_pipeline)
 
     def step(data, _):
-        for stage in stages:
-            data = stage(data)
+        for apply in stages:
+            data = apply(data)
         return data, None
 
     @jax.jit

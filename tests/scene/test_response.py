@@ -229,8 +229,8 @@ def test_the_landing_place_has_a_gradient():
     data = sim.data.replace(states=sim.data.states.replace(pos=jnp.array([[[0, 0, HALF + 0.01]]])))
 
     def step(data, _):
-        for stage in stages:
-            data = stage(data)
+        for apply in stages:
+            data = apply(data)
         return data, None
 
     def end(speed):
