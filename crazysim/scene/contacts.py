@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jax import Array
 
+from crazysim.eager import compiled
 from crazysim.errors import UnknownNameError
 from crazysim.scene import mjx
 
@@ -22,10 +22,16 @@ def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) 
     Raises:
         UnknownNameError: If the scene has no such body.
     """
-    geoms = jnp.asarray(np.flatnonzero(mj_model.geom_bodyid == body_id(mj_model, body)))
+    is_of_body = mj_model.geom_bodyid == body_id(mj_model, body)
     contact = mjx_data._impl.contact
-    geom = jnp.stack([contact.geom1, contact.geom2], axis=-1)
-    return (contact.dist < 0) & jnp.any(geom[..., None] == geoms, axis=(-1, -2))
+    return _flags_of(contact.dist, contact.geom1, contact.geom2, is_of_body)
+
+
+@compiled()
+def _flags_of(dist: Array, geom1: Array, geom2: Array, is_of_body: Array) -> Array:
+    """Return True for every slot that touches and has a geom of a body, given for each geom whether it is of it."""
+    is_of_body = jnp.asarray(is_of_body)
+    return (dist < 0) & ((geom1 >= 0) & is_of_body[geom1] | (geom2 >= 0) & is_of_body[geom2])
 
 
 def body_id(mj_model: mujoco.MjModel, body: str) -> int:

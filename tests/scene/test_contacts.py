@@ -1,7 +1,6 @@
 """Contact slots against distances from formulas, and against C MuJoCo, in many worlds at once."""
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -48,14 +47,13 @@ def scatter(sim):
     rng = np.random.default_rng(7)
     pos = rng.uniform([-0.25, -0.25, 0], [0.25, 0.25, 0.5], (sim.n_worlds, sim.n_drones, 3))
     quat = random_quats(rng, sim.n_worlds, sim.n_drones)
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos), quat=jnp.asarray(quat)))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.float32(pos), quat=np.float32(quat)))
     pole = sim.mj_model.body("pole").mocapid.item()
     pole_pos = rng.uniform([-0.4, -0.4, 0.1], [0.4, 0.4, 0.6], (sim.n_worlds, 3))
     pole_quat = random_quats(rng, sim.n_worlds)
-    sim.mjx_data = sim.mjx_data.replace(
-        mocap_pos=sim.mjx_data.mocap_pos.at[:, pole].set(pole_pos),
-        mocap_quat=sim.mjx_data.mocap_quat.at[:, pole].set(np.roll(pole_quat, 1, axis=-1)),
-    )
+    mocap_pos, mocap_quat = np.array(sim.mjx_data.mocap_pos), np.array(sim.mjx_data.mocap_quat)
+    mocap_pos[:, pole], mocap_quat[:, pole] = pole_pos, np.roll(pole_quat, 1, axis=-1)
+    sim.mjx_data = sim.mjx_data.replace(mocap_pos=mocap_pos, mocap_quat=mocap_quat)
     return pos, quat, pole_pos, pole_quat
 
 
@@ -70,7 +68,7 @@ def crowd():
 def touching(sim):
     """Return for every pair of geom names in how many worlds it touches, as one bool per world."""
     flags = np.asarray(sim.contacts())
-    contact = sim.mjx_data._impl.contact
+    contact = jax.device_get(sim.mjx_data._impl.contact)
     found = {}
     for world in range(sim.n_worlds):
         for slot in range(flags.shape[1]):
@@ -157,7 +155,7 @@ def test_a_body_filters_its_own_slots(crowd, body):
     """Contacts of a body keep the slots of its geoms and clear the others, in every world."""
     sim = crowd[0]
     sim.contacts()  # which geoms a slot is of, the first sync says
-    contact = sim.mjx_data._impl.contact
+    contact = jax.device_get(sim.mjx_data._impl.contact)
     bodies = sim.mj_model.geom_bodyid[np.stack([contact.geom1, contact.geom2])]
     of_body = (bodies == sim.mj_model.body(body).id).any(0)
     assert 0 < of_body.sum() < of_body.size
@@ -189,13 +187,13 @@ def test_a_closed_over_scene_gives_the_same_contacts(crowd):
         _, mjx_data = sync_sim2mjx(sim_data, mjx_data, mjx_model)
         return mjx_data._impl.contact.dist < 0
 
-    mocap_pos = sim.mjx_data.mocap_pos
+    mocap_pos = np.array(sim.mjx_data.mocap_pos)
     np.testing.assert_array_equal(check_contacts(sim.data, mocap_pos), expected)
-    far = check_contacts(sim.data, mocap_pos.at[:, sim.mj_model.body("pole").mocapid.item()].set(9.0))
-    contact = sim.mjx_data._impl.contact
-    of_pole = np.asarray(
-        (contact.geom1 == sim.mj_model.geom("pole").id) | (contact.geom2 == sim.mj_model.geom("pole").id)
-    )
+    away = mocap_pos.copy()
+    away[:, sim.mj_model.body("pole").mocapid.item()] = 9.0
+    far = check_contacts(sim.data, away)
+    contact = jax.device_get(sim.mjx_data._impl.contact)
+    of_pole = (contact.geom1 == sim.mj_model.geom("pole").id) | (contact.geom2 == sim.mj_model.geom("pole").id)
     assert expected[of_pole].any()
     np.testing.assert_array_equal(far, expected & ~of_pole)
     assert len(traces) == 1
@@ -226,7 +224,7 @@ def test_a_large_swarm_keeps_the_nearest_pairs():
     pos = np.asarray(sim.data.states.pos).copy()
     pos[..., 2] = 1.0
     pos[0, 40] = pos[0, 41] + [0.1, 0, 0]
-    sim.data = sim.data.replace(states=sim.data.states.replace(pos=jnp.asarray(pos)))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     contacts = np.asarray(sim.contacts())
     assert contacts.shape[1] < 64 * 63 // 2
     assert contacts.sum() == 1

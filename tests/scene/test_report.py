@@ -175,6 +175,7 @@ def test_large_swarms_are_computed_in_chunks():
 
 
 def test_a_swarm_of_4096_finds_the_two_that_touch_without_quadratic_memory():
+    """MuJoCo goes through the whole spec for every geom it is given: built one by one, this would take minutes."""
     n, rows = 4096, 64
     sim = Sim(n_drones=n, control="attitude")
     assert sim.mj_model.nmocap == n
