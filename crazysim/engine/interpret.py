@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -147,7 +148,7 @@ def call(block: Block, inputs: Sequence[Any], shape: tuple[int, ...]) -> list[Ar
     return list(jax.pure_callback(of_arrays, results, *inputs, vmap_method="sequential"))
 
 
-def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Any]:
     """Return what ``lanes.steps`` does, all in NumPy: at once, or in a callback where arguments are traced.
 
     If stages are not fused, only blocks are interpreted, and the rest runs in XLA.
@@ -159,7 +160,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
     written = [lanes.shape_of(program, i, n_worlds) for i in program.written]
     flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
 
-    def of_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], np.ndarray]:
+    def of_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], Any]:
         return _steps(program, with_leaves([None] * len(leaves), given, [np.asarray(x) for x in values]), int(n_steps))
 
     values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in given]
@@ -168,10 +169,10 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array) -> tuple[li
     else:
         out, flags = of_arrays(n_steps, *values)
     keys = [is_key(program.leaves[i]) for i in program.written]
-    return [jax.random.wrap_key_data(x) if key else x for x, key in zip(out, keys, strict=True)], flags
+    return [jax.random.wrap_key_data(jnp.asarray(x)) if key else x for x, key in zip(out, keys, strict=True)], flags
 
 
-def _steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.ndarray], np.ndarray]:
+def _steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.ndarray], Any]:
     now = lanes.Lanes(program, leaves, run, np)
     constants = lanes.prepare(program, now)
     for _ in range(n_steps):

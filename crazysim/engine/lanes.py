@@ -171,7 +171,7 @@ def _run_worlds(segment: Segment, lanes: Lanes) -> None:
         return value.reshape(shape)[:, 0] if library.ndim(value) and k != TABLE else value
 
     outs = lanes.execute(segment.block, [of_world(slot) for slot in segment.reads], shape[:1])
-    new: dict[Slot, dict[int, Array]] = {}
+    new: dict[Slot, dict[int, Any]] = {}
     for (leaf, k), value in zip(segment.writes, outs, strict=True):
         value = library.broadcast_to(value, shape[:1])
         if leaves[leaf].scope == "drone":

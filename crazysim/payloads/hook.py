@@ -122,7 +122,7 @@ class Hook(Colliding, Plugin):
             pos[..., 2] = np.maximum(pos[..., 2], np.asarray(load.clearance)[..., 0])
             vel, attached = np.zeros_like(pos), np.zeros(load.attached.shape, bool)
             values |= {"pos": on_device(pos), "vel": on_device(vel), "attached": on_device(attached, bool)}
-            no_clearance = np.zeros_like(load.clearance)
+            no_clearance = on_device(np.zeros(load.clearance.shape))
             tip_pos, tip_vel = hanging(sim.data.states, load.attach, load.length, no_clearance, False)
         return HookData(
             **values,

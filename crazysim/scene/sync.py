@@ -57,9 +57,9 @@ def _poses(data: SimData) -> list[tuple[Any, Any, Any]]:
 
 
 @compiled()
-def _without_axis(*arrays: Array) -> tuple[Array, ...]:
-    """Return arrays of objects without the axis of drones. (n_worlds, n, k)"""
-    return tuple(x[:, 0] for x in arrays)
+def _without_axis(pos: Array, quat: Array) -> tuple[Array, Array]:
+    """Return poses of objects without the axis of drones. (n_worlds, n, k)"""
+    return pos[:, 0], quat[:, 0]
 
 
 def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
@@ -86,16 +86,11 @@ def with_poses_of(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Arr
         worlds: Indices of worlds. (n,)
         poses: Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), joint positions (n, n_qpos).
     """
-    return (*_with_poses(_poses(data), worlds, *poses[:2]), jnp.asarray(poses[2]))
-
-
-@compiled()
-def _with_poses(owned: Any, worlds: Array, mocap_pos: Array, mocap_quat: Array) -> tuple[Array, Array]:
-    mocap_pos, mocap_quat = jnp.asarray(mocap_pos), jnp.asarray(mocap_quat)
-    for ids, pos, quat in owned:
+    mocap_pos, mocap_quat, qpos = map(jnp.asarray, poses)
+    for ids, pos, quat in _poses(data):
         mocap_pos = mocap_pos.at[:, ids].set(pos[worlds])
         mocap_quat = mocap_quat.at[:, ids].set(jnp.roll(quat[worlds], 1, axis=-1))
-    return mocap_pos, mocap_quat
+    return mocap_pos, mocap_quat, qpos
 
 
 def sync_one_world(
