@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 # Further requirements of an environment, such as PINS="jax<0.12"; one environment for each, named by VENV.
 PINS ?=
+# Processes that run tests: one more than there are cores to be busy, since tests of windows, pages and live loops wait.
+WORKERS ?= 3
 RUN = $(VENV)/bin/python
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 
@@ -18,7 +20,7 @@ demo: $(VENV)/installed
 	$(RUN) -m crazysim demo
 
 test: $(VENV)/installed
-	$(RUN) -m pytest -n 2 --dist loadgroup --no-loadscope-reorder $(TESTS)
+	$(RUN) -m pytest -n $(WORKERS) --dist loadgroup --no-loadscope-reorder $(TESTS)
 
 # Physics, control, geometry, data, and the engine on its interpreter: what compiles little.
 FAST = $(addprefix tests/control/test_,allocation.py attitude.py flat_state.py flatness.py setpoint.py state.py) \
@@ -29,7 +31,7 @@ FAST = $(addprefix tests/control/test_,allocation.py attitude.py flat_state.py f
   tests/test_pytree.py tests/test_rotation.py tests/test_prose.py tests/test_package.py
 
 test-fast: $(VENV)/installed
-	$(RUN) -m pytest -n 2 --dist loadgroup --no-loadscope-reorder $(FAST)
+	$(RUN) -m pytest -n $(WORKERS) --dist loadgroup --no-loadscope-reorder $(FAST)
 
 check: $(VENV)/installed
 	$(VENV)/bin/ruff format --check .

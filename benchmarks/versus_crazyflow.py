@@ -209,6 +209,7 @@ class Worker:
         """End the process."""
         self._in.close()
         self._process.wait()
+        self._out.close()
 
 
 def peer_environment(device: str) -> Path:

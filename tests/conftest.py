@@ -69,18 +69,22 @@ def pytest_collection_finish():
     gc.freeze()
 
 
-MEMORY = 2e9
-"""Memory of a worker, bytes, above which it looks for garbage between two files."""
+MEMORY = 0.15 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2e9
+"""Memory of a worker, bytes, above which it looks for garbage between two files: a part of the machine's."""
 GROWTH = 1.3
 """Factor by which its memory has grown when it looks again: one look takes seconds."""
 limit = MEMORY
 
 
 def pytest_runtest_teardown(item, nextitem):
-    """Look for garbage where a file ends: simulations hold the programs that were compiled for them."""
+    """Look for garbage where a file ends: simulations hold the programs that were compiled for them.
+
+    What is left is not looked at again.
+    """
     global limit
     if nextitem is not None and nextitem.path != item.path and memory() > limit:
         gc.collect()
+        gc.freeze()
         limit = max(MEMORY, GROWTH * memory())
 
 
