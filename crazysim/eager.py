@@ -1,4 +1,4 @@
-"""Work outside of compiled code that compiles little: one program for a pure function, none for arrays of numbers."""
+"""Calls outside of compiled code, without a program for each operation."""
 
 from __future__ import annotations
 

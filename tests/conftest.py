@@ -69,8 +69,9 @@ def pytest_collection_finish():
     gc.freeze()
 
 
-MEMORY = 0.15 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2e9
-"""Memory of a worker, bytes, above which it looks for garbage between two files: a part of the machine's."""
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+MEMORY = 0.45 / WORKERS * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2e9
+"""Memory of a worker, bytes, above which it looks for garbage between two files: together a part of the machine's."""
 GROWTH = 1.3
 """Factor by which its memory has grown when it looks again: one look takes seconds."""
 limit = MEMORY

@@ -159,6 +159,9 @@ class Integration:
         return data, deriv.replace(plugins=own) if own else deriv
 
     def stage(self) -> Stage:
-        """Return the stage. Plugins are written for one drone or one world, the rest takes any leading axes."""
+        """Return the stage. Plugins are written for one drone or one world, the rest takes any leading axes.
+
+        The derivative is one of the package's own.
+        """
         scope = "world" if self.couples_world else "drone"
-        return Stage(self, scope, batched=not self.plugins, name="integration")
+        return Stage(self, scope, batched=not self.plugins, name="integration", fixed=not self.plugins)

@@ -33,9 +33,14 @@ class Stage:
         when: Callable[..., Array | None] | None = None,
         batched: bool = False,
         name: str | None = None,
+        fixed: bool = False,
     ):
-        """Declare a stage; see ``stage``. ``batched`` declares that the functions also take any leading axes."""
-        self.fn, self.when, self.batched = fn, when, batched
+        """Declare a stage; see ``stage``.
+
+        ``batched`` declares that the functions also take any leading axes. ``fixed`` declares that they always do the
+        same, for any numbers of worlds and drones, so that an engine traces them once in a process.
+        """
+        self.fn, self.when, self.batched, self.fixed = fn, when, batched, fixed
         self.scope: StageScope = scope
         self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
         self.__doc__ = fn.__doc__
@@ -102,7 +107,9 @@ def tick(data: Any, freq: int) -> Array | None:
 def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
     """Return the functions of a pipeline as stages under the pipeline's names; undeclared ones get the full batch."""
     return [
-        Stage(fn.fn, fn.scope, fn.when, fn.batched, name) if isinstance(fn, Stage) else Stage(fn, "batch", name=name)
+        Stage(fn.fn, fn.scope, fn.when, fn.batched, name, fn.fixed)
+        if isinstance(fn, Stage)
+        else Stage(fn, "batch", name=name)
         for name, fn in pipeline.items()
     ]
 

@@ -32,7 +32,7 @@ FLOOR = -0.001
 
 def _built_in(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
     """Declare a stage whose functions take data of one drone, one world or all worlds alike."""
-    return lambda fn: Stage(fn, scope, when, batched=True)
+    return lambda fn: Stage(fn, scope, when, batched=True, fixed=True)
 
 
 def _ticks(controller: str) -> Callable[[SimData], Array | None]:
@@ -202,7 +202,7 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
     return SimStateDeriv(vel=vel, ang_vel=s.ang_vel, acc=acc, ang_acc=ang_acc, rotor_acc=rotor_acc)
 
 
-@functools.cache
+@functools.cache  # the same function for equal derivatives, so that they share a trace
 def held_on_floor(deriv_fn: DerivFn) -> DerivFn:
     """Return a derivative in which a drone that stands on the floor and does not lift off neither slides nor turns.
 

@@ -58,11 +58,11 @@ def run(
             env.update(zip(op.results, results, strict=True))
             if observe is not None:
                 observe(op, results)
-    return [_spread(env[x] if isinstance(x, Value) else x, shape) for x in block.outputs]
+    return [_broadcast(env[x] if isinstance(x, Value) else x, shape) for x in block.outputs]
 
 
-def _spread(x: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a number of the lanes, or of all of them, for each lane; broadcasting takes as long as an operation."""
+def _broadcast(x: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a value broadcast to all lanes; NumPy's own call takes as long as an operation."""
     return x if np.shape(x) == shape else np.broadcast_to(x, shape)
 
 
@@ -105,7 +105,9 @@ def _structured(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
             return [args[0][args[1] + op.param("offset")]]
         case "threefry2x32":
             return list(threefry2x32(*args))
-    raise RuntimeError(f"operation {op.name!r} is structured, and the interpreter does not know it")
+    raise RuntimeError(
+        f"expected a structured operation that is interpreted, got {op.name!r}; add a case to _structured"
+    )
 
 
 def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: Env) -> list[np.ndarray]:

@@ -93,13 +93,13 @@ def write(program: Program, target: str, samples: Sequence[int] = ()) -> Kernel:
     inputs = needed(program)
     deferred = _deferred(program)
 
-    number = program.numbers
-    names = {(leaf, k): f"x{number[leaf]}_{k}" for leaf, k in slots}
+    rank = program.ranks
+    names = {(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots}
     depth = 1 + exchange.depth
     shared = [slot for slot in slots if program.leaves[slot[0]].scope not in ("drone", "world")]
     for slot in shared:
         if slot[1] == TABLE:
-            names[slot] = f"p{number[slot[0]]}"
+            names[slot] = f"p{rank[slot[0]]}"
         elif slot in stored or slot not in deferred:
             writer.line(f"const auto {names[slot]} = {_load(program, slot)};", 1)
         else:
@@ -137,11 +137,9 @@ def write(program: Program, target: str, samples: Sequence[int] = ()) -> Kernel:
         exchange.begin(writer, 2)
         for leaf in samples:
             kind, size, n_drones = _type(program, leaf), program.leaves[leaf].size, _drones(program, leaf)
-            writer.line(
-                f"{kind}* const r{number[leaf]} = s{number[leaf]} + sample * (n_lanes / {n_drones} * {size}ll);", 2
-            )
+            writer.line(f"{kind}* const r{rank[leaf]} = s{rank[leaf]} + sample * (n_lanes / {n_drones} * {size}ll);", 2)
             for k in range(size):
-                writer.line(f"STORE({size}, {n_drones}, r{number[leaf]}, {k}, {kind}_lanes({names[leaf, k]}))", 2)
+                writer.line(f"STORE({size}, {n_drones}, r{rank[leaf]}, {k}, {kind}_lanes({names[leaf, k]}))", 2)
         exchange.end(writer, 2)
         writer.line("}", 1)
     exchange.begin(writer, 1)
@@ -153,10 +151,10 @@ def write(program: Program, target: str, samples: Sequence[int] = ()) -> Kernel:
         writer.line(_store(program, slot, f"{_type(program, slot[0])}_lanes({names[slot]})"), depth)
     exchange.end(writer, 1)
 
-    pointers = [f"const {_type(program, i)}* __restrict__ p{number[i]}" for i in inputs]
-    pointers += [f"{_type(program, i)}* __restrict__ q{number[i]}" for i in outputs]
+    pointers = [f"const {_type(program, i)}* __restrict__ p{rank[i]}" for i in inputs]
+    pointers += [f"{_type(program, i)}* __restrict__ q{rank[i]}" for i in outputs]
     pointers += ["b1* __restrict__ flagged"] if check is not None else []
-    pointers += [f"{_type(program, i)}* __restrict__ s{number[i]}" for i in samples]
+    pointers += [f"{_type(program, i)}* __restrict__ s{rank[i]}" for i in samples]
     threads, lanes = lanes_of_block(program.group)
     body = "\n".join(writer.lines)
     frame = _cuda(pointers, body, threads, lanes) if target == "cuda" else _host(pointers, body, exchange.depth > 0)
@@ -265,17 +263,17 @@ def _deferred(program: Program) -> set[Slot]:
 
     If none changes them, they are loaded there, and take no register in between.
     """
-    in_blocks: set[Slot] = set()
-    always: set[Slot] = set()
+    below_rate: set[Slot] = set()
+    at_each_step: set[Slot] = set()
     for segment in program.fused_segments:
         block = segment.block
         now = {x for op in block.operations for x in op.args} | set(block.outputs)
         now = now.union(*(x.uses() for op in block.operations if op.name == "over_others" for x in op.blocks))
-        always.update(segment.hoisted_reads)
+        at_each_step.update(segment.hoisted_reads)
         for x, slot in zip(block.inputs, program.per_drone(segment, segment.reads), strict=False):
-            (always if segment.scope == "world" or x in now else in_blocks).add(slot)
+            (at_each_step if segment.scope == "world" or x in now else below_rate).add(slot)
     in_check = set(program.check.reads) if program.check is not None else set()
-    return (in_blocks ^ in_check) - always
+    return (below_rate ^ in_check) - at_each_step
 
 
 def _type(program: Program, leaf: int) -> str:
@@ -283,19 +281,19 @@ def _type(program: Program, leaf: int) -> str:
 
 
 def _load(program: Program, slot: Slot) -> str:
-    (leaf, k), number = slot, program.numbers[slot[0]]
+    (leaf, k), rank = slot, program.ranks[slot[0]]
     if program.leaves[leaf].scope not in ("drone", "world"):
-        return f"p{number}[{k}]"
+        return f"p{rank}[{k}]"
     if leaf in program.rows:
-        return f"LOAD_ROW({'q' if leaf in program.written else 'p'}{number}, {k})"
-    return f"LOAD({program.leaves[leaf].size}, {_drones(program, leaf)}, p{number}, {k})"
+        return f"LOAD_ROW({'q' if leaf in program.written else 'p'}{rank}, {k})"
+    return f"LOAD({program.leaves[leaf].size}, {_drones(program, leaf)}, p{rank}, {k})"
 
 
 def _store(program: Program, slot: Slot, value: str) -> str:
-    (leaf, k), number = slot, program.numbers[slot[0]]
+    (leaf, k), rank = slot, program.ranks[slot[0]]
     if leaf in program.rows:
-        return f"STORE_ROW(q{number}, {k}, {value})"
-    return f"STORE({program.leaves[leaf].size}, {_drones(program, leaf)}, q{number}, {k}, {value})"
+        return f"STORE_ROW(q{rank}, {k}, {value})"
+    return f"STORE({program.leaves[leaf].size}, {_drones(program, leaf)}, q{rank}, {k}, {value})"
 
 
 def _drones(program: Program, leaf: int) -> int:

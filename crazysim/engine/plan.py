@@ -69,7 +69,7 @@ class Plan(NamedTuple):
     static: Callable[..., Any]
     """The same for a number of steps that is a Python number, which can be differentiated in reverse."""
     direct: Callable[..., Any] | None = None
-    """The same without a compiler, for calls with arrays; None where there is none."""
+    """The step in NumPy, for arguments that are not traced; None for other engines."""
 
     @property
     def program(self) -> Program | None:
@@ -260,7 +260,7 @@ def _jitted(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[.
 
 
 def _on_host(advance: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of arrays that computes in NumPy, with results on the device of its arguments."""
+    """Return the step in NumPy, with results on the device of its arguments."""
 
     def direct(values: list[Any], n_steps: int | Array) -> list[Any]:
         committed = next((x for x in values if getattr(x, "committed", False)), None)

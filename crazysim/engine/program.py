@@ -182,8 +182,8 @@ class Program:
         return sorted({i for s in self.segments for i in s.read})
 
     @functools.cached_property
-    def numbers(self) -> dict[int, int]:
-        """Leaves that take part, numbered one after the other: equal steps of different data have the same kernel."""
+    def ranks(self) -> dict[int, int]:
+        """Ranks of the leaves that take part, by which kernels name them: in equal steps of different data they agree."""
         checked = [leaf for leaf, _ in self.check.reads] if self.check is not None else []
         used = {*checked, *(i for s in self.segments for i in (*s.read, *s.written))}
         return {leaf: n for n, leaf in enumerate(sorted(used))}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Sequence
 from typing import Any
 
@@ -69,7 +68,7 @@ class Tracer:
         shapes = tuple([(x.shape, x.dtype) for x in axes.of_one(list(leaves), stage.scope)])
         key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
         if key not in self._found:
-            if _is_built_in(stage):
+            if stage.fixed:
                 traced = _traced_once(stage, axes, leaves, shapes)
             else:
                 traced = TracedStage(stage, axes, leaves)
@@ -78,30 +77,23 @@ class Tracer:
         return self._found[key][1]
 
 
-_BUILT_IN: dict[Any, TracedStage] = {}
-"""Traced stages of the package itself, for all simulations of this process."""
-MOST = 256
-"""Number of them that are kept."""
-
-
-def _is_built_in(stage: Stage) -> bool:
-    """Return whether a stage is a function of the package itself, which always does the same.
-
-    What a user's function does may change with what it refers to.
-    """
-    return stage.batched and not inspect.ismethod(stage.fn)
+_FIXED: dict[Any, TracedStage] = {}
+"""Traced stages that always do the same, for all simulations of this process."""
+MAX_FIXED = 256
+"""Largest number of them."""
 
 
 def _traced_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
-    """Return a traced stage from the cache of this process; the numbers of worlds and drones do not matter to it."""
+    """Return a fixed stage, traced now or before in this process. It must not read the numbers of worlds and drones."""
     data = axes.treedef.unflatten(leaves)
     kind = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))
     key = (stage.fn, stage.when, kind, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)
-    if key not in _BUILT_IN:
-        if len(_BUILT_IN) >= MOST:
-            _BUILT_IN.clear()
-        _BUILT_IN[key] = TracedStage(stage, axes, leaves)
-    return _BUILT_IN[key]
+    traced = _FIXED.get(key)
+    if traced is None:
+        traced = _FIXED[key] = TracedStage(stage, axes, leaves)
+        for oldest in list(_FIXED)[:-MAX_FIXED]:
+            _FIXED.pop(oldest, None)
+    return traced
 
 
 def _used(jaxpr: jaxcompat.ClosedJaxpr) -> set[int]:

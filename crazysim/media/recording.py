@@ -193,21 +193,21 @@ def put(sim: Sim, flight: Flight, time: float) -> None:
     now, data = flight.at(time), sim.data
     controls, objects = data.controls, data.objects
     old = {"pos": data.states.pos, "quat": data.states.quat, "steps": data.core.steps}
-    new = {"pos": now["pos"], "quat": now["quat"], "steps": np.full((len(worlds), 1), round(time * sim.freq))}
+    new = {"pos": now["pos"], "quat": now["quat"], "steps": np.full((len(worlds), 1), round(time * sim.freq), np.int32)}
     if controls.state is not None and now["setpoint"].size:
         old["setpoint"], new["setpoint"] = controls.state.staged_cmd, now["setpoint"]
     if objects is not None:
         columns = np.searchsorted(flight.body_ids, np.asarray(objects.mocap_ids))
         old |= {"body_pos": objects.pos, "body_quat": objects.quat}
         new |= {name: now[name][:, None, columns] for name in ("body_pos", "body_quat")}
-    put = _with_worlds(old, worlds, new)
-    states = data.states.replace(pos=put["pos"], quat=put["quat"])
-    core = data.core.replace(steps=put["steps"])
-    if "setpoint" in put:
-        controls = controls.replace(state=controls.state.replace(staged_cmd=put["setpoint"]))
+    changed = _with_worlds(old, worlds, new)
+    states = data.states.replace(pos=changed["pos"], quat=changed["quat"])
+    core = data.core.replace(steps=changed["steps"])
+    if "setpoint" in changed:
+        controls = controls.replace(state=controls.state.replace(staged_cmd=changed["setpoint"]))
     if objects is not None:
         recorded = any(plugin.places for plugin in sim.plugins.values())
-        objects = objects.replace(pos=put["body_pos"], quat=put["body_quat"], recorded=recorded)
+        objects = objects.replace(pos=changed["body_pos"], quat=changed["body_quat"], recorded=recorded)
     sim.data = data.replace(states=states, core=core, controls=controls, objects=objects)
     body_pos, body_quat = _bodies(sim, worlds)
     if not (np.allclose(body_pos, now["body_pos"], atol=1e-6) and np.allclose(body_quat, now["body_quat"], atol=1e-6)):

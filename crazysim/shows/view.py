@@ -30,8 +30,8 @@ SHOWN = 0.7
 """Time for which a collision is marked, s."""
 RED = (1.0, 0.1, 0.1, 0.55)
 """Colour of a mark."""
-FPS = 60.0
-"""Most images per second of a window."""
+MAX_FPS = 60.0
+"""Largest number of images per second of a window."""
 NIGHT_LIGHT = 0.1
 """Brightest light at night, 0 to 1."""
 NIGHT_SKY = (8, 10, 24)
@@ -86,7 +86,7 @@ def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
             shown = time.perf_counter()
             put(sim, recorded, now)
             camera.show(sim)
-            time.sleep(max(shown + 1 / FPS - time.perf_counter(), 0.0))
+            time.sleep(max(shown + 1 / MAX_FPS - time.perf_counter(), 0.0))
     finally:
         sim.data = data
 

@@ -57,7 +57,7 @@ class Member:
                 raise UnknownNameError(
                     f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}."
                 )
-            new[field] = self._with_row(f"{field} of {self.name}", getattr(record, field), value)
+            new[field] = self._with_checked_row(f"{field} of {self.name}", getattr(record, field), value)
         self._sim.data = self._written(self._sim.data, record.replace(**new))
 
     def command(self, command: Any) -> None:
@@ -75,14 +75,14 @@ class Member:
             if plugin.command_field is None:
                 raise ConfigError(f"expected a population that takes commands, got {self.population!r}, which does not")
             record = plugin.read(data)
-            staged = self._with_row(f"command of {self.name}", getattr(record, plugin.command_field), command)
+            staged = self._with_checked_row(f"command of {self.name}", getattr(record, plugin.command_field), command)
             sim.data = plugin.write(data, record.replace(**{plugin.command_field: staged}))
             return
         level: Any = data.controls
         staged = level.rotor_vel if sim.control == "rotor_vel" else getattr(level, sim.control.value).staged_cmd
         if sim.control == "rotor_vel":
             command = self._for_rotors(command, command_shape(data, sim.control)[-1])
-        staged = self._with_row(f"{sim.control.value} command of {self.name}", staged, command)
+        staged = self._with_checked_row(f"{sim.control.value} command of {self.name}", staged, command)
         after: Any = F.stage_command(data, staged)
         before = getattr(level.state, "staged_feedforward", None)
         if before is not None:  # that of the other drones stays
@@ -98,7 +98,7 @@ class Member:
             return command
         return np.pad(np.asarray(command), [(0, 0)] * (np.ndim(command) - 1) + [(0, n_rotors - own)])
 
-    def _with_row(self, what: str, x: Array, value: Any) -> Array:
+    def _with_checked_row(self, what: str, x: Array, value: Any) -> Array:
         shape = x.shape[:1] + x.shape[2:]
         if np.shape(value) not in (shape[1:], shape):
             raise ValueError(

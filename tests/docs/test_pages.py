@@ -1,5 +1,6 @@
 """Every Python block of every page runs, in the order of the page and in one namespace."""
 
+import contextlib
 import re
 from pathlib import Path
 
@@ -19,14 +20,23 @@ The interpreter takes few steps, and the derivatives of ``plain`` compile soones
 PLAN = Step._plan
 
 
-def plan_for(engine):
-    """Return ``Step._plan`` for an engine, where the page chooses none."""
+@contextlib.contextmanager
+def planned_for(engine, monkeypatch):
+    """Let steps be planned for an engine, where the page chooses none; steps behind the block are planned anew."""
+    steps = []
 
     def plan(step, *data):
-        step.engine = engine if step.engine == "auto" else step.engine
+        if step.engine == "auto":
+            steps.append(step)
+            step.engine = engine
         return PLAN(step, *data)
 
-    return plan
+    with monkeypatch.context() as patch:
+        patch.setattr(Step, "_plan", plan)
+        yield
+    for step in steps:
+        step.engine = "auto"
+        step._plans.clear()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -41,9 +51,8 @@ def test_page_runs(page, tmp_path, monkeypatch, opengl):
     for block in BLOCK.finditer(text):
         # Blank lines in front, so that a traceback shows the line of the page.
         code = "\n" * text[: block.start()].count("\n") + "\n" + block.group(1)
-        with monkeypatch.context() as patch:
-            if engine := ENGINE.search(text, 0, block.start()):
-                patch.setattr(Step, "_plan", plan_for(engine[1]))
+        engine = ENGINE.search(text, 0, block.start())
+        with planned_for(engine[1], monkeypatch) if engine else contextlib.nullcontext():
             exec(compile(code, str(page), "exec"), namespace)
 
 

@@ -263,6 +263,9 @@ def lift(data):
     return data.replace(states=data.states.replace(force=data.states.force + jnp.asarray([0.0, 0.0, 1e-3])))
 
 
+drop = Stage(lambda data: data.replace(states=data.states.replace(force=0 * data.states.force)), "drone", batched=True)
+
+
 def test_stages_of_the_package_are_traced_once_in_a_process(sim, monkeypatch, tmp_path):
     """Whatever the number of worlds; a user's stage is traced for every simulation, since it may have changed."""
     traced = []
@@ -277,10 +280,15 @@ def test_stages_of_the_package_are_traced_once_in_a_process(sim, monkeypatch, tm
     for n_worlds in (3, 4):
         monkeypatch.setenv("CRAZYSIM_DUMP", str(tmp_path / str(n_worlds)))
         data = shared_sim(n_worlds=n_worlds, n_drones=2, control="rotor_vel").data
-        plans.append(Step(pipeline(sim, lift), "lanes").plan(data))
+        plans.append(Step(pipeline(sim, lift) | {"drop": drop}, "lanes").plan(data))
     stages = {name for segment in plans[1].program.segments for name in segment.stages}
-    assert {"lift", "integration", "clip_floor_pos"} <= stages
-    assert traced.count("lift") == 2
+    assert {"lift", "drop", "integration", "clip_floor_pos"} <= stages
+    assert traced.count("lift") == traced.count("drop") == 2
     assert traced.count("integration") <= 1
     dumps = [{path.name.split("-")[-1] for path in (tmp_path / n).glob("*.jaxpr")} for n in ("3", "4")]
     assert dumps[0] == dumps[1] == {f"{name}.jaxpr" for name in stages}
+    monkeypatch.setattr(tracing, "MAX_FIXED", 1)
+    data = shared_sim(n_worlds=3, n_drones=1, control="attitude").data
+    text = str(Step(shared_sim(n_worlds=3, n_drones=1, control="attitude").step_pipeline, "lanes").plan(data).program)
+    assert len(tracing._FIXED) == 1
+    assert "integration" in text

@@ -64,7 +64,7 @@ def move_many(eqn: Any, args: list[Elements], fixed: Sequence[Any] = ()) -> list
 
 
 def _places(eqn: Any, args: list[Any]) -> list[np.ndarray]:
-    """Return where the elements of the results come from: the primitive's results for indices."""
+    """Return, for each result, the indices of the elements that it takes; what NumPy can do needs no compilation."""
     p, x = eqn.params, args[0]
     match eqn.primitive.name:
         case "split":
