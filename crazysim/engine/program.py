@@ -183,7 +183,7 @@ class Program:
 
     @functools.cached_property
     def ranks(self) -> dict[int, int]:
-        """Ranks of the leaves that take part, by which kernels name them: in equal steps of different data they agree."""
+        """Ranks of the leaves that take part, by which kernels name them; equal steps have equal ranks."""
         checked = [leaf for leaf, _ in self.check.reads] if self.check is not None else []
         used = {*checked, *(i for s in self.segments for i in (*s.read, *s.written))}
         return {leaf: n for n, leaf in enumerate(sorted(used))}

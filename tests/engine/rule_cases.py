@@ -112,7 +112,8 @@ def movement(g):
         m.T.ravel(), m[::-1].ravel(), jnp.pad(m, ((1, 0), (0, 2)), constant_values=2.0).ravel(), jnp.tile(m[0], 2),
         jnp.roll(g.x, 2), g.big[1:5:2, ::3].ravel(), jnp.repeat(m[:, 0], 2), jnp.diag(m), jnp.rot90(m).ravel(),
         jnp.stack(jnp.split(g.x, 3)).ravel(), m[jnp.array([2, 0, 2])].ravel(), m.at[1].set(7.0).ravel(),
-        m.at[:, 0].add(g.x[:3]).ravel(), jax.lax.pad(m, 3.0, ((-1, 2, 1), (2, -1, 0))).ravel(), jnp.broadcast_to(g.x[:1], (4,)), jnp.concatenate([g.x, m[0]])[2:5],
+        m.at[:, 0].add(g.x[:3]).ravel(), jax.lax.pad(m, 3.0, ((-1, 2, 1), (2, -1, 0))).ravel(),
+        jnp.broadcast_to(g.x[:1], (4,)), jnp.concatenate([g.x, m[0]])[2:5],
     ])  # fmt: skip
 
 

@@ -59,7 +59,7 @@ ENGINES = [
     for case in [*((*pair, "stages") for pair in PAIRS[1:]), (*PAIRS[0], "plain"), (*PAIRS[0], "auto"), FITTED]
 ]
 """Every pair, as its stages are written, without an engine; the longest pipeline on the plain engine, and on the one
-that users get, and one of fitted dynamics on the latter. Tests of one case share its flight, so one worker runs them."""
+that users get, as well as one of fitted dynamics. Tests of one case share its flight, so one worker runs them."""
 
 
 @functools.cache
