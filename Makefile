@@ -3,8 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 # Further requirements of an environment, such as PINS="jax<0.12"; one environment for each, named by VENV.
 PINS ?=
-# Processes that run tests: one more than there are cores to be busy, since tests of windows, pages and live loops wait.
-WORKERS ?= 3
+# Processes that run tests; each takes up to 4 GB.
+WORKERS ?= 2
 RUN = $(VENV)/bin/python
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 

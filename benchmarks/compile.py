@@ -49,9 +49,9 @@ def measure(control: str, integrator: str, n_worlds: int, engine: str, device: s
         "control": control,
         "integrator": integrator,
         "n_worlds": n_worlds,
-        "build_s": round(built - begin, 2),
-        "trace_s": round(traced - built, 2),
-        "compile_s": round(done - traced, 2),
+        "build_s": round(built - begin, 4),
+        "trace_s": round(traced - built, 4),
+        "compile_s": round(done - traced, 4),
         "crazysim": __version__,
         **machine(device),
     }

@@ -70,7 +70,7 @@ def pytest_collection_finish():
 
 
 WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-MEMORY = 0.45 / WORKERS * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2e9
+MEMORY = 0.4 / WORKERS * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2e9
 """Memory of a worker, bytes, above which it looks for garbage between two files: together a part of the machine's."""
 GROWTH = 1.3
 """Factor by which its memory has grown when it looks again: one look takes seconds."""
@@ -87,6 +87,13 @@ def pytest_runtest_teardown(item, nextitem):
         gc.collect()
         gc.freeze()
         limit = max(MEMORY, GROWTH * memory())
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish():
+    """Look once for what was not closed: pytest looks five times at what is not frozen."""
+    gc.collect()
+    gc.freeze()
 
 
 def memory():

@@ -161,7 +161,7 @@ def test_peers_that_misbehave_are_refused(server, caplog):
 
 def test_a_drone_has_only_its_own_commands(server):
     assert raw(server.drone_port, b"REQ_07", b"01_CMDSTART_land_EOF", wait=0.5) == b"ACK_07ERR"
-    assert raw(server.drone_port, b"REQ_07REQ_01") == b"ACK_07"
+    assert raw(server.drone_port, b"REQ_02REQ_01") == b"ACK_02"
 
 
 def test_server_says_where_it_listens(caplog):
