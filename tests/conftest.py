@@ -16,7 +16,8 @@ os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 import jax
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from crazysim.engine import cuda
 
@@ -63,10 +64,17 @@ def pytest_collection_modifyitems(items):
 def pytest_collection_finish():
     """Leave garbage to ``pytest_runtest_teardown``: tracing makes millions of objects, and looking took a tenth of all.
 
-    What is imported by now stays.
+    What is imported by now stays. Hypothesis looks as well, when it runs the first example of a process.
     """
+    first_example()
     gc.collect()
     gc.freeze()
+
+
+@settings(max_examples=1, database=None)
+@given(st.none())
+def first_example(_):
+    """Do nothing."""
 
 
 WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))

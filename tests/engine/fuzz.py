@@ -122,7 +122,7 @@ class Case:
     program: Program
     scope: str
 
-    @property
+    @functools.cached_property
     def avals(self) -> list[jax.ShapeDtypeStruct]:
         """Shapes and types of all values."""
         return jax.eval_shape(self.program.values, inputs_of(self.scope))
@@ -140,14 +140,21 @@ class Case:
 
     def blank(self, name: str) -> dict[str, Any]:
         """Return the slots that the stage writes to, of all worlds."""
-        floats, others = jax.eval_shape(
-            lambda g: packed(self.program.values(g), len(self.program.inputs)), inputs_of(self.scope)
-        )
+        results = self.avals[len(self.program.inputs) :]
+        n_floats = sum(aval.size for aval in results if jnp.issubdtype(aval.dtype, jnp.floating))
+        n_others = sum(aval.size for aval in results) - n_floats
         batch = (N_WORLDS, N_DRONES if self.scope == "drone" else 1)
         return {
-            f"{name}f": jnp.zeros((*batch, *floats.shape), np.float32),
-            f"{name}o": jnp.zeros((*batch, *others.shape), np.int32),
+            f"{name}f": np.zeros((*batch, n_floats), np.float32),
+            f"{name}o": np.zeros((*batch, n_others), np.int32),
         }
+
+    @functools.cached_property
+    def signed(self) -> list[bool]:
+        """Whether each line keeps the sign of zero."""
+        n = len(self.program.inputs)
+        lines = enumerate(self.program.lines)
+        return [keeps_sign_of_zero(functools.partial(_of_values, line), self.avals[: n + j]) for j, line in lines]
 
     def unpacked(self, floats: np.ndarray, others: np.ndarray) -> list[np.ndarray]:
         """Return the values of the lines from slots, of all worlds."""
@@ -314,7 +321,7 @@ class Fuzzer:
         inputs = [self._lanes(case.scope, name) for name in case.program.inputs]
         for j, (a, b) in enumerate(zip(plain, other, strict=True)):
             line = functools.partial(_of_values, case.program.lines[j])
-            signed = keeps_sign_of_zero(line, case.avals[: n + j])
+            signed = case.signed[j]
             bad = ~close(a, b, signed)
             lanes = np.flatnonzero(bad.reshape(len(a), -1).any(1))
             # A compiler may compute an operand once more and round it differently, so the inputs are tried as well.

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import shared_sim, with_params, with_states
+from cases import by_stages, shared_sim, with_params, with_states
 
 from crazysim import ConfigError, Sim
 from crazysim.control import Control, command_size
@@ -322,14 +322,14 @@ def assert_gradients_equal(found, expected):
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9 * scale)
 
 
-def test_gradients_equal_those_of_plain_in_float64(x64):
-    """Reverse mode through 40 steps of the attitude controller; forward mode, which compiles sooner, for plain."""
+def test_gradients_equal_those_of_the_stages_in_float64(x64):
+    """Reverse mode through 40 steps of the attitude controller; without an engine forwards, which compiles sooner."""
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
     data = scattered(sim, dtype=np.float64)
     command = data.controls.attitude.staged_cmd
     found, expected = (
-        jax.jit(derivative(functools.partial(loss, Step(sim.step_pipeline, engine), data=data, n=40)))(command)
-        for engine, derivative in ((FAST[-1], jax.grad), ("plain", jax.jacfwd))
+        jax.jit(derivative(functools.partial(loss, step, data=data, n=40)))(command)
+        for step, derivative in ((Step(sim.step_pipeline, FAST[-1]), jax.grad), (by_stages(sim), jax.jacfwd))
     )
     assert_gradients_equal(found, expected)
 
@@ -347,8 +347,8 @@ def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
         return jnp.sum(step(ready, 36).states.ang_vel ** 2)
 
     at = 1e-4 * at[0], at[1]
-    plain, fast = (functools.partial(energy, Step(sim.step_pipeline, engine)) for engine in ("plain", FAST[-1]))
-    expected = jax.jit(jax.jacfwd(plain, (0, 1)))(*at)
+    alone, fast = (functools.partial(energy, step) for step in (by_stages(sim), Step(sim.step_pipeline, FAST[-1])))
+    expected = jax.jit(jax.jacfwd(alone, (0, 1)))(*at)
     assert abs(float(expected[1][0, 1])) > 0
     assert_gradients_equal(jax.jit(jax.grad(fast, (0, 1)))(*at), expected)
     slope = jax.jit(lambda *x: jax.jvp(fast, x, x)[1])(*at)
