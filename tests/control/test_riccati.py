@@ -80,8 +80,8 @@ def test_a_double_integrator_by_hand():
 
 
 UNSOLVABLE = {
-    "unstable mode without input": (np.diag([1.0, -1.0]), np.diag([2.0, 0.5]), [[0.0], [1.0]], np.eye(2)),
-    "integrator without input": (np.zeros((2, 2)), np.eye(2), [[0.0], [1.0]], np.eye(2)),
+    "unstable mode without input": (np.diag([1.0, -1.0]), np.diag([2.0, 0.5]), np.diag([0.0, 1.0]), np.eye(2)),
+    "integrator without input": (np.zeros((2, 2)), np.eye(2), np.diag([0.0, 1.0]), np.eye(2)),
     "integrator without weight": (np.zeros((2, 2)), np.eye(2), np.eye(2), np.diag([0.0, 1.0])),
     "not a number": (np.full((2, 2), np.nan), np.full((2, 2), np.nan), np.eye(2), np.eye(2)),
 }
@@ -90,9 +90,8 @@ UNSOLVABLE = {
 @pytest.mark.parametrize("case", UNSOLVABLE)
 def test_without_a_solution_it_is_nan_and_the_host_raises(case):
     continuous, discrete, B, Q = UNSOLVABLE[case]
-    B = np.asarray(B, float)
     for gain, A in ((gain_continuous, continuous), (gain_discrete, discrete)):
-        K = GAINS[gain](A, B, Q, np.eye(B.shape[1]))
+        K = GAINS[gain](A, B, Q, np.eye(2))
         assert np.isnan(K).all()
         with pytest.raises(ConfigError, match="stabilising solution"):
             check_gain(K)

@@ -65,13 +65,13 @@ def positions(n_worlds, n_drones):
 def test_each_drone_flies_as_in_a_simulation_of_its_own(control, controller, fleet):
     pos = positions(1, len(fleet))
     mixed = in_flight(Sim(drone=fleet, control=control, controller=controller, engine="interpret"), pos)
-    mixed.step(40)
+    mixed.step(25)
     flown = jax.device_get(mixed.data.states)
     for k, airframe in enumerate(fleet):
         own = in_flight(
             Sim(drone=airframe, control=control, controller=controller, engine="interpret"), pos[:, k : k + 1]
         )
-        own.step(40)
+        own.step(25)
         n, alone = own.airframe.n_rotors, jax.device_get(own.data.states)
         for name in STATES:
             expected, got = getattr(alone, name)[0, 0], getattr(flown, name)[0, k]

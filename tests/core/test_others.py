@@ -91,7 +91,10 @@ def test_all_engines_compute_all_pairs(n_drones):
 
 @pytest.mark.parametrize("n_drones", [3, 9])
 def test_law_08_gradients_equal_central_differences(n_drones, x64):
-    """In float64 engines agree to its rounding, and the slope of a sum over velocities is that of differences."""
+    """In float64 engines agree to its rounding, and the slope of a sum over velocities is that of differences.
+
+    In reverse on lanes, on which a kernel's derivative is computed as well, and forwards on the others.
+    """
     sim = simulation(2, n_drones, Downwash())
     data = as_float64(sim.data)
     pos, way = np.asarray(data.states.pos), np.random.default_rng(2).normal(size=data.states.pos.shape)
@@ -107,7 +110,9 @@ def test_law_08_gradients_equal_central_differences(n_drones, x64):
         def loss(size, step=step):
             return score(step(data.replace(states=data.states.replace(pos=pos + size * way)), 2))
 
-        value_and_slope = jax.jit(jax.value_and_grad(loss))
+        forward = lambda size, loss=loss: jax.jvp(loss, (size,), (1.0,))  # noqa: E731
+        is_reverse = engine == "lanes" or (engine, n_drones) == ("plain", 3)
+        value_and_slope = jax.jit(jax.value_and_grad(loss) if is_reverse else forward)
         ends[engine] = float(value_and_slope(0.0)[0] if engine in ("plain", "lanes") else loss(0.0))
         np.testing.assert_allclose(ends[engine], ends["plain"], rtol=1e-12)
         if engine != "interpret":
