@@ -40,7 +40,7 @@ def add_cross(offset: Array, a: Array, b: Array) -> Array:
 
 
 def matvec(matrix: Array, vector: Array, offset: Array | None = None) -> Array:
-    """Return ``matrix @ vector + offset`` for small arrays, unrolled.
+    """Return ``matrix @ vector + offset`` for small arrays, column by column.
 
     Args:
         matrix: (..., m, n)
@@ -50,11 +50,8 @@ def matvec(matrix: Array, vector: Array, offset: Array | None = None) -> Array:
     Returns:
         (..., m)
     """
-    n_rows, n_columns = matrix.shape[-2:]
-    columns = [vector[..., k] for k in range(n_columns)]
-    start = [0 if offset is None else offset[..., i] for i in range(n_rows)]
-    rows = [sum((matrix[..., i, k] * columns[k] for k in range(n_columns)), start[i]) for i in range(n_rows)]
-    return jnp.stack(rows, axis=-1)
+    columns = (matrix[..., :, k] * vector[..., k : k + 1] for k in range(matrix.shape[-1]))
+    return sum(columns, 0 if offset is None else offset)
 
 
 @jax.custom_jvp
