@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import by_stages
 from springs import STIFFNESS, Crowd, Masses, Springs, Tied, Tying
 
 from crazysim import ConfigError, Sim, stage
@@ -140,29 +141,30 @@ def test_semi_implicit_euler_keeps_energy():
 
 
 def test_gradients_pass_through_populations():
-    """In reverse on lanes, and forwards through a kernel, which is derived on lanes; both are those of differences."""
+    """In reverse as through stages without an engine, and forwards through a kernel, which is derived on lanes."""
     cmd = np.ones((4, 2, 3, 3), np.float32)
 
-    def loss(sim, cmd):
+    def loss(sim, step, cmd):
         data = sim.data
         for population, own in zip(sim.plugins.values(), cmd, strict=True):
             data = population.commanded(data, own)
-        data = sim.step_fn(data, 5)
+        data = step(data, 5)
         return sum(jnp.sum(record.pos**2) for record in data.plugins.values()) + jnp.sum(data.states.pos)
 
-    lanes, fused = (functools.partial(loss, build(KINDS, 2, 2, 3, engine=engine)) for engine in ("lanes", "fused"))
-    reverse = np.asarray(jax.jit(jax.grad(lanes))(cmd))
-    assert np.all(np.abs(reverse) > 0)
-    value_and_slope = jax.jit(lambda x, way: jax.jvp(fused, (x,), (way,)))
-    ways = [np.float32(np.random.default_rng(k).uniform(0.5, 1, cmd.shape)) for k in range(3)]
-    for place in np.ndindex(4, 2, 3):  # along x, y and z in turn
-        way = np.zeros(cmd.shape, np.float32)
-        way[place][sum(place) % 3] = 1
-        ways.append(way)
-    for way in ways:
-        np.testing.assert_allclose(value_and_slope(cmd, way)[1], np.sum(way * reverse), rtol=1e-4, atol=1e-8)
-        ahead, behind = (float(value_and_slope(cmd + h * way, way)[0]) for h in (0.5, -0.5))  # the loss is quadratic
-        np.testing.assert_allclose(np.sum(way * reverse), ahead - behind, rtol=2e-2)
+    sims = [build(KINDS, 2, 2, 3, engine=engine) for engine in ("plain", "lanes", "fused")]
+    steps = [by_stages(sims[0]), sims[1].step_fn, sims[2].step_fn]
+    alone, lanes, fused = (functools.partial(loss, sim, step) for sim, step in zip(sims, steps, strict=True))
+    alone, lanes = (np.asarray(jax.jit(jax.grad(fn))(cmd)) for fn in (alone, lanes))
+    assert np.all(np.abs(alone) > 0)
+    np.testing.assert_allclose(lanes, alone, rtol=1e-4, atol=1e-8)
+    way = np.float32(np.random.default_rng(1).uniform(0.5, 1, cmd.shape))
+    value_and_slope = jax.jit(lambda x: jax.jvp(fused, (x,), (way,)))
+    np.testing.assert_allclose(value_and_slope(cmd)[1], np.sum(way * alone), rtol=1e-4)
+    for k in range(4):  # the loss is quadratic
+        h = np.zeros(cmd.shape, np.float32)
+        h[k, 1, 2, 0] = 0.5
+        central = float(value_and_slope(cmd + h)[0]) - float(value_and_slope(cmd - h)[0])
+        np.testing.assert_allclose(alone[k, 1, 2, 0], central, rtol=2e-2)
 
 
 def test_a_derivative_reaches_the_drones_from_a_mass():
