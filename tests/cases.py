@@ -196,30 +196,6 @@ def by_stages(sim):
     return step
 
 
-class StagedSim(Sim):
-    """A simulation without an engine, which applies the stages as they are written: for tests of what stages do.
-
-    They are traced once, and compile in half the time of the engine ``"plain"``. The first step fixes the pipeline.
-    """
-
-    _advance = None
-
-    def step(self, n_steps=1):
-        """Advance every world by a number of physics steps."""
-        if self._advance is None:
-            self._advance = jax.jit(self._by_stages)
-        self.data = self._advance(jax.device_put(self.data, self.device), np.int32(n_steps))
-
-    def _by_stages(self, data, n_steps):
-        def once(_, data):
-            for stage in as_stages(self.step_pipeline):
-                data = stage(data)
-            return data
-
-        data = jax.lax.fori_loop(0, n_steps, once, data)
-        return data.replace(core=data.core.replace(nonfinite=data.core.nonfinite | ~finite(data)))
-
-
 @functools.cache
 def shared_sim(**settings):
     """Return a simulation that several tests step: compiled once, and to be left as it was found."""

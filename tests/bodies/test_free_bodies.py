@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from cases import StagedSim, by_stages, with_params, with_states
+from cases import with_params, with_states
 from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, ContactResponse, FreeBodies, Sim, Terrain
@@ -19,7 +19,7 @@ FREQ = 500
 def build(members=1, size=(0.2, 0.2, 0.2), mass=0.1, n_worlds=1, drone_pos=None, **kwargs):
     """Return a simulation with bodies. Without a place for its drone this one stands still, and nothing touches it."""
     flies = drone_pos is not None
-    sim = (Sim if flies else StagedSim)(n_worlds=n_worlds, control="rotor_vel", freq=FREQ)
+    sim = Sim(n_worlds=n_worlds, control="rotor_vel", freq=FREQ, engine="auto" if flies else "plain")
     sim.data = with_states(sim.data, pos=drone_pos if flies else (-3.0, 0.0, 1.0))
     sim.build_default_data()
     plugin = sim.add(FreeBodies(members, size=size, mass=mass, **{"drones": flies} | kwargs))
@@ -312,7 +312,7 @@ def test_drones_and_bodies_push_each_other():
 
 
 def test_an_object_moved_by_the_user_pushes_a_body():
-    sim = StagedSim(control="rotor_vel")
+    sim = Sim(control="rotor_vel", engine="plain")
     pusher = sim.scene.add("box", "pusher", size=(0.2, 0.2, 0.2), pos=(0, 0, 0.1))
     plugin = sim.add(FreeBodies(1, size=(0.2, 0.2, 0.2), pos=(0.25, 0, 0.1), drones=False))
     leave_out_drones(sim)
@@ -326,7 +326,7 @@ def test_an_object_moved_by_the_user_pushes_a_body():
 
 
 def test_objects_of_any_kind_carry_bodies():
-    sim = StagedSim(control="rotor_vel")
+    sim = Sim(control="rotor_vel", engine="plain")
     sim.scene.add("landing_pad", pos=(0, 0, 0.3), radius=0.4, mocap=False)
     sim.scene.add("sphere", pos=(3, 0, 0.2), radius=0.2, mocap=False)
     pos = [[0, 0, 0.45], [0.25, 0, 0.45], [3.0, 0, 0.55]]
@@ -340,7 +340,7 @@ def test_objects_of_any_kind_carry_bodies():
 def test_bodies_rest_on_terrain():
     """Level ground of 0.4 m, and a slope of 0.3 that friction of 0.6 holds."""
     heights = np.concatenate([np.full((4, 3), 0.4), 0.4 + 0.3 * np.tile(np.arange(1.0, 4.0), (4, 1))], axis=1)
-    sim = StagedSim(control="rotor_vel")
+    sim = Sim(control="rotor_vel", engine="plain")
     sim.add(Terrain(heights, (5.0, 3.0)))
     plugin = sim.add(FreeBodies(2, size=(0.2, 0.2, 0.1), pos=[[-1.5, 0, 0.5], [1.5, 0.1, 0.95]], drones=False))
     leave_out_drones(sim)
@@ -398,7 +398,7 @@ def test_law_07_a_lost_world_stays_alone():
 def test_law_08_gradients_equal_central_differences(x64):
     """Of a slide with friction, with respect to the speed at the start: d(v^2 / (2 mu g)) / dv."""
     sim, plugin = build(1, (0.2, 0.2, 0.1), 0.5, pos=(0, 0, 0.05))
-    step = by_stages(sim)
+    step = sim.build_step_fn()
 
     def end(speed):
         record = plugin.read(sim.data)
