@@ -59,16 +59,6 @@ class OneStep:
             _, _, floats = self._step(*before, floats)
         return self._joined(floats, rest)
 
-    def gradient_of(self, total):
-        """Return a compiled function from such a tree to the gradient of ``total(*tree)``, for ``gradient``."""
-        slope = jax.jit(jax.grad(lambda floats, rest: total(*self._joined(floats, rest))))
-
-        def gradient(tree):
-            floats, rest = self._parted(on_device(tree))
-            return self._joined(slope(floats, rest), rest)
-
-        return gradient
-
     def _parted(self, data):
         """Return the leaves of floating type, and the others, each with None for the rest."""
         leaves = self._treedef.flatten_up_to(data)

@@ -19,7 +19,6 @@ from env_cases import (
     random_action,
 )
 from gymnasium.vector.utils import batch_space
-from one_step import OneStep
 
 from crazysim.dynamics import first_principles
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
@@ -323,45 +322,24 @@ def test_a_world_that_is_lost_ends_alone(env, begun):
 def test_the_gradient_of_the_reward_is_finite(env, begun, flown):
     """Law 7, for actions and states, at the beginning of an episode and where random flight leads.
 
-    One physics step, stage by stage: what is differentiated here is the task; the engine has tests of its own. The
-    stages before the first of a task's own are compiled once for all tasks.
+    One physics step, stage by stage: what is differentiated here is the task; the engine has tests of its own.
     """
-    own, bare = env.env.stages, make("hover", 1).stages
-    n = next(k for k, (x, y) in enumerate(zip(own, bare, strict=False)) if x.fn != y.fn or k == len(bare) - 1)
 
-    def begin(before):
-        return act(env.env, *before, all_worlds)
-
-    def reward(state, action):
+    @jax.jit
+    @jax.grad
+    def slope(wrt, state):
+        action, states = wrt
+        state, action = act(env.env, state.replace(data=state.data.replace(states=states)), action, all_worlds)
         data = state.data
-        for stage in own[n:]:
+        for stage in env.env.stages:
             data = stage(data)
         return observe(env.env, state.replace(data=data), action, all_worlds).reward.sum()
 
     end = first_worlds(flown.end.replace(info={}, memory={})).replace(info=begun.info)
-    command = OneStep([begin], (begun, begun.action))
-    shared = physics(n, env.sim.n_drones)
-    slope = command.gradient_of(reward)
     for state in (begun, end):
-        (state, action), before = command.fly((state, np.full(state.action.shape, 0.1, np.float32)), 1)
-        data = state.data
-        moved, passed = shared.fly(data.replace(plugins={}, objects=None), 1)
-        state = state.replace(data=moved.replace(plugins=data.plugins, objects=data.objects))
-        by_state, by_action = slope((state, action))
-        by_data = by_state.data
-        by_moved = shared.gradient(by_data.replace(plugins={}, objects=None), passed)
-        by_data = by_moved.replace(plugins=by_data.plugins, objects=by_data.objects)
-        by_state, by_action = command.gradient((by_state.replace(data=by_data), by_action), before)
-        grads = jax.tree.leaves((by_state.data.states, by_action))
-        assert all(np.isfinite(g).all() for g in grads)
-        assert any(np.any(g) for g in grads)
-
-
-@functools.cache
-def physics(n, n_drones):
-    """Return the first stages of bare drones, with their gradient, for ``N_WORLDS`` worlds."""
-    env = make("hover", N_WORLDS, n_drones=n_drones)
-    return OneStep(env.stages[:n], env.sim.data.replace(plugins={}, objects=None))
+        grads = slope((np.full(state.action.shape, 0.1, np.float32), state.data.states), state)
+        assert all(np.isfinite(g).all() for g in jax.tree.leaves(grads))
+        assert any(np.any(g) for g in jax.tree.leaves(grads))
 
 
 class AtRest(Hover):
