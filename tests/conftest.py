@@ -5,7 +5,6 @@ import os
 from pathlib import Path
 
 import compiling
-import small_programs
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 # XLA logs an error of 3,000 characters for every program from the cache that could use another vector width.
@@ -17,6 +16,7 @@ os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 import jax
 import numpy as np
 import pytest
+import small_programs
 from hypothesis import HealthCheck, settings
 
 from crazysim.engine import cuda
