@@ -18,14 +18,15 @@ NEAR = 12
 class Browser:
     """A browser without a screen, spoken to over its debugging protocol."""
 
-    def __init__(self, program, folder, width=640, height=480):
+    def __init__(self, program, folder):
         from websockets.sync.client import connect
 
         options = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader"]
         options += ["--enable-unsafe-swiftshader", "--remote-debugging-port=0", f"--user-data-dir={folder}"]
         options += ["--disable-features=BackForwardCache"]  # a page that is left must end
+        options += ["--webgl-antialiasing-mode=none"]
         self._process = subprocess.Popen(
-            [program, *options, f"--window-size={width},{height}", "about:blank"],
+            [program, *options, "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -40,6 +41,11 @@ class Browser:
         tab = next(tab for tab in tabs if tab["type"] == "page")
         self._socket = connect(tab["webSocketDebuggerUrl"], max_size=None)
         self._n = 0
+
+    def open(self, url, width, height):
+        """Open a page in a view of some pixels."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.call("Page.navigate", url=url)
 
     def call(self, method, **params):
         self._n += 1
@@ -93,12 +99,29 @@ def wait_for(condition, seconds=60):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "it did not come to be"
-        time.sleep(0.1)
+        time.sleep(0.05)
 
 
-def start_browser(folder, kind=Browser, **size):
+def start_browser(folder):
     """Return a browser, or skip the test where there is none; CI forbids the skip."""
     program = shutil.which("chromium") or shutil.which("google-chrome")
     if program is None:
         pytest.skip("no chromium")
-    return kind(program, folder, **size)
+    return Browser(program, folder)
+
+
+def light_simply(patch=setattr):
+    """Let pages of viser that are made from now on have light from everywhere, without shadows and reflections.
+
+    Those take seconds for the first image where no GPU draws.
+    """
+    import viser
+
+    class Simple(viser.ViserServer):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            self.scene.configure_environment_map(None)
+            self.scene.configure_default_lights(cast_shadow=False)
+            self.scene.add_light_ambient("/light", intensity=2.0)
+
+    patch(viser, "ViserServer", Simple)

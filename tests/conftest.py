@@ -157,6 +157,25 @@ def plain_scene(tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="session")
+def _chromium(tmp_path_factory):
+    from browsing import start_browser
+
+    browser = start_browser(tmp_path_factory.mktemp("browser"))
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def chromium(_chromium, viser, monkeypatch):
+    """Return a browser that leaves its page when the test ends; pages of flights are lit simply meanwhile."""
+    from browsing import light_simply
+
+    light_simply(monkeypatch.setattr)
+    yield _chromium
+    _chromium.call("Page.navigate", url="about:blank")
+
+
 def can_render():
     """Return whether this machine can make an OpenGL context."""
     import mujoco

@@ -30,13 +30,23 @@ class Compiled(Wrapper):
         """Number of times that Python ran each of the functions."""
         for name in ("reset", "restart", "step"):
             setattr(self, name, jax.jit(self._counted(name, getattr(env, name))))
+        self.step = self._besides_final_obs(self.step)
 
     def begin(self, state):
         """Return the state with new episodes in all worlds, by the program of ``restart``."""
-        added = {name: x for name, x in state.info.items() if name == "final_obs"}
-        own = {name: x for name, x in state.info.items() if name not in added}
-        new = self.restart(state.replace(info=own), np.ones(len(state.terminated), bool))
-        return new.replace(info=new.info | added)
+        return self._besides_final_obs(self.restart)(state, np.ones(len(state.terminated), bool))
+
+    @staticmethod
+    def _besides_final_obs(fn):
+        """Return a function of a state that passes by what ``AutoReset`` adds to it: one program is for both."""
+
+        def call(state, *args):
+            added = {name: x for name, x in state.info.items() if name == "final_obs"}
+            own = {name: x for name, x in state.info.items() if name not in added}
+            new = fn(state.replace(info=own), *args)
+            return new.replace(info=new.info | added)
+
+        return call
 
     def _counted(self, name, fn):
         def counted(*args):

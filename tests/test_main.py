@@ -107,7 +107,7 @@ def test_without_opengl_the_demo_says_so_and_does_the_rest(tmp_path, capsys, mon
     def no_picture(*args, **kwargs):
         raise flight.RenderError("no OpenGL context could be made")
 
-    monkeypatch.setattr(flight.Sim, "render", no_picture)
+    monkeypatch.setattr(flight.Sim, "draw", no_picture)
     assert main(["demo", "--worlds", "8", "--seconds", "1", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert len([line for line in out.splitlines() if line.startswith("no film")]) == 1

@@ -64,7 +64,7 @@ class DroneParallelEnv(ParallelEnv):
         self.now: EnvState | None = None
         self._reset, self._step = jax.jit(env.reset), jax.jit(self._advance)
         self._generator, _ = gymnasium.utils.seeding.np_random()
-        shapes = jax.eval_shape(env.reset, jax.random.key(0))
+        shapes = self._reset.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
         self.observation_spaces = {
             agent: gymnasium.spaces.Dict({k: _box(x.shape[2:], np.inf, x.dtype) for k, x in shapes.obs.items()})
             for agent in self.possible_agents

@@ -66,7 +66,7 @@ class DroneVecEnv(VecEnv):
         self._actions: np.ndarray | None = None
         self._since = time.time()
         self.state: EnvState | None = None
-        _, obs = jax.eval_shape(self._first, jax.random.key(0))
+        _, obs = self._begin.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
         spaces: dict[str, gymnasium.Space] = {
             name: gymnasium.spaces.Box(-np.inf, np.inf, x.shape[1:], np.float32) for name, x in obs.items()
         }

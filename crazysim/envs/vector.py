@@ -70,7 +70,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self._again = jax.jit(self.env.restart)
         self._stepper = EnvStepper(self.env, self._output)
         self._outputs: Any = None
-        shapes = jax.eval_shape(self.env.reset, jax.random.key(0))
+        shapes = self._begin.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
         self._of_drone = {k for k, v in shapes.info.items() if k != "final_obs" and v.ndim > 1}
         self.single_observation_space = gymnasium.spaces.Dict(
             {name: self._box(x, np.inf) for name, x in shapes.obs.items()}

@@ -6,6 +6,7 @@ import contextlib
 import io
 import logging
 import socket
+import threading
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,8 @@ MAX_WORLDS = 64
 """Most worlds that are shown unless they are listed."""
 MARGIN = 1.0
 """Free space between neighbouring worlds, m."""
+STOP = 0.5
+"""Longest time for which ``close`` waits, s."""
 
 log = logging.getLogger(__name__)
 
@@ -158,11 +161,14 @@ class Browser(Viewer):
         self._panel.update(picture, time.perf_counter())
 
     def close(self) -> None:
-        """Stop the server."""
+        """Stop the server, which disconnects all browsers."""
         if self._server is not None:
             server, self._server = self._server, None
             with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it stops
-                server.stop()
+                # viser waits for 6 s for connections that a browser has opened in advance and not used.
+                stop = threading.Thread(target=server.stop, daemon=True)
+                stop.start()
+                stop.join(STOP)
 
 
 def _require_free(host: str, port: int) -> int:

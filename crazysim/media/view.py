@@ -131,7 +131,7 @@ class View:
                 sim.overlays.restore(before)
                 self._draw(sim, k, time[k])
                 config = self._cam_config(k, time[k], pos[k])
-                image[self.tile(k)] = np.asarray(sim.render("rgb_array", world, self.camera, config, width, height))
+                image[self.tile(k)] = np.asarray(sim.draw("rgb_array", world, self.camera, config, width, height))
         except Exception:
             sim.overlays.restore(before)  # they are kept for the next image
             raise
@@ -151,7 +151,7 @@ class View:
         """
         time, pos = self._sample(sim)
         self._draw(sim, 0, time[0])
-        sim.render("human", self.worlds[0], self.camera, self._cam_config(0, time[0], pos[0]), self.width, self.height)
+        sim.draw("human", self.worlds[0], self.camera, self._cam_config(0, time[0], pos[0]), self.width, self.height)
 
     def _sample(self, sim: Sim) -> tuple[NDArray, NDArray]:
         """Return times, s (n,), and drone positions, m (n, n_drones, 3), of the worlds, and extend the trails."""

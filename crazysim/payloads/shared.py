@@ -10,10 +10,11 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.core.data import Objects, SimData, SimStateDeriv
+from crazysim.core.data import Objects, SimData, SimState, SimStateDeriv
 from crazysim.core.integration import euler
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import Stage
+from crazysim.eager import compiled
 from crazysim.errors import ConfigError
 from crazysim.geometry.linear import solve
 from crazysim.payloads.body import LoadBody, rest_height
@@ -46,6 +47,26 @@ class SharedLoadData(PyTree):
     """Coulomb's coefficient between load and floor, 1. (1,)"""
     clearance: Array = leaf("shared", 1)
     """Height of the load above the floor where it rests, m. (1,)"""
+
+
+@compiled()
+def below(states: SimState, length: Array, clearance: Array) -> tuple[Array, Array]:
+    """Return position and velocity of a load at rest below the drones of each world.
+
+    Args:
+        states: States of the drones. (n_worlds, n_drones, ...)
+        length: Length of each rod or cable, m. (1,) or (n_worlds, n_drones, 1)
+        clearance: Height of the load above the floor where it rests, m. (1,)
+
+    Returns:
+        World frame, m and m/s. (n_worlds, 1, 3) each
+    """
+    mean = states.pos.mean(axis=1, keepdims=True)
+    # As low as the cables of the drones around it allow.
+    level = rotation.safe_norm((states.pos - mean)[..., :2])
+    drop = rotation.safe_sqrt(length * length - level * level)
+    height = jnp.maximum(jnp.max(states.pos[..., 2:] - drop, axis=1, keepdims=True), clearance)
+    return jnp.concatenate([mean[..., :2], height], axis=-1), states.vel.mean(axis=1, keepdims=True)
 
 
 class SharedLoad(PointLoad, Plugin):
@@ -94,19 +115,14 @@ class SharedLoad(PointLoad, Plugin):
                 )
         if self.in_scene:
             add_to_scene(
-                sim, self.name, self.size, self.rgba, float(jnp.max(length)), 1,
+                sim, self.name, self.size, self.rgba, float(np.max(length)), 1,
                 CABLE_SEGMENTS if self.cable else 1,
             )  # fmt: skip
-        s = sim.data.states
-        mean = s.pos.mean(axis=1, keepdims=True)
-        # As low as the cables of the drones around it allow.
-        level = rotation.safe_norm((s.pos - mean)[..., :2])
-        drop = rotation.safe_sqrt(length * length - level * level)
-        height = jnp.maximum(jnp.max(s.pos[..., 2:] - drop, axis=1, keepdims=True), scalars["size"])
+        pos, vel = below(sim.data.states, length, scalars["size"])
         return SharedLoadData(
-            pos=jnp.concatenate([mean[..., :2], height], axis=-1),
-            vel=s.vel.mean(axis=1, keepdims=True),
-            attached=on_device(np.ones(s.pos.shape[:2]), bool),
+            pos=pos,
+            vel=vel,
+            attached=on_device(np.ones(sim.data.states.pos.shape[:2]), bool),
             mass=scalars["mass"],
             length=length,
             attach=attach if np.any(np.asarray(attach)) else None,

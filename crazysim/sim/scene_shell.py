@@ -116,10 +116,14 @@ class SceneShell:
         Raises:
             ValueError: If the world does not exist.
         """
-        if world is not None and not 0 <= world < self.n_worlds:
-            raise ValueError(f"expected a world from 0 to {self.n_worlds - 1}, got {world}")
+        if world is not None:
+            self._require_world(world)
         self._scene.compile_if_edited()
         self._stepper.data = self._scene.sync(self._placed(), world)
+
+    def _require_world(self, world: int) -> None:
+        if not 0 <= world < self.n_worlds:
+            raise ValueError(f"expected a world from 0 to {self.n_worlds - 1}, got {world}")
 
     def _placed(self) -> SimData:
         """Return the data with the objects of plugins, such as loads, at their poses."""
@@ -205,6 +209,47 @@ class SceneShell:
             RenderError: If this machine cannot draw.
         """
         self.sync(world)
+        return self._image(mode, world, camera, cam_config, width, height)
+
+    def draw(
+        self,
+        mode: str = "rgb_array",
+        world: int = 0,
+        camera: int | str = -1,
+        cam_config: dict[str, Any] | None = None,
+        width: int = 1920,
+        height: int = 1080,
+    ) -> NDArray | tuple[NDArray, NDArray] | None:
+        """Render one world as ``render`` does, and leave ``mjx_data`` as it is, even where there is only one world.
+
+        The first image comes seconds earlier, as MJX is neither imported nor compiled for it. Views and films use it.
+
+        Args:
+            mode: As in ``render``, and so are the others.
+            world: Index of the world.
+            camera: Name or id.
+            cam_config: Settings of the free camera.
+            width: Pixels.
+            height: Pixels.
+
+        Raises:
+            ValueError: If the world, camera, mode or a setting does not exist.
+            RenderError: If this machine cannot draw.
+        """
+        self._require_world(world)
+        self._scene.sync_one(self._placed(), world)
+        return self._image(mode, world, camera, cam_config, width, height)
+
+    def _image(
+        self,
+        mode: str,
+        world: int,
+        camera: int | str,
+        cam_config: dict[str, Any] | None,
+        width: int,
+        height: int,
+    ) -> NDArray | tuple[NDArray, NDArray] | None:
+        """Render the world that was synced last, with the overlays of plugins."""
         before = self.overlays.copy()
         try:
             self.plugins.draw(world)

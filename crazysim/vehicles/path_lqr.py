@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.typing import ArrayLike
 
 from crazysim.control.lqr import as_weights, on_host
 from crazysim.control.riccati import gain_discrete
@@ -54,14 +55,10 @@ class PathLQR(PathController):
         Raises:
             ConfigError: If no gain stabilises the vehicle, or a weight has another shape.
         """
-        model = kinematic if vehicle.dynamics == "kinematic" else single_track
+        rows = kinematic_rows if vehicle.dynamics == "kinematic" else single_track_rows
         speeds = SPEED_STEP * np.arange(1, N_SPEEDS + 1) * np.array([[1.0], [-1.0]])
         Q, R = as_weights("Q", self.Q, 4), as_weights("R", [self.R], 1)
-
-        def rows(speeds: Array, car: CarParams, Q: Array, R: Array) -> Array:
-            return jax.vmap(lambda speed: lateral_gains(model, car, speed, 1 / freq, Q, R))(speeds.ravel())
-
-        table = on_host(rows, speeds, car, Q, R)
+        table = on_host(rows, car, speeds.ravel(), 1 / freq, Q, R)
         return PathLQRGains(as_parameter(table.reshape(2, N_SPEEDS, 5)))
 
     def steering(
@@ -93,7 +90,7 @@ def lateral_model(model: Any, car: CarParams, speed: Array) -> tuple[Array, Arra
     return jax.jacfwd(rates)(x, steer), jax.jacfwd(rates, argnums=1)(x, steer)
 
 
-def lateral_gains(model: Any, car: CarParams, speed: Array, period: float, Q: Array, R: Array) -> Array:
+def lateral_gains(model: Any, car: CarParams, speed: Array, period: ArrayLike, Q: Array, R: Array) -> Array:
     """Return the gain of the regulator at a speed and the feed-forward of curvature. (5,)"""
     A, B = lateral_model(model, car, speed)
     block = jnp.zeros((5, 5), A.dtype).at[:4, :4].set(A).at[:4, 4:].set(B)
@@ -106,6 +103,16 @@ def lateral_gains(model: Any, car: CarParams, speed: Array, period: float, Q: Ar
     side, steer = jnp.linalg.solve(balance, -A[rows, 3] * speed)
     steady = jnp.stack([jnp.zeros_like(speed), side, -side / speed, speed])
     return jnp.concatenate([K, (steer + K @ steady)[None]])
+
+
+def single_track_rows(car: CarParams, speeds: Array, period: Array, Q: Array, R: Array) -> Array:
+    """Return ``lateral_gains`` of the single-track model at several speeds. (n, 5)"""
+    return jax.vmap(lambda speed: lateral_gains(single_track, car, speed, period, Q, R))(speeds)
+
+
+def kinematic_rows(car: CarParams, speeds: Array, period: Array, Q: Array, R: Array) -> Array:
+    """Return ``lateral_gains`` of the kinematic model at several speeds. (n, 5)"""
+    return jax.vmap(lambda speed: lateral_gains(kinematic, car, speed, period, Q, R))(speeds)
 
 
 def exponential(matrix: Array) -> Array:

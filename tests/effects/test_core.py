@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from cases import hover_command, hover_rotor_state, to_all, trees_equal, with_states
 from jax import Array
+from one_step import OneStep, zero_like
 
 from crazysim import (
     Battery,
@@ -253,23 +254,16 @@ def test_law_07_values_and_gradients_are_finite(every):
     command = np.stack([0 * to_all(data, hover_command(data))[0], 100 + to_all(data, hover_command(data))[0]] * 2)[:3]
     sim.data = data
     sim.attitude_control(command)
-    data, stages = sim.data, as_stages(sim.step_pipeline)
-
-    def step(data, _):
-        for apply in stages:
-            data = apply(data)
-        return data, None
-
-    def total(floats):
-        leaves = [x if y is None else y for x, y in zip(jax.tree.leaves(data), floats, strict=True)]
-        end, _ = jax.lax.scan(step, jax.tree.structure(data).unflatten(leaves), length=40)
-        return sum(jnp.sum(x) for x in (end.states.pos, end.states.quat, end.states.vel, end.states.ang_vel)), end
-
-    floats = [x if jnp.issubdtype(x.dtype, jnp.floating) else None for x in jax.tree.leaves(data)]
-    gradient, end = jax.jit(jax.grad(total, has_aux=True))(floats)
+    step = OneStep(as_stages(sim.step_pipeline), sim.data)
+    end, passed = step.fly(sim.data, 40)
+    ones = {name: np.ones_like(getattr(end.states, name)) for name in ("pos", "quat", "vel", "ang_vel")}
+    slope = jax.tree.map(zero_like, end)
+    gradient = step.gradient(slope.replace(states=slope.states.replace(**ones)), passed)
     np.testing.assert_array_equal(end.core.steps, 40)
-    for x in jax.tree.leaves(gradient):
-        assert np.isfinite(x).all()
+    assert np.any(gradient.states.pos)
+    assert np.any(gradient.plugins["motors"].effectiveness)
+    for x in jax.tree.leaves((gradient.states, gradient.controls, gradient.params, gradient.plugins)):
+        assert np.isfinite(np.asarray(x, np.float64)).all()
     for x in jax.tree.leaves((end.states, end.controls, end.plugins)):
         assert np.isfinite(np.asarray(x, np.float64)).all()
 

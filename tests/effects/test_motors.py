@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import hover_rotor_state, with_states
+from cases import by_stages, hover_rotor_state, with_states
 
 from crazysim import ConfigError, MotorFailure, Sim
 
@@ -110,7 +110,7 @@ def test_rotors_fail_when_told(weak):
 
 def test_the_gradient_with_respect_to_effectiveness_is_the_thrust(weak):
     """dv_z / de_i = dt thrust_i / m: a fault can be identified by descent."""
-    step = weak.build_step_fn()
+    step = by_stages(weak)
 
     def climb(e):
         data = weak.data.replace(plugins={"motors": weak.data.plugins["motors"].replace(effectiveness=e)})

@@ -2,6 +2,8 @@
 
 import dataclasses
 import re
+import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -189,15 +191,27 @@ def test_a_compiler_that_fails_costs_speed_and_says_so(sim, monkeypatch, tmp_pat
 
 def test_a_compiler_that_hangs_is_ended(sim, monkeypatch, tmp_path):
     """Its children too: a compiler is a driver that runs others."""
-    marker = tmp_path / "done"
-    use_compiler(monkeypatch, tmp_path, f'case "$*" in *fsyntax-only*) exit 0;; esac; (sleep 3; touch {marker}) & wait')
-    monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "0.3")
-    with pytest.warns(EngineWarning, match="took longer than 0.3 s; set CRAZYSIM_COMPILE_TIMEOUT"):
+    child = tmp_path / "pid"
+    use_compiler(
+        monkeypatch, tmp_path, f'case "$*" in *fsyntax-only*) exit 0;; esac; sleep 30 & echo $! > {child}; wait'
+    )
+    monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "0.5")
+    begin = time.monotonic()
+    with pytest.warns(EngineWarning, match="took longer than 0.5 s; set CRAZYSIM_COMPILE_TIMEOUT"):
         assert Step(sim.step_pipeline).plan(sim.data).engine == "lanes"
-    import time
+    while runs(int(child.read_text())) and time.monotonic() < begin + 20:
+        time.sleep(0.01)
+    assert not runs(int(child.read_text()))
+    assert time.monotonic() < begin + 20, "the child ended by itself"
 
-    time.sleep(3.2)
-    assert not marker.exists()
+
+def runs(pid):
+    """Return whether a process runs; one that has ended may still be listed."""
+    status = Path(f"/proc/{pid}/stat")
+    try:
+        return status.read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 @needs_compiler

@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import shared_sim, trees_equal
+from jax.sharding import NamedSharding, PartitionSpec
 
-from crazysim.engine import Stepper
+from crazysim.core.sharding import world_mesh
+from crazysim.engine import Stepper, flat
 from crazysim.engine.flat import PackCache, ZerosCache
 
 
@@ -74,9 +76,30 @@ def test_packed_parameters_are_made_again_only_for_other_arrays():
     first = pack([a, b])
     np.testing.assert_array_equal(first, [1, 1, 0, 0, 0, 0])
     assert pack([a, b]) is first
-    assert pack([a, b + 0]) is not first
+    np.testing.assert_array_equal(pack([a, b - 1]), [1, 1, -1, -1, -1, -1])
     traced = jax.jit(lambda x: pack([x, b]))(a)
     np.testing.assert_array_equal(traced, first)
+
+
+def test_the_first_packed_parameters_of_a_processor_need_no_program():
+    """They are an array where the parameters are, inside a trace too."""
+    far = jax.devices("cpu")[1]
+    a, b = np.float32([[1, 2]]), np.float32([3])
+    before = flat._compiled._cache_size()
+    for device in (None, far):
+        arrays = [jax.device_put(x, device) for x in (a, b)]
+        first = PackCache()(arrays)
+        np.testing.assert_array_equal(first, [1, 2, 3])
+        assert (first.sharding, first.committed) == (arrays[0].sharding, device is not None)
+        pack = PackCache()
+        inside = jax.jit(lambda x, pack=pack, arrays=arrays: x * pack(arrays))(2.0)
+        np.testing.assert_array_equal(inside, [2, 4, 6])
+        np.testing.assert_array_equal(pack(arrays), first)
+    assert flat._compiled._cache_size() == before
+    mesh = world_mesh(jax.devices("cpu")[:2])
+    copied = [jax.device_put(x, NamedSharding(mesh, PartitionSpec())) for x in (a, b)]
+    assert PackCache()(copied).sharding.device_set == set(mesh.devices.flat)
+    assert flat._compiled._cache_size() == before + 1
 
 
 def test_zeros_are_looked_for_in_shared_floats_alone(sim):

@@ -246,3 +246,12 @@ def test_several_drones_have_an_axis_and_share_their_mean_reward():
     np.testing.assert_allclose(reward, np.asarray(env.state.reward).mean(axis=1), rtol=1e-6)
     with pytest.raises(ValueError, match=r"expected actions of shape \(3, 2, 4\)"):
         env.step(np.zeros((3, 4)))
+
+
+def test_construction_and_the_first_reset_share_a_trace(envs, monkeypatch):
+    """Spaces have the shapes of a reset, which is traced for them and not again where it is called."""
+    traces, real = [], AutoReset.reset
+    monkeypatch.setattr(AutoReset, "reset", lambda *args: traces.append(1) or real(*args))
+    env = DroneVectorEnv(envs["NextStep"].env.env)
+    env._begin.trace(jax.random.key(3))
+    assert len(traces) == 1

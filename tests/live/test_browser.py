@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from browsing import NEAR, start_browser, wait_for
+from browsing import NEAR, wait_for
 
 from crazysim import SlungLoad, Wind
 from crazysim.errors import ConfigError, RenderError
@@ -19,6 +19,7 @@ from crazysim.media.web import FOV
 from crazysim.sim import Sim
 from crazysim.vehicles import Cars
 
+pytestmark = pytest.mark.xdist_group("browser")
 MAGENTA = (1, 0, 1)
 
 
@@ -31,13 +32,6 @@ def sim(plain_scene):
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
     sim.build_default_data()
     return sim
-
-
-@pytest.fixture(scope="module")
-def chromium(tmp_path_factory):
-    browser = start_browser(tmp_path_factory.mktemp("browser"), width=1100, height=500)
-    yield browser
-    browser.close()
 
 
 @pytest.fixture
@@ -96,7 +90,7 @@ SIZE = 4.0
 """Extent of the worlds of these tests, m: 2 m between the drones, and 1 m of margin on both sides."""
 
 
-def test_a_page_is_watched_and_used(viser, chromium, live, caplog):
+def test_a_page_is_watched_and_used(chromium, live, caplog):
     pilot, clicked, values = Pilot(), [], []
     live.add(pilot)
     live.on_click = lambda live, world, point: clicked.append((world, point))
@@ -104,7 +98,7 @@ def test_a_page_is_watched_and_used(viser, chromium, live, caplog):
     live.slider("wind", 0.0, 10.0, 5.0, lambda live, value: values.append(value))
     page = live.show(Browser(port=0, trail=0.5))
     with Running(live):
-        chromium.call("Page.navigate", url=page.url)
+        chromium.open(page.url, 1100, 360)
         wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
 
         # The left drone is where it is.
@@ -154,7 +148,7 @@ def test_a_page_is_watched_and_used(viser, chromium, live, caplog):
     assert not page.is_open
 
 
-def test_cars_and_loads_are_picked_and_lights_are_drawn(viser, chromium, plain_scene):
+def test_cars_and_loads_are_picked_and_lights_are_drawn(chromium, plain_scene):
     """Two worlds side by side, each with a drone, its load and a car."""
     sim = Sim(n_worlds=2, control="state", xml_path=plain_scene)
     states = sim.data.states
@@ -166,7 +160,7 @@ def test_cars_and_loads_are_picked_and_lights_are_drawn(viser, chromium, plain_s
     page = live.show(Browser(port=0, spacing=3.0, trail=0.5))
     size = 3.0 + 2.0  # of the grid: the distance of the worlds, and 1 m of margin on both sides
     with Running(live):
-        chromium.call("Page.navigate", url=page.url)
+        chromium.open(page.url, 1100, 360)
         wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
 
         def pick(point, expected):
@@ -205,6 +199,17 @@ def test_a_port_in_use_is_named(viser, live, caplog):
         live.show(Browser(port=0, host="0.0.0.0"))
     assert "listening at 0.0.0.0" in caplog.text
     assert "every machine of that network" in caplog.text
+
+
+def test_closing_waits_for_no_unused_connection(viser, live):
+    """Browsers open connections in advance."""
+    page = live.show(Browser(port=0))
+    with socket.create_connection(("127.0.0.1", int(page.url.rpartition(":")[2]))):
+        time.sleep(0.1)
+        begin = time.monotonic()
+        live.close()
+        assert time.monotonic() - begin < 4
+    assert not page.is_open
 
 
 def test_wrong_settings(viser, live):

@@ -52,7 +52,7 @@ WATCHED = textwrap.dedent("""
             other._process.kill()
             thread.join(20)
             assert not thread.is_alive() and not other.is_open, "the run ends with its last window"
-        time.sleep(0.5)
+        time.sleep(0.1)
         print(line.strip(), live.step, window.is_open, flush=True)
     live.close()
 """)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from browsing import NEAR, Browser, start_browser, wait_for
+from browsing import NEAR, wait_for
 
 from crazysim.__main__ import main
 from crazysim.errors import RenderError
@@ -18,6 +18,7 @@ from crazysim.media import Recorder, web
 from crazysim.media.web import FOV, camera_of, page
 from crazysim.sim import Sim
 
+pytestmark = pytest.mark.xdist_group("browser")
 START, END = np.array([-0.5, 0.0, 0.8]), np.array([0.5, 0.0, 1.2])
 """Where the drone of world 1 begins and ends, m."""
 BOX = np.array([0.25, 0.0, 0.05])
@@ -48,37 +49,34 @@ def flight(plain_scene):
     return recorder.flight()
 
 
-class FlightBrowser(Browser):
-    """A browser of pages with flights."""
-
-    def open(self, url):
-        """Open a page with a flight, and wait until its bar and its image are there."""
-        self.call("Page.navigate", url=url)
-        wait_for(lambda: self.box(".mantine-Slider-track") and self.box("canvas"))
-        self.scrub(0.5)  # from here on it stands still
-
-    def scrub(self, part):
-        """Click into the bar of a flight of one second until the page shows that time.
-
-        The first click may be one too few: it ends the playing, a frame late.
-        """
-        left, top, width, height = self.box(".mantine-Slider-track")
-        where = {"x": left + part * width, "y": top + height / 2, "button": "left", "clickCount": 1}
-
-        def shown():
-            for event in ("mousePressed", "mouseReleased"):
-                self.call("Input.dispatchMouseEvent", type=event, **where)
-            time.sleep(0.5)
-            return abs(float(self.value("document.querySelector('input').value")) - part) < 0.06
-
-        wait_for(shown)
+def open_flight(browser, url):
+    """Open a page with a flight, and wait until its bar and its image are there."""
+    browser.open(url, 640, 340)
+    wait_for(lambda: browser.box(".mantine-Slider-track") and browser.box("canvas"))
+    scrub(browser, 0.5)  # from here on it stands still
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    browser = start_browser(tmp_path_factory.mktemp("browser"), FlightBrowser)
-    yield browser
-    browser.close()
+def scrub(browser, part):
+    """Click into the bar of a flight of one second until the page shows that time.
+
+    The first click may be one too few: it ends the playing, a frame late.
+    """
+    left, top, width, height = browser.box(".mantine-Slider-track")
+    where = {"x": left + part * width, "y": top + height / 2, "button": "left", "clickCount": 1}
+
+    def shown():
+        return abs(float(browser.value("document.querySelector('input').value")) - part) < 0.06
+
+    def stays():
+        for event in ("mousePressed", "mouseReleased"):
+            browser.call("Input.dispatchMouseEvent", type=event, **where)
+        deadline = time.monotonic() + 0.5
+        while not shown() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        time.sleep(0.1)
+        return shown()
+
+    wait_for(stays)
 
 
 def pixel(browser, flight, point, world):
@@ -92,11 +90,12 @@ def pixel(browser, flight, point, world):
     return left + 0.5 * width + focal * x / z, top + 0.5 * height - focal * y / z
 
 
-def test_a_served_flight_is_scrubbed_in_a_browser(viser, browser, flight, tmp_path):
+def test_a_served_flight_is_scrubbed_in_a_browser(chromium, flight, tmp_path):
     """Wherever the bar is clicked, forwards and backwards, the drone is shown where it was at that time."""
     flight.save(tmp_path / "flight.npz")
     # Programs that a shell started in the background ignore SIGINT, and so would this one.
-    start = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    start = "import browsing, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    start += "browsing.light_simply(); "
     start += "from crazysim.__main__ import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", start, "replay", "flight.npz", "--world", "1", "--port", "0"]
     program = subprocess.Popen(
@@ -104,30 +103,30 @@ def test_a_served_flight_is_scrubbed_in_a_browser(viser, browser, flight, tmp_pa
     )
     try:
         url = program.stdout.readline().split()[4].rstrip(";")
-        browser.open(url)
+        open_flight(chromium, url)
         for part in (0.1, 0.9, 0.3):
-            browser.scrub(part)
-            wanted = pixel(browser, flight, START + part * (END - START), 1)
-            np.testing.assert_allclose(browser.find(MAGENTA, wanted), wanted, atol=NEAR)
+            scrub(chromium, part)
+            wanted = pixel(chromium, flight, START + part * (END - START), 1)
+            np.testing.assert_allclose(chromium.find(MAGENTA, wanted), wanted, atol=NEAR)
     finally:
         program.send_signal(signal.SIGINT)
         assert program.wait(30) == 0
         program.stdout.close()
 
 
-def test_an_exported_flight_opens_from_its_file(viser, browser, flight, tmp_path, capsys):
+def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, capsys):
     """One file, no server: it has what was recorded of the requested world, here a drone and a box at rest."""
     flight.save(tmp_path / "flight.npz")
     out = tmp_path / "flight.html"
     assert main(["replay", str(tmp_path / "flight.npz"), "--export", str(out)]) == 0
     assert capsys.readouterr().out == f"wrote {out}\n"
-    browser.open(out.as_uri())
+    open_flight(chromium, out.as_uri())
     for part in (0.2, 0.8):
-        browser.scrub(part)
+        scrub(chromium, part)
         for color, place in ((MAGENTA, np.zeros(3)), (GREEN, BOX)):
-            wanted = pixel(browser, flight, place, 0)
-            np.testing.assert_allclose(browser.find(color, wanted), wanted, atol=NEAR)
-    rows, columns = browser.mask(GREEN)
+            wanted = pixel(chromium, flight, place, 0)
+            np.testing.assert_allclose(chromium.find(color, wanted), wanted, atol=NEAR)
+    rows, columns = chromium.mask(GREEN)
     assert np.ptp(columns) > 2 * np.ptp(rows), "the box lies"
 
 

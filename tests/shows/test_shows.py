@@ -90,7 +90,7 @@ def open_coarse(self, model, *settings):
     opened(self, model, *settings)
 
 Window.__init__ = open_coarse
-view.FPS = 10.0
+view.MAX_FPS = 10.0
 
 def close(sim, world):
     frames.append(sim.time)

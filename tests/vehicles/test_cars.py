@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import with_states
+from cases import by_stages, with_states
 
 from crazysim import ConfigError, Sim, Terrain
 from crazysim.trajectories import circle, figure_eight
@@ -108,13 +108,14 @@ def test_a_car_drives_as_it_does_alone():
 
 
 def test_gradients_reach_commands_and_parameters():
-    sim, cars = build(1, engine="plain", in_scene=False)
+    sim, cars = build(1, in_scene=False)
+    step = by_stages(sim)
 
     def end(command, mass):
         data = cars.commanded(sim.data, command)
         record = cars.read(data)
         data = cars.write(data, record.replace(params=record.params.replace(mass=mass)))
-        return jnp.sum(cars.read(sim.step_fn(data, 100)).pos[..., :2])
+        return jnp.sum(cars.read(step(data, 100)).pos[..., :2])
 
     command, mass = np.float32([[[0.2, 0.1]]]), cars.read(sim.data).params.mass
     both = jax.jit(jax.value_and_grad(end, argnums=(0, 1)))
@@ -183,7 +184,7 @@ def test_wheels_roll_and_steer_in_the_scene():
     sim, cars = build(1, members=2, trailer=True, vehicle="aiml_head", pos=[(1, 0), (-1, 0)], yaw=[0.0, np.pi / 2])
     sim.data = cars.commanded(sim.data, np.tile([0.05, 0.3], (1, 2, 1)))
     sim.step(100)
-    sim.sync(0)
+    sim.scene.sync_one(sim.plugins.placed(sim.data), 0)
     model, data, record = sim.mj_model, sim.mj_data, jax.tree.map(np.asarray, cars.read(sim.data))
     left, right = np.asarray(jax.jit(ackermann)(record.steer[0, 0], 0.32226, 0.24477))
     for k, angle in ((0, left), (1, right), (2, 0.0), (3, 0.0)):

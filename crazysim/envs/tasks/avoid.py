@@ -20,7 +20,7 @@ from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.core import install_rules, nearest, others_near, state_of, with_record
 from crazysim.envs.tracks import ranks
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, static
+from crazysim.pytree import PyTree, leaf, on_device, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
@@ -128,7 +128,8 @@ class Avoid(Task):
         if self.n_boxes:
             handles.append(sim.scene.add("box", count=self.n_boxes, pos=(0, 0, HEIGHT / 2), size=(BOX, BOX, BOX)))
         contacts = sim.scene.contact_fn(handles, drones=False)
-        zero, no = jnp.zeros_like(sim.data.states.pos), jnp.zeros((sim.n_worlds, sim.n_drones), bool)
+        shape = (sim.n_worlds, sim.n_drones)
+        zero, no = on_device(np.zeros((*shape, 3)), sim.data.states.pos.dtype), on_device(np.zeros(shape), bool)
         half = self.field(sim.n_drones).half
 
         @stage("drone")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim import rotation
@@ -13,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.core import with_record
 from crazysim.payloads import load_pos, load_vel
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 
 SLOW = 0.2
 """Largest speed of a load that is delivered, m/s."""
@@ -106,11 +107,12 @@ def delivery_of(data: SimData) -> Any:
 def not_yet(data: SimData) -> dict[str, Array]:
     """Return the fields of ``Delivery`` at the start: nothing is delivered, and no drone has crashed. All worlds."""
     pos = data.states.pos
-    zero, no = jnp.zeros_like(pos[..., 0]), jnp.zeros(pos.shape[:2], bool)
+    shape = pos.shape[:2]
+    no = on_device(np.zeros(shape), bool)
     return {
-        "goal": jnp.zeros_like(pos),
-        "to_go_before": zero,
-        "steps_there": no.astype(jnp.int32),
+        "goal": on_device(np.zeros(pos.shape), pos.dtype),
+        "to_go_before": on_device(np.zeros(shape), pos.dtype),
+        "steps_there": on_device(np.zeros(shape), np.int32),
         "delivered": no,
         "crashed": no,
     }

@@ -20,7 +20,7 @@ from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, not
 from crazysim.envs.tasks.core import install_rules, pick, state_of, with_record
 from crazysim.errors import ConfigError
 from crazysim.payloads import Hook
-from crazysim.pytree import leaf
+from crazysim.pytree import leaf, on_device
 from crazysim.sim.sim import Sim
 from crazysim.vehicles import Cars
 from crazysim.vehicles.car_data import CarData
@@ -112,7 +112,7 @@ class Deliver(BringLoad):
             crashed = beyond(data) | (taken & (load.pos[2] < DROPPED))
             return with_record(data, self.judged(data, crashed).replace(taken=taken))
 
-        not_taken = jnp.zeros((sim.n_worlds, sim.n_drones), bool)
+        not_taken = on_device(np.zeros((sim.n_worlds, sim.n_drones)), bool)
         install_rules(sim, TrailerDelivery(**not_yet(sim.data), taken=not_taken), judge)
 
     def spawn(self, data: SimData, key: Array) -> SimData:

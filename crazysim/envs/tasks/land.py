@@ -20,7 +20,7 @@ from crazysim.envs.task import NAME
 from crazysim.envs.tasks.core import pick, with_record
 from crazysim.envs.tasks.touch_down import Landing, TouchDown, landing_of, not_yet
 from crazysim.errors import ConfigError
-from crazysim.pytree import leaf, static
+from crazysim.pytree import leaf, on_device, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
@@ -87,7 +87,7 @@ class Land(TouchDown):
             pos, vel = pad_of(data, data.core.steps + 1)
             return pads.set_pose(data, pos, vel=vel)
 
-        zero = jnp.zeros_like(sim.data.states.pos[..., :1])
+        zero = on_device(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)
         record = PadLanding(circle=zero, rate=zero, phase=zero, pads=pads, **not_yet(sim.data))
         placements = [Placement(self.touch(contacts, self.radius), before="increment_steps")]
         if self.speed > 0:

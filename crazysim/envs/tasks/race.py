@@ -23,6 +23,7 @@ from crazysim.envs.tasks.race_observations import observe, visited
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.tracks import Track, checked, n_random, random_course, start_offsets
 from crazysim.errors import ConfigError
+from crazysim.pytree import of_host, on_device
 from crazysim.sim.sim import Sim
 
 SENSOR_RANGE = 0.7
@@ -106,19 +107,23 @@ class Race(Task):
         if self.level >= 1:
             _one_per_drone(sim, {"mass": 1, "J": 2, "J_inv": 2})
         pos, shape = sim.data.states.pos, (sim.n_worlds, sim.n_drones)
-        zero, none = jnp.zeros(shape, jnp.int32), jnp.zeros(shape, bool)
+
+        def zeros(*shape: int, dtype: Any = pos.dtype) -> Array:
+            return on_device(np.zeros(shape), dtype)
+
+        zero, none = zeros(*shape, dtype=np.int32), zeros(*shape, dtype=bool)
         n, moved = course.n_gates + course.n_obstacles, self.level >= 2
         record = rules.RaceRecord(
             passed=zero,
             disabled=none,
-            last_pos=jnp.zeros_like(pos),
-            gates_visited=jnp.zeros((*shape, course.n_gates), bool),
-            obstacles_visited=jnp.zeros((*shape, course.n_obstacles), bool),
+            last_pos=zeros(*shape, 3),
+            gates_visited=zeros(*shape, course.n_gates, dtype=bool),
+            obstacles_visited=zeros(*shape, course.n_obstacles, dtype=bool),
             passed_before=zero,
             out_before=none,
-            to_go_before=jnp.zeros(shape, pos.dtype),
-            nominal_pos=jnp.zeros((sim.n_worlds, 1, n, 3), pos.dtype) if moved else None,
-            nominal_quat=jnp.zeros((sim.n_worlds, 1, course.n_gates, 4), pos.dtype) if moved else None,
+            to_go_before=zeros(*shape),
+            nominal_pos=zeros(sim.n_worlds, 1, n, 3) if moved else None,
+            nominal_quat=zeros(sim.n_worlds, 1, course.n_gates, 4) if moved else None,
             gates=gates,
             obstacles=obstacles,
         )
@@ -214,7 +219,7 @@ class Race(Task):
 
     def _gates_quat(self) -> np.ndarray:
         with jax.ensure_compile_time_eval():  # an array, also while a step is traced
-            return np.asarray(rotation.from_rpy(jnp.asarray(np.asarray(self.track.gates_rpy, float))))
+            return np.asarray(jax.jit(rotation.from_rpy)(of_host(self.track.gates_rpy, self.track.n_gates, 3)))
 
     def _place(self, data: SimData, x: dict[str, Array]) -> tuple[SimData, Any]:
         """Return the data with gates and obstacles displaced from their nominal poses, and the start, m."""
@@ -238,7 +243,7 @@ def _one_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
     each = {}
     for name, ndim in names.items():  # they may be one per drone already
         value = getattr(params, name)
-        each[name] = jnp.broadcast_to(value, (*shape, *value.shape[-ndim:]))
+        each[name] = on_device(np.broadcast_to(value, (*shape, *value.shape[-ndim:])), value.dtype)
     sim.data = sim.data.replace(params=params.replace(**each))
     sim.build_default_data()
 

@@ -20,7 +20,7 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.core import install_rules, on_floor, others_near, state_of, with_record
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.sim.sim import Sim
 
 SEPARATION = (0.24, 0.24, 0.6)
@@ -89,7 +89,6 @@ class Swarm(Task):
             raise ConfigError(f"expected at least two drones in a swarm, got {sim.n_drones}. Use n_drones=2 or more.")
         if self.formation is not None:
             as_formation(self.formation, sim.n_drones)
-        zero = jnp.zeros_like(sim.data.states.pos)
 
         @stage("drone")
         def keep_closest(data: SimData) -> SimData:
@@ -102,7 +101,9 @@ class Swarm(Task):
             nearest = rotation.safe_sqrt(reduce_over_others(square, place, "min"))
             return with_record(data, own.replace(closest=jnp.minimum(own.closest, nearest)))
 
-        record = SwarmRecord(zero, jnp.full(zero.shape[:2], jnp.inf, zero.dtype))
+        pos = sim.data.states.pos
+        zero, far = on_device(np.zeros(pos.shape), pos.dtype), on_device(np.full(pos.shape[:2], np.inf), pos.dtype)
+        record = SwarmRecord(zero, far)
         install_rules(sim, record, keep_closest)
 
     def spawn(self, data: SimData, key: Array) -> SimData:

@@ -15,7 +15,7 @@ from crazysim.core.stage import Stage, stage
 from crazysim.envs import terms
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.core import state_of, with_record
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.scene.report import ContactFn
 
 SOFT = 0.5
@@ -156,6 +156,6 @@ def landing_of(data: SimData) -> Any:
 
 def not_yet(data: SimData) -> dict[str, Array]:
     """Return the fields of ``Landing`` for drones in the air, of all worlds."""
-    zero = jnp.zeros(data.states.pos.shape[:2], data.states.pos.dtype)
-    no = jnp.zeros(zero.shape, bool)
+    pos = data.states.pos
+    zero, no = on_device(np.zeros(pos.shape[:2]), pos.dtype), on_device(np.zeros(pos.shape[:2]), bool)
     return {"landed": no, "crashed": no, "out_before": no, "to_go_before": zero}

@@ -20,7 +20,7 @@ from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.core import on_floor, state_of, with_record
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Trajectory, figure_eight
 
@@ -70,7 +70,7 @@ class TrackTrajectory(Task):
 
     def install(self, sim: Sim) -> None:
         """Give every drone its time on the trajectory."""
-        self.add_record(sim, Phase(jnp.zeros_like(sim.data.states.pos[..., :1])))
+        self.add_record(sim, Phase(on_device(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones near the trajectory, moving along it."""
