@@ -12,43 +12,30 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import SimData
-from crazysim.eager import compiled, is_traced, to_host
+from crazysim.eager import compiled, to_host
 from crazysim.scene import mjx
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
 """Modes of cameras that follow a centre of mass; a sync computes it for them only."""
 
 
+@jax.jit
 def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tuple[SimData, mjx.Data]:
     """Return the data with ``core.mjx_synced`` set, and the scene brought up to date with the data.
 
     Writes the poses of drones and of objects with handles, and computes the transforms of all bodies, the cameras and
-    lights, and the contacts. Other mocap bodies stay where ``mjx_data`` has them. It is one compiled program, which
-    simulations with equal scenes share.
+    lights, and the contacts. Other mocap bodies stay where ``mjx_data`` has them.
 
     Args:
         data: Simulation. Quaternions are xyzw here and wxyz in MuJoCo.
         mjx_data: State of the scene in every world.
         mjx_model: Compiled scene, shared by all worlds.
     """
-    flag = data.core.mjx_synced
-    if is_traced([flag]):
-        synced = jnp.asarray(True)
-    else:
-        synced = jax.device_put(np.True_, getattr(flag, "sharding", None))
-    return data.replace(core=data.core.replace(mjx_synced=synced)), synced_scene(_poses(data), mjx_data, mjx_model)
-
-
-@jax.jit
-def synced_scene(poses: list[tuple[Any, Any, Any]], mjx_data: mjx.Data, mjx_model: mjx.Model) -> mjx.Data:
-    """Return the scene with mocap bodies at some poses, and all that follows from them.
-
-    Args:
-        poses: Mocap ids, positions and attitudes, xyzw, of bodies. (n,), (n_worlds, n, 3), (n_worlds, n, 4)
-        mjx_data: State of the scene in every world.
-        mjx_model: Compiled scene, shared by all worlds.
-    """
-    mocap_pos, mocap_quat = _written(poses, mjx_data.mocap_pos, mjx_data.mocap_quat)
+    for ids, pos, quat in _poses(data):
+        mjx_data = mjx_data.replace(
+            mocap_pos=mjx_data.mocap_pos.at[:, ids].set(pos),
+            mocap_quat=mjx_data.mocap_quat.at[:, ids].set(jnp.roll(quat, 1, axis=-1)),
+        )
 
     def of_world(world: mjx.Data) -> mjx.Data:
         world = mjx.kinematics(_carry_children(mjx_model, world), world)
@@ -57,24 +44,22 @@ def synced_scene(poses: list[tuple[Any, Any, Any]], mjx_data: mjx.Data, mjx_mode
         world = mjx.camlight(mjx_model, world)
         return mjx.collision(mjx_model, world)
 
-    return jax.vmap(of_world)(mjx_data.replace(mocap_pos=mocap_pos, mocap_quat=mocap_quat))
+    mjx_data = jax.vmap(of_world)(mjx_data)
+    return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
 
 
 def _poses(data: SimData) -> list[tuple[Any, Any, Any]]:
-    """Return mocap ids, positions and attitudes of drones and of objects with handles, as the data have them."""
+    """Return mocap ids, positions and attitudes of drones and of objects with handles."""
     owned = [(data.core.drone_mocap_ids, data.states.pos, data.states.quat)]
     if data.objects is not None:
-        owned.append((data.objects.mocap_ids, data.objects.pos, data.objects.quat))
+        owned.append((data.objects.mocap_ids, *_without_axis(data.objects.pos, data.objects.quat)))
     return owned
 
 
-def _written(poses: list[tuple[Any, Any, Any]], mocap_pos: Array, mocap_quat: Array) -> tuple[Array, Array]:
-    """Return mocap poses of all bodies, (n_worlds, n_mocap, k), with those of some bodies written into them."""
-    for ids, pos, quat in poses:
-        pos, quat = (x.reshape(len(x), -1, x.shape[-1]) for x in (pos, quat))  # objects have an axis of drones
-        mocap_pos = mocap_pos.at[:, ids].set(pos)
-        mocap_quat = mocap_quat.at[:, ids].set(jnp.roll(quat, 1, axis=-1))
-    return mocap_pos, mocap_quat
+@compiled()
+def _without_axis(pos: Array, quat: Array) -> tuple[Array, Array]:
+    """Return poses of objects without the axis of drones. (n_worlds, n, k)"""
+    return pos[:, 0], quat[:, 0]
 
 
 def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
@@ -102,8 +87,10 @@ def with_poses_of(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Arr
         poses: Mocap positions, m (n, n_mocap, 3), attitudes, wxyz (n, n_mocap, 4), joint positions (n, n_qpos).
     """
     mocap_pos, mocap_quat, qpos = map(jnp.asarray, poses)
-    chosen = [(ids, pos[worlds], quat[worlds]) for ids, pos, quat in _poses(data)]
-    return *_written(chosen, mocap_pos, mocap_quat), qpos
+    for ids, pos, quat in _poses(data):
+        mocap_pos = mocap_pos.at[:, ids].set(pos[worlds])
+        mocap_quat = mocap_quat.at[:, ids].set(jnp.roll(quat[worlds], 1, axis=-1))
+    return mocap_pos, mocap_quat, qpos
 
 
 def sync_one_world(

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from crazysim.scene.sync import sync_one_world, synced_scene
+from crazysim.scene.sync import sync_one_world
 from crazysim.sim import Sim
 from crazysim.sim.sim import sync_sim2mjx
 
@@ -132,10 +132,10 @@ def test_a_sync_works_within_transformations(sim, synced):
 def test_syncs_compile_once(sim):
     """A scene written with NumPy or JAX arrays, on any data, is synced by one compilation."""
     sim.contacts()
-    before = synced_scene._cache_size()
+    before = sync_sim2mjx._cache_size()
     mocap_pos = np.asarray(sim.mjx_data.mocap_pos)
     for poses in (mocap_pos, mocap_pos.astype(np.float64), jnp.asarray(mocap_pos)):
         sim.mjx_data = sim.mjx_data.replace(mocap_pos=poses)
         sim.data = sim.data.replace(states=sim.data.states.replace(pos=np.asarray(sim.data.states.pos) + 0.0))
         sim.contacts()
-    assert synced_scene._cache_size() == before
+    assert sync_sim2mjx._cache_size() == before
