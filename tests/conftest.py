@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 
 import compiling
+import small_programs
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 # XLA logs an error of 3,000 characters for every program from the cache that could use another vector width.
@@ -24,6 +25,7 @@ from crazysim.engine import cuda
 gc.disable()  # see pytest_collection_finish
 compiling.share_mlir_context()
 first_steps.install()
+small_programs.interpret()
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
 
 # What was compiled once is kept, in any worker, any run, and any process that a test starts.
@@ -80,7 +82,7 @@ def pytest_runtest_protocol(item):
 
 
 WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-MEMORY = 0.4 / WORKERS * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2e9
+MEMORY = 0.7 / WORKERS * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2e9
 """Memory of a worker, bytes, above which it looks for garbage between two files: together a part of the machine's."""
 GROWTH = 1.3
 """Factor by which its memory has grown when it looks again: one look takes seconds."""

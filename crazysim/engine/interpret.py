@@ -6,8 +6,10 @@ and ``Sim(engine="interpret")`` steps with it.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import jax
 import jax.numpy as jnp
@@ -20,19 +22,12 @@ from crazysim.engine.ir import Block, Operation, Value
 from crazysim.engine.program import Program
 from crazysim.jaxcompat import is_key
 
-Env = dict[Value, np.ndarray]
-"""Arrays by the values that they are."""
-
 Observer = Callable[[Operation, Sequence[np.ndarray]], None]
 """Gets every operation with its results."""
 
 
 def run(
-    block: Block,
-    inputs: Sequence[Any],
-    shape: tuple[int, ...],
-    env: Env | None = None,
-    observe: Observer | None = None,
+    block: Block, inputs: Sequence[Any], shape: tuple[int, ...], observe: Observer | None = None
 ) -> list[np.ndarray]:
     """Return the outputs of a block.
 
@@ -40,25 +35,20 @@ def run(
         block: The block.
         inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
         shape: Shape of the lanes.
-        env: Values of the blocks around it.
         observe: Gets every operation with its results.
 
     Returns:
         Its outputs, of the lanes' shape.
     """
-    env = dict(env or {})
+    if block not in _PREPARED:
+        places: dict[Any, int] = {}
+        constants: list[Any] = []
+        _PREPARED[block] = _prepare(block, places, constants), constants
+    prepared, constants = _PREPARED[block]
     given = [np.asarray(x, v.dtype) for x, v in zip(inputs, block.inputs, strict=True)]
-    lanes_of = (x if v.size else np.broadcast_to(x, shape) for x, v in zip(given, block.inputs, strict=True))
-    env.update(zip(block.inputs, lanes_of, strict=True))
     with np.errstate(all="ignore"):
-        for op in block.operations:
-            args = [env[x] if isinstance(x, Value) else x for x in op.args]
-            row = ops.TABLE[op.name]
-            results = _structured(op, args, shape, env) if row.structured else [_number(op, row.numpy, args)]
-            env.update(zip(op.results, results, strict=True))
-            if observe is not None:
-                observe(op, results)
-    return [_broadcast(env[x] if isinstance(x, Value) else x, shape) for x in block.outputs]
+        out = prepared.run(constants.copy(), given, shape, observe)
+    return [_broadcast(x, shape) for x in out]
 
 
 def _broadcast(x: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -66,39 +56,129 @@ def _broadcast(x: Any, shape: tuple[int, ...]) -> np.ndarray:
     return x if np.shape(x) == shape else np.broadcast_to(x, shape)
 
 
-def _number(op: Operation, numpy: Callable[..., Any] | None, args: Sequence[Any]) -> Any:
-    """Return the result of an operation that has one: of the lanes' shape, or a scalar."""
-    if numpy is None:
+class _Call(NamedTuple):
+    """An operation of a prepared block."""
+
+    op: Operation
+    fn: Callable[..., Any] | None
+    """NumPy's function; None for a structured operation."""
+    args: list[int]
+    """Places of the operands."""
+    results: list[int]
+    """Places of the results."""
+    dtype: np.dtype
+    """Type of the first result."""
+    blocks: list[_Prepared]
+    """Blocks that it runs."""
+
+
+class _Prepared(NamedTuple):
+    """A block whose values have places in a list, with the functions of its operations at hand."""
+
+    inputs: list[int]
+    """Places of the inputs."""
+    calls: list[_Call]
+    """Operations in order."""
+    outputs: list[int]
+    """Places of the outputs."""
+
+    def run(self, values: list[Any], given: Sequence[Any], shape: tuple[int, ...], observe: Observer | None) -> list:
+        """Return the outputs for some inputs.
+
+        Args:
+            values: Constants, and values of the blocks around it, at their places. It gets those of this block: of the
+                lanes' shape, or scalars, or tables.
+            given: Its inputs.
+            shape: Shape of the lanes.
+            observe: Gets every operation with its results.
+        """
+        for place, x in zip(self.inputs, given, strict=True):
+            values[place] = x
+        for op, fn, args, results, dtype, blocks in self.calls:
+            if fn is not None:
+                x = fn(*[values[k] for k in args])
+                values[results[0]] = x if x.dtype == dtype else np.asarray(x).astype(dtype)
+            else:
+                runs = [lambda given, block=block: block.run(values, given, shape, observe) for block in blocks]
+                for place, x in zip(results, _structured(op, [values[k] for k in args], shape, runs), strict=True):
+                    values[place] = x
+            if observe is not None:
+                observe(op, [values[k] for k in results])
+        return [values[k] for k in self.outputs]
+
+
+_Run = Callable[[Sequence[Any]], list[Any]]
+"""Runs a block: from its inputs to its outputs."""
+
+_PREPARED: WeakKeyDictionary[Block, tuple[_Prepared, list[Any]]] = WeakKeyDictionary()
+"""Blocks that were run, prepared, with the constants at their places and None elsewhere."""
+
+
+def _prepare(block: Block, places: dict[Any, int], constants: list[Any]) -> _Prepared:
+    """Return a block prepared, and add places of its values and constants to those of the blocks around it."""
+
+    def place(x: Any) -> int:
+        if isinstance(x, Value):
+            if x not in places:
+                places[x] = len(constants)
+                constants.append(None)
+            return places[x]
+        constants.append(x)
+        return len(constants) - 1
+
+    inputs = [place(x) for x in block.inputs]
+    calls = []
+    for op in block.operations:
+        args = [place(x) for x in op.args]
+        blocks = [_prepare(inner, places, constants) for inner in op.blocks]
+        results = [place(x) for x in op.results]
+        dtype = op.dtype if op.results else np.dtype(bool)
+        calls.append(_Call(op, _numpy(op), args, results, dtype, blocks))
+    return _Prepared(inputs, calls, [place(x) for x in block.outputs])
+
+
+def _numpy(op: Operation) -> Callable[..., Any] | None:
+    """Return the NumPy function of an operation; None for a structured one."""
+    row = ops.TABLE[op.name]
+    if row.structured:
+        return None
+    if row.numpy is None:
         raise RuntimeError(f"operation {op.name!r} has no NumPy function; give it one in ops.TABLE")
     params = dict(op.params)
     if op.name in ("convert_element_type", "bitcast_convert_type"):
         params["dtype"] = op.dtype
-    x = numpy(*args, **params)
-    return x if x.dtype == op.dtype else np.asarray(x).astype(op.dtype)
+    return functools.partial(row.numpy, **params) if params else row.numpy
 
 
-def _structured(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
-    """Return the results of an operation that runs blocks, looks something up, or has several results."""
+def _structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Sequence[_Run]) -> list[Any]:
+    """Return the results of an operation that runs blocks, looks something up, or has several results.
+
+    Args:
+        op: The operation.
+        args: Its operands.
+        shape: Shape of the lanes.
+        runs: Functions that run its blocks.
+    """
     match op.name:
         case "barrier":
             return []
         case "when":
             mask, *old = args
-            new = run(op.blocks[0], [], shape, env) if mask.any() else old
+            new = runs[0]([]) if mask.any() else old
             return [np.where(mask, x, y) for x, y in zip(new, old, strict=True)]
         case "loop":
             for _ in range(op.param("length")):
-                args = run(op.blocks[0], args, shape, env)
+                args = runs[0](args)
             return args
         case "while":
-            test, body = op.blocks
-            while (mask := run(test, args, shape, env)[0]).any():
-                args = [np.where(mask, x, y) for x, y in zip(run(body, args, shape, env), args, strict=True)]
+            test, body = runs
+            while (mask := test(args)[0]).any():
+                args = [np.where(mask, x, y) for x, y in zip(body(args), args, strict=True)]
             return args
         case "over_others":
-            return _over_others(op, args, shape, env)
+            return _over_others(op, args, shape, runs[0])
         case "custom_jvp":
-            return run(op.blocks[0], args, shape, env)
+            return runs[0](args)
         case "table":
             return [op.param("numbers").array]
         case "lookup":
@@ -110,7 +190,7 @@ def _structured(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
     )
 
 
-def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], env: Env) -> list[np.ndarray]:
+def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], run: _Run) -> list[np.ndarray]:
     """Combine the results of a block for each drone of the world, one after the other."""
     n = op.param("n_members")
     own = np.arange(shape[0]) % n
@@ -118,7 +198,7 @@ def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], 
     found = [np.full(shape, ops.neutral(name, x.dtype)) for name, x in zip(op.param("reduce"), op.results, strict=True)]
     for j in range(n):
         other = [np.repeat(np.broadcast_to(x, shape).reshape(-1, n)[:, j], n) for x in args]
-        new = run(op.blocks[0], [*other, own == j], shape, env)
+        new = run([*other, own == j])
         found = [fn(x, y) for fn, x, y in zip(combine, found, new, strict=True)]
     return found
 

@@ -1,0 +1,92 @@
+"""Small programs mean in NumPy, as the tests run them, what they mean compiled."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import small_programs
+from jax import lax
+
+SIGNED = np.float32([[-2.5, -0.0, 0.0, 1.5], [np.nan, np.inf, -np.inf, 3e38]])
+OTHER = np.float32([[0.3, 7.0, 0.0, -1.5], [1.0, -np.inf, -np.inf, 3e38]])
+COUNTS = np.int32([[3, -7, 0, 2147483647], [1, 2, -2147483648, 5]])
+FLAGS = SIGNED > 0
+
+CASES = {
+    "and": (lax.bitwise_and, COUNTS, COUNTS.T.reshape(2, 4)),
+    "broadcast_in_dim": (lambda x: lax.broadcast_in_dim(x, (2, 3, 4), (0, 2)), SIGNED),
+    "concatenate": (lambda x, y: lax.concatenate([x, y], 1), SIGNED, OTHER),
+    "convert_element_type": (lambda x: lax.convert_element_type(x, np.float32), COUNTS),
+    "copy": (jnp.copy, SIGNED),
+    "dynamic_slice": (lambda x, k: lax.dynamic_slice(x, (k, 1), (1, 2)), SIGNED, np.int32(9)),
+    "dynamic_update_slice": (lambda x, y: lax.dynamic_update_slice(x, y, (-3, 3)), SIGNED, OTHER[:, :2]),
+    "eq": (lax.eq, SIGNED, OTHER),
+    "ge": (lax.ge, SIGNED, OTHER),
+    "gt": (lax.gt, SIGNED, OTHER),
+    "iota": (lambda: lax.broadcasted_iota(np.int32, (2, 3), 1),),
+    "is_finite": (lax.is_finite, SIGNED),
+    "le": (lax.le, SIGNED, OTHER),
+    "lt": (lax.lt, SIGNED, OTHER),
+    "max": (lax.max, SIGNED, OTHER),
+    "min": (lax.min, SIGNED, OTHER),
+    "ne": (lax.ne, SIGNED, OTHER),
+    "neg": (lax.neg, SIGNED),
+    "not": (lax.bitwise_not, FLAGS),
+    "or": (lax.bitwise_or, FLAGS, ~FLAGS),
+    "reduce_and": (lambda x: jnp.all(x, 0), FLAGS),
+    "reduce_max": (lambda x: jnp.max(x, 1), SIGNED),
+    "reduce_min": (lambda x: jnp.min(x), COUNTS),
+    "reduce_or": (lambda x: jnp.any(x, (0, 1)), FLAGS),
+    "reshape": (lambda x: lax.reshape(x, (4, 2)), SIGNED),
+    "rev": (lambda x: lax.rev(x, (1,)), SIGNED),
+    "select_n": (lambda c, x, y: lax.select(c, x, y), FLAGS, SIGNED, OTHER),
+    "slice": (lambda x: lax.slice(x, (0, 1), (2, 4), (1, 2)), SIGNED),
+    "squeeze": (lambda x: lax.squeeze(x[:, :1], (1,)), SIGNED),
+    "transpose": (lambda x: lax.transpose(x, (1, 0)), SIGNED),
+    "add": (lax.add, SIGNED, OTHER),
+    "div": (lax.div, SIGNED, OTHER),
+    "mul": (lax.mul, COUNTS, COUNTS[::-1]),
+    "sqrt": (lax.sqrt, SIGNED),
+    "sub": (lax.sub, SIGNED, OTHER),
+}
+"""A function for each operation, and its arguments."""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_numpy_has_the_bits_of_the_compiled_program(name):
+    fn, *args = CASES[name]
+    jaxpr = jax.make_jaxpr(fn)(*args)
+    assert name.removesuffix("_p") in str(jaxpr)
+    (compiled,) = jax.tree.leaves(jax.jit(fn).lower(*args).compile()(*args))
+    assert small_programs.is_small(jaxpr)
+    (interpreted,) = small_programs.evaluate(jaxpr, args)
+    assert interpreted.dtype == compiled.dtype
+    assert interpreted.tobytes() == np.asarray(compiled).tobytes()
+
+
+def test_every_operation_has_a_case():
+    assert set(CASES) == set(small_programs.EXACT | small_programs.ROUNDED) - {"stage"}  # which is its argument
+
+
+@pytest.mark.parametrize(
+    "fn",
+    [
+        lambda x: x * 2 + x,  # XLA may round once
+        jnp.sin,
+        lambda x: x.astype(np.int32),
+        lambda x: jnp.sum(x),
+        lambda x: lax.fori_loop(0, 3, lambda _, y: y, x),
+        lambda x: jax.random.key_data(jax.random.key(x.size)),
+    ],
+)
+def test_what_numpy_rounds_otherwise_is_compiled(fn):
+    assert not small_programs.is_small(jax.make_jaxpr(fn)(SIGNED))
+
+
+def test_results_are_where_compiled_ones_would_be():
+    first, second = jax.devices()[:2]
+    free, bound = jnp.ones(3), jax.device_put(np.ones(3, np.float32), second)
+    assert not (free + free).committed
+    assert (free + free).devices() == {first}
+    assert (free + bound).committed
+    assert (free + bound).devices() == {second}
