@@ -11,7 +11,7 @@ import jax
 
 from crazysim.engine import Step, fused, interpret, kernel, plan
 
-FOLDERS = ("bodies", "core", "drones", "effects", "media", "payloads", "scene", "shows", "sim", "trajectories")
+FOLDERS = ("core", "drones", "effects", "media", "scene", "sim")
 """Folders whose tests make many short flights, and whose subject is not the compiler."""
 BUDGET = 80
 """Operations that are interpreted in half the time in which g++ and XLA compile one."""

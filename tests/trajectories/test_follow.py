@@ -92,7 +92,6 @@ def test_every_engine_flies_what_plain_flies(engine):
     np.testing.assert_allclose(found.controls.state.cmd, plain.controls.state.cmd, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.compiled
 def test_uploads_are_flown_and_nothing_is_compiled_again():
     sim = build()
     plugin = sim.add(Follow([EIGHT, UP], n_slots=4, max_pieces=20))
