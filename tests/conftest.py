@@ -5,7 +5,6 @@ import os
 from pathlib import Path
 
 import compiling
-import small_programs
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 # XLA logs an error of 3,000 characters for every program from the cache that could use another vector width.
@@ -18,6 +17,7 @@ import first_steps
 import jax
 import numpy as np
 import pytest
+import small_programs
 from hypothesis import HealthCheck, settings
 
 from crazysim.engine import cuda
