@@ -10,8 +10,9 @@ HAS_EMITTERS = version("jaxlib").startswith("0.10.")
 """True where XLA has an option for the fusion of loops; later versions refuse it."""
 
 
-QUICK = "-Og -fira-algorithm=priority -fira-region=one"
-"""Options of g++ that take 0.6 of the time that -O1 takes, and as little as -O0, whose kernels are slow."""
+QUICK = "-Og -fira-algorithm=priority -fira-region=one --param ggc-min-expand=200 --param ggc-min-heapsize=500000"
+"""Options of g++ that take 0.6 of the time that -O1 takes, and as little as -O0, whose kernels are slow; below
+500 MB it looks for no garbage."""
 
 
 CACHE = Path(__file__).parents[1] / ".cache" / "jax"

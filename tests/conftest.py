@@ -13,6 +13,7 @@ os.environ.update(compiling.environment(os.environ))
 # A program's operations do not carry the lines of Python that made them: writing it takes less time.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
+import first_steps
 import jax
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from crazysim.engine import cuda
 
 gc.disable()  # see pytest_collection_finish
 compiling.share_mlir_context()
+first_steps.install()
 small_programs.interpret()
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
 
@@ -77,6 +79,14 @@ def pytest_collection_finish():
 @given(st.none())
 def first_example(_):
     """Do nothing."""
+
+
+@pytest.hookimpl(hookwrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item):
+    """Interpret the first steps where the compiler is not the subject; fixtures belong to the test that asks first."""
+    folder = item.path.relative_to(Path(__file__).parent).parts[0]
+    first_steps.active = folder in first_steps.FOLDERS and item.get_closest_marker("compiled") is None
+    yield
 
 
 WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))

@@ -178,6 +178,7 @@ def test_the_order_and_the_end_of_a_pipeline_are_edits(sim):
     np.testing.assert_array_equal(heights(sim.data), 6.0)
 
 
+@pytest.mark.compiled
 def test_law_06_an_edit_compiles_once_and_an_undone_one_not_at_all(sim):
     traces = []
 

@@ -199,6 +199,7 @@ def test_integration_has_one_place_for_all_plugins():
     assert names == ["latency", "battery", "downwash", "ground_effect", "motors", "wake", "wind"]
 
 
+@pytest.mark.compiled
 def test_replace_changes_numbers_without_compiling_and_keeps_states():
     sim = hovering()
     sim.add(Wind((2.0, 0, 0), 7.7))

@@ -206,6 +206,7 @@ def test_docstrings_tell_the_shapes(every):
                 assert shape == x.shape, f"{name}.{field.target.id}"
 
 
+@pytest.mark.compiled
 def test_law_06_one_trace_whatever_is_reset_and_changed(every):
     sim = every
     for i in range(4):

@@ -106,6 +106,7 @@ def test_a_reset_empties_the_queues_of_its_worlds_alone(late):
         assert np.any(getattr(flown, name)[0] != getattr(after, name)[0])
 
 
+@pytest.mark.compiled
 def test_the_delay_may_change_in_flight_without_another_trace(late):
     sim, before = late, late.data
     record = before.plugins["latency"]

@@ -81,6 +81,7 @@ def test_the_air_at_loads_counts_for_loads():
     assert np.abs(np.asarray(load.read(sim.data).vel)[..., 0]).max() < push[..., 0].max(), "no wind remains"
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("largest", [10**6, 1])
 def test_engines_agree_whether_the_table_is_fused_or_not(monkeypatch, largest, rng):
     monkeypatch.setattr(wind_field, "LARGEST_FUSED", largest)
@@ -118,6 +119,7 @@ def test_law_08_gradients_of_a_flight_equal_central_differences(x64, rng):
     np.testing.assert_allclose(found[0, 0], central, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.compiled
 def test_other_velocities_compile_nothing():
     sim = build(engine="auto")
     sim.step()

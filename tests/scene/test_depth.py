@@ -162,6 +162,7 @@ def test_the_slope_of_depth_is_the_way_to_the_wall(room):
     assert float(jax.jit(jax.grad(middle))(0.0)) == pytest.approx(-1.0, abs=1e-5)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("engine", ["plain", "auto"])
 def test_a_range_finder_measures_in_the_step(engine):
     sim = Sim(n_worlds=2, n_drones=2, control="attitude", engine=engine)
@@ -182,6 +183,7 @@ def test_a_range_finder_measures_in_the_step(engine):
     assert "not fused" not in sim.explain()
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("engine", ["plain", "auto"])
 def test_rays_in_a_step_meet_loads_where_they_are_now(engine):
     """No image was drawn since the load and its drone moved. The rod, which begins at the drone, is not measured."""

@@ -102,6 +102,7 @@ def test_set_pose_is_pure_masked_and_differentiable(course):
     assert slope == pytest.approx(2 * 2.0 * 3 * 2 * 3)  # d/dz of z^2 over 3 worlds, 2 gates, 3 components
 
 
+@pytest.mark.compiled
 def test_a_stage_of_one_world_moves_them_on_every_engine():
     ends = []
     for engine in ("plain", "auto"):

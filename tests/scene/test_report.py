@@ -122,6 +122,7 @@ def test_fields_that_were_not_requested_are_none(flown):
     assert sim.contact_report((), drones=False).objects is None
 
 
+@pytest.mark.compiled
 def test_one_drone_one_world_and_all_worlds_get_the_same(flown):
     sim, _ = flown
     everything = jax.device_get(sim.contact_report())
@@ -196,6 +197,7 @@ def test_a_swarm_of_4096_finds_the_two_that_touch_without_quadratic_memory():
     assert not report.floor.any()
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("engine", ["plain", "auto"])
 def test_contacts_are_logged_at_the_step_they_begin(engine):
     """Drones fly past a pole in the first world and into it in the second; the third stands still next to another."""
@@ -341,6 +343,7 @@ def test_law_09_wrong_queries_are_refused(attached):
         sim.contact_report((), floor=False, drones=False)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("box", [False, True])
 @pytest.mark.parametrize("n_drones", [1, 3, 9])
 def test_the_log_has_the_contacts_between_drones_of_a_report(n_drones, box, rng):
@@ -362,6 +365,7 @@ def test_the_log_has_the_contacts_between_drones_of_a_report(n_drones, box, rng)
     np.testing.assert_array_equal(log.read(sim.data).drones, expected)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("n_drones", [1, 3, 9])
 def test_one_kernel_reports_what_xla_does(n_drones, rng):
     """Of more than eight drones the others of a world are no kernel's; what is left out stays out."""

@@ -11,6 +11,8 @@ from crazysim import ConfigError, ContactResponse, Sim
 from crazysim.core.stage import as_stages, stage
 from crazysim.engine import Step
 
+pytestmark = pytest.mark.compiled  # a response is interpreted slowly, and bounces take many steps
+
 HALF = 0.02
 """Half the height of the collision box of a cf21B_500, m."""
 GRAVITY = 9.81

@@ -169,6 +169,7 @@ def test_range_finders_and_depth_measure_it():
     np.testing.assert_allclose(finder.read(sim.data).distance, height, atol=1e-4)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("largest", [10**6, 1])
 def test_engines_agree_whether_the_heights_are_fused_or_not(monkeypatch, largest):
     monkeypatch.setattr(terrain_module, "LARGEST_FUSED", largest)
