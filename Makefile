@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 # Further requirements of an environment, such as PINS="jax<0.12"; one environment for each, named by VENV.
 PINS ?=
-# Processes that run tests; each takes up to 4 GB.
+# Processes that run tests, which together take up to 0.7 of the memory.
 WORKERS ?= 2
 RUN = $(VENV)/bin/python
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)

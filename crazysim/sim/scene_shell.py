@@ -225,12 +225,15 @@ class SceneShell:
         The first image comes seconds earlier, as MJX is neither imported nor compiled for it. Views and films use it.
 
         Args:
-            mode: As in ``render``, and so are the others.
-            world: Index of the world.
-            camera: Name or id.
-            cam_config: Settings of the free camera.
+            mode: As in ``render``.
+            world: As in ``render``.
+            camera: As in ``render``.
+            cam_config: As in ``render``.
             width: Pixels.
             height: Pixels.
+
+        Returns:
+            What ``render`` returns.
 
         Raises:
             ValueError: If the world, camera, mode or a setting does not exist.
