@@ -7,6 +7,7 @@ products fuse.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +52,8 @@ def matvec(matrix: Array, vector: Array, offset: Array | None = None) -> Array:
         (..., m)
     """
     columns = (matrix[..., :, k] * vector[..., k : k + 1] for k in range(matrix.shape[-1]))
-    return sum(columns, 0 if offset is None else offset)
+    start: Any = 0 if offset is None else offset
+    return sum(columns, start)
 
 
 @jax.custom_jvp
