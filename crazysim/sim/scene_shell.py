@@ -233,7 +233,7 @@ class SceneShell:
             height: Pixels.
 
         Returns:
-            What ``render`` returns.
+            Same as ``render``.
 
         Raises:
             ValueError: If the world, camera, mode or a setting does not exist.
