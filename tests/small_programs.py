@@ -112,7 +112,7 @@ def evaluate(closed, args) -> list[np.ndarray]:
             if inner is not None:
                 env.update(zip(eqn.outvars, evaluate(inner, given), strict=True))
             else:
-                env[eqn.outvars[0]] = (EXACT | ROUNDED)[eqn.primitive.name](*given, eqn=eqn)
+                env[eqn.outvars[0]] = OPERATIONS[eqn.primitive.name](*given, eqn=eqn)
     return [read(x) for x in jaxpr.outvars]
 
 
@@ -214,3 +214,5 @@ ROUNDED = {
     "sub": _each(np.subtract),
 }
 """Operations that round as IEEE 754 says."""
+
+OPERATIONS = EXACT | ROUNDED

@@ -65,7 +65,7 @@ def test_numpy_has_the_bits_of_the_compiled_program(name):
 
 
 def test_every_operation_has_a_case():
-    assert set(CASES) == set(small_programs.EXACT | small_programs.ROUNDED) - {"stage"}  # which is its argument
+    assert set(CASES) == set(small_programs.OPERATIONS) - {"stage"}  # which is its argument
 
 
 @pytest.mark.parametrize(

@@ -240,6 +240,7 @@ class SceneShell:
             RenderError: If this machine cannot draw.
         """
         self._require_world(world)
+        self._scene.compile_if_edited()
         self._scene.sync_one(self._placed(), world)
         return self._image(mode, world, camera, cam_config, width, height)
 

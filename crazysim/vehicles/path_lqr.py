@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
@@ -55,10 +56,9 @@ class PathLQR(PathController):
         Raises:
             ConfigError: If no gain stabilises the vehicle, or a weight has another shape.
         """
-        rows = kinematic_rows if vehicle.dynamics == "kinematic" else single_track_rows
         speeds = SPEED_STEP * np.arange(1, N_SPEEDS + 1) * np.array([[1.0], [-1.0]])
         Q, R = as_weights("Q", self.Q, 4), as_weights("R", [self.R], 1)
-        table = on_host(rows, car, speeds.ravel(), 1 / freq, Q, R)
+        table = on_host(ROWS[vehicle.dynamics], car, speeds.ravel(), 1 / freq, Q, R)
         return PathLQRGains(as_parameter(table.reshape(2, N_SPEEDS, 5)))
 
     def steering(
@@ -105,14 +105,13 @@ def lateral_gains(model: Any, car: CarParams, speed: Array, period: ArrayLike, Q
     return jnp.concatenate([K, (steer + K @ steady)[None]])
 
 
-def single_track_rows(car: CarParams, speeds: Array, period: Array, Q: Array, R: Array) -> Array:
-    """Return ``lateral_gains`` of the single-track model at several speeds. (n, 5)"""
-    return jax.vmap(lambda speed: lateral_gains(single_track, car, speed, period, Q, R))(speeds)
+def _rows(model: Any, car: CarParams, speeds: Array, period: Array, Q: Array, R: Array) -> Array:
+    """Return ``lateral_gains`` at several speeds. (n, 5)"""
+    return jax.vmap(lambda speed: lateral_gains(model, car, speed, period, Q, R))(speeds)
 
 
-def kinematic_rows(car: CarParams, speeds: Array, period: Array, Q: Array, R: Array) -> Array:
-    """Return ``lateral_gains`` of the kinematic model at several speeds. (n, 5)"""
-    return jax.vmap(lambda speed: lateral_gains(kinematic, car, speed, period, Q, R))(speeds)
+ROWS = {"kinematic": functools.partial(_rows, kinematic), "single_track": functools.partial(_rows, single_track)}
+"""``lateral_gains`` at several speeds, by the vehicle's dynamics: one function for all vehicles, compiled once."""
 
 
 def exponential(matrix: Array) -> Array:
