@@ -1,7 +1,11 @@
 """Shared by all tests: two host devices, a persistent compilation cache, and simulations built once."""
 
 import gc
+import io
 import os
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import compiling
@@ -65,6 +69,10 @@ def pytest_collection_modifyitems(items):
     items.sort(key=rank)
 
 
+open_at_start = set()
+"""Identities of the files, sockets and processes that are open before the first test."""
+
+
 def pytest_collection_finish():
     """Leave garbage to ``pytest_runtest_teardown``: tracing makes millions of objects, and looking took a tenth of all.
 
@@ -73,6 +81,7 @@ def pytest_collection_finish():
     first_example()
     gc.collect()
     gc.freeze()
+    open_at_start.update(map(id, opened()))
 
 
 @settings(max_examples=1, database=None)
@@ -85,7 +94,9 @@ def first_example(_):
 def pytest_runtest_protocol(item):
     """Interpret the first steps where the compiler is not the subject; fixtures belong to the test that asks first."""
     folder = item.path.relative_to(Path(__file__).parent).parts[0]
-    first_steps.active = folder in first_steps.FOLDERS and item.get_closest_marker("compiled") is None
+    free = item.get_closest_marker("compiled") is None
+    first_steps.active = free and folder in first_steps.FOLDERS
+    small_programs.active = free and folder in small_programs.FOLDERS
     yield
 
 
@@ -97,23 +108,35 @@ GROWTH = 1.3
 limit = MEMORY
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item, nextitem):
     """Look for garbage where a file ends: simulations hold the programs that were compiled for them.
 
-    What is left is not looked at again.
+    What is left is not looked at again. After the last test nothing is looked for, which would take 15 s; what a test
+    left open fails it.
     """
     global limit
-    if nextitem is not None and nextitem.path != item.path and memory() > limit:
+    if nextitem is None:
+        left = [x for x in opened() if id(x) not in open_at_start]
+        gc.freeze()
+        assert not left, "tests close what they open"
+    elif nextitem.path != item.path and memory() > limit:
         gc.collect()
         gc.freeze()
         limit = max(MEMORY, GROWTH * memory())
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_sessionfinish():
-    """Look once for what was not closed: pytest looks five times at what is not frozen."""
-    gc.collect()
-    gc.freeze()
+def opened():
+    """Return what is open in this process, without libraries' own files: files, sockets, and children that run."""
+    some = [x for x in gc.get_objects() if isinstance(x, io.FileIO | socket.socket | subprocess.Popen)]
+    return [x for x in some if is_open(x) and not str(getattr(x, "name", "")).startswith(sys.prefix)]
+
+
+def is_open(x):
+    """Return whether a file or a socket is open, or a process runs."""
+    if isinstance(x, subprocess.Popen):
+        return x.poll() is None
+    return x.fileno() >= 0 if isinstance(x, socket.socket) else not x.closed
 
 
 def memory():

@@ -205,6 +205,7 @@ def test_worlds_are_spread_over_devices(engine):
         np.testing.assert_allclose(numbers(spread.data)[name], value, rtol=1e-6, atol=1e-7, err_msg=name)
 
 
+@pytest.mark.compiled
 def test_random_numbers_are_those_of_world_and_member():
     """Law 10: they do not depend on how many worlds and members there are."""
 

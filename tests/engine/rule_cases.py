@@ -7,6 +7,7 @@ import numpy as np
 from crazysim.pytree import PyTree, leaf
 
 N_WORLDS, N_DRONES = 7, 3  # 21 lanes: not a multiple of any vector's or block's length
+N_LANES = N_WORLDS * N_DRONES
 
 
 class Given(PyTree):
@@ -262,3 +263,34 @@ def of_one(g):
     kinds = Given("d", "d", "d", "d", "d", "shared", "d")
     strip = {"d": 2, "shared": 0}
     return jax.tree.map(lambda s, x: jax.ShapeDtypeStruct(x.shape[strip[s] :], x.dtype), kinds, g)
+
+
+def function(name):
+    """Return a case as a function of one drone's arrays, to a flat array."""
+    fn = (lambda g: RANDOM[name](jax.random.key(3), g)) if name in RANDOM else CASES[name]
+    return lambda g: jnp.ravel(fn(g))
+
+
+def of_all(name):
+    """Return a case as a function of the arrays of all drones, to rows. (n_lanes, k)"""
+    axes = Given(0, 0, 0, 0, 0, None, 0)
+    return lambda g: jax.vmap(jax.vmap(function(name), (axes,)), (axes,))(g).reshape(N_LANES, -1)
+
+
+# What rounds: library functions of XLA and NumPy differ by a few units in the last place, and a solve multiplies that
+# by the condition of the system, here below 1e2. All else is the same arithmetic.
+ULP = 2.0**-23
+TOLERANCE = {"functions": 16 * ULP, "small_systems": 1e3 * ULP, "far_angles": 8 * ULP, "interpolation": 1e2 * ULP}
+TOLERANCE |= dict.fromkeys(["lanes", "fused"], 32 * ULP)  # sums of products that cancel, contracted or not
+
+
+def agree(found, expected, name):
+    """Check that what rounds differs by what rounding explains, and the rest not at all."""
+    found, expected = np.asarray(found), np.asarray(expected)
+    assert found.dtype == expected.dtype
+    if expected.dtype.kind != "f":
+        np.testing.assert_array_equal(found, expected, err_msg=name)
+        return
+    tolerance = TOLERANCE.get(name, 8 * ULP)
+    scale = np.max(np.abs(np.where(np.isfinite(expected), expected, 0)))
+    np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance * min(scale, 1e2), err_msg=name)

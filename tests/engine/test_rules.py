@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from blocks import program_of
-from rule_cases import CASES, N_DRONES, N_WORLDS, RANDOM, given, of_one
+from rule_cases import CASES, N_LANES, RANDOM, ULP, agree, function, given, of_all, of_one
 
 from crazysim import Sim
 from crazysim.core.stage import as_stages, stage
@@ -16,41 +16,10 @@ from crazysim.engine.lower_stages import lower_stages
 from crazysim.engine.verify import verify_block
 from crazysim.errors import EngineWarning
 
-N_LANES = N_WORLDS * N_DRONES
-
-# What rounds: library functions of XLA and NumPy differ by a few units in the last place, and a solve multiplies that
-# by the condition of the system, here below 1e2. All else is the same arithmetic.
-ULP = 2.0**-23
-TOLERANCE = {"functions": 16 * ULP, "small_systems": 1e3 * ULP, "far_angles": 8 * ULP, "interpolation": 1e2 * ULP}
-TOLERANCE |= dict.fromkeys(["lanes", "fused"], 32 * ULP)  # sums of products that cancel, contracted or not
-
-
-def function(name):
-    """Return a case as a function of one drone's arrays, to a flat array."""
-    fn = (lambda g: RANDOM[name](jax.random.key(3), g)) if name in RANDOM else CASES[name]
-    return lambda g: jnp.ravel(fn(g))
-
-
 def lanes_of(g):
     """Return the numbers of all drones: of what they share one, of the rest one for each lane."""
     return [x for name, array in vars(g).items()
             for x in (np.asarray(array) if name == "table" else np.asarray(array).reshape(N_LANES, -1).T)]  # fmt: skip
-
-
-def plain(name, g):
-    """Return what JAX gives for all drones. (n_lanes, k)"""
-    axes = type(g)(0, 0, 0, 0, 0, None, 0)
-    return np.asarray(jax.jit(jax.vmap(jax.vmap(function(name), (axes,)), (axes,)))(g)).reshape(N_LANES, -1)
-
-
-def agree(found, expected, name):
-    assert found.dtype == expected.dtype
-    if expected.dtype.kind != "f":
-        np.testing.assert_array_equal(found, expected, err_msg=name)
-        return
-    tolerance = TOLERANCE.get(name, 8 * ULP)
-    scale = np.max(np.abs(np.where(np.isfinite(expected), expected, 0)))
-    np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance * min(scale, 1e2), err_msg=name)
 
 
 @pytest.mark.parametrize("name", [*CASES, *RANDOM])
@@ -61,7 +30,7 @@ def test_a_case_gives_what_jax_gives(name):
     verify_block(block)
     assert block.outputs
     found = interpret.run(block, lanes_of(g), (N_LANES,))
-    agree(np.stack(found, axis=-1), plain(name, g), name)
+    agree(np.stack(found, axis=-1), jax.jit(of_all(name))(g), name)
 
 
 @pytest.mark.parametrize("engine", ["lanes", *(["fused"] if native.compiler() else [])])
