@@ -80,8 +80,8 @@ def pytest_collection_finish():
     """
     first_example()
     gc.collect()
-    gc.freeze()
     open_at_start.update(map(id, opened()))
+    gc.freeze()
 
 
 @settings(max_examples=1, database=None)

@@ -173,11 +173,9 @@ def undisturbed() -> Iterator[None]:
     """Keep other threads of Python and the garbage collector from delaying the loop."""
     interval = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL)
-    frozen = gc.get_freeze_count() > 0
     gc.freeze()  # the objects of JAX and MuJoCo are not examined again: that takes 0.1 s and more
     try:
         yield
     finally:
-        if not frozen:  # what somebody else froze stays so
-            gc.unfreeze()
+        gc.unfreeze()
         sys.setswitchinterval(interval)
