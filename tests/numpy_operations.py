@@ -5,10 +5,11 @@ bits that XLA gives, and those of ``ROUNDED`` do, one at a time; numbers below 1
 for zero.
 """
 
+import ctypes
 import functools
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -16,9 +17,10 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 from jax import lax
-from jax._src import prng
+from jax._src import core, prng
 from jax.extend.core import Literal
 
+from crazysim.engine import native
 from crazysim.engine.interpret import threefry2x32
 
 
@@ -45,7 +47,7 @@ class Program:
 
     def __init__(self, jaxpr, consts=()):
         """Prepare a jaxpr with its constants; raise ``MissingError`` if NumPy has not all of its operations."""
-        self.values, self.calls, self.cost = [], [], 0.0
+        self.values, self.calls, self.cost, self.size = [], [], 0.0, 0
         places = {}
         for v, x in zip(jaxpr.constvars, consts, strict=True):
             places[v] = self.place(data(x))
@@ -72,7 +74,9 @@ class Program:
                 known = dict(zip((*inner.constvars, *inner.invars), (*consts, *args), strict=True))
                 places.update(zip(eqn.outvars, self.add(inner, known), strict=True))
                 continue
-            if name not in OPERATIONS or (name not in OF_KEYS and not all(is_number(v.aval) for v in (*eqn.invars, *eqn.outvars))):
+            if name not in OPERATIONS or (
+                name not in OF_KEYS and not all(is_number(v.aval) for v in (*eqn.invars, *eqn.outvars))
+            ):
                 raise MissingError(name)
             fn = OPERATIONS[name](eqn)
             results = [self.place() for _ in eqn.outvars]
@@ -80,6 +84,7 @@ class Program:
             one = not eqn.primitive.multiple_results
             dtype = eqn.outvars[0].aval.dtype if one and is_number(eqn.outvars[0].aval) else None
             self.calls.append(Call(fn, args, results[0] if one else results, dtype))
+            self.size += n_operations(eqn)
             self.cost += 1 + sum(math.prod(v.aval.shape) for v in eqn.outvars) / ELEMENTS
         return [read(x) for x in jaxpr.outvars]
 
@@ -139,6 +144,11 @@ def data(x):
     """Return an array in NumPy; of keys their numbers."""
     is_key = jax.dtypes.issubdtype(getattr(x, "dtype", np.float32), jax.dtypes.prng_key)
     return np.asarray(jax.random.key_data(x) if is_key else x)
+
+
+def n_operations(eqn) -> int:
+    """Return the number of operations of an equation and of the jaxprs in it, as they are written."""
+    return 1 + sum(n_operations(inner) for jaxpr in core.jaxprs_in_params(eqn.params) for inner in jaxpr.eqns)
 
 
 def prepare(closed) -> Program:
@@ -357,9 +367,7 @@ def pad(eqn):
         spread = [(n - 1) * inside + n if n else 0 for n, (_, _, inside) in zip(x.shape, config, strict=True)]
         margins = [(max(low, 0), max(high, 0)) for low, high, _ in config]
         out = np.full([n + a + b for n, (a, b) in zip(spread, margins, strict=True)], value, x.dtype)
-        steps = [
-            slice(a, a + n, inside + 1) for n, (a, _), (_, _, inside) in zip(spread, margins, config, strict=True)
-        ]
+        steps = [slice(a, a + n, inside + 1) for n, (a, _), (_, _, inside) in zip(spread, margins, config, strict=True)]
         out[tuple(steps)] = x
         cut = [slice(max(-low, 0), max(-low, 0) + n) for n, (low, _, _) in zip(shape, config, strict=True)]
         return out[tuple(cut)]
@@ -541,9 +549,14 @@ def while_loop(eqn):
     """Run a jaxpr as long as another one says; where they are arrays, for the places for which it does."""
     p = eqn.params
     test, body, n, m = prepare(p["cond_jaxpr"]), prepare(p["body_jaxpr"]), p["cond_nconsts"], p["body_nconsts"]
+    limits = counted(p["cond_jaxpr"].jaxpr)
 
     def fn(*args):
         of_test, of_body, carry = args[:n], args[n : n + m], args[n + m :]
+        if limits is not None:
+            count, end = ((*of_test, *carry)[k] if isinstance(k, int) else k.val for k in limits)
+            if (int(end) - int(count)) * body.cost > _left:
+                raise TooLongError
         while (going := test.run(*of_test, *carry)[0]).any():
             new = body.run(*of_body, *carry)
             if np.ndim(going):
@@ -555,10 +568,85 @@ def while_loop(eqn):
     return fn
 
 
+def counted(test):
+    """Return the counter and its end, as places or literals, of a loop that ends at a number; None for others."""
+    if len(test.eqns) != 1 or test.eqns[0].primitive.name != "lt" or test.eqns[0].outvars[0].aval.shape:
+        return None
+    return [x if isinstance(x, Literal) else test.invars.index(x) for x in test.eqns[0].invars]
+
+
 def cond(eqn):
     """Run one of several jaxprs."""
     branches = [prepare(x) for x in eqn.params["branches"]]
     return lambda k, *args: branches[min(max(int(k), 0), len(branches) - 1)].run(*args)
+
+
+def callback(eqn):
+    """Call a function of the host."""
+    fn = eqn.params["callback"]
+    return lambda *xs: [np.asarray(y, v.aval.dtype) for y, v in zip(fn(*xs), eqn.outvars, strict=True)]
+
+
+class Buffer(ctypes.Structure):
+    """``XLA_FFI_Buffer`` of XLA's foreign function interface."""
+
+    _fields_ = (
+        ("struct_size", ctypes.c_size_t),
+        ("extension_start", ctypes.c_void_p),
+        ("dtype", ctypes.c_int),
+        ("data", ctypes.c_void_p),
+        ("rank", ctypes.c_int64),
+        ("dims", ctypes.c_void_p),
+    )
+
+
+class Buffers(ctypes.Structure):
+    """``XLA_FFI_Args`` and ``XLA_FFI_Rets``."""
+
+    _fields_ = (
+        ("struct_size", ctypes.c_size_t),
+        ("extension_start", ctypes.c_void_p),
+        ("size", ctypes.c_int64),
+        ("types", ctypes.c_void_p),
+        ("buffers", ctypes.POINTER(ctypes.POINTER(Buffer))),
+    )
+
+
+class Frame(ctypes.Structure):
+    """``XLA_FFI_CallFrame`` up to the results: a kernel reads addresses alone."""
+
+    _fields_ = (
+        ("struct_size", ctypes.c_size_t),
+        ("extension_start", ctypes.c_void_p),
+        ("api", ctypes.c_void_p),
+        ("ctx", ctypes.c_void_p),
+        ("stage", ctypes.c_int),
+        ("args", Buffers),
+        ("rets", Buffers),
+    )
+
+
+def kernel(eqn):
+    """Call a kernel of the fused engine as XLA does."""
+    library, aliases = native._LOADED.get(eqn.params["target_name"]), dict(eqn.params["input_output_aliases"])
+    if library is None:
+        raise MissingError("ffi_call of something else")
+    types = [v.aval for v in eqn.outvars]
+
+    def buffers(arrays):
+        one = [ctypes.pointer(Buffer(data=x.ctypes.data)) for x in arrays]
+        return Buffers(size=len(one), buffers=(ctypes.POINTER(Buffer) * len(one))(*one))
+
+    def fn(*xs):
+        out = [np.empty(x.shape, x.dtype) for x in types]
+        for k, result in aliases.items():
+            out[result][...] = xs[k]
+        given = [out[aliases[k]] if k in aliases else np.ascontiguousarray(x) for k, x in enumerate(xs)]
+        frame = Frame(args=buffers(given), rets=buffers(out))
+        library.crazysim_advance(ctypes.byref(frame))
+        return out
+
+    return fn
 
 
 def lu(eqn):
@@ -805,10 +893,13 @@ CLOSE = {
 STRUCTURED = {
     "cond": cond,
     "custom_linear_solve": linear_solve,
+    "device_put": all_same,
+    "ffi_call": kernel,
     "iota_2x32_shape": counts,
     "lu": lu,
     "optimization_barrier": all_same,
     "platform_index": platform_index,
+    "pure_callback": callback,
     "random_bits": random,
     "random_fold_in": random,
     "random_seed": random,

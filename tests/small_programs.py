@@ -13,6 +13,8 @@ from importlib.metadata import version
 
 import jax
 import numpy as np
+from jax.core import ShapedArray
+from jax.sharding import SingleDeviceSharding
 from numpy_operations import CALLS, EXACT, ROUNDED, MissingError, TooLongError, data, is_number, prepare
 
 FOLDERS = (
@@ -20,7 +22,7 @@ FOLDERS = (
     "payloads", "scene", "shows", "sim", "test_main.py", "train", "trajectories", "vehicles",
 )  # fmt: skip
 """Folders whose subject is not the compiler."""
-BEGIN, EACH = 4000, 30
+BEGIN, EACH = 2500, 25
 """Operations that NumPy runs while XLA compiles a program: without operations, and more for each."""
 CALL = 30
 """Operations that take as long as a call does besides its operations."""
@@ -53,9 +55,8 @@ class Known:
 
     def __init__(self, closed):
         """Take its jaxpr."""
-        self.types = [v.aval for v in closed.jaxpr.invars], closed.out_avals
-        # NumPy has no weak types.
-        self.possible = not closed.effects and not any(x.weak_type for x in closed.out_avals if is_number(x))
+        self.given, self.results = [v.aval for v in closed.jaxpr.invars], closed.out_avals
+        self.possible = not closed.effects
         self.exact = self.possible and is_exact(closed.jaxpr)
         self.program, self.left = None, BEGIN
 
@@ -63,8 +64,8 @@ class Known:
         """Return the results of a call; None if it must be compiled."""
         if not (self.possible and (active or self.exact)):
             return None
-        device = _device(args, params)
-        if device is None:
+        place = _place(args, params)
+        if place is None:
             return None
         if self.program is None:
             try:
@@ -72,16 +73,14 @@ class Known:
             except MissingError:
                 self.possible = False
                 return None
-            self.left = BEGIN + EACH * len(self.program.calls)
-        given, results = self.types
+            self.left = BEGIN + EACH * self.program.size
         try:
-            found, done = self.program.run_within(self.left - CALL, map(_read, args, given))
+            found, done = self.program.run_within(self.left - CALL, map(_read, args, self.given))
         except TooLongError:
             self.possible = False
             return None
         self.left -= CALL + done
-        out = jax.device_put(list(map(np.asarray, found)), *device)
-        return [x if is_number(v) else jax.random.wrap_key_data(x) for x, v in zip(out, results, strict=True)]
+        return [_put(x, aval, *place) for x, aval in zip(found, self.results, strict=True)]
 
 
 _KNOWN = weakref.WeakKeyDictionary()
@@ -93,21 +92,28 @@ def _read(x, aval):
     return np.asarray(x, aval.dtype) if is_number(aval) else data(x)
 
 
-def _device(args, params):
-    """Return the device that the results are committed to, if any, in a tuple; None if the call must be compiled."""
+def _place(args, params):
+    """Return the device of the results, and whether they are committed to it; None if the call must be compiled."""
     from jax._src.sharding_impls import UnspecifiedValue
 
-    places = [params[name] for name in ("in_shardings", "out_shardings", "in_layouts", "out_layouts")]
-    if any(not isinstance(x, UnspecifiedValue | None) for some in places for x in some):
+    wishes = [params[name] for name in ("in_shardings", "out_shardings", "in_layouts", "out_layouts")]
+    if any(not isinstance(x, UnspecifiedValue | None) for some in wishes for x in some):
         return None
-    if any(params["donated_invars"]) or params["compiler_options_kvs"] or jax.config.jax_default_device is not None:
+    if any(params["donated_invars"]) or params["compiler_options_kvs"]:
         return None
+    first, *_ = jax.devices()
     arrays = [x for x in args if isinstance(x, jax.Array)]
-    devices = {device for x in arrays for device in x.devices()}
-    committed = any(x.committed for x in arrays)
-    if jax.default_backend() != "cpu" or not devices <= {jax.devices()[0]}:
-        return None
-    return tuple(devices) if committed else ()
+    known = {device for x in arrays for device in x.devices()} | {jax.config.jax_default_device or first}
+    return (first, any(x.committed for x in arrays)) if known == {first} and first.platform == "cpu" else None
+
+
+def _put(x, aval, device, committed):
+    """Return a result in JAX, in memory of its own."""
+    from jax._src.interpreters import pxla
+
+    if not is_number(aval):
+        return jax.random.wrap_key_data(_put(x, ShapedArray(np.shape(x), x.dtype), device, committed))
+    return pxla.batched_device_put(aval, SingleDeviceSharding(device), [np.array(x)], [device], committed)
 
 
 def is_exact(jaxpr) -> bool:

@@ -4,9 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from blocks import program_of
 from jax import lax
 from numpy_operations import CLOSE, STRUCTURED, MissingError, TooLongError, evaluate, prepare
 from rule_cases import CASES, RANDOM, agree, given, of_all
+
+from crazysim.engine import native
+from crazysim.engine.fused import build
+from crazysim.engine.lower import lower_function
 
 WINDOWS = lax.GatherDimensionNumbers((1,), (), (0,))
 PICKED = lax.GatherDimensionNumbers((), (1,), (1,), (0,), (0,))
@@ -14,6 +19,8 @@ OF_WINDOWS = lax.ScatterDimensionNumbers((1,), (), (0,))
 OF_PICKED = lax.ScatterDimensionNumbers((), (1,), (1,), (0,), (0,))
 PLACES = np.int32([-3, 1, 9, 2])
 MODES = ("clip", "fill")
+
+OPERANDS = [np.linspace(-2, 2, 9, dtype=np.float32), np.zeros(9, np.float32)]
 
 MORE = {
     "gather of windows": lambda g: jnp.stack(
@@ -59,6 +66,8 @@ MORE = {
     "neighbours": lambda g: lax.nextafter(g.nan, g.nan[::-1]),
     "rows": lambda g: lax.optimization_barrier(jnp.unstack(g.x)[1]),
     "wrapped keys": lambda g: jax.random.bits(jax.random.wrap_key_data(g.u[0, 0, :2]), (3,)).view(jnp.int32),
+    "a function of the host": lambda g: jax.pure_callback(np.negative, g.x, g.x),
+    "a place": lambda g: jax.device_put(g.x, jax.devices()[0]) + 1,
     "margins inside": lambda g: lax.pad(g.m[0, 0], jnp.float32(2), ((1, -1, 1), (-1, 2, 0))),
 }
 """Functions of the arrays of all drones."""
@@ -81,8 +90,22 @@ def test_every_operation_has_a_case():
     """Those of which NumPy has the same bits are in ``test_small_programs``."""
     g = given()
     found = set().union(*(names(jax.make_jaxpr(MORE.get(k) or of_all(k))(g).jaxpr) for k in [*CASES, *RANDOM, *MORE]))
-    within_random = {"iota_2x32_shape", "threefry2x32"}
-    assert set(CLOSE | STRUCTURED) - found == within_random
+    elsewhere = {"ffi_call", "iota_2x32_shape", "threefry2x32"}  # below, and within those that draw numbers
+    assert set(CLOSE | STRUCTURED) - found == elsewhere
+
+
+def test_kernels_are_called_as_xla_calls_them():
+    if native.compiler() is None:
+        pytest.skip("no C++ compiler here")
+    one = jax.ShapeDtypeStruct((), np.float32)
+    program, leaves = program_of(lower_function(lambda x, y: [jnp.sin(x) + y, x < y], one, one), OPERANDS, 9)
+    run = build(program, "cpu")
+    jaxpr = jax.make_jaxpr(lambda leaves: run(leaves, 1))(leaves)
+    assert "ffi_call" in names(jaxpr.jaxpr)
+    for x, y in zip(
+        evaluate(jaxpr, jax.tree.leaves(leaves)), jax.tree.leaves(jax.jit(lambda x: run(x, 1))(leaves)), strict=True
+    ):
+        np.testing.assert_array_equal(x, y)
 
 
 def test_what_is_missing_or_takes_too_long_is_compiled():

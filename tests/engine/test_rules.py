@@ -16,6 +16,7 @@ from crazysim.engine.lower_stages import lower_stages
 from crazysim.engine.verify import verify_block
 from crazysim.errors import EngineWarning
 
+
 def lanes_of(g):
     """Return the numbers of all drones: of what they share one, of the rest one for each lane."""
     return [x for name, array in vars(g).items()
