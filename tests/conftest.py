@@ -90,13 +90,18 @@ def first_example(_):
     """Do nothing."""
 
 
+FOLDERS = (
+    "bodies", "control", "core", "drones", "dynamics", "effects", "envs", "geometry", "live", "media",
+    "payloads", "scene", "shows", "sim", "test_main.py", "train", "trajectories", "vehicles",
+)  # fmt: skip
+"""Folders whose subject is not the compiler."""
+
+
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item):
     """Interpret the first steps where the compiler is not the subject; fixtures belong to the test that asks first."""
     folder = item.path.relative_to(Path(__file__).parent).parts[0]
-    free = item.get_closest_marker("compiled") is None
-    first_steps.active = free and folder in first_steps.FOLDERS
-    small_programs.active = free and folder in small_programs.FOLDERS
+    first_steps.active = small_programs.active = folder in FOLDERS and item.get_closest_marker("compiled") is None
     yield
 
 

@@ -1,6 +1,6 @@
 """First steps of a simulation on the interpreter: many flights of tests are over sooner than a kernel is compiled.
 
-In tests of ``FOLDERS`` simulations plan for the fused engine as ever, which refuses what has no kernel. Their steps are
+Where the compiler is not the subject, simulations plan for the fused engine as ever, which refuses what has no kernel. Their steps are
 interpreted until they have taken as long as compiling does, or one is traced. From then on the kernel takes all of
 them. Steps on several devices, steps with stages that are not fused, and engines chosen by name are left alone.
 """
@@ -11,8 +11,6 @@ import jax
 
 from crazysim.engine import Step, fused, interpret, kernel, plan
 
-FOLDERS = ("core", "drones", "effects", "media", "scene", "sim")
-"""Folders whose tests make many short flights, and whose subject is not the compiler."""
 BUDGET = 250
 """Operations that are interpreted in half the time in which g++ and XLA compile one."""
 CALL = 500
@@ -25,7 +23,7 @@ WHILE = 10
 """Iterations of a loop that ends by a condition, as a guess."""
 
 active = False
-"""True while a test of ``FOLDERS`` runs."""
+"""True while a test runs whose subject is not the compiler."""
 _planning = threading.local()
 
 

@@ -129,15 +129,20 @@ CALLS = {
 """Operations that call a jaxpr and do nothing else, and the parameter that has it."""
 
 
-OF_KEYS = ("cond", "select_n", "slice", "squeeze", "while") + tuple(
+OF_KEYS = ("broadcast_in_dim", "concatenate", "cond", "scan", "select_n", "slice", "squeeze", "stack", "while") + tuple(
     f"random_{name}" for name in ("bits", "fold_in", "seed", "split", "unwrap", "wrap")
 )
-"""Operations that take random keys as they are here: their numbers."""
+"""Operations that take random keys as they are here: their two numbers, along a last axis."""
 
 
 def is_number(aval):
     """Return whether values of a type are numbers of NumPy."""
     return isinstance(getattr(aval, "dtype", None), np.dtype)
+
+
+def shape_of(aval):
+    """Return the shape of values of a type here."""
+    return aval.shape if is_number(aval) else (*aval.shape, 2)
 
 
 def data(x):
@@ -195,10 +200,10 @@ def broadcast_in_dim(eqn):
     """Write an array along axes of a larger one."""
     if len(eqn.invars) > 1:
         raise MissingError("broadcast_in_dim to a shape that is not known")
-    shape, (x,) = tuple(eqn.params["shape"]), eqn.invars
-    axes = eqn.params["broadcast_dimensions"]
+    shape, (x,) = shape_of(eqn.outvars[0].aval), eqn.invars
+    axes = (*eqn.params["broadcast_dimensions"], -1)
     spread = [1] * len(shape)
-    for axis, n in zip(axes, x.aval.shape, strict=True):
+    for axis, n in zip(axes, shape_of(x.aval), strict=False):
         spread[axis] = n
     return lambda x: np.broadcast_to(np.reshape(x, spread), shape)
 
@@ -267,8 +272,7 @@ def reshape(eqn):
 
 def to_shape(eqn):
     """Return an array in the shape of the result."""
-    out = eqn.outvars[0].aval
-    return functools.partial(np.reshape, shape=out.shape if is_number(out) else (*out.shape, 2))
+    return functools.partial(np.reshape, shape=shape_of(eqn.outvars[0].aval))
 
 
 def select_n(eqn):
@@ -529,12 +533,13 @@ def scan(eqn):
     body, n_consts, n_carry = prepare(p["jaxpr"]), p["num_consts"], p["num_carry"]
     order = range(p["length"])[::-1] if p["reverse"] else range(p["length"])
     rows = [v.aval for v in eqn.outvars[n_carry:]]
+    rows = [(shape_of(x), x.dtype if is_number(x) else np.uint32) for x in rows]
 
     def fn(*args):
         if p["length"] * body.cost > _left:
             raise TooLongError
         consts, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
-        ys = [np.empty(row.shape, row.dtype) for row in rows]
+        ys = [np.empty(*row) for row in rows]
         for i in order:
             out = body.run(*consts, *carry, *[x[i] for x in xs])
             carry = out[:n_carry]
@@ -666,6 +671,14 @@ def lu(eqn):
         return [out, pivots, orders]
 
     return fn
+
+
+def qr(eqn):
+    """Return a matrix as an orthogonal one and an upper triangle."""
+    if eqn.params["pivoting"]:
+        raise MissingError("qr with pivots")
+    mode = "complete" if eqn.params["full_matrices"] else "reduced"
+    return lambda x: list(np.linalg.qr(x, mode))
 
 
 def triangular_solve(eqn):
@@ -900,6 +913,7 @@ STRUCTURED = {
     "optimization_barrier": all_same,
     "platform_index": platform_index,
     "pure_callback": callback,
+    "qr": qr,
     "random_bits": random,
     "random_fold_in": random,
     "random_seed": random,

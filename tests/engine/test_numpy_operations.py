@@ -61,6 +61,14 @@ MORE = {
     ),
     "keys of a shape": lambda g: jax.vmap(lambda k: jax.random.normal(k, (2,)))(jax.random.split(jax.random.key(3), 4)),
     "angles": lambda g: jnp.stack([jnp.arctan2(g.x, g.x[..., ::-1]), jnp.tan(g.x), jnp.tanh(g.x)]),
+    "more keys": lambda g: lax.scan(
+        lambda c, k: (jax.random.fold_in(c, 1), jax.random.bits(jnp.stack([c, k, c])[0], (2,)).view(jnp.int32)),
+        jax.random.key(1),
+        jnp.concatenate([jnp.broadcast_to(jax.random.key(2), (2,)), jax.random.split(jax.random.key(3))]),
+    )[1],
+    "orthogonal matrices": lambda g: jnp.concatenate(
+        [x.ravel() for full in ("complete", "reduced") for x in jnp.linalg.qr(g.big[..., :4], full)]
+    ),
     "a branch": lambda g: lax.switch(g.i[0, 0, 0], [jnp.sin, jnp.cos, jnp.tan], g.x),
     "cases by number": lambda g: lax.select_n(jnp.int32([0, 2, 1, 2, 0, 1]), *g.x[0]),
     "neighbours": lambda g: lax.nextafter(g.nan, g.nan[::-1]),
