@@ -30,7 +30,8 @@ from crazysim.engine import cuda
 gc.disable()  # see pytest_collection_finish
 compiling.share_mlir_context()
 first_steps.install()
-small_programs.interpret()
+if not os.environ.get("CRAZYSIM_COMPILE"):
+    small_programs.interpret()
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
 
 os.environ["CXXFLAGS"] = os.environ.get("CXXFLAGS", "") + compiling.precompiled_headers()
@@ -92,17 +93,18 @@ def first_example(_):
 
 
 FOLDERS = (
-    "control", "core", "drones", "dynamics", "effects", "envs", "geometry", "media", "payloads", "scene", "shows", "sim",
-    "test_main.py", "train", "trajectories",
+    "control", "core", "drones", "dynamics", "effects", "envs", "geometry", "media", "payloads", "scene", "shows",
+    "sim", "test_main.py", "train", "trajectories",
 )  # fmt: skip
-"""Folders whose subject is not the compiler, and whose flights are short."""
+"""Folders whose subject is not the compiler, and whose flights are short; CRAZYSIM_COMPILE=1 compiles in them too."""
 
 
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item):
-    """Interpret the first steps where the compiler is not the subject; fixtures belong to the test that asks first."""
+    """Interpret first steps and programs in tests of ``FOLDERS``; fixtures belong to the test that asks first."""
     folder = item.path.relative_to(Path(__file__).parent).parts[0]
-    first_steps.active = small_programs.active = folder in FOLDERS and item.get_closest_marker("compiled") is None
+    free = not os.environ.get("CRAZYSIM_COMPILE") and item.get_closest_marker("compiled") is None
+    first_steps.active = small_programs.active = free and folder in FOLDERS
     yield
 
 

@@ -1,8 +1,9 @@
 """First steps of a simulation on the interpreter: many flights of tests are over sooner than a kernel is compiled.
 
-Where the compiler is not the subject, simulations plan for the fused engine as ever, which refuses what has no kernel. Their steps are
-interpreted until they have taken as long as compiling does, or one is traced. From then on the kernel takes all of
-them. Steps on several devices, steps with stages that are not fused, and engines chosen by name are left alone.
+Where the compiler is not the subject, simulations plan for the fused engine as ever, which refuses what has no kernel.
+Their steps are interpreted until they have taken as long as compiling does, or one is traced. From then on the kernel
+takes all of them. Steps on several devices, steps with stages that are not fused, and engines chosen by name are left
+alone.
 """
 
 import threading

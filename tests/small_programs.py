@@ -15,7 +15,8 @@ import jax
 import numpy as np
 from jax.core import ShapedArray
 from jax.sharding import SingleDeviceSharding
-from numpy_operations import CALLS, EXACT, ROUNDED, MissingError, TooLongError, data, is_number, prepare
+from numpy_jax.program import CALLS, MissingError, TooLongError, data, is_number, prepare
+from numpy_jax.table import EXACT, ROUNDED
 
 BEGIN, EACH = 2500, 25
 """Operations that NumPy runs while XLA compiles a program: without operations, and more for each."""

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import small_programs
 from jax import lax
-from numpy_operations import EXACT, ROUNDED, evaluate
+from numpy_jax.program import evaluate
+from numpy_jax.table import EXACT, ROUNDED
 
 SIGNED = np.float32([[-2.5, -0.0, 0.0, 1.5], [np.nan, np.inf, -np.inf, 3e38]])
 OTHER = np.float32([[0.3, 7.0, 0.0, -1.5], [1.0, -np.inf, -np.inf, 3e38]])

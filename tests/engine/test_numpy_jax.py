@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from blocks import program_of
 from jax import lax
-from numpy_operations import CLOSE, STRUCTURED, MissingError, TooLongError, evaluate, prepare
+from numpy_jax.program import MissingError, TooLongError, evaluate, prepare
+from numpy_jax.table import CLOSE, STRUCTURED
 from rule_cases import CASES, RANDOM, agree, given, of_all
 
 from crazysim.engine import native

@@ -1,0 +1,1 @@
+"""Programs of JAX in NumPy, for the tests; see ``small_programs``."""

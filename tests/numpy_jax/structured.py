@@ -1,0 +1,184 @@
+"""Loops, branches, random numbers, and calls of the host."""
+
+import ctypes
+import functools
+import math
+
+import jax
+import numpy as np
+from jax._src import prng
+from jax.extend.core import Literal
+
+from crazysim.engine import native
+from crazysim.engine.interpret import threefry2x32
+from numpy_jax.program import MissingError, TooLongError, is_number, left, prepare, shape_of
+
+
+def scan(eqn):
+    """Run a jaxpr for each row."""
+    p = eqn.params
+    body, n_consts, n_carry = prepare(p["jaxpr"]), p["num_consts"], p["num_carry"]
+    order = range(p["length"])[::-1] if p["reverse"] else range(p["length"])
+    rows = [v.aval for v in eqn.outvars[n_carry:]]
+    rows = [(shape_of(x), x.dtype if is_number(x) else np.uint32) for x in rows]
+
+    def fn(*args):
+        if p["length"] * body.cost > left():
+            raise TooLongError
+        consts, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
+        ys = [np.empty(*row) for row in rows]
+        for i in order:
+            out = body.run(*consts, *carry, *[x[i] for x in xs])
+            carry = out[:n_carry]
+            for y, new in zip(ys, out[n_carry:], strict=True):
+                y[i] = new
+        return [*carry, *ys]
+
+    return fn
+
+
+def while_loop(eqn):
+    """Run a jaxpr as long as another one says; where they are arrays, for the places for which it does."""
+    p = eqn.params
+    test, body, n, m = prepare(p["cond_jaxpr"]), prepare(p["body_jaxpr"]), p["cond_nconsts"], p["body_nconsts"]
+    limits = counted(p["cond_jaxpr"].jaxpr)
+
+    def fn(*args):
+        of_test, of_body, carry = args[:n], args[n : n + m], args[n + m :]
+        if limits is not None:
+            count, end = ((*of_test, *carry)[k] if isinstance(k, int) else k.val for k in limits)
+            if (int(end) - int(count)) * body.cost > left():
+                raise TooLongError
+        while (going := test.run(*of_test, *carry)[0]).any():
+            new = body.run(*of_body, *carry)
+            if np.ndim(going):
+                spread = [going.reshape(going.shape + (1,) * (np.ndim(x) - going.ndim)) for x in carry]
+                new = [np.where(k, x, y) for k, x, y in zip(spread, new, carry, strict=True)]
+            carry = new
+        return carry
+
+    return fn
+
+
+def counted(test):
+    """Return the counter and its end, as places or literals, of a loop that ends at a number; None for others."""
+    if test.constvars or [eqn.primitive.name for eqn in test.eqns] != ["lt"] or test.outvars[0].aval.shape:
+        return None
+    return [x if isinstance(x, Literal) else test.invars.index(x) for x in test.eqns[0].invars]
+
+
+def cond(eqn):
+    """Run one of several jaxprs."""
+    branches = [prepare(x) for x in eqn.params["branches"]]
+    return lambda k, *args: branches[min(max(int(k), 0), len(branches) - 1)].run(*args)
+
+
+def platform_index(eqn):
+    """Return the number of the case for the host."""
+    platforms = eqn.params["platforms"]
+    k = next(k for k, names in enumerate(platforms) if names is None or "cpu" in names)
+    return lambda: np.int32(k)
+
+
+def random(eqn):
+    """Make keys or draw numbers from them; a key is its two numbers."""
+    name, p, first = eqn.primitive.name, eqn.params, eqn.invars[0].aval
+    impl = p["impl"] if name == "random_seed" else first.dtype._impl
+    if impl.name != "threefry2x32":
+        raise MissingError(f"keys of {impl.name}")
+    keys = jax.ShapeDtypeStruct((*first.shape, 2), np.uint32)
+    if name == "random_seed":
+        program = of(functools.partial(prng.random_seed_impl_base, impl=impl), first)
+    elif name == "random_fold_in":
+        program = of(lambda x, y: prng.random_fold_in_impl_base(impl, x, y, first.shape), keys, eqn.invars[1].aval)
+    elif name == "random_split":
+        program = of(lambda x: prng.random_split_impl_base(impl, x, first.ndim, **p), keys)
+    else:
+        program = of(lambda x: prng.random_bits_impl_base(impl, x, first.ndim, **p), keys)
+    return lambda *xs: program.run(*xs)[0]
+
+
+def of(fn, *types):
+    """Return a function as a program."""
+    return prepare(jax.make_jaxpr(fn)(*types))
+
+
+def of_words(eqn):
+    """Return the two numbers of 32 bits that Threefry makes."""
+    return lambda *xs: list(threefry2x32(*xs))
+
+
+def counts(eqn):
+    """Return the high and low words of the numbers of a shape."""
+    shape = eqn.params["shape"]
+    n = np.arange(math.prod(shape), dtype=np.uint64).reshape(shape)
+    words = [(n >> np.uint64(32)).astype(np.uint32), n.astype(np.uint32)]
+    return lambda: list(words)
+
+
+def callback(eqn):
+    """Call a function of the host."""
+    fn = eqn.params["callback"]
+    return lambda *xs: [np.asarray(y, v.aval.dtype) for y, v in zip(fn(*xs), eqn.outvars, strict=True)]
+
+
+def kernel(eqn):
+    """Call a kernel of the fused engine as XLA does."""
+    library, aliases = native._LOADED.get(eqn.params["target_name"]), dict(eqn.params["input_output_aliases"])
+    if library is None:
+        raise MissingError("ffi_call of something else")
+    types = [v.aval for v in eqn.outvars]
+
+    def buffers(arrays):
+        one = [ctypes.pointer(Buffer(data=x.ctypes.data)) for x in arrays]
+        return Buffers(size=len(one), buffers=(ctypes.POINTER(Buffer) * len(one))(*one))
+
+    def fn(*xs):
+        out = [np.empty(x.shape, x.dtype) for x in types]
+        for k, result in aliases.items():
+            out[result][...] = xs[k]
+        given = [out[aliases[k]] if k in aliases else np.ascontiguousarray(x) for k, x in enumerate(xs)]
+        frame = Frame(args=buffers(given), rets=buffers(out))
+        library.crazysim_advance(ctypes.byref(frame))
+        return out
+
+    return fn
+
+
+class Buffer(ctypes.Structure):
+    """``XLA_FFI_Buffer`` of XLA's foreign function interface."""
+
+    _fields_ = (
+        ("struct_size", ctypes.c_size_t),
+        ("extension_start", ctypes.c_void_p),
+        ("dtype", ctypes.c_int),
+        ("data", ctypes.c_void_p),
+        ("rank", ctypes.c_int64),
+        ("dims", ctypes.c_void_p),
+    )
+
+
+class Buffers(ctypes.Structure):
+    """``XLA_FFI_Args`` and ``XLA_FFI_Rets``."""
+
+    _fields_ = (
+        ("struct_size", ctypes.c_size_t),
+        ("extension_start", ctypes.c_void_p),
+        ("size", ctypes.c_int64),
+        ("types", ctypes.c_void_p),
+        ("buffers", ctypes.POINTER(ctypes.POINTER(Buffer))),
+    )
+
+
+class Frame(ctypes.Structure):
+    """``XLA_FFI_CallFrame`` up to the results: a kernel reads addresses alone."""
+
+    _fields_ = (
+        ("struct_size", ctypes.c_size_t),
+        ("extension_start", ctypes.c_void_p),
+        ("api", ctypes.c_void_p),
+        ("ctx", ctypes.c_void_p),
+        ("stage", ctypes.c_int),
+        ("args", Buffers),
+        ("rets", Buffers),
+    )
