@@ -17,18 +17,20 @@ QUICK = (
     "-Og -fira-algorithm=priority -fira-region=one --param ggc-min-expand=200 --param ggc-min-heapsize=500000 -nostdlib"
 )
 """Options of g++ that take 0.6 of the time that -O1 takes, and as little as -O0, whose kernels are slow; below
-500 MB it looks for no garbage, and Python has loaded the libraries already."""
+500 MB it collects no garbage. Python has loaded the C libraries already, so none is linked."""
 
 
+SHORT = 0.05
+"""Time of compiling from which a program is kept, s: writing and reading one takes some 10 ms."""
 CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 """Folder of compiled programs and kernels."""
 
 
 def cache() -> dict[str, str]:
-    """Return variables that make processes keep all programs, small ones too: reading takes half the time."""
+    """Return variables that make processes keep programs; what compiles within 50 ms is compiled again as soon."""
     return {
         "JAX_COMPILATION_CACHE_DIR": str(CACHE),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(SHORT),
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
 
@@ -60,9 +62,10 @@ def precompiled_headers() -> str:
     folder = CACHE.parent / "headers" / hashlib.sha256("\n".join([*words, text]).encode()).hexdigest()[:16]
     if not (folder / "kernel.h.gch").exists():
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "kernel.h").write_text(text)
-        made = folder / f"{os.getpid()}.gch"
-        subprocess.run([*words, "-x", "c++-header", str(folder / "kernel.h"), "-o", str(made)], check=True)
+        header, made = (folder / f"{os.getpid()}{suffix}" for suffix in (".h", ".gch"))  # two workers may be here
+        header.write_text(text)
+        subprocess.run([*words, "-x", "c++-header", str(header), "-o", str(made)], check=True)
+        header.replace(folder / "kernel.h")
         made.replace(folder / "kernel.h.gch")
     return f" -include {folder / 'kernel.h'}"
 

@@ -38,7 +38,7 @@ os.environ["CXXFLAGS"] = os.environ.get("CXXFLAGS", "") + compiling.precompiled_
 # What was compiled once is kept, in any worker, any run, and any process that a test starts.
 os.environ.update(compiling.cache())
 jax.config.update("jax_compilation_cache_dir", str(compiling.CACHE))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", compiling.SHORT)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 # Compilation inside an example must not count as slowness, and CI must not depend on luck.
@@ -71,8 +71,8 @@ def pytest_collection_modifyitems(items):
     items.sort(key=rank)
 
 
-open_at_start = set()
-"""Identities of the files, sockets and processes that are open before the first test."""
+open_at_start, suspects = [], []
+"""Files, sockets and processes: those open before the first test, and those open when others were frozen."""
 
 
 def pytest_collection_finish():
@@ -82,7 +82,7 @@ def pytest_collection_finish():
     """
     first_example()
     gc.collect()
-    open_at_start.update(map(id, opened()))
+    open_at_start.extend(opened())
     gc.freeze()
 
 
@@ -94,14 +94,14 @@ def first_example(_):
 
 FOLDERS = (
     "control", "core", "drones", "dynamics", "effects", "envs", "geometry", "media", "payloads", "scene", "shows",
-    "sim", "test_main.py", "train", "trajectories",
+    "sim", "test_export.py", "test_main.py", "test_rotation.py", "train", "trajectories",
 )  # fmt: skip
 """Folders whose subject is not the compiler, and whose flights are short; CRAZYSIM_COMPILE=1 compiles in them too."""
 
 
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item):
-    """Interpret first steps and programs in tests of ``FOLDERS``; fixtures belong to the test that asks first."""
+    """Interpret in tests of ``FOLDERS``; what a fixture makes is made as the first test that uses it is run."""
     folder = item.path.relative_to(Path(__file__).parent).parts[0]
     free = not os.environ.get("CRAZYSIM_COMPILE") and item.get_closest_marker("compiled") is None
     first_steps.active = small_programs.active = free and folder in FOLDERS
@@ -125,11 +125,13 @@ def pytest_runtest_teardown(item, nextitem):
     """
     global limit
     if nextitem is None:
-        left = [x for x in opened() if id(x) not in open_at_start]
+        known = {id(x) for x in open_at_start}
+        left = [x for x in (*suspects, *opened()) if id(x) not in known and is_open(x)]
         gc.freeze()
         assert not left, "tests close what they open"
     elif nextitem.path != item.path and memory() > limit:
         gc.collect()
+        suspects.extend(opened())
         gc.freeze()
         limit = max(MEMORY, GROWTH * memory())
 

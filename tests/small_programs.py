@@ -14,14 +14,17 @@ from importlib.metadata import version
 import jax
 import numpy as np
 from jax.core import ShapedArray
+from jax.extend.core import Literal
 from jax.sharding import SingleDeviceSharding
-from numpy_jax.program import CALLS, MissingError, TooLongError, data, is_number, prepare
+from numpy_jax.program import CALLS, MissingError, TooLongError, called, data, is_number, prepare
 from numpy_jax.table import EXACT, ROUNDED
 
-BEGIN, EACH = 2500, 25
+BEGIN, EACH = 2000, 15
 """Operations that NumPy runs while XLA compiles a program: without operations, and more for each."""
 CALL = 30
 """Operations that take as long as a call does besides its operations."""
+
+TRANSFERS = ("host_to_device", "device_to_device", "device_to_host")
 
 active = False
 """True while a test runs whose subject is not the compiler."""
@@ -97,10 +100,18 @@ def _place(args, params):
         return None
     if any(params["donated_invars"]) or params["compiler_options_kvs"]:
         return None
+    if jax.config.jax_debug_nans or jax.config.jax_debug_infs or _is_guarded():
+        return None
     first, *_ = jax.devices()
     arrays = [x for x in args if isinstance(x, jax.Array)]
     known = {device for x in arrays for device in x.devices()} | {jax.config.jax_default_device or first}
     return (first, any(x.committed for x in arrays)) if known == {first} and first.platform == "cpu" else None
+
+
+def _is_guarded():
+    """Return whether transfers between host and device are watched, which there are none of in a compiled call."""
+    names = ("jax_transfer_guard", *(f"jax_transfer_guard_{way}" for way in TRANSFERS))
+    return any(getattr(jax.config, name, None) not in (None, "allow") for name in names)
 
 
 def _put(x, aval, device, committed):
@@ -123,10 +134,14 @@ def _n_rounded(jaxpr):
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         if name in CALLS:
-            inner = eqn.params[CALLS[name]]
-            total += _n_rounded(getattr(inner, "jaxpr", inner))
-        elif name in ROUNDED:
-            total += eqn.outvars[0].aval.dtype.kind == "f"
-        elif name not in EXACT:
+            total += _n_rounded(called(eqn)[0])
+        elif name in ROUNDED and eqn.outvars[0].aval.dtype.kind == "f":
+            total += 1
+        elif name not in EXACT | ROUNDED or eqn.outvars[0].aval.dtype not in PLAIN:
             return math.inf
-    return total
+    constant = any(isinstance(x, Literal) and x.aval.dtype.kind == "f" for eqn in jaxpr.eqns for x in eqn.invars)
+    return math.inf if total and constant else total  # XLA multiplies by the reciprocal, and drops a sum with zero
+
+
+PLAIN = [np.dtype(x) for x in (bool, "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")]
+"""Types of which NumPy has the bits that XLA has."""

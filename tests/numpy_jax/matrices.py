@@ -29,13 +29,14 @@ def dot_general(eqn):
 
 def lu(eqn):
     """Return a matrix as lower and upper triangle, its pivots, and the permutation that they make."""
-    (*_, n, m) = eqn.invars[0].aval.shape
+    x = eqn.invars[0].aval
+    n, m = x.shape[-2:]
+    (getrf,) = scipy.linalg.get_lapack_funcs(("getrf",), dtype=x.dtype)
 
     def fn(x):
         out, pivots = np.empty_like(x), np.empty((*x.shape[:-2], min(n, m)), np.int32)
         orders = np.empty((*x.shape[:-2], n), np.int32)
         for k in np.ndindex(x.shape[:-2]):
-            (getrf,) = scipy.linalg.get_lapack_funcs(("getrf",), (x,))
             out[k], pivots[k], _ = getrf(x[k])
             order = list(range(n))
             for i, j in enumerate(pivots[k]):
@@ -63,23 +64,21 @@ def cholesky(eqn):
         except np.linalg.LinAlgError:
             return np.full_like(x, np.nan)
 
-    return lambda x: np.stack([one(a) for a in x.reshape(-1, *x.shape[-2:])]).reshape(x.shape)
+    return lambda x: np.array([one(a) for a in x.reshape(-1, *x.shape[-2:])], x.dtype).reshape(x.shape)
 
 
 def triangular_solve(eqn):
-    """Return the solutions of triangular equations."""
+    """Return the solutions of triangular equations; of a singular one they are not finite."""
     p = eqn.params
     if p["conjugate_a"]:
         raise MissingError("triangular_solve of complex numbers")
+    (trsm,) = scipy.linalg.get_blas_funcs(("trsm",), dtype=eqn.outvars[0].aval.dtype)
+    how = {"side": not p["left_side"], "lower": p["lower"], "trans_a": p["transpose_a"], "diag": p["unit_diagonal"]}
 
     def fn(a, b):
         out = np.empty_like(b)
         for k in np.ndindex(b.shape[:-2]):
-            (trtrs,) = scipy.linalg.get_lapack_funcs(("trtrs",), (a,))
-            trans = p["transpose_a"] == p["left_side"]
-            given = b[k] if p["left_side"] else b[k].T
-            x, _ = trtrs(a[k], given, lower=p["lower"], trans=trans, unitdiag=p["unit_diagonal"])
-            out[k] = x if p["left_side"] else x.T
+            out[k] = trsm(1.0, a[k], b[k], **how)
         return out
 
     return fn

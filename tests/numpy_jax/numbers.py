@@ -29,6 +29,19 @@ def along_exactly(fn):
     return lambda eqn: functools.partial(fn, axis=tuple(eqn.params["axes"]))
 
 
+def extreme_along(fn):
+    """Return the entry of a largest or smallest number along ``axes``, of which there may be none."""
+
+    def make(eqn):
+        dtype = eqn.outvars[0].aval.dtype
+        if dtype.kind == "b":
+            raise MissingError("extremes of bools")
+        least, most = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+        return functools.partial(fn, axis=tuple(eqn.params["axes"]), initial=least if fn is np.max else most)
+
+    return make
+
+
 def cumulative(fn):
     """Return the entry of a cumulative reduction."""
 
@@ -78,7 +91,8 @@ def convert(eqn):
 
     def fn(x):
         x = np.nan_to_num(np.trunc(np.asarray(x, np.float64)), nan=0.0)
-        return np.where(x <= least, least, np.where(x >= most, most, np.clip(x, least, most))).astype(dtype)
+        inside = np.where((x <= least) | (x >= most), 0, x).astype(dtype)
+        return np.where(x >= most, dtype.type(most), np.where(x <= least, dtype.type(least), inside))
 
     return fn
 
@@ -98,6 +112,8 @@ def to_shape(eqn):
 def select_n(eqn):
     """Return for each place the number of the case that is chosen there."""
     if not is_number(eqn.outvars[0].aval):
+        if len(eqn.invars) > 3:
+            raise MissingError("select_n of several keys")
         return lambda which, no, yes: np.where(which[..., None], yes, no)
     if eqn.invars[0].aval.dtype == bool:
         return lambda which, no, yes: np.where(which, yes, no)

@@ -1,6 +1,7 @@
 """A jaxpr in NumPy: prepared once, and then run without a compiler."""
 
 import math
+import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -33,8 +34,8 @@ OF_KEYS = ("broadcast_in_dim", "concatenate", "cond", "scan", "select_n", "slice
     f"random_{name}" for name in ("bits", "fold_in", "seed", "split", "unwrap", "wrap")
 )
 """Operations that take random keys as they are here: their two numbers, along a last axis."""
-_left = math.inf
-"""Operations that may still be run."""
+_budget = threading.local()
+"""Operations that this thread may still run, as ``left``."""
 ELEMENTS = 500
 """Numbers that take as long as an operation does besides them."""
 
@@ -76,9 +77,8 @@ class Program:
         for eqn in jaxpr.eqns:
             name, args = eqn.primitive.name, [read(x) for x in eqn.invars]
             if name in CALLS:
-                inner = eqn.params[CALLS[name]]
-                consts = [self.place(data(x)) for x in getattr(inner, "consts", ())]
-                inner = getattr(inner, "jaxpr", inner)
+                inner, consts = called(eqn)
+                consts = [self.place(data(x)) for x in consts]
                 known = dict(zip((*inner.constvars, *inner.invars), (*consts, *args), strict=True))
                 places.update(zip(eqn.outvars, self.add(inner, known), strict=True))
                 continue
@@ -98,19 +98,17 @@ class Program:
 
     def run_within(self, limit, args) -> tuple[list[Any], float]:
         """Return the results for some operands, and how many operations that took; raise beyond a limit."""
-        global _left
-        before, _left = _left, limit
+        before, _budget.left = left(), limit
         try:
             with np.errstate(all="ignore"):
-                return self.run(*args), limit - _left
+                return self.run(*args), limit - left()
         finally:
-            _left = before  # a function of the host may run programs too
+            _budget.left = before  # a function of the host may run programs too
 
     def run(self, *args) -> list[Any]:
         """Return the results for some operands."""
-        global _left
-        _left -= self.cost
-        if _left < 0:
+        _budget.left = left() - self.cost
+        if left() < 0:
             raise TooLongError
         values = self.values.copy()
         for place, x in zip(self.inputs, args, strict=True):
@@ -125,14 +123,20 @@ class Program:
         return [values[k] for k in self.outputs]
 
 
+def called(eqn):
+    """Return the jaxpr that an operation of ``CALLS`` calls, and its constants."""
+    inner = eqn.params[CALLS[eqn.primitive.name]]
+    return getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+
+
 def n_operations(eqn) -> int:
     """Return the number of operations of an equation and of the jaxprs in it, as they are written."""
     return 1 + sum(n_operations(inner) for jaxpr in core.jaxprs_in_params(eqn.params) for inner in jaxpr.eqns)
 
 
 def left() -> float:
-    """Return how many operations may still be run."""
-    return _left
+    """Return how many operations this thread may still run."""
+    return getattr(_budget, "left", math.inf)
 
 
 def prepare(closed) -> Program:

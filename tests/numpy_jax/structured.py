@@ -1,12 +1,11 @@
 """Loops, branches, random numbers, and calls of the host."""
 
 import ctypes
-import functools
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax._src import prng
 from jax.extend.core import Literal
 
 from crazysim.engine import native
@@ -64,6 +63,8 @@ def counted(test):
     """Return the counter and its end, as places or literals, of a loop that ends at a number; None for others."""
     if test.constvars or [eqn.primitive.name for eqn in test.eqns] != ["lt"] or test.outvars[0].aval.shape:
         return None
+    if test.eqns[0].invars[0].aval.dtype.kind not in "iu":
+        return None
     return [x if isinstance(x, Literal) else test.invars.index(x) for x in test.eqns[0].invars]
 
 
@@ -86,29 +87,30 @@ def random(eqn):
     impl = p["impl"] if name == "random_seed" else first.dtype._impl
     if impl.name != "threefry2x32":
         raise MissingError(f"keys of {impl.name}")
-    keys = jax.ShapeDtypeStruct((*first.shape, 2), np.uint32)
-    if name == "random_seed":
-        program = of(functools.partial(prng.random_seed_impl_base, impl=impl), first)
-    elif name == "random_fold_in":
-        program = of(lambda x, y: prng.random_fold_in_impl_base(impl, x, y, first.shape), keys, eqn.invars[1].aval)
-    elif name == "random_split":
-        program = of(lambda x: prng.random_split_impl_base(impl, x, first.ndim, **p), keys)
-    else:
-        program = of(lambda x: prng.random_bits_impl_base(impl, x, first.ndim, **p), keys)
-    return lambda *xs: program.run(*xs)[0]
+    shape = np.broadcast_shapes(*(v.aval.shape for v in eqn.invars))
+    one = {
+        "random_bits": lambda key: impl.random_bits(key, p["bit_width"], p["shape"]),
+        "random_fold_in": impl.fold_in,
+        "random_seed": impl.seed,
+        "random_split": lambda key: impl.split(key, p["shape"]),
+    }[name]
+    for _ in shape:
+        one = jax.vmap(one)
+    # A key and a number may be one for several of the other.
+    types = [
+        jax.ShapeDtypeStruct(shape, v.aval.dtype) if is_number(v.aval) else jax.ShapeDtypeStruct((*shape, 2), np.uint32)
+        for v in eqn.invars
+    ]
+    program = prepare(jax.make_jaxpr(one)(*types))
+    return lambda *xs: program.run(*(np.broadcast_to(x, t.shape) for x, t in zip(xs, types, strict=True)))[0]
 
 
-def of(fn, *types):
-    """Return a function as a program."""
-    return prepare(jax.make_jaxpr(fn)(*types))
-
-
-def of_words(eqn):
+def threefry(eqn):
     """Return the two numbers of 32 bits that Threefry makes."""
     return lambda *xs: list(threefry2x32(*xs))
 
 
-def counts(eqn):
+def iota_2x32(eqn):
     """Return the high and low words of the numbers of a shape."""
     shape = eqn.params["shape"]
     n = np.arange(math.prod(shape), dtype=np.uint64).reshape(shape)
@@ -118,8 +120,13 @@ def counts(eqn):
 
 def callback(eqn):
     """Call a function of the host."""
-    fn = eqn.params["callback"]
-    return lambda *xs: [np.asarray(y, v.aval.dtype) for y, v in zip(fn(*xs), eqn.outvars, strict=True)]
+
+    def fn(*xs):
+        with np.errstate(all="warn"):
+            found = eqn.params["callback"](*map(jnp.asarray, xs))
+        return [np.asarray(y, v.aval.dtype) for y, v in zip(found, eqn.outvars, strict=True)]
+
+    return fn
 
 
 def kernel(eqn):

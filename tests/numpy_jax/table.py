@@ -1,7 +1,7 @@
 """The table of operations: for each a function from an equation to a function of its operands.
 
 The functions of ``EXACT`` give the bits that XLA gives, and those of ``ROUNDED`` do, one at a time. Numbers below 1e-38
-are the exception: XLA takes them for zero.
+are the exception, which XLA flushes to zero, and the sign of the larger of two zeros.
 """
 
 import functools
@@ -46,10 +46,10 @@ EXACT: dict[str, Callable[[Any], Callable[..., Any]]] = {
     "not": each(np.invert),
     "or": each(np.bitwise_or),
     "pad": numbers.pad,
-    "reduce_and": along_exactly(np.all),
-    "reduce_max": along_exactly(np.max),
-    "reduce_min": along_exactly(np.min),
-    "reduce_or": along_exactly(np.any),
+    "reduce_and": along_exactly(np.bitwise_and.reduce),
+    "reduce_max": numbers.extreme_along(np.max),
+    "reduce_min": numbers.extreme_along(np.min),
+    "reduce_or": along_exactly(np.bitwise_or.reduce),
     "rem": numbers.remainder,
     "reshape": numbers.reshape,
     "rev": lambda eqn: functools.partial(np.flip, axis=eqn.params["dimensions"]),
@@ -131,7 +131,7 @@ STRUCTURED = {
     "custom_linear_solve": matrices.linear_solve,
     "device_put": numbers.all_same,
     "ffi_call": structured.kernel,
-    "iota_2x32_shape": structured.counts,
+    "iota_2x32_shape": structured.iota_2x32,
     "lu": matrices.lu,
     "optimization_barrier": numbers.all_same,
     "platform_index": structured.platform_index,
@@ -146,7 +146,7 @@ STRUCTURED = {
     "scan": structured.scan,
     "sort": numbers.sort,
     "split": numbers.split,
-    "threefry2x32": structured.of_words,
+    "threefry2x32": structured.threefry,
     "unstack": numbers.unstack,
     "while": structured.while_loop,
 }
