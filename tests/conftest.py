@@ -105,6 +105,7 @@ def pytest_runtest_protocol(item):
     folder = item.path.relative_to(Path(__file__).parent).parts[0]
     free = not os.environ.get("CRAZYSIM_COMPILE") and item.get_closest_marker("compiled") is None
     first_steps.active = small_programs.active = free and folder in FOLDERS
+    small_programs.patience = 1 if item.get_closest_marker("steady") is None else 10
     yield
 
 

@@ -19,13 +19,15 @@ from jax.sharding import SingleDeviceSharding
 from numpy_jax.program import CALLS, MissingError, TooLongError, called, data, is_number, prepare
 from numpy_jax.table import EXACT, ROUNDED
 
-BEGIN, EACH = 2000, 15
+BEGIN, EACH = 2500, 25
 """Operations that NumPy runs while XLA compiles a program: without operations, and more for each."""
 CALL = 30
 """Operations that take as long as a call does besides its operations."""
 
 TRANSFERS = ("host_to_device", "device_to_device", "device_to_host")
 
+patience = 1
+"""Factor by which a test lets programs be interpreted for longer."""
 active = False
 """True while a test runs whose subject is not the compiler."""
 
@@ -57,7 +59,7 @@ class Known:
         self.given, self.results = [v.aval for v in closed.jaxpr.invars], closed.out_avals
         self.possible = not closed.effects and not any(x.dtype == jax.dtypes.float0 for x in closed.out_avals)
         self.exact = self.possible and is_exact(closed.jaxpr)
-        self.program, self.left = None, BEGIN
+        self.program, self.budget, self.done = None, BEGIN, 0.0
 
     def call(self, args, params):
         """Return the results of a call; None if it must be compiled."""
@@ -72,13 +74,14 @@ class Known:
             except MissingError:
                 self.possible = False
                 return None
-            self.left = BEGIN + EACH * self.program.size
+            self.budget = BEGIN + EACH * self.program.size
         try:
-            found, done = self.program.run_within(self.left - CALL, map(_read, args, self.given))
+            left = patience * self.budget - self.done - CALL
+            found, done = self.program.run_within(left, map(_read, args, self.given))
         except TooLongError:
             self.possible = False
             return None
-        self.left -= CALL + done
+        self.done += CALL + done
         return [_put(x, aval, *place) for x, aval in zip(found, self.results, strict=True)]
 
 
