@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -67,7 +68,7 @@ def precompiled_headers() -> str:
         subprocess.run([*words, "-x", "c++-header", str(header), "-o", str(made)], check=True)
         header.replace(folder / "kernel.h")
         made.replace(folder / "kernel.h.gch")
-    return f" -include {folder / 'kernel.h'}"
+    return f" -include {shlex.quote(str(folder / 'kernel.h'))}"
 
 
 def _is_gcc(given: Mapping[str, str]) -> bool:

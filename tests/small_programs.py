@@ -16,15 +16,15 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Literal
 from jax.sharding import SingleDeviceSharding
-from numpy_jax.program import CALLS, MissingError, TooLongError, called, data, is_number, prepare
+from numpy_jax.program import CALLS, MissingError, TooLongError, called, data, is_known, is_number, prepare
 from numpy_jax.table import EXACT, ROUNDED
 
-BEGIN, EACH = 2500, 25
+BUDGET, BUDGET_EACH = 2500, 25
 """Operations that NumPy runs while XLA compiles a program: without operations, and more for each."""
 CALL = 30
 """Operations that take as long as a call does besides its operations."""
-
 TRANSFERS = ("host_to_device", "device_to_device", "device_to_host")
+"""Kinds of transfers that JAX can watch for."""
 
 patience = 1
 """Factor by which a test lets programs be interpreted for longer."""
@@ -57,9 +57,9 @@ class Known:
     def __init__(self, closed):
         """Take its jaxpr."""
         self.given, self.results = [v.aval for v in closed.jaxpr.invars], closed.out_avals
-        self.possible = not closed.effects and not any(x.dtype == jax.dtypes.float0 for x in closed.out_avals)
+        self.possible = not closed.effects and all(map(is_known, (*self.given, *self.results)))
         self.exact = self.possible and is_exact(closed.jaxpr)
-        self.program, self.budget, self.done = None, BEGIN, 0.0
+        self.program, self.budget, self.done = None, BUDGET, 0.0
 
     def call(self, args, params):
         """Return the results of a call; None if it must be compiled."""
@@ -74,7 +74,7 @@ class Known:
             except MissingError:
                 self.possible = False
                 return None
-            self.budget = BEGIN + EACH * self.program.size
+            self.budget = BUDGET + BUDGET_EACH * self.program.size
         try:
             left = patience * self.budget - self.done - CALL
             found, done = self.program.run_within(left, map(_read, args, self.given))
@@ -98,8 +98,8 @@ def _place(args, params):
     """Return the device of the results, and whether they are committed to it; None if the call must be compiled."""
     from jax._src.sharding_impls import UnspecifiedValue
 
-    wishes = [params[name] for name in ("in_shardings", "out_shardings", "in_layouts", "out_layouts")]
-    if any(not isinstance(x, UnspecifiedValue | None) for some in wishes for x in some):
+    requested = [params[name] for name in ("in_shardings", "out_shardings", "in_layouts", "out_layouts")]
+    if any(not isinstance(x, UnspecifiedValue | None) for some in requested for x in some):
         return None
     if any(params["donated_invars"]) or params["compiler_options_kvs"]:
         return None
@@ -112,7 +112,7 @@ def _place(args, params):
 
 
 def _is_guarded():
-    """Return whether transfers between host and device are watched, which there are none of in a compiled call."""
+    """Return whether a test watches for transfers between host and device: a compiled call has none."""
     names = ("jax_transfer_guard", *(f"jax_transfer_guard_{way}" for way in TRANSFERS))
     return any(getattr(jax.config, name, None) not in (None, "allow") for name in names)
 
@@ -140,11 +140,7 @@ def _n_rounded(jaxpr):
             total += _n_rounded(called(eqn)[0])
         elif name in ROUNDED and eqn.outvars[0].aval.dtype.kind == "f":
             total += 1
-        elif name not in EXACT | ROUNDED or eqn.outvars[0].aval.dtype not in PLAIN:
+        elif name not in EXACT and name not in ROUNDED:
             return math.inf
     constant = any(isinstance(x, Literal) and x.aval.dtype.kind == "f" for eqn in jaxpr.eqns for x in eqn.invars)
     return math.inf if total and constant else total  # XLA multiplies by the reciprocal, and drops a sum with zero
-
-
-PLAIN = [np.dtype(x) for x in (bool, "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")]
-"""Types of which NumPy has the bits that XLA has."""

@@ -128,6 +128,8 @@ def test_kernels_are_called_as_xla_calls_them():
 def test_what_is_missing_or_takes_too_long_is_compiled():
     with pytest.raises(MissingError, match="eigh"):
         prepare(jax.make_jaxpr(jnp.linalg.eigh)(jnp.eye(3)))
+    with pytest.raises(MissingError, match="mul"):
+        prepare(jax.make_jaxpr(lambda x: x * x)(jnp.bfloat16(3)))
     long = prepare(jax.make_jaxpr(lambda x: lax.fori_loop(0, 1000, lambda _, y: y * y, x))(1.0))
     with pytest.raises(TooLongError):
         long.run_within(500, [np.float32(1)])

@@ -82,9 +82,8 @@ class Program:
                 known = dict(zip((*inner.constvars, *inner.invars), (*consts, *args), strict=True))
                 places.update(zip(eqn.outvars, self.add(inner, known), strict=True))
                 continue
-            if name not in OPERATIONS or (
-                name not in OF_KEYS and not all(is_number(v.aval) for v in (*eqn.invars, *eqn.outvars))
-            ):
+            types = [v.aval for v in (*eqn.invars, *eqn.outvars)]
+            if name not in OPERATIONS or not all(map(is_number if name not in OF_KEYS else is_known, types)):
                 raise MissingError(name)
             fn = OPERATIONS[name](eqn)
             results = [self.place() for _ in eqn.outvars]
@@ -150,8 +149,14 @@ def evaluate(closed, args) -> list[Any]:
 
 
 def is_number(aval):
-    """Return whether values of a type are numbers of NumPy."""
-    return isinstance(getattr(aval, "dtype", None), np.dtype)
+    """Return whether values of a type are numbers of NumPy: bools, integers, or floats of IEEE 754."""
+    dtype = getattr(aval, "dtype", None)
+    return isinstance(dtype, np.dtype) and dtype.kind in "biuf"
+
+
+def is_known(aval):
+    """Return whether values of a type are such numbers or random keys."""
+    return is_number(aval) or jax.dtypes.issubdtype(getattr(aval, "dtype", np.complex64), jax.dtypes.prng_key)
 
 
 def shape_of(aval):
