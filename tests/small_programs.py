@@ -19,7 +19,7 @@ from jax.sharding import SingleDeviceSharding
 from numpy_jax.program import CALLS, MissingError, TooLongError, called, data, is_known, is_number, prepare
 from numpy_jax.table import EXACT, ROUNDED
 
-BUDGET, BUDGET_EACH = 2500, 25
+BUDGET, BUDGET_EACH = 2500, 80
 """Operations that NumPy runs while XLA compiles a program: without operations, and more for each."""
 CALL = 30
 """Operations that take as long as a call does besides its operations."""
