@@ -20,7 +20,7 @@ from numpy_jax.program import CALLS, MissingError, TooLongError, called, data, i
 from numpy_jax.table import EXACT, ROUNDED
 
 BUDGET, BUDGET_EACH = 2500, 80
-"""Operations that NumPy runs while XLA compiles a program: without operations, and more for each."""
+"""Operations that NumPy runs in about half the time in which XLA compiles a program: always, and more for each."""
 CALL = 30
 """Operations that take as long as a call does besides its operations."""
 TRANSFERS = ("host_to_device", "device_to_device", "device_to_host")

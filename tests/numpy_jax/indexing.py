@@ -44,9 +44,7 @@ def gather(eqn):
     removed = (*d.collapsed_slice_dims, *d.operand_batching_dims)
     kept = [k for k in range(operand.ndim) if k not in removed]
     places = window_places(operand.shape, sizes, batch, kept, d.operand_batching_dims, d.start_indices_batching_dims)
-    order = list(range(len(batch)))
-    ndim = len(batch) + len(kept)
-    axes = iter(order)
+    ndim, axes = len(batch) + len(kept), iter(range(len(batch)))
     offsets = dict(zip(d.offset_dims, range(len(batch), ndim), strict=True))
     final = [offsets[k] if k in offsets else next(axes) for k in range(ndim)]
 

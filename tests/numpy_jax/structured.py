@@ -152,12 +152,16 @@ def kernel(eqn):
     return fn
 
 
-class Buffer(ctypes.Structure):
-    """``XLA_FFI_Buffer`` of XLA's foreign function interface."""
+class Struct(ctypes.Structure):
+    """What all structures of XLA's foreign function interface begin with."""
+
+    _fields_ = (("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p))
+
+
+class Buffer(Struct):
+    """``XLA_FFI_Buffer``."""
 
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension_start", ctypes.c_void_p),
         ("dtype", ctypes.c_int),
         ("data", ctypes.c_void_p),
         ("rank", ctypes.c_int64),
@@ -165,24 +169,20 @@ class Buffer(ctypes.Structure):
     )
 
 
-class Buffers(ctypes.Structure):
+class Buffers(Struct):
     """``XLA_FFI_Args`` and ``XLA_FFI_Rets``."""
 
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension_start", ctypes.c_void_p),
         ("size", ctypes.c_int64),
         ("types", ctypes.c_void_p),
         ("buffers", ctypes.POINTER(ctypes.POINTER(Buffer))),
     )
 
 
-class Frame(ctypes.Structure):
+class Frame(Struct):
     """``XLA_FFI_CallFrame`` up to the results: a kernel reads addresses alone."""
 
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension_start", ctypes.c_void_p),
         ("api", ctypes.c_void_p),
         ("ctx", ctypes.c_void_p),
         ("stage", ctypes.c_int),
