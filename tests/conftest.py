@@ -19,6 +19,7 @@ os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
 import first_steps
 import jax
+import late_kernels
 import numpy as np
 import pytest
 import small_programs
@@ -30,6 +31,7 @@ from crazysim.engine import cuda
 gc.disable()  # see pytest_collection_finish
 compiling.share_mlir_context()
 first_steps.install()
+late_kernels.install()
 if not os.environ.get("CRAZYSIM_COMPILE"):
     small_programs.interpret()
 cuda.nvrtc()  # loaded first: a process full of other libraries may have no room left for its thread-local storage
@@ -92,19 +94,25 @@ def first_example(_):
     """Do nothing."""
 
 
-FOLDERS = (
+IN_NUMPY = (
     "control", "core", "drones", "dynamics", "effects", "envs", "geometry", "media", "payloads", "scene", "shows",
     "sim", "test_export.py", "test_main.py", "test_rotation.py", "train", "trajectories",
 )  # fmt: skip
-"""Folders whose subject is not the compiler, and whose flights are short; CRAZYSIM_COMPILE=1 compiles in them too."""
+"""Folders in which programs of JAX are interpreted: their subject is not the compiler, and their flights are short."""
+KERNELS_LATE = (*IN_NUMPY, "golden", "laws")
+"""Folders in which steps are taken in Python before a kernel is compiled, unless an engine is chosen by its name."""
 
 
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item):
-    """Interpret in tests of ``FOLDERS``; what a fixture makes is made as the first test that uses it is run."""
+    """Compile what a test asks for; what a fixture makes is made as the first test that uses it is run.
+
+    CRAZYSIM_COMPILE=1 compiles everything at once.
+    """
     folder = item.path.relative_to(Path(__file__).parent).parts[0]
     free = not os.environ.get("CRAZYSIM_COMPILE") and item.get_closest_marker("compiled") is None
-    first_steps.active = small_programs.active = free and folder in FOLDERS
+    small_programs.active = free and folder in IN_NUMPY
+    first_steps.active = late_kernels.active = free and folder in KERNELS_LATE
     small_programs.patience = 1 if item.get_closest_marker("steady") is None else 10
     yield
 

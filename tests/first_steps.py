@@ -9,19 +9,12 @@ alone.
 import threading
 
 import jax
+import late_kernels
+import numpy as np
+import python_steps
 
-from crazysim.engine import Step, fused, interpret, kernel, plan
-
-BUDGET = 250
-"""Operations that are interpreted in half the time in which g++ and XLA compile one."""
-CALL = 500
-"""Operations that take as long as a call does besides its steps."""
-LANES = 5000
-"""Drones in all worlds that double the time of an operation."""
-ITERATIONS = {"loop": "length", "over_others": "n_members"}
-"""Operations that repeat their block, and the parameter that says how often."""
-WHILE = 10
-"""Iterations of a loop that ends by a condition, as a guess."""
+from crazysim.engine import Step, fused, kernel, plan
+from crazysim.jaxcompat import is_key
 
 active = False
 """True while a test runs whose subject is not the compiler."""
@@ -38,7 +31,10 @@ BUILD, FAST, CACHE_SIZE = fused.build, plan.Planner._fast, Step._cache_size
 
 def fast(planner, data, zeros):
     """Return what ``Planner._fast`` does; a plan of kernels begins on the interpreter, and has not compiled them."""
-    if not (active and planner.engine == "auto"):
+    if planner.engine != "auto":
+        with late_kernels.chosen_by_name():
+            return FAST(planner, data, zeros)
+    if not active:
         return FAST(planner, data, zeros)
     _planning.runs = runs = []
     try:
@@ -78,9 +74,15 @@ class Run:
     def __call__(self, leaves, n_steps):
         """Return the written leaves after some steps, and the worlds that are flagged."""
         if not any(isinstance(x, jax.core.Tracer) for x in (n_steps, *leaves)):
-            return interpret.steps(self.program, leaves, n_steps)
+            return self._interpreted(leaves, int(n_steps))
         self.kernel = self.kernel or BUILD(self.program, *self.target)
         return self.kernel(leaves, n_steps)
+
+    def _interpreted(self, leaves, n_steps):
+        numbers = [x if x is None else np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in leaves]
+        out, flagged = python_steps.steps(self.program, numbers, n_steps)
+        keys = [is_key(self.program.leaves[i]) for i in self.program.written]
+        return [jax.random.wrap_key_data(x) if key else x for x, key in zip(out, keys, strict=True)], flagged
 
 
 class FirstSteps:
@@ -88,27 +90,15 @@ class FirstSteps:
 
     def __init__(self, made, runs):
         """Take a plan, and the steps of its programs."""
-        blocks = [segment.block for program in made.programs for segment in program.fused_segments]
         n_worlds = next(leaf.shape[0] for leaf in made.program.leaves if leaf.scope == "drone")
-        slower = 1 + n_worlds * made.program.n_drones / LANES
         self.plan, self.runs, self.interpreted = made, runs, plan._on_host(made.dynamic.__wrapped__)
-        self.per_step = slower * sum(n_operations(block, repeated=True) for block in blocks)
-        self.left = BUDGET * sum(n_operations(block, repeated=False) for block in blocks)
+        self.per_step = sum(python_steps.cost(program, n_worlds * program.n_drones) for program in made.programs)
+        self.left = sum(map(python_steps.budget, made.programs))
 
     def __call__(self, values, n_steps):
         """Return the values after some steps."""
-        self.left -= CALL + int(n_steps) * self.per_step
+        self.left -= python_steps.CALL + int(n_steps) * self.per_step
         if active and self.left >= 0 and not any(run.kernel for run in self.runs):
             return self.interpreted(values, n_steps)
         compiled = self.plan.static if isinstance(n_steps, int) else self.plan.dynamic
         return compiled(values, n_steps)
-
-
-def n_operations(block, repeated):
-    """Return the number of operations of a block: as they are written, or as often as they are executed."""
-
-    def inner(op):
-        times = WHILE if op.name == "while" else op.param(ITERATIONS[op.name]) if op.name in ITERATIONS else 1
-        return (times if repeated else 1) * sum(n_operations(b, repeated) for b in op.blocks)
-
-    return sum(1 + inner(op) for op in block.operations)

@@ -202,6 +202,7 @@ def test_the_flag_of_the_data_follows(two):
             assert not bool(two.data.core.mjx_synced), name
 
 
+@pytest.mark.compiled
 def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two):
     """Whatever the flag is, it is exchanged; one that is known to be clear stays, so that edits cost no transfer."""
     fresh(two, UP, UP)

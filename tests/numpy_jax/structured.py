@@ -3,10 +3,12 @@
 import ctypes
 import math
 
+import ffi
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
+from late_kernels import Late
 
 from crazysim.engine import native
 from crazysim.engine.interpret import threefry2x32
@@ -136,56 +138,15 @@ def kernel(eqn):
         raise MissingError("ffi_call of something else")
     types = [v.aval for v in eqn.outvars]
 
-    def buffers(arrays):
-        one = [ctypes.pointer(Buffer(data=x.ctypes.data)) for x in arrays]
-        return Buffers(size=len(one), buffers=(ctypes.POINTER(Buffer) * len(one))(*one))
-
     def fn(*xs):
         out = [np.empty(x.shape, x.dtype) for x in types]
         for k, result in aliases.items():
             out[result][...] = xs[k]
         given = [out[aliases[k]] if k in aliases else np.ascontiguousarray(x) for k, x in enumerate(xs)]
-        frame = Frame(args=buffers(given), rets=buffers(out))
-        library.crazysim_advance(ctypes.byref(frame))
+        if isinstance(library, Late):
+            library.call(given, out)
+        else:
+            library.crazysim_advance(ctypes.byref(ffi.frame(given, out)))
         return out
 
     return fn
-
-
-class Struct(ctypes.Structure):
-    """What all structures of XLA's foreign function interface begin with."""
-
-    _fields_ = (("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p))
-
-
-class Buffer(Struct):
-    """``XLA_FFI_Buffer``."""
-
-    _fields_ = (
-        ("dtype", ctypes.c_int),
-        ("data", ctypes.c_void_p),
-        ("rank", ctypes.c_int64),
-        ("dims", ctypes.c_void_p),
-    )
-
-
-class Buffers(Struct):
-    """``XLA_FFI_Args`` and ``XLA_FFI_Rets``."""
-
-    _fields_ = (
-        ("size", ctypes.c_int64),
-        ("types", ctypes.c_void_p),
-        ("buffers", ctypes.POINTER(ctypes.POINTER(Buffer))),
-    )
-
-
-class Frame(Struct):
-    """``XLA_FFI_CallFrame`` up to the results: a kernel reads addresses alone."""
-
-    _fields_ = (
-        ("api", ctypes.c_void_p),
-        ("ctx", ctypes.c_void_p),
-        ("stage", ctypes.c_int),
-        ("args", Buffers),
-        ("rets", Buffers),
-    )

@@ -1,0 +1,100 @@
+"""Steps in Python and kernels that are compiled late, with which the tests save compiling, do what kernels do."""
+
+import jax
+import jax.numpy as jnp
+import late_kernels
+import numpy as np
+import pytest
+import python_steps
+from blocks import program_of
+from cases import shared_sim
+from rule_cases import CASES, N_LANES, RANDOM, function, given, of_one
+from test_rules import lanes_of
+
+from crazysim import Downwash, Sim
+from crazysim.core.stage import as_stages, stage
+from crazysim.engine import interpret, kernel_cache, native
+from crazysim.engine.build import build_program
+from crazysim.engine.fused import build
+from crazysim.engine.lower import lower_function
+
+
+def same(program, leaves, n_steps):
+    """Check that a function of scalars gives the bits that the interpreter gives."""
+    leaves = [None if x is None else np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in leaves]
+    found, flagged = python_steps.Function(program)(leaves, n_steps)
+    expected, flags = interpret._steps(program, leaves, n_steps)
+    np.testing.assert_array_equal(flagged, flags)
+    for i, x, y in zip(program.written, found, expected, strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(x, y, program.leaves[i].name)
+
+
+def is_key(x):
+    """Return whether an array is one of random keys."""
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+@pytest.mark.parametrize("name", [*CASES, *RANDOM])
+def test_a_case_gives_the_bits_of_the_interpreter(name):
+    g = given()
+    same(*program_of(lower_function(function(name), of_one(g)), lanes_of(g), N_LANES), 1)
+
+
+def flown(**given):
+    """Return the program of a simulation, and leaves that it starts from."""
+    sim = shared_sim(**given) if "add" not in given else Sim(n_worlds=2, n_drones=3)
+    if "add" in given:
+        sim.add(given["add"])
+    program = build_program(as_stages(sim.step_pipeline), sim.data, watched=lambda data: jax.tree.leaves(data.states))
+    return program, with_packed(program, jax.tree.leaves(sim.data))
+
+
+def with_packed(program, leaves):
+    """Return leaves with the one that passes add, if they did."""
+    return [*leaves, *([jnp.concatenate([leaves[i].ravel() for i in program.packed])] if program.packed else [])]
+
+
+@pytest.mark.parametrize(
+    "given", [{"n_worlds": 3, "n_drones": 2, "control": "attitude"}, {"add": Downwash()}], ids=["alone", "together"]
+)
+def test_steps_of_drones_are_those_of_the_interpreter(given):
+    """Of drones that do not know of each other, and of a world whose drones read each other's numbers."""
+    program, leaves = flown(**given)
+    assert (program.group > 1) == ("add" in given)
+    same(program, leaves, 4)
+
+
+def test_stages_of_worlds_step_all_drones():
+    @stage(scope="world")
+    def gather_up(data):
+        pos = data.states.pos
+        return data.replace(states=data.states.replace(pos=pos + 0.1 * (pos.mean(axis=0) - pos)))
+
+    sim = shared_sim(n_worlds=2, n_drones=3)
+    program = build_program([gather_up], sim.data, watched=lambda data: [data.states.pos])
+    leaves = jax.tree.leaves(sim.data)
+    pos = next(i for i, leaf in enumerate(program.leaves) if leaf.name.endswith("states.pos"))
+    leaves[pos] = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, 3)), jnp.float32).at[1, 2, 0].set(jnp.inf)
+    same(program, with_packed(program, leaves), 3)
+
+
+@pytest.mark.skipif(not native.compiler(), reason="needs a C++ compiler")
+def test_a_kernel_is_compiled_when_it_is_worth_it(monkeypatch):
+    """Called by XLA: in Python at first, with the same results afterwards."""
+    monkeypatch.setattr(late_kernels, "active", True)
+    monkeypatch.setattr(kernel_cache, "find", lambda *_: [])
+    compiled, library = [], late_kernels.LIBRARY
+    monkeypatch.setattr(late_kernels, "LIBRARY", lambda *given: compiled.append(given) or library(*given))
+    block = lower_function(lambda x: (x[0] * 2 + 17, x[1] > 1), np.zeros(2, np.float32))
+    program, leaves = program_of(block, [np.float32([1, 2, 3]), np.float32([0, 1, 2])], 3)
+    run = build(program, "cpu")
+    call = jax.jit(lambda leaves: run(leaves, 1)[0]).lower(leaves).compile()
+    first = call(leaves)
+    assert not compiled
+    (late,) = [x for x in native._LOADED.values() if isinstance(x, late_kernels.Late) and x.program is program]
+    late.left = 0
+    for x, y in zip(first, call(leaves), strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert len(compiled) == 1
+    np.testing.assert_array_equal(first[0][:, 0], [19, 21, 23])
