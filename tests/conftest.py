@@ -99,8 +99,8 @@ IN_NUMPY = (
     "sim", "test_export.py", "test_main.py", "test_rotation.py", "train", "trajectories",
 )  # fmt: skip
 """Folders in which programs of JAX are interpreted: their subject is not the compiler, and their flights are short."""
-KERNELS_LATE = (*IN_NUMPY, "golden", "laws")
-"""Folders in which steps are taken in Python before a kernel is compiled, unless an engine is chosen by its name."""
+KERNELS_LATE = (*IN_NUMPY, "laws")
+"""Folders in which steps are taken in Python before a kernel is compiled."""
 
 
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)
@@ -112,7 +112,8 @@ def pytest_runtest_protocol(item):
     folder = item.path.relative_to(Path(__file__).parent).parts[0]
     free = not os.environ.get("CRAZYSIM_COMPILE") and item.get_closest_marker("compiled") is None
     small_programs.active = free and folder in IN_NUMPY
-    first_steps.active = late_kernels.active = free and folder in KERNELS_LATE
+    may_wait = free and folder in KERNELS_LATE and item.get_closest_marker("kernels") is None
+    first_steps.active = late_kernels.active = may_wait
     small_programs.patience = 1 if item.get_closest_marker("steady") is None else 10
     yield
 

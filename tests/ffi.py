@@ -107,13 +107,14 @@ METADATA = 1
 """Type of the extension."""
 
 
-def answered(frame):
-    """Return whether XLA asked for the version, which is then told."""
-    if not frame.extension_start:
-        return False
-    question = Question.from_address(frame.extension_start)
-    if question.type != METADATA:
-        return False
-    told = question.metadata.contents.version
-    told.major, told.minor = version()
-    return True
+def answer(frame):
+    """Fill in the version if a call asks for that, and return whether it did."""
+    place = frame.extension_start
+    while place:
+        question = Question.from_address(place)
+        if question.type == METADATA:
+            asked = question.metadata.contents.version
+            asked.major, asked.minor = version()
+            return True
+        place = question.next
+    return False

@@ -1,9 +1,9 @@
-"""First steps of a simulation on the interpreter: many flights of tests are over sooner than a kernel is compiled.
+"""First steps of a simulation in Python: many flights of tests are over sooner than a kernel is compiled.
 
 Where the compiler is not the subject, simulations plan for the fused engine as ever, which refuses what has no kernel.
-Their steps are interpreted until they have taken as long as compiling does, or one is traced. From then on the kernel
-takes all of them. Steps on several devices, steps with stages that are not fused, and engines chosen by name are left
-alone.
+Their steps are interpreted until they have taken as long as compiling does, or one is traced: what XLA calls from then
+on is a kernel of ``late_kernels``. Steps on several devices, steps with stages that are not fused, and engines chosen
+by name do not begin so.
 """
 
 import threading
@@ -30,7 +30,7 @@ BUILD, FAST, CACHE_SIZE = fused.build, plan.Planner._fast, Step._cache_size
 
 
 def fast(planner, data, zeros):
-    """Return what ``Planner._fast`` does; a plan of kernels begins on the interpreter, and has not compiled them."""
+    """Return what ``Planner._fast`` does; a plan of kernels begins in Python, and has not compiled them."""
     if planner.engine != "auto":
         with late_kernels.chosen_by_name():
             return FAST(planner, data, zeros)
@@ -90,14 +90,14 @@ class FirstSteps:
 
     def __init__(self, made, runs):
         """Take a plan, and the steps of its programs."""
-        n_worlds = next(leaf.shape[0] for leaf in made.program.leaves if leaf.scope == "drone")
+        self.n_worlds = next(leaf.shape[0] for leaf in made.program.leaves if leaf.scope == "drone")
         self.plan, self.runs, self.interpreted = made, runs, plan._on_host(made.dynamic.__wrapped__)
-        self.per_step = sum(python_steps.cost(program, n_worlds * program.n_drones) for program in made.programs)
         self.left = sum(map(python_steps.budget, made.programs))
 
     def __call__(self, values, n_steps):
         """Return the values after some steps."""
-        self.left -= python_steps.CALL + int(n_steps) * self.per_step
+        programs = self.plan.programs
+        self.left -= sum(python_steps.cost(p, self.n_worlds * p.n_drones, int(n_steps)) for p in programs)
         if active and self.left >= 0 and not any(run.kernel for run in self.runs):
             return self.interpreted(values, n_steps)
         compiled = self.plan.static if isinstance(n_steps, int) else self.plan.dynamic

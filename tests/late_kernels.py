@@ -21,7 +21,8 @@ LIBRARY, TARGET, WRITE = native._library, native.target, kernel.write
 
 active = False
 """True while a test runs whose subject is not the compiler."""
-_thread = threading.local()
+_chosen = 0
+"""Number of plans that are being made for an engine that was chosen by its name."""
 _programs, _kernels = WeakValueDictionary(), WeakKeyDictionary()
 """Programs by their source, and their kernels."""
 
@@ -33,17 +34,18 @@ def install():
 
 @contextlib.contextmanager
 def chosen_by_name():
-    """Compile kernels at once: they are wanted for an engine that was chosen by its name."""
-    _thread.chosen = True
+    """Compile kernels at once, in all threads."""
+    global _chosen
+    _chosen += 1
     try:
         yield
     finally:
-        _thread.chosen = False
+        _chosen -= 1
 
 
 def may_wait():
     """Return whether kernels that are wanted now may be compiled late."""
-    return active and not getattr(_thread, "chosen", False)
+    return active and not _chosen
 
 
 def write(program, target, samples=()):
@@ -84,7 +86,7 @@ class Late:
         try:
             if self.library is not None:
                 self.library.crazysim_advance(frame)
-            elif not ffi.answered(frame.contents):
+            elif not ffi.answer(frame.contents):
                 self.call(frame.contents.args.arrays(), frame.contents.rets.arrays(), frame)
         except Exception as error:  # there is nobody to catch it; pytest fails the test
             about = {"err_msg": "a kernel that was interpreted failed", "object": self}
@@ -94,31 +96,36 @@ class Late:
 
     def call(self, given, out, frame=None):
         """Take steps from arrays to arrays; a frame of both is made if it is not given."""
-        (n_lanes,), (n_steps, *_), *numbers = given
-        self.left -= python_steps.CALL + int(n_steps) * python_steps.cost(self.program, int(n_lanes))
-        few = active and self.left >= 0 and python_steps.are_few(self.program, int(n_lanes))
-        if self.library is not None or not few or not self.is_for(numbers):
+        program = self.program
+        if program is None or not self.is_cheap(program, given):
             self.compiled().crazysim_advance(ctypes.byref(ffi.frame(given, out)) if frame is None else frame)
             return
-        leaves = [None] * len(self.program.leaves)
+        _, (n_steps,), *numbers = given
+        leaves = [None] * len(program.leaves)
         for i, x in zip(self.source.inputs, numbers, strict=True):
             leaves[i] = x
-        written, flagged = python_steps.steps(self.program, leaves, int(n_steps))
+        written, flagged = python_steps.steps(program, leaves, int(n_steps))
         for x, y in zip(out, written, strict=False):
             x[...] = y.reshape(x.shape)
-        if self.program.check is not None:
+        if program.check is not None:
             out[-1][...] = flagged
 
-    def is_for(self, numbers):
-        """Return whether inputs are of worlds as the program has them: its source may be that of others too."""
-        drones = [
-            x for i, x in zip(self.source.inputs, numbers, strict=True)
-            if self.program.leaves[i].scope == "drone" and not self.program.leaves[i].rows_of
-        ]  # fmt: skip
-        return bool(drones) and all(x.shape[1] == self.program.n_drones for x in drones)
+    def is_cheap(self, program, given):
+        """Return whether to interpret a call: if its drones are few, and of worlds as the program has them.
+
+        Programs of worlds with two and with three drones may have one source.
+        """
+        (n_lanes,), (n_steps,), *numbers = given
+        self.left -= python_steps.cost(program, int(n_lanes), int(n_steps))
+        leaves = [program.leaves[i] for i in self.source.inputs]
+        drones = [x for leaf, x in zip(leaves, numbers, strict=True) if leaf.scope == "drone" and not leaf.rows_of]
+        fits = bool(drones) and all(x.shape[1] == program.n_drones for x in drones)
+        return active and self.left >= 0 and fits and python_steps.are_few(program, int(n_lanes))
 
     def compiled(self):
         """Return the compiled library."""
         with self.lock:
-            self.library = self.library or self.compile()
+            if self.library is None:
+                self.library = self.compile()
+                self.program = None  # libraries are kept as long as the process runs
         return self.library

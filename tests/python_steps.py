@@ -1,10 +1,11 @@
 """Steps in Python, for the tests: a function of NumPy's scalars that is written for a program.
 
-An operation on a scalar takes a tenth of the time that one on an array takes, so that short flights of a few drones
-are over before a kernel is compiled. Numbers have the types that they have in ``interpret``, and so the same rounding.
+An operation on a scalar takes a small part of the time that one on an array takes, so that short flights of a few
+drones are over before a kernel is compiled. Numbers have the types that they have in ``interpret``, and so the same
+rounding.
 """
 
-import functools
+import contextlib
 import itertools
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -33,7 +34,7 @@ FORMS = {
 }
 """Expressions of Python in place of NumPy's functions, which take longer on scalars."""
 UFUNCS = (np.sqrt, np.sin, np.cos, np.exp, np.log, np.arctan2, np.floor)
-"""Functions that return scalars of the type of theirs."""
+"""Functions whose results have the type of their operands, scalars of scalars."""
 
 
 BUDGET = 300
@@ -57,11 +58,19 @@ def budget(program):
     return BUDGET * sum(n_operations(segment.block, repeated=False) for segment in program.fused_segments)
 
 
-def cost(program, n_lanes):
-    """Return the number of operations on arrays that take as long as a step of all drones."""
-    if program not in _COSTS:
-        _COSTS[program] = sum(n_operations(segment.block, repeated=True) for segment in program.fused_segments)
-    return _COSTS[program] * (SCALAR * n_lanes if are_few(program, n_lanes) else 1 + n_lanes / LANES)
+def cost(program, n_lanes, n_steps):
+    """Return the number of operations on arrays that take as long as a call that takes some steps of all drones."""
+    per_operation = SCALAR * n_lanes if are_few(program, n_lanes) else 1 + n_lanes / LANES
+    return CALL + n_executed(program, n_steps) * per_operation
+
+
+def n_executed(program, n_steps):
+    """Return the number of operations that some steps of a drone execute."""
+    if program not in _SIZES:
+        sizes = [(s.phase == "each", n_operations(s.block, repeated=True)) for s in program.fused_segments]
+        _SIZES[program] = sum(n for each, n in sizes if not each), sum(n for each, n in sizes if each)
+    once, each = _SIZES[program]
+    return once + n_steps * each
 
 
 def n_operations(block, repeated):
@@ -80,112 +89,124 @@ def are_few(program, n_lanes):
 
 
 def steps(program, leaves, n_steps):
-    """Return the written leaves after some steps, and the worlds that are flagged, as ``interpret.steps`` does."""
+    """Return the written leaves after some steps, and the worlds that are flagged, all in NumPy."""
     n_worlds, n_drones = lanes.batch(program, leaves)
     n_lanes = n_worlds * n_drones
-    taken = _TAKEN[program] = _TAKEN.get(program, 0) + n_steps
-    if not are_few(program, n_lanes):
-        return interpret._steps(program, leaves, n_steps)
-    if program not in _WRITTEN and taken * (1 - SCALAR * n_lanes) > WRITING * program.group:
-        _WRITTEN[program] = Function(program)
-    return (_WRITTEN.get(program) or functools.partial(interpret._steps, program))(leaves, n_steps)
+    done = _DONE[program] = _DONE.get(program, 0) + n_executed(program, n_steps)
+    few = are_few(program, n_lanes)
+    if few and program not in _WRITTEN:
+        written_in = WRITING * program.group * n_executed(program, 1)
+        if done * (1 - SCALAR * n_lanes) > written_in:
+            _WRITTEN[program] = Function(program)
+    if few and program in _WRITTEN:
+        return _WRITTEN[program](leaves, n_steps, n_worlds)
+    return interpret._steps(program, leaves, n_steps)
 
 
-_COSTS, _TAKEN = WeakKeyDictionary(), WeakKeyDictionary()
-"""Operations of a step of programs, and how many steps they have taken."""
+_SIZES, _DONE = WeakKeyDictionary(), WeakKeyDictionary()
+"""Operations of programs, those executed once and those of each step; and how many were executed."""
 
 
 class Function:
-    """The steps of drones that read each other's numbers, or of one."""
+    """The steps of drones that read each other's numbers, or of one. It does not keep its program."""
 
     def __init__(self, program):
         """Write the function of a program whose stages are all fused."""
-        self.program, self.group, self.globals = program, program.group, {}
-        self.lines, self.depth, self.count = [], 1, itertools.count()
-        segments, check = program.fused_segments, program.check
-        checked = check.reads if check is not None else ()
-        slots = {slot for s in segments for slot in program.per_drone(s, [*s.reads, *s.writes])}
-        slots |= {slot for s in segments for slot in s.hoisted_reads} | {*checked}
-        slots |= {(i, k) for i in program.written for k in range(program.leaves[i].size)}
+        self.leaves, self.n_drones, self.group = program.leaves, program.n_drones, program.group
+        writer = Writer(program)
+        exec(compile(writer.text(), "<steps>", "exec"), writer.globals)
+        self.steps, self.columns = writer.globals["steps"], writer.columns
         self.shapes = {i: lanes.shape_of(program, i, 1).shape[1:] for i in program.written}
-        self.columns = {i: [k for _, k in some] for i, some in itertools.groupby(sorted(slots), lambda slot: slot[0])}
 
-        for segment in program.of("first"):
-            self.segment(segment, [()] * self.group)
-        each = [(s, self.drones(s.hoisted, [[self.name(x, d) for x in s.hoisted_reads] for d in range(self.group)]))
-                for s in program.of("each")]  # fmt: skip
-        self.line("for _ in range(n_steps):")
-        self.depth += 1
-        self.line("pass")
-        for segment, constants in each:
-            self.segment(segment, constants)
-        self.depth -= 1
-        flags = ["False"] * self.group
-        if check is not None:
-            given = [[self.name(x, d) for x in checked] for d in range(self.group)]
-            flags = [x for (x,) in self.drones(check.block, given)]
-            fresh = [self.new() for _ in flags]
-            self.assign(fresh, flags)  # the last stages may write what it was made of
-            flags = fresh
-        for segment in program.of("last"):
-            self.segment(segment, [()] * self.group)
-
-        arguments = [x for i in self.columns for x in self.names(i)]
-        results = [*flags, *(x for i in program.written for x in self.names(i))]
-        self.line(f"return {', '.join(results)},")
-        text = "\n".join([f"def steps({', '.join(['n_steps', *arguments])}):", *self.lines])
-        exec(compile(text, "<steps>", "exec"), self.globals)
-        self.steps = self.globals["steps"]
-
-    def __call__(self, leaves, n_steps):
+    def __call__(self, leaves, n_steps, n_worlds):
         """Return the written leaves after some steps, and the worlds that are flagged."""
-        n_worlds, n_drones = lanes.batch(self.program, leaves)
-        n_units = n_worlds * n_drones // self.group
+        n_units = n_worlds * self.n_drones // self.group
         given = [self.numbers(i, leaves[i], n_worlds, n_units) for i in self.columns]
         with np.errstate(all="ignore"):
             found = [self.steps(n_steps, *itertools.chain(*numbers)) for numbers in zip(*given, strict=True)]
-        flagged = np.array([some[: self.group] for some in found], bool).reshape(n_worlds, n_drones)
+        flagged = np.array([some[: self.group] for some in found], bool).reshape(n_worlds, self.n_drones)
         written, end = [], self.group
-        for i in self.program.written:
-            start, end = end, end + self.group * self.program.leaves[i].size
+        for i in self.shapes:
+            start, end = end, end + self.group * self.leaves[i].size
             written.append(self.array(i, [some[start:end] for some in found], n_worlds))
         return written, flagged.any(axis=1, keepdims=True)
 
-    def names(self, leaf):
-        """Return the names of the numbers of a leaf, drone after drone."""
-        drones = range(self.group if self.program.leaves[leaf].scope in ("drone", "world") else 1)
-        return [self.name((leaf, k), d) for d in drones for k in self.columns[leaf]]
-
     def numbers(self, leaf, x, n_worlds, n_units):
         """Return the numbers of a leaf that each call takes."""
-        columns, example, n_drones = self.columns[leaf], self.program.leaves[leaf], self.program.n_drones
-        if example.scope not in ("drone", "world"):
+        columns, example = self.columns[leaf], self.leaves[leaf]
+        if is_shared(example):
             x = x.reshape(-1)
             return [[x if k == TABLE else x[k] for k in columns]] * n_units
         if x is None:  # written before it is read
-            x = np.zeros((n_worlds * n_drones, example.size), example.number)
+            x = np.zeros((n_worlds, self.n_drones, example.size), example.number)
         elif example.rows_of:
             x = x.T
         else:
-            x = x.reshape(n_worlds, -1, example.size)
-            x = x if x.shape[1] == n_drones else np.broadcast_to(x, (n_worlds, n_drones, example.size))
+            x = np.broadcast_to(x.reshape(n_worlds, -1, example.size), (n_worlds, self.n_drones, example.size))
         x = x.reshape(-1, example.size)
         x = x if len(columns) == example.size else x[:, columns]
         return [list(numbers) for numbers in x.reshape(n_units, -1)]
 
     def array(self, leaf, numbers, n_worlds):
         """Return a written leaf, from its numbers of each call."""
-        example, n_drones = self.program.leaves[leaf], self.program.n_drones
-        x = np.array(numbers, example.number).reshape(n_worlds, n_drones, example.size)
+        example, shape = self.leaves[leaf], self.shapes[leaf]
+        x = np.array(numbers, example.number).reshape(n_worlds, self.n_drones, example.size)
         if example.rows_of:
             return np.ascontiguousarray(x.reshape(-1, example.size).T)
-        shape = self.shapes[leaf]
         return np.ascontiguousarray(x[:, : shape[0]]).reshape(n_worlds, *shape)
+
+
+class Writer:
+    """Writes the function of a program."""
+
+    def __init__(self, program):
+        """Find the numbers that the function takes: those used of each leaf, and all of a leaf that is written."""
+        self.program, self.group, self.globals = program, program.group, {}
+        self.lines, self.depth, self.count = [], 1, itertools.count()
+        checked = program.check.reads if program.check is not None else ()
+        slots = {slot for s in program.fused_segments for slot in program.per_drone(s, [*s.reads, *s.writes])}
+        slots |= {slot for s in program.fused_segments for slot in s.hoisted_reads} | {*checked}
+        slots |= {(i, k) for i in program.written for k in range(program.leaves[i].size)}
+        self.columns = {i: [k for _, k in some] for i, some in itertools.groupby(sorted(slots), lambda slot: slot[0])}
+        """Elements of each leaf, in the order of the arguments."""
+
+    def text(self):
+        """Return the function, which is called steps."""
+        program, none = self.program, [()] * self.group
+        for segment in program.of("first"):
+            self.segment(segment, none)
+        each = [(segment, self.drones(segment.hoisted, self.read(segment.hoisted_reads)))
+                for segment in program.of("each")]  # fmt: skip
+        self.line("for _ in range(n_steps):")
+        with self.indented():
+            self.line("pass")
+            for segment, constants in each:
+                self.segment(segment, constants)
+        flags = ["False"] * self.group
+        if program.check is not None:
+            found = [x for (x,) in self.drones(program.check.block, self.read(program.check.reads))]
+            flags = [self.new() for _ in found]
+            self.assign(flags, found)  # the last stages may write what it was made of
+        for segment in program.of("last"):
+            self.segment(segment, none)
+        results = [*flags, *(x for i in program.written for x in self.names(i))]
+        self.line(f"return {', '.join(results)},")
+        arguments = ["n_steps", *(x for i in self.columns for x in self.names(i))]
+        return "\n".join([f"def steps({', '.join(arguments)}):", *self.lines])
+
+    def read(self, slots):
+        """Return the names of slots, for each drone."""
+        return [[self.name(slot, d) for slot in slots] for d in range(self.group)]
+
+    def names(self, leaf):
+        """Return the names of the numbers of a leaf, drone after drone."""
+        drones = range(1 if is_shared(self.program.leaves[leaf]) else self.group)
+        return [self.name((leaf, k), d) for d in drones for k in self.columns[leaf]]
 
     def name(self, slot, drone):
         """Return the variable of a slot: one for each drone, or for all."""
         leaf, k = slot
-        if self.program.leaves[leaf].scope not in ("drone", "world"):
+        if is_shared(self.program.leaves[leaf]):
             return f"x{leaf}_{'table' if k == TABLE else k}"
         return f"x{leaf}_{k}_{drone}"
 
@@ -212,7 +233,7 @@ class Function:
         """Add a segment, with the hoisted numbers of each drone."""
         leaves = self.program.leaves
         if segment.scope == "drone":
-            given = [[*(self.name(x, d) for x in segment.reads), *constants[d]] for d in range(self.group)]
+            given = [[*names, *more] for names, more in zip(self.read(segment.reads), constants, strict=True)]
             outs = self.drones(segment.block, given)
             pairs = [(self.name(slot, d), x) for d, some in enumerate(outs)
                      for slot, x in zip(segment.writes, some, strict=True)]  # fmt: skip
@@ -271,16 +292,13 @@ class Function:
             return FORMS[op.name].format(*args)
         if op.name == "div" and floating:
             return f"{args[0]} / {args[1]}"
-        if op.name == "integer_pow" and op.param("y") == 2:
-            return f"{args[0]} * {args[0]}"
+        if op.name == "integer_pow" and abs(op.param("y")) == 2:  # NumPy squares arrays, but not scalars
+            square = f"{args[0]} * {args[0]}"
+            return square if op.param("y") > 0 else f"1 / ({square})"
         if op.name == "convert_element_type" and (floating or a.dtype.kind != "f") and op.dtype.kind != "b":
             return f"{args[0]}.astype({self.known(op.dtype)})"
         if row.numpy in UFUNCS:
-            return (
-                f"{self.known(row.numpy)}({args[0]})"
-                if len(args) == 1
-                else f"{self.known(row.numpy)}({', '.join(args)})"
-            )
+            return f"{self.known(row.numpy)}({', '.join(args)})"
         return f"{self.known(op.dtype.type)}({self.known(interpret._numpy(op))}({', '.join(args)}))"
 
     def op_barrier(self, op, args, names):
@@ -313,7 +331,7 @@ class Function:
         (block,), found = op.blocks, [self.new() for _ in op.results]
         self.assign(found, args[1:])
         self.line(f"if {args[0]}:")
-        with self:
+        with self.indented():
             self.assign(found, self.block(block, dict(names)))
             self.line("pass")
         return found
@@ -323,7 +341,7 @@ class Function:
         (block,), carry = op.blocks, [self.new() for _ in op.results]
         self.assign(carry, args)
         self.line(f"for _ in range({op.param('length')}):")
-        with self:
+        with self.indented():
             self.assign(carry, self.block(block, names | dict(zip(block.inputs, carry, strict=True))))
         return carry
 
@@ -332,7 +350,7 @@ class Function:
         (test, body), carry = op.blocks, [self.new() for _ in op.results]
         self.assign(carry, args)
         self.line("while True:")
-        with self:
+        with self.indented():
             (going,) = self.block(test, names | dict(zip(test.inputs, carry, strict=True)))
             self.line(f"if not {going}: break")
             self.assign(carry, self.block(body, names | dict(zip(body.inputs, carry, strict=True))))
@@ -351,18 +369,22 @@ class Function:
             *others, itself = inputs
             target = "".join(f"{x}, " for x in others)
             self.line(f"for ({target}), {itself} in zip({published}, {is_own}):")
-            with self:
+            with self.indented():
                 outs = self.block(block, own | dict(zip(block.inputs, inputs, strict=True)))
                 self.assign(found, [f"({FORMS[n].format(x, y)})" for n, x, y in zip(reduce, found, outs, strict=True)])
             own.update(zip(op.results, found, strict=True))
 
-    def __enter__(self):
-        """Begin an inner block."""
+    @contextlib.contextmanager
+    def indented(self):
+        """Indent the lines that are added meanwhile."""
         self.depth += 1
-
-    def __exit__(self, *_):
-        """End it."""
+        yield
         self.depth -= 1
+
+
+def is_shared(leaf):
+    """Return whether all drones of all worlds have the same numbers of a leaf."""
+    return leaf.scope not in ("drone", "world")
 
 
 _WRITTEN = WeakKeyDictionary()

@@ -13,16 +13,17 @@ from test_rules import lanes_of
 
 from crazysim import Downwash, Sim
 from crazysim.core.stage import as_stages, stage
-from crazysim.engine import interpret, kernel_cache, native
+from crazysim.engine import interpret, kernel_cache, lanes, native
 from crazysim.engine.build import build_program
 from crazysim.engine.fused import build
+from crazysim.engine.fused_rollout import FusedRollout
 from crazysim.engine.lower import lower_function
 
 
 def same(program, leaves, n_steps):
-    """Check that a function of scalars gives the bits that the interpreter gives."""
+    """Check that a function of scalars gives the numbers that the interpreter gives."""
     leaves = [None if x is None else np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in leaves]
-    found, flagged = python_steps.Function(program)(leaves, n_steps)
+    found, flagged = python_steps.Function(program)(leaves, n_steps, lanes.batch(program, leaves)[0])
     expected, flags = interpret._steps(program, leaves, n_steps)
     np.testing.assert_array_equal(flagged, flags)
     for i, x, y in zip(program.written, found, expected, strict=True):
@@ -36,7 +37,7 @@ def is_key(x):
 
 
 @pytest.mark.parametrize("name", [*CASES, *RANDOM])
-def test_a_case_gives_the_bits_of_the_interpreter(name):
+def test_a_case_gives_the_numbers_of_the_interpreter(name):
     g = given()
     same(*program_of(lower_function(function(name), of_one(g)), lanes_of(g), N_LANES), 1)
 
@@ -76,7 +77,38 @@ def test_stages_of_worlds_step_all_drones():
     leaves = jax.tree.leaves(sim.data)
     pos = next(i for i, leaf in enumerate(program.leaves) if leaf.name.endswith("states.pos"))
     leaves[pos] = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, 3)), jnp.float32).at[1, 2, 0].set(jnp.inf)
+    assert program.group == 3
     same(program, with_packed(program, leaves), 3)
+
+
+def test_stages_before_and_after_the_steps_on_rows_and_a_table():
+    """As in a whole step of an environment, of which some leaves are rows."""
+
+    @stage(scope="drone")
+    def begin(data):
+        vel = data.states.vel + jnp.asarray(PLACES)[jnp.int32(data.states.pos[0]) % len(PLACES)]
+        return data.replace(states=data.states.replace(vel=vel))
+
+    @stage(scope="drone")
+    def move(data):
+        return data.replace(states=data.states.replace(pos=data.states.pos + 0.5 * data.states.vel))
+
+    @stage(scope="drone")
+    def end(data):
+        return data.replace(states=data.states.replace(ang_vel=data.states.pos**-2))
+
+    data = shared_sim(n_worlds=3, n_drones=2).data
+    whole = FusedRollout([begin], [move], [end], data, {}, 2, "cpu", rows=lambda written: written[1:])
+    leaves = list(jax.tree.leaves(data))
+    pos = next(i for i, leaf in enumerate(whole.program.leaves) if leaf.name.endswith("states.pos"))
+    leaves[pos] = jnp.asarray(np.random.default_rng(0).normal(size=(3, 2, 3)) * 3, jnp.float32)
+    given = [leaves[i] if i in whole.read else None for i in range(len(leaves))]
+    assert whole.program.rows
+    assert {segment.phase for segment in whole.program.segments} == {"first", "each", "last"}
+    same(whole.program, [*given, *whole.shared(leaves), *whole.pack(leaves)], 2)
+
+
+PLACES = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
 
 
 @pytest.mark.skipif(not native.compiler(), reason="needs a C++ compiler")
@@ -98,3 +130,17 @@ def test_a_kernel_is_compiled_when_it_is_worth_it(monkeypatch):
         np.testing.assert_array_equal(x, y)
     assert len(compiled) == 1
     np.testing.assert_array_equal(first[0][:, 0], [19, 21, 23])
+
+
+def test_worlds_of_another_size_are_stepped_by_the_kernel(monkeypatch):
+    """Programs of worlds with one and with three drones have one source here, and so one kernel."""
+    monkeypatch.setattr(late_kernels, "active", True)
+    block = lower_function(lambda x: x * 2 + 23, np.float32(0))
+    program, leaves = program_of(block, [np.float32([1, 2, 3])], 3)
+    late = late_kernels.Late(program, late_kernels.write(program, "host"), lambda: 1 / 0)
+    numbers = [np.asarray(leaves[i]) for i in late.source.inputs]
+    out = [np.zeros((3, 1), np.float32)]
+    late.call([np.int32([3]), np.int32([1]), *numbers], out)
+    np.testing.assert_array_equal(out[0][:, 0], [25, 27, 29])
+    with pytest.raises(ZeroDivisionError):  # as it compiles
+        late.call([np.int32([3]), np.int32([1]), *(x.reshape(1, 3) for x in numbers)], [out[0].reshape(1, 3)])

@@ -31,7 +31,7 @@ from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import autoreset
 from crazysim.pytree import map_batched
 
-pytestmark = pytest.mark.steady
+pytestmark = [pytest.mark.steady, pytest.mark.kernels]
 N_WORLDS = 4
 N_FLYING, N_STEPS = 32, 1250
 """Worlds and environment steps of the random flight: 40,000 steps, and at least two episodes in each world."""

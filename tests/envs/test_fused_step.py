@@ -16,7 +16,10 @@ from crazysim.envs.wrappers import AutoReset, Wrapper
 from crazysim.errors import EngineWarning
 from crazysim.pytree import CORE_NDIM_KEY
 
-pytestmark = pytest.mark.skipif(fused.missing("cpu") is not None, reason="there is no C++ compiler")
+pytestmark = [
+    pytest.mark.kernels,
+    pytest.mark.skipif(fused.missing("cpu") is not None, reason="there is no C++ compiler"),
+]
 N = 6
 
 

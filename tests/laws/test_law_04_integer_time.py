@@ -12,6 +12,7 @@ COMPILED = (("first_principles", "state"), ("so_rpy_rotor_drag", "state"))
 RATES = {f"{level}_freq": 100 for level in ("state", "attitude", "body_rate", "force_torque")}
 
 
+@pytest.mark.kernels
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_a_command_is_taken_over_at_its_tick(dynamics, control):
     """Law 4: every step brings another command; in force is the last one that met a tick of its own world.

@@ -148,6 +148,7 @@ def test_jets_of_all_drones():
     np.testing.assert_allclose(both[1], alone[1], rtol=1e-5)
 
 
+@pytest.mark.kernels
 @pytest.mark.parametrize("largest", [10**6, 1])
 def test_engines_agree_whether_the_table_is_fused_or_not(monkeypatch, largest):
     monkeypatch.setattr(rotor_jet, "LARGEST_FUSED", largest)

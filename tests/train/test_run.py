@@ -23,7 +23,7 @@ from crazysim.train import run as runs
 from crazysim.train.evaluate import evaluate
 from crazysim.train.run import CHECKPOINT, POLICY, TrainConfig, load_policy, train
 
-pytestmark = pytest.mark.xdist_group("training runs")  # one worker, as they share a run
+pytestmark = [pytest.mark.kernels, pytest.mark.xdist_group("training runs")]  # one worker, as they share a run
 
 SMALL = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (16, 16)}
 
