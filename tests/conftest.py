@@ -100,7 +100,7 @@ IN_NUMPY = (
 )  # fmt: skip
 """Folders in which programs of JAX are interpreted: their subject is not the compiler, and their flights are short."""
 KERNELS_LATE = (*IN_NUMPY, "laws")
-"""Folders in which steps are taken in Python before a kernel is compiled."""
+"""Folders in which steps are taken in Python before a kernel is compiled; CI also compiles the laws at once."""
 
 
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)
