@@ -34,7 +34,7 @@ FORMS = {
 }
 """Expressions of Python in place of NumPy's functions, which take longer on scalars."""
 UFUNCS = (np.sqrt, np.sin, np.cos, np.exp, np.log, np.arctan2, np.floor)
-"""Functions whose results have the type of their operands, scalars of scalars."""
+"""Functions of NumPy that return a scalar of their operands' type for scalars."""
 
 
 BUDGET = 300
