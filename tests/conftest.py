@@ -112,8 +112,7 @@ def pytest_runtest_protocol(item):
     folder = item.path.relative_to(Path(__file__).parent).parts[0]
     free = not os.environ.get("CRAZYSIM_COMPILE") and item.get_closest_marker("compiled") is None
     small_programs.active = free and folder in IN_NUMPY
-    may_wait = free and folder in KERNELS_LATE and item.get_closest_marker("kernels") is None
-    first_steps.active = late_kernels.active = may_wait
+    late_kernels.active = free and folder in KERNELS_LATE and item.get_closest_marker("kernels") is None
     small_programs.patience = 1 if item.get_closest_marker("steady") is None else 10
     yield
 

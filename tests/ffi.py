@@ -1,6 +1,7 @@
 """XLA's foreign function interface, as far as kernels use it: frames of calls, with the arrays that they point to."""
 
 import ctypes
+import functools
 import math
 import re
 from pathlib import Path
@@ -13,6 +14,7 @@ DTYPES = {1: "bool", 4: "int32", 8: "uint32", 11: "float32", 12: "float64"}
 """Types of numbers that kernels have: values of ``XLA_FFI_DataType``."""
 
 
+@functools.cache
 def version():
     """Return the version of the interface, major and minor."""
     text = (Path(jaxcompat.ffi_include_folder()) / "xla/ffi/api/c_api.h").read_text()

@@ -16,13 +16,11 @@ import python_steps
 from crazysim.engine import Step, fused, kernel, plan
 from crazysim.jaxcompat import is_key
 
-active = False
-"""True while a test runs whose subject is not the compiler."""
 _planning = threading.local()
 
 
 def install():
-    """Let simulations that are planned while ``active`` take their first steps on the interpreter."""
+    """Let simulations that are planned while kernels may be late take their first steps in Python."""
     fused.build, plan.Planner._fast, Step._cache_size = build, fast, cache_size
 
 
@@ -34,7 +32,7 @@ def fast(planner, data, zeros):
     if planner.engine != "auto":
         with late_kernels.chosen_by_name():
             return FAST(planner, data, zeros)
-    if not active:
+    if not late_kernels.active:
         return FAST(planner, data, zeros)
     _planning.runs = runs = []
     try:
@@ -58,7 +56,7 @@ def build(program, platform, devices=None):
 
 def cache_size(step):
     """Return what ``Step._cache_size`` does; a test that counts compilations must have some."""
-    if active and any(isinstance(made.direct, FirstSteps) for made in step._plans.values()):
+    if late_kernels.active and any(isinstance(made.direct, FirstSteps) for made in step._plans.values()):
         raise RuntimeError("a test that counts compilations was not marked; mark it with pytest.mark.compiled")
     return CACHE_SIZE(step)
 
@@ -86,7 +84,7 @@ class Run:
 
 
 class FirstSteps:
-    """Steps outside of traces: on the interpreter as long as there are few of them."""
+    """Steps outside of traces: interpreted as long as there are few of them."""
 
     def __init__(self, made, runs):
         """Take a plan, and the steps of its programs."""
@@ -98,7 +96,7 @@ class FirstSteps:
         """Return the values after some steps."""
         programs = self.plan.programs
         self.left -= sum(python_steps.cost(p, self.n_worlds * p.n_drones, int(n_steps)) for p in programs)
-        if active and self.left >= 0 and not any(run.kernel for run in self.runs):
+        if late_kernels.active and self.left >= 0 and not any(run.kernel for run in self.runs):
             return self.interpreted(values, n_steps)
         compiled = self.plan.static if isinstance(n_steps, int) else self.plan.dynamic
         return compiled(values, n_steps)

@@ -36,7 +36,6 @@ FORMS = {
 UFUNCS = (np.sqrt, np.sin, np.cos, np.exp, np.log, np.arctan2, np.floor)
 """Functions of NumPy that return a scalar of their operands' type for scalars."""
 
-
 BUDGET = 300
 """Operations on arrays that are interpreted in about the time in which g++ compiles one."""
 CALL = 500

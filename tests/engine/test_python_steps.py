@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import python_steps
 from blocks import program_of
-from cases import shared_sim
+from cases import shared_sim, with_states
 from rule_cases import CASES, N_LANES, RANDOM, function, given, of_one
 from test_rules import lanes_of
 
@@ -18,6 +18,9 @@ from crazysim.engine.build import build_program
 from crazysim.engine.fused import build
 from crazysim.engine.fused_rollout import FusedRollout
 from crazysim.engine.lower import lower_function
+from crazysim.jaxcompat import is_key
+
+PLACES = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
 
 
 def same(program, leaves, n_steps):
@@ -31,24 +34,10 @@ def same(program, leaves, n_steps):
         np.testing.assert_array_equal(x, y, program.leaves[i].name)
 
 
-def is_key(x):
-    """Return whether an array is one of random keys."""
-    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
 @pytest.mark.parametrize("name", [*CASES, *RANDOM])
 def test_a_case_gives_the_numbers_of_the_interpreter(name):
     g = given()
     same(*program_of(lower_function(function(name), of_one(g)), lanes_of(g), N_LANES), 1)
-
-
-def flown(**given):
-    """Return the program of a simulation, and leaves that it starts from."""
-    sim = shared_sim(**given) if "add" not in given else Sim(n_worlds=2, n_drones=3)
-    if "add" in given:
-        sim.add(given["add"])
-    program = build_program(as_stages(sim.step_pipeline), sim.data, watched=lambda data: jax.tree.leaves(data.states))
-    return program, with_packed(program, jax.tree.leaves(sim.data))
 
 
 def with_packed(program, leaves):
@@ -56,14 +45,15 @@ def with_packed(program, leaves):
     return [*leaves, *([jnp.concatenate([leaves[i].ravel() for i in program.packed])] if program.packed else [])]
 
 
-@pytest.mark.parametrize(
-    "given", [{"n_worlds": 3, "n_drones": 2, "control": "attitude"}, {"add": Downwash()}], ids=["alone", "together"]
-)
-def test_steps_of_drones_are_those_of_the_interpreter(given):
+@pytest.mark.parametrize("plugins, group", [((), 1), ((Downwash(),), 3)], ids=["alone", "together"])
+def test_steps_of_drones_are_those_of_the_interpreter(plugins, group):
     """Of drones that do not know of each other, and of a world whose drones read each other's numbers."""
-    program, leaves = flown(**given)
-    assert (program.group > 1) == ("add" in given)
-    same(program, leaves, 4)
+    sim = Sim(n_worlds=2, n_drones=3)
+    for plugin in plugins:
+        sim.add(plugin)
+    program = build_program(as_stages(sim.step_pipeline), sim.data, watched=lambda data: jax.tree.leaves(data.states))
+    assert program.group == group
+    same(program, with_packed(program, jax.tree.leaves(sim.data)), 4)
 
 
 def test_stages_of_worlds_step_all_drones():
@@ -72,13 +62,12 @@ def test_stages_of_worlds_step_all_drones():
         pos = data.states.pos
         return data.replace(states=data.states.replace(pos=pos + 0.1 * (pos.mean(axis=0) - pos)))
 
-    sim = shared_sim(n_worlds=2, n_drones=3)
-    program = build_program([gather_up], sim.data, watched=lambda data: [data.states.pos])
-    leaves = jax.tree.leaves(sim.data)
-    pos = next(i for i, leaf in enumerate(program.leaves) if leaf.name.endswith("states.pos"))
-    leaves[pos] = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, 3)), jnp.float32).at[1, 2, 0].set(jnp.inf)
+    pos = np.random.default_rng(0).normal(size=(2, 3, 3))
+    pos[1, 2, 0] = np.inf
+    data = with_states(shared_sim(n_worlds=2, n_drones=3).data, pos=pos)
+    program = build_program([gather_up], data, watched=lambda data: [data.states.pos])
     assert program.group == 3
-    same(program, with_packed(program, leaves), 3)
+    same(program, with_packed(program, jax.tree.leaves(data)), 3)
 
 
 def test_stages_before_and_after_the_steps_on_rows_and_a_table():
@@ -97,18 +86,14 @@ def test_stages_before_and_after_the_steps_on_rows_and_a_table():
     def end(data):
         return data.replace(states=data.states.replace(ang_vel=data.states.pos**-2))
 
-    data = shared_sim(n_worlds=3, n_drones=2).data
+    pos = 3 * np.random.default_rng(0).normal(size=(3, 2, 3))
+    data = with_states(shared_sim(n_worlds=3, n_drones=2).data, pos=pos)
     whole = FusedRollout([begin], [move], [end], data, {}, 2, "cpu", rows=lambda written: written[1:])
-    leaves = list(jax.tree.leaves(data))
-    pos = next(i for i, leaf in enumerate(whole.program.leaves) if leaf.name.endswith("states.pos"))
-    leaves[pos] = jnp.asarray(np.random.default_rng(0).normal(size=(3, 2, 3)) * 3, jnp.float32)
+    leaves = jax.tree.leaves(data)
     given = [leaves[i] if i in whole.read else None for i in range(len(leaves))]
     assert whole.program.rows
     assert {segment.phase for segment in whole.program.segments} == {"first", "each", "last"}
     same(whole.program, [*given, *whole.shared(leaves), *whole.pack(leaves)], 2)
-
-
-PLACES = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
 
 
 @pytest.mark.skipif(not native.compiler(), reason="needs a C++ compiler")
