@@ -22,6 +22,7 @@ import jax
 import late_kernels
 import numpy as np
 import pytest
+import quick_tracing
 import small_programs
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -30,6 +31,7 @@ from crazysim.engine import cuda
 
 gc.disable()  # see pytest_collection_finish
 compiling.share_mlir_context()
+quick_tracing.install()
 first_steps.install()
 late_kernels.install()
 if not os.environ.get("CRAZYSIM_COMPILE"):
