@@ -1,6 +1,7 @@
-"""Operators of traced arrays trace to what JAX traces them to."""
+"""Operators and indices that call ``lax`` directly produce the equations of JAX's own."""
 
 import operator
+import zlib
 from importlib.metadata import version
 
 import jax
@@ -9,6 +10,10 @@ import numpy as np
 import pytest
 import quick_tracing
 from jax.extend.core import Literal
+
+pytestmark = pytest.mark.skipif(
+    not version("jax").startswith("0.10."), reason="releases of JAX from 0.11 on keep their operators"
+)
 
 OPERATORS = [getattr(operator, name) for name in (*quick_tracing.OPERATORS, "eq", "pow")]
 ARRAYS = {
@@ -20,6 +25,7 @@ ARRAYS = {
     "integers": np.arange(3),
     "mask": np.ones(3, bool),
 }
+EMPTY = np.ones((0, 3), np.float32)
 CONSTANTS = [
     3.0, 3, 2**24 + 1, -(2**40), 1e-50, 1e50, float("nan"), float("-inf"), True, np.float32(3), np.float64(3),
     np.int64(3), np.ones(3, np.float32), np.ones(3), np.arange(3),
@@ -34,13 +40,13 @@ INDICES = [
 
 
 def results(functions, *args):
-    """Return what functions give, as numbers; an error as its length."""
+    """Return what functions give in float32; an error gives a number that depends on its message."""
 
     def result(fn):
         try:
             return jnp.asarray(fn(*args), jnp.float32)
         except Exception as error:
-            return jnp.full(len(f"{type(error).__name__}: {error}"), 1.0)
+            return jnp.float32(zlib.crc32(f"{type(error).__name__}: {error}".encode()))
 
     return [result(fn) for fn in functions]
 
@@ -48,67 +54,116 @@ def results(functions, *args):
 def equations(functions, args):
     """Return what functions are traced to by ``jit``, ``vmap`` and derivatives, with the types of their constants."""
 
-    def write(fn, args):
+    def describe(fn, args):
         jaxpr = jax.make_jaxpr(lambda *x: fn(*x))(*args)  # a function that JAX has not seen
         constants = [x.val for eqn in jaxpr.eqns for x in eqn.invars if isinstance(x, Literal)]
         return f"{jaxpr}\n{[(type(x), repr(x)) for x in constants]}"
 
+    def each(*x):
+        return results(functions, *x)
+
     def total(*x):
-        return sum(jnp.sum(y) for y in results(functions, *x))
+        return sum(jnp.sum(y) for y in each(*x))
 
     floats = [i for i, x in enumerate(args) if np.asarray(x).dtype in quick_tracing.FLOATS]
     many = [np.stack([x, x]) for x in args]
+    more = [np.stack([x, x, x]) for x in many]
     return [
-        write(lambda *x: results(functions, *x), args),
-        write(jax.vmap(lambda *x: results(functions, *x)), many),
-        write(jax.vmap(jax.grad(total, floats)), many),
-        write(jax.grad(lambda *x: jnp.sum(jax.vmap(total)(*x)), floats), many),
+        describe(each, args),
+        describe(jax.vmap(jax.vmap(each), in_axes=1, out_axes=1), more),
+        describe(jax.vmap(jax.grad(total, floats)), many),
+        describe(jax.grad(lambda *x: jnp.sum(jax.vmap(jax.vmap(total))(*x)), floats), more),
     ]
 
 
-def assert_same(functions, args, monkeypatch):
-    quickly = equations(functions, args)
+def assert_same(functions, args, primitive, monkeypatch):
+    """Assert that functions trace to the equations of JAX, of which one is of this primitive."""
+    found = equations(functions, args)
     with monkeypatch.context() as patch:
-        patch.setattr(quick_tracing, "quick", False)
-        slowly = equations(functions, args)
-    assert quickly == slowly
+        patch.setattr(quick_tracing, "enabled", False)
+        expected = equations(functions, args)
+    assert found == expected
+    assert all(f" {primitive}" in text for text in expected)
 
 
 @pytest.mark.parametrize("left", ["vector", "matrix", "scalar"])
-def test_operators_trace_to_the_equations_of_jax(left, monkeypatch):
+def test_operators_of_two_arrays(left, monkeypatch):
     for right in ARRAYS.values():
-        assert_same(OPERATORS, (ARRAYS[left], right), monkeypatch)
+        assert_same(OPERATORS, (ARRAYS[left], right), "mul ", monkeypatch)
 
 
-def test_operators_with_constants_trace_to_the_equations_of_jax(monkeypatch):
-    for name in ("vector", "scalar"):
-        assert_same([lambda x, f=f, c=c: f(x, c) for f in OPERATORS for c in CONSTANTS], (ARRAYS[name],), monkeypatch)
-    assert_same([lambda x, f=f, c=c: f(c, x) for f in OPERATORS for c in CONSTANTS], (ARRAYS[name],), monkeypatch)
+def test_weakly_typed_numbers_keep_the_types_of_jax(monkeypatch):
+    def types(enabled):
+        monkeypatch.setattr(quick_tracing, "enabled", enabled)
+        functions = [*OPERATORS, *[lambda x, y, f=f: f(x, 2) for f in OPERATORS], lambda x, y: x[()]]
+        jaxprs = [jax.make_jaxpr(lambda x, y, f=f: f(x, y))(2.0, array) for f in functions for array in ARRAYS.values()]
+        return [(str(jaxpr), [(x, x.weak_type) for x in jaxpr.out_avals]) for jaxpr in jaxprs]
+
+    found = types(True)
+    assert found == types(False)
+    assert any(weak for _, out in found for _, weak in out)
 
 
-def test_operators_trace_to_the_equations_of_jax_in_float64(x64, monkeypatch):
+def test_lengths_that_do_not_match_are_the_error_of_jax(monkeypatch):
+    def message(enabled):
+        monkeypatch.setattr(quick_tracing, "enabled", enabled)
+        with pytest.raises(TypeError) as error:
+            jax.make_jaxpr(lambda x, y: x * y)(ARRAYS["vector"], np.ones(4, np.float32))
+        return str(error.value)
+
+    assert message(True) == message(False)
+
+
+def test_operators_of_an_array_and_a_constant(monkeypatch):
+    functions = [lambda x, f=f, c=c: f(x, c) for f in OPERATORS for c in CONSTANTS]
+    reflected = [lambda x, f=f, c=c: f(c, x) for f in OPERATORS for c in CONSTANTS]
+    assert_same(functions + reflected, (ARRAYS["vector"],), "mul ", monkeypatch)
+
+
+def test_operators_in_float64(x64, monkeypatch):
+    functions = [*OPERATORS, *[lambda x, y, f=f: f(3 * x, 0.1) for f in OPERATORS]]
     for kind in (np.float32, np.float64):
-        functions = [*OPERATORS, *[lambda x, y, f=f: f(3 * x, 0.1) for f in OPERATORS]]
-        assert_same(functions, (np.ones(3, kind), np.ones(3)), monkeypatch)
+        assert_same(functions, (np.ones(3, kind), np.ones(3)), "mul ", monkeypatch)
 
 
-@pytest.mark.parametrize("name", ["vector", "matrix", "scalar", "column"])
-def test_indices_trace_to_the_equations_of_jax(name, monkeypatch):
-    assert_same([lambda x, i=i: x[i] for i in INDICES], (ARRAYS[name],), monkeypatch)
+@pytest.mark.parametrize("name", ["vector", "matrix", "scalar", "column", "empty"])
+def test_indices(name, monkeypatch):
+    array = ARRAYS.get(name, EMPTY)
+    primitive = "squeeze" if array.shape else "broadcast_in_dim"
+    assert_same([lambda x, i=i: x[i] for i in INDICES], (array,), primitive, monkeypatch)
 
 
-@pytest.mark.skipif(not version("jax").startswith("0.10."), reason="releases of JAX from 0.11 on keep their operators")
-def test_operators_and_indices_need_no_function_of_jax_numpy(monkeypatch):
+def test_lengths_may_be_symbols():
+    shape = jax.ShapeDtypeStruct(jax.export.symbolic_shape("n, 3"), np.float32)
+    jaxpr = jax.make_jaxpr(lambda x: (x[0], x[1], x[:, 0] * x[:, 1], x[:2]))(shape)
+    assert [str(x.shape) for x in jaxpr.out_avals] == ["(3,)", "(3,)", "(n,)", "(min(n, 2), 3)"]
+
+
+def test_no_function_of_jax_numpy_is_called(monkeypatch):
     from jax._src.numpy import indexing, ufuncs
 
-    monkeypatch.delattr(ufuncs, "multiply")
+    names = "multiply add subtract true_divide less less_equal greater greater_equal"
+    functions = [getattr(operator, name) for name in quick_tracing.OPERATORS]
+    for name in names.split():
+        monkeypatch.delattr(ufuncs, name)
     monkeypatch.delattr(indexing, "rewriting_take")
 
     def fn(x, y):
-        return 2 * (x * y) * y[..., :1] * y[0]
+        arrays = [f(x, other) for f in functions for other in (y, 2.0)]
+        return arrays + [f(2, x) for f in functions] + [x[..., :1], y[0]]
 
-    jax.make_jaxpr(lambda x, y: fn(x, y))(jnp.ones(3), jnp.ones(3))
-    jax.make_jaxpr(jax.vmap(fn))(jnp.ones((2, 3)), jnp.ones((2, 3)))
-    monkeypatch.setattr(quick_tracing, "quick", False)
-    with pytest.raises(AttributeError):
-        jax.make_jaxpr(lambda x, y: fn(x, y))(jnp.ones(3), jnp.ones(3))
+    args = np.ones((2, 4, 3), np.float32)
+    for f in (fn, jax.vmap(fn), jax.vmap(jax.vmap(fn))):
+        jax.make_jaxpr(f)(args, args)
+    monkeypatch.setattr(quick_tracing, "enabled", False)
+    for f in functions:
+        with pytest.raises(AttributeError, match="has no attribute"):
+            jax.make_jaxpr(lambda x, f=f: f(x, x))(args)
+
+
+def test_messages_name_the_line_of_the_operator():
+    from jax._src import source_info_util
+
+    jaxpr = jax.make_jaxpr(lambda x: x[0] * 2)(np.ones(3, np.float32))
+    lines = [source_info_util.summarize(eqn.source_info) for eqn in jaxpr.eqns]
+    assert all(line.startswith(__file__) for line in lines), lines
