@@ -6,9 +6,11 @@ PINS ?=
 # Processes that run tests, which together take up to 0.7 of the memory.
 WORKERS ?= 2
 RUN = $(VENV)/bin/python
+# One worker runs all tests of a file, which share simulations.
+PYTEST = $(RUN) -m pytest -n $(WORKERS) --dist loadfile
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 
-.PHONY: demo test test-fast check docs format benchmark clean
+.PHONY: demo test test-fast test-all test-gpu check docs format benchmark clean
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -19,19 +21,20 @@ $(VENV)/installed: pyproject.toml
 demo: $(VENV)/installed
 	$(RUN) -m crazysim demo
 
+# All tests that are not marked slow; TESTS=tests/control for a part.
 test: $(VENV)/installed
-	$(RUN) -m pytest -n $(WORKERS) --dist loadgroup --no-loadscope-reorder $(TESTS)
-
-# Physics, control, geometry, data, and the engine on its interpreter: what compiles little.
-FAST = $(addprefix tests/control/test_,allocation.py attitude.py flat_state.py flatness.py setpoint.py state.py) \
-  tests/dynamics tests/drones $(addprefix tests/geometry/test_,heightfield.py manifold.py rays.py shapes.py) \
-  $(addprefix tests/core/test_,data.py pipeline.py random.py functional.py) $(addprefix tests/engine/test_,ir.py \
-  simplify.py passes.py interpret.py rules.py symbolic.py plan.py) tests/envs/test_task.py tests/envs/test_actions.py \
-  tests/laws/test_law_03_functional_core.py tests/laws/test_law_09_wrong_input.py tests/test_jaxcompat.py \
-  tests/test_pytree.py tests/test_rotation.py tests/test_prose.py tests/test_package.py
+	$(PYTEST) -m "not slow" $(TESTS)
 
 test-fast: $(VENV)/installed
-	$(RUN) -m pytest -n $(WORKERS) --dist loadgroup --no-loadscope-reorder $(FAST)
+	$(PYTEST) -m fast $(TESTS)
+
+# The slow ones too, and new examples for the tests of properties.
+test-all: $(VENV)/installed
+	CRAZYSIM_HYPOTHESIS=explore $(PYTEST) $(TESTS)
+
+# On a machine with an NVIDIA GPU, which the workers share; PINS="jax[cuda12]" installs JAX for it.
+test-gpu: $(VENV)/installed
+	XLA_FLAGS=--xla_backend_optimization_level=3 $(PYTEST) --dist worksteal tests/gpu
 
 check: $(VENV)/installed
 	$(VENV)/bin/ruff format --check .
@@ -48,6 +51,7 @@ format: $(VENV)/installed
 	$(VENV)/bin/ruff check --fix .
 
 benchmark: $(VENV)/installed
+	$(RUN) benchmarks/loop.py
 	$(RUN) benchmarks/step.py
 	$(RUN) benchmarks/compile.py
 	$(RUN) benchmarks/limits.py

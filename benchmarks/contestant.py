@@ -57,8 +57,50 @@ def build(package: str, task: str, case: dict[str, Any], device: str) -> Any:
         return Question(package, task, case, device)
     settings = dict(case)
     n_steps = settings.pop("n_steps")
+    if package == "crazysim":
+        settings["controller"] = "crazyflow"  # the same flights in both
     sim = importlib.import_module(f"{package}.sim").Sim(**settings, device=device)
+    if task == "loop":
+        return Loop(sim, case["control"], n_steps)
     return Gradient(package, sim, n_steps) if task == "gradient" else Flight(sim, case["control"], n_steps, device)
+
+
+class Loop:
+    """The loop of every script: a command from NumPy, some steps, the positions into NumPy."""
+
+    def __init__(self, sim: Any, control: str, n_steps: int, iterations: int = 50):
+        """Fly it once, which compiles it."""
+        import numpy as np
+        from measure import hovering
+
+        hovering(sim, control)
+        self._sim, self._start, self._n_steps, self._iterations = sim, sim.data, n_steps, iterations
+        self._send = getattr(sim, f"{control}_control")
+        self._command = np.array(getattr(sim.data.controls, control).staged_cmd)
+        self.first_s = self.seconds()
+
+    def seconds(self) -> float:
+        """Return the time of one iteration, s."""
+        import numpy as np
+
+        self._sim.data = self._start
+        begin = time.perf_counter()
+        for _ in range(self._iterations):
+            self._send(self._command)
+            self._sim.step(self._n_steps)
+            np.asarray(self._sim.data.states.pos)
+        return (time.perf_counter() - begin) / self._iterations
+
+    def require_flying(self) -> None:
+        """Check that the drones are still flying.
+
+        Raises:
+            SystemExit: If they are not.
+        """
+        from measure import still_flies
+
+        if not still_flies(self._sim):
+            raise SystemExit("a drone has crashed; no figure")
 
 
 class Gradient:

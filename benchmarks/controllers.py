@@ -1,14 +1,17 @@
-"""Controllers compared on the same flights: tracking, disturbance and cost, one line each.
+"""Controllers compared on the same flights: one line for each controller and airframe, one for its cost.
 
-    python benchmarks/controllers.py [--device gpu] [--drone cf21B_500] [--controllers geometric indi ...] [--speed 2]
+    python benchmarks/controllers.py [--controllers auto indi ...] [--drones cf21B_500 my_drone.toml ...] [--speed 2]
 
-- tracking_rms: figure eight of 2 m, 2 m/s in its middle, from a matching start, RMS distance over 9 s, m
-- from_rest_rms: the same from hover at its middle, over the last 6 of 9 s, m
-- pushed: hover under a sideways force of a tenth of the weight from 2 s on, distance at its largest and after 8 s, m
+- hover: from the floor to a height of 1 m, distance from the setpoint after 5 s, m
+- tracking: figure eight of 2 m, ``--speed`` in its middle, from a matching start, RMS distance over 9 s, m
+- pushed: hover under a sideways force of a tenth of the weight from 2 s on, distance 5 s later, and its largest, m
+- heavier: hover with 20% more mass from 0 s on, distance after 5 s, m
+- home: part of random attitudes at 5 rad/s that are within 0.1 m of their setpoint after 15 s
+- lost_178: height lost from rest at a roll of 178 degrees, m
 - steps_per_s: physics steps of many worlds that hover, in calls of 100 steps; without, with --worlds 0
 
-load_lqr carries 0.2 kg on a rod of 0.4 m; its distances are those of the load. It needs a drone that lifts that, such
-as bumblebee.
+Without --drones these are all built-in airframes with rotors, and three made of plain physics (``OWN``). A controller
+that lacks numbers of an airframe is left out for it. ``tracking_lqr`` is only measured on the figure eight.
 """
 
 from __future__ import annotations
@@ -21,118 +24,199 @@ import jax.numpy as jnp
 import numpy as np
 from measure import digits, engine_of, medians, report, seconds
 
-from crazysim import Sim, SlungLoad
-from crazysim.control import LoadLQR, TrackingLQR
-from crazysim.dynamics import first_principles
-from crazysim.trajectories import Follow, figure_eight, hover
+from crazysim import Sim, load_airframe
+from crazysim.control import TrackingLQR
+from crazysim.core import functional as F
+from crazysim.drones import Airframe
+from crazysim.dynamics.models import supported_drones
+from crazysim.envs.actions import hover_rotors
+from crazysim.errors import ConfigError
+from crazysim.trajectories import figure_eight
 
-CONTROLLERS = ("crazyflow", "mellinger", "pid", "geometric", "lqr", "tracking_lqr", "indi")
-LOAD_MASS, LENGTH = 0.2, 0.4
-"""Mass of the load of load_lqr, kg, and length of its rod, m."""
+CONTROLLERS = ("auto", "crazyflow", "mellinger", "pid", "geometric", "lqr", "tracking_lqr", "indi")
 KNOTS = 0.15
 """Time between gains of tracking_lqr, s; 60 of them last 9 s."""
+HIGH = 100.0
+"""Height of the flights that may fall, m."""
+TAKE_OFF, TRACKING, PUSHED, HEAVIER, INVERTED, TUMBLING = range(6)
+"""Worlds of the flights; the last is the first of many."""
+
+
+def own_airframe(
+    name: str, mass: float, radius: float, n: int, inertia: list[float], thrust_max: float, rpm: float, lag: float
+) -> Airframe:
+    """Return an airframe of plain physics: rotors on a circle that hover at a speed, and nothing about controllers."""
+    angles = 2 * np.pi * (np.arange(n) + 0.5) / n
+    k2 = mass * 9.81 / n / rpm**2
+    return load_airframe(
+        {
+            "name": name,
+            "rigid_body": {"mass": mass, "inertia": inertia},
+            "rotors": {
+                "position": np.stack([radius * np.cos(angles), radius * np.sin(angles), 0 * angles], -1).tolist(),
+                "yaw_torque_sign": [1, -1] * (n // 2),
+                "thrust_min": 0.02 * thrust_max,
+                "thrust_max": thrust_max,
+                "inertia": 1e-3 * inertia[2],
+                "thrust_curve": [0.0, 0.0, k2],
+                "torque_curve": [0.0, 0.0, 0.015 * k2],
+                "lag": [lag, 0.0, 0.7 * lag, 0.0],
+            },
+            "drag": {"coefficients": [-0.15 * mass] * 3},
+        }
+    )
+
+
+def own_airframes() -> list[Airframe]:
+    """Return a quadrotor with propellers of 3 inches, one of 5 inches, and a hexarotor."""
+    return [
+        own_airframe("quad_3_inch", 0.25, 0.07, 4, [2.5e-4, 2.5e-4, 4.2e-4], 2.2, 15e3, 30.0),
+        own_airframe("quad_5_inch", 1.2, 0.12, 4, [5e-3, 5e-3, 9e-3], 12.0, 11e3, 20.0),
+        own_airframe("hexa", 4.0, 0.35, 6, [0.08, 0.08, 0.14], 16.0, 5.5e3, 10.0),
+    ]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--drone", default="cf21B_500")
+    parser.add_argument("--drones", nargs="+", help="airframes; by default all with rotors and three of plain physics")
+    parser.add_argument("--dynamics", default="first_principles", help="dynamics model; fitted ones take auto alone")
     parser.add_argument("--controllers", nargs="+", default=CONTROLLERS)
     parser.add_argument("--speed", type=float, default=2.0, help="largest speed along the figure eight, m/s")
+    parser.add_argument("--attitudes", type=int, default=100, help="random attitudes of each airframe")
     parser.add_argument("--worlds", type=int, default=16384, help="worlds of the measurement of cost; 0 for none")
     parser.add_argument("--repeats", type=int, default=7)
     args = parser.parse_args()
+    names = args.drones or supported_drones(args.dynamics)
+    has_rotors = args.dynamics == "first_principles"
+    airframes = [load_airframe(name) for name in names] + (own_airframes() if has_rotors and not args.drones else [])
     for name in args.controllers:
-        compare(name, args)
+        able = [airframe for airframe in airframes if is_able(name, airframe, args.dynamics)]
+        if able:
+            rows = fly(name, able, args.speed, args.attitudes, args.dynamics, args.device)
+            for drone, row in rows.items():
+                row = {key: digits(value) for key, value in row.items()}
+                report(args.device, benchmark="controllers", controller=name, drone=drone, speed=args.speed, **row)
+    if args.worlds:
+        cost(args)
 
 
-def compare(name: str, args: argparse.Namespace) -> None:
-    """Print the line of one controller."""
-    eight = figure_eight(2.0, 1.0, speed=args.speed, height=1.0)
-    flown = distances(flight(name, args, eight, moving=True), 9.0)
-    settled = distances(flight(name, args, eight, moving=False), 9.0)[1500:]
-    pushed = distances(flight(name, args, hover([0, 0, 1.0]), moving=False), 10.0, 0.1)
-    report(
-        args.device,
-        benchmark="controllers",
-        controller=name,
-        drone=args.drone,
-        speed=args.speed,
-        tracking_rms=digits(rms(flown)),
-        from_rest_rms=digits(rms(settled)),
-        pushed_largest=digits(float(pushed[1000:].max())),
-        pushed_after=digits(float(pushed[-1])),
-        **(cost(name, args) if args.worlds else {}),
-    )
+def is_able(name: str, airframe: Airframe, dynamics: str) -> bool:
+    """Return True if an airframe has the numbers that a controller needs."""
+    try:
+        Sim(drone=airframe, dynamics=dynamics, control="state", controller=controller_of(name))
+    except ConfigError:
+        return False
+    return True
 
 
-def cost(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Return the rate of steps of many worlds that hover, and the engine."""
-    sim = flight(name, args, hover([0, 0, 1.0]), moving=False, n_worlds=args.worlds)
-
-    def steps() -> Any:
-        sim.step(100)
-        return sim.data.states.pos
-
-    seconds(steps)
-    duration = medians({"steps": lambda: seconds(steps)}, args.repeats)["steps"]
-    return {"n_worlds": args.worlds, "engine": engine_of(sim), "steps_per_s": digits(args.worlds * 100 / duration)}
-
-
-def controller_of(name: str, trajectory: Any) -> Any:
-    """Return the argument ``controller`` of a simulation that follows a trajectory."""
-    if name == "load_lqr":
-        return LoadLQR(load_mass=LOAD_MASS, length=LENGTH)
+def controller_of(name: str, speed: float = 2.0) -> Any:
+    """Return the argument ``controller`` of a simulation."""
     if name == "tracking_lqr":
-        return TrackingLQR(jax.vmap(trajectory.evaluate)(KNOTS * np.arange(60, dtype=np.float32)), dt=KNOTS)
+        eight = figure_eight(2.0, 1.0, speed=speed, height=1.0)
+        return TrackingLQR(jax.vmap(eight.evaluate)(KNOTS * np.arange(60, dtype=np.float32)), dt=KNOTS)
     return name
 
 
-def flight(name: str, args: argparse.Namespace, trajectory: Any, moving: bool, n_worlds: int = 1) -> Sim:
-    """Return a simulation that follows a trajectory, from its first point, with its velocity or at rest."""
-    controller = controller_of(name, trajectory)
-    sim = Sim(n_worlds, drone=args.drone, control="state", controller=controller, device=args.device)
-    sim.add(Follow(trajectory, visible=False))
-    start, s = trajectory.evaluate(jnp.float32(0)), sim.data.states
-    rotors = first_principles.hover_rotor_vel(sim.data.params)
-    above = jnp.array([0, 0, LENGTH if name == "load_lqr" else 0.0])
-    new = {"pos": start.pos + above, "rotor_vel": rotors} | ({"vel": start.vel} if moving else {})
-    placed = {key: jnp.broadcast_to(jnp.asarray(x), getattr(s, key).shape) for key, x in new.items()}
-    sim.data = sim.data.replace(states=s.replace(**placed))
-    if name == "load_lqr":
-        sim.add(SlungLoad(mass=LOAD_MASS, length=LENGTH))
-    return sim
+def fly(
+    name: str,
+    airframes: list[Airframe],
+    speed: float,
+    n: int,
+    dynamics: str = "first_principles",
+    device: str = "cpu",
+) -> dict[str, dict[str, float]]:
+    """Return the figures of a controller for each airframe; all fly at once, one drone each in every world."""
+    worlds, drones = TUMBLING + n, len(airframes)
+    controller = controller_of(name, speed)
+    sim = Sim(worlds, drone=airframes, dynamics=dynamics, control="state", controller=controller, device=device)
+    eight, s, params = figure_eight(2.0, 1.0, speed=speed, height=1.0), sim.data.states, sim.data.params
+    start, rng = eight.evaluate(jnp.float32(0)), np.random.default_rng(0)
+
+    pos, vel, quat, ang_vel = (np.array(x) for x in (s.pos, s.vel, s.quat, s.ang_vel))
+    rotor_vel = np.array(np.broadcast_to(hover_rotors(params), s.rotor_vel.shape))
+    pos[:], rotor_vel[TAKE_OFF] = [0, 0, 1], 0
+    pos[TAKE_OFF, :, 2], pos[INVERTED:, :, 2] = 0, HIGH
+    pos[TRACKING], vel[TRACKING] = start.pos, start.vel
+    quat[INVERTED] = [np.sin(np.radians(89)), 0, 0, np.cos(np.radians(89))]
+    quat[TUMBLING:], ang_vel[TUMBLING:] = rng.normal(size=(n, drones, 4)), rng.normal(size=(n, drones, 3))
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    ang_vel[TUMBLING:] *= 5 / np.linalg.norm(ang_vel[TUMBLING:], axis=-1, keepdims=True)
+    mass = np.array(np.broadcast_to(params.mass, (worlds, drones, 1)))
+    force = np.zeros((worlds, drones, 3))
+    force[PUSHED, :, 0] = 0.1 * 9.81 * mass[PUSHED, :, 0]
+    mass[HEAVIER] *= 1.2
+
+    as_data = lambda x: jnp.asarray(x, s.pos.dtype)  # noqa: E731
+    states = s.replace(pos=as_data(pos), vel=as_data(vel), quat=as_data(quat), ang_vel=as_data(ang_vel))
+    sim.data = sim.data.replace(
+        states=states.replace(rotor_vel=as_data(rotor_vel)), params=params.replace(mass=as_data(mass))
+    )
+    target = np.array(np.broadcast_to([0, 0, 1.0], pos.shape))
+    target[INVERTED:, :, 2] = HIGH
+    flown, wanted = positions(sim, eight, target, as_data(force))
+    return {airframe.name: figures(flown[:, :, k], wanted, name) for k, airframe in enumerate(airframes)}
 
 
-def distances(sim: Sim, duration: float, push: float = 0.0) -> np.ndarray:
-    """Return the distance from the setpoint after every step, m; under a force of ``push`` weights from 2 s on."""
-    step, follow = sim.build_step_fn(), sim.plugins["follow"]
-    weight = float(sim.airframe.value("rigid_body.mass", ())) * 9.81
-    data, zeros = sim.data, step.zeros(sim.data)
+def positions(sim: Sim, eight: Any, target: np.ndarray, force: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions of all drones after each step of 15 s, m, and those of the figure eight."""
+    step, feeds = sim.build_step_fn(), sim.data.controls.controller is not None
+    zeros, command = step.zeros(sim.data), np.zeros((*target.shape[:2], 16), np.float32)
+    command[..., :3], command[..., 12] = target, 1
 
-    def fly(data: Any, force: jax.Array, n: int) -> Any:
-        s = data.states
-        data = data.replace(states=s.replace(force=jnp.broadcast_to(force, s.force.shape)))
+    def one(data: Any, k: jax.Array) -> Any:
+        setpoint = eight.evaluate(k / sim.freq)
+        feedforward = jnp.zeros((*target.shape[:2], 8)).at[TRACKING].set(setpoint.feedforward())
+        everybody = jnp.asarray(command).at[TRACKING].set(setpoint.command())
+        data = F.state_control(data, everybody, feedforward=feedforward if feeds else None)
+        data = data.replace(states=data.states.replace(force=jnp.where(k < 2 * sim.freq, 0.0, force)))
+        data = step(data, 1, zeros)
+        return data, (data.states.pos, eight.evaluate((k + 1) / sim.freq).pos)
 
-        def one(data: Any, _: Any) -> Any:
-            data = step(data, 1, zeros)
-            t = data.core.steps[0, 0] / data.core.freq
-            target = follow.read(data).trajectories.evaluate_one(0, t).pos
-            carried = data.plugins.get("load", data.states)
-            return data, jnp.linalg.norm(carried.pos[0, 0] - target)
-
-        return jax.lax.scan(one, data, length=n)
-
-    fly = jax.jit(fly, static_argnums=2)
-    n_free = round(2.0 * sim.freq)
-    data, first = fly(data, jnp.zeros(3), n_free)
-    _, second = fly(data, jnp.array([push * weight, 0.0, 0.0]), round(duration * sim.freq) - n_free)
-    return np.concatenate([first, second])
+    steps = jnp.arange(15 * sim.freq)
+    _, (flown, wanted) = jax.jit(lambda data: jax.lax.scan(one, data, steps))(sim.data)
+    return np.asarray(flown), np.asarray(wanted)
 
 
-def rms(x: np.ndarray) -> float:
-    """Return the root of the mean square."""
-    return float(np.sqrt(np.mean(np.square(x))))
+def figures(pos: np.ndarray, eight: np.ndarray, name: str) -> dict[str, float]:
+    """Return the figures of one airframe from its positions. (n_steps, n_worlds, 3)"""
+    per_s, home = len(pos) // 15, np.array([0, 0, 1.0])
+    off = np.linalg.norm(pos - home, axis=-1)
+    found = {"tracking": float(np.sqrt(np.mean(np.sum((pos[:, TRACKING] - eight)[: 9 * per_s] ** 2, axis=-1))))}
+    if name == "tracking_lqr":
+        return found
+    return {
+        "hover": float(off[5 * per_s, TAKE_OFF]),
+        **found,
+        "pushed": float(off[7 * per_s, PUSHED]),
+        "pushed_largest": float(off[:, PUSHED].max()),
+        "heavier": float(off[5 * per_s, HEAVIER]),
+        "home": float(np.mean(np.linalg.norm(pos[-1, TUMBLING:] - [0, 0, HIGH], axis=-1) < 0.1)),
+        "lost_178": float(HIGH - pos[:, INVERTED, 2].min()),
+    }
+
+
+def cost(args: argparse.Namespace) -> None:
+    """Print the rates of steps of many worlds that hover, measured in turns."""
+
+    def steps_of(sim: Sim) -> Any:
+        def steps() -> Any:
+            sim.step(100)
+            return sim.data.states.pos
+
+        seconds(steps)
+        return lambda: seconds(steps)
+
+    command = np.zeros((args.worlds, 1, 16), np.float32)
+    command[..., 2], command[..., 12] = 1, 1
+    sims = {}
+    for name in args.controllers:
+        sims[name] = Sim(args.worlds, control="state", controller=controller_of(name), device=args.device)
+        sims[name].state_control(command)
+    for name, duration in medians({name: steps_of(sim) for name, sim in sims.items()}, args.repeats).items():
+        rate, engine = args.worlds * 100 / duration, engine_of(sims[name])
+        line = {"n_worlds": args.worlds, "engine": engine, "steps_per_s": digits(rate)}
+        report(args.device, benchmark="controllers", controller=name, **line)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import numpy as np
 from measure import Flight, digits, engine_of, medians, report
 
 from crazysim import Sim, __version__
-from crazysim.vehicles import Cars
+from crazysim.plugins.vehicles import Cars
 
 LEVELS = ("state", "attitude", "body_rate", "force_torque")
 PAIR = ("cf21B_500", "cf2x_L250")

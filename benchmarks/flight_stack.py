@@ -23,8 +23,9 @@ import numpy as np
 from measure import Flight, digits, engine_of, medians, report
 
 from crazysim import Sim, SlungLoad
-from crazysim.engine.program import Segment
-from crazysim.trajectories import Follow, Trajectory, figure_eight
+from crazysim.engine.ir.program import Segment
+from crazysim.plugins.follow import Follow
+from crazysim.trajectories import Trajectory, figure_eight
 
 N_STEPS = 100
 """Steps per call."""
@@ -69,6 +70,7 @@ def main() -> None:
 def fly(args: argparse.Namespace, name: str) -> Flight:
     """Return the compiled flight of a case."""
     reference, settings, add = CASES[name]
+    settings = {"controller": "crazyflow", **settings}
     sim = Sim(args.worlds, device=args.device, engine=args.engine, **settings)
     if add is not None:
         add(sim)

@@ -24,9 +24,10 @@ from measure import Flight, digits, engine_of, medians, report, seconds
 
 from crazysim import PyTree, Sim, __version__, leaf
 from crazysim.core.stage import stage
-from crazysim.engine import ENGINES, fused
-from crazysim.engine.ir import Block, Operation, Value
-from crazysim.engine.ops import TABLE
+from crazysim.engine import ENGINES
+from crazysim.engine.backends import fused
+from crazysim.engine.ir.blocks import Block, Operation, Value
+from crazysim.engine.ir.ops import TABLE
 
 BIG = {"cpu": 2**26, "gpu": 2**28}
 """Number of float32 in the copy that measures the bandwidth, larger than any cache."""
@@ -73,7 +74,9 @@ def measure(
     args: argparse.Namespace, machine: Machine, control: str, integrator: str, n_worlds: int, n_steps: int, engine: str
 ) -> None:
     """Print lower bound and measured time of one case."""
-    sim = Sim(n_worlds, control=control, integrator=integrator, device=args.device, engine=engine)
+    sim = Sim(
+        n_worlds, control=control, integrator=integrator, controller="crazyflow", device=args.device, engine=engine
+    )
     flight = Flight(sim, control, n_steps, args.device)
     measured = medians({"step": flight.seconds}, args.repeats)["step"]
     flight.require_flying()
@@ -107,7 +110,7 @@ def work(sim: Sim) -> tuple[float, float, int]:
     Raises:
         SystemExit: If a stage is not part of the program, so that its operations cannot be counted.
     """
-    one = Sim(1, control=sim.control, integrator=sim.integrator, engine="lanes")
+    one = Sim(1, control=sim.control, integrator=sim.integrator, controller="crazyflow", engine="lanes")
     program = one.build_step_fn().plan(one.data).program
     assert program is not None
     if program.unfused_stages:

@@ -77,7 +77,7 @@ def powers_of_4(most: int) -> list[int]:
 
 def measure(case: dict[str, Any], n_steps: int, device: str, repeats: int) -> dict[str, Any]:
     """Return the results of one case."""
-    sim = Sim(**case, device=device)
+    sim = Sim(**case, device=device, controller="crazyflow")
     flight = Flight(sim, case["control"], n_steps, device)
     taken = medians({"step": flight.seconds}, repeats)["step"]
     flight.require_flying()

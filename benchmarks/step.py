@@ -67,7 +67,15 @@ def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: i
 
 def build(args: argparse.Namespace, engine: str, control: str, integrator: str, n_worlds: int, n_drones: int) -> Sim:
     """Return the simulation given by the options."""
-    sim = Sim(n_worlds, n_drones, control=control, integrator=integrator, device=args.device, engine=engine)
+    sim = Sim(
+        n_worlds,
+        n_drones,
+        control=control,
+        integrator=integrator,
+        controller="crazyflow",
+        device=args.device,
+        engine=engine,
+    )
     if args.no_drag:
         params = sim.data.params
         sim.data = sim.data.replace(params=params.replace(drag_matrix=jnp.zeros_like(params.drag_matrix)))

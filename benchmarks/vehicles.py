@@ -15,8 +15,8 @@ import numpy as np
 from measure import digits, engine_of, medians, report, seconds
 
 from crazysim import Sim
+from crazysim.plugins.vehicles import Cars, PathLQR, PurePursuit, Stanley
 from crazysim.trajectories import circle
-from crazysim.vehicles import Cars, PathLQR, PurePursuit, Stanley
 
 WORLDS = {"cpu": 16384, "gpu": 1048576}
 CASES: dict[str, dict[str, Any]] = {

@@ -5,6 +5,7 @@ machine affects both. Medians and the ratios of medians are printed. The cases:
 
     first_step  from Sim(n_worlds=1) to its first step, in fresh processes
     step        100 physics steps per call, for each command level, integrator and number of worlds
+    loop        a command from NumPy, 5 steps, the positions into NumPy, for attitude and state commands
     call        one step(1) of one world, for each command level
     gradient    of 100 attitude steps with respect to their commands, 1,024 worlds
     swarm       64 drones in 1,024 worlds compared with as many single drones, crazysim only
@@ -37,7 +38,7 @@ from measure import digits, medians
 
 HERE = Path(__file__).parent
 PEER = HERE.parent / ".cache" / "crazyflow"
-CASES = ("first_step", "step", "call", "gradient", "swarm", "contacts", "depth", "swarm_build", "gym", "memory")
+CASES = ("first_step", "step", "loop", "call", "gradient", "swarm", "contacts", "depth", "swarm_build", "gym", "memory")
 LEVELS = ("rotor_vel", "force_torque", "body_rate", "attitude", "state")
 
 
@@ -47,6 +48,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engine", nargs="+", default=["auto"], help="engines of crazysim")
     parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384], help="values for 'step'")
+    parser.add_argument("--loop-worlds", type=int, nargs="+", default=[1, 64, 1024, 16384], help="values for 'loop'")
     parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"], help="values for 'step'")
     parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"], help="values for 'step'")
     parser.add_argument("--batch-worlds", type=int, default=1024, help="worlds of 'gradient' and 'swarm'")
@@ -67,6 +69,9 @@ def main() -> None:
     if "step" in args.only:
         for control, integrator, n_worlds in itertools.product(args.controls, args.integrators, args.worlds):
             versus.compare("step", control=control, integrator=integrator, n_worlds=n_worlds, n_steps=100)
+    if "loop" in args.only:
+        for control, n_worlds in itertools.product(("attitude", "state"), args.loop_worlds):
+            versus.compare("loop", control=control, integrator="euler", n_worlds=n_worlds, n_steps=5)
     if "call" in args.only:
         for control in LEVELS:
             versus.compare("call", control=control, integrator="euler", n_worlds=1, n_steps=1)

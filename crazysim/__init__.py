@@ -2,6 +2,10 @@
 
 from typing import TYPE_CHECKING
 
+import crazysim.surroundings  # noqa: F401 - before JAX and MuJoCo
+
+# isort: split
+from crazysim.cache import enable_cache
 from crazysim.control import Control, Controller
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
@@ -11,26 +15,27 @@ from crazysim.core.population import Population
 from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
-from crazysim.effects import Battery, Downwash, GroundEffect, Latency, MotorFailure, Wind, WindField
 from crazysim.errors import ConfigError
 from crazysim.lazy import lazy
+from crazysim.plugins.effects import Battery, Downwash, GroundEffect, Latency, MotorFailure, Wind, WindField
 from crazysim.pytree import Members, PyTree, leaf, static
 from crazysim.sim.sim import Sim
 from crazysim.version import __version__
 
 if TYPE_CHECKING:
-    from crazysim.bodies import DroneCollisions, FreeBodies
     from crazysim.core import functional as functional
     from crazysim.envs import make
-    from crazysim.payloads import Hook, RotorJet, SharedLoad, SlungLoad
-    from crazysim.scene.contact_log import ContactLog
-    from crazysim.scene.radar import Radar
-    from crazysim.scene.range_finder import RangeFinder
-    from crazysim.scene.response import ContactResponse
-    from crazysim.scene.terrain import Terrain
+    from crazysim.plugins.bodies import FreeBodies
+    from crazysim.plugins.contacts.contact_log import ContactLog
+    from crazysim.plugins.contacts.drone_collisions import DroneCollisions
+    from crazysim.plugins.contacts.response import ContactResponse
+    from crazysim.plugins.contacts.terrain import Terrain
+    from crazysim.plugins.follow import Follow
+    from crazysim.plugins.payloads import Hook, RotorJet, SharedLoad, SlungLoad
+    from crazysim.plugins.sensors.radar import Radar
+    from crazysim.plugins.sensors.range_finder import RangeFinder
+    from crazysim.plugins.vehicles import Bicycles, Cars
     from crazysim.sim.mppi import MPPI
-    from crazysim.trajectories import Follow
-    from crazysim.vehicles import Bicycles, Cars
 
 __all__ = [
     "MPPI",
@@ -70,6 +75,7 @@ __all__ = [
     "Wind",
     "WindField",
     "__version__",
+    "enable_cache",
     "leaf",
     "load_airframe",
     "make",
@@ -82,21 +88,21 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
-        "Bicycles": "crazysim.vehicles",
-        "Cars": "crazysim.vehicles",
-        "ContactLog": "crazysim.scene.contact_log",
-        "ContactResponse": "crazysim.scene.response",
-        "DroneCollisions": "crazysim.bodies",
-        "Follow": "crazysim.trajectories",
-        "FreeBodies": "crazysim.bodies",
-        "Hook": "crazysim.payloads",
+        "Bicycles": "crazysim.plugins.vehicles",
+        "Cars": "crazysim.plugins.vehicles",
+        "ContactLog": "crazysim.plugins.contacts.contact_log",
+        "ContactResponse": "crazysim.plugins.contacts.response",
+        "DroneCollisions": "crazysim.plugins.contacts.drone_collisions",
+        "Follow": "crazysim.plugins.follow",
+        "FreeBodies": "crazysim.plugins.bodies",
+        "Hook": "crazysim.plugins.payloads",
         "MPPI": "crazysim.sim.mppi",
-        "RotorJet": "crazysim.payloads",
-        "SharedLoad": "crazysim.payloads",
-        "SlungLoad": "crazysim.payloads",
-        "Radar": "crazysim.scene.radar",
-        "RangeFinder": "crazysim.scene.range_finder",
-        "Terrain": "crazysim.scene.terrain",
+        "RotorJet": "crazysim.plugins.payloads",
+        "SharedLoad": "crazysim.plugins.payloads",
+        "SlungLoad": "crazysim.plugins.payloads",
+        "Radar": "crazysim.plugins.sensors.radar",
+        "RangeFinder": "crazysim.plugins.sensors.range_finder",
+        "Terrain": "crazysim.plugins.contacts.terrain",
         "functional": "crazysim.core",
         "make": "crazysim.envs",
     },

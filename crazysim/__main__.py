@@ -10,8 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from crazysim import cache
 from crazysim.demos import DEMOS
-from crazysim.errors import RenderError
+from crazysim.errors import DivergedError, RenderError
 
 
 class DefaultsFormatter(argparse.HelpFormatter):
@@ -78,18 +79,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _add_show(commands)
     _add_live(commands)
     _add_training(commands)
+    _add_airframe(commands)
+    commands.add_parser("info", help="print versions, devices, compiler and caches, for reports of bugs")
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help()
         return 0
+    if options.command != "info":
+        cache.enable_for_command()
     try:
         COMMANDS[options.command](options)
-    except (ValueError, ImportError, RenderError) as error:
-        print(f"crazysim: {error}", file=sys.stderr)
+    except (ValueError, ImportError, DivergedError, RenderError) as error:
+        print(f"crazysim: {_named_extra(error, options.command)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
     return 0
+
+
+def _named_extra(error: Exception, command: str) -> str:
+    """Return the message of an error; that of a missing package says which extra of crazysim brings it."""
+    package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+    if package not in EXTRAS:
+        return str(error)
+    install = f"pip install 'crazysim[{EXTRAS[package]}]'"
+    return f"expected {package}, which 'crazysim {command}' needs, got none. Run {install}."
 
 
 def _add_show(commands: Any) -> None:
@@ -118,7 +132,7 @@ def _add_show(commands: Any) -> None:
     show.add_argument("--fps", type=float, default=25.0, help="frames per second of the film")
     show.add_argument("--drone", help="airframe: a name or the path of a TOML file; by default cf21B_500")
     show.add_argument(
-        "--controller", help="controller that follows the trajectories, such as mellinger; by default crazyflow"
+        "--controller", help="controller that follows the trajectories, such as mellinger; by default auto"
     )
     show.add_argument("--device", default="cpu", help="device: cpu, gpu")
 
@@ -151,9 +165,7 @@ def _add_live(commands: Any) -> None:
     live.add_argument("--gamepad", action="store_true", help="pilot the first drone with a gamepad and the keyboard")
     live.add_argument("--commands", action="store_true", help="listen for commands over TCP, at ports 7000 and 7002")
     live.add_argument("--drone", help="airframe: a name or the path of a TOML file; by default cf21B_500")
-    live.add_argument(
-        "--controller", help="controller that follows the setpoints, such as mellinger; by default crazyflow"
-    )
+    live.add_argument("--controller", help="controller that follows the setpoints, such as mellinger; by default auto")
     live.add_argument("--device", help="device: cpu, gpu; by default cpu")
 
 
@@ -168,9 +180,11 @@ def _add_training(commands: Any) -> None:
     train = commands.add_parser(
         "train", help="train a policy; write checkpoint, learning curve, policy and film", **with_defaults
     )
-    train.add_argument("task", help="name of a task, such as hover; list prints all")
+    train.add_argument(
+        "task", help="name of a task, such as hover, or place of your own, FILE.py:CLASS; list prints all names"
+    )
     train.add_argument("--algorithm", help="ppo or apg; by default that of the task's recipe")
-    train.add_argument("--seed", type=int, default=0, help="random seed")
+    train.add_argument("--seed", type=int, help="random seed; by default 0")
     train.add_argument("--worlds", type=int, help="number of parallel worlds; by default that of the task's recipe")
     train.add_argument(
         "--iterations",
@@ -178,8 +192,12 @@ def _add_training(commands: Any) -> None:
         help="number of rollouts, each with its updates; by default that of the task's recipe",
     )
     train.add_argument("--out", type=Path, help="folder of the run; by default out/TASK")
-    train.add_argument("--resume", action="store_true", help="continue from the checkpoint in that folder")
-    train.add_argument("--device", default="cpu", help="device: cpu, gpu")
+    train.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue from the checkpoint in that folder, with its settings where none are given",
+    )
+    train.add_argument("--device", help="device: cpu, gpu; by default cpu")
     train.add_argument(
         "--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation"
     )
@@ -191,6 +209,10 @@ def _add_training(commands: Any) -> None:
     evaluation.add_argument("folder", type=Path, help="folder of the run")
     evaluation.add_argument("--worlds", type=int, default=1000, help="number of initial states")
     evaluation.add_argument("--seed", type=int, help="seed of other initial states than the held-out ones")
+    evaluation.add_argument("--plot", type=Path, metavar="FILE", help="plot of the terms of the reward to write, .png")
+    evaluation.add_argument(
+        "--task", metavar="FILE.py:CLASS", help="place of a task of your own, if it is not where it was in training"
+    )
     evaluation.add_argument("--device", help="device: cpu, gpu; by default that of the training")
     export = commands.add_parser("export", help="write a trained policy as ONNX or as a C header", **with_defaults)
     export.add_argument("folder", type=Path, help="folder of the run")
@@ -201,6 +223,9 @@ def _add_training(commands: Any) -> None:
     render.add_argument("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
     render.add_argument("--worlds", type=int, default=4, help="number of worlds side by side")
     render.add_argument("--seed", type=int, default=1, help="seed of the initial states")
+    render.add_argument(
+        "--task", metavar="FILE.py:CLASS", help="place of a task of your own, if it is not where it was in training"
+    )
     render.add_argument("--device", help="device: cpu, gpu; by default that of the training")
 
 
@@ -208,6 +233,114 @@ def _demo(options: argparse.Namespace) -> None:
     names = ("n_worlds", "n_drones", "seconds", "device", "out", "film")
     settings = {name: x for name in names if (x := getattr(options, name)) is not None}
     importlib.import_module(f"crazysim.demos.{options.name}").run(**settings)
+
+
+def _add_airframe(commands: Any) -> None:
+    """Add the commands that make and check airframes."""
+    airframe = commands.add_parser("airframe", help="make an airframe of your own from a few numbers, or check one")
+    actions = airframe.add_subparsers(title="actions", metavar="ACTION", dest="action", required=True)
+    new = actions.add_parser(
+        "new",
+        help="estimate an airframe from mass, rotors and thrust; write a TOML file with a source for every number",
+        epilog="example: crazysim airframe new mine.toml --mass 1.2 --arm 0.12 --propeller 0.127 --thrust-to-weight 4",
+        formatter_class=DefaultsFormatter,
+    )
+    new.add_argument("file", type=Path, help=".toml file to write")
+    new.add_argument("--mass", type=float, required=True, metavar="KG", help="mass with the battery")
+    new.add_argument("--propeller", type=float, required=True, metavar="M", help="diameter of the propellers")
+    new.add_argument("--arm", type=float, metavar="M", help="distance of the rotors from the centre")
+    new.add_argument("--rotors", type=int, default=4, dest="n_rotors", metavar="N", help="number of rotors on a circle")
+    new.add_argument("--layout", default="x", choices=("x", "+"), help="nose between two rotors, or on the first rotor")
+    new.add_argument(
+        "--positions",
+        metavar="'X,Y ...'",
+        help="rotors from the centre of mass, m, instead of --arm: X,Y or X,Y,Z each",
+    )
+    new.add_argument(
+        "--spins",
+        nargs="+",
+        metavar="CCW|CW",
+        help="sense of rotation of each rotor seen from above; by default they alternate from ccw",
+    )
+    new.add_argument("--thrust-to-weight", type=float, metavar="RATIO", help="largest thrust of all rotors over weight")
+    new.add_argument(
+        "--motor-table",
+        type=Path,
+        metavar="FILE",
+        help="data sheet of one motor with its propeller instead of --thrust-to-weight, .csv with columns thrust_g or "
+        "thrust_n, and if known rpm, torque_nm, power_w",
+    )
+    new.add_argument("--pitch", type=float, metavar="M", help="pitch of the propellers; by default half the diameter")
+    new.add_argument("--inertia", type=float, nargs=3, metavar="KGM2", help="moments; by default estimated")
+    new.add_argument("--time-constant", type=float, metavar="S", help="of the rotors; by default estimated")
+    new.add_argument("--cells", type=int, metavar="N", help="battery cells in series; by default estimated")
+    new.add_argument("--capacity", type=float, metavar="AH", help="of the battery, A h; by default estimated")
+    new.add_argument("--resistance", type=float, metavar="OHM", help="of the whole battery; by default estimated")
+    new.add_argument("--name", help="name of the airframe; by default that of the file")
+    check = actions.add_parser(
+        "check", help="print what an airframe can do and what it lacks, and draw it", formatter_class=DefaultsFormatter
+    )
+    check.add_argument("file", help="path of a .toml file, or the name of a built-in airframe")
+    check.add_argument("--picture", type=Path, metavar="FILE", help="picture of the body to write, .png")
+
+
+def _airframe(options: argparse.Namespace) -> None:
+    from crazysim.drones import load_airframe
+
+    if options.action == "check":
+        from crazysim.airframe_check import describe_airframe, draw_airframe
+
+        airframe = load_airframe(options.file)
+        print(describe_airframe(airframe))
+        if options.picture is not None:
+            draw_airframe(airframe, options.picture)
+            print(f"wrote {options.picture}")
+        return
+    _new_airframe(options)
+
+
+def _new_airframe(options: argparse.Namespace) -> None:
+    import tomllib
+
+    from crazysim.drones import estimate_airframe, load_airframe
+
+    path: Path = options.file
+    if path.suffix != ".toml" or not path.parent.is_dir():
+        raise ValueError(f"expected a .toml file in an existing folder, got {str(path)!r}")
+    if path.exists():
+        raise ValueError(f"expected a new file, got {str(path)!r}, which exists; choose another name or remove it")
+    spins = {"ccw": 1, "cw": -1}
+    wrong = [x for x in options.spins or () if x.lower() not in spins]
+    if wrong:
+        raise ValueError(f"expected --spins of ccw and cw, got {wrong[0]!r}")
+    try:
+        places = (options.positions or "").split()
+        positions = [[float(x) for x in f"{place},0".split(",")][:3] for place in places] or None
+    except ValueError:
+        raise ValueError(f"expected --positions such as '0.1,-0.1 0.1,0.1', got {options.positions!r}") from None
+    given = (
+        "mass", "propeller", "arm", "n_rotors", "layout", "thrust_to_weight", "motor_table", "pitch", "inertia",
+        "time_constant", "cells", "capacity", "resistance",
+    )  # fmt: skip
+    numbers = {name: getattr(options, name) for name in given}
+    text = estimate_airframe(
+        **numbers,
+        positions=positions,
+        spins=options.spins and [spins[x.lower()] for x in options.spins],
+        name=options.name or path.stem,
+    )
+    tables = tomllib.loads(text)
+    load_airframe(tables)
+    path.write_text(text, encoding="utf-8")
+    estimates = [key for key, source in tables["sources"].items() if source.startswith("estimate: ")]
+    print(f"wrote {path}; estimated: {', '.join(estimates)}")
+    print(f"next: crazysim airframe check {path} --picture {path.with_suffix('.png')}")
+
+
+def _info(_: argparse.Namespace) -> None:
+    from crazysim.info import info
+
+    print(info())
 
 
 def _replay(options: argparse.Namespace) -> None:
@@ -289,44 +422,49 @@ def _train(options: argparse.Namespace) -> None:
         for name, entry in TASKS.items():
             print(f"{name:12} {(entry.task.__doc__ or '').splitlines()[0]}")
         return
-    from crazysim.train.run import CHECKPOINT, TrainConfig, train
-    from crazysim.train.show import film, plot_curve, read_curve
+    from crazysim.train.runs import run
 
     hyperparameters = _pairs(options.config)
     if options.iterations is not None:
         hyperparameters["iterations"] = options.iterations
-    device = {} if options.device == "cpu" else {"device": options.device}
-    config = TrainConfig.create(
-        options.task, options.algorithm, options.seed, options.worlds, _pairs(options.set) | device, hyperparameters
+    device = {} if options.device is None else {"device": options.device}
+    run(
+        options.task,
+        options.out,
+        resume=options.resume,
+        film=not options.no_film,
+        algorithm=options.algorithm,
+        seed=options.seed,
+        n_worlds=options.worlds,
+        options=_pairs(options.set) | device,
+        config=hyperparameters,
     )
-    folder = options.out or Path("out") / options.task
-    result = train(config, folder, options.resume)
-    print(f"wrote {folder / CHECKPOINT}, {folder / 'policy.npz'}")
-    try:
-        plot_curve({options.task: read_curve(folder)}, folder / "curve.png")
-        print(f"wrote {folder / 'curve.png'}")
-        if not options.no_film:
-            film(config.make_env(4), result.policy, folder / "policy.mp4", progress=True)
-            print(f"wrote {folder / 'policy.mp4'}")
-    except (ImportError, RenderError) as error:
-        print(f"no curve or film: {error}")
 
 
 def _evaluate(options: argparse.Namespace) -> None:
     import jax
 
-    from crazysim.train.evaluate import evaluate
-    from crazysim.train.run import load_policy
+    from crazysim.train.evaluation import TERM, evaluate, outcome
+    from crazysim.train.show import plot_episode
+    from crazysim.train.training import load_policy
 
-    policy, config, _ = load_policy(options.folder)
+    policy, config, _ = load_policy(options.folder, options.task)
     env = config.with_device(options.device).make_env(options.worlds)
-    metrics = evaluate(env, policy, None if options.seed is None else jax.random.key(options.seed))
-    print(f"{config.task}, {options.worlds:,} starts: " + ", ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
+    key = None if options.seed is None else jax.random.key(options.seed)
+    metrics = evaluate(env, policy, key)
+    terms = ", ".join(f"{k.removeprefix(TERM)} {x:.4g}" for k, x in metrics.items() if k.startswith(TERM))
+    print(
+        f"{config.title}, {options.worlds:,} starts: success {metrics['success']:.1%}, "
+        f"{outcome(metrics, env.task.unit)}, mean return {metrics['reward']:.4g} ({terms})"
+    )
+    if options.plot is not None:
+        plot_episode(env, policy, options.plot, key)
+        print(f"wrote {options.plot}")
 
 
 def _export(options: argparse.Namespace) -> None:
     from crazysim.train.export import to_c, to_onnx
-    from crazysim.train.run import load_policy
+    from crazysim.train.training import load_policy
 
     if options.onnx is None and options.c is None:
         raise ValueError("expected a file to write, got none; use --onnx FILE, --c FILE, or both")
@@ -338,15 +476,19 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    from crazysim.train.run import load_policy
     from crazysim.train.show import film
+    from crazysim.train.training import load_policy
 
-    policy, config, _ = load_policy(options.folder)
+    policy, config, _ = load_policy(options.folder, options.task)
     path = options.film or options.folder / "policy.mp4"
     env = config.with_device(options.device).make_env(options.worlds)
     film(env, policy, path, options.worlds, options.seed, progress=True)
     print(f"wrote {path}")
 
+
+EXTRAS = {"optax": "train", "matplotlib": "demo", "imageio_ffmpeg": "demo", "tqdm": "demo", "viser": "web",
+          "websockets": "web", "onnx": "onnx", "motioncapture": "mocap", "cflib": "radio"}  # fmt: skip
+"""Extra of crazysim that brings a package."""
 
 COMMANDS = {
     "demo": _demo,
@@ -357,6 +499,8 @@ COMMANDS = {
     "evaluate": _evaluate,
     "export": _export,
     "render": _render,
+    "airframe": _airframe,
+    "info": _info,
 }
 """Functions that run the commands."""
 

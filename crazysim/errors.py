@@ -2,7 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
+
+LONGEST = 60
+"""Most characters of a value in a message."""
+
+
+def shown(value: Any) -> str:
+    """Return a value for a message, at most ``LONGEST`` characters of it."""
+    try:
+        text = repr(value) if not isinstance(value, (list, dict)) or len(value) < LONGEST else _kind(value)
+    except RecursionError:
+        text = _kind(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def _kind(value: Any) -> str:
+    return f"a {type(value).__name__}"
 
 
 class ConfigError(ValueError):
@@ -15,6 +33,14 @@ class UnknownNameError(ConfigError, KeyError):
     def __str__(self) -> str:
         """Return the message itself; ``KeyError`` would show its quoted form."""
         return str(self.args[0])
+
+
+class DamagedFileError(ConfigError):
+    """A file that is damaged, cut off, or of another kind than expected."""
+
+
+class DivergedError(RuntimeError):
+    """A training whose weights or losses became non-finite."""
 
 
 class RenderError(RuntimeError):

@@ -12,11 +12,11 @@ import numpy as np
 from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, as_stages
-from crazysim.engine import symbolic
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.lower_stages import lower_stages
-from crazysim.engine.passes import fuse
-from crazysim.engine.program import Program, Slot, UnfusedStage
+from crazysim.engine.ir.program import Program, Slot, UnfusedStage
+from crazysim.engine.lowering.stages import lower_stages
+from crazysim.engine.passes.schedule import fuse
+from crazysim.engine.tools import symbolic
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.jaxcompat import is_key
 

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
 import jaxlib
+import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
-from jax.experimental.layout import Layout, with_layout_constraint
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
 from jax.extend.random import threefry2x32_p, threefry_prng_impl
 from jax.interpreters import batching, mlir
+from jaxlib.xla_client import batched_device_put
 
 from crazysim.errors import UnsupportedError
 
@@ -28,6 +30,7 @@ __all__ = [
     "ClosedJaxpr",
     "Equation",
     "Jaxpr",
+    "JaxprEqn",
     "Literal",
     "Parameters",
     "as_function",
@@ -46,13 +49,14 @@ __all__ = [
     "is_symbolic_zero",
     "jaxpr_as_fun",
     "n_compilations",
+    "primitive_by_platform",
+    "put_own",
     "reading",
     "register_host_target",
     "threefry2x32_p",
     "threefry_prng_impl",
     "versions",
     "with_inputs",
-    "with_major_to_minor",
     "without_constants",
 ]
 
@@ -158,6 +162,30 @@ def batched_primitive(
     return primitive
 
 
+def primitive_by_platform(
+    name: str, results: Callable[..., Sequence[Any]], on: Mapping[str, Callable[..., Any]]
+) -> Primitive:
+    """Return a primitive that is lowered, only then, as the function of the platform that it is compiled for.
+
+    Args:
+        name: Its name.
+        results: From operands and parameters, which are hashable, to the shapes and types of its results.
+        on: Functions of operands and parameters to a list of results, by platform: ``"cpu"``, ``"cuda"``, ...
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(lambda *args, **params: _compiled_primitive(primitive, **params)(*args))
+    primitive.def_abstract_eval(lambda *args, **params: list(map(jax.typeof, results(*args, **params))))
+    for platform, fn in on.items():
+        mlir.register_lowering(primitive, mlir.lower_fun(fn, multiple_results=True), platform=platform)
+    return primitive
+
+
+@functools.lru_cache(maxsize=64)
+def _compiled_primitive(primitive: Primitive, **params: Any) -> Callable[..., Any]:
+    return jax.jit(functools.partial(primitive.bind, **params))
+
+
 def without_constants(closed: ClosedJaxpr) -> ClosedJaxpr:
     """Return a jaxpr that takes what it closes over as its first inputs."""
     x = closed.jaxpr
@@ -185,6 +213,29 @@ def expanded(eqn: Any) -> Callable[..., list[Any]]:
     """Return a ``call_hi_primitive`` of JAX 0.12 as a function of arrays, written in terms of other primitives."""
     primitive = eqn.params["_prim"]
     return lambda *args: jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, args)))
+
+
+# Arrays ---------------------------------------------------------------------------------------------------------
+
+
+def put_own(x: np.ndarray, sharding: jax.sharding.Sharding) -> jax.Array:
+    """Return an array of the host on a device, committed to it: ``jax.device_put`` in a tenth of the time.
+
+    It is the same memory where that is possible, so the argument must not be written into afterwards.
+
+    Args:
+        x: The array, of a type that JAX has.
+        sharding: Its device; for several this is ``jax.device_put``.
+    """
+    devices = sharding.device_set
+    if len(devices) > 1:
+        return jax.device_put(x, sharding)
+    return batched_device_put(_aval(x.shape, x.dtype), sharding, [x], list(devices), True)
+
+
+@functools.cache
+def _aval(shape: tuple[int, ...], dtype: Any) -> Any:
+    return jax.core.ShapedArray(shape, dtype)
 
 
 # Random numbers -------------------------------------------------------------------------------------------------
@@ -219,11 +270,6 @@ def batched_rule(fn: Callable[..., Any], rule: Callable[..., Any]) -> Callable[.
 def is_symbolic_zero(tangent: Any) -> bool:
     """Return whether the tangent that a rule of ``defjvp(symbolic_zeros=True)`` was given is zero by construction."""
     return tangent is None or isinstance(tangent, SymbolicZero)
-
-
-def with_major_to_minor(x: Any, order: tuple[int, ...]) -> Any:
-    """Return an array with its axes stored in an order, the slowest first; its logical shape stays."""
-    return with_layout_constraint(x, Layout(major_to_minor=order))
 
 
 # Compilation ----------------------------------------------------------------------------------------------------

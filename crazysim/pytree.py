@@ -118,6 +118,16 @@ def scopes(tree: Any) -> Any:
     return _map_declared(lambda x, metadata, _, members: _scope(x, metadata, members), tree, {}, "", None)
 
 
+def numbered(tree: Any) -> Any:
+    """Return the same tree with the number of every leaf, in the order of ``jax.tree.leaves``, in its place.
+
+    Code that handles flattened trees finds the number of a leaf by its path, as in ``numbered(data).core.nonfinite``.
+    It cannot find it by identity, since leaves may share one array.
+    """
+    treedef = jax.tree.structure(tree)
+    return treedef.unflatten(range(treedef.num_leaves))
+
+
 def sparse_leaves(tree: Any) -> Any:
     """Return the same tree with True in the place of every leaf that is declared sparse, and False elsewhere."""
     return _map_declared(lambda _, metadata, *__: bool(metadata.get("sparse")), tree, {}, "", None)
@@ -279,6 +289,6 @@ def on_device(value: Any, dtype: Any = None) -> jax.Array:
     return jax.device_put(np.array(value, dtype or floating()))
 
 
-def of_host(value: Any, *shape: int, dtype: Any = None) -> Any:
+def host_array(value: Any, *shape: int, dtype: Any = None) -> Any:
     """Return a value broadcast to a shape as a NumPy array, of floating dtype by default; it needs no compilation."""
     return np.array(np.broadcast_to(value, shape), dtype or floating())

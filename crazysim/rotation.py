@@ -26,6 +26,13 @@ def cross(a: Array, b: Array) -> Array:
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
+def cross_matrix(a: Array) -> Array:
+    """Return the matrix of the cross product with a vector, ``cross_matrix(a) @ b = a x b``. (..., 3, 3)"""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    zero = jnp.zeros_like(x)
+    return jnp.stack([jnp.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], axis=-2)
+
+
 def along_z(value: Array) -> Array:
     """Return the vectors along z with these values. (...) -> (..., 3)"""
     zero = jnp.zeros_like(value)
@@ -207,16 +214,21 @@ def from_rpy(rpy: Array) -> Array:
 def to_rpy(q: Array) -> Array:
     """Return roll, pitch, yaw in rad, pitch in [-pi/2, pi/2]. (..., 4) -> (..., 3)
 
-    At a pitch of exactly 90 degrees roll and yaw are not unique; zero is returned for an angle whose sine and cosine
-    both vanish.
+    Roll and yaw come from half their sum and half their difference (Bernardes and Viollet 2022), one of which is
+    well-defined at any pitch, so that :func:`from_rpy` gives the same rotation back. At a pitch of 90 degrees roll and
+    yaw are not unique, and the other half counts as zero.
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    half_sum, half_difference = safe_arctan2(z + x, w - y), safe_arctan2(z - x, w + y)
     r00, r10 = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
-    r21, r22 = 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
     cos_pitch = safe_norm(jnp.stack([r00, r10], axis=-1))[..., 0]
-    return jnp.stack(
-        [safe_arctan2(r21, r22), jnp.arctan2(2 * (w * y - x * z), cos_pitch), safe_arctan2(r10, r00)], axis=-1
-    )
+    pitch = jnp.arctan2(2 * (w * y - x * z), cos_pitch)
+    return jnp.stack([_wrap(half_sum - half_difference), pitch, _wrap(half_sum + half_difference)], axis=-1)
+
+
+def _wrap(angle: Array) -> Array:
+    """Return an angle of at most two turns as one in [-pi, pi], rad. (...)"""
+    return angle - 2 * jnp.pi * ((angle > jnp.pi).astype(angle.dtype) - (angle < -jnp.pi).astype(angle.dtype))
 
 
 def yaw(q: Array) -> Array:

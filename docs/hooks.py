@@ -1,7 +1,7 @@
 """Hooks of MkDocs: pages that are generated, and links from the repository's layout to the site's.
 
-The site holds the pages of ``docs/`` and, generated here, the README, CONTRIBUTING and CHANGELOG of the repository,
-one page for each example, and one page of API reference for each public module.
+The site holds the pages of ``docs/`` and, generated here, README, CONTRIBUTING, SECURITY and CHANGELOG of the
+repository, one page for each example, and one page of API reference for each public module.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ ROOT_PAGES = {
     "README.md": "index.md",
     "docs/README.md": "contents.md",
     "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
     "CHANGELOG.md": "changelog.md",
 }
 """Pages of the repository, and their places on the site."""
@@ -89,7 +90,7 @@ _modules: list[griffe.Module] = []
 
 
 def _public_modules() -> list[griffe.Module]:
-    """Return every public module of the package; deprecated paths are left out."""
+    """Return every public module of the package."""
     if not _modules:
         package = griffe.load("crazysim", search_paths=[str(ROOT)], docstring_parser="google", resolve_aliases=True)
         assert isinstance(package, griffe.Module)
@@ -98,7 +99,7 @@ def _public_modules() -> list[griffe.Module]:
 
 
 def _collect(module: griffe.Module, found: list[griffe.Module]) -> None:
-    if module.name.startswith("_") or (module.docstring and module.docstring.value.startswith("Deprecated")):
+    if module.name.startswith("_"):
         return
     found.append(module)
     for name in sorted(module.modules):

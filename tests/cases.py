@@ -13,7 +13,7 @@ from crazysim.core import functional as F
 from crazysim.core.controls import SimControls
 from crazysim.core.data import create_params
 from crazysim.core.stage import as_stages
-from crazysim.core.stages import finite
+from crazysim.core.stages import nonfinite
 from crazysim.dynamics import first_principles
 
 FITTED = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
@@ -108,9 +108,10 @@ def with_airframes(sim, airframes):
         return jax.tree.map(lambda *x: jax.device_put(np.stack(x)[which][:, None]), *shared)
 
     params = stacked([create_params(sim.dynamics, airframe) for airframe in kinds])
-    each = [SimControls.create(1, 1, sim.control, sim.dynamics, a, sim.configuration.control_freqs) for a in kinds]
+    settings = sim.configuration.control_freqs, sim.configuration.controller
+    each = [SimControls.create(1, 1, sim.control, sim.dynamics, airframe, *settings) for airframe in kinds]
     controls = sim.data.controls
-    for name in ("state", "attitude", "body_rate", "force_torque"):
+    for name in ("state", "attitude", "body_rate", "force_torque", "controller"):
         ctrl = getattr(controls, name)
         if ctrl is not None and ctrl.params is not None:
             own = stacked([getattr(c, name).params for c in each])
@@ -191,7 +192,7 @@ def by_stages(sim):
             return data, None
 
         data, _ = jax.lax.scan(once, data, length=n_steps)
-        return data.replace(core=data.core.replace(nonfinite=data.core.nonfinite | ~finite(data)))
+        return data.replace(core=data.core.replace(nonfinite=nonfinite(data)))
 
     return step
 

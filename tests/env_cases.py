@@ -1,16 +1,13 @@
 """What tests of environments share: environments compiled once, states near an episode's end, parts of a state."""
 
 import collections
-import contextlib
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from cases import as_numbers
 
-from crazysim.engine import fused, interpret
 from crazysim.envs import TASKS, make
 from crazysim.envs.wrappers import Wrapper
 from crazysim.pytree import map_batched
@@ -92,19 +89,6 @@ def obs_of(state, mask):
     return jax.tree.map(lambda x: as_numbers(x)[mask], state.obs)
 
 
-@contextlib.contextmanager
-def interpreted():
-    """Interpret, within the context, what would be compiled to a kernel: the programs are the same."""
-
-    def build(program, *_):
-        return lambda leaves, n_steps: interpret.steps(program, leaves, n_steps)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fused, "build", build)
-        yield
-
-
 def entries(classes_once=False):
-    """Return the names of all tasks, or one for each class of tasks, each with a worker of its own."""
-    names = {TASKS[name].task: name for name in reversed(TASKS)}.values() if classes_once else TASKS
-    return [pytest.param(name, marks=pytest.mark.xdist_group(f"env {name}")) for name in names]
+    """Return the names of all tasks, or one for each class of tasks."""
+    return list({TASKS[name].task: name for name in reversed(TASKS)}.values() if classes_once else TASKS)

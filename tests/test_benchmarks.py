@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -49,6 +50,12 @@ def test_step_prints_a_line_with_its_machine(run):
     ]  # fmt: skip
     assert all(line["steps_per_s"] > 0 for line in lines)
     assert {"device", "processor", "cores", "jax", "python", "date", "crazysim"} <= lines[0].keys()
+
+
+def test_loop_prints_the_time_of_an_iteration(run):
+    (line,) = run("loop.py", "--worlds", "4", "--controls", "state", "--repeats", "2")
+    assert (line["control"], line["n_worlds"]) == ("state", 4)
+    assert line["realtime"] == pytest.approx(4 * 0.01 / line["iteration_s"])
 
 
 def test_compile_prints_its_parts_from_a_process_of_its_own():
@@ -141,7 +148,7 @@ def test_limits_prints_a_floor_and_how_far_from_it(monkeypatch, benchmarks, caps
 def test_operations_are_counted_in_multiply_adds(benchmarks):
     import limits
 
-    from crazysim.engine.ir import Builder
+    from crazysim.engine.ir.blocks import Builder
 
     builder = Builder()
     x, y = builder.input(np.float32), builder.input(np.float32)
@@ -188,6 +195,18 @@ def test_a_gradient_is_timed_like_a_flight(benchmarks):
     gradient.require_flying()
 
 
+def test_a_loop_of_commands_steps_and_reads_is_timed(benchmarks):
+    import contestant
+
+    loop = contestant.build("crazysim", "loop", {"control": "state", "n_worlds": 2, "n_steps": 5}, "cpu")
+    assert loop.seconds() > 0
+    assert loop._sim.data.core.steps[0, 0] == 5 * loop._iterations
+    loop.require_flying()
+    loop._sim.data = loop._sim.data.replace(states=loop._sim.data.states.replace(pos=jnp.zeros((2, 1, 3))))
+    with pytest.raises(SystemExit, match="crashed"):
+        loop.require_flying()
+
+
 @pytest.mark.parametrize("script", ["step.py", "compile.py", "scaling.py", "limits.py", "versus_crazyflow.py"])
 def test_every_script_explains_itself(script, run, capsys):
     with pytest.raises(SystemExit) as end:
@@ -232,11 +251,12 @@ def test_live_prints_the_factor_and_the_lateness(run):
 
 
 def test_controllers_are_compared_on_the_same_flights(run):
-    lines = run("controllers.py", "--controllers", "geometric", "--worlds", "4", "--repeats", "1")
-    assert [line["controller"] for line in lines] == ["geometric"]
-    assert lines[0]["tracking_rms"] < 0.02
-    assert lines[0]["pushed_after"] == pytest.approx(0.289, abs=0.02)
-    assert lines[0]["steps_per_s"] > 0
+    small = ["--drones", "cf21B_500", "hb_x500", "--attitudes", "1", "--worlds", "4", "--repeats", "1"]
+    flown, cost = run("controllers.py", "--controllers", "geometric", *small)
+    assert (flown["controller"], flown["drone"]) == ("geometric", "cf21B_500")  # the other one has no rotors
+    assert flown["tracking"] < 0.02
+    assert flown["pushed"] == pytest.approx(0.289, abs=0.02)
+    assert cost["steps_per_s"] > 0
 
 
 def test_the_flight_stack_is_timed_against_its_references(run):
@@ -255,3 +275,9 @@ def test_cars_are_timed_alone_and_beside_drones(run):
         ("beside_drone", False),
     ]
     assert all(line["steps_per_s"] > 0 for line in lines)
+
+
+def test_first_results_are_measured_without_and_with_a_cache(run):
+    lines = run("first_results.py", "--repeat", 1, "--cases", "step")
+    assert [line["cache"] for line in lines] == ["off", "on"]
+    assert all(line["cpu_s"] > 0 for line in lines)

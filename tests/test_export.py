@@ -102,7 +102,11 @@ def test_the_jacobian_is_that_of_jax(dynamics, control, integrator):
     sim = Sim(dynamics=dynamics, control=control, integrator=integrator)
     exported, step = to_casadi(sim), by_stages(sim)
     rng = np.random.default_rng(1)
-    x = exported.x.of(sim.data) + 0.05 * rng.normal(size=len(exported.x))
+    start = exported.x.of(sim.data)
+    x = start + 0.05 * rng.normal(size=len(exported.x))
+    for name in exported.x.sizes:
+        if ".memory." in name:  # such torques would saturate the rotors
+            x[exported.x[name]] = start[exported.x[name]]
     x[exported.x["states.pos"]] = [0.1, 0.2, 1.0]
     x[exported.x["states.quat"]] /= np.linalg.norm(x[exported.x["states.quat"]])
     x[exported.x["states.rotor_vel"]] = hover_rotor_state(sim.data) * [0.9, 0.92, 0.94, 0.96]

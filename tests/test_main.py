@@ -2,15 +2,18 @@
 
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
-from drawing import draw_coarsely
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from crazysim.__main__ import COMMANDS, main
+from crazysim import Sim
+from crazysim.__main__ import COMMANDS, EXTRAS, main
 from crazysim.demos import DEMOS, flight
-from crazysim.media import Flight
+from crazysim.media import Flight, Recorder
+from crazysim.scene.software import film_size
 
 
 def test_without_a_command_it_lists_what_there_is(capsys):
@@ -33,7 +36,7 @@ def test_the_help_of_a_command_states_defaults_once(command, capsys):
     for argument in out.split(" --"):
         assert argument.count("by default") + argument.count("(default:") <= 1, argument
     if command == "train":
-        assert "random seed (default: 0)" in out
+        assert "random seed; by default 0" in out
 
 
 def test_a_demo_has_a_name(capsys, monkeypatch):
@@ -47,9 +50,8 @@ def test_a_demo_has_a_name(capsys, monkeypatch):
     assert all(name in message for name in DEMOS)
 
 
-def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, monkeypatch, opengl):
+def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
     """A second of 8 worlds of 4 drones: figures are printed and both files are pictures of something."""
-    draw_coarsely(monkeypatch)
     assert main(["demo", "--worlds", "8", "--seconds", "1", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     for word in ("compile time", "steps per second", "tracking error", "contacts"):
@@ -63,7 +65,8 @@ def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, monkeypatch, op
     film = tmp_path / "flight.mp4"
     decode = [get_ffmpeg_exe(), "-loglevel", "error", "-i", film, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)
-    frames = pixels.reshape(-1, 544, 960, 3)
+    width, height = film_size(960, 544)
+    frames = pixels.reshape(-1, height, width, 3)
     assert len(frames) == 25  # 1 s
     assert np.mean(np.abs(frames[-1].astype(float) - frames[0])) > 1, "nothing moves in the film"
 
@@ -107,7 +110,7 @@ def test_without_opengl_the_demo_says_so_and_does_the_rest(tmp_path, capsys, mon
     def no_picture(*args, **kwargs):
         raise flight.RenderError("no OpenGL context could be made")
 
-    monkeypatch.setattr(flight.Sim, "draw", no_picture)
+    monkeypatch.setattr(flight.Sim, "render", no_picture)
     assert main(["demo", "--worlds", "8", "--seconds", "1", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert len([line for line in out.splitlines() if line.startswith("no film")]) == 1
@@ -135,3 +138,54 @@ def test_the_poles_are_where_drones_can_hit_them():
         sim.data, _ = fly(sim.data)
         touched |= flight.touches(sim).any((1, 2))
     assert 0 < touched.sum() < 64
+
+
+BASE = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in sys.argv[1].split(","):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing())
+from crazysim.__main__ import COMMANDS, main
+sys.exit(main(sys.argv[2:]))
+"""
+"""The command line of an installation without the packages of the first argument."""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "extra"),
+    [
+        ("train hover --iterations 1 --out {0}", "train"),
+        ("evaluate {0}", "train"),
+        ("export {0} --c {0}/policy.h", "train"),
+        ("render {0}", "train"),
+        ("replay {0}/flight.npz", "web"),
+        ("live --browser --seconds 0.1 --port 0", "web"),
+        ("demo load --worlds 1 --seconds 0.1 --out {0}", "demo"),
+    ],
+)
+def test_a_command_names_the_extra_that_it_lacks(arguments, extra, tmp_path):
+    if "replay" in arguments:
+        recorder = Recorder(Sim())
+        recorder.add()
+        recorder.flight().save(tmp_path / "flight.npz")
+    packages = ",".join({*EXTRAS, "trimesh"})
+    command = [sys.executable, "-c", BASE, packages, *arguments.format(tmp_path).split()]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    text = done.stdout + done.stderr
+    assert f"pip install 'crazysim[{extra}]'" in text
+    assert "Traceback" not in text
+    assert done.returncode == (0 if extra == "demo" else 2), "a demonstration flies without its film"
+    assert "1 worlds" not in text
+    assert "1 drones" not in text
+
+
+def test_the_extras_of_the_table_bring_their_packages():
+    text = (Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
+    extras = tomllib.loads(text)["project"]["optional-dependencies"]
+    for package, extra in EXTRAS.items():
+        needed = "viser" if package == "websockets" else package  # viser depends on it
+        assert any(line.replace("-", "_").startswith(needed) for line in extras[extra]), package

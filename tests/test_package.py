@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 import tomllib
@@ -9,8 +10,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
 import crazysim
+
+pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -74,9 +78,32 @@ def test_the_readme_begins_with_what_it_is_and_is_not():
     assert "not the firmware-in-the-loop simulator of the same name" in lines.replace("\n", " ")
 
 
-def test_the_fast_tests_exist():
-    """A file that was moved would end ``make test-fast`` before its first test."""
-    commands = subprocess.run(["make", "-n", "test-fast"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    paths = [word for word in commands.split() if word.startswith("tests/")]
-    assert len(paths) > 20
-    assert [path for path in paths if not (ROOT / path).exists()] == []
+def yaml_of(path):
+    return yaml.safe_load((ROOT / path).read_text())
+
+
+@pytest.mark.parametrize("path", [".pre-commit-config.yaml", ".github/workflows/ci.yml", ".ci/run", "CONTRIBUTING.md"])
+def test_every_target_of_make_that_is_named_exists(path):
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    named = set(re.findall(r"\bmake ([a-z-]+)", (ROOT / path).read_text()))
+    assert named
+    assert named <= targets
+
+
+def test_workflows_and_templates_are_complete():
+    jobs = yaml_of(".github/workflows/ci.yml")["jobs"]
+    assert all(job["steps"] and job["timeout-minutes"] for job in jobs.values())
+    assert [hook["entry"] for repo in yaml_of(".pre-commit-config.yaml")["repos"] for hook in repo["hooks"]]
+    for name in ("bug", "feature"):
+        template = yaml_of(f".github/ISSUE_TEMPLATE/{name}.yml")
+        assert template["name"]
+        assert template["description"]
+        assert "crazysim info" in str(template["body"])
+
+
+def test_the_citation_is_of_this_version():
+    citation = yaml_of("CITATION.cff")
+    assert citation["version"] == PROJECT["version"]
+    assert citation["license"] == PROJECT["license"]
+    assert citation["keywords"] == PROJECT["keywords"]
+    assert citation["authors"] == PROJECT["authors"]

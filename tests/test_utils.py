@@ -53,12 +53,6 @@ def test_enable_cache_takes_the_settings_of_crazyflow(tmp_path, cache_settings, 
     assert found == [str(tmp_path), 1000, 2, "all" if enable_xla_caches else "none"]
 
 
-def test_enable_cache_keeps_everything_in_the_home_folder_by_default(cache_settings, monkeypatch, tmp_path):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert enable_cache() == tmp_path / ".cache" / "crazysim" / "jax"
-    assert [getattr(jax.config, name) for name in cache_settings[1:3]] == [-1, 0.0]
-
-
 def test_world_mask_names_the_leaves_of_worlds_and_pytree_replace_writes_them():
     sim = Sim(n_worlds=3, n_drones=2)
     data = sim.data

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
 from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque
-from crazysim.control.core import COMMAND_FIELDS, Control, command_size
+from crazysim.control.levels import COMMAND_FIELDS, Control, command_size
 from crazysim.control.mellinger import Mellinger
 from crazysim.control.parameters import load_fn_params, load_params
 from crazysim.control.pid import PID
@@ -15,6 +15,7 @@ from crazysim.control.switch import Switch
 from crazysim.lazy import lazy
 
 if TYPE_CHECKING:
+    from crazysim.control.auto import Auto
     from crazysim.control.geometric import Geometric, geometric_control
     from crazysim.control.indi import INDI, indi_control
     from crazysim.control.load_lqr import LoadLQR, load_lqr_control
@@ -28,6 +29,7 @@ __all__ = [
     "PID",
     "AllocationParams",
     "AttitudeParams",
+    "Auto",
     "Control",
     "Controller",
     "Geometric",
@@ -54,6 +56,7 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
+        "Auto": "crazysim.control.auto",
         "Geometric": "crazysim.control.geometric",
         "INDI": "crazysim.control.indi",
         "LQR": "crazysim.control.lqr",

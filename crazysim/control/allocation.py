@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from crazysim.control.core import allocation_matrix
+from crazysim.control.levels import allocation_matrix
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
@@ -32,18 +33,54 @@ class AllocationParams(PyTree):
     def create(airframe: Airframe) -> AllocationParams:
         """Return the shared parameters of an airframe.
 
+        The drag torque over thrust is that of ``torque_arms``.
+
         Raises:
             ConfigError: If the airframe lacks one.
         """
-        yaw_arm = airframe.value("controller.thrust2torque", ())
         curve = airframe.value("rotors.thrust_curve")
         return AllocationParams(
             thrust_min=as_parameter(airframe.value("rotors.thrust_min", ())),
             thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
-            arms=as_parameter([airframe.arm, airframe.arm, float(yaw_arm)]),
+            arms=as_parameter(torque_arms(airframe)),
             rpm2thrust=as_parameter(curve.reshape(-1, 3)),
             allocation_matrix=as_parameter(allocation_matrix(airframe)),
         )
+
+
+def hover_rotor_vel(airframe: Airframe) -> np.ndarray:
+    """Return the speed at which each rotor lifts its share of the weight, rpm. (1,), or (n_rotors,) if rotors differ.
+
+    Raises:
+        ConfigError: If the airframe has no thrust curve.
+    """
+    thrust = float(airframe.value("rigid_body.mass", ())) * 9.81 / airframe.n_rotors
+    k0, k1, k2 = np.atleast_2d(airframe.value("rotors.thrust_curve")).T
+    return (np.sqrt(k1**2 - 4 * k2 * (k0 - thrust)) - k1) / (2 * k2)
+
+
+def torque_arms(airframe: Airframe) -> np.ndarray:
+    """Return torque per thrust about x, y and z, m: the third is the airframe's number, or else ``yaw_arm``. (3,)
+
+    Raises:
+        ConfigError: If the airframe has neither that number nor the curves of its rotors.
+    """
+    known = airframe.values.get("controller.thrust2torque")
+    return np.array([airframe.arm, airframe.arm, yaw_arm(airframe) if known is None else float(known)])
+
+
+def yaw_arm(airframe: Airframe) -> float:
+    """Return the change of a rotor's drag torque over that of its thrust around hover, m.
+
+    Raises:
+        ConfigError: If the airframe has no thrust curve or no torque curve.
+    """
+    hover = hover_rotor_vel(airframe)
+    slopes = []
+    for key in ("torque_curve", "thrust_curve"):
+        _, k1, k2 = np.atleast_2d(airframe.value(f"rotors.{key}")).T
+        slopes.append(k1 + 2 * k2 * hover)
+    return float(np.mean(slopes[0] / slopes[1]))
 
 
 def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:

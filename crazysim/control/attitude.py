@@ -6,10 +6,19 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.core import allocation_matrix, number_of, where_present
+from crazysim.control.gains import require_gains
+from crazysim.control.levels import allocation_matrix, number_of, where_present
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import matvec
+
+_GAINS = ("kR", "kw", "ki_m", "kd_omega", "int_err_max")
+KEYS = (
+    *(f"controller.attitude.{key}" for key in _GAINS),
+    *(f"controller.{key}" for key in ("torque_pwm_max", "thrust2torque", "pwm_min", "pwm_max")),
+    "rotors.thrust_max",
+)
+"""Values of an airframe that these controllers need."""
 
 
 class AttitudeParams(PyTree):
@@ -49,14 +58,12 @@ class AttitudeParams(PyTree):
         Raises:
             ConfigError: If the airframe has no table for this controller.
         """
+        require_gains(airframe, KEYS, "crazyflow")
         yaw_arm = airframe.value("controller.thrust2torque", ())
         # The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the
         # least-norm allocation of a quadrotor in X. Other layouts get the same factors.
         allocation = allocation_matrix(airframe)[:, 1:] * [2.0, 2.0, 4.0]
-        gain = {
-            key: as_parameter(airframe.value(f"controller.attitude.{key}", (3,)))
-            for key in ("kR", "kw", "ki_m", "kd_omega", "int_err_max")
-        }
+        gain = {key: as_parameter(airframe.value(f"controller.attitude.{key}", (3,))) for key in _GAINS}
         return AttitudeParams(
             **gain,
             torque_pwm_max=as_parameter(airframe.value("controller.torque_pwm_max", (3,))),
@@ -153,7 +160,7 @@ def body_rate2force_torque(
     Returns:
         Collective thrust, N, and body torque, N m (..., 4); the new integral, rad s (..., 3).
     """
-    yaw = rotation.to_rpy(quat)[..., 2:]
+    yaw = rotation.yaw(quat)[..., None]
     level = jnp.concatenate([jnp.zeros_like(ang_vel[..., :2]), yaw, cmd[..., 3:4]], axis=-1)
     return attitude2force_torque(
         quat,

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crazysim.control.allocation import hover_rotor_vel
 from crazysim.drones import Airframe
 
 ATTITUDE_STIFFNESS = 0.3
@@ -46,9 +47,7 @@ def rotor_rate(airframe: Airframe) -> float:
     Raises:
         ConfigError: If the airframe has no rotor constants.
     """
-    thrust = float(airframe.value("rigid_body.mass", ())) * 9.81 / airframe.n_rotors
-    k0, k1, k2 = np.atleast_2d(airframe.value("rotors.thrust_curve")).T
-    hover = (np.sqrt(k1**2 - 4 * k2 * (k0 - thrust)) - k1) / (2 * k2)
+    hover = hover_rotor_vel(airframe)
     lag = np.atleast_2d(airframe.value("rotors.lag"))
     return float(np.min([lag[:, 0] + 2 * lag[:, 1] * hover, lag[:, 2] + 2 * lag[:, 3] * hover]))
 

@@ -11,7 +11,10 @@ from crazysim.errors import ConfigError, UnknownNameError
 
 CASCADE = "crazyflow"
 """Name of Crazyflow's cascade, which is made of stages of its own and follows every command level."""
+DEFAULT = "auto"
+"""Name of the default controller."""
 CONTROLLERS = {
+    "auto": "crazysim.control.auto:Auto",
     "pid": "crazysim.control.pid:PID",
     "mellinger": "crazysim.control.mellinger:Mellinger",
     "geometric": "crazysim.control.geometric:Geometric",
@@ -52,7 +55,7 @@ def find_controller(controller: Any, switch: Any = None) -> Controller | None:
             f"instance of a subclass of crazysim.control.Controller."
         )
     if controller not in CONTROLLERS:
-        names = ", ".join(repr(name) for name in (CASCADE, *CONTROLLERS))
+        names = ", ".join(repr(name) for name in sorted((CASCADE, *CONTROLLERS)))
         raise UnknownNameError(f"expected controller as one of {names}, got {controller!r}")
     module, _, name = CONTROLLERS[controller].partition(":")
     return getattr(importlib.import_module(module), name)()

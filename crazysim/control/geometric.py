@@ -10,18 +10,31 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.bandwidth import Bandwidth, bandwidth
-from crazysim.control.core import Control
 from crazysim.control.flatness import Attitude, attitude_of_thrust
+from crazysim.control.levels import Control
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.pytree import as_parameter, leaf
-from crazysim.rotation import cross, dot, matvec
+from crazysim.dynamics.models import GRAVITY
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import cross, dot, matvec, safe_clip
 
 Gains = Literal["bandwidth", "airframe"]
 """Rule for the gains: by bandwidth, or from the airframe's table ``[geometric]``."""
+
+
+INTEGRAL = 0.5
+"""Largest acceleration by the integral of the position error, along an axis, over that of gravity, 1."""
+
+
+class GeometricMemory(PyTree):
+    """Memory of geometric control with an integral."""
+
+    acc: Array = leaf("drone", 1)
+    """Acceleration by the integral of the position error, world frame, m/s^2. (n_worlds, n_drones, 3)"""
 
 
 class GeometricParams(RigidBodyParams):
@@ -80,6 +93,7 @@ def geometric_control(
     *,
     params: GeometricParams,
     feedforward: bool = True,
+    integral: Array | None = None,
 ) -> Array:
     """Return the wrench that tracks a setpoint.
 
@@ -99,6 +113,7 @@ def geometric_control(
         params: Gains, shared or with the leading axes of the state.
         feedforward: False for the law of AIMotionLab-Virtual, in which acceleration, jerk, snap, yaw rates and drag
             are not fed forward.
+        integral: Acceleration that is added to that of the errors, world frame, m/s^2; None for none. (..., 3)
 
     Returns:
         Collective thrust, N, and body torque, N m. (..., 4)
@@ -109,6 +124,8 @@ def geometric_control(
         sp = sp.replace(acc=zero, jerk=zero, snap=zero, yaw_rate=still, yaw_acc=still)
     matrix = rotation.matrix(quat)
     feedback = -(p.kr * (pos - sp.pos) + p.kv * (vel - sp.vel)) / p.mass
+    if integral is not None:
+        feedback = feedback + integral
 
     def undragged(motion: Array, rate: Array) -> Array:
         """Return the acceleration, or a derivative of it, that the rotors give for a motion under drag."""
@@ -179,13 +196,33 @@ class Geometric(Controller):
     """Rule for the gains, as for ``GeometricParams.create``."""
     feedforward: bool = True
     """True to feed the derivatives of the setpoint forward; without, it is the law of AIMotionLab-Virtual."""
+    integral: float = 0.0
+    """Rate at which the integral of the position error takes up a constant force, 1/s: its gain over that on the
+    position, per axis. 0 for none, and no memory. Without delays the loop is stable below the ratio of ``kv`` to the
+    mass. Errors that alone would require more than ``INTEGRAL`` are left out."""
 
     def params(self, airframe: Airframe) -> GeometricParams:
-        """Return gains and constants for an airframe."""
+        """Return gains and constants for an airframe.
+
+        Raises:
+            ConfigError: If the airframe lacks a value, or the integral is negative or not finite.
+        """
+        if not (np.isfinite(self.integral) and self.integral >= 0):
+            raise ConfigError(f"expected a finite integral of at least 0, 1/s, got {self.integral!r}. Use 0 for none.")
         return GeometricParams.create(airframe, self.freq, self.gains)
 
+    def memory(self, airframe: Airframe) -> GeometricMemory | None:
+        """Return the memory before the first tick; None without an integral."""
+        return GeometricMemory(as_parameter(np.zeros(3))) if self.integral else None
+
     def update(self, data: Any, command: Any, memory: Any, params: GeometricParams) -> tuple[Array, Any]:
-        """Return the wrench."""
+        """Return the wrench, and the memory."""
         s = data.states
+        if self.integral:
+            limit = -INTEGRAL * GRAVITY[2]
+            acc = params.kr * (command.pos - s.pos) / params.mass
+            acc = jnp.where(jnp.abs(acc) < limit, acc, 0.0)  # Farther away, the drone approaches: no disturbance.
+            memory = GeometricMemory(safe_clip(memory.acc + self.integral / self.freq * acc, -limit, limit))
         state = (s.pos, s.quat, s.vel, s.ang_vel)
-        return geometric_control(*state, command, params=params, feedforward=self.feedforward), memory
+        acc = memory.acc if self.integral else None
+        return geometric_control(*state, command, params=params, feedforward=self.feedforward, integral=acc), memory

@@ -10,11 +10,11 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.allocation import force_torque2rotor_vel
+from crazysim.control.allocation import force_torque2rotor_vel, yaw_arm
 from crazysim.control.bandwidth import bandwidth, rotor_rate
-from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.control.geometric import GeometricParams, attitude_errors, gains_of
+from crazysim.control.levels import Control
 from crazysim.control.low_pass import butterworth
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
@@ -64,7 +64,7 @@ class INDIParams(PyTree):
             raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
         params = GeometricParams.create(airframe, freq)
         gains = gains_of(airframe, bandwidth(airframe, freq, LEAD * rotor_rate(airframe)))
-        arms = np.array([airframe.arm, airframe.arm, float(airframe.value("controller.thrust2torque", ()))])
+        arms = np.array([airframe.arm, airframe.arm, yaw_arm(airframe)])
         mixing = np.vstack([np.ones(airframe.n_rotors), arms[:, None] * airframe.mixing_matrix])
         return INDIParams(
             geometric=params.replace(**{key: as_parameter(np.broadcast_to(x, (3,))) for key, x in gains.items()}),

@@ -10,17 +10,17 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.bandwidth import bandwidth
-from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust, direction_of
+from crazysim.control.levels import Control
 from crazysim.control.linear import linearize, load_derivative, rod_angles
-from crazysim.control.lqr import Reference, as_weights, into_heading, on_host, state_error
+from crazysim.control.lqr import Reference, as_weights, into_heading, solve_on_host, state_error
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
 from crazysim.control.riccati import gain_discrete
 from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.dynamics.core import GRAVITY
+from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
@@ -86,7 +86,7 @@ class LoadLQRParams(RigidBodyParams):
         Q = as_weights("Q", weights[0] if Q is None else Q, 16)
         R = as_weights("R", weights[1] if R is None else R, 4)
         off_centre = [joint] if np.any(joint) else []
-        gain = on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R, *off_centre)
+        gain = solve_on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R, *off_centre)
         return LoadLQRParams(
             **rigid_body(airframe),
             load_mass=as_parameter(load_mass),

@@ -11,8 +11,8 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.bandwidth import bandwidth
-from crazysim.control.core import Control
 from crazysim.control.flatness import attitude_of_thrust
+from crazysim.control.levels import Control
 from crazysim.control.linear import drone_derivative, linearize
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller
@@ -20,7 +20,7 @@ from crazysim.control.riccati import check_gain, gain_continuous
 from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.dynamics.core import GRAVITY
+from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.pytree import as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
@@ -51,7 +51,7 @@ class LQRParams(RigidBodyParams):
         R = as_weights("R", weights[1] if R is None else R, 4)
         return LQRParams(
             **rigid_body(airframe),
-            gain=as_parameter(on_host(hover_gain, airframe.value("rigid_body.mass"), airframe.inertia, Q, R)),
+            gain=as_parameter(solve_on_host(hover_gain, airframe.value("rigid_body.mass"), airframe.inertia, Q, R)),
         )
 
 
@@ -87,7 +87,7 @@ def as_weights(name: str, weights: Any, n: int) -> np.ndarray:
     return array
 
 
-def on_host(gain: Any, *args: Any) -> np.ndarray:
+def solve_on_host(gain: Any, *args: Any) -> np.ndarray:
     """Return a gain computed in float64 on the CPU.
 
     Raises:

@@ -9,7 +9,9 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.core import Control
+from crazysim.control import power_distribution
+from crazysim.control.gains import require_gains
+from crazysim.control.levels import Control
 from crazysim.control.power_distribution import (
     PowerDistributionParams,
     command_of_rotor_vel,
@@ -20,11 +22,13 @@ from crazysim.control.power_distribution import (
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.dynamics.core import GRAVITY
+from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import dot, safe_clip, safe_normalize
 
 _GAINS = ("kp", "kd", "ki", "integral_max", "kR", "kw", "ki_m", "kd_omega", "integral_m_max", "torque_max")
+KEYS = (*(f"mellinger.{key}" for key in ("mass", "mass_thrust", *_GAINS)), *power_distribution.KEYS)
+"""Values of an airframe that this controller needs."""
 
 
 class MellingerParams(PyTree):
@@ -66,7 +70,7 @@ class MellingerParams(PyTree):
         Raises:
             ConfigError: If the airframe has no table for this controller.
         """
-        airframe.table("mellinger")
+        require_gains(airframe, KEYS, "mellinger")
         gains = {key: as_parameter(airframe.value(f"mellinger.{key}", (3,))) for key in _GAINS}
         return MellingerParams(
             mass=as_parameter(airframe.value("mellinger.mass", ())),

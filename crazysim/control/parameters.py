@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any
 
 from crazysim.drones import load_airframe
-from crazysim.dynamics.core import GRAVITY
+from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.parameters import Drone, as_arrays
 from crazysim.errors import UnknownNameError
 

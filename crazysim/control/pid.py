@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.core import Control
+from crazysim.control.levels import Control
 from crazysim.control.pid_cascade import (
     THRUST_SCALE,
     PIDMemory,

@@ -9,6 +9,8 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.control import power_distribution
+from crazysim.control.gains import require_gains
 from crazysim.control.pid_loop import Loop, LoopMemory, pid_step
 from crazysim.control.power_distribution import PowerDistributionParams
 from crazysim.drones import Airframe
@@ -19,6 +21,14 @@ THRUST_SCALE = 1000.0
 """PWM per unit of the vertical velocity loop's output (``thrustScale``)."""
 TORQUE_MAX = 32767.0
 """Limit of the outputs of the rate loops, PWM (``saturateSignedInt16``)."""
+
+_LOOPS = ("position", "velocity", "attitude", "rate")
+KEYS = (
+    *(f"pid.{loop}.{key}" for loop in _LOOPS for key in ("kp", "ki", "kd")),
+    *(f"pid.{key}" for key in ("tilt_max", "thrust_base", "thrust_min")),
+    *power_distribution.KEYS,
+)
+"""Values of an airframe that this controller needs."""
 
 
 class PIDParams(PyTree):
@@ -48,6 +58,7 @@ class PIDParams(PyTree):
         Raises:
             ConfigError: If the airframe has no tables for this controller.
         """
+        require_gains(airframe, KEYS, "pid")
         return PIDParams(
             position=Loop.create(airframe, "pid.position", outer_freq),
             velocity=Loop.create(airframe, "pid.velocity", outer_freq),
@@ -83,7 +94,7 @@ class PIDMemory(PyTree):
         """Return the memory of one drone before the first tick."""
         p, rest = params, LoopMemory.at_rest
         zeros: Any = np.zeros(3)
-        loops = {name: rest(getattr(p, name)) for name in ("position", "velocity", "attitude", "rate")}
+        loops = {name: rest(getattr(p, name)) for name in _LOOPS}
         return PIDMemory(**loops, rpy_des=zeros, thrust=zeros[:1], started=zeros[:1] > 0)
 
 

@@ -8,11 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from crazysim.control.core import allocation_matrix, number_of, where_present
+from crazysim.control.levels import allocation_matrix, number_of, where_present
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import matvec, safe_clip
+
+KEYS = ("controller.pwm_max", "rotors.thrust_max", "rotors.thrust_curve")
+"""Values of an airframe that the power distribution needs."""
 
 
 class PowerDistributionParams(PyTree):

@@ -7,12 +7,12 @@ from typing import Any, ClassVar, dataclass_transform
 
 from jax import Array
 
-from crazysim.control.core import Control
+from crazysim.control.levels import Control
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree
 
-OUTPUTS = (Control.force_torque, Control.rotor_vel)
+OUTPUTS = (Control.attitude, Control.force_torque, Control.rotor_vel)
 """Levels of the commands that controllers return."""
 
 
@@ -30,7 +30,7 @@ class Controller:
     levels: ClassVar[tuple[Control, ...]]
     """Command levels that it follows."""
     output: ClassVar[Control]
-    """Level of the command that it returns, ``force_torque`` or ``rotor_vel``."""
+    """Level of the command that it returns: ``force_torque`` or ``rotor_vel``, or ``attitude`` with fitted dynamics."""
     freq: int
     """Rate of ``update``, Hz. A default that does not divide the simulation's rate is lowered to the next divisor."""
     outer_freq: int | None = None
@@ -82,7 +82,8 @@ class Controller:
             params: Parameters of the drone.
 
         Returns:
-            Collective thrust, N, and body torque, N m (4,), or rotor speeds, rpm (n_rotors,); the memory.
+            A command of the level ``output``, such as collective thrust, N, and body torque, N m (4,), or rotor
+            speeds, rpm (n_rotors,); the memory.
         """
         raise NotImplementedError(f"controller {self.name!r} does not define update")
 
@@ -99,6 +100,15 @@ class Controller:
             rotor_vel: Rotor speeds that the other controller commanded last, rpm. (n_rotors,)
         """
         return memory
+
+    def adapted(self, control: Control, fitted: str | None) -> Controller | None:
+        """Return the controller to use for a command level and dynamics; None if commands need none.
+
+        Args:
+            control: Command level.
+            fitted: Name of the fitted model; None for dynamics with rotors.
+        """
+        return self
 
     @property
     def members(self) -> tuple[Controller, ...]:

@@ -9,7 +9,7 @@ from jax import Array
 
 from crazysim.control.allocation import AllocationParams
 from crazysim.drones import Airframe
-from crazysim.dynamics.core import GRAVITY
+from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import PyTree, as_parameter, leaf
 
 

@@ -6,8 +6,17 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
+from crazysim.control.gains import require_gains
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
+
+_GAINS = ("kp", "kd", "ki", "int_err_max")
+KEYS = (
+    *(f"controller.state.{key}" for key in _GAINS),
+    *(f"controller.{key}" for key in ("mass", "mass_thrust", "pwm_max")),
+    "rotors.thrust_max",
+)
+"""Values of an airframe that this controller needs."""
 
 
 class StateParams(PyTree):
@@ -35,6 +44,7 @@ class StateParams(PyTree):
         Raises:
             ConfigError: If the airframe has no table for this controller.
         """
+        require_gains(airframe, KEYS, "crazyflow")
         to_pwm = airframe.value("controller.mass_thrust", ())
         from_pwm = (
             airframe.n_rotors * airframe.value("rotors.thrust_max", ()) / airframe.value("controller.pwm_max", ())

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
-from crazysim.control.core import Control
+from crazysim.control.levels import Control
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe

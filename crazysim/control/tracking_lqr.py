@@ -12,13 +12,13 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.core import Control
+from crazysim.control.levels import Control
 from crazysim.control.lqr import (
     Reference,
     as_weights,
     default_weights,
-    on_host,
     reference_of,
+    solve_on_host,
     state_error,
 )
 from crazysim.control.priority import prioritized_wrench
@@ -27,7 +27,7 @@ from crazysim.control.riccati import gain_continuous, solve_lyapunov
 from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.dynamics.core import GRAVITY
+from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.pytree import as_parameter, leaf
 from crazysim.rotation import cross, matvec
@@ -223,7 +223,7 @@ class TrackingLQR(Controller):
         mass, drag = airframe.value("rigid_body.mass"), airframe.value("drag.coefficients")
         drag = np.diag(drag) if drag.ndim == 1 else drag
         gains_of = functools.partial(tracking_gains, substeps=math.ceil(self.dt * self.freq))
-        gains = on_host(gains_of, self.setpoints, self.dt, mass, airframe.inertia, drag, Q, R)
+        gains = solve_on_host(gains_of, self.setpoints, self.dt, mass, airframe.inertia, drag, Q, R)
         return TrackingLQRParams(
             **rigid_body(airframe),
             gains=as_parameter(gains),

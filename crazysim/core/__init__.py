@@ -6,6 +6,7 @@ Exported here are the functions with which stages and resets are written.
 from crazysim.core.pipeline import append_fn, insert_fn_after, insert_fn_before, prepend_fn, remove_fn, replace_fn
 from crazysim.core.plugin import FunctionPlugin, Placement, Plugin, check_parameter, parameter
 from crazysim.core.random import drone_key, drone_keys, seed_sim, world_key, world_keys
+from crazysim.core.settings import dividing_rate
 from crazysim.core.sharding import shard, world_mesh
 from crazysim.pytree import map_batched, scopes, select_worlds
 
@@ -15,6 +16,7 @@ __all__ = [
     "Plugin",
     "append_fn",
     "check_parameter",
+    "dividing_rate",
     "drone_key",
     "drone_keys",
     "insert_fn_after",

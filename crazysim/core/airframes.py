@@ -40,6 +40,8 @@ def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: i
     """
     if not is_list(drone):
         return (load_airframe(drone),) * n_drones  # type: ignore[arg-type]
+    if not drone:
+        raise ConfigError("expected an airframe or a list with one for each drone, got an empty list")
     if len(drone) != n_drones:
         raise ConfigError(
             f"expected {n_drones} airframes, one for each drone, got {len(drone)}. Use Sim(n_drones={len(drone)}), or "

@@ -38,6 +38,8 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
         command, memory = controller.update(data, command_in_force(data), own.memory, own.params)
         if controller.output == Control.rotor_vel:
             controls = controls.replace(rotor_vel=command)
+        elif controller.output == Control.attitude:
+            controls = controls.replace(attitude=controls.attitude.replace(staged_cmd=command))
         else:
             controls = controls.replace(force_torque=controls.force_torque.replace(staged_cmd=command))
         return data.replace(controls=controls.replace(controller=own.replace(memory=memory)))

@@ -10,11 +10,15 @@ import numpy as np
 from jax import Array
 
 from crazysim.control import AllocationParams, AttitudeParams, Control, Controller, StateParams
+from crazysim.control import attitude as attitude_control
+from crazysim.control import state as state_control
+from crazysim.control.controllers import CASCADE
+from crazysim.control.gains import require_gains
 from crazysim.core.airframes import Airframes, as_airframes, for_drones, n_rotors_of
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, floating, leaf, of_host, scopes, static
+from crazysim.pytree import PyTree, floating, host_array, leaf, scopes, static
 
 
 class StateControlData(PyTree):
@@ -129,7 +133,7 @@ class ControllerData(PyTree):
         def of_all(x: Any, like: Any) -> Any:
             dtype = floating() if np.issubdtype(np.asarray(x).dtype, np.floating) else np.asarray(x).dtype
             core = np.shape(x)[np.ndim(x) - np.ndim(like) :]  # it may have rows of drones, and more rotors
-            return of_host(x, n_worlds, n_drones, *core, dtype=dtype)
+            return host_array(x, n_worlds, n_drones, *core, dtype=dtype)
 
         return ControllerData(jax.tree.map(of_all, memory, one), params, controller.freq)
 
@@ -173,16 +177,20 @@ class SimControls(PyTree):
         require_controller(dynamics, control, controller)
 
         def zeros(n: int) -> Any:
-            return of_host(0.0, *shape, n)
+            return host_array(0.0, *shape, n)
 
         def gains(create: Callable[[Airframe], Any]) -> Any:
             return for_drones(airframes, create, n_worlds)
 
         cascade = with_rotors and controller is None
 
+        if controller is None:
+            for airframe in as_airframes(airframes):
+                require_gains(airframe, _gains_of_cascade(control, with_rotors), CASCADE)
+
         state = attitude = body_rate = force_torque = rotor_vel = None
         if control == Control.state:
-            cmd = of_host(np.eye(16)[12], *shape, 16)
+            cmd = host_array(np.eye(16)[12], *shape, 16)
             # A copy, because two leaves that share a buffer cannot both be donated.
             state = StateControlData(
                 cmd,
@@ -193,7 +201,8 @@ class SimControls(PyTree):
                 feedforward=None if controller is None else zeros(8),
                 staged_feedforward=None if controller is None else zeros(8),
             )
-        if control == Control.attitude or (control == Control.state and controller is None):
+        commands_attitude = controller is None or controller.output == Control.attitude
+        if control == Control.attitude or (control == Control.state and commands_attitude):
             attitude = AttitudeControlData(
                 cmd=zeros(4),
                 staged_cmd=zeros(4),
@@ -220,6 +229,12 @@ class SimControls(PyTree):
             force_torque = ForceTorqueControlData(zeros(4), zeros(4), freqs[Control.force_torque], params)
         data = None if controller is None else ControllerData.create(*shape, controller, airframes)
         return SimControls(control, state, attitude, body_rate, force_torque, rotor_vel, data)
+
+
+def _gains_of_cascade(control: Control, with_rotors: bool) -> tuple[str, ...]:
+    """Return the values of an airframe that Crazyflow's cascade needs at a level and at those below it."""
+    rotates = with_rotors and control in (Control.state, Control.attitude, Control.body_rate)
+    return (state_control.KEYS if control == Control.state else ()) + (attitude_control.KEYS if rotates else ())
 
 
 def require_pair(dynamics: Dynamics, control: Control) -> None:
@@ -249,8 +264,13 @@ def require_controller(dynamics: Dynamics, control: Control, controller: Control
                 f"expected a command level that controller {member.name!r} follows, {' or '.join(member.levels)}, got "
                 f"control={control.value!r}. Use another level, or controller='crazyflow', which follows all."
             )
-    if dynamics != Dynamics.first_principles:
+    if dynamics != Dynamics.first_principles and controller.output != Control.attitude:
         raise ConfigError(
             f"expected dynamics with rotors for controller {controller.name!r}, got {dynamics.value!r}, which contains "
-            f"a controller of its own. Use dynamics='first_principles'."
+            f"a controller of its own. Use dynamics='first_principles' or controller='auto'."
+        )
+    if dynamics == Dynamics.first_principles and controller.output == Control.attitude:
+        raise ConfigError(
+            f"expected a controller that commands rotors for dynamics {dynamics.value!r}, got {controller.name!r} with "
+            f"output 'attitude'. Use output = Control.force_torque."
         )

@@ -17,9 +17,12 @@ from crazysim.core.controls import SimControls
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, of_host, static
+from crazysim.pytree import PyTree, host_array, leaf, static
 
 SimParams = first_principles.Params | fitted.Params
+
+MAX_STEPS = 2**31 - 1
+"""Largest number of steps since a reset, that of an int32: 24.9 days at 1000 Hz."""
 
 
 class SimState(PyTree):
@@ -47,13 +50,13 @@ class SimState(PyTree):
         grid = np.zeros((n_drones, 3))
         grid[:, :2] = grid_2d(n_drones)
         return SimState(
-            pos=of_host(grid, *shape, 3),
-            quat=of_host([0.0, 0.0, 0.0, 1.0], *shape, 4),
-            vel=of_host(0.0, *shape, 3),
-            ang_vel=of_host(0.0, *shape, 3),
-            force=of_host(0.0, *shape, 3),
-            torque=of_host(0.0, *shape, 3),
-            rotor_vel=of_host(0.0, *shape, n_rotors),
+            pos=host_array(grid, *shape, 3),
+            quat=host_array([0.0, 0.0, 0.0, 1.0], *shape, 4),
+            vel=host_array(0.0, *shape, 3),
+            ang_vel=host_array(0.0, *shape, 3),
+            force=host_array(0.0, *shape, 3),
+            torque=host_array(0.0, *shape, 3),
+            rotor_vel=host_array(0.0, *shape, n_rotors),
         )
 
 
@@ -84,7 +87,7 @@ class SimStateDeriv(PyTree):
             n_rotors: Number of rotors.
         """
         sizes = {"vel": 3, "ang_vel": 3, "acc": 3, "ang_acc": 3, "rotor_acc": n_rotors}
-        zeros = {name: of_host(0.0, n_worlds, n_drones, size) for name, size in sizes.items()}
+        zeros = {name: host_array(0.0, n_worlds, n_drones, size) for name, size in sizes.items()}
         return SimStateDeriv(**(zeros if device is None else jax.device_put(zeros, device)))
 
 
@@ -94,11 +97,12 @@ class SimCore(PyTree):
     freq: int = static()
     """Rate of physics steps, Hz."""
     steps: Array = leaf("world")
-    """Number of physics steps since the last reset of the world. (n_worlds, 1)"""
+    """Number of physics steps since the last reset of the world, at most ``MAX_STEPS``. (n_worlds, 1)"""
     episode: Array = leaf("world")
     """Number of resets of the world; enters its random numbers. (n_worlds, 1)"""
     nonfinite: Array = leaf("world")
-    """True where the world has become non-finite since its last reset. (n_worlds, 1)"""
+    """True where the world has become non-finite, or taken more than ``MAX_STEPS``, since its last reset.
+    (n_worlds, 1)"""
     n_worlds: int = static()
     """Number of worlds."""
     n_drones: int = static()
@@ -119,16 +123,16 @@ class SimCore(PyTree):
         """Return the core of a simulation before its first step."""
         return SimCore(
             freq=freq,
-            steps=of_host(0, n_worlds, 1, dtype=np.int32),
-            episode=of_host(0, n_worlds, 1, dtype=np.int32),
-            nonfinite=of_host(False, n_worlds, 1, dtype=bool),
+            steps=host_array(0, n_worlds, 1, dtype=np.int32),
+            episode=host_array(0, n_worlds, 1, dtype=np.int32),
+            nonfinite=host_array(False, n_worlds, 1, dtype=bool),
             n_worlds=n_worlds,
             n_drones=n_drones,
-            world_id=of_host(np.arange(n_worlds)[:, None], n_worlds, 1, dtype=np.int32),
-            drone_id=of_host(np.arange(n_drones), n_worlds, n_drones, dtype=np.int32),
-            drone_mocap_ids=of_host(drone_mocap_ids, n_drones, dtype=np.int32),
+            world_id=host_array(np.arange(n_worlds)[:, None], n_worlds, 1, dtype=np.int32),
+            drone_id=host_array(np.arange(n_drones), n_worlds, n_drones, dtype=np.int32),
+            drone_mocap_ids=host_array(drone_mocap_ids, n_drones, dtype=np.int32),
             rng_key=as_key(rng_key),
-            mjx_synced=of_host(False, dtype=bool),
+            mjx_synced=host_array(False, dtype=bool),
         )
 
 

@@ -2,45 +2,129 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
+from crazysim import jaxcompat
 from crazysim.control import COMMAND_FIELDS, Control, Setpoint
 from crazysim.core.data import SimData, command_shape
+from crazysim.core.settings import flag
 from crazysim.core.stage import tick
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 
 FEEDFORWARD = "jerk x, y, z [m/s^3], snap x, y, z [m/s^4], yaw rate [rad/s], yaw acceleration [rad/s^2]"
 """Entries of a feedforward with their units, for messages."""
 
 
-def state_control(data: SimData, controls: Any, check_finite: bool = False, *, feedforward: Any = None) -> SimData:
-    """Stage a full-state setpoint for every drone.
+def state_control(
+    data: SimData,
+    controls: ArrayLike | None = None,
+    check_finite: bool = False,
+    *,
+    pos: ArrayLike | None = None,
+    vel: ArrayLike | None = None,
+    acc: ArrayLike | None = None,
+    yaw: ArrayLike | None = None,
+    feedforward: ArrayLike | None = None,
+) -> SimData:
+    """Stage a full-state setpoint for every drone: a vector for each, or ``pos`` and what else is not zero.
+
+    ``pos``, ``vel`` and ``acc`` broadcast to (n_worlds, n_drones, 3) by NumPy's rules, ``yaw`` to (n_worlds, n_drones):
+    (3,) is one position for all, (n_drones, 3) one for each drone, (n_worlds, 1, 3) one for each world.
 
     Args:
         data: Data of a simulation built with ``control="state"``.
-        controls: Position, velocity, acceleration, quaternion (xyzw), body rates. (n_worlds, n_drones, 16)
+        controls: Position, velocity, acceleration, quaternion (xyzw), body rates; None with ``pos``.
+            (n_worlds, n_drones, 16)
         check_finite: True to check device arrays too, which waits for the device; host input is always checked.
+        pos: Position, world frame, m; None with ``controls``. (..., 3)
+        vel: Velocity, world frame, m/s, with ``pos``. (..., 3)
+        acc: Acceleration, world frame, m/s^2, with ``pos``. (..., 3)
+        yaw: Yaw, rad, with ``pos``. (...)
         feedforward: Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, yaw acceleration, rad/s^2; None for the yaw rate of the
             setpoint and zeros. Crazyflow's cascade takes none. (n_worlds, n_drones, 8)
 
     Raises:
-        ValueError: Wrong shape, type or command level, or a NaN or infinite command.
+        ValueError: Wrong shape, type or command level, a NaN or infinite command, or both forms at once.
     """
+    return stage_command(
+        data, *check_setpoint(data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward)
+    )
+
+
+def check_setpoint(
+    data: SimData, controls: ArrayLike | None, check_finite: bool, *, feedforward: ArrayLike | None, **parts: Any
+) -> tuple[Array, Array | None]:
+    """Return a full-state setpoint and its feedforward as arrays of the state's dtype, for ``stage_command``.
+
+    Arguments and errors as in ``state_control``; of the data, shapes and types are enough.
+    """
+    parts = {name: x for name, x in parts.items() if x is not None}
+    if controls is None:
+        controls = _joined(data, parts)
+    elif parts:
+        raise ConfigError(
+            f"expected one vector of 16 numbers per drone or its parts, got both, with {', '.join(parts)}. Write them "
+            f"into the vector, or leave it out."
+        )
     command = check_command(data, Control.state, controls, check_finite)
     if feedforward is None:
-        return stage_command(data, command)
+        return command, None
     if data.controls.state.staged_feedforward is None:
         raise ConfigError("expected no feedforward, which Crazyflow's cascade cannot follow. Use Sim(controller=...).")
     shape = (*command.shape[:-1], 8)
-    return stage_command(data, command, _as_command(data, "feedforward", shape, FEEDFORWARD, feedforward, check_finite))
+    return command, _as_command(data, "feedforward", shape, FEEDFORWARD, feedforward, check_finite)
 
 
-def attitude_control(data: SimData, controls: Any, check_finite: bool = False) -> SimData:
+def _joined(data: SimData, parts: dict[str, Any]) -> Array | np.ndarray:
+    """Return the setpoint of some parts, on the host if all of them are. (n_worlds, n_drones, 16)
+
+    Raises:
+        ConfigError: If there is no position, or a part has another shape or type, or is NaN or infinite on the host.
+    """
+    if "pos" not in parts:
+        raise ConfigError("expected a state command, got no position. Use pos=(0, 0, 1), or 16 numbers per drone.")
+    counts = data.states.pos.shape[:2]
+    given = {name: _part(name, x, counts if name == "yaw" else (*counts, 3)) for name, x in parts.items()}
+    if any(isinstance(x, jax.Array) for x in given.values()):
+        return _device_setpoint(counts, data.states.pos.dtype, given)
+    return _setpoint(np, counts, float, given)
+
+
+def _part(name: str, value: Any, shape: tuple[int, ...]) -> Array | np.ndarray:
+    """Return a part of a setpoint as an array that broadcasts to a shape."""
+    try:
+        array = value if isinstance(value, jax.Array) else np.asarray(value)
+        fits = np.broadcast_shapes(array.shape, shape) == shape
+    except ValueError:  # a list of lists of unequal lengths, or shapes that do not broadcast
+        array, fits = np.zeros(0), False
+    numbers = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
+    if not (fits and numbers and (name == "yaw" or array.shape[-1:] == (3,))):
+        raise ConfigError(f"expected {name} as numbers that broadcast to shape {shape}, got {shown(value)}")
+    if isinstance(array, np.ndarray) and not np.isfinite(array).all():
+        raise ConfigError(f"expected finite numbers as {name}, got {shown(value)}. Check its computation.")
+    return array
+
+
+def _setpoint(xp: Any, counts: tuple[int, ...], dtype: Any, parts: dict[str, Any]) -> Any:
+    """Return the setpoint of some parts, with zeros for the others and for the body rates. (n_worlds, n_drones, 16)"""
+    zeros = xp.zeros((*counts, 3), dtype)
+    vectors = [xp.asarray(parts.get(name, zeros), dtype) for name in ("pos", "vel", "acc")]
+    half = xp.asarray(parts.get("yaw", 0.0), dtype)[..., None] / 2 + zeros[..., :1]
+    quat = [zeros[..., :2], xp.sin(half), xp.cos(half)]
+    return xp.concatenate([*(xp.broadcast_to(x, zeros.shape) for x in vectors), *quat, zeros], axis=-1)
+
+
+_device_setpoint = jax.jit(functools.partial(_setpoint, jnp), static_argnums=(0, 1))
+
+
+def attitude_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Stage roll, pitch, yaw, rad, and collective thrust, N, for every drone. (n_worlds, n_drones, 4)
 
     Arguments and errors as in ``state_control``.
@@ -48,7 +132,7 @@ def attitude_control(data: SimData, controls: Any, check_finite: bool = False) -
     return stage_command(data, check_command(data, Control.attitude, controls, check_finite))
 
 
-def body_rate_control(data: SimData, controls: Any, check_finite: bool = False) -> SimData:
+def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Stage body rates, rad/s, and collective thrust, N, for every drone. (n_worlds, n_drones, 4)
 
     Arguments and errors as in ``state_control``.
@@ -56,7 +140,7 @@ def body_rate_control(data: SimData, controls: Any, check_finite: bool = False) 
     return stage_command(data, check_command(data, Control.body_rate, controls, check_finite))
 
 
-def force_torque_control(data: SimData, controls: Any, check_finite: bool = False) -> SimData:
+def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Stage collective thrust, N, and body torque, N m, for every drone. (n_worlds, n_drones, 4)
 
     Arguments and errors as in ``state_control``.
@@ -64,7 +148,7 @@ def force_torque_control(data: SimData, controls: Any, check_finite: bool = Fals
     return stage_command(data, check_command(data, Control.force_torque, controls, check_finite))
 
 
-def rotor_vel_control(data: SimData, controls: Any, check_finite: bool = False) -> SimData:
+def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
     """Command rotor speeds, rpm, for every drone; they hold from the next step on. (n_worlds, n_drones, n_rotors)
 
     Arguments and errors as in ``state_control``.
@@ -84,19 +168,29 @@ def stage_command(data: SimData, command: Array, feedforward: Array | None = Non
         feedforward: Feedforward of a setpoint; None for the yaw rate of the setpoint and zeros. (..., 8)
     """
     controls, mode = data.controls, data.controls.mode
+    fields = staged_fields(data, command, feedforward)
     if mode == Control.rotor_vel:
-        return data.replace(controls=controls.replace(rotor_vel=command))
-    level = getattr(controls, mode.value).replace(staged_cmd=command)
-    if mode == Control.state and level.staged_feedforward is not None:
-        if feedforward is None:
-            feedforward = _feedforward_of(command)
-        level = level.replace(staged_feedforward=feedforward)
+        return data.replace(controls=controls.replace(**fields))
+    level = getattr(controls, mode.value).replace(**fields)
     return data.replace(controls=controls.replace(**{mode.value: level}))
 
 
+def staged_fields(data: SimData, command: Array, feedforward: Array | None = None) -> dict[str, Array]:
+    """Return the fields that ``stage_command`` writes: of ``data.controls``, or of the record of the command level."""
+    mode = data.controls.mode
+    if mode == Control.rotor_vel:
+        return {"rotor_vel": command}
+    if mode != Control.state or getattr(data.controls, mode.value).staged_feedforward is None:
+        return {"staged_cmd": command}
+    return {
+        "staged_cmd": command,
+        "staged_feedforward": feedforward_of(command) if feedforward is None else feedforward,
+    }
+
+
 @jax.jit
-def _feedforward_of(command: Array) -> Array:
-    """Return the feedforward of a setpoint that is given without one."""
+def feedforward_of(command: Array) -> Array:
+    """Return the feedforward of a setpoint that is given without one. (..., 8)"""
     return Setpoint.of_command(command).feedforward()
 
 
@@ -112,8 +206,8 @@ def controllable(data: SimData) -> Array:
     return jnp.ones_like(data.core.steps, bool) if mask is None else mask
 
 
-def check_command(data: SimData, control: Control, command: Any, check_finite: bool = False) -> Array:
-    """Return a command as an array of the state's dtype.
+def check_command(data: SimData, control: Control, command: ArrayLike, check_finite: bool = False) -> Array:
+    """Return a command as an array of the state's dtype; of the data, shapes and types are enough.
 
     Raises:
         ValueError: Wrong shape, type or command level, or a NaN or infinite command.
@@ -129,7 +223,7 @@ def check_command(data: SimData, control: Control, command: Any, check_finite: b
 
 
 def _as_command(
-    data: SimData, name: str, shape: tuple[int, ...], fields: str, command: Any, check_finite: bool
+    data: SimData, name: str, shape: tuple[int, ...], fields: str, command: ArrayLike, check_finite: bool
 ) -> Array:
     """Return a command of some shape as an array of the state's dtype, as ``check_command``."""
     on_host = not isinstance(command, jax.Array)
@@ -143,13 +237,17 @@ def _as_command(
             f"(n_worlds, n_drones, {shape[-1]}): {fields}. "
             f"For one command to all drones use np.broadcast_to(cmd, {shape})."
         )
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise ValueError(f"expected real numbers as {name} command, got type {array.dtype}; use float32")
     dtype = data.states.pos.dtype
     # Host input of any type reaches the device with one dtype and placement, so nothing is traced or compiled again.
-    with np.errstate(over="ignore"):  # a number too large for the dtype becomes infinite, which is reported below
-        array = array.astype(dtype)
+    if array.dtype == dtype:
+        array = array.copy() if on_host else array.astype(dtype)
+    elif jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer):
+        with np.errstate(over="ignore"):  # a number too large for the dtype becomes infinite, which is reported below
+            array = array.astype(dtype)
+    else:
+        raise ValueError(f"expected real numbers as {name} command, got type {array.dtype}; use float32")
     is_tracer = isinstance(array, jax.core.Tracer)
+    check_finite = flag("check_finite", check_finite)
     if (on_host or (check_finite and not is_tracer)) and not np.all(np.isfinite(array)):
         worlds = np.unique(np.nonzero(~np.isfinite(np.asarray(array)))[0])[:8]
         raise ValueError(
@@ -157,4 +255,9 @@ def _as_command(
             f"until their next reset; check the computation that returns it"
         )
     inside_jit = is_tracer or isinstance(data.states.pos, jax.core.Tracer)
-    return jnp.asarray(array) if inside_jit else jax.device_put(array, data.states.pos.sharding)
+    if inside_jit:
+        return jnp.asarray(array)
+    sharding = data.states.pos.sharding
+    if isinstance(array, np.ndarray):
+        return jaxcompat.put_own(array, sharding)
+    return array if array.committed and array.sharding == sharding else jax.device_put(array, sharding)

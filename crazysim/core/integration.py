@@ -101,7 +101,7 @@ def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, final: bool
     return data.replace(states=states, plugins=data.plugins | moved)
 
 
-def limit_ang_vel(ang_vel: Array, freq: int) -> Array:
+def limit_ang_vel(ang_vel: Array, freq: float) -> Array:
     """Return angular velocities limited to ``MAX_ROTATION`` per step about each axis, rad/s. (..., 3)"""
     limit = MAX_ROTATION * freq
     return rotation.safe_clip(ang_vel, -limit, limit)

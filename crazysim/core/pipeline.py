@@ -9,9 +9,30 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from crazysim.errors import UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, shown
 
 Pipeline = dict[str, Callable[..., Any]]
+
+
+def checked(name: str, pipeline: Any) -> Pipeline:
+    """Return a pipeline that a user assigns.
+
+    Args:
+        name: Name of the pipeline, for messages.
+        pipeline: The pipeline.
+
+    Raises:
+        ConfigError: If it is not a dict from names to functions, or is empty.
+    """
+    if not isinstance(pipeline, dict) or not pipeline:
+        raise ConfigError(
+            f"expected {name} as a dict with a function for each name of a stage, got {shown(pipeline)}. Use "
+            f"insert_fn_before or remove_fn of crazysim.core.pipeline to edit the present one."
+        )
+    for stage, fn in pipeline.items():
+        if not isinstance(stage, str) or not callable(fn):
+            raise ConfigError(f"expected names and functions in {name}, got {shown(stage)}: {shown(fn)}")
+    return pipeline
 
 
 def append_fn(pipeline: Pipeline, fn: Callable[..., Any], name: str | None = None) -> None:

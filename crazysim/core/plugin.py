@@ -18,6 +18,7 @@ from crazysim.core.pipeline import Pipeline
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import PyTree, on_device
+from crazysim.tables import LARGEST
 
 
 class Simulation(Protocol):
@@ -30,6 +31,7 @@ class Simulation(Protocol):
     integrator: Any
     n_worlds: int
     n_drones: int
+    lock: Any
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -139,10 +141,10 @@ def check_parameter(
             f"{array.dtype}"
         )
     if (
-        not np.all(np.isfinite(array))
+        not np.all(np.abs(array.astype(np.float64)) <= LARGEST)
         or np.any(array < low)
         or np.any(array > high)
-        or (positive and np.any(array <= 0))
+        or (positive and np.any(array < 1 / LARGEST))
     ):
         bounds = "positive" if positive else f"from {low} to {high}"
         raise ConfigError(f"expected {name} to be finite and {bounds}, got {value!r}")

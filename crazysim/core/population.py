@@ -20,10 +20,13 @@ from crazysim.core.data import SimData
 from crazysim.core.influence import own_rates
 from crazysim.core.integration import Integrator
 from crazysim.core.plugin import Placement, Plugin, Simulation
-from crazysim.core.settings import positive
+from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import RESERVED, Stage, tick
 from crazysim.errors import ConfigError
 from crazysim.pytree import Members, PyTree, floating
+
+MAX_MEMBERS = 100_000
+"""Most members of a population in a world."""
 
 R = TypeVar("R", bound=Members)
 
@@ -64,6 +67,8 @@ class Population(Plugin):
         """
         members, kind = self.members, type(self).__name__
         if isinstance(members, (int, np.integer)) and not isinstance(members, bool):
+            if members > MAX_MEMBERS:
+                raise ConfigError(f"expected at most {MAX_MEMBERS} members of {kind} in a world, got {members}")
             names = tuple([f"{self.prefix}_{k}" for k in range(members)])
         else:
             names = tuple(members) if isinstance(members, Sequence) and not isinstance(members, str) else ()
@@ -122,15 +127,8 @@ class Population(Plugin):
         """
         if self.name in (*RESERVED, "drone", "world"):
             raise ConfigError(f"expected a name of a population, got {self.name!r}, a scope of stages. Use name=.")
-        if self.control_freq is None:
-            return
-        freq, rate = sim.data.core.freq, positive(f"control_freq of {self.name!r}", self.control_freq)
-        if freq % rate:
-            nearest = next(f for f in range(min(rate, freq), 0, -1) if freq % f == 0)
-            raise ConfigError(
-                f"expected control_freq of {self.name!r} to divide freq = {freq} Hz, got {rate} Hz. Use the nearest "
-                f"rate below, {nearest} Hz."
-            )
+        if self.control_freq is not None:
+            dividing_rate(f"control_freq of {self.name!r}", self.control_freq, sim.data.core.freq)
 
     def control(self, data: SimData) -> Members:
         """Return the record of one member with what its controller computes, at ``control_freq``."""
@@ -143,6 +141,13 @@ class Population(Plugin):
         of its four numbers; ``finish`` restores its length.
         """
         return {}
+
+    def scheme(self, integrator: Integrator) -> Callable[..., Any]:
+        """Return the function ``(record, rates, dt) -> record`` by which the integration advances one member.
+
+        Override it for states that another method advances better, such as fast rotation under Euler's schemes.
+        """
+        return scheme_of(integrator, self.positions)
 
     def finish(self, record: Members) -> Members:
         """Return the record of one member at the end of a step: unit quaternions restored, states limited."""
@@ -158,7 +163,7 @@ class Population(Plugin):
             found.append(Placement(Stage(self._controlled, self.name, when, name=name), name=name))
         if cls.derivative is not Population.derivative:
             name = f"{self.name}_integration"
-            step = functools.partial(self._integrated, scheme_of(sim.integrator, self.positions))
+            step = functools.partial(self._integrated, self.scheme(sim.integrator))
             found.append(Placement(Stage(step, self.name, name=name), before="increment_steps", name=name))
         return found
 

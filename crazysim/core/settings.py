@@ -3,27 +3,99 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import itertools
+from collections.abc import Mapping
+from enum import Enum
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import NDArray
 
 from crazysim.control import Control, Controller
 from crazysim.control.switch import Switch
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, shown
+
+E = TypeVar("E", bound=Enum)
+
+MAX_ITERATIONS = 1000
+"""Most iterations of a solver of contacts; the defaults are 8 to 20."""
+MAX_FRICTION = 1000.0
+"""Largest coefficient of friction; that of rubber is about 1."""
+MAX_SOFTNESS = 10.0
+"""Largest softness of contacts, s."""
+
+SLOW_FREQ = 200
+"""Rate of physics steps, Hz, below which half of it is too slow for a controller: the cascades of small drones are
+stable from 100 Hz on, and none of them at 50 Hz (hover of ``cf21B_500``, euler)."""
 
 
-def positive(name: str, value: Any) -> int:
+def positive(name: str, value: Any, at_most: int | None = None) -> int:
     """Return a positive integer.
+
+    Args:
+        name: Name of the setting, for messages.
+        value: The setting.
+        at_most: Largest value; None for any.
 
     Raises:
         ConfigError: If the value is anything else.
     """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ConfigError(f"{name} is {value!r}; it must be a positive whole number")
+        raise ConfigError(f"{name} is {shown(value)}; it must be a positive whole number")
+    if at_most is not None and value > at_most:
+        raise ConfigError(f"{name} is {shown(value)}; it must be at most {at_most}")
     return int(value)
+
+
+def flag(name: str, value: Any) -> bool:
+    """Return a setting that is on or off.
+
+    Args:
+        name: Name of the setting, for messages.
+        value: The setting.
+
+    Raises:
+        ConfigError: If it is anything but True or False; ``"no"`` and 2 would count as true.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ConfigError(f"expected {name} as True or False, got {shown(value)}")
+    return bool(value)
+
+
+def check_flags(settings: Any) -> None:
+    """Check every field of a record of settings, such as a plugin, that is declared as ``bool``.
+
+    Raises:
+        ConfigError: If one is anything but True or False.
+    """
+    for field in dataclasses.fields(settings):
+        if field.type in (bool, "bool"):
+            flag(f"{field.name} of {type(settings).__name__}", getattr(settings, field.name))
+
+
+def check_contacts(freq: int, friction: Any, restitution: Any, softness: Any, iterations: Any) -> None:
+    """Check the settings of contacts.
+
+    Args:
+        freq: Rate of physics steps, Hz.
+        friction: Coulomb's coefficients.
+        restitution: Ratios of the speeds after and before a bounce.
+        softness: Time constant with which an overlap is pushed out, s.
+        iterations: Iterations of the solver.
+
+    Raises:
+        ConfigError: If one is invalid.
+    """
+    settings = {"friction": (friction, 0.0, MAX_FRICTION), "restitution": (restitution, 0.0, 1.0)}
+    for name, (value, low, high) in (settings | {"softness": (softness, 2 / freq, MAX_SOFTNESS)}).items():
+        array = np.asarray(value)
+        if array.dtype.kind not in "iuf" or not np.all((array >= low) & (array <= high)):
+            least = f"two steps, {low:.4g} s," if low else "0"
+            raise ConfigError(f"expected {name} to be from {least} to {high:g}, got {shown(value)}")
+    positive("iterations", iterations, MAX_ITERATIONS)
 
 
 def physics_freq(freq: Any) -> int:
@@ -41,7 +113,7 @@ def physics_freq(freq: Any) -> int:
     return freq
 
 
-def member(enum: Any, name: str, value: Any) -> Any:
+def member(enum: type[E], name: str, value: Any) -> E:
     """Return the member of an enum.
 
     Raises:
@@ -62,11 +134,12 @@ def find_device(device: str | jax.Device) -> jax.Device:
     """
     if isinstance(device, jax.Device):
         return device
-    if not isinstance(device, str):
+    platform, colon, index = device.partition(":") if isinstance(device, str) else ("", "", "")
+    if not platform or (colon and not index.isdecimal()):
         raise ConfigError(
-            f"expected a platform such as 'cpu', 'gpu' or 'gpu:1', or a jax.Device, got {device!r}; use device='cpu'"
+            f"expected a platform such as 'cpu', 'gpu' or 'gpu:1', or a jax.Device, got {shown(device)}; use "
+            f"device='cpu'"
         )
-    platform, _, index = device.partition(":")
     try:
         devices = jax.devices("gpu" if platform == "cuda" else platform)
         return devices[int(index or 0)]
@@ -78,63 +151,155 @@ def find_device(device: str | jax.Device) -> jax.Device:
         ) from None
 
 
-def as_mask(mask: Any, n_worlds: int) -> Array | None:
-    """Return a mask over worlds as an array, None for all worlds. (n_worlds,)
+def as_rgba(rgba: Any, n: int | None = None, name: str = "rgba") -> NDArray[np.float64]:
+    """Return a colour. (4,)
+
+    Args:
+        rgba: Red, green, blue and opacity, 0 to 1.
+        n: Number of things that may have a colour each, for (n, 4); None for one colour.
+        name: Name of the setting, for messages.
 
     Raises:
-        ValueError: If it is not one bool per world.
+        ConfigError: If it is anything else, such as a name.
+    """
+    try:
+        array = np.asarray(rgba)
+    except ValueError:
+        array = np.array(None)
+    shapes = [(4,)] if n is None else [(4,), (n, 4)]
+    if array.dtype.kind not in "iuf" or array.shape not in shapes or not np.all((array >= 0) & (array <= 1)):
+        raise ConfigError(
+            f"expected {name} as numbers from 0 to 1 of shape {' or '.join(map(str, shapes))}, got {shown(rgba)}. Use "
+            f"(1, 0, 0, 1) for red."
+        )
+    return array.astype(np.float64)
+
+
+def as_mask(mask: Any, *shapes: tuple[int, ...], each: str = "world") -> Array | None:
+    """Return a mask as an array; None, for all, stays None.
+
+    Of a traced mask shape and type are checked, which are known while it is traced.
+
+    Args:
+        mask: One bool for each world, or for each of something else.
+        shapes: Shapes that it may have: (n_worlds,), or () in functions of one world.
+        each: Name of the things that have one bool each, for the message.
+
+    Raises:
+        ConfigError: If it has another type or shape. Numbers, indices and single bools are not broadcast.
     """
     if mask is None:
         return None
     try:
         array = mask if isinstance(mask, jax.Array) else np.asarray(mask)
-    except ValueError as error:
-        raise ValueError(f"expected a mask of one bool per world, got {mask!r}; use a NumPy array") from error
-    if array.shape != (n_worlds,) or array.dtype != bool:
-        raise ValueError(
-            f"expected a mask of shape {(n_worlds,)} and bool, one per world, got shape {array.shape} and type "
-            f"{array.dtype}; for indices use np.isin(np.arange({n_worlds}), indices)"
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"expected a mask of one bool per {each}, got {mask!r}; use a NumPy array") from error
+    if array.shape not in shapes or array.dtype != bool:
+        n = shapes[0][0] if shapes[0] else 1
+        raise ConfigError(
+            f"expected a mask of shape {' or '.join(map(str, shapes))} and bool, one per {each}, got shape "
+            f"{array.shape} and type {array.dtype}; for indices use np.isin(np.arange({n}), indices)"
         )
     return jnp.asarray(array)
 
 
-def control_freqs(control: Control, freq: int, given: dict[Control, int | None]) -> dict[Control, int]:
+def control_freqs(
+    control: Control,
+    freq: int,
+    given: Mapping[Control, int | None],
+    is_fitted: bool = False,
+    controller: Controller | None = None,
+) -> dict[Control, int]:
     """Return the rate of every controller, Hz: as given, or else the largest divisor of ``freq`` up to the default.
 
     Args:
         control: Command level, which determines the controllers in use.
         freq: Rate of physics steps, Hz.
         given: Requested rates, Hz; None for the default.
+        is_fitted: True for fitted dynamics, which contain the controllers below the state controller. Like the
+            allocation, which has no memory, these may be as slow as the physics.
+        controller: Controller in place of the cascade; ``controller_at_rates`` checks its rates.
 
     Raises:
-        ConfigError: If the rate of a controller in use does not divide ``freq``.
+        ConfigError: If the rate of a controller in use does not divide ``freq``, or is far below its default.
     """
     in_use = {
         Control.state: (Control.state, Control.attitude, Control.force_torque),
         Control.rotor_vel: (),
     }.get(control, (control, Control.force_torque))
-    freqs = {}
+    checked = in_use
+    if controller is not None:
+        checked = () if controller.output == Control.rotor_vel else (Control.force_torque,)
+    freqs, defaults = {}, {}
     for level, requested in given.items():
         if requested is None:
-            freqs[level] = _largest_divisor(freq, min(100 if level == Control.state else 500, freq))
+            as_fast_as_physics = is_fitted or level == Control.force_torque
+            default = 100 if level == Control.state else min(500, freq) if as_fast_as_physics else 500
+            freqs[level] = _largest_divisor(freq, default)
+            if level in checked:
+                defaults[f"{level.value}_freq"] = default
             continue
         freqs[level] = positive(f"{level.value}_freq", requested)
         if level in in_use and freq % requested:
-            nearest = _largest_divisor(freq, min(requested, freq))
+            nearest = _largest_divisor(freq, requested)
             raise ConfigError(
                 f"{level.value}_freq is {requested} Hz, which does not divide freq = {freq} Hz, so it cannot fire "
                 f"every whole number of steps. Use the nearest rate below, {nearest} Hz."
             )
+    default_rates(freq, defaults)
     return freqs
 
 
+def default_rates(freq: int, defaults: Mapping[str, int], of: str = "") -> dict[str, int]:
+    """Return the rates of whatever runs at a default rate: the largest divisors of ``freq`` up to the defaults, Hz.
+
+    Args:
+        freq: Rate of physics steps, Hz.
+        defaults: Default rates by the names of their settings, Hz.
+        of: End of the names in the message.
+
+    Raises:
+        ConfigError: If a rate is below half of its default; where ``freq`` is below the default, if it is below half
+            of ``freq`` or of ``SLOW_FREQ``. The message names the nearest ``freq`` that is good for all.
+    """
+
+    def low(freq: int) -> list[str]:
+        limits = {name: min(default, max(freq, SLOW_FREQ)) for name, default in defaults.items()}
+        return [name for name, limit in limits.items() if 2 * _largest_divisor(freq, defaults[name]) < limit]
+
+    if names := low(freq):
+        name, default = names[0], defaults[names[0]]
+        candidates = (f for k in itertools.count(1) for f in (freq + k, freq - k) if f > 0)
+        good = next(f for f in candidates if not low(f))
+        raise ConfigError(
+            f"expected a freq with a divisor near {default} Hz, the default of {name}{of}, got {freq} Hz, whose "
+            f"largest divisor up to that is {_largest_divisor(freq, default)} Hz. Use freq={good}, or set {name}{of}."
+        )
+    return {name: _largest_divisor(freq, default) for name, default in defaults.items()}
+
+
+def dividing_rate(name: str, rate: Any, freq: int) -> int:
+    """Return a rate that was set, Hz.
+
+    Raises:
+        ConfigError: If it does not divide ``freq``.
+    """
+    rate = positive(name, rate)
+    if freq % rate:
+        raise ConfigError(
+            f"expected {name} to divide freq = {freq} Hz, got {rate} Hz. Use the nearest rate below, "
+            f"{_largest_divisor(freq, rate)} Hz."
+        )
+    return rate
+
+
 def controller_at_rates(
-    controller: Controller, control: Control, freq: int, given: dict[Control, int | None]
+    controller: Controller, control: Control, freq: int, given: Mapping[Control, int | None]
 ) -> Controller:
     """Return a controller with the rates that it has in a simulation, each a divisor of ``freq``.
 
     The requested rate of the command's level is that of the outer loop if there is one, and that of attitude then that
-    of ``update``. A rate that is the default of its class is lowered to the largest divisor.
+    of ``update``. A rate that is the default of its class becomes one of ``default_rates``.
 
     Args:
         controller: The controller.
@@ -143,28 +308,26 @@ def controller_at_rates(
         given: Requested rates, Hz; None for those of the controller.
 
     Raises:
-        ConfigError: If a rate does not divide ``freq``.
+        ConfigError: If a rate does not divide ``freq``, or is far below its default.
     """
     if isinstance(controller, Switch):
         members = tuple(controller_at_rates(member, control, freq, given) for member in controller.controllers)
         own = {rate for member in members for rate in (member.freq, member.outer_freq) if rate is not None}
         common = max(own) if all(max(own) % rate == 0 for rate in own) else freq
         return dataclasses.replace(controller, controllers=members, freq=common)
-    rates = {"freq": given.get(control)}
+    requested = {"freq": given.get(control)}
     if control == Control.state and controller.has_outer:
-        rates = {"outer_freq": given.get(control), "freq": given.get(Control.attitude)}
-    defaults = {f.name: f.default for f in dataclasses.fields(controller)}  # type: ignore[arg-type]
-    for name, requested in rates.items():
-        rate = positive(f"{name} of controller {controller.name!r}", requested or getattr(controller, name))
-        nearest = _largest_divisor(freq, min(rate, freq))
-        if rate != nearest and (requested or rate != defaults[name]):
-            raise ConfigError(
-                f"expected {name} of controller {controller.name!r} to divide freq = {freq} Hz, got {rate} Hz. Use the "
-                f"nearest rate below, {nearest} Hz."
-            )
-        rates[name] = nearest
-    return dataclasses.replace(controller, **rates)  # type: ignore[type-var]
+        requested = {"outer_freq": given.get(control), "freq": given.get(Control.attitude)}
+    own = {f.name: f.default for f in dataclasses.fields(controller)}  # type: ignore[arg-type]
+    rates, defaults, of = {}, {}, f" of controller {controller.name!r}"
+    for name, given_rate in requested.items():
+        rate = getattr(controller, name) if given_rate is None else given_rate
+        if given_rate is None and rate == own[name]:
+            defaults[name] = positive(name + of, rate)
+        else:
+            rates[name] = dividing_rate(name + of, rate, freq)
+    return dataclasses.replace(controller, **rates, **default_rates(freq, defaults, of))  # type: ignore[type-var]
 
 
 def _largest_divisor(freq: int, limit: int) -> int:
-    return next(f for f in range(limit, 0, -1) if freq % f == 0)
+    return next(f for f in range(min(limit, freq), 0, -1) if freq % f == 0)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple, cast
 
 import jax
+import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from crazysim.core.data import SimData
@@ -46,7 +48,7 @@ def locate(x: jax.Array) -> Location:
 
 
 def put(tree: Any, device: jax.Device) -> Any:
-    """Return the tree committed to a device; leaves that already are remain the same arrays."""
+    """Return the tree committed to a device, itself if it is; leaves that are remain the same arrays."""
     here = SingleDeviceSharding(device)
 
     def is_here(x: Any) -> bool:
@@ -54,8 +56,34 @@ def put(tree: Any, device: jax.Device) -> Any:
 
     leaves, treedef = jax.tree.flatten(tree)
     away = [i for i, x in enumerate(leaves) if not is_here(x)]
+    if not away:
+        return tree
     placed = jax.device_put([leaves[i] for i in away], here)  # one call for all takes half the time
     return treedef.unflatten(with_leaves(leaves, away, placed))
+
+
+def commit(x: Any, device: jax.Device) -> jax.Array:
+    """Return an array committed to a device. Under a trace, the function that is compiled then runs on it.
+
+    JAX compiles a function of uncommitted arrays for its default device. If that is the device, or under a mesh, which
+    has devices of its own, a traced array is returned as it is.
+    """
+    if not isinstance(x, jax.core.Tracer):
+        return jax.device_put(x, device)
+    with jax.ensure_compile_time_eval():
+        default = jax.device_put(np.int8(0)).devices()
+    if default == {device} or not jax.sharding.get_abstract_mesh().empty:
+        return x
+    return jax.lax.with_sharding_constraint(x, SingleDeviceSharding(device))
+
+
+def beside(x: Any) -> AbstractContextManager[Any]:
+    """Return a context in which new arrays are made on the device of an array, not on JAX's default one.
+
+    It changes nothing under a trace, whose program runs where its arguments are, and for arrays of several devices.
+    """
+    devices = () if isinstance(x, jax.core.Tracer) or not isinstance(x, jax.Array) else tuple(x.devices())
+    return jax.default_device(devices[0]) if len(devices) == 1 else nullcontext()
 
 
 def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
@@ -63,7 +91,7 @@ def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
     return jax.make_mesh((len(devices),), (WORLD_AXIS,), axis_types=(AxisType.Auto,), devices=list(devices))
 
 
-def placement(data: SimData, mesh: Mesh) -> SimData:
+def shardings_of(data: SimData, mesh: Mesh) -> SimData:
     """Return the sharding of every leaf: leaves of members and worlds are split, shared leaves are replicated.
 
     Raises:
@@ -88,9 +116,9 @@ def placement(data: SimData, mesh: Mesh) -> SimData:
 
 def shard(data: SimData, mesh: Mesh) -> SimData:
     """Return the data distributed over a mesh."""
-    return jax.device_put(data, placement(data, mesh))
+    return jax.device_put(data, shardings_of(data, mesh))
 
 
-def place_scene(mjx_data: Any, mesh: Mesh) -> Any:
+def shard_scene(mjx_data: Any, mesh: Mesh) -> Any:
     """Return the MJX data of all worlds distributed over a mesh."""
     return jax.device_put(mjx_data, NamedSharding(mesh, PartitionSpec(WORLD_AXIS)))

@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim.core.others import AXIS
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, has_members, n_batch_axes, n_world_axes, scopes
+from crazysim.pytree import PyTree, has_members, n_batch_axes, n_world_axes, numbered, scopes
 
 StageScope = str
 """``"drone"``, ``"world"``, ``"batch"`` for all worlds, or the name of a population."""
@@ -121,6 +121,8 @@ class Axes:
         """Take the data of all worlds."""
         paths, self.treedef = jax.tree_util.tree_flatten_with_path(data)
         self.names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in paths]
+        self.numbers = numbered(data)
+        """Number of every leaf, by its path."""
         self.scopes: list[str] = jax.tree.leaves(scopes(data))
 
     def written(self, before: list[Any], after: Any, stage: Stage) -> list[int]:
@@ -173,11 +175,11 @@ class Axes:
             )
         return [stage.scope]
 
-    def of_one(self, leaves: list[Any], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
+    def shapes_of_one(self, leaves: list[Any], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
         """Return what a stage is given, for each leaf of all worlds: its shape and type for one drone or world."""
-        return [self.one_of(i, x, scope) for i, x in enumerate(leaves)]
+        return [self.shape_of_one(i, x, scope) for i, x in enumerate(leaves)]
 
-    def one_of(self, i: int, x: Any, scope: StageScope) -> jax.ShapeDtypeStruct:
+    def shape_of_one(self, i: int, x: Any, scope: StageScope) -> jax.ShapeDtypeStruct:
         """Return the same for the leaf with number ``i``."""
         own, taken = self.scopes[i], 0
         if scope != "batch" and own != "batched":
@@ -219,6 +221,8 @@ def over_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
             result = fn(*treedef.unflatten(values))
             paths, returned["treedef"] = jax.tree_util.tree_flatten_with_path(result)
             returned["kinds"] = after = _kinds(result)
+            # By identity, since ``fn`` may return other trees. Only shared leaves can be the very same array, and then
+            # each stands for the others.
             numbers = {id(x): i for i, x in enumerate(values)}
             unchanged = [numbers.get(id(x)) for _, x in paths]
             for k, number in enumerate(unchanged):

@@ -22,6 +22,7 @@ from crazysim.core.controllers import controller_stages
 from crazysim.core.data import SimData, SimStateDeriv
 from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integrator
 from crazysim.core.pipeline import Pipeline
+from crazysim.core.settings import as_mask
 from crazysim.core.stage import Stage, StageScope, tick
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.pytree import Members, has_members, n_batch_axes, scopes, select_worlds
@@ -46,6 +47,8 @@ def build_step_pipeline(
     """Return the stages of one physics step, in order; ``controller`` None is Crazyflow's cascade."""
     fitted_model = dynamics != Dynamics.first_principles
     stages = cascade_stages(control, fitted_model) if controller is None else controller_stages(controller, control)
+    if controller is not None and controller.output == Control.attitude:
+        stages["commit_attitude"] = commit_attitude
     if not fitted_model and Control.rotor_vel not in (control, controller and controller.output):
         stages["force_torque_controller"] = force_torque_controller
     stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
@@ -244,13 +247,20 @@ def watched(data: SimData) -> Any:
     return data.states, data.controls, populations
 
 
-def finite(data: SimData) -> Array:
-    """Return in which worlds no state and no command is NaN or infinite. (n_worlds, 1)"""
-    records = watched(data)
+def nonfinite(data: SimData) -> Array:
+    """Return True where a world was flagged, holds NaN or infinity in a state or command, or has counted too far.
+
+    As a call takes at most ``MAX_STEPS``, a count beyond that is negative. For data of all worlds or of one world.
+
+    Returns:
+        (n_worlds, 1), or () in one world
+    """
+    records, core = watched(data), data.core
+    n_axes = max(core.steps.ndim - 1, 0)
     pairs = zip(jax.tree.leaves(scopes(records)), jax.tree.leaves(records), strict=True)
     leaves = [x for scope, x in pairs if has_members(scope)]
-    each = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in leaves])
-    return jnp.all(each, axis=0)[:, None]
+    each = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(n_axes, x.ndim))) for x in leaves])
+    return core.nonfinite | ~jnp.all(each, axis=0).reshape(core.steps.shape) | (core.steps < 0)
 
 
 def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:
@@ -265,7 +275,11 @@ def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> Si
         data: The simulation.
         default_data: The data to return to.
         mask: True in the worlds to reset; None for all. (n_worlds,)
+
+    Raises:
+        ConfigError: If the mask has another shape or type.
     """
+    mask = as_mask(mask, data.core.steps.shape[:1])
     plugins = {name: default_data.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
 
     def restore(scope: str, x: Any, default: Any) -> Any:

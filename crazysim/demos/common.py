@@ -26,8 +26,13 @@ def frames_of(seconds: float) -> int:
     return round(seconds * FPS)
 
 
+def counted(n: int, noun: str) -> str:
+    """Return a number with a noun in singular or plural, such as "1 world" or "1,024 worlds"."""
+    return f"{n:,} {noun}{'s' * (n != 1)}"
+
+
 class FilmedFlight:
-    """Steps by frames, with the time that they take, and a film that ends where this machine cannot render."""
+    """Steps by frames, with the time that they take, and a film unless this machine cannot make one."""
 
     def __init__(self, sim: Sim, path: Path, view: View, film: bool):
         """Prepare the film.
@@ -39,8 +44,12 @@ class FilmedFlight:
             film: True to make a film.
         """
         self._sim, self._path = sim, path
-        self._film = Film(path, view, fps=FPS) if film else None
+        self._film = None
         self._seconds: list[float] = []
+        try:
+            self._film = Film(path, view, fps=FPS) if film else None
+        except ImportError as error:
+            print(f"no film: {error}")
 
     def fly_frame(self) -> None:
         """Step to the next frame."""

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from crazysim.control import LoadLQR
-from crazysim.demos.common import FPS, FilmedFlight, frames_of
+from crazysim.demos.common import FPS, FilmedFlight, counted, frames_of
 from crazysim.media import View
-from crazysim.payloads import Hook
+from crazysim.plugins.payloads import Hook
+from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 
 MASS, LENGTH, HEIGHT = 0.2, 0.4, 1.2
@@ -42,8 +43,11 @@ def run(
     n_frames = frames_of(seconds)
     sim = build(n_worlds, n_drones, device)
     goal = np.asarray(sim.data.plugins["load"].pos)
-    print(f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}")
-    view = View(width=960, height=544, trail=1.0, cam_config={"lookat": [0, 0, 0.9], "distance": 2.6, "elevation": -12})
+    print(f"{counted(n_worlds, 'world')} of {counted(n_drones, 'drone')}, {sim.freq} Hz, {seconds:g} s, on {device}")
+    width, height = film_size(960, 544)
+    view = View(
+        width=width, height=height, trail=1.0, cam_config={"lookat": [0, 0, 0.9], "distance": 2.6, "elevation": -12}
+    )
     out.mkdir(parents=True, exist_ok=True)
     flight = FilmedFlight(sim, out / "load.mp4", view, film)
     for k in range(n_frames):

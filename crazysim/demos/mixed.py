@@ -12,16 +12,18 @@ from jax import Array
 
 from crazysim.control import LoadLQR, Setpoint
 from crazysim.core.data import SimData
-from crazysim.demos.common import FPS, FilmedFlight, frames_of
+from crazysim.demos.common import FPS, FilmedFlight, counted, frames_of
 from crazysim.envs.spawn import flying
 from crazysim.media import View
-from crazysim.payloads import SlungLoad
+from crazysim.plugins.contacts.terrain import Terrain
+from crazysim.plugins.follow import Follow
+from crazysim.plugins.payloads import SlungLoad
+from crazysim.plugins.vehicles import Cars, PathLQR
+from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.pytree import PyTree
-from crazysim.scene.terrain import Terrain
+from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
-from crazysim.trajectories import Follow, Trajectory, figure_eight, lissajous
-from crazysim.vehicles import Cars, PathLQR
-from crazysim.vehicles.car_data import CarData
+from crazysim.trajectories import Trajectory, figure_eight, lissajous
 
 DRONES = ("cf21B_500", "cf21B_500", "bumblebee")
 """Airframes of the drones."""
@@ -80,8 +82,13 @@ def run(
         raise ValueError(f"expected --drones {len(DRONES)}, the mixed fleet of this demonstration, got {n_drones}")
     sim = build(n_worlds, device)
     engine = sim.explain().splitlines()[0]
-    print(f"{n_worlds:,} worlds of {', '.join(sim.names)}, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
-    view = View(width=960, height=544, cam_config={"lookat": [0, 0, 0.5], "distance": 5.6, "elevation": -24})
+    print(
+        f"{counted(n_worlds, 'world')} of {', '.join(sim.names)}, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}"
+    )
+    width, height = film_size(960, 544)
+    view = View(
+        width=width, height=height, trail=1.5, cam_config={"lookat": [0, 0, 0.6], "distance": 5.2, "elevation": -24}
+    )
     out.mkdir(parents=True, exist_ok=True)
     flight = FilmedFlight(sim, out / "mixed.mp4", view, film)
     measure, frames = build_measure(sim), []
@@ -191,7 +198,7 @@ def report(sim: Sim, frames: Frame) -> None:
     )
     began = frames.touches[1:] & ~frames.touches[:-1]
     n_begun, n_worlds = int(began.sum() + frames.touches[0].sum()), int(frames.touches.any((0, 2)).sum())
-    print(f"contacts          {n_begun:,} begun, in {n_worlds:,} of {sim.n_worlds:,} worlds")
+    print(f"contacts          {n_begun:,} begun, in {n_worlds:,} of {counted(sim.n_worlds, 'world')}")
     names = [name + "'s load" * (name == "Bumblebee_0") for name in sim.names]
     first = min(round(SETTLED * FPS), len(frames.drones) - 1)
     errors = 100 * np.concatenate([frames.drone_errors, frames.car_errors], axis=-1)[first:]

@@ -12,11 +12,13 @@ from jax import Array
 from crazysim.control.load_lqr import LoadLQR
 from crazysim.control.setpoint import Setpoint
 from crazysim.core.data import SimState
-from crazysim.demos.common import FPS, FilmedFlight, frames_of
+from crazysim.demos.common import FPS, FilmedFlight, counted, frames_of
 from crazysim.media import Recorder, View
-from crazysim.payloads import Hook
+from crazysim.plugins.follow import Follow
+from crazysim.plugins.payloads import Hook
+from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
-from crazysim.trajectories import Follow, Trajectory, figure_eight, hover, line, minimum_snap
+from crazysim.trajectories import Trajectory, figure_eight, hover, line, minimum_snap
 
 MASS, HOOK_MASS, LENGTH, RING = 0.2, 0.0203, 0.4, 0.1675
 """Masses of load and hook, kg, length of the rod, m, and height of a standing load's ring, m."""
@@ -60,8 +62,10 @@ def run(
     n_frames = frames_of(seconds)
     sim, hook, plans = build(n_worlds, n_drones, device)
     engine = sim.explain().splitlines()[0]
-    print(f"{n_worlds:,} worlds of {n_drones} drones, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
-    view = View(width=960, height=544, follow=0, trail=1.5, cam_config={"distance": 1.7, "elevation": -20})
+    fleet = f"{counted(n_worlds, 'world')} of {counted(n_drones, 'drone')}"
+    print(f"{fleet}, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
+    width, height = film_size(960, 544)
+    view = View(width=width, height=height, follow=0, trail=1.5, cam_config={"distance": 1.7, "elevation": -20})
     out.mkdir(parents=True, exist_ok=True)
     recorder, flight = Recorder(sim, worlds=[0]), FilmedFlight(sim, out / "pick.mp4", view, film)
     setpoints = jax.jit(lambda t: jax.vmap(lambda plan: plan.evaluate(t).pos)(plans).reshape(n_worlds, n_drones, 3))

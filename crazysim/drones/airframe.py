@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -13,10 +12,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.drones.keys import GUIDE, KEYS, TOP_LEVEL, check_keys, suggestion
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.drones.checks import check_airframe
+from crazysim.drones.keys import GUIDE, KEYS, TABLES, TOP_LEVEL, check_keys, suggestion
+from crazysim.errors import ConfigError, UnknownNameError, shown
+from crazysim.storage import is_file, read_toml
+from crazysim.tables import as_numbers, extended
 
 FOLDER = Path(__file__).parent
+BODY = (
+    "rigid_body.mass",
+    "rigid_body.inertia",
+    "rotors.position",
+    "rotors.yaw_torque_sign",
+    "rotors.thrust_max",
+    "rotors.thrust_curve",
+)
+"""Numbers that gains and fits of an airframe assume."""
+TUNED = ("fitted", "controller", "geometric", "mellinger", "pid")
+"""Tables of gains and fits."""
 
 
 class Drone(StrEnum):
@@ -40,6 +53,8 @@ class Airframe:
     """Name: the key ``name``, or else the file's stem; ``custom`` for a dict without one."""
     tables: Mapping[str, Any]
     """All tables of the file with their numbers as float64 arrays, without units and sources."""
+    not_inherited: str = ""
+    """Reason why gains and fits of the base are missing, for messages; empty if all were inherited."""
 
     def table(self, path: str) -> Mapping[str, Any]:
         """Return a table by its dotted path, such as ``controller.state``.
@@ -53,7 +68,7 @@ class Airframe:
             if not isinstance(node, Mapping):
                 raise ConfigError(
                     f"airframe {self.name!r} has no table [{path}], only {sorted(self.tables)}. "
-                    f"Add [{path}] to the airframe; {GUIDE} lists its keys."
+                    f"{self.why_missing(path)}Add [{path}] to the airframe; {GUIDE} lists its keys."
                 )
         return node
 
@@ -67,15 +82,22 @@ class Airframe:
         Raises:
             ConfigError: If the value is missing or has another shape.
         """
-        if path not in self._by_path:
-            raise ConfigError(f"airframe {self.name!r} has no value {path!r}. {_remedy(path, self._by_path)}")
-        value = self._by_path[path]
+        if path not in self.values:
+            raise ConfigError(
+                f"airframe {self.name!r} has no value {path!r}. {self.why_missing(path)}{_remedy(path, self.values)}"
+            )
+        value = self.values[path]
         if shape is not None and value.shape != shape:
             raise ConfigError(f"airframe {self.name!r}: expected {path} of shape {shape}, got {value.shape}")
         return value
 
+    def why_missing(self, path: str) -> str:
+        """Return why a table or value of the base was not inherited, with a space at the end; empty if it was."""
+        return f"{self.not_inherited} " if self.not_inherited and path.partition(".")[0] in TUNED else ""
+
     @functools.cached_property
-    def _by_path(self) -> dict[str, NDArray[np.float64]]:
+    def values(self) -> Mapping[str, NDArray[np.float64]]:
+        """All numbers by dotted path, such as ``rigid_body.mass``."""
         return dict(_values(self.tables))
 
     @property
@@ -106,13 +128,21 @@ class Airframe:
         return np.stack([position[:, 1] / self.arm, -position[:, 0] / self.arm, sign])
 
     @property
+    def rotor_vel_limits(self) -> NDArray[np.float64]:
+        """Speeds of the least and the largest thrust of a rotor that is on, rpm. (2, 1 or n_rotors)"""
+        k0, k1, k2 = np.atleast_2d(self.value("rotors.thrust_curve")).T
+        thrusts = np.array([self.value("rotors.thrust_min", ()), self.value("rotors.thrust_max", ())])[:, None]
+        return (-k1 + np.sqrt(k1**2 - 4 * k2 * (k0 - thrusts))) / (2 * k2)
+
+    @property
     def full_thrust_voltage(self) -> float | None:
-        """Motor voltage at which a rotor reaches ``rotors.thrust_max``, V; None without a table ``[battery]``."""
-        if "battery" not in self.tables:
+        """Motor voltage at which a rotor reaches ``rotors.thrust_max``, V; None if ``[battery]`` has no such number."""
+        if "battery.thrust_over_voltage" not in self.values:
             return None
         excess = self.value("battery.thrust_over_voltage") - [self.value("rotors.thrust_max"), 0, 0, 0]
         roots = np.polynomial.polynomial.polyroots(excess)
-        return float(np.min(roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]))
+        voltages = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+        return float(np.min(voltages)) if len(voltages) else None
 
     def __repr__(self) -> str:
         """Return the name alone; the tables are long."""
@@ -128,7 +158,8 @@ def load_airframe(source: str | Path | Mapping[str, Any] | Airframe) -> Airframe
     """Return the airframe of a name, a TOML file anywhere on disk, or a dict of the same tables.
 
     A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. With
-    the key ``base``, the name or path of another airframe, only the numbers that differ from it are given.
+    the key ``base``, the name or path of another airframe, only the numbers that differ from it are given. Another body
+    (``BODY``) does not inherit gains and fits (``TUNED``).
 
     Args:
         source: Name of a built-in airframe, path of a ``.toml`` file, dict, or an airframe (returned as is).
@@ -137,42 +168,77 @@ def load_airframe(source: str | Path | Mapping[str, Any] | Airframe) -> Airframe
         UnknownNameError: If the source is neither the name of an airframe nor a file.
         ConfigError: If a table or key does not exist, or the numbers cannot be those of a drone.
     """
+    return _load(source, ())
+
+
+def is_airframe_file(source: Any) -> bool:
+    """Return True for the path of a file, and False for a name of a built-in airframe or anything else."""
+    return isinstance(source, (str, Path)) and str(source) not in airframe_names() and is_file(source)
+
+
+def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
+    """Return the airframe of a source, which is the base of others."""
     if isinstance(source, Airframe):
         return source
-    if isinstance(source, Mapping):
-        default_name, origin, tables = "custom", "", dict(source)
-    else:
-        default_name, origin, tables = _read(source)
+    bases = extended(bases, source)
+    default_name, origin, tables = ("custom", "", dict(source)) if isinstance(source, Mapping) else _read(source)
     name = str(tables.get("name", default_name))
     check_keys(f"airframe {name!r}{origin}", tables)
-    base = tables.get("base")
-    numbers = _numbers(name, {key: table for key, table in tables.items() if key not in TOP_LEVEL}, ())
-    if base is not None:
-        numbers = _merged(load_airframe(base).tables, numbers)
-    airframe = Airframe(name, numbers)
-    _check(airframe)
+    numbers, why = _numbers(name, {key: table for key, table in tables.items() if key not in TOP_LEVEL}), ""
+    if tables.get("base") is not None:
+        base = _load(tables["base"], bases)
+        inherited, why = _inherited(base, dict(_values(numbers)))
+        numbers = _merged(inherited, numbers)
+    airframe = Airframe(name, numbers, why)
+    check_airframe(airframe)
     return airframe
 
 
-def _read(source: str | Path) -> tuple[str, str, dict[str, Any]]:
+def _read(source: Any) -> tuple[str, str, Mapping[str, Any]]:
     """Return the name of an airframe, its origin for messages, and its tables."""
     if not isinstance(source, (str, Path)):
-        raise ConfigError(f"expected a drone as a name, the path of a TOML file, a dict or an Airframe, got {source!r}")
-    path = FOLDER / f"{source}.toml" if str(source) in airframe_names() else Path(source)
-    if not path.is_file():
+        raise ConfigError(
+            f"expected a drone as a name, the path of a TOML file, a dict or an Airframe, got {shown(source)}"
+        )
+    if str(source) in airframe_names():
+        return str(source), "", _built_in(str(source))
+    if not is_file(source):
         raise UnknownNameError(
             f"expected a drone as one of {', '.join(airframe_names())}, the path of a .toml file, or a dict, "
-            f"got {str(source)!r}, and no file of that path exists"
+            f"got {shown(str(source))}, and no file of that path exists"
         )
-    try:
-        return path.stem, f" in {path}", _parsed(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}; see {GUIDE} for the format") from error
+    return Path(source).stem, f" in {source}", read_toml(source, GUIDE)
 
 
-@functools.lru_cache(maxsize=32)
-def _parsed(text: str) -> dict[str, Any]:
-    return tomllib.loads(text)
+@functools.cache
+def _built_in(name: str) -> Mapping[str, Any]:
+    return read_toml(FOLDER / f"{name}.toml", GUIDE)
+
+
+def _inherited(base: Airframe, changes: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
+    """Return the tables that an airframe inherits, and why not all of them.
+
+    Args:
+        base: The base.
+        changes: The airframe's own numbers, by dotted path.
+    """
+    old = base.values
+    changed = [path for path in BODY if path in changes and not np.array_equal(changes[path], old.get(path, np.nan))]
+    lost = [table for table in TUNED if table in base.tables]
+    if not changed or not lost:
+        return base.tables, base.not_inherited
+    tables = {key: table for key, table in base.tables.items() if key not in TUNED}
+    ratio = old.get("controller.thrust2torque")
+    if ratio is not None and not {"rotors.thrust_curve", "rotors.torque_curve"} & set(changes):
+        tables["controller"] = {"thrust2torque": ratio}  # of the propellers alone
+    names = _listed(f"[{table}]" for table in lost)
+    why = f"Its base {base.name!r} has {names}, which fit another {_listed(changed)} and are not inherited."
+    return tables, why
+
+
+def _listed(names: Iterable[str]) -> str:
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -184,20 +250,16 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
     return merged
 
 
-def _numbers(name: str, node: Any, path: tuple[str, ...]) -> Any:
-    if isinstance(node, Mapping) and "value" not in node:
-        return {key: _numbers(name, item, (*path, key)) for key, item in node.items()}
-    value = node["value"] if isinstance(node, Mapping) else node
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(
-            f"airframe {name!r}: expected {'.'.join(path)} as a number or array, got {value!r}"
-        ) from error
-    if not np.all(np.isfinite(array)):
-        raise ConfigError(f"airframe {name!r}: expected {'.'.join(path)} to be finite, got {value!r}")
-    array.setflags(write=False)
-    return array
+def _numbers(name: str, tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return tables, checked by ``check_keys``, with their numbers as arrays."""
+    found = {}
+    for key, item in tables.items():
+        path = f"{prefix}{key}"
+        if path in TABLES:
+            found[key] = _numbers(name, item, f"{path}.")
+        else:
+            found[key] = as_numbers(f"airframe {name!r}", path, item)
+    return found
 
 
 def _values(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, NDArray[np.float64]]]:
@@ -213,40 +275,3 @@ def _remedy(path: str, paths: Iterable[str]) -> str:
     """Return the advice for a value that an airframe lacks: to add it if it exists, else the path that was meant."""
     table, _, key = path.rpartition(".")
     return f"Add {key} to its table [{table}]; {GUIDE} lists all keys." if path in KEYS else suggestion(path, paths)
-
-
-def _check(airframe: Airframe) -> None:
-    """Check that the numbers are those of a drone that can fly."""
-
-    def refuse(problem: str) -> ConfigError:
-        return ConfigError(f"airframe {airframe.name!r}: {problem}")
-
-    for table in ("rigid_body", "rotors"):
-        airframe.table(table)
-    mass = airframe.value("rigid_body.mass", ())
-    if mass <= 0:
-        raise refuse(f"expected a positive mass, got {mass} kg")
-    inertia = airframe.inertia
-    if inertia.shape != (3, 3) or not np.allclose(inertia, inertia.T) or np.min(np.linalg.eigvalsh(inertia)) <= 0:
-        raise refuse(
-            "expected an inertia of three positive moments or a symmetric positive definite 3 x 3 matrix, kg m^2, "
-            f"got {inertia.tolist()}"
-        )
-    position = airframe.value("rotors.position")
-    if position.ndim != 2 or position.shape[1] != 3:
-        raise refuse(f"expected rotors.position of shape (n, 3), got {position.shape}")
-    airframe.value("rotors.yaw_torque_sign", (len(position),))
-    low, high = airframe.value("rotors.thrust_min", ()), airframe.value("rotors.thrust_max", ())
-    if not 0 <= low < high:
-        raise refuse(f"expected 0 <= thrust_min < thrust_max, got {low} N and {high} N")
-    for path, value in _values(airframe.tables):
-        shapes = _shapes(path, len(position))
-        if value.shape not in shapes:
-            raise refuse(f"expected {path} of shape {' or '.join(map(str, shapes))}, got {value.shape}")
-    if len(position) * high <= mass * 9.81:
-        raise refuse(f"expected rotors that lift {mass} kg, got {len(position)} rotors of at most {high} N")
-
-
-def _shapes(path: str, n_rotors: int) -> list[tuple[int, ...]]:
-    """Return the allowed shapes of a number."""
-    return [tuple(n_rotors if n == "n" else int(n) for n in shape) for shape in KEYS[path]]

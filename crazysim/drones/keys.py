@@ -6,97 +6,107 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
+from crazysim.tables import (
+    LENGTH,
+    MASS,
+    NEGATIVE,
+    NOT_NEGATIVE,
+    PLACE,
+    POSITIVE,
+    Key,
+    Range,
+    Shapes,
+)
 
 GUIDE = "docs/guides/airframes.md"
 
-Shapes = tuple[tuple[int | str, ...], ...]
 _NUMBER: Shapes = ((),)
 _VECTOR: Shapes = ((3,),)
-_RESPONSE: dict[str, Shapes] = {
-    "acc_coef": _NUMBER,
-    "cmd_f_coef": _NUMBER,
-    "rpy_coef": _VECTOR,
-    "rpy_rates_coef": _VECTOR,
-    "cmd_rpy_coef": _VECTOR,
+_MATRIX: Shapes = ((3,), (3, 3))
+_SIGN = Range("1 or -1 for each rotor", -1.0, 1.0)
+_GAIN, _GAINS = Key(_NUMBER, NOT_NEGATIVE), Key(_VECTOR, NOT_NEGATIVE)
+_POSITIVE = Key(_NUMBER, POSITIVE)
+_FAR = 3 * (PLACE.low,)
+_SIZE, _SIZES = Key(_NUMBER, LENGTH), Key(_VECTOR, LENGTH)
+_RESPONSE = {
+    "acc_coef": Key(_NUMBER),
+    "cmd_f_coef": _POSITIVE,
+    "rpy_coef": Key(_VECTOR, NEGATIVE),
+    "rpy_rates_coef": Key(_VECTOR, NEGATIVE),
+    "cmd_rpy_coef": Key(_VECTOR, POSITIVE),
 }
-_PID: dict[str, Shapes] = {"kp": _VECTOR, "ki": _VECTOR, "kd": _VECTOR}
+_PID = dict.fromkeys(("kp", "ki", "kd"), _GAINS)
 
-TABLES: dict[str, dict[str, Shapes]] = {
-    "rigid_body": {"mass": _NUMBER, "inertia": ((3,), (3, 3))},
+TABLES: dict[str, dict[str, Key]] = {
+    "rigid_body": {"mass": Key(_NUMBER, MASS), "inertia": Key(_MATRIX)},
     "rotors": {
-        "position": (("n", 3),),
-        "yaw_torque_sign": (("n",),),
-        "thrust_min": _NUMBER,
-        "thrust_max": _NUMBER,
-        "inertia": ((), ("n",)),
-        "thrust_curve": ((3,), ("n", 3)),
-        "torque_curve": ((3,), ("n", 3)),
-        "lag": ((4,), ("n", 4)),
+        "position": Key((("n", 3),), PLACE),
+        "yaw_torque_sign": Key((("n",),), _SIGN),
+        "thrust_min": Key(_NUMBER, NOT_NEGATIVE),
+        "thrust_max": _POSITIVE,
+        "inertia": Key(((), ("n",)), NOT_NEGATIVE),
+        "thrust_curve": Key(((3,), ("n", 3))),
+        "torque_curve": Key(((3,), ("n", 3))),
+        "lag": Key(((4,), ("n", 4)), NOT_NEGATIVE),
     },
-    "drag": {"coefficients": ((3,), (3, 3))},
+    "drag": {"coefficients": Key(_MATRIX)},
     "fitted": {},
     "fitted.so_rpy": _RESPONSE,
-    "fitted.so_rpy_rotor": _RESPONSE | {"thrust_dyn_coef": _NUMBER},
-    "fitted.so_rpy_rotor_drag": _RESPONSE | {"thrust_dyn_coef": _NUMBER, "drag_coefficients": ((3,), (3, 3))},
-    "battery": {"thrust_over_voltage": ((4,),)},
+    "fitted.so_rpy_rotor": _RESPONSE | {"thrust_dyn_coef": _POSITIVE},
+    "fitted.so_rpy_rotor_drag": _RESPONSE | {"thrust_dyn_coef": _POSITIVE, "drag_coefficients": Key(_MATRIX)},
+    "battery": {
+        "thrust_over_voltage": Key(((4,),)),
+        "cells": Key(_NUMBER, Range("a whole number from 1 to 100", 1, 100)),
+        "capacity": _POSITIVE,
+        "resistance": _POSITIVE,
+        "mass": Key(_NUMBER, MASS),
+    },
     "controller": {
-        "thrust2torque": _NUMBER,
-        "mass": _NUMBER,
-        "mass_thrust": _NUMBER,
-        "pwm_min": _NUMBER,
-        "pwm_max": _NUMBER,
-        "torque_pwm_max": _VECTOR,
+        "thrust2torque": _POSITIVE,
+        "mass": Key(_NUMBER, MASS),
+        "mass_thrust": _POSITIVE,
+        "pwm_min": _GAIN,
+        "pwm_max": _POSITIVE,
+        "torque_pwm_max": _GAINS,
     },
-    "controller.state": {"kp": _VECTOR, "kd": _VECTOR, "ki": _VECTOR, "int_err_max": _VECTOR},
-    "controller.attitude": {
-        "kR": _VECTOR,
-        "kw": _VECTOR,
-        "ki_m": _VECTOR,
-        "kd_omega": _VECTOR,
-        "int_err_max": _VECTOR,
-    },
-    "geometric": {"kr": _NUMBER, "kv": _NUMBER, "kR": _NUMBER, "kw": _NUMBER},
+    "controller.state": dict.fromkeys(("kp", "kd", "ki", "int_err_max"), _GAINS),
+    "controller.attitude": dict.fromkeys(("kR", "kw", "ki_m", "kd_omega", "int_err_max"), _GAINS),
+    "geometric": dict.fromkeys(("kr", "kv", "kR", "kw"), _GAIN),
     "mellinger": {
-        "mass": _NUMBER,
-        "mass_thrust": _NUMBER,
-        "kp": _VECTOR,
-        "kd": _VECTOR,
-        "ki": _VECTOR,
-        "integral_max": _VECTOR,
-        "kR": _VECTOR,
-        "kw": _VECTOR,
-        "ki_m": _VECTOR,
-        "kd_omega": _VECTOR,
-        "integral_m_max": _VECTOR,
-        "torque_max": _VECTOR,
+        "mass": Key(_NUMBER, MASS),
+        "mass_thrust": _POSITIVE,
+        **dict.fromkeys(("kp", "kd", "ki", "integral_max"), _GAINS),
+        **dict.fromkeys(("kR", "kw", "ki_m", "kd_omega", "integral_m_max", "torque_max"), _GAINS),
     },
-    "pid": {"tilt_max": ((2,),), "thrust_base": _NUMBER, "thrust_min": _NUMBER},
-    "pid.position": _PID | {"output_max": _VECTOR, "cutoff": _NUMBER},
-    "pid.velocity": _PID | {"output_max": _VECTOR, "cutoff": _NUMBER},
-    "pid.attitude": _PID | {"integral_max": _VECTOR, "cutoff": _NUMBER},
-    "pid.rate": _PID | {"integral_max": _VECTOR, "cutoff": _NUMBER},
+    "pid": {"tilt_max": Key(((2,),), NOT_NEGATIVE), "thrust_base": _GAIN, "thrust_min": _GAIN},
+    "pid.position": _PID | {"output_max": _GAINS, "cutoff": _POSITIVE},
+    "pid.velocity": _PID | {"output_max": _GAINS, "cutoff": _POSITIVE},
+    "pid.attitude": _PID | {"integral_max": _GAINS, "cutoff": _POSITIVE},
+    "pid.rate": _PID | {"integral_max": _GAINS, "cutoff": _POSITIVE},
     "shape": {
-        "plate": _VECTOR,
-        "battery": _VECTOR,
-        "battery_height": _NUMBER,
-        "arm_radius": _NUMBER,
-        "motor_radius": _NUMBER,
-        "motor_height": _NUMBER,
-        "propeller_radius": _NUMBER,
-        "propeller_height": _NUMBER,
-        "led_radius": _NUMBER,
-        "led_heights": ((2,),),
-        "collision_sphere": ((4,),),
-        "collision_box": ((6,),),
-        "fpv_camera": _VECTOR,
-        "track_camera": _VECTOR,
+        "plate": _SIZES,
+        "battery": _SIZES,
+        "battery_height": Key(_NUMBER, PLACE),
+        "arm_radius": _SIZE,
+        "motor_radius": _SIZE,
+        "motor_height": _SIZE,
+        "propeller_radius": _SIZE,
+        "propeller_height": Key(_NUMBER, PLACE),
+        "led_radius": _SIZE,
+        "led_heights": Key(((2,),), PLACE),
+        "collision_sphere": Key(((4,),), Range("three coordinates and a positive radius, m", (*_FAR, LENGTH.low), 1e3)),
+        "collision_box": Key(
+            ((6,),), Range("three coordinates and three positive half sizes, m", (*_FAR, *3 * (LENGTH.low,)), 1e3)
+        ),
+        "fpv_camera": Key(_VECTOR, PLACE),
+        "track_camera": Key(_VECTOR, PLACE),
     },
 }
-"""All tables by dotted path, with the keys of each and the shapes allowed; ``"n"`` is the number of rotors."""
+"""All tables by dotted path, with the keys of each."""
 
-KEYS: dict[str, Shapes] = {f"{table}.{key}": shapes for table, keys in TABLES.items() for key, shapes in keys.items()}
-"""Allowed shapes of all numbers, by dotted path."""
+KEYS: dict[str, Key] = {f"{table}.{key}": entry for table, keys in TABLES.items() for key, entry in keys.items()}
+"""Shapes and ranges of all numbers, by dotted path."""
 
 TOP_LEVEL = ("name", "base", "sources")
 """Keys outside of tables."""
@@ -122,7 +132,7 @@ def check_keys(airframe: str, tables: Mapping[str, Any], prefix: str = "") -> No
             continue
         if path in TABLES:
             if not isinstance(item, Mapping):
-                raise ConfigError(f"{airframe}: expected a table [{path}], got {item!r}. {GUIDE} lists its keys.")
+                raise ConfigError(f"{airframe}: expected a table [{path}], got {shown(item)}. {GUIDE} lists its keys.")
             check_keys(airframe, item, f"{path}.")
         elif path in KEYS:
             _check_entry(airframe, path, item)
@@ -152,7 +162,7 @@ def _check_entry(airframe: str, path: str, item: Any) -> None:
     unknown = [key for key in item if key not in ENTRY]
     if unknown or "value" not in item:
         raise ConfigError(
-            f"{airframe}: expected {path} as a number, an array or {{ value, unit, source }}, got {dict(item)!r}. "
+            f"{airframe}: expected {path} as a number, an array or {{ value, unit, source }}, got {shown(dict(item))}. "
             f"{GUIDE} shows both forms."
         )
 

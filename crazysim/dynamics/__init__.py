@@ -1,8 +1,8 @@
 """Dynamics models: pure functions for one drone, with any leading axes."""
 
 from crazysim.dynamics import first_principles, fitted
-from crazysim.dynamics.core import Dynamics, supported_drones, supported_dynamics
 from crazysim.dynamics.first_principles import hover_rotor_vel
+from crazysim.dynamics.models import Dynamics, supported_drones, supported_dynamics
 from crazysim.dynamics.parameters import load_fn_params, load_params
 
 __all__ = [

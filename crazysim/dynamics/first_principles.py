@@ -8,8 +8,8 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.drones import Airframe
-from crazysim.dynamics.core import GRAVITY, Dynamics, require_support
 from crazysim.dynamics.drag import body_drag_force
+from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
 from crazysim.dynamics.rigid_body import angular_acceleration, linear_acceleration, stable_angular_acceleration
 from crazysim.dynamics.rotor import (
     curve,
@@ -63,10 +63,8 @@ class Params(PyTree):
         """
         require_support(airframe, Dynamics.first_principles)
         thrust_curve = airframe.value("rotors.thrust_curve")
-        limits = np.array([airframe.value("rotors.thrust_min", ()), airframe.value("rotors.thrust_max", ())])
         # In float64, whatever the precision of the simulation: the limits are constants, not results.
-        k0, k1, k2 = np.atleast_2d(thrust_curve).T
-        low, high = ((-k1 + np.sqrt(k1**2 - 4 * k2 * (k0 - f))) / (2 * k2) for f in limits)
+        low, high = airframe.rotor_vel_limits
         drag = airframe.value("drag.coefficients")
         return Params(
             mass=as_parameter(airframe.value("rigid_body.mass")),

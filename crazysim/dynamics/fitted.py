@@ -19,8 +19,8 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.drones import Airframe
-from crazysim.dynamics.core import GRAVITY, Dynamics, require_support
 from crazysim.dynamics.drag import body_drag_force
+from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import along_z, matvec
 

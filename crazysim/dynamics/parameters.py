@@ -11,7 +11,7 @@ import numpy as np
 
 from crazysim.drones import Airframe, load_airframe
 from crazysim.dynamics import first_principles, fitted
-from crazysim.dynamics.core import GRAVITY, Dynamics, require_support
+from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
 from crazysim.errors import ConfigError, UnknownNameError
 
 Drone = str | Path | Mapping[str, Any] | Airframe
@@ -87,8 +87,7 @@ def rotor_vel_limits(dynamics: Dynamics | str, drone: Drone) -> tuple[float, flo
     if dynamics != Dynamics.first_principles:
         low, high = load_airframe(drone).n_rotors * thrusts
     else:
-        k0, k1, k2 = np.atleast_2d(params["rpm2thrust"])[0]
-        low, high = (-k1 + np.sqrt(k1**2 - 4 * k2 * (k0 - thrusts))) / (2 * k2)
+        low, high = load_airframe(drone).rotor_vel_limits[:, 0]
     return float(low), float(high)
 
 

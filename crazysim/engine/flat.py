@@ -1,9 +1,9 @@
-"""``SimData`` flattened to a list of arrays, and the caches that make flattening it again cheap."""
+"""Caches that make flattening ``SimData`` to a list of arrays cheap."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,34 +11,8 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.pytree import scopes, sparse_leaves
-
-if TYPE_CHECKING:
-    from crazysim.engine.plan import Plan
-
-Zeros = tuple[tuple[int, frozenset[int]], ...]
-"""Leaves with the elements of them that are zero."""
-
-
-class FlatData:
-    """``SimData`` as a list of arrays with the plan that steps it; steps in a row need no record between them."""
-
-    __slots__ = ("leaves", "packed", "plan", "treedef")
-
-    def __init__(self, leaves: list[Any], treedef: Any, plan: Plan, packed: Array | None):
-        """Hold the leaves, and the array of those that are packed."""
-        self.leaves, self.treedef, self.plan, self.packed = leaves, treedef, plan, packed
-
-    def data(self) -> SimData:
-        """Return the data as a record."""
-        return self.treedef.unflatten(self.leaves)
-
-    def inputs(self) -> list[Any]:
-        """Return the arguments of the compiled step besides the number of steps."""
-        values = [self.leaves[i] for i in self.plan.read]
-        if self.packed is not None:
-            values.append(self.packed)
-        return values
+from crazysim.engine.ir.program import Zeros
+from crazysim.pytree import numbered, scopes, sparse_leaves
 
 
 class PackCache:
@@ -59,12 +33,12 @@ class PackCache:
         if not _same(arrays, self._arrays):
             with jax.ensure_compile_time_eval():  # inside a user's trace too: a cached value must be an array
                 is_first = self._packed is None
-                self._packed = _joined(arrays) if is_first and _on_one_host(arrays) else _compiled(arrays)
+                self._packed = _joined(arrays) if is_first and _on_one_cpu(arrays) else _compiled(arrays)
                 self._arrays = arrays
         return self._packed
 
 
-def _on_one_host(arrays: list[Any]) -> bool:
+def _on_one_cpu(arrays: list[Any]) -> bool:
     """Return True if all arrays are on one device, and that is a processor of the host."""
     devices = {device for x in arrays if isinstance(x, jax.Array) for device in x.devices()}
     return len(devices) <= 1 and all(device.platform == "cpu" for device in devices)
@@ -98,7 +72,7 @@ class ZerosCache:
 
     def __call__(self, data: SimData, leaves: list[Any]) -> Zeros:
         """Return the elements of a simulation's data."""
-        places = self._places(data, leaves)
+        places = self._indices(data, leaves)
         arrays = [leaves[i] for i in places]
         if _same(arrays, self._arrays):
             return self._found
@@ -108,15 +82,16 @@ class ZerosCache:
         self._arrays, self._found = arrays, tuple((i, zeros) for i, zeros in found.items() if zeros)
         return self._found
 
-    def _places(self, data: SimData, leaves: list[Any]) -> list[int]:
+    def _indices(self, data: SimData, leaves: list[Any]) -> list[int]:
         key = tuple([x.ndim for x in leaves])
         if key not in self._shared:
-            ids = {id(x) for x in jax.tree.leaves((data.params, data.controls))}
+            numbers = numbered(data)
+            parameters = set(jax.tree.leaves((numbers.params, numbers.controls)))
             rows = zip(jax.tree.leaves(scopes(data)), jax.tree.leaves(sparse_leaves(data)), leaves, strict=True)
             self._shared[key] = [
                 i
                 for i, (scope, is_sparse, x) in enumerate(rows)
-                if scope == "shared" and (is_sparse or id(x) in ids) and jnp.issubdtype(x.dtype, jnp.floating)
+                if scope == "shared" and (is_sparse or i in parameters) and jnp.issubdtype(x.dtype, jnp.floating)
             ]
         return self._shared[key]
 

@@ -26,22 +26,22 @@ from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Stage, with_leaves
 from crazysim.core.stages import watched
-from crazysim.engine import fused, interpret, lanes, passes, plain
-from crazysim.engine.build import build_program
+from crazysim.engine.backends import Build, Run, fused, interpret, kernel, lanes, plain
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
-from crazysim.engine.flat import Zeros
-from crazysim.engine.groups import Group, independent
-from crazysim.engine.program import Program
-from crazysim.engine.relative import on_data
-from crazysim.engine.tracing import Tracer
+from crazysim.engine.ir.program import Program, Zeros
+from crazysim.engine.lowering.groups import Group, independent
+from crazysim.engine.lowering.relative import on_data
+from crazysim.engine.lowering.stages import lower_stages
+from crazysim.engine.lowering.tracing import Tracer
+from crazysim.engine.optimise import optimise
 from crazysim.errors import ConfigError
-from crazysim.pytree import n_batch_axes, scopes
+from crazysim.pytree import n_batch_axes, numbered, scopes
 
 ENGINES = ("auto", "plain", "lanes", "fused", "interpret")
 """Values of ``engine=``. ``interpret`` runs the program in NumPy: slow, without derivatives, to find bugs with."""
 
-Steps = Callable[[list[Any], int | Array], tuple[list[Any], Array]]
-"""Leaves and a number of steps to the written leaves and the worlds that are flagged as not finite."""
+BACKENDS: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "interpret": interpret.build}
+"""Backends of the engines that run programs."""
 
 
 class Plan(NamedTuple):
@@ -62,14 +62,19 @@ class Plan(NamedTuple):
     """Leaves that are passed as one array behind them."""
     written: tuple[int, ...]
     """Leaves that are returned."""
-    synced: int
-    """Leaf ``core.mjx_synced``, which is false after a step."""
+    numbers: SimData
+    """Number of every leaf, by its path."""
     dynamic: Callable[..., Any]
     """The compiled step, for a number of steps that is an array."""
     static: Callable[..., Any]
     """The same for a number of steps that is a Python number, which can be differentiated in reverse."""
     direct: Callable[..., Any] | None = None
     """The step in NumPy, for arguments that are not traced; None for other engines."""
+
+    @property
+    def synced(self) -> int:
+        """Leaf ``core.mjx_synced``, which is false after a step."""
+        return int(self.numbers.core.mjx_synced)
 
     @property
     def program(self) -> Program | None:
@@ -135,38 +140,37 @@ class Planner(NamedTuple):
             return self._plain(data, limit), []
         kinds = jax.tree.leaves(scopes(data))
         # Zeros that a caller found earlier may belong to a parameter that was shared then and is one per drone now.
-        known = {i: some for i, some in zeros if kinds[i] == "shared"}
+        known = tuple([(i, some) for i, some in zeros if kinds[i] == "shared"])
         tracer = Tracer()
         groups = independent(self.stages, data, tracer)
-        programs = tuple([
-            build_program(
-                group.stages, data, known, _watched, population=group.population, pack=k == 0, tracer=tracer
-            )
-            for k, group in enumerate(groups)
-        ])  # fmt: skip
+        lowered = [
+            lower_stages(g.stages, data, known, _watched, population=g.population, tracer=tracer) for g in groups
+        ]
+        programs = tuple([optimise(program, pack=k == 0) for k, program in enumerate(lowered)])
         split = [stage for program in programs for stage in program.unfused_stages]
         problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
         if self.location.spread and split:
             return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}"), problems
-        on_lanes = [passes.separate(p) if self.location.platform == "cpu" else p for p in programs]
-        engine, why, runs = "lanes", "it was chosen", [functools.partial(lanes.steps, p) for p in on_lanes]
-        if self.engine == "interpret":
-            engine, runs = "interpret", [functools.partial(interpret.steps, p) for p in programs]
-        elif self.engine != "lanes":
-            why = fused.missing(self.location.platform) or ""
+        engine, why, runs = self.engine, "it was chosen", []
+        if engine in ("auto", "fused"):
+            engine, why = "lanes", fused.missing(self.location.platform) or ""
             if not why:
                 try:
-                    runs = [fused.build(p, self.location.platform, self.location.devices) for p in programs]
-                    engine = "fused"
+                    runs, engine = self._built("fused", programs), "fused"
                 except UnsupportedError as error:
+                    error = self._of_one_stage(error, data)
                     why = str(error)
                     problems.append(self._without_kernel(error))
             if why and self.engine == "fused":
                 raise ConfigError(f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'.")
+        runs = runs or self._built(engine, programs)
         read = tuple(i for program in programs for i in (*program.read, *_needed(program)))
         run, written = _together(groups, programs, runs)
         plan = self._wrap(engine, why, data, programs, read, written, run, len(programs[0].leaves))
         return plan, problems
+
+    def _built(self, engine: str, programs: Sequence[Program]) -> list[Run]:
+        return [BACKENDS[engine](program, self.location) for program in programs]
 
     def _spread_limit(self, data: SimData) -> str:
         """Return why data on several devices is stepped by ``plain``, or nothing."""
@@ -178,8 +182,7 @@ class Planner(NamedTuple):
         return f"with a mesh every stage must be declared, and {undeclared[0]!r} is not" if undeclared else ""
 
     def _plain(self, data: SimData, why: str) -> Plan:
-        on_cpu = self.location.platform == "cpu"
-        run, written = plain.build(self.stages, data, by_component=not self.location.spread, barriers=on_cpu)
+        run, written = plain.build(self.stages, data)
         everything = tuple(range(len(jax.tree.leaves(data))))
         # XLA spreads the arrays of ``plain`` over devices by itself.
         return self._wrap("plain", why, data, (), everything, tuple(written), run, len(everything))
@@ -192,13 +195,12 @@ class Planner(NamedTuple):
         programs: tuple[Program, ...],
         read: tuple[int, ...],
         written: tuple[int, ...],
-        run: Steps,
+        run: Run,
         n_leaves: int,
     ) -> Plan:
-        numbers = {id(x): i for i, x in enumerate(jax.tree.leaves(data))}
-        nonfinite, synced = numbers[id(data.core.nonfinite)], numbers[id(data.core.mjx_synced)]
+        numbers = numbered(data)
         everything = tuple(sorted({*read, *written}))
-        written = (*written, nonfinite)
+        written = (*written, numbers.core.nonfinite)
         packed = programs[0].packed if programs else ()
         read = everything[:-1] if packed else everything  # the packed array is the last
 
@@ -209,9 +211,9 @@ class Planner(NamedTuple):
 
         if programs and self.location.mesh is not None:
             advance = self._over_mesh(advance, data, everything, written)
-        plan = Plan(engine, why, programs, self.location, read, packed, written, synced, *_jitted(advance))
+        plan = Plan(engine, why, programs, self.location, read, packed, written, numbers, *_jitted(advance))
         direct = engine == "interpret" and self.location.mesh is None and all(p.fused for p in programs)
-        return plan._replace(direct=_on_host(advance)) if direct else plan
+        return plan._replace(direct=_results_on_device(advance)) if direct else plan
 
     def _over_mesh(
         self, advance: Callable[..., Any], data: SimData, inputs: Sequence[int], outputs: Sequence[int]
@@ -244,11 +246,20 @@ class Planner(NamedTuple):
             return f"stage {error.stage!r} has no kernel: {error.reason}"
         return f"the kernel of the stages {', '.join(s.__name__ for s in self.stages)} cannot be built: {error.reason}"
 
+    def _of_one_stage(self, error: UnsupportedError, data: SimData) -> UnsupportedError:
+        """Return the error of the one stage that has no source, for that of a kernel of several stages."""
+        for stage in self.stages:
+            try:
+                kernel.require_source(optimise(lower_stages([stage], data)))
+            except UnsupportedError as own:
+                return own
+        return error
+
     def _culprit(self, data: SimData) -> str:
         """Return the stage at which the engine fails, for a message."""
         for stage in self.stages:
             try:
-                build_program([stage], data)
+                optimise(lower_stages([stage], data))
             except Exception:
                 return f" in stage {stage.__name__!r}"
         return ""
@@ -259,7 +270,7 @@ def _jitted(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[.
     return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
 
-def _on_host(advance: Callable[..., Any]) -> Callable[..., Any]:
+def _results_on_device(advance: Callable[..., Any]) -> Callable[..., Any]:
     """Return the step in NumPy, with results on the device of its arguments."""
 
     def direct(values: list[Any], n_steps: int | Array) -> list[Any]:
@@ -270,9 +281,7 @@ def _on_host(advance: Callable[..., Any]) -> Callable[..., Any]:
     return direct
 
 
-def _together(
-    groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Steps]
-) -> tuple[Steps, tuple[int, ...]]:
+def _together(groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Run]) -> tuple[Run, tuple[int, ...]]:
     """Return one function that runs independent programs, and the leaves that it writes."""
     runs = [on_data(program, run) for program, run in zip(programs, runs, strict=True)]
     if len(runs) == 1:
@@ -300,5 +309,5 @@ def _watched(data: SimData) -> list[Any]:
 def _needed(program: Program) -> list[int]:
     """Return the leaves that are watched, and one whose shape gives the number of worlds."""
     check = program.check
-    watched = [leaf for leaf, _ in check.reads] if check is not None else []
-    return [*watched, next(i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone")]
+    checked = [leaf for leaf, _ in check.reads] if check is not None else []
+    return [*checked, next(i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone")]

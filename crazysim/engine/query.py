@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, Stage
-from crazysim.engine.fused_rollout import FusedRollout
+from crazysim.engine.fused_call import FusedCall
 from crazysim.pytree import PyTree, leaf
 
 NAME = "results"
@@ -45,7 +45,7 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     rows: dict[str, Array] = {}
     shapes, trees, stages = [], [], []
     for number, (scope, fn) in enumerate(queries):
-        one = axes.treedef.unflatten(axes.of_one(leaves, scope))
+        one = axes.treedef.unflatten(axes.shapes_of_one(leaves, scope))
         outs, treedef = jax.tree.flatten(jax.eval_shape(fn, one))
         names = [f"{number} {k}" for k in range(len(outs))]
         per_drone = [x.shape[1:] if scope == "world" else x.shape for x in outs]
@@ -55,7 +55,7 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
         trees.append(treedef)
         stages.append(Stage(_writing(fn, names, scope), scope, name=f"query {number}"))
     prepared = data.replace(plugins={NAME: Results(rows)})
-    rollout = FusedRollout((), (), stages, prepared, {}, 0, platform)
+    rollout = FusedCall((), (), stages, prepared, (), 0, platform)
     found = jax.tree.unflatten(jax.tree.structure(prepared), rollout(jax.tree.leaves(prepared))).plugins[NAME].rows
     return [
         tree.unflatten([found[name].reshape(n_worlds, n_drones, *shape) for name, shape in some.items()])

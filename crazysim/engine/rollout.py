@@ -12,8 +12,9 @@ import jax.numpy as jnp
 from crazysim.control import Control
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
+from crazysim.core.settings import positive
 from crazysim.core.stage import with_leaves
-from crazysim.engine.flat import Zeros
+from crazysim.engine.ir.program import Zeros
 from crazysim.engine.step import Step
 from crazysim.errors import ConfigError
 
@@ -70,17 +71,15 @@ def rollout(
         ConfigError: If a number is not a positive int, or does not divide.
         ValueError: If the policy returns a command of another shape.
     """
-    for name, number in (("n_control_steps", n_control_steps), ("n_substeps", n_substeps), ("every", every)):
-        if type(number) is not int or number < 1:
-            raise ConfigError(f"{name} must be a positive int, not {number!r}")
+    n_control_steps = positive("n_control_steps", n_control_steps)
+    n_substeps, every = positive("n_substeps", n_substeps), positive("every", every)
     if n_control_steps % every:
         raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it")
     zeros = step.zeros(data) if zeros is None else zeros
     command = COMMANDS[data.controls.mode]
     leaves, treedef = jax.tree.flatten(data)
     plan = step.plan(data, zeros)
-    staged = next(i for i, x in enumerate(leaves) if x is _staged(data))
-    changed = sorted({*plan.written, plan.synced, staged})
+    changed = sorted({*plan.written, plan.synced, _staged(plan.numbers)})
 
     def control_step(carry: list[Any]) -> list[Any]:
         data = unpack(carry)

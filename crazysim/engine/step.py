@@ -11,15 +11,56 @@ from jax import Array
 from jax.sharding import Mesh
 
 from crazysim import jaxcompat
-from crazysim.core.data import SimData
+from crazysim.control import Control
+from crazysim.core.data import MAX_STEPS, SimData
+from crazysim.core.functional import staged_fields
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS, Location, locate
 from crazysim.core.stage import Axes, as_stages, with_leaves
-from crazysim.engine import fused
-from crazysim.engine.flat import FlatData, PackCache, Zeros, ZerosCache
+from crazysim.engine.backends import fused
+from crazysim.engine.flat import PackCache, ZerosCache
+from crazysim.engine.ir.program import Zeros
 from crazysim.engine.plan import ENGINES, Plan, Planner
 from crazysim.errors import ConfigError
 from crazysim.pytree import check_axes
+
+
+class FlatData:
+    """``SimData`` as a list of arrays with the plan that steps it; steps in a row need no record between them."""
+
+    __slots__ = ("_record", "leaves", "packed", "plan", "treedef")
+
+    def __init__(self, leaves: list[Any], treedef: Any, plan: Plan, packed: Array | None):
+        """Hold the leaves, and the array of those that are packed."""
+        self.leaves, self.treedef, self.plan, self.packed = leaves, treedef, plan, packed
+        self._record: SimData | None = None
+
+    def is_record(self, data: SimData) -> bool:
+        """Return whether a record is the one that ``data`` returned."""
+        return data is self._record
+
+    def data(self) -> SimData:
+        """Return the data as a record, which is put together once."""
+        record = self._record
+        if record is None:
+            record = self._record = self.treedef.unflatten(self.leaves)
+        return record
+
+    def staged(self, command: Array, feedforward: Array | None = None) -> FlatData:
+        """Return the data with a command that was checked, as ``crazysim.core.functional.stage_command`` does."""
+        controls = self.plan.numbers.controls
+        level: Any = controls if controls.mode == Control.rotor_vel else getattr(controls, controls.mode.value)
+        leaves = list(self.leaves)
+        for field, x in staged_fields(self.plan.numbers, command, feedforward).items():
+            leaves[getattr(level, field)] = x
+        return FlatData(leaves, self.treedef, self.plan, self.packed)
+
+    def inputs(self) -> list[Any]:
+        """Return the arguments of the compiled step besides the number of steps."""
+        values = [self.leaves[i] for i in self.plan.read]
+        if self.packed is not None:
+            values.append(self.packed)
+        return values
 
 
 class Step:
@@ -78,7 +119,12 @@ class Step:
             n_steps: Number of steps.
             zeros: Result of ``zeros`` for this data before it was traced. Under a trace the values of parameters are
                 unknown, and the step computes with zeros as with any other number.
+
+        Raises:
+            ConfigError: If the number of steps is larger than ``MAX_STEPS``.
         """
+        if isinstance(n_steps, (int, np.integer)) and n_steps > MAX_STEPS:
+            raise ConfigError(f"expected at most {MAX_STEPS} steps in a call, got {n_steps}. Use several calls.")
         return self.advance(self.flatten(data, zeros, n_steps), n_steps).data()
 
     def flatten(self, data: SimData, zeros: Zeros | None = None, n_steps: int | Array | None = None) -> FlatData:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from crazysim.core.data import SimData
+from crazysim.core.data import MAX_STEPS, SimData
+from crazysim.core.functional import stage_command
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import put, shard
-from crazysim.engine.flat import FlatData
-from crazysim.engine.step import Step
+from crazysim.engine.plan import Plan
+from crazysim.engine.step import FlatData, Step
+from crazysim.errors import ConfigError
 
 
 class Stepper:
@@ -34,34 +38,62 @@ class Stepper:
             strict: As for ``Step``.
         """
         self.device, self.mesh, self.engine, self.strict = device, mesh, engine, strict
-        self._record: SimData | None = None
-        self._flat: FlatData | None = None
+        self._data: SimData | FlatData | None = None
+        self._like: tuple[Plan, SimData] | None = None
         self._counts: dict[int, Array] = {}
         self._unsynced: object = None
+        self._most_steps: int | None = None
 
     @property
     def data(self) -> SimData:
         """The data as a record."""
-        if self._record is None:
-            self._record = self._flat.data()
-        return self._record
+        data: Any = self._data
+        return data.data() if isinstance(data, FlatData) else data
 
     @data.setter
     def data(self, data: SimData) -> None:
-        self._record, self._flat = data, None
+        if not (isinstance(self._data, FlatData) and self._data.is_record(data)):
+            self._data = data
+
+    @property
+    def like(self) -> SimData:
+        """The data as a record, or, where that would have to be put together, its shapes, types and devices."""
+        flat = self._data
+        if not isinstance(flat, FlatData):
+            return self.data
+        if self._like is None or self._like[0] is not flat.plan:
+            data = flat.data()
+            if isinstance(data.states.pos, jax.core.Tracer):
+                return data
+            self._like = flat.plan, jax.tree.map(_without_values, data)
+        return self._like[1]
+
+    def stage(self, command: Array, feedforward: Array | None = None) -> None:
+        """Stage a command that was checked with ``like``; flattened data stays flattened.
+
+        Args:
+            command: Command in the units of the command level. (n_worlds, n_drones, k)
+            feedforward: Feedforward of a setpoint; None for that of ``crazysim.core.functional.stage_command``.
+        """
+        if isinstance(self._data, FlatData):
+            self._data = self._data.staged(command, feedforward)
+        else:
+            self._data = stage_command(self.data, command, feedforward)
 
     def assign(self, data: SimData) -> None:
-        """Take data from outside: place it on the device, and clear ``core.mjx_synced``."""
+        """Take data from outside: put it on the device, and clear ``core.mjx_synced``."""
+        if self._data is None or data.core.steps is not self.data.core.steps:
+            self._most_steps = None
         if data.core.mjx_synced is not self._unsynced:
             # A new array: a user may donate data that was read from here, which must not share arrays with other data.
             data = data.replace(core=data.core.replace(mjx_synced=np.False_))
-        self.accept(self.place(data))
+        self.accept(self.to_device(data))
 
     def accept(self, data: SimData) -> None:
         """Take data that is on the device, with ``core.mjx_synced`` false, as compiled calls return it."""
         self.data, self._unsynced = data, data.core.mjx_synced
 
-    def place(self, data: SimData) -> SimData:
+    def to_device(self, data: SimData) -> SimData:
         """Return the data with every leaf on the device, or spread over the mesh.
 
         An edited leaf is wherever JAX puts new arrays by default. An array elsewhere, or one that is not committed to
@@ -71,19 +103,45 @@ class Stepper:
 
     def build(self, pipeline: Pipeline) -> Step:
         """Make the step of a pipeline, use it from now on, and return it."""
-        if self._flat is not None:
-            self.data = self.data  # it was flattened for the step before
+        self._data = self.data  # it may be flattened for the step before
         self.step = Step(pipeline, self.engine, self.device.platform, self.mesh, device=self.device, strict=self.strict)
         return self.step
 
     def advance(self, n_steps: int) -> None:
         """Advance the data; any number of steps uses the same compilation."""
-        flat = self.step.flatten(self.data) if self._flat is None else self._flat
-        self._flat, self._record = self.step.advance(flat, self._count(n_steps)), None
-        self._unsynced = self._flat.leaves[flat.plan.synced]
+        self.count(n_steps)
+        flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
+        self._data = after = self.step.advance(flat, self._as_array(n_steps))
+        self._unsynced = after.leaves[flat.plan.synced]
 
-    def _count(self, n_steps: int) -> Array:
+    def count(self, n_steps: int, times: int = 1) -> None:
+        """Count steps that are about to be taken.
+
+        Args:
+            n_steps: Number of steps.
+            times: Number of times that they will be taken.
+
+        Raises:
+            ConfigError: If a world would have taken more than ``MAX_STEPS`` since its last reset.
+        """
+        n_steps *= times
+        if self._most_steps is None or self._most_steps + n_steps > MAX_STEPS:
+            self._most_steps = int(np.max(self.data.core.steps))  # waits for the device, so not in every call
+        if self._most_steps + n_steps > MAX_STEPS:
+            freq = self.data.core.freq
+            raise ConfigError(
+                f"expected at most {MAX_STEPS} steps between two resets, {MAX_STEPS / freq / 86400:.1f} days at {freq} "
+                f"Hz, got {n_steps} after {self._most_steps}. Use sim.reset(), or a lower freq."
+            )
+        self._most_steps += n_steps
+
+    def _as_array(self, n_steps: int) -> Array:
         """Return a number of steps as an array; making one costs more than a step, so they are kept."""
         if n_steps not in self._counts:
-            self._counts[n_steps] = jnp.int32(n_steps)
+            with jax.default_device(self.device):
+                self._counts[n_steps] = jnp.int32(n_steps)
         return self._counts[n_steps]
+
+
+def _without_values(x: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding)

@@ -1,4 +1,4 @@
-"""Environments: tasks in many worlds, as pure functions, and as vector environments of Gymnasium.
+"""Environments: tasks in many worlds, as pure functions, and as environments of Gymnasium.
 
 Importing this module registers every task with Gymnasium, as ``crazysim/Hover-v0`` and so on.
 """
@@ -9,13 +9,14 @@ from crazysim.envs import terms
 from crazysim.envs.actions import Actions, actions_of
 from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.random import draw, uniform
-from crazysim.envs.registry import TASKS, make
+from crazysim.envs.registry import TASKS, make, register
 from crazysim.envs.rollout import rollout
+from crazysim.envs.single import DroneSingleEnv
 from crazysim.envs.spawn import flying
 from crazysim.envs.state import EnvState, flatten
 from crazysim.envs.task import Task
-from crazysim.envs.tasks.core import state_of
-from crazysim.envs.vector import DroneVectorEnv, register
+from crazysim.envs.tasks.goals import state_of
+from crazysim.envs.vector import DroneVectorEnv
 from crazysim.envs.wrappers import (
     ActionDelay,
     AutoReset,
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from crazysim.envs.pettingzoo import make_parallel
     from crazysim.envs.sb3 import DroneVecEnv
 
-register()
-
 __all__ = [
     "TASKS",
     "ActionDelay",
@@ -46,6 +45,7 @@ __all__ = [
     "AutoresetMode",
     "BraxEnv",
     "DroneEnv",
+    "DroneSingleEnv",
     "DroneVecEnv",
     "DroneVectorEnv",
     "Env",
@@ -65,6 +65,7 @@ __all__ = [
     "flying",
     "make",
     "make_parallel",
+    "register",
     "rollout",
     "state_of",
     "terms",

@@ -8,6 +8,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.control import COMMAND_FIELDS, Control
+from crazysim.control.allocation import torque_arms
 from crazysim.core.airframes import Airframes, as_airframes
 from crazysim.core.data import SimParams
 from crazysim.drones import Airframe
@@ -110,8 +111,7 @@ def _of_drone(airframe: Airframe, params: SimParams, control: Control, tilt: flo
     if control == Control.state:
         return Actions(np.array([0, 0, 1.0]), np.array(REACH), control)
     if control == Control.force_torque:
-        arms = np.array([airframe.arm, airframe.arm, float(airframe.value("controller.thrust2torque", ()))])
-        most = each / 2 * arms * np.abs(airframe.mixing_matrix).sum(axis=-1)
+        most = each / 2 * torque_arms(airframe) * np.abs(airframe.mixing_matrix).sum(axis=-1)
         return Actions(np.array([hover, 0, 0, 0]), np.array([span, *most / 4]), control)
     if isinstance(params, fitted.Params):
         raise ConfigError(

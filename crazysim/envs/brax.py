@@ -81,6 +81,10 @@ class BraxEnv:
         """Length of a step, s."""
         return self.env.task.seconds / self.env.max_steps
 
+    def explain(self) -> str:
+        """Return how a step is executed, as ``Env.explain`` does."""
+        return self.env.explain()
+
     def reset(self, rng: Array) -> State:
         """Return all worlds at the start of an episode.
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,23 +13,22 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.settings import positive
-from crazysim.core.sharding import shard
+from crazysim.core.settings import as_mask, positive
+from crazysim.core.sharding import beside, commit, put, shard
 from crazysim.core.stage import Stage
 from crazysim.core.stages import reset
-from crazysim.engine import fused
+from crazysim.eager import is_traced
+from crazysim.engine.backends import fused
 from crazysim.envs.actions import Actions, actions_of
 from crazysim.envs.default_data import compact, reset_world, spread, with_own
-from crazysim.envs.phases import act, all_worlds, begin, observe
-from crazysim.envs.state import EnvState, validate_action
+from crazysim.envs.hooks import Hooks
+from crazysim.envs.phases import Phases, all_worlds
+from crazysim.envs.state import EnvState, state_of_data, validate_action
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_task, require_installed
 from crazysim.errors import ConfigError
-from crazysim.pytree import n_batch_axes, n_world_axes, scopes, select_worlds
+from crazysim.pytree import n_batch_axes, n_world_axes, numbered, scopes, select_worlds
 from crazysim.sim.sim import Sim
-
-if TYPE_CHECKING:
-    from crazysim.envs.wrappers.base import Wrapper
 
 
 class Env(ABC):
@@ -48,7 +48,7 @@ class Env(ABC):
 
     @property
     @abstractmethod
-    def wrappers(self) -> tuple[Wrapper, ...]:
+    def wrappers(self) -> tuple[Hooks, ...]:
         """Wrappers around it, the innermost first."""
 
     @property
@@ -76,26 +76,39 @@ class Env(ABC):
         """Environment steps in one episode."""
         return self.base.max_steps
 
+    @functools.cached_property
+    def phases(self) -> Phases:
+        """The phases of its step."""
+        base, last_step = self.base, self.max_steps * self.n_substeps
+        reset_data, batched = base.reset_data, base.batched_reset
+        return Phases(self.task, self.actions, self.wrappers, base.sim.n_drones, last_step, reset_data, batched)
+
     def reset(self, key: Array) -> EnvState:
         """Return all worlds at the start of an episode; the same key gives the same episodes.
 
         Args:
             key: Random key, as ``jax.random.key`` makes. ()
         """
-        data = self.base.initial_data(key)
-        for wrapper in self.wrappers:
-            data = wrapper.prepare(data)
-        blank: Any = None
-        return self.begin(EnvState(data, {}, blank, blank, blank, blank, {}, {}))
+        key = commit(key, self.sim.device) if self.sim.mesh is None else key
+        with beside(key):
+            data = self.base.initial_data(key)
+            for wrapper in self.wrappers:
+                data = wrapper.prepare(data)
+            return self.begin(state_of_data(data))
 
-    def restart(self, state: EnvState, mask: Array) -> EnvState:
+    def restart(self, state: EnvState, mask: Array | None) -> EnvState:
         """Return the state with new episodes in some worlds.
 
         Args:
             state: The state of all worlds.
-            mask: True where a new episode begins. (n_worlds,)
+            mask: True where a new episode begins; None for all. (n_worlds,)
+
+        Raises:
+            ConfigError: If the mask has another shape or type.
         """
-        return select_states(mask, self.begin(state), state)
+        with beside(state.data.core.steps):
+            mask = as_mask(mask, state.data.core.steps.shape[:1])
+            return select_states(mask, self.begin(state), state)
 
     def step(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one environment step later.
@@ -109,22 +122,31 @@ class Env(ABC):
         Raises:
             ValueError: If the action has another shape.
         """
-        action = validate_action(action, state, self.actions)
-        state, action = act(self, state, action, all_worlds)
-        state = state.replace(data=self.base.physics(state.data))
-        return observe(self, state, action, all_worlds)
+        with beside(state.data.core.steps):
+            action = validate_action(action, state, self.actions)
+            state, action = self.phases.act(state, action, all_worlds)
+            state = state.replace(data=self.base.physics(state.data))
+            return self.phases.observe(state, action, all_worlds)
 
     def begin(self, state: EnvState) -> EnvState:
         """Return the state with new episodes in all worlds."""
-        state = begin(self, state, self.base.default_of(state.data), all_worlds)
+        state = self.phases.begin(state, self.base.default_of(state.data), all_worlds)
         data = state.data.replace(core=state.data.core.replace(mjx_synced=jnp.asarray(False)))
         return state.replace(data=data if self.sim.mesh is None else shard(data, self.sim.mesh))
 
+    def explain(self) -> str:
+        """Return how a step is executed: whether it is one kernel, and if not, why; then the physics in it."""
+        return f"a step is {self._kind_of_step()}\nits physics, as in sim.explain():\n{self.sim.explain()}"
+
+    def _kind_of_step(self) -> str:
+        """Return the part of ``explain`` about the step: that it is one kernel, or that it is not, with the reason."""
+        return "not one kernel: new episodes do not begin within it; see AutoReset"
+
     def target(self, state: EnvState) -> Array | None:
-        """Return the place where each drone should be, for images, m; None if the task has none.
+        """Return the place where each drone should be, or several marks, for images, m; None if the task has none.
 
         Returns:
-            (n_worlds, n_drones, 3)
+            (n_worlds, n_drones, 3) or (n_worlds, n_drones, n_marks, 3)
         """
         return self._of_task(self.task.target, state)
 
@@ -177,17 +199,16 @@ class DroneEnv(Env):
         self._foreign = "batched" in jax.tree.leaves(scopes(sim.default_data))
         self.batched_reset = self._foreign or list(sim.reset_pipeline.values()) != [reset]
         """True if the reset pipeline has functions of all worlds, or a record of another library is reset."""
-        reset_all, worlds = sim.build_reset_fn().__wrapped__, np.ones(sim.n_worlds, bool)
+        reset_all, worlds = sim.build_reset_fn().plain, np.ones(sim.n_worlds, bool)
         self.reset_data: Callable[[SimData, SimData], SimData] = (
             (lambda data, default: reset_all(data, default, worlds)) if self.batched_reset else reset_world
         )
         """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``batched_reset``."""
         self.zeros = self._step.zeros(sim.data)
         self._default = default = compact(sim.default_data)
-        kinds = zip(jax.tree.leaves(scopes(default)), jax.tree.leaves(default), strict=True)
-        self.default_varies = any(
-            n_batch_axes(kind) == 2 and x.shape[0] > 1 and x is not default.core.world_id for kind, x in kinds
-        )
+        rows = zip(*map(jax.tree.leaves, (scopes(default), default, numbered(default))), strict=True)
+        world_id = numbered(default).core.world_id
+        self.default_varies = any(n_batch_axes(kind) == 2 and x.shape[0] > 1 and i != world_id for kind, x, i in rows)
         """True if episodes begin from different data in different worlds."""
 
     @property
@@ -196,7 +217,7 @@ class DroneEnv(Env):
         return self
 
     @property
-    def wrappers(self) -> tuple[Wrapper, ...]:
+    def wrappers(self) -> tuple[Hooks, ...]:
         """None."""
         return ()
 
@@ -259,11 +280,11 @@ class DroneEnv(Env):
 
     def initial_data(self, key: Array) -> SimData:
         """Return the data of all worlds before their first episode. The key is that of ``reset``. ()"""
-        if not isinstance(key, jax.core.Tracer):
-            key = jax.device_put(key, self.sim.device)
-        data = spread(self._default, self.sim.n_worlds, self.sim.n_drones)
+        data, mesh = spread(self._default, self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
         data = data.replace(core=data.core.replace(rng_key=key))
-        return data if self.sim.mesh is None else shard(data, self.sim.mesh)
+        if mesh is not None:
+            return shard(data, mesh)
+        return data if is_traced([key]) else put(data, self.sim.device)
 
     def default_of(self, data: SimData) -> SimData:
         """Return the data of all worlds that an episode begins from; seed and numbers are those of the data given."""
@@ -279,11 +300,11 @@ class DroneEnv(Env):
         return with_own(jax.tree.map(one, scopes(self._default), self._default), data)
 
 
-def select_states(mask: Array, new: EnvState, old: EnvState) -> EnvState:
+def select_states(mask: Array | None, new: EnvState, old: EnvState) -> EnvState:
     """Return one state in the worlds of a mask, and another elsewhere; leaves that worlds share are the new ones.
 
     Args:
-        mask: True where the new state is taken. (n_worlds,)
+        mask: True where the new state is taken; None for all. (n_worlds,)
         new: State of the worlds in the mask. Its reward and info may hold more than the old state's.
         old: State of the others.
     """

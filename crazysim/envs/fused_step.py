@@ -6,7 +6,7 @@ The phases of a step (``crazysim.envs.phases``) are functions of one world. Here
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,16 +14,15 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.stage import Axes, Stage
-from crazysim.core.stages import watched
+from crazysim.core.stages import nonfinite
 from crazysim.engine.errors import LimitError
-from crazysim.engine.fused_rollout import FusedRollout
-from crazysim.envs.phases import act, begin, observe
+from crazysim.engine.fused_call import FusedCall
+from crazysim.engine.ir.program import Program
+from crazysim.envs.env import Env
+from crazysim.envs.reset_policy import ResetPolicy
 from crazysim.envs.state import EnvState
-from crazysim.pytree import PyTree, has_members, leaf, n_world_axes, scopes
-
-if TYPE_CHECKING:
-    from crazysim.envs.env import Env
-    from crazysim.envs.wrappers.autoreset import ResetPolicy
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, leaf, n_world_axes, numbered, scopes
 
 NAME = "environment"
 """Key in ``data.plugins`` of the rest of an environment's state while the kernel runs."""
@@ -71,7 +70,7 @@ class FusedEnvStep:
         Raises:
             UnsupportedError: If the engine cannot lower it.
         """
-        self._env, self._policy, base = env, policy, env.base
+        self._phases, self._policy, self._base, base = env.phases, policy, env.base, env.base
         for wrapper in env.wrappers:
             if wrapper.batched:
                 raise LimitError(f"wrapper {wrapper.name!r} is declared to need all worlds at once")
@@ -81,23 +80,30 @@ class FusedEnvStep:
         self._before, self._after = _Layout(one), _Layout(jax.eval_shape(self._outline, one, one_action))
         self._shapes = self._before.shapes | self._after.shapes | {ACTION: one_action}
         self._shapes |= {OVER: jax.ShapeDtypeStruct((), bool)} if policy else {}
+        self._kinds = self._before.kinds | self._after.kinds | {ACTION: "drone", OVER: "world"}
+        self._check_kinds()
         joined = jax.eval_shape(self._joined, state, action)
         axes = Axes(joined)
         places = _places(state.data, joined)
         # A parameter that has become one per drone since is not certain to be zero for all of them.
-        zeros = {places[i]: some for i, some in base.zeros if axes.scopes[places[i]] == "shared"}
+        zeros = tuple([(places[i], some) for i, some in base.zeros if axes.scopes[places[i]] == "shared"])
         first, last = [Stage(self._act, "world", name="actions")], [Stage(self._observe, "world", name="observations")]
         if policy is not None:
             last.append(Stage(self._begin, "world", lambda one: one.plugins[NAME].of_worlds[OVER][0], name="resets"))
-        scratch = [i for i, name in enumerate(axes.names) if name.endswith(f"[{OVER!r}]")]
         self._leaf = _leaves_of_rest(joined)
+        scratch = [self._leaf[name] for name in (ACTION, OVER) if name in self._leaf]
         outputs = {self._leaf[name] for name in self._after.shapes if name.startswith(OUTPUTS)}
         rows = (lambda written: [i for i in written if i not in outputs]) if packed else None
         settings = (base.n_substeps, base.sim.device.platform, scratch, rows)
-        self._run = FusedRollout(first, base.stages, last, joined, zeros, *settings)
+        self._run = FusedCall(first, base.stages, last, joined, zeros, *settings)
         again = {name for name in self._after.shapes if self._leaf[name] in outputs & set(self._run.read)} - set(ENDS)
         if packed and again:
             raise LimitError(f"a step reads {', '.join(sorted(again))} of the step before")
+
+    @property
+    def program(self) -> Program:
+        """Program of the kernel."""
+        return self._run.program
 
     def __call__(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one step later. (n_worlds, n_drones, k)"""
@@ -130,9 +136,7 @@ class FusedEnvStep:
         read = {i: x for i, x in read.items() if i in self._run.read}
         rows, found = self._run.run_packed(packed.rows, packed.shared, read)
         outputs = {name: found.get(self._leaf[name]) for name in self._after.shapes}
-        arrays = {
-            name: None if x is None else x.reshape(n_worlds, *self._shapes[name].shape) for name, x in outputs.items()
-        }
+        arrays = {name: None if x is None else x.reshape(self._shape(name, (n_worlds,))) for name, x in outputs.items()}
         return packed._replace(rows=rows), self._after.state(arrays, None)
 
     def unpack(self, packed: PackedState, state: EnvState) -> EnvState:
@@ -150,14 +154,13 @@ class FusedEnvStep:
     # Stages of one world ------------------------------------------------------------------------------------------
 
     def _act(self, joined: SimData) -> SimData:
-        state, action = act(self._env, self._state(joined, self._before), self._get(joined, ACTION))
+        state, action = self._phases.act(self._state(joined, self._before), self._get(joined, ACTION))
         return self._with(joined, state, self._before, {ACTION: action})
 
     def _observe(self, joined: SimData) -> SimData:
         before = self._state(joined, self._before)
-        core = before.data.core
-        data = before.data.replace(core=core.replace(nonfinite=core.nonfinite | ~_finite(before.data)))
-        after = observe(self._env, before.replace(data=data), self._get(joined, ACTION))
+        data = before.data.replace(core=before.data.core.replace(nonfinite=nonfinite(before.data)))
+        after = self._phases.observe(before.replace(data=data), self._get(joined, ACTION))
         over = {}
         if self._policy is not None:
             over = {OVER: self._policy.is_over(before.done, after)}
@@ -166,12 +169,12 @@ class FusedEnvStep:
 
     def _begin(self, joined: SimData) -> SimData:
         ended = self._state(joined, self._after)
-        new = begin(self._env, ended, self._env.base.default_of_world(ended.data))
+        new = self._phases.begin(ended, self._base.default_of_world(ended.data))
         return self._with(joined, ended if self._policy is None else self._policy.begin(ended, new), self._after)
 
     def _outline(self, state: EnvState, action: Array) -> EnvState:
         """Return a state of the structure that a step returns."""
-        state = observe(self._env, *act(self._env, state, action))
+        state = self._phases.observe(*self._phases.act(state, action))
         return state if self._policy is None else self._policy.end(state)
 
     # Between a state and the data that the engine runs on -----------------------------------------------------------
@@ -190,10 +193,10 @@ class FusedEnvStep:
         return state.replace(data=state.data.replace(core=core))
 
     def _rest(self, arrays: dict[str, Any], worlds: tuple[int, ...]) -> Rest:
-        """Return arrays of all worlds, or of one, as rows; an axis as long as there are drones is taken for theirs."""
+        """Return arrays of all worlds, or of one, as rows; those that are not declared for drones are of worlds."""
         of_drones, of_worlds = {}, {}
         for name, x in arrays.items():
-            if self._shapes[name].shape[:1] == (self._n_drones,):
+            if self._kinds[name] == "drone":
                 of_drones[name] = x.reshape(*worlds, self._n_drones, -1)
             else:
                 of_worlds[name] = x.reshape(*worlds, *(1 for _ in worlds), -1)
@@ -202,7 +205,29 @@ class FusedEnvStep:
     def _get(self, joined: SimData, name: str, worlds: tuple[int, ...] = ()) -> Array:
         rest = joined.plugins[NAME]
         x = rest.of_drones[name] if name in rest.of_drones else rest.of_worlds[name]
-        return x.reshape(*worlds, *self._shapes[name].shape)
+        return x.reshape(self._shape(name, worlds))
+
+    def _shape(self, name: str, worlds: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the shape of an array of all worlds, or of one."""
+        ones = n_world_axes(self._kinds[name]) - 1 if worlds else 0
+        return (*worlds, *(1 for _ in range(ones)), *self._shapes[name].shape)
+
+    def _check_kinds(self) -> None:
+        """Check that every array belongs to worlds or drones, and that those of drones have their axis.
+
+        Raises:
+            LimitError: If worlds share one.
+            ConfigError: If one that is declared for drones has another first axis.
+        """
+        for name in self._before.shapes | self._after.shapes:
+            kind, shape = self._kinds[name], self._shapes[name].shape
+            if n_world_axes(kind) == 0:
+                raise LimitError(f"all worlds share {name.lstrip('.')}")
+            if kind == "drone" and shape[:1] != (self._n_drones,):
+                raise ConfigError(
+                    f"expected {name.lstrip('.')} of shape (n_drones, ...) in one world, with {self._n_drones} drones, "
+                    f"got {shape}. Return one row for every drone."
+                )
 
     def _state(self, joined: SimData, layout: _Layout, worlds: tuple[int, ...] = ()) -> EnvState:
         data = joined.replace(plugins={k: x for k, x in joined.plugins.items() if k != NAME})
@@ -220,18 +245,25 @@ class FusedEnvStep:
 
 
 class _Layout:
-    """Arrays of a state besides its data, by name, with their shapes and types in one world."""
+    """Arrays of a state besides its data, by name, with their shapes and types in one world, and their scopes."""
 
     def __init__(self, state: EnvState):
         paths, self._treedef = jax.tree_util.tree_flatten_with_path(state.replace(data=None))
         self._names = [jax.tree_util.keystr(path) for path, _ in paths]
         self.shapes = dict(zip(self._names, (x for _, x in paths), strict=True))
+        kinds = jax.tree.leaves(scopes(state.replace(data=None)))
+        self.kinds = {name: _kind(name, x, kind) for (name, x), kind in zip(self.shapes.items(), kinds, strict=True)}
 
     def arrays(self, state: EnvState) -> dict[str, Any]:
         return dict(zip(self._names, self._treedef.flatten_up_to(state.replace(data=None)), strict=True))
 
     def state(self, arrays: dict[str, Any], data: SimData | None) -> EnvState:
         return self._treedef.unflatten([arrays[name] for name in self._names]).replace(data=data)
+
+
+def _kind(name: str, x: Any, declared: str) -> str:
+    """Return the scope of an array: as declared, but for entries of ``info``, which are of drones unless scalar."""
+    return "drone" if declared == "batched" and name.startswith(".info") and x.ndim else declared
 
 
 def _of_one_world(state: EnvState) -> EnvState:
@@ -241,24 +273,13 @@ def _of_one_world(state: EnvState) -> EnvState:
     )
 
 
-def _finite(data: SimData) -> Array:
-    """Return true if all states and commands of a world are finite. ()"""
-    records = watched(data)
-    pairs = zip(jax.tree.leaves(scopes(records)), jax.tree.leaves(records), strict=True)
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for scope, x in pairs if has_members(scope)]))
-
-
 def _leaves_of_rest(joined: SimData) -> dict[str, int]:
     """Return the numbers of the leaves that are not data, by name."""
-    leaves, treedef = jax.tree.flatten(joined)
-    rest = treedef.unflatten(range(len(leaves))).plugins[NAME]
+    rest = numbered(joined).plugins[NAME]
     return rest.of_drones | rest.of_worlds
 
 
 def _places(data: SimData, joined: SimData) -> list[int]:
     """Return the numbers that the leaves of the data have among those of the joined data."""
-    leaves, treedef = jax.tree.flatten(data)
-    numbered = treedef.unflatten(range(len(leaves)))
-    rest = jax.tree.map(lambda _: -1, joined.plugins[NAME])
-    found = jax.tree.leaves(numbered.replace(plugins=numbered.plugins | {NAME: rest}))
-    return [found.index(i) for i in range(len(leaves))]
+    numbers = numbered(joined)
+    return jax.tree.leaves(numbers.replace(plugins={name: numbers.plugins[name] for name in data.plugins}))

@@ -146,6 +146,10 @@ class DroneParallelEnv(ParallelEnv):
         images = self._renderer(self.now)
         return images[0] if images else None
 
+    def explain(self) -> str:
+        """Return how a step is executed, as ``Env.explain`` does."""
+        return self.env.explain()
+
     def close(self) -> None:
         """Close the window."""
         self.sim.close()

@@ -1,13 +1,14 @@
 """Phases of an environment step: act, (physics), observe, and begin, which starts an episode.
 
 Each is written for one world. ``Env`` runs them for all worlds with ``apply=all_worlds``; ``FusedEnvStep`` runs the
-same functions as stages of the engine. Tasks and wrappers are called here and nowhere else.
+same functions as stages of the engine. Tasks and hooks of wrappers are called here and nowhere else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +17,11 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
 from crazysim.core.stage import over_worlds
+from crazysim.envs.actions import Actions
+from crazysim.envs.hooks import Hooks
 from crazysim.envs.random import episode_key
 from crazysim.envs.state import EnvState
 from crazysim.envs.task import Task, total
-
-if TYPE_CHECKING:
-    from crazysim.envs.env import Env
 
 Apply = Callable[[Callable[..., Any], bool], Callable[..., Any]]
 """``apply(fn, batched)``: the function as a phase calls it; ``batched`` for functions that take all worlds anyway."""
@@ -38,90 +38,103 @@ def all_worlds(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
     return fn if batched else over_worlds(fn)
 
 
-def act(env: Env, state: EnvState, action: Array, apply: Apply = one_world) -> tuple[EnvState, Array]:
-    """Return the state with the action's command staged, and the action as the wrappers pass it on.
+@dataclass(frozen=True)
+class Phases:
+    """The phases of an environment with its wrappers."""
 
-    Args:
-        env: The environment with its wrappers.
-        state: The state before the step.
-        action: Action. (n_drones, k)
-        apply: Caller of functions of one world.
-    """
-    for wrapper in reversed(env.wrappers):
-        state, action = apply(wrapper.before_step, wrapper.batched)(state, action)
-    data = apply(env.task.before_step, env.task.batched)(state.data)
-    return state.replace(data=stage_command(data, env.actions.command(action))), action
+    task: Task
+    """The task."""
+    actions: Actions
+    """Meaning of an action."""
+    wrappers: tuple[Hooks, ...]
+    """Hooks of the wrappers, the innermost first."""
+    n_drones: int
+    """Drones in a world."""
+    last_step: int
+    """Physics steps of an episode."""
+    reset_data: Callable[[SimData, SimData], SimData]
+    """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``batched_reset``."""
+    batched_reset: bool
+    """True if ``reset_data`` takes all worlds at once."""
 
+    def act(self, state: EnvState, action: Array, apply: Apply = one_world) -> tuple[EnvState, Array]:
+        """Return the state with the action's command staged, and the action as the wrappers pass it on.
 
-def observe(env: Env, state: EnvState, action: Array, apply: Apply = one_world) -> EnvState:
-    """Return the state after the physics: observations, reward and the end of the episode.
+        Args:
+            state: The state before the step.
+            action: Action. (n_drones, k)
+            apply: Caller of functions of one world.
+        """
+        for wrapper in reversed(self.wrappers):
+            state, action = apply(wrapper.before_step, wrapper.batched)(state, action)
+        data = apply(self.task.before_step, self.task.batched)(state.data)
+        return state.replace(data=stage_command(data, self.actions.command(action))), action
 
-    Args:
-        env: The environment with its wrappers.
-        state: Result of ``act``, with the data after the physics.
-        action: The action that ``act`` returned. (n_drones, k)
-        apply: Caller of functions of one world.
-    """
-    task, last_step = env.task, env.max_steps * env.n_substeps
+    def observe(self, state: EnvState, action: Array, apply: Apply = one_world) -> EnvState:
+        """Return the state after the physics: observations, reward and the end of the episode.
 
-    def evaluate(data: SimData, action: Array, last_action: Array) -> Any:
-        reward = jnp.asarray(total(task.rewards(data, action, last_action)), action.dtype)
-        return task.observe(data), reward, task.terminated(data), _step_info(task, data)
+        Args:
+            state: Result of ``act``, with the data after the physics.
+            action: The action that ``act`` returned. (n_drones, k)
+            apply: Caller of functions of one world.
+        """
+        task, last_step = self.task, self.last_step
 
-    def conclude(state: EnvState, action: Array, results: Any) -> EnvState:
-        obs, reward, terminated, info = results
-        nonfinite = state.data.core.nonfinite
-        return state.replace(
-            obs=jax.tree.map(lambda x: jnp.where(nonfinite, jnp.zeros((), x.dtype), x), obs),
-            reward=jnp.where(nonfinite, jnp.zeros((), reward.dtype), reward),
-            terminated=terminated | nonfinite,
-            truncated=state.data.core.steps >= last_step,
-            action=action,
-            info=state.info | {"nonfinite": nonfinite} | info,
-        )
+        def evaluate(data: SimData, action: Array, last_action: Array) -> Any:
+            reward = jnp.asarray(total(task.rewards(data, action, last_action)), action.dtype)
+            return task.observe(data), reward, task.terminated(data), _step_info(task, data)
 
-    results = apply(evaluate, task.batched)(state.data, action, state.action)
-    state = apply(conclude, False)(state, action, results)
-    for wrapper in env.wrappers:
-        state = apply(wrapper.after_step, wrapper.batched)(state)
-    return state
+        def conclude(state: EnvState, action: Array, results: Any) -> EnvState:
+            obs, reward, terminated, info = results
+            nonfinite = state.data.core.nonfinite
+            return state.replace(
+                obs=jax.tree.map(lambda x: jnp.where(nonfinite, jnp.zeros((), x.dtype), x), obs),
+                reward=jnp.where(nonfinite, jnp.zeros((), reward.dtype), reward),
+                terminated=terminated | nonfinite,
+                truncated=state.data.core.steps >= last_step,
+                action=action,
+                info=state.info | {"nonfinite": nonfinite} | info,
+            )
 
+        results = apply(evaluate, task.batched)(state.data, action, state.action)
+        state = apply(conclude, False)(state, action, results)
+        for wrapper in self.wrappers:
+            state = apply(wrapper.after_step, wrapper.batched)(state)
+        return state
 
-def begin(env: Env, state: EnvState, default: SimData, apply: Apply = one_world) -> EnvState:
-    """Return the state at the start of an episode; of the state before, only data, info and memory are read.
+    def begin(self, state: EnvState, default: SimData, apply: Apply = one_world) -> EnvState:
+        """Return the state at the start of an episode; of the state before, only data, info and memory are read.
 
-    Args:
-        env: The environment with its wrappers.
-        state: The state before.
-        default: Data that the world is reset to.
-        apply: Caller of functions of one world.
-    """
-    task, base = env.task, env.base
-    shape = (base.sim.n_drones, env.actions.size)
-    before = apply(base.reset_data, base.batched_reset)(state.data, default)
-    key = apply(lambda data: episode_key(data, f"spawn {task.name}"), False)(before)
-    data = apply(task.spawn, task.batched)(before, key)
-    for wrapper in env.wrappers:
-        data = apply(wrapper.after_spawn, wrapper.batched)(data)
-    data = jax.tree.map(_like, before, data)
+        Args:
+            state: The state before.
+            default: Data that the world is reset to.
+            apply: Caller of functions of one world.
+        """
+        task, shape = self.task, (self.n_drones, self.actions.size)
+        before = apply(self.reset_data, self.batched_reset)(state.data, default)
+        key = apply(lambda data: episode_key(data, f"spawn {task.name}"), False)(before)
+        data = apply(task.spawn, task.batched)(before, key)
+        for wrapper in self.wrappers:
+            data = apply(wrapper.after_spawn, wrapper.batched)(data)
+        data = jax.tree.map(_like, before, data)
 
-    def start(state: EnvState, obs: Any, info: Any) -> EnvState:
-        dtype = state.data.states.pos.dtype
-        over = jnp.zeros((), bool)
-        return state.replace(
-            obs=obs,
-            reward=jnp.zeros(shape[:1], dtype),
-            terminated=over,
-            truncated=over,
-            action=jnp.zeros(shape, dtype),
-            info=state.info | {"nonfinite": state.data.core.nonfinite} | info,
-        )
+        def start(state: EnvState, obs: Any, info: Any) -> EnvState:
+            dtype = state.data.states.pos.dtype
+            over = jnp.zeros((), bool)
+            return state.replace(
+                obs=obs,
+                reward=jnp.zeros(shape[:1], dtype),
+                terminated=over,
+                truncated=over,
+                action=jnp.zeros(shape, dtype),
+                info=state.info | {"nonfinite": state.data.core.nonfinite} | info,
+            )
 
-    seen = apply(lambda data: (task.observe(data), _step_info(task, data)), task.batched)(data)
-    state = apply(start, False)(state.replace(data=data), *seen)
-    for wrapper in env.wrappers:
-        state = apply(wrapper.after_reset, wrapper.batched)(state)
-    return state
+        seen = apply(lambda data: (task.observe(data), _step_info(task, data)), task.batched)(data)
+        state = apply(start, False)(state.replace(data=data), *seen)
+        for wrapper in self.wrappers:
+            state = apply(wrapper.after_reset, wrapper.batched)(state)
+        return state
 
 
 def _step_info(task: Task, data: SimData) -> dict[str, Array]:

@@ -1,15 +1,22 @@
-"""Tasks by name, and environments made from them in one call."""
+"""Tasks by name, registered with Gymnasium too, and environments made from them in one call."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib.metadata
 import inspect
+import re
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium
+
+from crazysim.control import Control
+from crazysim.core.settings import member, positive
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv
+from crazysim.envs.references import follow, is_reference, load
 from crazysim.envs.task import Task
 from crazysim.envs.tasks.avoid import Avoid
 from crazysim.envs.tasks.chase import Chase
@@ -33,7 +40,7 @@ class Entry:
     task: type[Task]
     """Class of the task."""
     id: str
-    """Id in Gymnasium's registry."""
+    """Id in Gymnasium's registry; empty if it is not registered there."""
     control: str = "attitude"
     """Default command level."""
     n_drones: int = 1
@@ -61,15 +68,22 @@ TASKS: dict[str, Entry] = {
 }
 """All registered tasks, by name."""
 
+BUILT_IN = frozenset(TASKS)
+"""Names of the tasks of this package."""
+PLUGINS = "crazysim.tasks"
+"""Group of entry points in which an installed package lists its classes of tasks by name."""
+
 SIM_OPTIONS = tuple(inspect.signature(Sim).parameters)
 """Options of ``make`` that belong to the simulation."""
 
 
-def make(name: str, n_worlds: int = 1, freq: int = 50, actions: Actions | None = None, **options: Any) -> DroneEnv:
+def make(
+    task: str | Task, n_worlds: int = 1, freq: int = 50, actions: Actions | None = None, **options: Any
+) -> DroneEnv:
     """Return an environment of many worlds of a task, with a simulation of its own.
 
     Args:
-        name: One of ``TASKS``.
+        task: One of ``TASKS``, the place of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
         n_worlds: Number of worlds.
         freq: Environment steps per second, Hz.
         actions: Meaning of an action; None for the usual one of the command level.
@@ -80,7 +94,8 @@ def make(name: str, n_worlds: int = 1, freq: int = 50, actions: Actions | None =
         ConfigError: If neither the simulation nor the task has an option.
         UnknownNameError: If there is no such task.
     """
-    entry = entry_of(name)
+    entry = entry_of(task)
+    name = task if isinstance(task, str) else entry.task.name or entry.task.__name__
     for option in options:
         if option not in SIM_OPTIONS + entry.options:
             near = difflib.get_close_matches(option, SIM_OPTIONS + entry.options, 1)
@@ -91,18 +106,107 @@ def make(name: str, n_worlds: int = 1, freq: int = 50, actions: Actions | None =
             )
     settings = {"control": entry.control, "n_drones": entry.n_drones}
     settings |= {k: v for k, v in options.items() if k in SIM_OPTIONS}
-    task = entry.task(**{k: v for k, v in options.items() if k in entry.options})
+    own = {k: v for k, v in options.items() if k in entry.options}
+    task = entry.task(**own) if isinstance(task, str) else dataclasses.replace(task, **own)
     sim = Sim(n_worlds=n_worlds, **settings)
     task.install(sim)
     return DroneEnv(sim, task, freq, actions)
 
 
-def entry_of(name: str) -> Entry:
-    """Return a registered task.
+def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:
+    """Register a task of your own by a name, for ``make``, training and Gymnasium, and return its id there.
+
+    A name that is registered again, as when a cell of a notebook is executed again, gets the new class.
+
+    Args:
+        name: Name, such as ``"two_hoops"``: lower case letters, digits and underscores.
+        task: Class of the task.
+        control: Default command level.
+        n_drones: Default number of drones.
+
+    Returns:
+        Id in Gymnasium's registry, such as ``"crazysim/TwoHoops-v0"``, for ``gymnasium.make_vec``.
 
     Raises:
-        UnknownNameError: If there is none of that name, with those there are.
+        ConfigError: If the name is invalid or that of a built-in task, or the class is not a frozen dataclass of
+            ``Task``.
     """
-    if name not in TASKS:
-        raise UnknownNameError(f"task {name!r} does not exist; there are {', '.join(TASKS)}")
-    return TASKS[name]
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in BUILT_IN:
+        raise ConfigError(
+            f"expected a name of lower case letters, digits and underscores that no built-in task has, got {name!r}. "
+            f"Use for example 'two_hoops'."
+        )
+    control = member(Control, "control", control).value
+    entry = Entry(_checked(task), _id(name), control, positive("n_drones", n_drones))
+    TASKS[name] = entry
+    _announce(name, entry)
+    return entry.id
+
+
+def entry_of(task: str | Task, named: bool = True) -> Entry:
+    """Return the entry of a task: that of a name, or one with the usual command level for a class of your own.
+
+    Args:
+        task: One of ``TASKS``, a name of the entry points of an installed package, the place of a class of your own,
+            or a task.
+        named: False for a place that was read from the files of a run; see ``crazysim.envs.references``.
+
+    Raises:
+        ConfigError: If there is no such file, module or class, or it may not be executed.
+        UnknownNameError: If there is no task of that name, with those there are.
+    """
+    if isinstance(task, Task):
+        same = (entry for entry in TASKS.values() if entry.task is type(task))
+        return next(same, Entry(_checked(type(task)), ""))
+    if not isinstance(task, str):
+        raise ConfigError(f"expected the name of a task or a task, got {task!r}. A class has to be called: Task().")
+    if task in TASKS:
+        return TASKS[task]
+    if is_reference(task):
+        found = load(task, TASKS) if named else follow(task, TASKS)
+        return TASKS[found] if isinstance(found, str) else Entry(_checked(found), "")
+    plugins = importlib.metadata.entry_points(group=PLUGINS)
+    if task in plugins.names:
+        register(task, plugins[task].load())
+        return TASKS[task]
+    raise UnknownNameError(
+        f"task {task!r} does not exist; there are {', '.join([*TASKS, *sorted(plugins.names)])}. A task of your own is "
+        f"named as FILE.py:CLASS."
+    )
+
+
+def _checked(task: Any) -> type[Task]:
+    """Return a class of tasks.
+
+    Raises:
+        ConfigError: If it is something else, or the class itself is not a frozen dataclass.
+    """
+    if not inspect.isclass(task) or not issubclass(task, Task) or task is Task:
+        raise ConfigError(f"expected a subclass of Task, got {task!r}. docs/guides/tasks.md has an example.")
+    fields = {f.name for f in dataclasses.fields(task)}
+    own = inspect.get_annotations(task).items()
+    if others := [name for name, kind in own if name not in fields and "ClassVar" not in str(kind)]:
+        raise ConfigError(
+            f"expected {', '.join(others)} as a setting of a dataclass, got the class {task.__name__} without the "
+            f"decorator. Write @dataclass(frozen=True, kw_only=True) above it."
+        )
+    return task
+
+
+def _id(name: str) -> str:
+    return f"crazysim/{''.join(part.capitalize() for part in name.split('_'))}-v0"
+
+
+def _announce(name: str, entry: Entry) -> None:
+    """Register a task with Gymnasium, where it is made by name."""
+    if entry.id not in gymnasium.registry:
+        gymnasium.register(
+            entry.id,
+            entry_point="crazysim.envs.single:make_single",
+            vector_entry_point="crazysim.envs.vector:make_vector",
+            kwargs={"task": name},
+        )
+
+
+for _name, _entry in TASKS.items():
+    _announce(_name, _entry)

@@ -47,6 +47,6 @@ class Renderer:
         self.sim.data = state.data
         width, height = self.size
         if self.mode == "human":
-            self.sim.draw("human", self.worlds[0], width=width, height=height)
+            self.sim.render("human", self.worlds[0], width=width, height=height)
             return []
-        return [np.asarray(self.sim.draw("rgb_array", w, width=width, height=height)) for w in self.worlds]
+        return [np.asarray(self.sim.render("rgb_array", w, width=width, height=height)) for w in self.worlds]

@@ -44,7 +44,7 @@ def rollout(
     start = bare(state)
     keys = jax.random.split(key, n_steps)
     fused = env.fused_step(start, start.action, packed=True) if isinstance(env, AutoReset) else None
-    if isinstance(fused, FusedEnvStep):
+    if fused is not None:
         return _packed(fused, start, act, keys, keep)
 
     def step(carry: EnvState, key: Array) -> tuple[EnvState, Any]:

@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.envs.env import Env
 from crazysim.envs.rendering import Renderer
-from crazysim.envs.state import EnvState, Obs, flatten, from_host
+from crazysim.envs.state import EnvState, Obs, check_actions, flatten
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
 from crazysim.errors import ConfigError
 
@@ -90,7 +91,7 @@ class DroneVecEnv(VecEnv):
         self.state, obs = self._begin(jax.random.key(number))
         return self._out(jax.device_get(obs))
 
-    def step_async(self, actions: Any) -> None:
+    def step_async(self, actions: ArrayLike) -> None:
         """Take the actions of the next step, (num_envs, k).
 
         Raises:
@@ -99,7 +100,7 @@ class DroneVecEnv(VecEnv):
         """
         if self.state is None:
             raise ConfigError("expected a reset before the first step, got none. Call reset().")
-        self._actions = from_host(actions, (self.num_envs, *(self.action_space.shape or ())))
+        self._actions = check_actions(actions, (self.num_envs, *(self.action_space.shape or ())))
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Return observations, rewards, which episodes ended, and infos.
@@ -128,7 +129,7 @@ class DroneVecEnv(VecEnv):
             }
         return self._out(obs), np.array(reward), np.array(done), infos
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: ArrayLike | None = None) -> list[Any]:
         """Return an attribute of the functional environment, which all worlds share, once per world.
 
         Raises:
@@ -137,7 +138,7 @@ class DroneVecEnv(VecEnv):
         value = self._renderer.mode if attr_name == "render_mode" else getattr(self.env, attr_name)
         return [value] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: ArrayLike | None = None) -> None:
         """Refuse: all worlds are one compiled program.
 
         Raises:
@@ -146,7 +147,7 @@ class DroneVecEnv(VecEnv):
         del value, indices
         raise ConfigError(f"cannot set {attr_name!r}: all worlds are one compiled program. Make another environment.")
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(self, method_name: str, *args: Any, indices: ArrayLike | None = None, **kwargs: Any) -> list[Any]:
         """Render, the only method of a single world.
 
         Raises:
@@ -159,7 +160,7 @@ class DroneVecEnv(VecEnv):
             )
         return list(self.get_images())
 
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: ArrayLike | None = None) -> list[bool]:
         """Return true for ``Monitor``, whose infos are there; false for other wrappers of Stable-Baselines3."""
         return [wrapper_class.__name__ == "Monitor"] * len(list(self._get_indices(indices)))
 
@@ -171,6 +172,10 @@ class DroneVecEnv(VecEnv):
             RenderError: If this machine cannot render.
         """
         return self._renderer(self.state)
+
+    def explain(self) -> str:
+        """Return how a step is executed, as ``Env.explain`` does."""
+        return self.env.explain()
 
     def close(self) -> None:
         """Close the window."""

@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.envs.actions import Actions
@@ -25,25 +26,30 @@ class EnvState(PyTree):
 
     data: SimData
     """The simulation."""
-    obs: Obs = leaf("batched")
+    obs: Obs = leaf("drone", 1)
     """Observations passed to the policy. (n_worlds, n_drones, k) each"""
-    reward: Array = leaf("batched")
+    reward: Array = leaf("drone")
     """Reward of the step that led here. (n_worlds, n_drones)"""
     terminated: Array = leaf("batched")
     """True where the episode ended by success or failure. (n_worlds,)"""
     truncated: Array = leaf("batched")
     """True where the episode reached its time limit. (n_worlds,)"""
-    action: Array = leaf("batched")
+    action: Array = leaf("drone", 1)
     """Action of the step that led here; zero at the start of an episode. (n_worlds, n_drones, k)"""
     info: dict[str, Any] = leaf("batched")
     """Further quantities by name. (n_worlds,) or (n_worlds, n_drones, ...) each"""
     memory: dict[str, Any] = leaf("batched")
-    """State of the wrappers, by name of the wrapper. (n_worlds, ...) each, but for declared shared leaves"""
+    """State of the wrappers, by name of the wrapper. (n_worlds, ...) each; those of records have their declared axes"""
 
     @property
     def done(self) -> Array:
         """True where the episode is over. (n_worlds,)"""
         return self.terminated | self.truncated
+
+
+def state_of_data(data: SimData) -> EnvState:
+    """Return a state that has data only, from which an episode begins."""
+    return EnvState(data, {}, None, None, None, None, {}, {})  # type: ignore[arg-type]
 
 
 def bare(state: EnvState) -> EnvState:
@@ -56,7 +62,7 @@ def flatten(obs: Obs) -> Array:
     return jnp.concatenate([obs[name] for name in sorted(obs)], axis=-1)
 
 
-def from_host(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+def check_actions(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """Return actions of the host for all worlds, checked. (n_worlds, ...)
 
     Raises:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.core.stage import with_leaves
 from crazysim.envs.fused_step import FusedEnvStep, PackedState
@@ -26,7 +27,7 @@ class EnvStepper:
     def __init__(self, env: AutoReset, output: Output):
         """Take the environment, and the function that selects what a step returns."""
         self._env, self._output = env, output
-        self._structure: Any = None
+        self._structure: object = None
         self._steps: _PackedSteps | _LeafSteps | None = None
 
     @property
@@ -41,8 +42,8 @@ class EnvStepper:
         structure = (treedef, [(x.shape, x.dtype) for x in leaves])
         if self._steps is None or structure != self._structure:
             fused = self._env.fused_step(state, state.action, packed=True)
-            is_fused = isinstance(fused, FusedEnvStep)
-            self._steps = _PackedSteps(fused, self._output) if is_fused else _LeafSteps(self._env, self._output)
+            packed = fused is not None
+            self._steps = _PackedSteps(fused, self._output) if packed else _LeafSteps(self._env, self._output)
             self._structure = structure
         self._steps.hold(state)
 
@@ -74,7 +75,7 @@ class _PackedSteps:
         self._start: EnvState
         self._ends: tuple[Array, Array]
 
-        def step(rows: list[Array], rest: PackedState, ends: tuple[Array, Array], actions: Any) -> Any:
+        def step(rows: list[Array], rest: PackedState, ends: tuple[Array, Array], actions: ArrayLike) -> Any:
             packed, state = fused.step_packed(rest._replace(rows=rows), ends, jnp.asarray(actions))
             return packed.rows, output(state), (state.terminated, state.truncated)
 
@@ -86,7 +87,7 @@ class _PackedSteps:
         self._rows, self._rest = packed.rows, packed._replace(rows=[])
         self._start, self._ends = state, (state.terminated, state.truncated)
 
-    def step(self, actions: Any) -> tuple[Any, Array, Array]:
+    def step(self, actions: ArrayLike) -> tuple[Any, Array, Array]:
         self._rows, output, self._ends = self.compiled(self._rows, self._rest, self._ends, actions)
         terminated, truncated = self._ends
         return output, terminated, truncated
@@ -108,7 +109,7 @@ class _LeafSteps:
     def hold(self, state: EnvState) -> None:
         self._leaves, self._treedef = jax.tree.flatten(state)
 
-    def step(self, actions: Any) -> tuple[Any, Array, Array]:
+    def step(self, actions: ArrayLike) -> tuple[Any, Array, Array]:
         if self.compiled is None:
             self.compiled = self._prepare(actions)
         values = self.compiled(self._leaves, actions)
@@ -120,11 +121,11 @@ class _LeafSteps:
     def state(self) -> EnvState:
         return self._treedef.unflatten(self._leaves)
 
-    def _prepare(self, actions: Any) -> Any:
+    def _prepare(self, actions: ArrayLike) -> Any:
         """Return the function to compile, after finding out which leaves it writes."""
         treedef = self._treedef
 
-        def flat(leaves: list[Any], actions: Any) -> list[Any]:
+        def flat(leaves: list[Any], actions: ArrayLike) -> list[Any]:
             before = treedef.unflatten(leaves)
             state = self._env.step(before, jnp.asarray(actions).reshape(before.action.shape))
             after, same = jax.tree.flatten(bare(state).replace(obs={}))

@@ -36,10 +36,13 @@ class Task:
     """True for a task that needs all worlds at once. Its methods then receive the data of all worlds with their batch
     axes, and one key per world, and its steps are not fused."""
 
+    unit: ClassVar[str] = "m"
+    """Unit of ``error``."""
+
     seconds: float = 5.0
     """Length of an episode, s."""
     tolerance: float = 0.05
-    """Error below which the task counts as done, in the unit of ``error``."""
+    """Error below which the task counts as done, in ``unit``."""
     hold: float = 1.0
     """Time at the end of an episode during which the error must stay below the tolerance, s."""
 
@@ -102,7 +105,7 @@ class Task:
         raise NotImplementedError(self._undefined("terminated(data)"))
 
     def error(self, data: SimData) -> Array:
-        """Return the task error of every drone, m unless the task says otherwise. (n_drones,)"""
+        """Return the task error of every drone, in ``unit``. (n_drones,)"""
         raise NotImplementedError(self._undefined("error(data)"))
 
     def info(self, data: SimData) -> dict[str, Array]:
@@ -111,7 +114,11 @@ class Task:
         return {}
 
     def target(self, data: SimData) -> Array | None:
-        """Return the place where each drone should be, for images, m; None to draw none. (n_drones, 3)"""
+        """Return the place where each drone should be, or several marks, for images, m; None to draw none.
+
+        Returns:
+            (n_drones, 3) or (n_drones, n_marks, 3)
+        """
         del data
         return None
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from crazysim.core.data import SimData
+from crazysim.core.settings import check_flags
 from crazysim.envs.task import NAME, Task
 from crazysim.errors import ConfigError
 from crazysim.pytree import n_world_axes, scopes
@@ -27,6 +28,7 @@ def require_installed(sim: Sim, task: Any) -> None:
     """
     if not isinstance(task, Task):
         raise ConfigError(f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
+    check_flags(task)
     if task.Record is not None and not isinstance(sim.data.plugins.get(NAME), task.Record):
         raise ConfigError(
             f"expected a simulation in which task {task.name!r} is installed, got one without its record. Call "
@@ -58,9 +60,10 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
     batch, names = ((n_worlds,), "n_worlds, ") if task.batched else ((), "")
     one = data if task.batched else jax.tree.map(_of_world, scopes(data), data)
     action = jax.ShapeDtypeStruct((*batch, n_drones, action_size), data.states.pos.dtype)
-    obs, rewards, terminated, error = jax.eval_shape(
+    obs, rewards, terminated, error, info = jax.eval_shape(
         lambda data, action: (
-            task.observe(data), task.rewards(data, action, action), task.terminated(data), task.error(data)
+            task.observe(data), task.rewards(data, action, action), task.terminated(data), task.error(data),
+            task.info(data),
         ), one, action,
     )  # fmt: skip
 
@@ -84,6 +87,13 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
             raise ConfigError(
                 f"{title}: expected {name} of shape ({names}n_drones,) = {per_drone}, got {_described(x)}. For the "
                 f"same number for all drones use jnp.full(data.core.n_drones, x)."
+            )
+    for name, x in info.items():
+        if x.shape != batch and x.shape[: len(per_drone)] != per_drone:
+            raise ConfigError(
+                f"{title}: expected info {name!r} of shape ({names.removesuffix(', ')}) or ({names}n_drones, ...) = "
+                f"({', '.join(map(str, per_drone))}, ...), got {_described(x)}. For an array of the world use "
+                f"jnp.broadcast_to(x, (data.core.n_drones, *x.shape))."
             )
     if getattr(terminated, "shape", None) != batch or not jnp.issubdtype(terminated.dtype, jnp.bool_):
         raise ConfigError(

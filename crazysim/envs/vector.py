@@ -14,9 +14,9 @@ from jax import Array
 
 from crazysim.core.settings import as_mask, member
 from crazysim.envs.env import DroneEnv, Env
-from crazysim.envs.registry import TASKS, make
+from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
-from crazysim.envs.state import EnvState, from_host
+from crazysim.envs.state import EnvState, check_actions
 from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
 from crazysim.errors import ConfigError
@@ -27,7 +27,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
     Observations are named, (num_envs, k) with one drone per world and (num_envs, n_drones, k) with several, and actions
     likewise; with several drones the reward is their mean. All are JAX arrays on the simulation's device, which
-    Gymnasium's wrappers ``JaxToNumpy`` and ``JaxToTorch`` convert.
+    Gymnasium's wrappers ``JaxToNumpy`` and ``JaxToTorch`` convert without a copy, or with ``numpy=True`` NumPy arrays
+    that the caller may write to, as Gymnasium's own wrappers of rewards do.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         render_mode: str | None = None,
         render_worlds: Sequence[int] = (0,),
         render_size: tuple[int, int] = (640, 480),
+        numpy: bool = False,
     ):
         """Take the functional environment, without automatic resets.
 
@@ -47,6 +49,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
                 window.
             render_worlds: Worlds to render.
             render_size: Width and height of an image, pixels.
+            numpy: True to return NumPy arrays, copies that may be written to.
 
         Raises:
             ConfigError: If there is no such mode, or the environment resets automatically.
@@ -64,7 +67,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             "render_modes": list(RENDER_MODES),
             "render_fps": round(env.max_steps / env.task.seconds),
         }
-        self.num_envs = env.sim.n_worlds
+        self.num_envs, self._numpy = env.sim.n_worlds, bool(numpy)
         self._single = env.sim.n_drones == 1
         self._begin = jax.jit(self.env.reset)
         self._again = jax.jit(self.env.restart)
@@ -88,7 +91,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             ConfigError: If the seed is not an integer, or an option does not exist.
         """
         options = dict(options or {})
-        mask = as_mask(options.pop("reset_mask", None), self.num_envs)
+        mask = as_mask(options.pop("reset_mask", None), (self.num_envs,))
         if options:
             raise ConfigError(f"expected no option of reset but reset_mask, got {', '.join(options)}")
         if seed is not None and not isinstance(seed, (int, np.integer)):
@@ -105,7 +108,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             number = seed if seed is not None else int(self.np_random.integers(2**31))
             state = self._begin(jax.random.key(int(number)))
         self._stepper.state, self._outputs = state, self._output(state)
-        return self._outputs[0], self._outputs[2]
+        return self._handed((self._outputs[0], self._outputs[2]))
 
     @property
     def state(self) -> EnvState | None:
@@ -134,14 +137,18 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             raise ConfigError("expected a reset before the first step, got none. Call reset().")
         needed = self.action_space.shape or ()
         if not isinstance(actions, jax.Array):
-            actions = from_host(actions, needed)
+            actions = check_actions(actions, needed)
         elif actions.shape != needed:
             raise ValueError(f"expected actions of shape {needed}, got {actions.shape}")
         self._outputs, terminated, truncated = self._stepper(actions)
         obs, reward, info = self._outputs
         if self.render_mode == "human":
             self.render()
-        return obs, reward, terminated, truncated, info
+        return self._handed((obs, reward, terminated, truncated, info))
+
+    def _handed(self, results: Any) -> Any:
+        """Return results as the caller gets them."""
+        return jax.tree.map(np.array, results) if self._numpy else results
 
     def _output(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
         """Return observations, rewards and infos in Gymnasium's form."""
@@ -172,6 +179,10 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         images = self._renderer(self.state)
         return tuple(images) if self.render_mode == "rgb_array" else None
 
+    def explain(self) -> str:
+        """Return how a step is executed, as ``Env.explain`` does."""
+        return self.env.explain()
+
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window."""
         del kwargs
@@ -184,6 +195,7 @@ def make_vector(
     autoreset_mode: GymnasiumMode | str = GymnasiumMode.NEXT_STEP,
     render_mode: str | None = None,
     max_episode_steps: int | None = None,
+    numpy: bool = False,
     **options: Any,
 ) -> DroneVectorEnv:
     """Return a vector environment of a task, for ``gymnasium.make_vec``.
@@ -194,16 +206,10 @@ def make_vector(
         autoreset_mode: Mode of automatic resets.
         render_mode: Mode of ``render``.
         max_episode_steps: Length of an episode, steps; None for that of the task.
+        numpy: True to return NumPy arrays, copies that may be written to.
         options: Options of ``crazysim.envs.make``.
     """
     if max_episode_steps is not None:
         options["seconds"] = max_episode_steps / options.get("freq", 50)
     env: DroneEnv = make(task, num_envs, **options)
-    return DroneVectorEnv(env, autoreset_mode, render_mode)
-
-
-def register() -> None:
-    """Register every task with Gymnasium under its id."""
-    for name, entry in TASKS.items():
-        if entry.id not in gymnasium.registry:
-            gymnasium.register(entry.id, vector_entry_point=f"{__name__}:make_vector", kwargs={"task": name})
+    return DroneVectorEnv(env, autoreset_mode, render_mode, numpy=numpy)

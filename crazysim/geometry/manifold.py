@@ -22,8 +22,12 @@ PARALLEL = 1e-3
 EDGE_SHARE, EDGE_BIAS = 0.95, 0.01
 """An axis of two edges is taken where its overlap is below this share of that of the best face, by more than this share
 of the smaller box: faces have several points, which rest more steadily."""
+FACE_BIAS = 1e-3
+"""A face of the first box is taken unless one of the second has less overlap by this share of the smaller box: between
+aligned boxes rounding would choose, and impulses of the last step would belong to other points."""
 WITHIN = 1 - 1e-4
-"""Share of a face within which the corners of the other are points of their own; beyond, its clipped edges are."""
+"""Share of a face within which the corners of the other are points of their own; beyond, its clipped edges are, up to
+as far outside of the face."""
 
 
 class Manifold(NamedTuple):
@@ -94,7 +98,8 @@ def boxes(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b: Array
         jnp.abs(along_a) - half_a - apply(size.T, half_b),
         jnp.abs(along_b) - half_b - apply(size, half_a),
     ])  # fmt: skip
-    best = jnp.argmax(lax.stop_gradient(faces))
+    smaller = jnp.minimum(jnp.min(half_a), jnp.min(half_b))
+    best = jnp.argmax(lax.stop_gradient(faces + FACE_BIAS * smaller * jnp.asarray([1, 1, 1, 0, 0, 0], faces.dtype)))
     axes = rotation.cross(rot_b.T[:, None], rot_a.T[None])  # (3 of b, 3 of a, 3)
     length = rotation.safe_norm(axes)
     spans = length[..., 0] > PARALLEL
@@ -103,10 +108,9 @@ def boxes(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b: Array
     reach = reach + jnp.sum(half_b * jnp.abs(jnp.sum(axes[..., None] * rot_b, axis=-2)), axis=-1)
     edges = jnp.where(spans, jnp.abs(jnp.sum(axes * offset, axis=-1)) - reach, -FAR).reshape(-1)
     pair = jnp.argmax(lax.stop_gradient(edges))
-    smaller = jnp.minimum(jnp.min(half_a), jnp.min(half_b))
     by_edge = edges[pair] > EDGE_SHARE * faces[best] + EDGE_BIAS * smaller
-    # Apart, the axis of largest distance counts, face or edge.
-    by_edge = jnp.where(faces[best] > 0, edges[pair] > faces[best], by_edge)
+    # Apart, the axis of largest distance counts, face or edge; between level faces that touch rounding would choose.
+    by_edge = jnp.where(faces[best] > 0, edges[pair] > faces[best] + FACE_BIAS * smaller, by_edge)
 
     is_a = best < 3
     own = (half_a, pos_a, rot_a), (half_b, pos_b, rot_b)
@@ -142,7 +146,7 @@ def _clipped(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> 
     edge_1, edge_2 = half_o[1] * apply(frame, rot_o[:, 1]), half_o[2] * apply(frame, rot_o[:, 2])
     ring = jnp.stack([middle + x * edge_1 + y * edge_2 for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     along = jnp.roll(ring, -1, axis=0) - ring
-    limit = half[1:]
+    limit = half[1:] * (2 - WITHIN)
     first, last = jnp.zeros(4, pos.dtype), jnp.ones(4, pos.dtype)
     for k in range(2):
         speed = along[:, k]
@@ -153,8 +157,9 @@ def _clipped(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> 
         first = jnp.maximum(first, jnp.where(moves, jnp.minimum(*ends), jnp.where(within, 0.0, 2.0)))
         last = jnp.minimum(last, jnp.where(moves, jnp.maximum(*ends), 1.0))
     exists = first <= last
-    found = [ring + first[:, None] * along, ring + last[:, None] * along]
     valid = [exists, exists & (last < 1)]  # the end of an edge is the beginning of the next
+    # Along an edge that is level to rounding the ends are far away: a lever of kilometres brings any point into reach.
+    found = [ring + jnp.clip(x, 0.0, 1.0)[:, None] * along for x in (first, last)]
     # Corners of the face below the inside of the other's.
     at = jnp.stack([jnp.stack([x * limit[0], y * limit[1]]) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     det = edge_1[0] * edge_2[1] - edge_1[1] * edge_2[0]

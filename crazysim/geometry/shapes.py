@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
 
@@ -136,7 +137,7 @@ def hull(vertices: Any, faces: Any = None) -> Shape:
     return Shape("mesh", (), *map(_constant, (v[used], places.reshape(-1, 3), planes, offsets)))
 
 
-def hfield(heights: Any, size: Sequence[float]) -> Shape:
+def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:
     """Return the ground below a surface of triangles over a rectangular grid, two per cell.
 
     As in MuJoCo, the diagonal of a cell joins its corners of smallest and of largest x and y.

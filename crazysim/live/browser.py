@@ -19,7 +19,8 @@ from crazysim.live.browser_scene import BrowserScene
 from crazysim.live.picture import PictureSource
 from crazysim.live.scene_bodies import SceneBodies
 from crazysim.live.viewer import Viewer
-from crazysim.media.web import FOV, LOCAL, free_port, import_viser
+from crazysim.media.access import LOCAL, Access, guarded_server
+from crazysim.media.web import FOV, free_port, import_viser
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
 
@@ -44,6 +45,9 @@ class Browser(Viewer):
 
     A click on a drone selects it, and one on a vehicle, load or object follows that. The panel plots any array of the
     data, pauses, resets, records, and has the buttons and sliders of the loop. Browsers may come and go.
+
+    The address has a new token every time. Whoever has it can watch and command the simulation; others are refused, and
+    so are pages of other sites.
     """
 
     def __init__(
@@ -62,8 +66,7 @@ class Browser(Viewer):
 
         Args:
             port: Port; 0 for any free one.
-            host: Address to listen at: this machine's alone by default, ``0.0.0.0`` for every network. There is no
-                password.
+            host: Address to listen at: this machine's alone by default, ``0.0.0.0`` for every network.
             worlds: Indices of the worlds, shown side by side; None for all, up to ``MAX_WORLDS``.
             spacing: Distance between their origins, m; None for the size of the first picture and a margin.
             trail: Duration of trails, s; 0 for none.
@@ -78,16 +81,16 @@ class Browser(Viewer):
         for name, value in (("trail", trail), ("spacing", 1.0 if spacing is None else spacing)):
             if not np.isfinite(value) or value < 0:
                 raise ConfigError(f"expected a {name} of 0 or more, got {value!r}")
-        self._port, self._host, self._worlds, self._spacing = port, host, worlds, spacing
+        self._access = Access(host, port)
+        self._worlds, self._spacing = worlds, spacing
         self._trail, self._contacts, self._wind = float(trail), contacts, wind
         self._follow, self._plot = follow, plot
         self._server: Any = None
 
     @property
     def url(self) -> str:
-        """Address for a browser."""
-        host = "127.0.0.1" if self._host == "0.0.0.0" else self._host
-        return f"http://{host}:{self._port}"
+        """Address for a browser, with the token."""
+        return self._access.url
 
     @property
     def is_open(self) -> bool:
@@ -109,18 +112,19 @@ class Browser(Viewer):
         """
         viser, sim = import_viser(), live.sim
         worlds = world_indices(sim, range(min(sim.n_worlds, MAX_WORLDS)) if self._worlds is None else self._worlds)
-        self._port = _require_free(self._host, self._port)
-        if self._host not in LOCAL:
-            log.warning("listening at %s:%d: every machine of that network can watch and command the simulation",
-                        self._host, self._port)  # fmt: skip
+        access = self._access
+        access.port = _require_free(access.host, access.port)
+        if access.host not in LOCAL:
+            log.warning("listening at %s:%d: every machine of that network that has the address with its token can "
+                        "watch and command the simulation", access.host, access.port)  # fmt: skip
         sim.scene.compile_if_edited()
-        sim.scene.sync_one(sim.plugins.placed(sim.data), int(worlds[0]))
+        sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), int(worlds[0]))
         shapes = visual_geoms(sim.mj_model, sim.mj_data)
         bodies = SceneBodies(sim, shapes)
         self._source = PictureSource(sim, bodies, worlds.tolist(), self._contacts, self._wind)
         self._picture = self._source.take(live)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
-            self._server = viser.ViserServer(host=self._host, port=self._port, label="crazysim", verbose=False)
+            self._server = guarded_server(viser, access, label="crazysim")
         scene = self._server.scene
         scene.set_up_direction("+z")
         drones = self._picture.drones

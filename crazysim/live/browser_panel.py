@@ -58,7 +58,7 @@ class BrowserPanel:
         """
         self._gui = gui = server.gui
         self._scene, self._live = scene, live
-        names = ["", *live.quantities, *quantities(live.sim)]
+        names = list(dict.fromkeys(["", *live.quantities, *quantities(live.sim)]))
         self.follow, self.plot = follow, plot if plot in names else ""
         gui.configure_theme(control_width="medium")
         self._text = gui.add_markdown("")
@@ -83,7 +83,8 @@ class BrowserPanel:
 
             @choice.on_update
             def _(_: Any) -> None:
-                self.plot = choice.value
+                if choice.value in names:  # a browser may send any text
+                    self.plot = choice.value
 
     def update(self, picture: Picture, now: float) -> None:
         """Show text and plot, at rates of their own.

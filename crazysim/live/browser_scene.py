@@ -6,7 +6,7 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.live.browser_trails import Trails, finite_rows
 from crazysim.live.mocap.frames import rotate
@@ -18,7 +18,7 @@ from crazysim.scene.visual_geoms import VisualGeom
 
 SETPOINT_RADIUS = 0.025
 """Radius of a setpoint's sphere, m."""
-NEAR = 0.02
+CLICK_SIZE = 0.02
 """Smallest half size of what a click picks, as a multiple of the distance from the camera."""
 HIDDEN = 1e-6
 """Scale of a mark that is not shown."""
@@ -118,7 +118,9 @@ class BrowserScene:
             self._trail.update(picture.time, finite_rows(pos[:, self._tracked].reshape(-1, 3)), show["trails"])
         self._show_followed(pos, picture, follow)
 
-    def pick(self, picture: Picture, origin: Any, direction: Any) -> tuple[int, SceneBody | None, NDArray | None]:
+    def pick(
+        self, picture: Picture, origin: ArrayLike, direction: ArrayLike
+    ) -> tuple[int, SceneBody | None, NDArray | None]:
         """Return index of the world, body or None, and point of the floor, m, or None, that a ray from the camera hits.
 
         Args:
@@ -153,7 +155,7 @@ class BrowserScene:
         away = np.linalg.norm(start, axis=-1, keepdims=True)
         low, high = self._bodies.low, self._bodies.high
         drones = np.array([self._bodies.items[k].kind == DRONE for k in self._bodies.owner])
-        least = np.maximum(np.where(drones, MARK_RADIUS, 0.0)[:, None], NEAR * away)
+        least = np.maximum(np.where(drones, MARK_RADIUS, 0.0)[:, None], CLICK_SIZE * away)
         to_body = picture.quat * (-1, -1, -1, 1)
         begin, ray = rotate(to_body, start), rotate(to_body, np.broadcast_to(direction, start.shape))
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 from crazysim.live.commands import Command, Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
 from crazysim.live.paths import Path
+from crazysim.plugins.follow import Follow
 from crazysim.sim.sim import Sim
-from crazysim.trajectories import Follow, Lights, Trajectory, hover, line
+from crazysim.trajectories import Lights, Trajectory, hover, line
 
 SPEED = 0.5
 """Mean speed of take-off and landing, m/s."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
+from time import perf_counter, sleep
 from typing import Any, TypeVar
 
 import jax
@@ -21,8 +21,8 @@ from crazysim.live.history import History, Snapshot
 from crazysim.live.interaction import Interaction
 from crazysim.live.pace import LiveReport, Pace, Speed, undisturbed
 from crazysim.live.process import Event, OnError, Process, RateLimit, period_of
-from crazysim.live.recording import Recordings
-from crazysim.live.report import make_report
+from crazysim.live.recordings import Recordings
+from crazysim.live.run_report import make_report
 from crazysim.live.staging import StagedCommands
 from crazysim.live.viewer import Viewer
 from crazysim.live.viewers import Viewers
@@ -32,6 +32,8 @@ SLICE = 0.01
 """Longest sleep, s: the time after which a click or a key is noticed."""
 ALARM = 0.02
 """Lateness of a control step that is logged, s."""
+ALARM_PERIOD = 10.0
+"""Time from one such warning to the next, s."""
 
 V = TypeVar("V", bound=Viewer)
 log = logging.getLogger(__name__)
@@ -98,8 +100,8 @@ class Live(Interaction, Closing):
         self._recordings = Recordings()
         self._paused = self._stopped = self._in_step = False
         self._refused = 0
-        self._factor = (time.perf_counter(), 0, 0.0)
-        self._may_warn = RateLimit()
+        self._factor = (perf_counter(), 0, 0.0)
+        self._may_warn = RateLimit(ALARM_PERIOD)
 
     # Time -----------------------------------------------------------------------------------------------------------
 
@@ -256,12 +258,12 @@ class Live(Interaction, Closing):
         self._stopped = False
         self._warm_up()
         self._pace = Pace(self._dt, self._pace.speed)
-        first, pictures, paused_s, begin = self.flown, self._viewers.n_pictures, 0.0, time.perf_counter()
+        first, pictures, paused_s, begin = self.flown, self._viewers.n_pictures, 0.0, perf_counter()
         with undisturbed(), contextlib.suppress(KeyboardInterrupt):
             while not self._stopped and (end is None or self.flown < end):
                 paused_s += self._turn()
         jax.block_until_ready(self.sim.data.states.pos)
-        wall = time.perf_counter() - begin - paused_s
+        wall = perf_counter() - begin - paused_s
         simulated = (self.flown - first) * self._dt
         failures = self._refused + self._viewers.failures + self._recordings.failures
         drawn = self._viewers.n_pictures - pictures
@@ -275,7 +277,7 @@ class Live(Interaction, Closing):
     @property
     def status(self) -> str:
         """State of the loop for viewers: time, speed, pause, recording."""
-        now, (then, flown, factor) = time.perf_counter(), self._factor
+        now, (then, flown, factor) = perf_counter(), self._factor
         if now - then > 0.5:
             factor = (self.flown - flown) * self._dt / (now - then)
             self._factor = (now, self.flown, factor)
@@ -290,15 +292,15 @@ class Live(Interaction, Closing):
         if self._stopped:
             return 0.0
         if self._paused:
-            begin = time.perf_counter()
+            begin = perf_counter()
             viewers.draw(self, viewers.next_at)
-            time.sleep(SLICE)
-            return time.perf_counter() - begin
+            sleep(SLICE)
+            return perf_counter() - begin
         wait = self._pace.due_in()
         if wait > 0:
             if not viewers.draw(self, viewers.next_at):
-                until_picture = viewers.next_at - time.perf_counter() if viewers else SLICE
-                time.sleep(max(min(wait, until_picture, SLICE), 0.0))
+                until_picture = viewers.next_at - perf_counter() if viewers else SLICE
+                sleep(max(min(wait, until_picture, SLICE), 0.0))
             return 0.0
         late = self._pace.begin(self.time)
         if late > ALARM and self._may_warn():
@@ -381,4 +383,4 @@ class Live(Interaction, Closing):
         jax.block_until_ready(self.sim.data.states.pos)
         self.sim.data = data
         self._viewers.update(self)
-        self._viewers.next_at = time.perf_counter()
+        self._viewers.next_at = perf_counter()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import gc
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Literal
 
 import numpy as np
@@ -106,7 +106,7 @@ class Pace:
     lost: float
     """Time given up, s."""
 
-    def __init__(self, dt: float, speed: Speed, clock: Callable[[], float] = time.perf_counter):
+    def __init__(self, dt: float, speed: Speed, clock: Callable[[], float] = perf_counter):
         """Begin now.
 
         Args:

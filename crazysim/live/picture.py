@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
 from crazysim.core.stage import over_drones, over_worlds
-from crazysim.effects.wind import WindData
-from crazysim.effects.wind_field import WindFieldData
 from crazysim.live.scene_bodies import SceneBodies
 from crazysim.media.poses import mocap_poses
+from crazysim.plugins.effects.wind import WindData
+from crazysim.plugins.effects.wind_field import WindFieldData
 from crazysim.pytree import has_members, scopes
 from crazysim.sim.sim import Sim
 

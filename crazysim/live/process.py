@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -76,16 +77,20 @@ class Event:
 
 
 class RateLimit:
-    """Permission to log one message a second."""
+    """Permission to log one message in some time."""
 
-    def __init__(self) -> None:
-        """Begin with the permission."""
-        self._last = -QUIET
+    def __init__(self, period: float = QUIET):
+        """Begin with the permission.
+
+        Args:
+            period: Time from one message to the next, s.
+        """
+        self._period, self._last = period, -math.inf
 
     def __call__(self) -> bool:
         """Return True if a message may be logged now."""
         now = time.monotonic()
-        if now - self._last < QUIET:
+        if now - self._last < self._period:
             return False
         self._last = now
         return True

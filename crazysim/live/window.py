@@ -104,7 +104,7 @@ class Window(Viewer):
         if self.plot and self.plot not in (known := [*live.quantities, *quantities(sim)]):
             raise ConfigError(f"expected a quantity to plot, one of {', '.join(known)}, got {self.plot!r}")
         sim.scene.compile_if_edited()
-        sim.scene.sync_one(sim.plugins.placed(sim.data), worlds[0])
+        sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), worlds[0])
         bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
         self._source = PictureSource(sim, bodies, worlds, self.contacts, self.wind)
         path = os.pathsep.join([str(Path(crazysim.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crazysim.core.settings import flag
 from crazysim.errors import ConfigError, RenderError
 from crazysim.media.flight import Flight
-from crazysim.media.recording import Clock, put
+from crazysim.media.flight_recorder import Clock, put
 from crazysim.media.view import View
 from crazysim.media.worlds import require_world
 from crazysim.sim.sim import Sim
@@ -22,8 +23,8 @@ from crazysim.sim.sim import Sim
 ENCODERS = {
     # Fragments of a second, each written at once, keep what has been encoded readable if the encoder is killed.
     ".mp4": [
-        "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "22", "-movflags", "+frag_keyframe+empty_moov",
-        "-flush_packets", "1",
+        "-c:v", "libx264", "-preset", "veryfast", "-pix_fmt", "yuv420p", "-crf", "22",
+        "-movflags", "+frag_keyframe+empty_moov", "-flush_packets", "1",
     ],
     ".gif": ["-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse"],
 }  # fmt: skip
@@ -88,7 +89,7 @@ class Film:
         self.fps, self.speed, self.n_frames = float(fps), float(speed), 0
         self._command = self._encode(*size)
         self._ffmpeg: subprocess.Popen[bytes] | None = None
-        self._bar = _bar(total) if progress else None
+        self._bar = _bar(total) if flag("progress", progress) else None
         self._clock = Clock()
 
     def add(self, sim: Sim) -> int:
@@ -192,7 +193,8 @@ class Film:
             ) from error
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self.fps:g}", "-i", "-"]
         encoder = [*ENCODERS[self.path.suffix.lower()], "-g", f"{math.ceil(self.fps)}"]  # a key frame every second
-        return [get_ffmpeg_exe(), "-loglevel", "error", *raw, *encoder, "-y", str(self.path)]
+        target = str(self.path.absolute())  # not an option, as -y.mp4 would be
+        return [get_ffmpeg_exe(), "-loglevel", "error", *raw, *encoder, "-y", target]
 
     def __enter__(self) -> Film:
         return self

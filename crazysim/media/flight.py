@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 from crazysim.media.journal import is_journal, pack_arrays, read_journal, unpack_arrays
 from crazysim.scene.visual_geoms import KINDS, VisualGeom
+from crazysim.storage import read_arrays, reading, replacing
 
 FORMAT = 1
 """Version of the file format."""
@@ -91,40 +92,34 @@ class Flight:
         """Write the flight to a compressed ``.npz`` file.
 
         Raises:
-            ConfigError: If the folder does not exist, or the name has another suffix.
+            ConfigError: If the name has another suffix, or the file cannot be written; then nothing of it stays.
         """
         path = Path(path)
         if path.suffix != ".npz":
             raise ConfigError(f"expected the name of a recording to end with .npz, got {str(path)!r}")
-        if not path.parent.is_dir():
-            raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
         arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shapes"}
         arrays |= shape_arrays(self.shapes)
-        np.savez_compressed(path, format=FORMAT, **arrays)
+        with replacing(path) as file:
+            np.savez_compressed(file, format=FORMAT, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Flight:
         """Return the flight that ``save`` or a ``Recorder`` with a path has written, even one that crashed.
 
         Raises:
-            ConfigError: If the file does not exist or is not a recorded flight.
+            ConfigError: If the file does not exist, or is of another format.
+            DamagedFileError: If it is damaged or not a recorded flight.
         """
         path = Path(path)
-        if not path.is_file():
-            raise ConfigError(f"expected an existing file, got {str(path)!r}")
-        try:
+        with reading(path, "a recorded flight", "Save it again, or use another copy."):
             if is_journal(path):
                 arrays = _read_samples(path)
             else:
-                with np.load(path, allow_pickle=False) as file:
-                    arrays = dict(file)
+                with path.open("rb") as file:
+                    arrays = read_arrays(file, str(path))
             if int(arrays["format"]) != FORMAT:
                 raise ConfigError(f"expected a recording of format {FORMAT}, got format {arrays['format']} in {path}")
             return cls(**{f.name: arrays[f.name] for f in fields(cls) if f.name != "shapes"}, shapes=_shapes(arrays))
-        except ConfigError:
-            raise
-        except (KeyError, ValueError, OSError, EOFError) as error:
-            raise ConfigError(f"expected a recorded flight, got {str(path)!r}: {error}") from error
 
 
 def shape_arrays(shapes: Sequence[VisualGeom]) -> dict[str, NDArray]:
@@ -176,7 +171,7 @@ def _read_samples(path: Path) -> dict[str, NDArray]:
     """Return the arrays of a flight in a journal.
 
     Raises:
-        ConfigError: If it holds no sample.
+        ValueError: If it holds no sample.
     """
     scene: dict[str, NDArray] = {}
     samples: list[NDArray] = []
@@ -186,7 +181,7 @@ def _read_samples(path: Path) -> dict[str, NDArray]:
         elif kind == SAMPLE:
             samples.append(np.frombuffer(content, "<f8"))
     if not samples or not scene:
-        raise ConfigError(f"expected a recorded flight with at least one sample, got none in {str(path)!r}")
+        raise ValueError("expected at least one sample, got none")
     n_worlds, n_drones, n_bodies = (len(scene[name]) for name in ("worlds", "drone_ids", "body_ids"))
     values = np.stack(samples)
     sizes = [(), (n_worlds, n_drones, 3), (n_worlds, n_drones, 4), (n_worlds, n_bodies, 3), (n_worlds, n_bodies, 4)]

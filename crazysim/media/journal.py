@@ -3,12 +3,13 @@
 A file is its first line, ``crazysim journal 1``, and chunks: kind (4 bytes), length of the content (8 bytes, little
 endian), CRC-32 of kind and content (4 bytes), content. Each chunk is handed to the operating system in one write, so
 that the end of the process, even by SIGKILL, loses nothing that was appended. A chunk that is cut off, by a full disk
-or a loss of power, ends the file for a reader.
+or a loss of power, ends the file for a reader, with a warning.
 """
 
 from __future__ import annotations
 
 import io
+import logging
 import os
 import struct
 import zlib
@@ -20,6 +21,9 @@ from numpy.typing import NDArray
 
 from crazysim.closing import Closing
 from crazysim.errors import ConfigError
+from crazysim.storage import read_arrays
+
+log = logging.getLogger(__name__)
 
 MAGIC = b"crazysim journal 1\n"
 """First line of a journal."""
@@ -33,15 +37,20 @@ class Journal(Closing):
     path: Path
     """Path of the file."""
 
-    def __init__(self, path: str | Path):
+    def __init__(self, path: str | Path, replace: bool = False):
         """Create the file.
 
+        Args:
+            path: Path.
+            replace: True to replace an existing file.
+
         Raises:
-            ConfigError: If it exists, which protects earlier recordings, or cannot be created.
+            ConfigError: If it exists and is not to be replaced, or cannot be created.
         """
         self.path = Path(path)
+        if_exists = os.O_TRUNC if replace else os.O_EXCL
         try:
-            self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644)
+            self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | if_exists | getattr(os, "O_BINARY", 0), 0o644)
         except FileExistsError:
             raise ConfigError(f"expected a new file, got {str(path)!r}, which exists. Use another name.") from None
         except OSError as error:
@@ -81,21 +90,24 @@ class Journal(Closing):
 
 
 def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
-    """Yield kind and content of the chunks of a file, which may still be growing, up to the first incomplete one.
+    """Yield kind and content of the chunks of a file, which may still be growing.
+
+    At the first chunk that is cut off or damaged, it warns and ends.
 
     Raises:
-        ConfigError: If the file does not exist or is not a journal.
+        ValueError: If the file is not a journal.
+        OSError: If it cannot be read.
     """
-    path = Path(path)
-    if not is_journal(path):
-        raise ConfigError(f"expected a journal, got {str(path)!r}")
-    with path.open("rb") as file:
-        file.seek(len(MAGIC))
-        size = path.stat().st_size
-        while len(head := file.read(HEAD.size)) == HEAD.size:
-            kind, length, checksum = HEAD.unpack(head)
+    with open(path, "rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise ValueError(f"the first line is not {MAGIC.decode().strip()!r}")
+        size = os.fstat(file.fileno()).st_size
+        while (start := file.tell()) < size:
+            head = file.read(HEAD.size)
+            kind, length, checksum = HEAD.unpack(head) if len(head) == HEAD.size else (b"", size, 0)
             content = file.read(length) if length <= size - file.tell() else b""
             if len(content) < length or zlib.crc32(content, zlib.crc32(kind)) != checksum:
+                log.warning("%s is cut off or damaged at byte %d of %d; what is before it was read", path, start, size)
                 return
             yield kind, content
 
@@ -118,5 +130,4 @@ def pack_arrays(**arrays: NDArray) -> bytes:
 
 def unpack_arrays(content: bytes) -> dict[str, NDArray]:
     """Return the arrays in the content of a chunk."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        return dict(arrays)
+    return read_arrays(io.BytesIO(content), "a chunk of a journal")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.sim.sim import Sim
 
 
-def mocap_poses(sim: Sim, worlds: Any) -> tuple[NDArray, NDArray]:
+def mocap_poses(sim: Sim, worlds: int | NDArray) -> tuple[NDArray, NDArray]:
     """Return poses of all mocap bodies: drones, objects, and what plugins place, such as loads.
 
     Args:
@@ -20,7 +18,7 @@ def mocap_poses(sim: Sim, worlds: Any) -> tuple[NDArray, NDArray]:
     Returns:
         Positions, world frame, m (n, n_mocap, 3), and attitudes, body to world, xyzw (n, n_mocap, 4).
     """
-    data = sim.plugins.placed(sim.data)
+    data = sim.plugins.with_placed_objects(sim.data)
     base_pos, base_quat = sim.scene.mocap_poses()
     pos = np.array(np.asarray(base_pos)[worlds], float)
     quat = np.roll(np.asarray(base_quat, float)[worlds], -1, axis=-1)

@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.core.settings import as_rgba
 from crazysim.errors import ConfigError
 from crazysim.scene.overlays import Overlays
 
@@ -18,7 +19,9 @@ MIN_ALPHA = 0.15
 
 def colors_of(n_drones: int, rgba: ArrayLike | None) -> NDArray:
     """Return a colour for each drone: the given one, or one of ``COLORS`` if it is None. (n_drones, 4)"""
-    return COLORS[np.arange(n_drones) % len(COLORS)] if rgba is None else np.broadcast_to(rgba, (n_drones, 4))
+    if rgba is None:
+        return COLORS[np.arange(n_drones) % len(COLORS)]
+    return np.broadcast_to(as_rgba(rgba, n_drones), (n_drones, 4))
 
 
 class Trail:

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.core.settings import positive
-from crazysim.deprecation import warn_renamed
+from crazysim.core.settings import as_rgba, check_flags, positive
 from crazysim.eager import to_host
 from crazysim.errors import ConfigError
 from crazysim.media.trail import Trail, colors_of
@@ -20,6 +19,9 @@ from crazysim.sim.visualize import draw_setpoints, draw_text
 
 BORDER_COLOR = 40
 """Grey level between two worlds, 0 to 255."""
+
+MAX_PIXELS = 16_384
+"""Largest width and height of an image."""
 
 
 @dataclass
@@ -66,7 +68,10 @@ class View:
         Raises:
             ConfigError: If a setting is invalid.
         """
-        self.width, self.height = positive("width", self.width), positive("height", self.height)
+        check_flags(self)
+        self.width, self.height = (positive(name, getattr(self, name), MAX_PIXELS) for name in ("width", "height"))
+        if self.rgba is not None:
+            as_rgba(np.atleast_2d(self.rgba)[0])
         self.worlds = [self.worlds] if isinstance(self.worlds, (int, np.integer)) else list(self.worlds)
         if not self.worlds:
             raise ConfigError("expected at least one world, got none")
@@ -131,16 +136,11 @@ class View:
                 sim.overlays.restore(before)
                 self._draw(sim, k, time[k])
                 config = self._cam_config(k, time[k], pos[k])
-                image[self.tile(k)] = np.asarray(sim.draw("rgb_array", world, self.camera, config, width, height))
+                image[self.tile(k)] = np.asarray(sim.render("rgb_array", world, self.camera, config, width, height))
         except Exception:
             sim.overlays.restore(before)  # they are kept for the next image
             raise
         return image
-
-    def picture(self, sim: Sim) -> NDArray:
-        """Deprecated name of ``render``."""
-        warn_renamed("View.picture", "View.render")
-        return self.render(sim)
 
     def show(self, sim: Sim) -> None:
         """Show the first of the worlds in a window of the view's size.
@@ -151,7 +151,7 @@ class View:
         """
         time, pos = self._sample(sim)
         self._draw(sim, 0, time[0])
-        sim.draw("human", self.worlds[0], self.camera, self._cam_config(0, time[0], pos[0]), self.width, self.height)
+        sim.render("human", self.worlds[0], self.camera, self._cam_config(0, time[0], pos[0]), self.width, self.height)
 
     def _sample(self, sim: Sim) -> tuple[NDArray, NDArray]:
         """Return times, s (n,), and drone positions, m (n, n_drones, 3), of the worlds, and extend the trails."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, RenderError
+from crazysim.media.access import LOCAL, Access, guarded_server, is_own_name, wrong_name
 from crazysim.media.flight import Flight
 from crazysim.media.trail import colors_of
 from crazysim.scene.visual_geoms import VisualGeom
@@ -24,8 +25,6 @@ PLANE_SIZE = 20.0
 """Half size of infinite planes, m."""
 LIGHT_RADIUS = 0.03
 """Radius of a light, m."""
-LOCAL = ("127.0.0.1", "localhost", "::1")
-"""Addresses that other machines cannot reach."""
 FOV = 50.0
 """Initial vertical field of view, degrees."""
 
@@ -53,7 +52,7 @@ def page(flight: Flight, world: int | None = None, lights: NDArray | None = None
     with contextlib.redirect_stdout(
         io.StringIO()
     ):  # viser prints the address of its server, which runs for this call only
-        server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
+        server = guarded_server(viser, Access("127.0.0.1", free_port()))
         try:
             return _record(server, flight, k, lights).as_html()
         finally:
@@ -90,6 +89,10 @@ def server_of(html: str, port: int, host: str = "127.0.0.1") -> http.server.Thre
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
+            name = self.headers.get("Host", "")
+            if not is_own_name(name, host):
+                self.send_error(403, explain=wrong_name(name))
+                return
             self.send_response(200)
             self.send_header("Content-Type", "text/html; charset=utf-8")
             self.send_header("Content-Length", str(len(content)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +27,9 @@ class BatchRenderer:
     Its memory is that of the images and of the scene in as many worlds.
     """
 
-    def __init__(self, model: mujoco.MjModel, camera: str | int, width: int, height: int, n_worlds: int, device: Any):
+    def __init__(
+        self, model: mujoco.MjModel, camera: str | int, width: int, height: int, n_worlds: int, device: jax.Device
+    ):
         """Prepare. MuJoCo Warp compiles its kernels at its first run on a machine, which takes some seconds.
 
         Args:

@@ -12,9 +12,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
-from crazysim.core.sharding import place_scene, put
+from crazysim.core.sharding import put, shard_scene
 from crazysim.eager import to_host
-from crazysim.errors import ConfigError
 from crazysim.scene import build, contacts, mjx
 from crazysim.scene.sync import sync_sim2mjx
 
@@ -55,12 +54,12 @@ class MjxScene:
     def data(self) -> mjx.Data:
         """State of the scene in every world; assigned poses are checked. (n_worlds, ...)"""
         if self._data is None:
-            self._data = self._place(build.make_data(self._mj_model, self._n_worlds, self._device))
+            self._data = self._to_device(build.make_data(self._mj_model, self._n_worlds, self._device))
         return self._data
 
     @data.setter
     def data(self, data: mjx.Data) -> None:
-        self._data = self._place(build.check_poses(data, self._mj_model, self._n_worlds))
+        self._data = self._to_device(build.check_poses(data, self._mj_model, self._n_worlds))
 
     @property
     def is_allocated(self) -> bool:
@@ -72,7 +71,7 @@ class MjxScene:
         data, self._data = sync_sim2mjx(data, self.data, self.model)
         return data
 
-    def poses(self, worlds: Any = None) -> tuple[Any, Any, Any]:
+    def poses(self, worlds: int | NDArray | None = None) -> tuple[Any, Any, Any]:
         """Return poses of some worlds at the last sync, or as the model has them while nothing is allocated.
 
         Args:
@@ -94,14 +93,6 @@ class MjxScene:
         pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[chosen] for x in self._rest)
         return pos, quat, qpos
 
-    @property
-    def is_supported(self) -> bool:
-        """True if MJX supports the scene; others can be drawn, but have no ``contacts``."""
-        try:
-            return self.model is not None
-        except ConfigError:
-            return False
-
     def contacts(self, body: str | None) -> Array:
         """Return True for every contact slot, of one body or of all, that touched at the last sync.
 
@@ -119,7 +110,7 @@ class MjxScene:
         """Spread the worlds over devices."""
         self._mesh, self._model = mesh, None
         if self._data is not None:
-            self._data = self._place(self._data)
+            self._data = self._to_device(self._data)
 
-    def _place(self, data: mjx.Data) -> mjx.Data:
-        return put(data, self._device) if self._mesh is None else place_scene(data, self._mesh)
+    def _to_device(self, data: mjx.Data) -> mjx.Data:
+        return put(data, self._device) if self._mesh is None else shard_scene(data, self._mesh)

@@ -11,17 +11,21 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import Objects, SimData
-from crazysim.core.settings import positive
+from crazysim.core.settings import as_mask, flag, positive
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import on_device, select_worlds
 from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
 
+MAX_OBJECTS = 100_000
+"""Most objects that are added at once."""
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 """Identity attitude, xyzw."""
+Source = str | Path | mujoco.MjSpec | mujoco.MjsBody
+"""Name of a primitive, path of an MJCF file, MJCF text, a spec, or a body of one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +58,14 @@ class Handle:
         some = (lambda x: x[k]) if isinstance(k, slice) else (lambda x: (x[k],))
         return Handle(self.name, some(self.numbers), some(self.rows) if self.movable else ())
 
-    def set_pose(self, data: SimData, pos: Any = None, quat: Any = None, vel: Any = None, mask: Any = None) -> SimData:
+    def set_pose(
+        self,
+        data: SimData,
+        pos: ArrayLike | None = None,
+        quat: ArrayLike | None = None,
+        vel: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
+    ) -> SimData:
         """Return the data with these objects moved. Pure: for jit, rollouts, and stages of one world.
 
         Args:
@@ -70,6 +81,7 @@ class Handle:
                 not finite.
         """
         objects = self._objects(data)
+        mask = as_mask(mask, objects.pos.shape[:-3])
         if pos is not None and vel is None:
             vel = np.zeros(3)
         new = {
@@ -95,23 +107,28 @@ class Handle:
             )
         return data.objects  # type: ignore[return-value]
 
-    def _with_rows(self, old: Array, what: str, value: Any, mask: Any) -> Array:
+    def _with_rows(self, old: Array, what: str, value: ArrayLike, mask: Array | None) -> Array:
         value = as_poses(value, what, len(self), old.shape[-1], old.shape[0] if old.ndim == 4 else None)
-        return _moved(old, value, None if mask is None else jnp.asarray(mask), self.rows, what == "quat")
+        return _moved(old, value, mask, self.rows, what == "quat")
 
 
 @compiled("numbers", "is_quat")
-def _moved(old: Array, value: Array, mask: Array | None, numbers: tuple[int, ...], is_quat: bool) -> Array:
+def _moved(old: Array, value: Array | NDArray, mask: Array | None, numbers: tuple[int, ...], is_quat: bool) -> Array:
     """Return positions, attitudes or velocities of all objects with some rows replaced; attitudes are normalised."""
     n, size = len(numbers), old.shape[-1]
     value = jnp.asarray(value, old.dtype)
     if is_quat:
         value = value * jax.lax.rsqrt(jnp.sum(value**2, axis=-1, keepdims=True))
     value = jnp.broadcast_to(value[:, None] if value.ndim == 3 else value, (*old.shape[:-2], n, size))
-    rows = [old[..., k, :] for k in range(old.shape[-2])]
-    for i, k in enumerate(numbers):
-        rows[k] = value[..., i, :]
-    return select_worlds(mask, jnp.stack(rows, axis=-2), old)
+    begin, end = numbers[0], numbers[0] + n
+    if numbers == tuple(range(begin, end)):  # as long to compile for thousands as for one
+        new = jnp.concatenate([old[..., :begin, :], value, old[..., end:, :]], axis=-2)
+    else:
+        rows = [old[..., k, :] for k in range(old.shape[-2])]
+        for i, k in enumerate(numbers):
+            rows[k] = value[..., i, :]
+        new = jnp.stack(rows, axis=-2)
+    return select_worlds(mask, new, old)
 
 
 @compiled("numbers")
@@ -120,26 +137,26 @@ def _rows(old: Array, numbers: tuple[int, ...]) -> Array:
     return (old if old.ndim == 2 else old[:, 0])[..., np.array(numbers), :]
 
 
-def as_poses(value: Any, what: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
+def as_poses(value: ArrayLike, what: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
     """Return positions, attitudes or velocities of ``n`` objects, checked. (size,), (n, size) or (n_worlds, n, size)
 
     Raises:
         ConfigError: If it has another shape, or comes from the host and is not finite.
     """
     try:
-        shape = np.shape(value)
-        host = None if isinstance(value, jax.Array) else np.asarray(value, np.float64)
+        array = value if isinstance(value, jax.Array) else np.asarray(value, np.float64)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"expected numbers for {what}, got {value!r}") from error
     shapes = [(size,), (n, size)] + ([] if n_worlds is None else [(n_worlds, n, size)])
-    if shape not in shapes:
-        raise ConfigError(f"expected {what} of shape {' or '.join(map(str, shapes))}, got {shape}")
-    if host is not None and (not np.isfinite(host).all() or (what == "quat" and not host.any(axis=-1).all())):
+    if array.shape not in shapes:
+        raise ConfigError(f"expected {what} of shape {' or '.join(map(str, shapes))}, got {array.shape}")
+    on_host = isinstance(array, np.ndarray)
+    if on_host and (not np.isfinite(array).all() or (what == "quat" and not array.any(axis=-1).all())):
         raise ConfigError(
             f"expected finite numbers for {what}, not all zero in a quaternion, got "
-            f"{np.array2string(host, threshold=8)}"
+            f"{np.array2string(array, threshold=8)}"
         )
-    return value if host is None else host
+    return array
 
 
 class SceneObjects:
@@ -159,24 +176,24 @@ class SceneObjects:
     def add(
         self,
         spec: mujoco.MjSpec,
-        what: Any,
+        what: Source,
         name: str | None,
         count: int,
-        pos: Any,
-        quat: Any,
+        pos: ArrayLike,
+        quat: ArrayLike,
         mocap: bool,
         options: dict[str, Any],
     ) -> Handle:
         """Add bodies to a spec, and return their handle; see ``Scene.add``."""
         name = _default_name(what) if name is None else name
-        numbers = tuple(range(positive("count", count)))
+        numbers = tuple(range(positive("count", count, MAX_OBJECTS)))
         names = [f"{name}:{k}" for k in numbers]
         taken = sorted({body.name for body in spec.bodies} & {name, *names})
         if taken or name == "drone":
             raise ConfigError(
                 f"expected a new name, got {(taken or ['drone:0'])[0]!r}, a body of the scene. Pass name=."
             )
-        n_worlds = self._n_worlds if mocap else None
+        n_worlds = self._n_worlds if flag("mocap", mocap) else None
         poses = [
             np.broadcast_to(np.asarray(as_poses(x, what, count, size, n_worlds)), (n_worlds or 1, count, size))
             for x, what, size in ((pos, "pos", 3), (quat, "quat", 4))
@@ -209,7 +226,7 @@ class SceneObjects:
 
 
 def add_bodies(
-    spec: mujoco.MjSpec, what: Any, names: list[str], pos: np.ndarray, quat: np.ndarray, mocap: bool, options: dict
+    spec: mujoco.MjSpec, what: Source, names: list[str], pos: np.ndarray, quat: np.ndarray, mocap: bool, options: dict
 ) -> None:
     """Add bodies to a spec.
 
@@ -247,7 +264,7 @@ def add_bodies(
             frame.attach_body(source, prefix, "")
 
 
-def _source(what: Any) -> mujoco.MjSpec | mujoco.MjsBody:
+def _source(what: Source) -> mujoco.MjSpec | mujoco.MjsBody:
     """Return a spec or body to attach; it is read for every body, because attaching may consume it."""
     if isinstance(what, mujoco.MjsBody):
         return what
@@ -271,7 +288,7 @@ def _source(what: Any) -> mujoco.MjSpec | mujoco.MjsBody:
     return spec
 
 
-def _default_name(what: Any) -> str:
+def _default_name(what: Source) -> str:
     """Return the name of objects that are added without one."""
     if isinstance(what, mujoco.MjsBody):
         return what.name or "object"

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.core.settings import as_rgba
 from crazysim.errors import ConfigError, UnknownNameError
 
 RED = (1.0, 0.0, 0.0, 1.0)
@@ -76,7 +77,7 @@ class Overlays:
                 f"expected at most {self.limit} overlays in one image, got {len(self) + len(geoms)}. Increase "
                 f"sim.max_visual_geom before drawing."
             )
-        colors = np.broadcast_to(np.asarray(rgba, np.float32), (len(geoms), 4))
+        colors = np.broadcast_to(as_rgba(rgba, len(geoms)).astype(np.float32), (len(geoms), 4))
         self._geoms += [(*geom, color, emission) for geom, color in zip(geoms, colors, strict=True)]
 
     def write(self, scene: mujoco.MjvScene) -> None:

@@ -9,7 +9,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from crazysim.core.settings import as_rgba
 from crazysim.errors import ConfigError
+from crazysim.tables import LENGTH
 
 TOUCHED_BY_DRONES = {"contype": 0, "conaffinity": 2}
 """Bits of geoms that touch drones only, so that no object is in contact with the floor it stands on."""
@@ -96,15 +98,18 @@ def primitive_geoms(name: str, options: dict[str, Any]) -> Geoms:
     """
     make, rgba = PRIMITIVES[name]
     settings = {"rgba": rgba} | options
-    rgba = settings.pop("rgba")
+    rgba = as_rgba(settings.pop("rgba"))
     try:
         geoms = make(**settings)
-    except TypeError as error:
+    except ConfigError:
+        raise
+    except (TypeError, ValueError) as error:
         defaults = [f"{p.name}={p.default}" for p in inspect.signature(make).parameters.values()]
         raise ConfigError(f"expected settings {', '.join([*defaults, 'rgba'])} of {name!r}, got: {error}") from error
     for geom in geoms:
-        if not np.all(np.asarray(geom["size"], float) > 0):
-            raise ConfigError(f"expected positive lengths of {name!r}, in m, got {settings}")
+        lengths = np.asarray(geom["size"], float)
+        if not np.all((lengths > 0) & (lengths <= LENGTH.high)):
+            raise ConfigError(f"expected positive lengths of {name!r}, in m, up to {LENGTH.high:g}, got {settings}")
         geom["type"] = getattr(mujoco.mjtGeom, f"mjGEOM_{geom['type'].upper()}")
         geom["size"] = (*geom["size"], 0, 0)[:3]
         geom |= {"rgba": rgba, **TOUCHED_BY_DRONES}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 
-from crazysim.scene import collision, depth, report
+from crazysim.scene import collision, contact_report, depth
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.objects import SceneObjects
 from crazysim.scene.placement import Placing
@@ -14,7 +14,7 @@ class PureQueries:
     """The part of ``Scene`` that returns pure functions, and the geoms that these are about."""
 
     added: SceneObjects
-    """Objects that were added with ``add``."""
+    """ObjectSelection that were added with ``add``."""
     plugins: Placing
     """Returns the plugins of the simulation, some of which place objects."""
 
@@ -49,7 +49,9 @@ class PureQueries:
         """Names of the objects that drones can touch, in the order of a contact report."""
         return tuple(body.name for body in self.collision_model.objects)
 
-    def contact_fn(self, objects: report.Objects = None, floor: bool = True, drones: bool = True) -> report.ContactFn:
+    def contact_fn(
+        self, objects: contact_report.ObjectSelection = None, floor: bool = True, drones: bool = True
+    ) -> contact_report.ContactFn:
         """Return ``contacts(data, mocap=None) -> ContactReport``, pure, for the scene as it is now.
 
         The function takes all worlds or, in a stage, one world or one drone; for a stage of one drone pass
@@ -67,7 +69,7 @@ class PureQueries:
         Raises:
             ConfigError: If nothing is requested, or an object does not exist.
         """
-        return report.build(self.collision_model, objects, floor, drones, self.plugins)
+        return contact_report.build(self.collision_model, objects, floor, drones, self.plugins)
 
     def depth_fn(
         self,

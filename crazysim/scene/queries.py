@@ -8,19 +8,24 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.engine import fused
+from crazysim.engine.backends import fused
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.query import Query, query
-from crazysim.scene import report
+from crazysim.scene import contact_report
 from crazysim.scene.collision import CollisionModel
+from crazysim.scene.contact_report import ContactReport, ObjectSelection
 from crazysim.scene.depth import Along
-from crazysim.scene.mocap import with_mocap_bodies
+from crazysim.scene.mocap import MocapPoses, with_mocap_bodies
 from crazysim.scene.objects import Handle
-from crazysim.scene.report import ContactReport, Objects
 from crazysim.scene.scene import Scene
+
+MAX_SIZE = 256
+"""Largest ``size_of`` a contact report that gets a kernel: it takes 20 s to compile for 64 movable boxes. XLA takes 1 s
+for any number, and 1.4 times as long in each call."""
 
 
 class SceneQueries:
@@ -37,10 +42,10 @@ class SceneQueries:
         self._scene, self._strict = scene, strict
         self._reported: set[str] = set()
         self._platform = None if platform is None or fused.missing(platform) else platform
-        self._model: Any = None
+        self._model: mujoco.MjModel | None = None
         self._compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}
 
-    def contact_report(self, data: SimData, objects: Objects, floor: bool, drones: bool) -> ContactReport:
+    def contact_report(self, data: SimData, objects: ObjectSelection, floor: bool, drones: bool) -> ContactReport:
         """Return the contacts of every drone; see ``Sim.contact_report``."""
         key = objects if isinstance(objects, (Handle, str, type(None))) else tuple(objects)
         settings = (key, floor, drones)
@@ -72,22 +77,22 @@ class SceneQueries:
         mocap = self._scene.mocap_poses() if model.mocap_bodies else None
         return self._compiled[name, *settings](*poses, mocap)
 
-    def _contacts(self, objects: Objects, floor: bool, drones: bool) -> Callable[..., ContactReport]:
+    def _contacts(self, objects: ObjectSelection, floor: bool, drones: bool) -> Callable[..., ContactReport]:
         """Return the contacts of all worlds as a function of data and mocap poses, by one kernel where possible."""
         # The data come with the objects of plugins at their poses.
         model, platform = self._scene.collision_model, self._platform
-        by_xla = report.build(model, objects, floor, drones)
-        if platform is None:
+        by_xla = contact_report.build(model, objects, floor, drones)
+        if platform is None or contact_report.size_of(model, objects) > MAX_SIZE:
             return by_xla
         # Their poses become part of the data before the kernel runs, which is for data alone.
         in_data = model.without_mocap_bodies()
         queries: list[Query] = []
-        if floor or report.choose(in_data, objects):
-            queries.append(("drone", report.build(in_data, objects, floor, drones=False)))
+        if floor or contact_report.choose(in_data, objects):
+            queries.append(("drone", contact_report.build(in_data, objects, floor, drones=False)))
         if drones:
-            queries.append(("world", report.build(in_data, (), floor=False)))
+            queries.append(("world", contact_report.build(in_data, (), floor=False)))
 
-        def contacts(data: SimData, mocap: Any) -> ContactReport:
+        def contacts(data: SimData, mocap: MocapPoses) -> ContactReport:
             try:
                 found = query(queries, with_mocap_bodies(model, data, mocap), platform)
                 return functools.reduce(ContactReport.joined, found)
@@ -105,7 +110,9 @@ def _of_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
     """Return a function of data and mocap poses as one of poses alone; the rest of the data is left out."""
     bare = jax.tree.map(lambda _: None, data)
 
-    def of_poses(pos: Array, quat: Array, objects_pos: Array | None, objects_quat: Array | None, mocap: Any) -> Any:
+    def of_poses(
+        pos: Array, quat: Array, objects_pos: Array | None, objects_quat: Array | None, mocap: MocapPoses
+    ) -> Any:
         states, objects = bare.states.replace(pos=pos, quat=quat), bare.objects
         core = bare.core.replace(drone_id=jnp.broadcast_to(jnp.arange(pos.shape[-2]), pos.shape[:-1]))
         if objects is not None:

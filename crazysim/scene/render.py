@@ -8,10 +8,11 @@ from typing import Any
 import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError, RenderError, UnknownNameError
 from crazysim.scene.overlays import Overlays
+from crazysim.scene.software import quality
 from crazysim.scene.window import Window
 
 MAX_SIZES = 4
@@ -105,7 +106,10 @@ class Viewer:
             # Buffers are made once per context; a larger image than any before needs a new context.
             buffers.offwidth, buffers.offheight = max(buffers.offwidth, width), max(buffers.offheight, height)
             try:
-                renderer = mujoco.Renderer(self._model, height, width, self._max_geom, font_scale(height))
+                with quality(self._model):
+                    renderer = mujoco.Renderer(self._model, height, width, self._max_geom, font_scale(height))
+            except ConfigError:
+                raise
             except Exception as error:  # OpenGL bindings raise errors of any type
                 raise RenderError(
                     f"expected a working OpenGL, got {type(error).__name__}: {error}. On a machine without a screen "
@@ -137,7 +141,7 @@ def camera_id(model: mujoco.MjModel, camera: int | str) -> int:
     return int(camera)
 
 
-def require_size(width: Any, height: Any) -> None:
+def require_size(width: ArrayLike, height: ArrayLike) -> None:
     """Check the size of an image.
 
     Raises:

@@ -28,7 +28,7 @@ class SceneRenderer:
         self._device = device
         self.overlays = Overlays()
         self.viewer = None
-        self._batch: tuple[Any, BatchRenderer] | None = None
+        self._batch: tuple[tuple[int | str, ...], BatchRenderer] | None = None
 
     def render(
         self,

@@ -10,14 +10,15 @@ import jax
 import mujoco
 from jax import Array
 from jax.sharding import Mesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import Objects, SimData
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
 from crazysim.scene import build, mjx
 from crazysim.scene.mjx_scene import MjxScene
-from crazysim.scene.objects import IDENTITY, Handle, SceneObjects
+from crazysim.scene.objects import IDENTITY, Handle, SceneObjects, Source
+from crazysim.scene.placement import Placing
 from crazysim.scene.pure_queries import PureQueries
 from crazysim.scene.renderer import SceneRenderer
 from crazysim.scene.sync import sync_one_world, with_poses_of
@@ -29,8 +30,8 @@ LARGE_SWARM = 64
 class Scene(PureQueries):
     """MuJoCo's side of a simulation.
 
-    The scene is updated lazily, when contacts or images are requested: ``sync`` decides whether it is up to date, and
-    ``contacts`` and ``render`` read the result. Nothing is allocated per world before the first ``contacts``.
+    The scene is updated lazily: ``sync`` does so for all worlds when contacts are requested and anything has changed
+    since, ``sync_one`` for the world of an image. Nothing is allocated per world before the first ``contacts``.
     """
 
     spec: mujoco.MjSpec
@@ -53,6 +54,7 @@ class Scene(PureQueries):
         freq: int,
         device: jax.Device,
         mesh: Mesh | None,
+        plugins: Placing = tuple,
     ):
         """Build and compile the spec.
 
@@ -64,6 +66,7 @@ class Scene(PureQueries):
             freq: Physics steps per second, Hz.
             device: Device of the scene of all worlds.
             mesh: Devices over which the worlds are spread instead; None for one device.
+            plugins: Returns the plugins of the simulation, some of which place objects.
 
         Raises:
             ConfigError: If the scene cannot be read or compiled.
@@ -74,18 +77,18 @@ class Scene(PureQueries):
         self.renderer = SceneRenderer(device)
         self.spec = build.build_spec(xml_path, airframes, freq, self.max_geom_pairs)
         self.added = SceneObjects(n_worlds)
-        self.plugins = tuple
+        self.plugins = plugins
         self.revision = 0
         self.compile()
 
     def add(
         self,
-        what: Any,
+        what: Source,
         name: str | None = None,
         *,
         count: int = 1,
-        pos: Any = (0.0, 0.0, 0.0),
-        quat: Any = IDENTITY,
+        pos: ArrayLike = (0.0, 0.0, 0.0),
+        quat: ArrayLike = IDENTITY,
         mocap: bool = True,
         **options: Any,
     ) -> Handle:
@@ -212,25 +215,25 @@ class Scene(PureQueries):
         """Mark the scene as out of date."""
         self._synced = False
 
-    def sync(self, data: SimData, world: int | None = None) -> SimData:
-        """Bring the scene up to date: all worlds, or ``mj_data`` with the one world that is to be drawn.
+    def sync(self, data: SimData) -> SimData:
+        """Bring ``mjx_data`` up to date in all worlds, and return the data with ``core.mjx_synced`` set.
 
-        Drawing one world leaves the others alone, except where there is only one. Whether a sync is due
-        is a flag on the host, so the call does not wait for the device.
-
-        Returns:
-            The data, with ``core.mjx_synced`` set if all worlds were synced.
+        Whether a sync is due is a flag on the host, so the call does not wait for the device.
         """
         self.compile_if_edited()
-        if not self._synced and (world is None or (self.n_worlds == 1 and self._mjx.is_supported)):
+        if not self._synced:
             data = self._mjx.sync(data)
             self._synced = True
-        if world is not None:
-            self.sync_one(data, world)
         return data
 
     def sync_one(self, data: SimData, world: int) -> None:
-        """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used."""
+        """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used.
+
+        Raises:
+            ConfigError: If the world does not exist.
+        """
+        if not 0 <= world < self.n_worlds:
+            raise ConfigError(f"expected a world from 0 to {self.n_worlds - 1}, got {world}")
         self.compile_if_edited()
         sync_one_world(data, world, self._mjx.poses(world), self._mj_model, self._mj_data)
 

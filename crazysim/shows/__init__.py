@@ -2,7 +2,7 @@
 
 from crazysim.shows.flight import ShowFlight, fly
 from crazysim.shows.live_show import ShowLights, live_show
-from crazysim.shows.report import collisions, report, sampled_approaches, summary, tracking_rms
+from crazysim.shows.show_report import collisions, report, sampled_approaches, summary, tracking_rms
 from crazysim.shows.view import film, page, play
 
 __all__ = [

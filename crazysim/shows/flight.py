@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
 from crazysim.dynamics import first_principles
-from crazysim.engine.samples import compile_sampler
 from crazysim.errors import ConfigError
+from crazysim.plugins.follow import Follow
 from crazysim.sim.sim import Sim
-from crazysim.trajectories import Follow, Trajectory
+from crazysim.trajectories import Trajectory
 from crazysim.trajectories.files.show import Show
 
 RATES = (50, 25, 10, 5)
@@ -79,7 +79,7 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
     n = max(int(np.ceil(end * rate - 1e-6)), 1)
     times = np.arange(n + 1) / rate
 
-    fly_chunk = compile_sampler(sim.step_fn, sim.data, _pose, CHUNK, sim.freq // rate)
+    fly_chunk = _compile_chunk(sim, sim.freq // rate)
     jax.block_until_ready(planned_at(show.trajectories, jnp.asarray(times)))  # compiles
     show.lights.colors(times)
     begin = time.perf_counter()
@@ -129,6 +129,17 @@ def _rate(freq: int, seconds: float, n_drones: int) -> int:
         f"expected at most {MAX_RECORDED} recorded poses and freq a multiple of {RATES[-1]} Hz, got {seconds:g} s of "
         f"{n_drones} drones at {freq} Hz. Fly a part of the show with seconds=..."
     )
+
+
+def _compile_chunk(sim: Sim, n_steps: int) -> Callable[[SimData], tuple[SimData, tuple[Array, Array]]]:
+    """Return a compiled function from data to the data ``CHUNK`` samples later, and poses after every ``n_steps``."""
+    step, zeros = sim.step_fn, sim.step_fn.zeros(sim.data)
+
+    def sample(data: SimData, _: None) -> tuple[SimData, tuple[Array, Array]]:
+        data = step(data, n_steps, zeros)
+        return data, _pose(data)
+
+    return jax.jit(lambda data: jax.lax.scan(sample, data, length=CHUNK)).lower(sim.data).compile()
 
 
 def _pose(data: SimData) -> tuple[Array, Array]:

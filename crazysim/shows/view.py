@@ -11,12 +11,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.core.settings import flag
 from crazysim.drones.body import LED_MATERIALS
 from crazysim.errors import ConfigError
 from crazysim.media import Film, Flight, View, flight_of, web
-from crazysim.media.recording import put
+from crazysim.media.flight_recorder import put
 from crazysim.shows.flight import ShowFlight
-from crazysim.shows.report import collisions
+from crazysim.shows.show_report import collisions
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material, draw_label, draw_points
 
@@ -56,7 +57,7 @@ def film(
         ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
         RenderError: If this machine cannot draw, or the file cannot be written.
     """
-    if night:
+    if flag("night", night):
         darken(flight.sim)
     with Film(path, view_of(flight, **view), fps=fps, progress=progress) as recording:
         return recording.play(flight.sim, media_flight(flight))

@@ -5,12 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
 
+from crazysim.core.airframes import AirframeSource
 from crazysim.core.population import Population
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.build import read_spec
@@ -18,13 +21,13 @@ from crazysim.scene.build import read_spec
 if TYPE_CHECKING:
     from crazysim.sim.sim import Sim
 
-Kind = Any
+Kind = AirframeSource | type[Population]
 """An airframe, or a subclass of ``Population``."""
 
 
 def known_kinds() -> dict[str, Kind]:
     """Return the built-in airframes and populations by the prefix of names."""
-    from crazysim.vehicles import Bicycles, Cars  # imported where a file is adopted
+    from crazysim.plugins.vehicles import Bicycles, Cars  # imported where a file is adopted
 
     return {"Crazyflie": "crazyflie", "Bumblebee": "bumblebee", Cars.prefix: Cars, Bicycles.prefix: Bicycles}
 
@@ -47,7 +50,11 @@ class Vehicle(NamedTuple):
 
 
 def adopt(
-    kind_of_sim: type[Sim], xml_path: str | Path, n_worlds: int, kinds: Mapping[str, Kind] | None, settings: Any
+    kind_of_sim: type[Sim],
+    xml_path: str | Path,
+    n_worlds: int,
+    kinds: Mapping[str, Kind] | None,
+    settings: dict[str, Any],
 ) -> Sim:
     """Return a simulation with the vehicles of an MJCF; see ``Sim.from_mjcf``."""
     spec = read_spec(xml_path)
@@ -108,9 +115,9 @@ def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, Kind]) -> list[Vehicl
     return [vehicle for _, vehicle in found]
 
 
-def _is_population(kind: Kind) -> bool:
+def _is_population(kind: Kind) -> TypeGuard[type[Population]]:
     return isinstance(kind, type) and issubclass(kind, Population)
 
 
-def _in_worlds(rows: list[np.ndarray], n_worlds: int, dtype: Any) -> Any:
+def _in_worlds(rows: list[np.ndarray], n_worlds: int, dtype: DTypeLike) -> Array:
     return jnp.asarray(np.broadcast_to(rows, (n_worlds, *np.shape(rows))), dtype)

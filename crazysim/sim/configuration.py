@@ -14,10 +14,20 @@ from crazysim.control.controllers import find_controller
 from crazysim.core.airframes import AirframeSource, is_list, load_airframes
 from crazysim.core.controls import require_controller, require_pair
 from crazysim.core.integration import Integrator
-from crazysim.core.settings import control_freqs, controller_at_rates, find_device, member, physics_freq, positive
+from crazysim.core.settings import (
+    check_flags,
+    control_freqs,
+    controller_at_rates,
+    find_device,
+    flag,
+    member,
+    physics_freq,
+    positive,
+)
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
-from crazysim.dynamics.core import require_support
+from crazysim.dynamics.models import require_freq, require_support
+from crazysim.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +61,30 @@ class Configuration:
     strict: bool
     """True to raise an error where a slower engine would be taken with a warning."""
 
+    def check(self, data: Any) -> None:
+        """Check that data are those of a simulation with these settings; it takes a microsecond.
+
+        The axes of each leaf are checked by the step.
+
+        Raises:
+            ConfigError: If they are not.
+        """
+        try:
+            core, controls = data.core, data.controls
+            cascade, fitted = controls.controller is None, controls.rotor_vel is None
+            given = core.n_worlds, core.n_drones, core.freq, controls.mode, cascade, fitted
+        except AttributeError:
+            raise ConfigError(
+                f"expected the data of a simulation, got {type(data).__name__}. Use sim.data = sim.data.replace(...)."
+            ) from None
+        cascade, fitted = self.controller is None, self.dynamics != Dynamics.first_principles
+        needed = self.n_worlds, self.n_drones, self.freq, self.control, cascade, fitted
+        if given != needed:
+            raise ConfigError(
+                f"expected data of {_described(*needed)}, got data of {_described(*given)}. Use data of this "
+                f"simulation, or of one with the same settings."
+            )
+
     @staticmethod
     def create(
         n_worlds: Any,
@@ -79,14 +113,22 @@ class Configuration:
         integrator = member(Integrator, "integrator", integrator)
         require_pair(dynamics, control)
         airframes = load_airframes(drone, n_drones)
-        for airframe in airframes:
+        for airframe in dict.fromkeys(airframes):
             require_support(airframe, dynamics)
-        freqs, controller = control_freqs(control, freq, dict(rates)), find_controller(controller, switch)
+        controller = find_controller(controller, switch)
+        if controller is not None:
+            for each in controller.members:
+                check_flags(each)
+            controller = controller.adapted(control, None if dynamics == Dynamics.first_principles else dynamics)
         if controller is not None:
             require_controller(dynamics, control, controller)
-            controller = controller_at_rates(controller, control, freq, dict(rates))
+        freqs = control_freqs(control, freq, rates, dynamics != Dynamics.first_principles, controller)
+        if controller is not None:
+            controller = controller_at_rates(controller, control, freq, rates)
             with_outer = control == Control.state and controller.has_outer
             freqs = {**freqs, control: controller.outer_freq if with_outer else controller.freq}
+        for airframe in dict.fromkeys(airframes):
+            require_freq(airframe, dynamics, freq)  # after the rates, which need a higher freq
         return Configuration(
             n_worlds,
             n_drones,
@@ -100,5 +142,15 @@ class Configuration:
             find_device(device),
             mesh,
             engine,
-            strict,
+            flag("strict", strict),
         )
+
+
+def _described(n_worlds: int, n_drones: int, freq: int, control: Control, cascade: bool, fitted: bool) -> str:
+    """Return the settings of data for a message."""
+    controller = "Crazyflow's cascade" if cascade else "another controller"
+    dynamics = "fitted" if fitted else "first-principles"
+    return (
+        f"{n_worlds} worlds of {n_drones} drones at {freq} Hz with {control.value!r} commands, {controller} and "
+        f"{dynamics} dynamics"
+    )

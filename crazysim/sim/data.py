@@ -1,5 +1,6 @@
 """Records of a simulation, under the path that Crazyflow uses."""
 
+from crazysim.control import Control
 from crazysim.core.controls import (
     AttitudeControlData,
     BodyRateControlData,
@@ -15,6 +16,7 @@ ControlData = StateControlData | AttitudeControlData | BodyRateControlData | For
 __all__ = [
     "AttitudeControlData",
     "BodyRateControlData",
+    "Control",
     "ControlData",
     "ForceTorqueControlData",
     "SimControls",

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.core import functional as F
 from crazysim.core.data import SimData, command_shape
+from crazysim.core.locking import locked
 from crazysim.core.population import Population
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.pytree import PyTree
 
 if TYPE_CHECKING:
     from crazysim.sim.sim import Sim
@@ -32,6 +35,7 @@ class Member:
     def __init__(self, sim: Sim, name: str, population: str, index: int):
         """Take the simulation, the name, the population and the index in it."""
         self._sim, self.name, self.population, self.index = sim, name, population, index
+        self.lock = sim.lock
 
     def __getattr__(self, field: str) -> Array:
         """Return a field of the record. (n_worlds, ...)
@@ -44,7 +48,8 @@ class Member:
             raise AttributeError(f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}.")
         return _row(value, self.index)
 
-    def set(self, **values: Any) -> None:
+    @locked
+    def set(self, **values: ArrayLike) -> None:
         """Write fields of the record, such as ``pos``, in all worlds: (...), or (n_worlds, ...) for each.
 
         Raises:
@@ -60,7 +65,8 @@ class Member:
             new[field] = self._with_checked_row(f"{field} of {self.name}", getattr(record, field), value)
         self._sim.data = self._written(self._sim.data, record.replace(**new))
 
-    def command(self, command: Any) -> None:
+    @locked
+    def command(self, command: ArrayLike) -> None:
         """Stage a command for this one alone: (k,), or (n_worlds, k) for each world.
 
         A drone takes the command of the simulation's level, a member of a population that of its population.
@@ -83,22 +89,19 @@ class Member:
         if sim.control == "rotor_vel":
             command = self._for_rotors(command, command_shape(data, sim.control)[-1])
         staged = self._with_checked_row(f"{sim.control.value} command of {self.name}", staged, command)
-        after: Any = F.stage_command(data, staged)
-        before = getattr(level.state, "staged_feedforward", None)
+        before, feedforward = getattr(level.state, "staged_feedforward", None), None
         if before is not None:  # that of the other drones stays
-            state = after.controls.state
-            own = _with_row(before, self.index, _row(state.staged_feedforward, self.index))
-            after = after.replace(controls=after.controls.replace(state=state.replace(staged_feedforward=own)))
-        sim.data = after
+            feedforward = _with_row(before, self.index, _row(F.feedforward_of(staged), self.index))
+        sim._stepper.stage(staged, feedforward)
 
-    def _for_rotors(self, command: Any, n_rotors: int) -> Any:
+    def _for_rotors(self, command: ArrayLike, n_rotors: int) -> ArrayLike:
         """Return rotor speeds with zeros for rotors that other drones of the simulation have."""
         own = self._sim.airframes[self.index].n_rotors
         if np.shape(command)[-1:] != (own,) or own == n_rotors:
             return command
         return np.pad(np.asarray(command), [(0, 0)] * (np.ndim(command) - 1) + [(0, n_rotors - own)])
 
-    def _with_checked_row(self, what: str, x: Array, value: Any) -> Array:
+    def _with_checked_row(self, what: str, x: Array, value: ArrayLike) -> Array:
         shape = x.shape[:1] + x.shape[2:]
         if np.shape(value) not in (shape[1:], shape):
             raise ValueError(
@@ -110,11 +113,11 @@ class Member:
                 raise ValueError(f"expected finite numbers as {what}, got NaN or infinity. Check its computation.")
         return _with_row(x, self.index, value)
 
-    def _record(self) -> Any:
+    def _record(self) -> PyTree:
         data = self._sim.data
         return data.states if self.population == DRONE else self._sim.plugins[self.population].read(data)
 
-    def _written(self, data: SimData, record: Any) -> SimData:
+    def _written(self, data: SimData, record: PyTree) -> SimData:
         if self.population == DRONE:
             return data.replace(states=record)
         return self._sim.plugins[self.population].write(data, record)
@@ -136,12 +139,12 @@ def _row(x: Array, index: Array | int) -> Array:
 
 
 @compiled()
-def _with_row(x: Array, index: Array | int, value: Any) -> Array:
+def _with_row(x: Array, index: Array | int, value: ArrayLike) -> Array:
     """Return rows with that of one drone or member replaced. (n_worlds, n, ...)"""
     return x.at[:, index].set(value)
 
 
-def find_member(sim: Sim, name: Any) -> Member:
+def find_member(sim: Sim, name: str) -> Member:
     """Return the view of a drone or member.
 
     Raises:

@@ -15,7 +15,7 @@ from crazysim.control import Control, Setpoint
 from crazysim.core.data import SimData, SimState
 from crazysim.core.settings import positive
 from crazysim.core.stage import Stage
-from crazysim.dynamics.core import GRAVITY
+from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.eager import is_traced
 from crazysim.engine import Step

@@ -1,13 +1,13 @@
 """Worlds spread over devices, under the path that Crazyflow uses."""
 
 from crazysim.core.sharding import (
-    placement,
     shard,
+    shardings_of,
     world_mesh,
 )
 
 __all__ = [
-    "placement",
     "shard",
+    "shardings_of",
     "world_mesh",
 ]

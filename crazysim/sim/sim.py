@@ -2,43 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.control import Control, Controller
-from crazysim.control.controllers import CASCADE
+from crazysim.control.controllers import DEFAULT
 from crazysim.core import functional as F
 from crazysim.core.airframes import AirframeSource, airframe_of, drone_names
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
+from crazysim.core.locking import locked
+from crazysim.core.pipeline import Pipeline
+from crazysim.core.plugin import Plugin
 from crazysim.core.random import seed_sim
-from crazysim.core.registry import PluginRegistry
-from crazysim.core.settings import as_mask, positive
+from crazysim.core.settings import flag, positive
 from crazysim.core.sharding import shard
 from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
 from crazysim.drones import Airframe, Drone
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.parameters import rotor_vel_limits
-from crazysim.engine import Stepper, explain
+from crazysim.engine import Reset, Step, Stepper, explain
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
+from crazysim.plugins.registry import P, PluginRegistry
 from crazysim.pytree import on_device
+from crazysim.scene import mjx
+from crazysim.scene.build import use_boxes
+from crazysim.scene.contact_report import ContactReport, ObjectSelection
+from crazysim.scene.contacts import body_id
+from crazysim.scene.depth import Along
+from crazysim.scene.overlays import Overlays
 from crazysim.scene.queries import SceneQueries
+from crazysim.scene.render import Viewer
 from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
-from crazysim.sim.adopt import adopt
-from crazysim.sim.commands import Commands
+from crazysim.sim.adopt import Kind, adopt
+from crazysim.sim.built_pipeline import BuiltPipeline
 from crazysim.sim.configuration import Configuration
 from crazysim.sim.members import Member, find_member
-from crazysim.sim.pipelines import Pipelines
-from crazysim.sim.plugins import PluginMethods
-from crazysim.sim.scene_shell import SceneShell, use_box_collision
 
 __all__ = [
     "Sim",
@@ -52,12 +62,20 @@ __all__ = [
 ]
 
 
-class Sim(Commands, Pipelines, PluginMethods, SceneShell):
+class Sim:
     """Worlds of drones that advance together.
 
     ``data`` holds everything that changes, ``step_pipeline`` and ``reset_pipeline`` the stages that change it, ``spec``
     the scene. Physics does not depend on the scene, which is updated lazily, when contacts or images are requested.
+
+    Threads may share a simulation: calls that change its data follow each other.
     """
+
+    lock: threading.RLock
+    """Lock that these calls take. A thread holds it to change data that another one steps: ``with sim.lock: sim.data =
+    load.release(sim.data)``."""
+    plugins: PluginRegistry
+    """The plugins by name, in the order in which they were added."""
 
     def __init__(
         self,
@@ -79,8 +97,8 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         mesh: Mesh | None = None,
         engine: str = "auto",
         strict: bool = False,
-        controller: str | Controller | Sequence[str | Controller] = CASCADE,
-        switch: Any = None,
+        controller: str | Controller | Sequence[str | Controller] = DEFAULT,
+        switch: Callable[..., Array] | ArrayLike | None = None,
     ):
         """Build the scene's spec, the data and both pipelines; MuJoCo allocates nothing per world.
 
@@ -104,8 +122,9 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
             engine: Engine that executes steps, one of ``crazysim.engine.ENGINES``; ``"auto"`` takes the fastest that
                 can run the step pipeline here. ``explain`` says which that is.
             strict: True to raise an error where a slower engine would be taken with an ``EngineWarning``.
-            controller: Controller that follows the commands: a name of ``crazysim.control.controllers.CONTROLLERS``, a
-                ``crazysim.control.Controller``, or ``"crazyflow"`` for the cascade of Crazyflow; or a list of several.
+            controller: Controller that follows the commands: ``"auto"`` for any airframe, another name of
+                ``crazysim.control.controllers.CONTROLLERS``, a ``crazysim.control.Controller``, or ``"crazyflow"`` for
+                the cascade of Crazyflow; or a list of several.
                 The rates above replace its own.
             switch: Chooses among several controllers: a function ``(state, setpoint, time) -> index`` of one drone, or
                 indices, () or (n_worlds, n_drones).
@@ -119,6 +138,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
             Control.body_rate: body_rate_freq,
             Control.force_torque: force_torque_freq,
         }
+        self.lock = threading.RLock()
         self.configuration = c = Configuration.create(
             n_worlds,
             n_drones,
@@ -141,24 +161,23 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self.drone_names = drone_names(c.airframes)
         self.device, self.mesh, self.engine = c.device, mesh, engine
 
-        self._scene = Scene(xml_path, self.airframes, self.n_worlds, self.n_drones, self.freq, self.device, mesh)
+        self.plugins = PluginRegistry(self)  # type: ignore[arg-type]  # properties serve as attributes
+        worlds = self.n_worlds, self.n_drones
+        self._scene = Scene(xml_path, self.airframes, *worlds, self.freq, self.device, mesh, self.plugins.values)
         self._revision = self._scene.revision
         self._stepper = Stepper(self.device, mesh, engine, strict)
         self._queries = self._new_queries()
         self._seed = as_key(rng_key)
-        self.plugins = PluginRegistry(self)  # type: ignore[arg-type]  # properties serve as attributes
-        self._scene.plugins = self.plugins.values
         self.build_data()
         self.build_default_data()
 
-        self.step_pipeline = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
-        self.reset_pipeline = {"reset": reset}
-        self.build_step_fn()
-        self.build_reset_fn()
+        stages = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
+        self._steps = BuiltPipeline("step_pipeline", stages, self._stepper.build)
+        self._resets = BuiltPipeline("reset_pipeline", {"reset": reset}, Reset)
 
     @classmethod
     def from_mjcf(
-        cls, xml_path: str | Path, n_worlds: int = 1, *, kinds: Mapping[str, Any] | None = None, **settings: Any
+        cls, xml_path: str | Path, n_worlds: int = 1, *, kinds: Mapping[str, Kind] | None = None, **settings: Any
     ) -> Sim:
         """Return a simulation with the vehicles of an MJCF, at their poses; everything else there is the scene.
 
@@ -196,7 +215,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         """
         return self.airframe.name
 
-    # Names --------------------------------------------------------------------------------------------------
+    # Names ------------------------------------------------------------------------------------------------------------
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -211,7 +230,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         """
         return find_member(self, name)
 
-    # Data ---------------------------------------------------------------------------------------------------
+    # Data -------------------------------------------------------------------------------------------------------------
 
     def _new_queries(self) -> SceneQueries:
         kernels = self.mesh is None and self.engine in ("auto", "fused")
@@ -219,12 +238,18 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
 
     @property
     def data(self) -> SimData:
-        """Everything that changes. Assigning to it makes the scene stale, and clears ``core.mjx_synced``."""
+        """Everything that changes. Assigning to it makes the scene stale, and clears ``core.mjx_synced``.
+
+        Raises:
+            ConfigError: If it is assigned something else than data of a simulation with the same settings.
+        """
         self._adopt_scene()
         return self._stepper.data
 
     @data.setter
+    @locked
     def data(self, data: SimData) -> None:
+        self.configuration.check(data)
         self._stepper.assign(data)
         self._scene.invalidate()
 
@@ -236,15 +261,17 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
 
     @default_data.setter
     def default_data(self, data: SimData) -> None:
+        self.configuration.check(data)
         self._default_data = data
 
     def _adopt_scene(self) -> None:
         """Give the data the objects and mocap ids of an edited scene; the scene itself is not compiled."""
         if self._revision == self._scene.revision:
             return
-        self._revision = self._scene.revision
-        self.data = self._with_scene(self._stepper.data)
-        self._default_data = self._stepper.place(self._with_scene(self._default_data))
+        with self.lock, jax.ensure_compile_time_eval():  # data that are first read inside a user's trace stay arrays
+            self._revision = self._scene.revision
+            self.data = self._with_scene(self._stepper.data)
+            self._default_data = self._stepper.to_device(self._with_scene(self._default_data))
 
     def _with_scene(self, data: SimData) -> SimData:
         ids = on_device(self._scene.drone_mocap_ids, np.int32)
@@ -255,6 +282,7 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         """Time since each world's last reset, s. (n_worlds, 1)"""
         return F.time(self.data)
 
+    @locked
     def build_data(self) -> SimData:
         """Return new data at rest, as at construction, with a new record of every plugin; make it the simulation's."""
         data = SimData.create(
@@ -278,17 +306,19 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self.default_data = self.data
         return self.default_data
 
+    @locked
     def shard(self, mesh: Mesh) -> SimData:
         """Spread data, default data and scene over devices, and return the data."""
         default = self.default_data
         self.mesh = self._stepper.mesh = mesh
-        self.data = self.data
+        self.data = shard(self.data, mesh)
         self.default_data = shard(default, mesh)
         self._scene.shard(mesh)
         self._queries = self._new_queries()
         self.build_step_fn()
         return self.data
 
+    @locked
     def seed(self, seed: int) -> None:
         """Set the seed of all random numbers drawn from now on.
 
@@ -298,16 +328,157 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         self._seed = as_key(seed)
         self.data = seed_sim(self.data, self._seed)
 
-    # Stepping -----------------------------------------------------------------------------------------------
+    # Plugins ----------------------------------------------------------------------------------------------------------
 
+    @locked
+    def add(self, plugin: P, name: str | None = None) -> P:
+        """Add an effect, a sensor, a log or any other plugin, and return it.
+
+        Its record goes into ``data.plugins`` of the data and the default data, of which nothing else changes, its
+        stages into the step pipeline, its influences and states into the integration. The step is compiled again.
+
+        Args:
+            plugin: The plugin, such as ``crazysim.Wind(velocity=(2, 0, 0))``.
+            name: Name to add it under; None for ``plugin.name``.
+
+        Raises:
+            ConfigError: If the name is taken, a setting is invalid, or the simulation lacks what the plugin needs.
+        """
+        return self.plugins.add(plugin, name)
+
+    @locked
+    def remove(self, plugin: Plugin | str) -> None:
+        """Remove a plugin, with its record and its stages; stages that it had replaced return.
+
+        Raises:
+            UnknownNameError: If it has not been added.
+            ConfigError: If one of its stages has been replaced since.
+        """
+        self.plugins.remove(plugin)
+
+    @locked
+    def replace(self, plugin: P) -> P:
+        """Replace the settings of the plugin of the same name; its states continue.
+
+        Where only numbers change (the fields declared with ``parameter``), nothing is compiled.
+
+        Raises:
+            UnknownNameError: If there is no plugin of that name.
+            ConfigError: If it is of another class, or a setting is invalid.
+        """
+        return self.plugins.replace(plugin)
+
+    # Commands ---------------------------------------------------------------------------------------------------------
+
+    # A command moves nothing, so the scene stays as fresh as it was. Arguments and errors of all methods are those of
+    # ``crazysim.core.functional.state_control``.
+
+    @property
+    def control_freq(self) -> int:
+        """Rate at which staged commands take effect, Hz; with rotor commands that is every step."""
+        return self.configuration.control_freqs.get(self.configuration.control, self.configuration.freq)
+
+    @property
+    def controllable(self) -> Array:
+        """True in worlds where a staged command takes effect at the next step. (n_worlds, 1)"""
+        return F.controllable(self.data)
+
+    @locked
+    def state_control(
+        self,
+        controls: ArrayLike | None = None,
+        check_finite: bool = False,
+        *,
+        pos: ArrayLike | None = None,
+        vel: ArrayLike | None = None,
+        acc: ArrayLike | None = None,
+        yaw: ArrayLike | None = None,
+        feedforward: ArrayLike | None = None,
+    ) -> None:
+        """Stage a full-state setpoint: (n_worlds, n_drones, 16), or ``pos`` and other parts, which broadcast."""
+        like = self._stepper.like
+        self._stepper.stage(
+            *F.check_setpoint(like, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward)
+        )
+
+    @locked
+    def attitude_control(self, controls: ArrayLike, check_finite: bool = False) -> None:
+        """Stage roll, pitch, yaw, rad, and collective thrust, N. (n_worlds, n_drones, 4)"""
+        self._stage(Control.attitude, controls, check_finite)
+
+    @locked
+    def body_rate_control(self, controls: ArrayLike, check_finite: bool = False) -> None:
+        """Stage body rates, rad/s, and collective thrust, N. (n_worlds, n_drones, 4)"""
+        self._stage(Control.body_rate, controls, check_finite)
+
+    @locked
+    def force_torque_control(self, controls: ArrayLike, check_finite: bool = False) -> None:
+        """Stage collective thrust, N, and body torque, N m. (n_worlds, n_drones, 4)"""
+        self._stage(Control.force_torque, controls, check_finite)
+
+    @locked
+    def rotor_vel_control(self, controls: ArrayLike, check_finite: bool = False) -> None:
+        """Command rotor speeds, rpm. (n_worlds, n_drones, n_rotors)"""
+        self._stage(Control.rotor_vel, controls, check_finite)
+
+    def _stage(self, control: Control, command: ArrayLike, check_finite: bool) -> None:
+        self._stepper.stage(F.check_command(self._stepper.like, control, command, check_finite))
+
+    # Pipelines --------------------------------------------------------------------------------------------------------
+
+    @property
+    def step_pipeline(self) -> Pipeline:
+        """Stages of a step by name, in their order. An edit takes effect at the next step, which compiles again."""
+        return self._steps.stages
+
+    @step_pipeline.setter
+    def step_pipeline(self, pipeline: Pipeline) -> None:
+        self._steps.stages = pipeline
+
+    @property
+    def reset_pipeline(self) -> Pipeline:
+        """Functions of a reset by name, in order. An edit takes effect at the next reset, which compiles again."""
+        return self._resets.stages
+
+    @reset_pipeline.setter
+    def reset_pipeline(self, pipeline: Pipeline) -> None:
+        self._resets.stages = pipeline
+
+    @property
+    def step_fn(self) -> Step:
+        """The step of the pipeline as it is now, ``step(data, n_steps=1) -> data``, pure."""
+        return self._steps.fn()
+
+    @property
+    def reset_fn(self) -> Reset:
+        """The reset of the pipeline as it is now, ``reset(data, default_data, mask=None) -> data``, pure."""
+        return self._resets.fn()
+
+    def build_step_fn(self) -> Step:
+        """Return a new step of the pipeline as it is now, and use it; ``step(data, n_steps=1) -> data``, pure."""
+        return self._steps.build()
+
+    def build_reset_fn(self) -> Reset:
+        """Return a new reset of the pipeline as it is now, and use it; ``reset(data, default_data, mask=None)``."""
+        return self._resets.build()
+
+    # Stepping ---------------------------------------------------------------------------------------------------------
+
+    @locked
     def step(self, n_steps: int = 1) -> None:
-        """Advance every world by a number of physics steps; any number uses the same compilation."""
+        """Advance every world by a number of physics steps; any number uses the same compilation.
+
+        Raises:
+            ConfigError: If it is not a positive integer, or a world would have taken more than
+                ``crazysim.core.data.MAX_STEPS`` since its last reset.
+        """
         n_steps = positive("n_steps", n_steps)
         self._adopt_scene()
-        self._take_edits()
+        self._steps.fn()
         self._stepper.advance(n_steps)
         self._scene.invalidate()
 
+    @locked
     def rollout(
         self,
         policy: Policy,
@@ -337,9 +508,11 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         Raises:
             ValueError: If a number is invalid, or the policy returns a command of another shape.
         """
+        n_substeps = self.freq // self.control_freq
+        self._stepper.count(n_substeps, positive("n_control_steps", n_control_steps))
         data, kept = run_rollout(
-            self.step_fn, self.data, policy, params, n_control_steps, progress, every,
-            n_substeps=self.freq // self.control_freq, keep=keep,
+            self.step_fn, self.data, policy, params, n_control_steps, flag("progress", progress), every,
+            n_substeps=n_substeps, keep=keep,
         )  # fmt: skip
         self._advance(data)
         return kept
@@ -350,20 +523,220 @@ class Sim(Commands, Pipelines, PluginMethods, SceneShell):
         Args:
             measure: True to measure the cost of stages that are not fused, which compiles a second step.
         """
-        return explain(self.step_fn, self.data, measure)
+        return explain(self.step_fn, self.data, flag("measure", measure))
 
-    def reset(self, mask: Any = None) -> None:
+    @locked
+    def reset(self, mask: ArrayLike | None = None) -> None:
         """Return all worlds, or those of a mask, to ``default_data``, and run the reset pipeline.
 
         Args:
             mask: True in worlds to reset, of type bool; None for all. (n_worlds,)
 
         Raises:
-            ValueError: If the mask has another shape or type.
+            ConfigError: If the mask has another shape or type.
         """
-        self._advance(self.reset_fn(self.data, self.default_data, as_mask(mask, self.n_worlds)))
+        self._advance(self.reset_fn(self.data, self.default_data, mask))
 
     def _advance(self, data: SimData) -> None:
         """Take data that a compiled call returned."""
         self._stepper.accept(data)
         self._scene.invalidate()
+
+    # Scene ------------------------------------------------------------------------------------------------------------
+
+    @property
+    def scene(self) -> Scene:
+        """The MuJoCo scene; ``scene.add`` adds objects."""
+        return self._scene
+
+    @property
+    def spec(self) -> mujoco.MjSpec:
+        """Editable scene; ``build_mjx`` makes edits take effect."""
+        return self._scene.spec
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """Compiled scene."""
+        return self._scene.mj_model
+
+    @property
+    def mj_data(self) -> mujoco.MjData:
+        """State of the world that was drawn last."""
+        return self._scene.mj_data
+
+    @property
+    def mjx_model(self) -> mjx.Model:
+        """Compiled scene on the device; made when first read."""
+        return self._scene.mjx_model
+
+    @property
+    def mjx_data(self) -> mjx.Data:
+        """The scene's state in every world at its last sync; made when first read, and returned as it is.
+
+        Assigning to it makes the scene stale. Poses of bodies other than drones, ``mocap_pos`` and ``mocap_quat``,
+        must be one per world and finite, or it raises a ValueError.
+        """
+        return self._scene.mjx_data
+
+    @mjx_data.setter
+    def mjx_data(self, mjx_data: mjx.Data) -> None:
+        self._scene.mjx_data = mjx_data
+        self.data = self.data
+
+    @property
+    def max_geom_pairs(self) -> int:
+        """Most pairs that MJX checks per kind of collision, from the next ``build_mjx`` on; -1 for all."""
+        return self._scene.max_geom_pairs
+
+    @max_geom_pairs.setter
+    def max_geom_pairs(self, n_pairs: int) -> None:
+        self._scene.max_geom_pairs = n_pairs
+
+    @property
+    def overlays(self) -> Overlays:
+        """Lines, points, labels and text of the next image."""
+        return self._scene.renderer.overlays
+
+    @property
+    def max_visual_geom(self) -> int:
+        """Most overlays of one image."""
+        return self._scene.renderer.max_visual_geom
+
+    @max_visual_geom.setter
+    def max_visual_geom(self, limit: int) -> None:
+        self._scene.renderer.max_visual_geom = limit
+
+    @property
+    def viewer(self) -> Viewer | None:
+        """Renderer of one world; None before the first image."""
+        return self._scene.renderer.viewer
+
+    def build_mjx(self) -> None:
+        """Compile ``spec`` again after an edit; closes the viewer, and leaves the simulation's data as it is.
+
+        Raises:
+            ConfigError: If the spec does not compile or has lost a drone; the old scene stays then.
+        """
+        self._scene.compile()
+
+    @locked
+    def sync(self, world: int | None = None) -> None:
+        """Bring the scene up to date, if anything has changed since the last sync.
+
+        Args:
+            world: World to write into ``mj_data``, without touching the others; None for all, in ``mjx_data``.
+
+        Raises:
+            ValueError: If the world does not exist.
+        """
+        if world is None:
+            self._stepper.data = self._scene.sync(self._placed())
+        else:
+            self._scene.sync_one(self._placed(), world)
+
+    def _placed(self) -> SimData:
+        """Return the data with the objects of plugins, such as loads, at their poses."""
+        return self.plugins.with_placed_objects(self.data)
+
+    def contacts(self, body: str | None = None) -> Array:
+        """Return which contact slots touch, after a sync if anything has changed.
+
+        A slot is a pair of geoms that may touch; ``mj_model`` and MJX decide which pair it is. From 64 drones a world
+        on MJX keeps only ``max_geom_pairs`` pairs, the nearest; set it to -1 and call ``build_mjx`` for all.
+
+        Args:
+            body: Name of a body, such as ``"drone:0"``, to which a slot must belong; None for all.
+
+        Returns:
+            (n_worlds, n_slots), bool
+
+        Raises:
+            ValueError: If the scene has no such body.
+        """
+        if body is not None:
+            body_id(self.mj_model, body)  # a wrong name raises before anything changes
+        self.sync()
+        return self._scene.contacts(body)
+
+    def contact_report(self, objects: ObjectSelection = None, floor: bool = True, drones: bool = True) -> ContactReport:
+        """Return the contacts and distances of every drone: to the floor, to objects, to other drones.
+
+        Computed by JAX from the poses in the data. Bodies that were attached to ``spec`` and are moved through
+        ``mjx_data`` are where ``mjx_data`` has them. Fields that were not requested are None and are not computed.
+
+        Args:
+            objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.
+            floor: True to report the floor.
+            drones: True to report the other drones of a world.
+
+        Raises:
+            ValueError: If nothing is requested, or an object does not exist.
+        """
+        return self._queries.contact_report(self._placed(), objects, floor, drones)
+
+    def depth(
+        self,
+        camera: str | int = "fpv_cam",
+        width: int = 64,
+        height: int = 64,
+        drones: bool = True,
+        hide_own: bool = True,
+        along: Along = "axis",
+    ) -> Array:
+        """Return depth images of all worlds, m; see ``scene.depth_fn``. (n_worlds, n_cameras, height, width)
+
+        Infinite where nothing is hit.
+
+        Raises:
+            ValueError: If the camera does not exist, or the resolution is not positive.
+        """
+        return self._queries.depth(self._placed(), camera, width, height, drones, hide_own, along)
+
+    def render(
+        self,
+        mode: str = "human",
+        world: int = 0,
+        camera: int | str = -1,
+        cam_config: dict[str, Any] | None = None,
+        width: int = 1920,
+        height: int = 1080,
+    ) -> NDArray | tuple[NDArray, NDArray] | None:
+        """Render one world; all arguments take effect at every call.
+
+        Only the world that is rendered is brought up to date, by MuJoCo; ``mjx_data`` stays as it is.
+
+        Args:
+            mode: ``"human"`` draws into a window until the user closes it; ``"rgb_array"`` returns an image
+                (height, width, 3) of type uint8, ``"depth_array"`` the distance along the camera's axis, m
+                (height, width), ``"rgbd_tuple"`` both.
+            world: Index of the world.
+            camera: Name or id; -1 is the free camera. Drones carry ``fpv_cam:i`` and ``track_cam:i``.
+            cam_config: Settings of the free camera: lookat, distance, azimuth, elevation.
+            width: Pixels. A window is resized when it changes; the user may resize it too.
+            height: Pixels.
+
+        Raises:
+            ValueError: If the world, camera, mode or a setting does not exist.
+            RenderError: If this machine cannot draw.
+        """
+        self._scene.sync_one(self._placed(), world)
+        before = self.overlays.copy()
+        try:
+            self.plugins.draw(world)
+            return self._scene.render(mode, camera, cam_config, width, height)
+        except Exception:
+            self.overlays.restore(before)  # without what plugins have drawn, which draw again for the next image
+            raise
+
+    def close(self) -> None:
+        """Close the window and free the renderers."""
+        self._scene.close()
+
+
+def use_box_collision(sim: Sim, enable: bool = True) -> None:
+    """Let drones touch with boxes instead of spheres, or with spheres again; compiles the scene again.
+
+    Boxes follow the drone's outline more closely and cost more to check.
+    """
+    use_boxes(sim.spec, sim.n_drones, flag("enable", enable))
+    sim.build_mjx()

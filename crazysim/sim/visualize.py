@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crazysim.core.settings import as_rgba, flag
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.overlays import RED
 
@@ -72,7 +73,7 @@ def draw_capsule(
     first, last = np.asarray(p1, dtype=float), np.asarray(p2, dtype=float)
     if first.shape != (3,) or last.shape != (3,):
         raise ValueError(f"expected ends of shape (3,), got {first.shape} and {last.shape}")
-    sim.overlays.capsule(first, last, radius, RED if rgba is None else rgba, cylinder)
+    sim.overlays.capsule(first, last, radius, RED if rgba is None else rgba, flag("cylinder", cylinder))
 
 
 def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:
@@ -154,7 +155,7 @@ def change_material(
     if any(material < 0 for material in materials):
         raise UnknownNameError(f"expected material 'led_top' or 'led_bot', got {mat_name!r}")
     if rgba is not None:
-        sim.mj_model.mat_rgba[materials] = np.broadcast_to(np.asarray(rgba, float), (len(ids), 4))
+        sim.mj_model.mat_rgba[materials] = np.broadcast_to(as_rgba(rgba, len(ids)), (len(ids), 4))
     if emission is not None:
         sim.mj_model.mat_emission[materials] = np.broadcast_to(np.asarray(emission, float), (len(ids),))
 

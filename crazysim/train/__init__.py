@@ -5,8 +5,22 @@ from typing import TYPE_CHECKING
 from crazysim.lazy import lazy
 
 if TYPE_CHECKING:
-    from crazysim.train.run import TrainConfig, load_policy, train
+    from crazysim.train.config import TrainConfig
+    from crazysim.train.evaluation import evaluate
+    from crazysim.train.runs import run
+    from crazysim.train.show import film, plot_episode
+    from crazysim.train.training import load_policy
 
-__all__ = ["TrainConfig", "load_policy", "train"]
+__all__ = ["TrainConfig", "evaluate", "film", "load_policy", "plot_episode", "run"]
 
-__getattr__ = lazy(__name__, dict.fromkeys(__all__, "crazysim.train.run"))
+__getattr__ = lazy(
+    __name__,
+    {
+        "TrainConfig": "crazysim.train.config",
+        "evaluate": "crazysim.train.evaluation",
+        "film": "crazysim.train.show",
+        "load_policy": "crazysim.train.training",
+        "plot_episode": "crazysim.train.show",
+        "run": "crazysim.train.runs",
+    },
+)

@@ -15,7 +15,8 @@ from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
-from crazysim.train.networks import QUICK, Layers, Policy, init_mlp
+from crazysim.train.hyperparameters import check_hyperparameters
+from crazysim.train.networks import QUICK, Layers, Policy, all_finite, init_mlp
 
 STATS_ITERATIONS = 20
 """Iterations during which the observation statistics are updated."""
@@ -37,6 +38,10 @@ class Config:
     """Discount factor per environment step."""
     max_grad_norm: float = 1.0
     """Largest global norm of a gradient; larger ones are scaled down to it."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_hyperparameters(self)
 
 
 class Learner(PyTree):
@@ -74,9 +79,9 @@ def init(env: Env, config: Config, key: Array) -> Learner:
 def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
     """Return the learner after one rollout and one update, and the metrics of the iteration.
 
-    The rollout starts where the previous one ended; worlds whose episode is over start a new one. A non-finite
-    gradient is skipped. The scan stores its intermediates instead of recomputing them under ``jax.checkpoint``:
-    tens of steps fit in memory.
+    The metric ``finite`` is True if weights and loss are finite. The rollout starts where the previous one ended;
+    worlds whose episode is over start a new one. A non-finite gradient is skipped. The scan stores its intermediates
+    instead of recomputing them under ``jax.checkpoint``: tens of steps fit in memory.
     """
     start = env.restart(learner.env, learner.env.done)
 
@@ -95,7 +100,7 @@ def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
         metrics = {"reward": reward.mean(), "crashed": crashed.mean(), "error": jnp.nanmean(state.info["error"])}
         return -rewards.mean(), (state, raw, metrics)
 
-    grads, (state, raw, metrics) = jax.grad(loss, has_aux=True)(learner.policy)
+    (cost, (state, raw, metrics)), grads = jax.value_and_grad(loss, has_aux=True)(learner.policy)
     norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
     updates, optimizer = _optimizer(config).update(grads, learner.optimizer, learner.policy)
     new = (optax.apply_updates(learner.policy, updates), optimizer)
@@ -106,7 +111,7 @@ def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
     updated = learner.stats.update(raw)
     stats = jax.tree.map(lambda x, old: jnp.where(learner.iteration < STATS_ITERATIONS, x, old), updated, learner.stats)
     learner = Learner(policy, optimizer, stats, learner.key, state, learner.iteration + 1)
-    return learner, metrics | {"gradient": norm}
+    return learner, metrics | {"gradient": norm, "finite": all_finite((policy, optimizer, stats, cost))}
 
 
 def _optimizer(config: Config) -> optax.GradientTransformation:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.storage import read_arrays, reading, replacing
 
 T = TypeVar("T")
 META = "meta"
@@ -22,68 +25,65 @@ def save(path: str | Path, tree: Any, meta: dict[str, Any]) -> None:
     """Write the arrays of a pytree and its metadata; an existing file is replaced atomically.
 
     Args:
-        path: File to write, ``.npz``.
+        path: File to write, ``.npz``, in an existing folder.
         tree: Any pytree of arrays, including random keys.
         meta: Metadata that JSON can represent.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {name: np.asarray(_plain(x)) for name, x in _named(tree)}
-    unfinished = path.with_name(path.name + ".part")
-    with open(unfinished, "wb") as file:
-        np.savez(file, allow_pickle=False, **{META: np.array(json.dumps(meta))}, **arrays)
-    os.replace(unfinished, path)
-
-
-def read_meta(path: str | Path) -> dict[str, Any]:
-    """Return the metadata of a checkpoint.
 
     Raises:
-        ConfigError: If the file does not exist or is not a checkpoint.
+        ConfigError: If the file cannot be written; then nothing of it stays.
     """
-    path = Path(path)
-    if not path.exists():
-        raise ConfigError(
-            f"expected a checkpoint at {path}, got no file; run 'crazysim train TASK --out {path.parent}'"
-        )
-    try:
-        with np.load(path) as file:
-            return json.loads(str(file[META]))
-    except (OSError, KeyError, ValueError) as error:
-        raise ConfigError(
-            f"expected a checkpoint of crazysim at {path}, got an unreadable file ({error}); choose another folder"
-        ) from None
+    arrays = {name: np.asarray(_plain(x)) for name, x in _named(tree)}
+    with replacing(path) as file:
+        np.savez(file, allow_pickle=False, **{META: np.array(json.dumps(meta))}, **arrays)
 
 
-def load(path: str | Path, like: T) -> T:
-    """Return the pytree stored in a file.
+def read(path: str | Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """Return the arrays and the metadata of a file written by ``save``.
+
+    Raises:
+        ConfigError: If the file does not exist.
+        DamagedFileError: If it is damaged or not a checkpoint.
+    """
+    with opened(path), open(path, "rb") as file:
+        arrays = read_arrays(file, str(path))
+        return arrays, dict(json.loads(str(arrays.pop(META))))
+
+
+def opened(path: str | Path) -> AbstractContextManager[None]:
+    """Raise errors of a block that reads a checkpoint as ``crazysim.storage.reading`` does."""
+    remedy = "Use the folder of an intact run, or train again: crazysim train TASK --out FOLDER."
+    return reading(path, "a checkpoint of crazysim", remedy)
+
+
+def restore(path: str | Path, arrays: Mapping[str, NDArray], like: T) -> T:
+    """Return a pytree with the arrays of a file.
 
     Args:
-        path: File written by ``save``.
+        path: The file, for messages.
+        arrays: Its arrays, from ``read``.
         like: Pytree of the same structure and shapes, of arrays or of ``jax.ShapeDtypeStruct``.
 
     Raises:
-        ConfigError: If the file does not exist, or holds arrays of other names, shapes or types.
+        ConfigError: If the arrays have other names, shapes or types.
     """
-    read_meta(path)
+    named = _named(like)
+    if others := {name for name, _ in named} ^ set(arrays):
+        raise ConfigError(
+            f"expected the arrays of this task and version in {path}, got others: {', '.join(sorted(others)[:5])}. "
+            f"Use the settings it was saved with, or another folder."
+        )
     leaves = []
-    with np.load(path) as file:
-        named = list(_named(like))
-        if others := {name for name, _ in named} ^ (set(file.files) - {META}):
-            raise ConfigError(
-                f"expected the arrays of this task and version in {path}, got others: {', '.join(sorted(others)[:5])}. "
-                f"Use the settings it was saved with, or another folder."
-            )
-        for name, x in named:
-            is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-            value = jax.device_put(file[name])
+    for name, x in named:
+        is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        with opened(path):
+            value = jax.device_put(arrays[name])
             value = jax.random.wrap_key_data(value) if is_key else value
-            if value.shape != x.shape or value.dtype != x.dtype:
-                raise ConfigError(
-                    f"expected {name} in {path} as {x.dtype} {x.shape}, got {value.dtype} {value.shape}; use the "
-                    f"settings it was saved with, or another folder"
-                )
-            leaves.append(value)
+        if value.shape != x.shape or value.dtype != x.dtype:
+            raise ConfigError(
+                f"expected {name} in {path} as {x.dtype} {x.shape}, got {value.dtype} {value.shape}; use the "
+                f"settings it was saved with, or another folder"
+            )
+        leaves.append(value)
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 

@@ -54,6 +54,11 @@ def mlp(layers: Layers, x: Array) -> Array:
     return (x @ weight + bias).astype(dtype)
 
 
+def all_finite(tree: Any) -> Array:
+    """Return True if every number of a pytree is finite. ()"""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))
+
+
 class Policy(PyTree):
     """Deterministic policy: observation statistics and a network."""
 

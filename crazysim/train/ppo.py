@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,8 +15,10 @@ from jax import Array
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, bare, flatten
 from crazysim.envs.statistics import RunningStats
+from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
-from crazysim.train.networks import QUICK, Layers, Policy, init_mlp, mlp
+from crazysim.train.hyperparameters import check_hyperparameters
+from crazysim.train.networks import QUICK, Layers, Policy, all_finite, init_mlp, mlp
 
 
 @dataclass(frozen=True)
@@ -49,9 +52,9 @@ class Config:
     init_std: float = 0.5
     """Initial standard deviation of the actions."""
 
-
-RENAMED = {"trace": "gae_lambda"}
-"""Hyperparameters under their names of 0.1, still accepted by ``TrainConfig`` and in stored runs."""
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_hyperparameters(self)
 
 
 class Learner(PyTree):
@@ -97,7 +100,18 @@ class Sample(PyTree):
 
 
 def init(env: Env, config: Config, key: Array) -> Learner:
-    """Return an untrained learner; ``env`` resets automatically within the step that ends an episode."""
+    """Return an untrained learner; ``env`` resets automatically within the step that ends an episode.
+
+    Raises:
+        ConfigError: If the samples of a rollout cannot be divided into the minibatches.
+    """
+    n_samples = config.n_steps * env.sim.n_worlds * env.sim.n_drones
+    if n_samples % config.minibatches:
+        raise ConfigError(
+            f"expected minibatches that divide the {n_samples} samples of a rollout ({config.n_steps} steps, "
+            f"{env.sim.n_worlds} worlds, drones in each: {env.sim.n_drones}), got {config.minibatches}. Use for "
+            f"example {math.gcd(n_samples, 8)}."
+        )
     k_policy, k_value, k_env, key = jax.random.split(key, 4)
     state = env.reset(k_env)
     n_obs, n_actions = flatten(state.obs).shape[-1], env.actions.size
@@ -111,15 +125,20 @@ def init(env: Env, config: Config, key: Array) -> Learner:
 
 @partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK)
 def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
-    """Return the learner after one rollout and its updates, and the metrics of the iteration."""
+    """Return the learner after one rollout and its updates, and the metrics of the iteration.
+
+    The metric ``finite`` is True if weights and losses are finite.
+    """
     key, k_fly, k_learn = jax.random.split(learner.key, 3)
     state, samples, raw, metrics = _collect(learner, env, config, k_fly)
     advantages, returns = _advantages(samples, _value(learner.value, learner.stats, state.obs), config)
     parameters = (learner.policy, learner.log_std, learner.value)
     parameters, optimizer, losses = _learn(parameters, learner.optimizer, samples, advantages, returns, config, k_learn)
     policy, log_std, value = parameters
-    learner = Learner(policy, log_std, value, optimizer, learner.stats.update(raw), key, state, learner.iteration + 1)
-    return learner, metrics | losses | {"std": jnp.exp(log_std).mean()}
+    stats = learner.stats.update(raw)
+    finite = all_finite((parameters, optimizer, stats, losses))
+    learner = Learner(policy, log_std, value, optimizer, stats, key, state, learner.iteration + 1)
+    return learner, metrics | losses | {"std": jnp.exp(log_std).mean(), "finite": finite}
 
 
 def _collect(
@@ -173,7 +192,6 @@ def _learn(
     """Return parameters, optimiser state and mean losses after the updates on a rollout."""
     data = (samples.obs, samples.action, samples.log_prob, advantages, returns)
     data = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), data)
-    n = data[-1].shape[0] // config.minibatches * config.minibatches
 
     def loss(parameters: Any, batch: Any) -> tuple[Array, dict[str, Array]]:
         policy, log_std, value = parameters
@@ -193,7 +211,7 @@ def _learn(
         return (optax.apply_updates(parameters, updates), optimizer), losses
 
     def epoch(carry: Any, key: Array) -> tuple[Any, dict[str, Array]]:
-        order = jax.random.permutation(key, data[-1].shape[0])[:n].reshape(config.minibatches, -1)
+        order = jax.random.permutation(key, data[-1].shape[0]).reshape(config.minibatches, -1)
         return jax.lax.scan(lambda c, i: update(c, jax.tree.map(lambda x: x[i], data)), carry, order)
 
     carry, losses = jax.lax.scan(epoch, (parameters, optimizer), jax.random.split(key, config.epochs))

@@ -1,30 +1,104 @@
-"""Plots of learning curves, and films of policies."""
+"""Plots of learning curves and of episodes, and films of policies."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from jax import Array
 
-from crazysim.envs.env import DroneEnv
+from crazysim.envs.env import DroneEnv, Env
 from crazysim.media import Film, View
+from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points
+from crazysim.storage import reading
+from crazysim.train.evaluation import HELD_OUT, TERM, as_tree, fly
 from crazysim.train.networks import Policy
+from crazysim.train.training import CURVE
 
 TARGET_COLOR = (0.1, 0.8, 0.3, 0.6)
 """Colour of the target of a drone, RGBA."""
 
 
 def plot_curve(curves: dict[str, Any], path: Path) -> None:
-    """Plot success and error over environment steps and over time.
+    """Plot success, error and the terms of the reward over a training, as the evaluations found them.
 
     Args:
-        curves: Contents of ``curve.json`` of each run, by the name of the run.
+        curves: Contents of ``curve.json`` of each run, by the name of the run. The terms are those of the first.
         path: Image to write, such as a ``.png``.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    figure, axes = _figure(4)
+    for name, curve in curves.items():
+        steps = np.array([p["env_steps"] for p in curve]) / 1e6
+        seconds = [p["seconds"] for p in curve]
+        success = [100 * p["success"] for p in curve]
+        axes[0].plot(steps, success, label=name)
+        axes[1].plot(seconds, success)
+        axes[2].semilogy(steps, [p["error"] for p in curve])
+    first = next(iter(curves.values()))
+    steps = np.array([p["env_steps"] for p in first]) / 1e6
+    for name in (name for name in first[-1] if name.startswith(TERM)):
+        axes[3].plot(steps, [p[name] for p in first], label=name.removeprefix(TERM))
+    axes[3].plot(steps, [p["reward"] for p in first], "k--", label="sum")
+    axes[3].legend(fontsize="small")
+    million = "environment steps, millions"
+    labels = ("success, %", "success, %", "mean error", "reward in an episode, by term")
+    for axis, x, y in zip(axes, (million, "time with compilation, s", million, million), labels, strict=True):
+        axis.set(xlabel=x, ylabel=y)
+    if len(curves) > 1:
+        axes[0].legend()
+    _save(figure, path)
+
+
+def plot_episode(
+    env: Env, policy: Callable[[Any], Array], path: str | Path, key: Array | None = None
+) -> dict[str, np.ndarray]:
+    """Plot the terms of the reward and the error over an episode, means over all worlds, and return the terms.
+
+    Args:
+        env: Environment without automatic resets; each world flies from one initial state.
+        policy: Trained policy, or any function from observations to actions.
+        path: Image to write, such as a ``.png``.
+        key: Random key of the initial states; None for the held-out ones.
+
+    Returns:
+        Mean of each term at each step, by name; zero where an episode is over. (n_steps,) each
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    flight = jax.device_get(fly(env, as_tree(policy), jax.random.key(HELD_OUT) if key is None else key))
+    terms, over = flight["terms"], flight["over"]
+    t = env.task.seconds * (1 + np.arange(len(over))) / len(over)
+    figure, axes = _figure(3)
+    for name, x in terms.items():
+        axes[0].plot(t, x, label=name)
+        axes[1].plot(t, np.cumsum(x), label=name)
+    axes[1].plot(t, np.cumsum(sum(terms.values())), "k--", label="sum")
+    error = flight["error"].reshape(len(over), -1)
+    axes[2].plot(t, np.nanquantile(error, (0.1, 0.5, 0.9), axis=1).T, label=["best tenth", "median", "worst tenth"])
+    axes[2].axhline(env.task.tolerance, color="grey", linestyle=":", label="tolerance")
+    labels = ("reward of a step, by term", "reward until then, by term", "error")
+    for axis, y in zip(axes, labels, strict=True):
+        axis.set(xlabel="time in the episode, s", ylabel=y)
+        axis.legend(fontsize="small")
+    axes[0].set_title(
+        f"flying: 100% of {over.shape[1]:,} worlds at 0 s, {(~over[-1]).mean():.0%} at the end", fontsize=9
+    )
+    _save(figure, Path(path))
+    return terms
+
+
+def _figure(n: int) -> Any:
+    """Return a figure with panels in a row.
 
     Raises:
         ImportError: If matplotlib is not installed.
@@ -35,33 +109,32 @@ def plot_curve(curves: dict[str, Any], path: Path) -> None:
         matplotlib.use("Agg")
         import matplotlib.pyplot as plt
     except ImportError as error:
-        raise ImportError("a learning curve needs matplotlib; pip install 'crazysim[train]'") from error
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.5), constrained_layout=True)
-    for name, curve in curves.items():
-        steps = np.array([p["env_steps"] for p in curve]) / 1e6
-        seconds = [p["seconds"] for p in curve]
-        success = [100 * p["success"] for p in curve]
-        axes[0].plot(steps, success, label=name)
-        axes[1].plot(seconds, success)
-        axes[2].semilogy(steps, [p["error"] for p in curve])
-    for axis, x, y in zip(
-        axes,
-        ("environment steps, millions", "time with compilation, s", "environment steps, millions"),
-        ("success, %", "success, %", "mean error"),
-        strict=True,
-    ):
-        axis.set(xlabel=x, ylabel=y)
+        raise ImportError("a plot needs matplotlib; pip install 'crazysim[train]'") from error
+    figure, axes = plt.subplots(1, n, figsize=(4 * n, 3.5), constrained_layout=True)
+    for axis in axes:
         axis.grid(alpha=0.3)
-    if len(curves) > 1:
-        axes[0].legend()
+    return figure, axes
+
+
+def _save(figure: Any, path: Path) -> None:
+    """Write a figure and close it."""
+    import matplotlib.pyplot as plt
+
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
 def read_curve(folder: Path) -> Any:
-    """Return the learning curve of a run, one point per evaluation."""
-    return json.loads((folder / "curve.json").read_text())
+    """Return the learning curve of a run, one point per evaluation.
+
+    Raises:
+        ConfigError: If the file does not exist.
+        DamagedFileError: If it is damaged.
+    """
+    path = folder / CURVE
+    with reading(path, "a learning curve", "Write it again with 'crazysim train TASK --resume'."):
+        return json.loads(path.read_bytes())
 
 
 def film(
@@ -87,15 +160,16 @@ def film(
     def draw_target(sim: Sim, world: int) -> None:
         target = targets(state)
         if target is not None:
-            draw_points(sim, np.asarray(target[world]), TARGET_COLOR, 0.04)
+            draw_points(sim, np.asarray(target[world]).reshape(-1, 3), TARGET_COLOR, 0.04)
 
     targets = jax.jit(env.target)
     step = jax.jit(lambda state: env.step(state, policy(state.obs)))
     state = jax.jit(env.reset)(jax.random.key(seed))
+    width, height = film_size(960, 720)
     view = View(
         worlds=range(min(worlds, sim.n_worlds)),
-        width=960,
-        height=720,
+        width=width,
+        height=height,
         trail=1.5,
         text="{time:.1f} s",
         draw=draw_target,

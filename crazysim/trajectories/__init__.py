@@ -1,5 +1,6 @@
-"""Trajectories: a record of piecewise polynomials, its constructors and checks, and the plugin that follows them."""
+"""Trajectories: a record of piecewise polynomials, its constructors, checks and files."""
 
+from crazysim.trajectories import formation
 from crazysim.trajectories.approaches import Approach
 from crazysim.trajectories.files import (
     Cue,
@@ -12,7 +13,6 @@ from crazysim.trajectories.files import (
     save_samples,
     save_show,
 )
-from crazysim.trajectories.follow import Follow, FollowData
 from crazysim.trajectories.limits import Limits, Report, Violation, check
 from crazysim.trajectories.shapes import circle, figure_eight, helix, hover, line, lissajous
 from crazysim.trajectories.smoothest import smoothest
@@ -23,8 +23,6 @@ from crazysim.trajectories.waypoints import minimum_jerk, minimum_snap
 __all__ = [
     "Approach",
     "Cue",
-    "Follow",
-    "FollowData",
     "Lights",
     "Limits",
     "Report",
@@ -34,6 +32,7 @@ __all__ = [
     "check",
     "circle",
     "figure_eight",
+    "formation",
     "helix",
     "hover",
     "line",

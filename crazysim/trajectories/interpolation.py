@@ -13,10 +13,9 @@ from __future__ import annotations
 import functools
 import math
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
@@ -165,7 +164,7 @@ def unit_coefficients(nodes: Floats, durations: Floats) -> Floats:
     return np.einsum("cj,pj,pja->pac", hermite_basis(order), powers, pairs(nodes))
 
 
-def pad_degree(coefficients: Any, degree: int) -> Floats:
+def pad_degree(coefficients: ArrayLike, degree: int) -> Floats:
     """Return polynomials with zeros appended, up to a degree. (..., degree + 1)"""
     c = np.asarray(coefficients, float)
     return np.concatenate([c, np.zeros((*c.shape[:-1], degree + 1 - c.shape[-1]))], axis=-1)

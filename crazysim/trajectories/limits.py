@@ -169,10 +169,12 @@ def check(
     Thrust and body rate are those of a drone without drag that flies its trajectory exactly (differential flatness).
 
     Args:
-        trajectories: One trajectory, or one for each drone: a sequence, or a record with one leading axis.
+        trajectories: One trajectory, or one for each drone: a sequence, or a record with one leading axis. One
+            trajectory with several ``starts`` is flown by as many drones.
         limits: Limits.
         airframe: Airframe whose thrusts are limits where ``limits`` has none; None for no such limits.
-        starts: Start of each drone, s. () or (n_drones,)
+        starts: Start of each drone, s, as in ``Follow``: one that is negative has begun before time zero. () or
+            (n_drones,)
         duration: Duration, s; None for the time at which the last drone ends. A trajectory that repeats counts once.
         names: Names of the drones for the report; None for their numbers.
         tolerance: Largest error of a distance, m.
@@ -182,6 +184,8 @@ def check(
             or the tolerance is not positive.
     """
     several = _unstacked(trajectories) if isinstance(trajectories, Trajectory) else list(trajectories)
+    if len(several) == 1 and np.ndim(starts) == 1:
+        several *= len(starts)
     table = PieceTable.of(several, starts, duration)
     labels = tuple(names) if names is not None else tuple(f"drone {k}" for k in range(len(several)))
     if len(labels) != len(several):

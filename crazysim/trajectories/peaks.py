@@ -15,7 +15,7 @@ GRAVITY = 9.81
 """Gravitational acceleration, m/s^2: that of the dynamics and controllers."""
 N_INTERVALS = 64
 """Number of intervals into which each piece is divided by the samples."""
-NEAR = 0.05
+REFINED_PART = 0.05
 """Part of the range of the samples by which one may lie below the largest and still be refined."""
 N_SECTIONS = 40
 """Golden sections: they shorten two intervals to 1e-10 of a piece."""
@@ -95,11 +95,11 @@ class Peak:
 def peaks(table: PieceTable, names: Sequence[str]) -> dict[str, Peak]:
     """Return the peaks of some quantities.
 
-    Each piece is sampled at ``N_INTERVALS + 1`` times; every local maximum of the samples that lies at most ``NEAR`` of
-    their range below the largest is refined by golden sections. The squares of speed, acceleration and jerk are
-    polynomials of degree 12 at most, whose maxima the samples separate, so that the error is that of rounding, about
-    1e-9 of the value. Body rates can have narrower peaks, where the thrust almost vanishes or is almost horizontal; one
-    narrower than an interval may be missed.
+    Each piece is sampled at ``N_INTERVALS + 1`` times; every local maximum of the samples that lies at most
+    ``REFINED_PART`` of their range below the largest is refined by golden sections. The squares of speed,
+    acceleration and jerk are polynomials of degree 12 at most, whose maxima the samples separate, so that the error
+    is that of rounding, about 1e-9 of the value. Body rates can have narrower peaks, where the thrust almost
+    vanishes or is almost horizontal; one narrower than an interval may be missed.
 
     Args:
         table: Trajectories.
@@ -120,7 +120,7 @@ def _peak(table: PieceTable, quantity: Quantity) -> Peak:
     samples = np.concatenate([sampled(slice(k, k + PIECES)) for k in range(0, len(table.drone), PIECES)])
     high = np.maximum.reduceat(samples.max(axis=1), table.first)
     low = np.minimum.reduceat(samples.min(axis=1), table.first)
-    piece, at = _candidates(samples, (high - NEAR * (high - low))[table.drone])
+    piece, at = _candidates(samples, (high - REFINED_PART * (high - low))[table.drone])
 
     def value(u: Floats) -> Floats:
         return quantity.sign * quantity.compute(*(table.within(piece, u, k) for k in quantity.orders))

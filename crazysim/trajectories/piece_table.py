@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -39,25 +40,26 @@ class PieceTable:
 
         Args:
             trajectories: Trajectories, one for each drone.
-            starts: Start of each, s. () or (n_drones,)
+            starts: Start of each, s; one that is negative has begun before time zero. () or (n_drones,)
             duration: Duration, s; None for the time at which the last drone ends, where a trajectory that repeats
                 counts once.
 
         Raises:
-            ConfigError: If there is no trajectory, a start is negative or the duration is not positive.
+            ConfigError: If there is no trajectory, a start is not finite, or the duration is not positive.
         """
         if not trajectories:
             raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
         given = np.asarray(starts, float)
         n_drones = len(trajectories)
-        if given.shape not in ((), (n_drones,)) or not np.all(given >= 0) or not np.all(np.isfinite(given)):
-            raise ConfigError(f"expected one start, or one for each of {n_drones} drones, at least 0 s, got {starts!r}")
+        if given.shape not in ((), (n_drones,)) or not np.all(np.isfinite(given)):
+            raise ConfigError(f"expected one finite start, s, or one for each of {n_drones} drones, got {starts!r}")
         starts = np.broadcast_to(given, (n_drones,))
         host = [jax.tree.map(np.asarray, trajectory) for trajectory in trajectories]
         ends = [start + float(t.ends[-1]) for start, t in zip(starts, host, strict=True)]
         end = max(ends) if duration is None else float(duration)
         if not 0 < end < np.inf:
-            raise ConfigError(f"expected a positive, finite duration, s, got {duration!r}")
+            got = f"{duration!r}" if duration is not None else f"trajectories that end at {end:g} s"
+            raise ConfigError(f"expected a positive, finite duration, s, got {got}. Use for example duration=10.0.")
         size = max(t.coefficients.shape[-1] for t in host)
         parts = [_pieces(t, start, end, size) for t, start in zip(host, starts, strict=True)]
         drone = np.repeat(np.arange(n_drones), [len(part[0]) for part in parts])
@@ -129,11 +131,15 @@ def _pieces(t: Any, start: float, duration: float, size: int) -> tuple[Floats, F
     starts, lengths = starts[real], (ends - starts)[real]
     c = np.zeros((len(starts), 4, size))
     c[..., : t.coefficients.shape[-1]] = t.coefficients[real]
-    n_rounds = max(1, int(np.ceil((duration - start) / ends[-1] - 1e-9))) if t.repeats else 1
-    starts = (start + ends[-1] * np.arange(n_rounds)[:, None] + starts).ravel()
-    parts = [(starts, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))]
+    period = ends[-1]
+    if t.repeats:
+        start -= period * max(0.0, np.floor(-start / period))  # rounds that have ended before time zero
+    n_rounds = max(1, int(np.ceil((duration - start) / period - 1e-9))) if t.repeats else 1
+    starts = (start + period * np.arange(n_rounds)[:, None] + starts).ravel()
+    begun = _since_zero(starts, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))
+    parts = [begun]
     first, last = c[0, :, :1], c[-1].sum(axis=-1, keepdims=True)
-    end = start + ends[-1] * n_rounds
+    end = max(start + period * n_rounds, 0.0)
     if start > 0:
         parts.insert(0, _rest(0.0, start, first, size))
     if end < duration:
@@ -141,6 +147,20 @@ def _pieces(t: Any, start: float, duration: float, size: int) -> tuple[Floats, F
     starts, lengths, c = (np.concatenate(x) for x in zip(*parts, strict=True))
     inside = starts < duration
     return starts[inside], lengths[inside], c[inside]
+
+
+def _since_zero(starts: Floats, lengths: Floats, c: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the pieces that end after time zero, of which the first is cut there."""
+    later = starts + lengths > 0
+    starts, lengths, c = starts[later], lengths[later], c[later]
+    if len(starts) and starts[0] < 0:
+        u0, size = -starts[0] / lengths[0], c.shape[-1]
+        # p(u0 + (1 - u0) v) by the binomial theorem
+        rest = [[math.comb(j, k) * u0 ** (j - k) * (1 - u0) ** k if k <= j else 0.0 for k in range(size)]
+                for j in range(size)]  # fmt: skip
+        c[0] = c[0] @ np.array(rest)
+        lengths[0], starts[0] = lengths[0] + starts[0], 0.0
+    return starts, lengths, c
 
 
 def _rest(start: float, length: float, at: Floats, size: int) -> tuple[Floats, Floats, Floats]:

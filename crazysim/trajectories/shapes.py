@@ -12,12 +12,19 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories.trajectory import Trajectory
 
 TOLERANCE = 5e-6
 """Largest error of the position of a fitted curve, m; float32 adds its rounding, 6e-8 of a coordinate."""
+MAX_PIECES = 20_000
+"""Most pieces of a fitted curve."""
+MAX_SIZE = 1e6
+"""Largest length, m, number of oscillations, or phase, rad."""
+TIMES = (1e-3, 1e6)
+"""Shortest and longest period, s."""
 PERIOD = 5.0
 """Default period, s."""
 
@@ -45,9 +52,9 @@ def figure_eight(
 
 
 def lissajous(
-    amplitudes: Any = (1.0, 1.0, 0.2),
-    frequencies: Any = (1, 2, 3),
-    phases: Any = (0.0, 0.0, 0.0),
+    amplitudes: ArrayLike = (1.0, 1.0, 0.2),
+    frequencies: ArrayLike = (1, 2, 3),
+    phases: ArrayLike = (0.0, 0.0, 0.0),
     period: float | None = None,
     speed: float | None = None,
     center: Any = (0.0, 0.0, 1.0),
@@ -159,7 +166,7 @@ def line(
     return Trajectory.of_pieces([time], c)
 
 
-def hover(pos: Any = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 1.0) -> Trajectory:
+def hover(pos: ArrayLike = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 1.0) -> Trajectory:
     """Return a trajectory that stays at a point.
 
     Args:
@@ -170,7 +177,7 @@ def hover(pos: Any = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 1.0) -
     Raises:
         ConfigError: If a setting is invalid.
     """
-    _positive("duration", duration)
+    _period(duration, None, 0.0, "duration")
     return Trajectory.of_pieces([duration], np.append(_vector("pos", pos), _vector("yaw", yaw, ()))[None, :, None])
 
 
@@ -184,6 +191,11 @@ def fitted(curve: Curve, duration: float, eighth: float, repeats: bool = False) 
         repeats: True to start again after the end.
     """
     longest = 2 * (TOLERANCE * math.factorial(8) / eighth) ** (1 / 8) if eighth > 0 else math.inf
+    if duration / longest > MAX_PIECES:
+        raise ConfigError(
+            f"expected a curve of at most {MAX_PIECES} polynomials within {TOLERANCE * 1e6:g} um, got one of "
+            f"{duration / longest:.3g}. Use fewer turns or lower frequencies, or a smaller size."
+        )
     n = max(1, math.ceil(duration / longest))
     h = duration / n
     knots = np.linspace(0.0, duration, n + 1)
@@ -200,21 +212,27 @@ def _period(period: float | None, speed: float | None, length: float, name: str 
     if period is not None and speed is not None:
         raise ConfigError(f"expected {name} or speed, got both: {period!r} s and {speed!r} m/s. Leave one out.")
     if speed is None:
-        return _positive(name, PERIOD if period is None else period)
-    _positive("speed", speed)
-    if length == 0:
-        raise ConfigError(f"expected a curve of some size for a speed of {speed!r} m/s, got a point. Use {name}=.")
-    return length / speed
+        time = _positive(name, PERIOD if period is None else period)
+    else:
+        _positive("speed", speed)
+        if length == 0:
+            raise ConfigError(f"expected a curve of some size for a speed of {speed!r} m/s, got a point. Use {name}=.")
+        time = length / speed
+    if not TIMES[0] <= time <= TIMES[1]:
+        raise ConfigError(f"expected a {name} from {TIMES[0]:g} to {TIMES[1]:g} s, got {time:g} s")
+    return time
 
 
 def _positive(name: str, value: Any) -> float:
-    if not isinstance(value, (int, float, np.number)) or not np.isfinite(value) or value <= 0:
+    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    if not is_number or not np.isfinite(value) or value <= 0:
         raise ConfigError(f"expected {name} as a positive number, got {value!r}")
     return float(value)
 
 
 def _vector(name: str, value: Any, shape: tuple[int, ...] = (3,)) -> Any:
     array = np.asarray(value)
-    if array.shape != shape or array.dtype.kind not in "iuf" or not np.all(np.isfinite(array)):
-        raise ConfigError(f"expected {name} as {'3 finite numbers' if shape else 'a finite number'}, got {value!r}")
+    if array.shape != shape or array.dtype.kind not in "iuf" or not np.all(np.abs(array.astype(float)) <= MAX_SIZE):
+        kind = "3 finite numbers" if shape else "a finite number"
+        raise ConfigError(f"expected {name} as {kind} of a size up to {MAX_SIZE:g}, got {value!r}")
     return array.astype(float)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation
@@ -17,7 +17,9 @@ SPLINE_ORDERS = {3: 2, 5: 3, 7: 4}
 """Degree of a spline and the derivative whose square it minimises."""
 
 
-def spline(times: Any, points: Any, degree: int = 5, yaw: Any = 0.0, at_rest: bool = True) -> Trajectory:
+def spline(
+    times: ArrayLike, points: ArrayLike, degree: int = 5, yaw: ArrayLike = 0.0, at_rest: bool = True
+) -> Trajectory:
     """Return the smoothest spline through points at given times.
 
     Of all curves through the points, the spline of degree 3, 5 or 7 has the smallest integral of the squared
@@ -60,7 +62,7 @@ def spline(times: Any, points: Any, degree: int = 5, yaw: Any = 0.0, at_rest: bo
     return of_unit_pieces(durations, interpolation.unit_coefficients(filled, durations))
 
 
-def of_bezier(ends: Any, control_points: Sequence[Any], repeats: bool = False) -> Trajectory:
+def of_bezier(ends: ArrayLike, control_points: Sequence[Any], repeats: bool = False) -> Trajectory:
     """Return the trajectory of a sequence of Bezier curves.
 
     The Bernstein polynomials are expanded in float64: ``c_k = C(n, k) sum_i (-1)^(k - i) C(k, i) P_i``.
@@ -98,7 +100,7 @@ def of_bezier(ends: Any, control_points: Sequence[Any], repeats: bool = False) -
     return of_unit_pieces(durations, np.stack(pieces), repeats)
 
 
-def of_unit_pieces(durations: Any, coefficients: Any, repeats: bool = False) -> Trajectory:
+def of_unit_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
     """Return the trajectory of polynomials of each piece's time divided by its length.
 
     Args:
@@ -110,7 +112,7 @@ def of_unit_pieces(durations: Any, coefficients: Any, repeats: bool = False) -> 
     return Trajectory.of_pieces(lengths, c / lengths[:, None, None] ** np.arange(c.shape[-1]), repeats)
 
 
-def unwrapped(yaw: Any, n_points: int) -> NDArray[np.float64]:
+def unwrapped(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
     """Return the yaw at each point, rad, without jumps of a revolution. (n_points,)
 
     Args:

@@ -14,8 +14,9 @@ from jax import Array, lax
 
 from crazysim.control.setpoint import Setpoint
 from crazysim.eager import compiled
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.pytree import PyTree, floating, leaf
+from crazysim.trajectories.interpolation import unit_coefficients
 
 COUNTED = 16
 """Largest number of pieces for which the piece at a time is found by counting; above it, by bisection."""
@@ -203,16 +204,63 @@ class Trajectory(PyTree):
         rest = xp.broadcast_to(rest, (more, *rest.shape[1:]))
         return self.replace(ends=ends, coefficients=xp.concatenate([coefficients, rest]))
 
-    def then(self, other: Trajectory) -> Trajectory:
-        """Return this trajectory followed by another one, which starts at this one's end; for one vehicle.
+    def repeat(self, n: int | None = None) -> Trajectory:
+        """Return this trajectory flown several times, one after the other; for one vehicle.
 
-        A jump between the two remains. Move the other one with ``moved`` to avoid it.
+        A closed curve such as a circle repeats without end. ``repeat(n)`` ends it after n rounds, so that ``then`` can
+        continue it; ``repeat()`` makes any trajectory start again after its end.
+
+        Args:
+            n: Number of rounds, after which the trajectory ends; None for no end.
 
         Raises:
-            ConfigError: If one of them repeats.
+            ConfigError: If it is not a positive whole number.
+        """
+        if n is None:
+            return self.replace(repeats=np.bool_(True))
+        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
+            raise ConfigError(f"expected a number of rounds of at least 1, got {n!r}. Use None for no end.")
+        xp = _module(self)
+        rounds = xp.arange(n, dtype=self.ends.dtype)[:, None] * self.ends[-1]
+        return Trajectory(
+            (rounds + self.ends).reshape(-1),
+            xp.tile(self.coefficients, (n, 1, 1)),
+            np.bool_(False),  # type: ignore
+        )
+
+    def then(self, other: Trajectory, transition: float = 0.0) -> Trajectory:
+        """Return this trajectory followed by another one, which starts at this one's end; for one vehicle.
+
+        Without a transition, whatever differs between this one's end and the other one's start jumps: the position, if
+        they are in different places; the velocity, if a drone that rests is to join a curve.
+
+        Args:
+            other: The trajectory that follows.
+            transition: Time between the two, s, during which one more piece of degree 7 connects them, with continuous
+                velocity, acceleration and jerk, and turns the shorter way; 0 for none.
+
+        Raises:
+            ConfigError: If one of them repeats without end, or the transition is negative.
         """
         if self.repeats or other.repeats:
-            raise ConfigError("expected trajectories that end, got one that repeats. Use replace(repeats=np.False_).")
+            which = "first" if self.repeats else "second"
+            raise ConfigError(
+                f"expected trajectories that end, got a {which} one that repeats without end. Use its repeat(n), such "
+                f"as repeat(1) for one round."
+            )
+        is_number = isinstance(transition, (int, float, np.number)) and not isinstance(transition, bool)
+        if not is_number or not 0 <= transition < np.inf:
+            raise ConfigError(f"expected a transition of 0 s or more, got {transition!r}. Use for example 1.0.")
+        if transition > 0:
+            before, after = self._edge(last=True), other._edge(last=False)
+            turns = 2 * np.pi * np.round((before[0, 3] - after[0, 3]) / (2 * np.pi))
+            after[0, 3] += turns
+            lengths = np.array([transition], float)
+            between = unit_coefficients(np.stack([before, after]), lengths).astype(self.coefficients.dtype)
+            ends = lengths.astype(self.ends.dtype)
+            piece = Trajectory(ends, between, np.bool_(False))  # type: ignore[arg-type]
+            turned = other.coefficients + np.pad([[turns]], ((3, 0), (0, other.degree))).astype(between.dtype)
+            return self.then(piece).then(other.replace(coefficients=turned))
         degree = max(self.degree, other.degree)
         first, second = self.padded(0, degree), other.padded(0, degree)
         xp = _module([first, second])
@@ -221,13 +269,31 @@ class Trajectory(PyTree):
             coefficients=xp.concatenate([first.coefficients, second.coefficients]),
         )
 
+    def _edge(self, last: bool) -> np.ndarray:
+        """Return x, y, z and yaw at the start or the end, with derivatives up to jerk, on the host. (4, 4)"""
+        lengths = np.diff(np.asarray(self.ends, float), prepend=0.0)
+        real = np.flatnonzero(lengths > 0)
+        k, u = (real[-1], 1.0) if last else (real[0], 0.0)
+        c = np.polynomial.polynomial.Polynomial
+        polynomials = [c(x) for x in np.asarray(self.coefficients[k], float)]
+        return np.array([[p.deriv(m)(u) / lengths[k] ** m for p in polynomials] for m in range(4)])
+
     def moved(self, offset: Any = (0.0, 0.0, 0.0), yaw: Any = 0.0) -> Trajectory:
         """Return the trajectory turned around the z axis of the world, then moved, with any leading axes.
 
         Args:
             offset: Displacement, m. (3,)
             yaw: Angle by which the curve and the yaw along it are turned, rad. ()
+
+        Raises:
+            ConfigError: If one has another shape, or is not finite.
         """
+        for name, value, shape in (("offset", offset, (3,)), ("yaw", yaw, ())):
+            is_known = not isinstance(value, jax.core.Tracer)
+            array = np.asarray(value) if is_known else value
+            finite = is_known and array.dtype.kind in "iuf" and np.all(np.isfinite(array))
+            if array.shape != shape or (is_known and not finite):
+                raise ConfigError(f"expected {name} as finite numbers of shape {shape}, got {shown(value)}")
         xp = _module([self, offset, yaw])
         c, offset = self.coefficients, xp.asarray(offset, self.coefficients.dtype)
         cos, sin = xp.cos(yaw).astype(c.dtype), xp.sin(yaw).astype(c.dtype)

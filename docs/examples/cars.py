@@ -3,7 +3,8 @@
 import jax
 import numpy as np
 
-from crazysim import Cars, Sim, vehicles
+from crazysim import Cars, Sim
+from crazysim.plugins import vehicles
 from crazysim.trajectories import figure_eight
 
 

@@ -1,7 +1,7 @@
 """Fly a drone with the keyboard, in a window or in a browser.
 
     python keyboard_flight.py            # a window
-    python keyboard_flight.py browser    # a page: open http://127.0.0.1:8080
+    python keyboard_flight.py browser    # a page, whose address is printed
 
 Arrow keys fly forwards, backwards and sideways, W and S up and down, A and D turn; tab selects another drone, space
 pauses, R records. Without an argument and without a screen, the example presses the keys itself, and prints where the

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from crazysim import Cars, SharedLoad, Sim, vehicles
+from crazysim import Cars, SharedLoad, Sim
 from crazysim.live import FunctionSource, Live, ReplaySource, Twin, Twins
+from crazysim.plugins import vehicles
 from crazysim.trajectories import figure_eight
 
 SECONDS = 5.0

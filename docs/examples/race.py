@@ -19,7 +19,6 @@ N_WORLDS, N_GATES, SECONDS = 16, 4, 16
 OPENING = 0.45  # width and height of a gate's opening, m
 START = np.array([1.5, -0.5, 1.0])  # m
 LEG, SPEED = 1.2, 2.0  # time from gate to gate, s, and speed in a gate, m/s
-LOWER = np.array([0, 0, -0.08])  # m; the controller assumes a larger weight and hovers too high
 
 
 class ProgressData(PyTree):
@@ -93,7 +92,7 @@ def policy(_, data) -> Array:
         last, target = (lambda x, i=i: jnp.take_along_axis(x, i % N_GATES, axis=1) for i in (k - 1, k))
         start, leaving = jnp.where(k == 0, START, last(pos)), jnp.where(k == 0, 0.0, last(along))
         bend = u * (1 - u) * ((1 - u) * leaving - u * target(along))
-        return LOWER + start + (3 - 2 * u) * u**2 * (target(pos) - start) + bend
+        return start + (3 - 2 * u) * u**2 * (target(pos) - start) + bend
 
     time = jnp.maximum(data.core.steps / data.core.freq - 1.0, 0.0)
     one = jnp.ones_like(time)

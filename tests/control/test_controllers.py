@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from cases import with_states
 
-from crazysim import ConfigError, Latency, Sim, make
+from crazysim import ConfigError, Latency, Sim, load_airframe, make
 from crazysim.control import INDI, PID, Control, Controller, LoadLQR, Mellinger, Setpoint
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
@@ -69,8 +69,8 @@ def memory_of(sim):
     return sim.data.controls.controller.memory
 
 
-def test_the_default_has_no_controller_record():
-    sim = Sim(control="state")
+def test_the_cascade_of_crazyflow_has_no_controller_record():
+    sim = Sim(control="state", controller="crazyflow")
     assert sim.data.controls.controller is None
     assert sim.data.controls.state.feedforward is sim.data.controls.state.staged_feedforward is None
     assert list(sim.step_pipeline)[:3] == ["state_controller", "attitude_controller", "force_torque_controller"]
@@ -149,7 +149,7 @@ def test_feedforward_reaches_the_controller():
     with pytest.raises(ValueError, match=r"feedforward command has shape.*jerk"):
         sim.state_control(cmd, feedforward=forward[0])
     with pytest.raises(ConfigError, match="Crazyflow's cascade"):
-        Sim(control="state").state_control(cmd[:1, :1], feedforward=forward[:1, :1])
+        Sim(control="state", controller="crazyflow").state_control(cmd[:1, :1], feedforward=forward[:1, :1])
 
 
 def test_latency_delays_setpoint_and_feedforward():
@@ -181,12 +181,15 @@ def test_rates_of_the_simulation_replace_those_of_the_controller():
 @pytest.mark.parametrize(
     "settings, message",
     [
-        ({"controller": "pd"}, r"expected controller as one of 'crazyflow', 'pid', .*got 'pd'"),
+        ({"controller": "pd"}, r"expected controller as one of 'auto', 'crazyflow', .*got 'pd'"),
         ({"controller": 3}, r"expected a controller as a name or a Controller, got 3"),
         ({"controller": "mellinger", "control": "body_rate"}, r"'mellinger' follows, state or attitude.*body_rate"),
         ({"controller": "pid", "dynamics": "so_rpy"}, r"expected dynamics with rotors for controller 'pid'"),
         ({"controller": Mellinger(freq=300)}, r"expected freq of controller 'mellinger' to divide.*250 Hz"),
-        ({"controller": "pid", "drone": "bumblebee"}, r"'bumblebee' has no table \[pid"),
+        (
+            {"controller": "pid", "drone": "bumblebee"},
+            r"'bumblebee' lacks \[pid.position\] kp, ki, kd; \[pid.v.* controller='auto'",
+        ),
         ({"controller": ["pid", "mellinger"]}, r"expected a switch for several controllers, got None"),
         ({"controller": "pid", "switch": 0}, r"expected a list of controllers for a switch"),
         ({"controller": [], "switch": 0}, r"expected at least one controller"),
@@ -363,7 +366,6 @@ def every_controller(control):
     return sim, slope
 
 
-@pytest.mark.compiled  # a step and its gradient are called 60 times
 @pytest.mark.parametrize("control", LEVELS)
 def test_no_nan_in_values_or_gradients(control):
     """Law 7: from any attitude, at rest, spinning at 100 rad/s, with commands far beyond all limits, and motors off."""
@@ -444,3 +446,26 @@ def test_ten_steps_and_commands_trace_once():
         sim.state_control(each, feedforward=np.zeros((1, 1, 8)))
         sim.step(3)
     assert n_traces == 1
+
+
+@pytest.mark.parametrize(
+    ("controller", "control"),
+    [("pid", "state"), ("mellinger", "attitude"), *(("crazyflow", c) for c in ("state", "attitude", "body_rate"))],
+)
+def test_missing_gains_are_listed_all_at_once(controller, control):
+    """With the values that the message lists, and no others, the airframe flies."""
+    whole = load_airframe("cf2x_L250")
+    light = {"base": "cf2x_L250", "name": "light", "rigid_body": {"mass": 0.03}}
+    with pytest.raises(ConfigError) as error:
+        Sim(drone=light, control=control, controller=controller)
+    message = str(error.value)
+    assert f"which controller {controller!r} needs. Its base 'cf2x_L250' has [fitted], [controller], " in message
+    assert "are not inherited. Use controller='auto', which needs no gains, or add them" in message
+    listed = message.split(", which")[0].split(" lacks ")[1].split("; ")
+    for entry in listed:
+        path, _, keys = entry.partition("] ")
+        table = light
+        for part in path[1:].split("."):
+            table = table.setdefault(part, {})
+        table |= {key: whole.value(f"{path[1:]}.{key}") for key in keys.split(", ")}
+    Sim(drone=light, control=control, controller=controller)

@@ -12,13 +12,14 @@ from flights import figure_eight, fly, hover, rms, setpoint_of, simulation, star
 from hypothesis import given
 from scipy.spatial.transform import Rotation
 
-from crazysim import Sim, load_airframe
+from crazysim import ConfigError, Sim, load_airframe
 from crazysim.control import Setpoint
 from crazysim.control.bandwidth import bandwidth, rotor_rate
 from crazysim.control.flatness import Attitude
 from crazysim.control.geometric import Geometric, GeometricParams, attitude_errors, geometric_control
 from crazysim.control.priority import prioritized_wrench
-from crazysim.trajectories import Follow, shapes
+from crazysim.plugins.follow import Follow
+from crazysim.trajectories import shapes
 
 ZERO, LEVEL = np.zeros(3), np.array([0.0, 0, 0, 1])
 control = jax.jit(geometric_control, static_argnames="feedforward")
@@ -258,3 +259,45 @@ def test_figure_eight_in_a_simulation(freq):
     target = jax.jit(jax.vmap(eight.evaluate))(np.arange(1, 301, dtype=np.float32) * np.float32(0.02)).pos
     errors = np.linalg.norm(np.array(flown) - target, axis=-1)
     assert np.sqrt(np.mean(np.square(errors))) < 0.02
+
+
+@pytest.mark.parametrize("drone", ["cf21B_500", "bumblebee"])
+def test_an_integral_takes_up_a_push(drone):
+    """A tenth of the weight: with an integral under 1 cm after 5 s, without it the force over the gain on position."""
+    offsets, gains = {}, Geometric().params(load_airframe(drone))
+    for integral in (0.0, 0.6):
+        sim = Sim(drone=drone, control="state", controller=Geometric(integral=integral), strict=True)
+        start_at(sim, hover)
+        command = np.zeros((1, 1, 16))
+        command[..., 2] = 1.0
+        sim.state_control(command)
+        push = np.broadcast_to([0.1 * 9.81 * float(gains.mass[0]), 0, 0], (1, 1, 3)).astype("f4")
+        for _ in range(50):
+            sim.data = sim.data.replace(states=sim.data.states.replace(force=push))
+            sim.step(50)
+        offsets[integral] = np.linalg.norm(np.asarray(sim.data.states.pos)[0, 0] - [0, 0, 1])
+        assert (sim.data.controls.controller.memory is None) == (integral == 0)
+    assert offsets[0.6] < 0.01
+    # Drag and the last hundredth of the approach are what the law leaves out.
+    np.testing.assert_allclose(offsets[0.0], 0.1 * 9.81 * gains.mass[0] / gains.kr[0], rtol=0.02)
+
+
+def test_an_integral_does_not_wind_up():
+    """A drone held beside its setpoint fills the integral up to its limit; far from it the integral stays empty."""
+    for distance, largest in ((0.5, 0.5 * 9.81), (10.0, 0.0)):
+        sim = Sim(control="state", controller=Geometric(integral=1.0))
+        start_at(sim, hover)
+        held, command = sim.data.states, np.zeros((1, 1, 16))
+        command[..., :3] = [distance, 0, 1]
+        sim.state_control(command)
+        for _ in range(100):
+            sim.step(50)
+            sim.data = sim.data.replace(states=held)
+        acc = np.asarray(sim.data.controls.controller.memory.acc)[0, 0, 0]
+        np.testing.assert_allclose(acc, largest, rtol=1e-6)
+
+
+@pytest.mark.parametrize("integral", [-0.1, np.inf, np.nan])
+def test_law_09_a_wrong_integral_is_refused(integral):
+    with pytest.raises(ConfigError, match="expected a finite integral of at least 0, 1/s, got"):
+        Sim(control="state", controller=Geometric(integral=integral))

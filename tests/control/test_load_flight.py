@@ -9,8 +9,9 @@ from cases import broadcast_like, with_states
 from crazysim import Hook, Sim, SlungLoad, load_airframe
 from crazysim.control.load_lqr import LoadLQR
 from crazysim.dynamics.first_principles import rotor_vel_of_thrust
-from crazysim.payloads import load_flat_state
-from crazysim.trajectories import Follow, figure_eight
+from crazysim.plugins.follow import Follow
+from crazysim.plugins.payloads import load_flat_state
+from crazysim.trajectories import figure_eight
 
 LOAD, LENGTH = 0.2, 0.4
 SIZE, SPEED = np.array([1.0, 0.5]), 2.0

@@ -14,10 +14,12 @@ from crazysim.errors import UnknownNameError
 from crazysim.pytree import check_axes
 
 ANGLES = np.pi / 3 * np.arange(6) + np.pi / 6
+CRAZYFLIE = load_airframe("cf21B_500").tables
 HEXAROTOR = {
-    "base": "cf21B_500",
+    **CRAZYFLIE,
     "name": "hexarotor",
     "rotors": {
+        **CRAZYFLIE["rotors"],
         "position": np.stack([0.05 * np.cos(ANGLES), 0.05 * np.sin(ANGLES), 0 * ANGLES], axis=-1),
         "yaw_torque_sign": [1, -1, 1, -1, 1, -1],
     },
@@ -244,7 +246,7 @@ def test_one_airframe_is_asked_for_where_there_are_several():
     ("n_drones", "fleet", "error", "message"),
     [
         (3, ["cf21B_500", "bumblebee"], ConfigError, r"expected 3 airframes, .* got 2. Use Sim\(n_drones=2\)"),
-        (1, [], ConfigError, "expected 1 airframes, one for each drone, got 0"),
+        (1, [], ConfigError, "expected an airframe or a list with one for each drone, got an empty list"),
         (2, ["cf21B_500", "bumble"], UnknownNameError, "expected a drone as one of .* got 'bumble'"),
         (2, ["cf21B_500", 3], ConfigError, "expected a drone as a name"),
     ],
@@ -256,7 +258,7 @@ def test_wrong_lists_are_refused(n_drones, fleet, error, message):
 
 
 def test_airframes_that_lack_gains_are_named():
-    with pytest.raises(ConfigError, match=r"airframe 'bumblebee' has no table \[mellinger\]"):
+    with pytest.raises(ConfigError, match=r"airframe 'bumblebee' lacks \[mellinger\] mass, mass_thrust, kp, "):
         Sim(drone=FLEET, control="state", controller="mellinger")
     lacking = for_drones
     records = {"cf21B_500": first_principles.Params.create(load_airframe("cf21B_500"))}

@@ -12,6 +12,8 @@ from crazysim import Sim, load_airframe
 from crazysim.core.data import SimState, as_key, command_shape, create_params, grid_2d, n_rotor_states
 from crazysim.dynamics import Dynamics, first_principles, fitted
 
+pytestmark = pytest.mark.fast
+
 
 @given(n=st.integers(1, 200), spacing=st.floats(0.1, 5))
 def test_grid_2d_keeps_distance_and_fills_from_its_centre(n, spacing):
@@ -41,9 +43,9 @@ def test_drones_begin_at_rest_level_and_alike_in_every_world():
 
 
 USED = {
-    ("first_principles", "state"): {"state", "attitude", "force_torque", "rotor_vel"},
-    ("first_principles", "attitude"): {"attitude", "force_torque", "rotor_vel"},
-    ("first_principles", "body_rate"): {"body_rate", "force_torque", "rotor_vel"},
+    ("first_principles", "state"): {"state", "rotor_vel"},
+    ("first_principles", "attitude"): {"attitude", "rotor_vel"},
+    ("first_principles", "body_rate"): {"body_rate", "rotor_vel"},
     ("first_principles", "force_torque"): {"force_torque", "rotor_vel"},
     ("first_principles", "rotor_vel"): {"rotor_vel"},
 }
@@ -56,6 +58,14 @@ def test_controllers_that_are_not_in_use_are_none(dynamics, control):
     expected = USED.get((dynamics, control), {"state", "attitude"} if control == "state" else {"attitude"})
     assert {name for name in fields if getattr(controls, name) is not None} == expected
     assert controls.mode == control
+
+
+@pytest.mark.parametrize("control", ["state", "attitude", "body_rate"])
+def test_the_cascade_of_crazyflow_uses_every_level_below(control):
+    controls = Sim(control=control, controller="crazyflow").data.controls
+    below = {"state": {"state", "attitude"}}.get(control, {control}) | {"force_torque", "rotor_vel"}
+    fields = ("state", "attitude", "body_rate", "force_torque", "rotor_vel")
+    assert {name for name in fields if getattr(controls, name) is not None} == below
 
 
 @pytest.mark.parametrize("dynamics, control", PAIRS)
@@ -74,12 +84,12 @@ def test_nothing_is_commanded_at_the_start(dynamics, control):
 
 
 def test_default_rates_are_100_hz_for_state_and_500_below_or_the_next_divisor():
-    ctrl = shared_sim(n_worlds=2, n_drones=2, dynamics="first_principles", control="state").data.controls
+    ctrl = Sim(control="state", controller="crazyflow").data.controls
     assert (ctrl.state.freq, ctrl.attitude.freq, ctrl.force_torque.freq) == (100, 500, 500)
-    slow = Sim(control="state", freq=240)
-    assert (slow.data.controls.state.freq, slow.data.controls.attitude.freq) == (80, 240)
-    fast = Sim(control="state", freq=1000)
-    assert (fast.control_freq, fast.data.controls.attitude.freq) == (100, 500)
+    for freq, rates in ((500, (100, 500)), (240, (80, 240)), (1000, (100, 500))):
+        cascade, auto = (Sim(control="state", controller=name, freq=freq) for name in ("crazyflow", "auto"))
+        assert (cascade.control_freq, cascade.data.controls.attitude.freq) == rates
+        assert (auto.control_freq, auto.data.controls.controller.freq) == rates
     assert Sim(control="rotor_vel", freq=240).control_freq == 240
 
 

@@ -8,6 +8,9 @@ from cases import PAIRS, send, shared_sim, trees_equal
 
 from crazysim.core import functional as F
 from crazysim.core.data import command_shape
+from crazysim.errors import ConfigError
+
+pytestmark = pytest.mark.fast
 
 
 def sim_of(dynamics, control):
@@ -24,7 +27,8 @@ def test_a_command_is_staged_and_nothing_else_changes(dynamics, control):
     else:
         ctrl = getattr(after.controls, control)
         staged, back = ctrl.staged_cmd, {control: getattr(data.controls, control)}
-        assert trees_equal(ctrl.replace(staged_cmd=back[control].staged_cmd), back[control])
+        new = {"staged_cmd"} | ({"staged_feedforward"} if control == "state" else set())
+        assert trees_equal(ctrl.replace(**{name: getattr(back[control], name) for name in new}), back[control])
     np.testing.assert_array_equal(staged, command)
     assert trees_equal(after.replace(controls=after.controls.replace(**back)), data)
 
@@ -35,6 +39,66 @@ def test_a_command_does_not_alias_the_callers_array():
     staged = F.attitude_control(data, command).controls.attitude.staged_cmd
     command[:] = 7.0
     np.testing.assert_array_equal(staged, np.ones((2, 2, 4)))
+
+
+PARTS = [
+    {"pos": (0.0, 1.0, 2.0)},
+    {"pos": [[0, 1, 2], [3, 4, 5]], "yaw": 0.3},
+    {"pos": np.arange(6.0).reshape(2, 1, 3), "vel": (1, 0, 0), "acc": np.ones((2, 2, 3)), "yaw": [0.1, -2.0]},
+    {"pos": np.zeros((2, 2, 3)), "yaw": [[1.0], [2.0]]},
+]
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+@pytest.mark.parametrize("parts", PARTS, ids=lambda parts: "-".join(parts))
+def test_a_setpoint_in_parts_is_the_vector_of_these_parts(parts, on_device):
+    """NumPy broadcasts, on the host and on the device alike; other parts and the body rates are zero."""
+    data = sim_of("first_principles", "state").data
+    expected = np.zeros((2, 2, 16))
+    for name, where in (("pos", slice(0, 3)), ("vel", slice(3, 6)), ("acc", slice(6, 9))):
+        expected[..., where] = parts.get(name, 0.0)
+    yaw = np.broadcast_to(parts.get("yaw", 0.0), (2, 2))
+    expected[..., 11], expected[..., 12] = np.sin(yaw / 2), np.cos(yaw / 2)
+    given = {name: jnp.asarray(x) for name, x in parts.items()} if on_device else parts
+    staged = F.state_control(data, **given).controls.state.staged_cmd
+    np.testing.assert_allclose(staged, expected, atol=2e-7)  # rounding of float32
+    sim = sim_of("first_principles", "state")
+    sim.state_control(**parts)
+    np.testing.assert_allclose(sim.data.controls.state.staged_cmd, expected, atol=2e-7)
+    sim.data = data
+
+
+def test_a_setpoint_in_parts_has_a_gradient():
+    data = sim_of("first_principles", "state").data
+    gradient = jax.grad(lambda x: F.state_control(data, pos=x).controls.state.staged_cmd.sum())(jnp.zeros(3))
+    np.testing.assert_array_equal(gradient, [4.0, 4.0, 4.0])  # four drones
+
+
+@pytest.mark.parametrize(
+    "parts, message",
+    [
+        ({}, "expected a state command, got no position"),
+        ({"vel": (1, 0, 0)}, "expected a state command, got no position"),
+        ({"controls": np.zeros((2, 2, 16)), "pos": (0, 0, 1)}, "or its parts, got both, with pos"),
+        ({"controls": np.zeros((2, 2, 16)), "yaw": 0.0}, "or its parts, got both, with yaw"),
+        ({"pos": 1.0}, r"expected pos as numbers that broadcast to shape \(2, 2, 3\), got 1.0"),
+        ({"pos": [[0], [1]]}, "expected pos as numbers that broadcast"),
+        ({"pos": np.zeros((3, 3))}, "expected pos as numbers that broadcast"),
+        ({"pos": np.zeros((1, 2, 2, 3))}, "expected pos as numbers that broadcast"),
+        ({"pos": [[0, 0, 0], [1]]}, "expected pos as numbers that broadcast"),
+        ({"pos": "up"}, "expected pos as numbers that broadcast .* got 'up'"),
+        ({"pos": (True, False, True)}, "expected pos as numbers"),
+        ({"pos": (0, 0, 1), "yaw": (0, 0, 1)}, r"expected yaw as numbers that broadcast to shape \(2, 2\)"),
+        ({"pos": (0, 0, np.nan)}, "expected finite numbers as pos"),
+        ({"pos": jnp.zeros(3), "acc": (0, 0, np.inf)}, "expected finite numbers as acc"),
+    ],
+)
+def test_law_09_wrong_parts_of_a_setpoint_are_named(parts, message):
+    data = sim_of("first_principles", "state").data
+    with pytest.raises(ConfigError, match=message):
+        F.state_control(data, **parts)
+    with pytest.raises(ValueError, match="takes 'attitude' commands, not 'state'"):
+        F.state_control(sim_of("first_principles", "attitude").data, pos=(0, 0, 1))
 
 
 def test_law_09_a_number_too_large_for_the_state_is_reported_as_infinite():

@@ -94,7 +94,6 @@ WRITES = {
 }
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize("engine", ["auto", "plain"])
 @pytest.mark.parametrize("case", WRITES)
 def test_law_09_an_influence_writes_what_the_dynamics_use_alone(case, engine):
@@ -159,7 +158,6 @@ def test_law_09_rates_without_a_record():
         sim.step()
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize("engine", ["auto", "plain"])
 @pytest.mark.parametrize("method", ["influence", "derivative"])
 def test_errors_in_a_method_name_plugin_and_method(method, engine):

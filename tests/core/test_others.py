@@ -8,8 +8,9 @@ from cases import with_states
 
 from crazysim import ConfigError, Downwash, Plugin, Sim, reduce_over_others, stage
 from crazysim.core import insert_fn_before
-from crazysim.engine import Step, native
-from crazysim.engine.program import UnfusedStage
+from crazysim.engine import Step
+from crazysim.engine.backends import native
+from crazysim.engine.ir.program import UnfusedStage
 
 ENGINES = ["lanes", "interpret", *(["fused"] if native.compiler() else [])]
 

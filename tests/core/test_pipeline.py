@@ -18,6 +18,8 @@ from crazysim.core.pipeline import (
 )
 from crazysim.errors import UnknownNameError
 
+pytestmark = pytest.mark.fast
+
 
 def first(x):
     return x
@@ -178,7 +180,6 @@ def test_the_order_and_the_end_of_a_pipeline_are_edits(sim):
     np.testing.assert_array_equal(heights(sim.data), 6.0)
 
 
-@pytest.mark.compiled
 def test_law_06_an_edit_compiles_once_and_an_undone_one_not_at_all(sim):
     traces = []
 

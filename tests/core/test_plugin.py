@@ -34,7 +34,8 @@ from crazysim.core.integration import INTEGRATORS, Integration
 from crazysim.core.pipeline import replace_fn
 from crazysim.core.plugin import FunctionPlugin
 from crazysim.core.stages import first_principles_derivative
-from crazysim.engine import Step, native
+from crazysim.engine import Step
+from crazysim.engine.backends import native
 from crazysim.errors import UnknownNameError
 
 DURATION = 0.5
@@ -199,7 +200,6 @@ def test_integration_has_one_place_for_all_plugins():
     assert names == ["latency", "battery", "downwash", "ground_effect", "motors", "wake", "wind"]
 
 
-@pytest.mark.compiled
 def test_replace_changes_numbers_without_compiling_and_keeps_states():
     sim = hovering()
     sim.add(Wind((2.0, 0, 0), 7.7))
@@ -218,8 +218,8 @@ def test_replace_changes_numbers_without_compiling_and_keeps_states():
     np.testing.assert_array_equal(sim.default_data.plugins["wind"].gust, 0.0)
     fly_on(sim, 60)
     assert sim.step_fn._cache_size() == n
-    # after 7 time constants the lagging velocity is the drone's over the rate, which changes by some 10% meanwhile
-    np.testing.assert_allclose(sim.data.plugins["wake"].vel, np.asarray(sim.data.states.vel) / 60, rtol=0.3, atol=3e-5)
+    # After 7 time constants the lagging velocity is the drone's over the rate, which changes by some 10% meanwhile.
+    np.testing.assert_allclose(sim.data.plugins["wake"].vel, np.asarray(sim.data.states.vel) / 60, rtol=0.15, atol=2e-4)
 
 
 def test_replace_changes_the_step_where_it_must():
@@ -385,6 +385,24 @@ class Nameless(FunctionPlugin):
         return [Placement(lambda data: data, name="clip_floor_pos")]
 
 
+class Unlisted(Plugin):
+    """A plugin that returns a stage without a list."""
+
+    name: str = "unlisted"
+
+    def stages(self, sim):
+        return Placement(lambda data: data)
+
+
+class Undeclared(Plugin):
+    """A plugin whose record declares nothing."""
+
+    name: str = "undeclared"
+
+    def record(self, sim):
+        return {"height": np.zeros((1, 1, 1))}
+
+
 @pytest.mark.parametrize("act, error, words", [
     (lambda sim: sim.add(Wind()), ConfigError, r"wind is already enabled. Use sim.replace\(Wind\(...\)\)"),
     (lambda sim: sim.add("wind"), ConfigError, "expected a plugin, got 'wind'"),
@@ -393,6 +411,8 @@ class Nameless(FunctionPlugin):
     (lambda sim: sim.add(Nameless()), ConfigError, "already has a stage 'clip_floor_pos'"),
     (lambda sim: sim.add(FunctionPlugin("a", None, [Placement(lambda data: data, before="lunch")])),
      UnknownNameError, "No stage named 'lunch'"),
+    (lambda sim: sim.add(Unlisted()), ConfigError, "expected stages of plugin 'unlisted' to return a list"),
+    (lambda sim: sim.add(Undeclared()), ConfigError, "expected record of plugin 'undeclared' to return a PyTree or"),
     (lambda sim: sim.remove("wake"), UnknownNameError, "got 'wake'. Added are: wind, latency"),
     (lambda sim: sim.replace(Wake()), UnknownNameError, "got 'wake'"),
     (lambda sim: sim.replace(Wake(name="wind")), ConfigError, "expected a Wind to replace 'wind', got a Wake"),

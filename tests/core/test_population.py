@@ -16,7 +16,8 @@ from crazysim.core.pipeline import insert_fn_before
 from crazysim.core.population import Population
 from crazysim.core.random import member_key, world_key
 from crazysim.core.sharding import world_mesh
-from crazysim.engine import Step, kernel
+from crazysim.engine import Step
+from crazysim.engine.backends import kernel
 from crazysim.errors import EngineWarning, UnknownNameError
 from crazysim.pytree import PyTree, check_axes, leaf, scopes
 
@@ -119,7 +120,7 @@ def test_integration_follows_the_scheme(integrator):
     errors, freqs = [], (50, 100, 200)
     with jax.enable_x64(True):
         for freq in freqs:
-            sim = Sim(freq=freq, integrator=integrator, engine="interpret")
+            sim = Sim(control="rotor_vel", freq=freq, integrator=integrator, engine="interpret")
             sim.add(Springs(1, rate=None))
             of_masses(sim).step(2 * freq // 5)
             exact = np.cos(np.sqrt(STIFFNESS) * 0.4)
@@ -205,7 +206,6 @@ def test_worlds_are_spread_over_devices(engine):
         np.testing.assert_allclose(numbers(spread.data)[name], value, rtol=1e-6, atol=1e-7, err_msg=name)
 
 
-@pytest.mark.compiled
 def test_random_numbers_are_those_of_world_and_member():
     """Law 10: they do not depend on how many worlds and members there are."""
 

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from crazysim.core.random import drone_keys, world_keys
 
+pytestmark = pytest.mark.fast
+
 
 def bits(keys):
     return np.asarray(jax.random.key_data(keys))

@@ -135,19 +135,19 @@ def test_an_action_queue_flies_the_same_way_after_a_full_reset():
 def test_a_full_reset_restores_shared_parameters_and_a_masked_one_leaves_them():
     sim = Sim(n_worlds=N_WORLDS, control="attitude")
     key = jax.random.key_data(sim.data.core.rng_key)
-    params, attitude = sim.data.params, sim.data.controls.attitude
+    params, own = sim.data.params, sim.data.controls.controller
     heavy = params.replace(mass=2 * params.mass, gravity_vec=0 * params.gravity_vec)
-    stiff = attitude.replace(params=attitude.params.replace(kR=3 * attitude.params.kR))
-    changed = sim.data.replace(params=heavy, controls=sim.data.controls.replace(attitude=stiff))
+    stiff = own.replace(params=own.params.replace(stiffness=3 * own.params.stiffness))
+    changed = sim.data.replace(params=heavy, controls=sim.data.controls.replace(controller=stiff))
     sim.data = changed
     sim.seed(7)
     sim.reset(MASK)
     np.testing.assert_array_equal(sim.data.params.mass, heavy.mass)
-    np.testing.assert_array_equal(sim.data.controls.attitude.params.kR, stiff.params.kR)
+    np.testing.assert_array_equal(sim.data.controls.controller.params.stiffness, stiff.params.stiffness)
     sim.reset()
     np.testing.assert_array_equal(sim.data.params.mass, params.mass)
     np.testing.assert_array_equal(sim.data.params.gravity_vec, params.gravity_vec)
-    np.testing.assert_array_equal(sim.data.controls.attitude.params.kR, attitude.params.kR)
+    np.testing.assert_array_equal(sim.data.controls.controller.params.stiffness, own.params.stiffness)
     assert not np.array_equal(jax.random.key_data(sim.data.core.rng_key), key), "the seed stays"
 
 

@@ -1,4 +1,4 @@
-"""Worlds distributed over two devices: the placement of each leaf, and the same results as on one device."""
+"""Worlds distributed over two devices: the shardings_of of each leaf, and the same results as on one device."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from crazysim import ConfigError, Sim
 from crazysim.core import functional as F
 from crazysim.core.pipeline import append_fn
-from crazysim.core.sharding import WORLD_AXIS, placement, shard, world_mesh
+from crazysim.core.sharding import WORLD_AXIS, shard, shardings_of, world_mesh
 from crazysim.pytree import scopes
 
 SETTINGS = {"n_worlds": 4, "n_drones": 2, "control": "attitude"}
@@ -185,7 +185,7 @@ def test_law_09_worlds_that_cannot_be_split_evenly_are_refused(mesh):
 def test_law_09_a_mesh_with_another_axis_is_refused(whole):
     other = jax.make_mesh((2,), ("batch",), axis_types=(AxisType.Auto,), devices=jax.devices("cpu")[:2])
     with pytest.raises(ConfigError, match=f"an axis '{WORLD_AXIS}', got axes \\('batch',\\)"):
-        placement(whole.data, other)
+        shardings_of(whole.data, other)
     with pytest.raises(ConfigError, match="batch"):
         Sim(**SETTINGS, mesh=other)
 

@@ -1,59 +1,32 @@
-"""Every Python block of every page runs, in the order of the page and in one namespace."""
+"""Every Python block of every page runs, in the order of the page and in one namespace, and prints what is shown."""
 
-import contextlib
-import re
+import importlib.util
 from pathlib import Path
 
 import pytest
-from drawing import draw_coarsely
-
-from crazysim.engine import Step
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
-ENGINE = re.compile(r"<!-- engine: (\w+) -->\n$")
-"""In front of a block: engine of steps that are first taken there, as the fused one takes longer to compile.
 
-The interpreter takes few steps, and the derivatives of ``plain`` compile soonest.
-"""
-PLAN = Step._plan
-
-
-@contextlib.contextmanager
-def planned_for(engine, monkeypatch):
-    """Let steps be planned for an engine, where the page chooses none; steps behind the block are planned anew."""
-    steps = []
-
-    def plan(step, *data):
-        if step.engine == "auto":
-            steps.append(step)
-            step.engine = engine
-        return PLAN(step, *data)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Step, "_plan", plan)
-        yield
-    for step in steps:
-        step.engine = "auto"
-        step._plans.clear()
+spec = importlib.util.spec_from_file_location("outputs", ROOT / "docs" / "outputs.py")
+outputs = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(outputs)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_page_runs(page, tmp_path, monkeypatch, opengl):
     monkeypatch.chdir(tmp_path)
-    draw_coarsely(monkeypatch)
     text = page.read_text()
     for package, sign in (("casadi", "import casadi"), ("viser", "from crazysim.media import web")):
         if sign in text:
             pytest.importorskip(package)
     namespace = {"__name__": "page"}
-    for block in BLOCK.finditer(text):
-        # Blank lines in front, so that a traceback shows the line of the page.
-        code = "\n" * text[: block.start()].count("\n") + "\n" + block.group(1)
-        engine = ENGINE.search(text, 0, block.start())
-        with planned_for(engine[1], monkeypatch) if engine else contextlib.nullcontext():
-            exec(compile(code, str(page), "exec"), namespace)
+    for block in outputs.blocks(text):
+        printed = outputs.run(block, page, namespace)
+        line = text[: block.end].count("\n")
+        if block.output is not None and not outputs.same(block.output, printed):
+            name = page.relative_to(ROOT)
+            pytest.fail(f"the block that ends at line {line} prints\n{printed}; run `python docs/outputs.py {name}`")
 
 
 SCENE_PAGES = ("docs/concepts/scene.md", "docs/guides/obstacles.md", "docs/guides/pictures.md")
@@ -82,10 +55,39 @@ PEER_CODE = (
 
 
 def test_the_peers_way_with_the_scene_is_on_the_pages():
-    code = "".join("".join(BLOCK.findall((ROOT / page).read_text())) for page in SCENE_PAGES)
+    code = "".join(block.code for page in SCENE_PAGES for block in outputs.blocks((ROOT / page).read_text()))
     for line in PEER_CODE:
         assert line in code, line
 
 
 def test_pages_have_code():
-    assert sum(len(BLOCK.findall(page.read_text())) for page in PAGES) > 20
+    assert sum(len(list(outputs.blocks(page.read_text()))) for page in PAGES) > 20
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("shown", "printed", "same"),
+    [
+        ("[0.5 1.]\n", "[0.5   1.]\n", True),
+        ("[0.50 1.25]", "[0.51 1.23]", True),
+        ("0.500", "0.515", False),
+        ("(64, 2)", "(65, 2)", False),
+        ("3.1e-08", "-4.9e-08", True),
+        ("3.1e-03", "4.9e-03", False),
+        ("-0.001", "0.001", True),
+        ("-0.01", "0.02", False),
+        ("True False", "True True", False),
+        ("0.5 0.5", "0.5", False),
+        ("engine: fused, ... steps", "engine: fused, 12 of 13 steps", True),
+        ("engine: fused, ... steps", "engine: lanes, 12 of 13 steps", False),
+        ("a ... b ... c", "a 1 b c", True),
+        ("a ... b ... c", "a 1 c", False),
+    ],
+)
+def test_outputs_are_compared_to_the_digits_that_a_page_shows(shown, printed, same):
+    assert outputs.same(shown, printed) is same
+
+
+def test_an_output_belongs_to_the_block_before_it():
+    text = "```python\nprint(1)\n```\n\n```text\n1\n```\n\n```python\nx = 1\n```\n\nPlan:\n\n```text\nx\n```\n"
+    assert [block.output for block in outputs.blocks(text)] == ["1\n", None]

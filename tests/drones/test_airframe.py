@@ -16,6 +16,8 @@ from crazysim.drones.body import body_geoms, outline
 from crazysim.drones.keys import KEYS, TABLES, TOP_LEVEL
 from crazysim.dynamics import Dynamics, first_principles, fitted, supported_drones, supported_dynamics
 
+pytestmark = pytest.mark.fast
+
 FILES = sorted(FOLDER.glob("*.toml"))
 
 
@@ -51,6 +53,7 @@ def test_every_number_has_a_unit_and_a_source(path):
     tables = raw(path.stem)
     sources = tables.pop("sources")
     assert tables.pop("base", None) in (None, *airframe_names())
+    assert tables.pop("name", path.stem) == path.stem
     found = list(numbers(tables))
     assert len(list(numbers(load_airframe(path.stem).tables))) > 30
     for key, entry in found:
@@ -96,6 +99,18 @@ def test_every_airframe_gives_parameters_for_all_it_supports(name):
 
 
 @pytest.mark.parametrize("name", airframe_names())
+def test_every_airframe_has_a_battery(name):
+    """It is part of the drone, of 80 to 200 W h/kg as lithium-polymer batteries are, and not shorted by its motors."""
+    airframe = load_airframe(name)
+    cells, capacity, resistance, mass = (
+        float(airframe.value(f"battery.{key}", ())) for key in ("cells", "capacity", "resistance", "mass")
+    )
+    assert 0.1 < mass / airframe.value("rigid_body.mass") < 0.4
+    assert 80 < cells * capacity * 3.7 / mass < 200
+    assert 0.01 < resistance / cells * capacity < 0.05
+
+
+@pytest.mark.parametrize("name", airframe_names())
 def test_numbers_of_an_airframe_are_plausible(name):
     """Thrust to weight between 1.3 and 12 (a racer), drag that dissipates, and curves that rise."""
     airframe = load_airframe(name)
@@ -134,6 +149,17 @@ def test_mixing_matrix_of_a_crazyflie():
     """Rotors 1 to 4 go clockwise from ahead-right, seen from above; 1 and 3 turn so that their drag yaws right."""
     expected = [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]
     np.testing.assert_array_equal(load_airframe("cf21B_500").mixing_matrix, expected)
+
+
+@pytest.mark.parametrize("name", airframe_names())
+def test_rotors_of_built_in_airframes_are_in_bitcrazes_order_and_turn_as_its_motors(name):
+    """Clockwise from ahead-right; a torque to the left needs less of rotors 1 and 3 and more of 2 and 4.
+
+    As powerDistributionForceTorque of Bitcraze's firmware and of the lab's bumblebee-firmware have it. PX4's X500 turns
+    its motors ahead right and behind left counter-clockwise.
+    """
+    mixing = load_airframe(name).mixing_matrix
+    np.testing.assert_array_equal(np.sign(mixing), [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
 
 
 def test_names_files_and_dicts_give_the_same_airframe(tmp_path):
@@ -245,10 +271,69 @@ WRONG = {
         setting("rigid_body.mass", {"kilos": 0.03}),
         r"expected rigid_body.mass as a number, an array or \{ value, unit, source \}, got \{'kilos': 0.03\}",
     ),
-    "mass negative": (setting("rigid_body.mass", -0.03), "expected a positive mass, got -0.03 kg"),
-    "mass nan": (setting("rigid_body.mass", float("nan")), "expected rigid_body.mass to be finite, got nan"),
-    "too heavy": (setting("rigid_body.mass", 0.2), "expected rotors that lift 0.2 kg, got 4 rotors of at most 0.2 N"),
-    "inertia of two": (setting("rigid_body.inertia", [1e-5, 1e-5]), "three positive moments"),
+    "mass as text": (setting("rigid_body.mass", "0.03"), "rigid_body.mass as a number or array, got '0.03'"),
+    "mass true": (setting("rigid_body.mass", True), "rigid_body.mass as a number or array, got True"),
+    "mass negative": (setting("rigid_body.mass", -0.03), "rigid_body.mass to be from 1e-6 to 1e6 kg, got -0.03"),
+    "mass nan": (setting("rigid_body.mass", float("nan")), "rigid_body.mass to be from 1e-6 to 1e6 kg, got nan"),
+    "mass tiny": (setting("rigid_body.mass", 1e-300), "rigid_body.mass to be from 1e-6 to 1e6 kg, got 1e-300"),
+    "mass huge": (setting("rigid_body.mass", 10**400), "rigid_body.mass as a number or array, got 1000"),
+    "too light": (setting("rigid_body.mass", 1e-6), "expected rotors that lift 1e-06 kg, .* 1000 times its weight"),
+    "too heavy": (setting("rigid_body.mass", 0.2), "expected rotors that lift 0.2 kg, .*, got 4 rotors of .* to 0.2 N"),
+    "always up": (setting("rotors.thrust_min", 0.15), "expected rotors that lift 0.0434 kg, between"),
+    "inertia of no body": (
+        setting("rigid_body.inertia", [1e-5, 1e-5, 9e-5]),
+        "moment is at most the sum of the others",
+    ),
+    "inertia tiny": (setting("rigid_body.inertia", [1e-14] * 3), "turn the body with at most 1e[+]06 rad/s"),
+    "inertia zero": (setting("rigid_body.inertia", [1e-300] * 3), "three positive moments"),
+    "rotor of a mill": (setting("rotors.inertia", 1.0), "propellers with a smaller inertia than the whole drone"),
+    "rotor inertia negative": (setting("rotors.inertia", -1e-8), "rotors.inertia to be at least zero, got -1e-08"),
+    "thrust curve zero": (setting("rotors.thrust_curve", [0, 0, 0]), "expected thrust_curve with a positive quadratic"),
+    "thrust curve falls": (setting("rotors.thrust_curve", [0.2, 0, -1e-10]), "expected thrust_curve with a positive"),
+    "thrust curve linear": (setting("rotors.thrust_curve", [0, 1e-5, 0]), "expected thrust_curve with a positive"),
+    "thrust at rest": (setting("rotors.thrust_curve", [0.1, 0, 4e-10]), "rises from thrust_min to thrust_max"),
+    "thrust curve tiny": (setting("rotors.thrust_curve", [0, 0, 1e-28]), "between 0 and 1e[+]06 rpm"),
+    "thrust curve of one rotor": (
+        setting("rotors.thrust_curve", [[0, 0, 4e-10]] * 3 + [[0, 0, 0]]),
+        "thrust_curve with",
+    ),
+    "torque curve negative": (
+        setting("rotors.torque_curve", [0, 0, -1e-12]),
+        "expected torque_curve of at least 0 N m",
+    ),
+    "torque curve huge": (setting("rotors.torque_curve", [0, 0, 1.0]), "torque_curve of at least 0 N m .* at most"),
+    "lag negative": (setting("rotors.lag", [-14, 0, 14, 0]), "rotors.lag to be at least zero, got .-14.0"),
+    "lag without spin-up": (setting("rotors.lag", [0, 0, 14, 0]), "lag with a positive linear or quadratic term"),
+    "lag too fast": (
+        setting("rotors.lag", [1e4, 0, 14, 0]),
+        r"rotors.lag .* slow for steps of 1/500 s, .*freq=6667 or",
+    ),
+    "signs of two": (setting("rotors.yaw_torque_sign", [2, -1, 1, -1]), "yaw_torque_sign to be 1 or -1 for each rotor"),
+    "signs of a half": (setting("rotors.yaw_torque_sign", [0.5, -1, 1, -1]), "yaw_torque_sign as 1 or -1"),
+    "signs alike": (setting("rotors.yaw_torque_sign", [1, 1, 1, 1]), "yaw_torque_sign as 1 or -1 .* not all equal"),
+    "rotors in the middle": (setting("rotors.position", [[0, 0, 0.1]] * 4), "rotors beside the centre of mass"),
+    "rotors far away": (setting("rotors.position", [[1e9, 0, 0]] * 4), "rotors.position to be from -1e3 to 1e3 m"),
+    "drag that pushes": (setting("drag.coefficients", [0.02, -0.02, -0.02]), "expected drag.coefficients that brakes"),
+    "drag of a wall": (setting("drag.coefficients", [-1e3] * 3), "drag.coefficients .* slow for steps of 1/500 s"),
+    "drag askew": (
+        setting("drag.coefficients", [[-0.01, 0.03, 0], [0.03, -0.01, 0], [0, 0, -0.01]]),
+        "expected drag.coefficients that brakes",
+    ),
+    "stiffness that repels": (setting("fitted.so_rpy.rpy_coef", [150.0] * 3), "fitted.so_rpy.rpy_coef to be negative"),
+    "fit that does not lift": (
+        setting("fitted.so_rpy.cmd_f_coef", 0.1),
+        "cmd_f_coef of fitted.so_rpy to lift 0.4258 N",
+    ),
+    "battery without force": (setting("battery.thrust_over_voltage", [0, 0, 0, 0]), "reach thrust_max at a positive"),
+    "gain negative": (setting("controller.attitude.kR", [-1, 1, 1]), "controller.attitude.kR to be at least zero"),
+    "PWM reversed": (setting("controller.pwm_min", 70000.0), "pwm_min below pwm_max, got 70000.0 and 65535.0"),
+    "plate without size": (setting("shape.plate", [0.03, 0.0, 0.02]), "shape.plate to be from 1e-6 to 1e3 m"),
+    "sphere without size": (setting("shape.collision_sphere", [0, 0, 0, -1]), "coordinates and a positive radius"),
+    "camera above": (setting("shape.track_camera", [0, 0, 1]), "track_camera behind or ahead of the drone"),
+    "inertia of two": (
+        setting("rigid_body.inertia", [1e-5, 1e-5]),
+        r"rigid_body.inertia of shape \(3,\) or \(3, 3\), got \(2,\)",
+    ),
     "inertia negative": (setting("rigid_body.inertia", [1e-5, 1e-5, -1e-5]), "three positive moments"),
     "inertia askew": (
         setting("rigid_body.inertia", [[1e-5, 1e-6, 0], [0, 1e-5, 0], [0, 0, 1e-5]]),
@@ -280,9 +365,13 @@ WRONG = {
     ),
     "no gain": (
         without("controller.attitude.kR"),
-        r"has no value 'controller.attitude.kR'. Add kR to its table \[controller.attitude\]; docs",
+        r"lacks \[controller.attitude\] kR, which controller 'crazyflow' needs. Use controller='auto', which needs no",
     ),
-    "no controller": (without("controller"), r"has no value 'controller.\w+.\w+'. Add \w+ to its table"),
+    "no controller": (
+        without("controller"),
+        r"lacks \[controller.attitude\] kR, kw, ki_m, kd_omega, int_err_max; \[controller\] torque_pwm_max, "
+        r"thrust2torque, pwm_min, pwm_max, which",
+    ),
     "shape misspelt": (
         setting("shape.propellor_radius", 0.02),
         "expected a key that exists, got 'shape.propellor_radius'. Did you mean 'shape.propeller_radius'",
@@ -300,7 +389,7 @@ WRONG = {
         "expected a key that exists, got 'rigid_body.mas'. Did you mean 'rigid_body.mass'",
     ),
     "base misspelt": (setting("bse", "cf2x_L250"), "expected a key that exists, got 'bse'. Did you mean 'base'"),
-    "mass in no table": (setting("mass", 0.05), "got 'mass'. Did you mean 'rigid_body.mass' or 'controller.mass'"),
+    "mass in no table": (setting("mass", 0.05), "got 'mass'. Did you mean 'rigid_body.mass' or 'battery.mass' or 'con"),
     "unit misspelt": (
         setting("rigid_body.mass", {"value": 0.03, "units": "kg"}),
         r"as a number, an array or \{ value, unit, source \}, got \{'value': 0.03, 'units': 'kg'\}",
@@ -321,8 +410,9 @@ def test_law_09_a_wrong_airframe_is_refused(case):
     change, message = WRONG[case]
     tables = plain("cf21B_500")
     change(tables)
+    controller = "crazyflow" if case in ("no gain", "no controller") else "auto"  # which needs no gains
     with pytest.raises(ConfigError, match=message):
-        Sim(drone=tables)
+        Sim(drone=tables, controller=controller)
 
 
 @pytest.mark.parametrize(
@@ -340,6 +430,50 @@ def test_law_09_a_broken_toml_file_is_named(tmp_path):
     path.write_text("[rotors\nposition = 3", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"broken\.toml is not valid TOML"):
         load_airframe(path)
+
+
+def nested(depth):
+    """Return a list in a list in a list and so on."""
+    value = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+def test_law_09_files_that_are_no_text_or_too_deep_or_too_large_are_named(tmp_path):
+    path = tmp_path / "mine.toml"
+    for content, message in (
+        (b"\xff\xfe[rotors]", "expected text in .*mine.toml, got bytes that are not UTF-8"),
+        (b"a = " + b"[" * 5000, "mine.toml is not valid TOML"),
+        (b"a = " + b"{a=" * 5000, "mine.toml is not valid TOML"),
+        (b"rotors." + b"a." * 5000 + b"a = 1", "expected a table that exists"),
+        (b"rigid_body.mass." + b"a." * 5000 + b"a = 1", "expected rigid_body.mass as a number, an array or"),
+        (
+            b"rigid_body.mass.value." + b"a." * 5000 + b"a = 1",
+            "expected rigid_body.mass as a number or array, got (a dict|{)",
+        ),
+        (b"a = 2026-02-31", "mine.toml is not valid TOML"),
+        (b"#" * 2**21, "expected a file of at most 1048576 bytes"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(ConfigError, match=message):
+            load_airframe(path)
+    with pytest.raises(ConfigError, match=r"rigid_body.mass as a number or array, got a list"):
+        load_airframe({"rigid_body": {"mass": nested(5000)}})
+    for source in ("x" * 5000, "a\0b", tmp_path):
+        with pytest.raises(ConfigError, match="no file of that path exists"):
+            load_airframe(source)
+
+
+def test_law_09_a_base_in_a_circle_is_named(tmp_path):
+    one, two = tmp_path / "one.toml", tmp_path / "two.toml"
+    one.write_text(f'base = "{two}"\n', encoding="utf-8")
+    two.write_text(f'base = "{one}"\n', encoding="utf-8")
+    circle = {}
+    circle["base"] = circle
+    for source in (one, two, circle, {"base": str(one)}):
+        with pytest.raises(ConfigError, match=r"expected a base that leads to a file without one, got .* -> "):
+            load_airframe(source)
 
 
 def test_law_09_an_unknown_key_is_answered_with_the_file(tmp_path):
@@ -403,14 +537,41 @@ def test_law_09_a_mistyped_path_is_answered_with_those_that_are_near():
 
 def test_a_base_gives_the_numbers_that_are_not_given(tmp_path):
     """Numbers are replaced one by one, from dicts and files alike, and a base may have a base."""
-    (tmp_path / "light.toml").write_text('base = "bumblebee_lab"\n[rigid_body]\nmass = 0.5\n', encoding="utf-8")
+    (tmp_path / "light.toml").write_text('base = "bumblebee_lab"\n[rotors]\nthrust_min = 0.5\n', encoding="utf-8")
     lab, light = load_airframe("bumblebee_lab"), load_airframe(tmp_path / "light.toml")
-    named = load_airframe({"base": str(tmp_path / "light.toml"), "name": "named", "rotors": {"thrust_max": 12.0}})
-    changed = {"rigid_body.mass": (0.5, 0.5), "rotors.thrust_max": (15.0, 12.0)}
+    named = load_airframe({"base": str(tmp_path / "light.toml"), "name": "named", "rotors": {"inertia": 1e-6}})
+    changed = {"rotors.thrust_min": (0.5, 0.5), "rotors.inertia": (lab.value("rotors.inertia"), 1e-6)}
     assert (light.name, named.name) == ("light", "named")
     for path, value in numbers(lab.tables):
         for airframe, expected in zip((light, named), changed.get(path, (value, value)), strict=True):
             np.testing.assert_array_equal(airframe.value(path), expected)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rigid_body": {"mass": 0.04}},
+        {"rigid_body": {"inertia": [2e-5, 2e-5, 3e-5]}},
+        {"rotors": {"thrust_curve": [0.0, 0.0, 5e-10]}},
+    ],
+)
+def test_another_body_inherits_no_gains(changes):
+    """Gains and fits assume the body and rotors of the base; the heir says so where it is asked for one."""
+    base, heir = load_airframe("cf2x_L250"), load_airframe({"base": "cf2x_L250", "name": "mine", **changes})
+    changed = next(f"{table}.{key}" for table, keys in changes.items() for key in keys)
+    message = rf"Its base 'cf2x_L250' has \[fitted\], \[controller\], \[mellinger\] and \[pid\], .* another {changed}"
+    for ask in (lambda: heir.value("controller.mass"), lambda: heir.table("pid.rate")):
+        with pytest.raises(ConfigError, match=message):
+            ask()
+    assert not {"fitted", "mellinger", "pid"} & set(heir.tables)
+    ratios = [airframe.values.get("controller.thrust2torque") for airframe in (base, heir)]
+    assert (ratios[1] is None) if "thrust_curve" in changed else ratios[0] == ratios[1]
+    np.testing.assert_array_equal(heir.value("drag.coefficients"), base.value("drag.coefficients"))
+    same = load_airframe({"base": "cf2x_L250", "rigid_body": {"mass": float(base.value("rigid_body.mass"))}})
+    assert set(same.values) == set(base.values)
+    own = load_airframe({"base": "cf2x_L250", **changes, "controller": {"mass": 0.04}})
+    assert float(own.value("controller.mass")) == 0.04
+    assert "controller.mass_thrust" not in own.values
 
 
 @pytest.mark.parametrize("name", supported_drones("first_principles"))
@@ -437,9 +598,9 @@ def test_figure_of_merit_at_hover(name):
 def test_full_thrust_voltage_is_that_of_the_firmwares_curves():
     """Their cubic meets the largest thrust: worked out with numpy.roots from the firmware's four coefficients."""
     expected = {"cf21B_500": 3.1257, "cf2x_P250": 3.0799, "cf2x_T350": 2.8166, "cf2x_L250": 2.9836, "crazyflie": 3.3482}
-    for name in airframe_names():
-        found = load_airframe(name).full_thrust_voltage
-        assert found == (pytest.approx(expected[name], abs=1e-4) if name in expected else None)
+    for name, volts in expected.items():
+        assert load_airframe(name).full_thrust_voltage == pytest.approx(volts, abs=1e-4)
+    assert load_airframe("hb_x500").full_thrust_voltage is None
 
 
 @pytest.mark.parametrize("name", ["cf21B_500", "cf2x_L250", "bumblebee", "hb_x500"])
@@ -453,7 +614,7 @@ def test_a_body_without_a_shape_is_about_as_large_as_the_real_one(name):
         ratio = (derived[key] / true[key]).ravel()[:2]  # not the thickness of the plate
         assert np.all((ratio > 1 / 2.1) & (ratio < 2.1)), (key, ratio)
     np.testing.assert_allclose(derived["collision_sphere"][3], true["collision_sphere"][3], rtol=0.2)
-    assert {key: value.shape for key, value in derived.items()} == {k: v[0] for k, v in TABLES["shape"].items()}
+    assert {key: value.shape for key, value in derived.items()} == {k: v.shapes[0] for k, v in TABLES["shape"].items()}
     some = outline(load_airframe(tables | {"shape": {"propeller_radius": 0.02}}))
     assert some["propeller_radius"] == 0.02
     np.testing.assert_allclose(some["plate"], derived["plate"])

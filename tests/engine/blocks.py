@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from crazysim.engine.program import Leaf, Program, Segment
+from crazysim.engine.ir.program import Leaf, Program, Segment
 
 
 def program_of(block, inputs, n_lanes):

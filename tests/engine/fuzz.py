@@ -1,6 +1,7 @@
 """Differential fuzzer of the engines: random programs must give on every engine what they give on ``plain``.
 
     python tests/engine/fuzz.py --programs 20000 --seed 1
+    python tests/engine/fuzz.py --programs 5000 --seed 1 --device gpu
 
 Programs (``programs``) are drawn at random, each becomes a stage of one drone or of one world, and many stages make a
 step, so that compilers are called once for all of them. Every value of every program is written to a record and
@@ -37,18 +38,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from programs import Program, draw, evaluate, kept
-from rounding import close, explained, keeps_sign_of_zero
+from rounding import allow_gpu, close, explained, keeps_sign_of_zero
 
 from crazysim import Sim
 from crazysim.core.stage import Stage, as_stages, stage
-from crazysim.engine import Step, native
+from crazysim.engine import Step
+from crazysim.engine.backends import fused
+from crazysim.engine.backends.source import require
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.lower_stages import lower_stages
-from crazysim.engine.source import require
+from crazysim.engine.lowering.stages import lower_stages
 from crazysim.pytree import PyTree, leaf
 
 N_WORLDS, N_DRONES = 36, 2
-COMPARED = tuple(e for e in ("lanes", "interpret", "fused") if e != "fused" or native.compiler())
+COMPARED = ("lanes", "interpret", "fused")
 
 
 class Given(PyTree):
@@ -204,18 +206,20 @@ class Find:
 class Fuzzer:
     """Runs programs on all engines and counts."""
 
-    def __init__(self, seed: int, engines: Sequence[str] = COMPARED):
+    def __init__(self, seed: int, engines: Sequence[str] = COMPARED, device: str = "cpu"):
         """Draw the inputs of all programs.
 
         Args:
             seed: Seed of inputs and programs.
-            engines: Engines that are compared with ``plain``.
+            engines: Engines that are compared with ``plain``; those that cannot run on the device are left out.
+            device: Platform that runs the programs, ``"cpu"`` or ``"gpu"``.
         """
-        self.engines = tuple(engines)
+        self.platform = device
+        self.engines = tuple(e for e in engines if e != "fused" or fused.missing(device) is None)
         self.rng = np.random.default_rng(seed)
-        sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="rotor_vel")
-        self.given = given(self.rng)
-        self.data = sim.data
+        sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="rotor_vel", device=device)
+        self.device, self.data = sim.device, sim.data
+        self.given = jax.device_put(given(self.rng), sim.device)
         self.counts: collections.Counter[str] = collections.Counter()
         self.refused: collections.Counter[str] = collections.Counter()
 
@@ -277,7 +281,7 @@ class Fuzzer:
     def run(self, cases: Sequence[Case], engine: str) -> list[list[np.ndarray]]:
         """Return the values of programs on an engine."""
         data, stages = self._step_of(cases)
-        results = Step(stages, engine)(data).plugins["results"]
+        results = Step(stages, engine, self.platform, device=self.device)(data).plugins["results"]
         slots = {k: np.asarray(x) for k, x in {**results.drone, **results.world}.items()}
         return [case.unpacked(slots[f"p{k}f"], slots[f"p{k}o"]) for k, case in enumerate(cases)]
 
@@ -360,12 +364,22 @@ def _text(x: Any) -> str:
 
 def main() -> None:
     """Run the fuzzer from the command line."""
-    parser = argparse.ArgumentParser(description="Compare the engines on random programs.")
+    parser = argparse.ArgumentParser(
+        description="Compare the engines on random programs.",
+        epilog="5,000 programs on a GPU: python tests/engine/fuzz.py --programs 5000 --seed 1 --device gpu. Where a "
+        "command may not take that long, run parts with --programs 1000 and seeds 1 to 5. It exits with 1 if there is "
+        "a find.",
+    )
     parser.add_argument("--programs", type=int, default=1000, help="number of programs")
     parser.add_argument("--seed", type=int, default=0, help="seed of programs and inputs")
     parser.add_argument("--batch", type=int, default=40, help="programs that are compiled together")
+    parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu", help="platform that runs the programs")
     args = parser.parse_args()
-    fuzzer, start, n_finds = Fuzzer(args.seed), time.perf_counter(), 0
+    fuzzer, start, n_finds = Fuzzer(args.seed, device=args.device), time.perf_counter(), 0
+    jax.config.update("jax_default_device", fuzzer.device)  # for what is computed to explain a difference
+    if args.device == "gpu":
+        allow_gpu()
+    print(f"# {', '.join(fuzzer.engines)} against plain on {fuzzer.device.device_kind}", flush=True)
     for done in range(0, args.programs, args.batch):
         for find in fuzzer.check(fuzzer.draw(min(args.batch, args.programs - done))):
             n_finds += 1

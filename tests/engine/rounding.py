@@ -143,6 +143,21 @@ ALTERNATIVES: dict[tuple[str, str], tuple[Callable[..., Any], tuple[float, ...]]
 be."""
 
 
+LARGEST_ANGLE = 1e12
+"""Angle beyond which kernels on a GPU do not reduce it, rad."""
+
+
+def allow_gpu() -> None:
+    """Allow what kernels on a GPU may find besides, from now on: any sine, cosine and tangent of a very large angle."""
+
+    def is_large(eqn: Any, x: Any) -> Any:
+        del eqn
+        return jnp.abs(x) > LARGEST_ANGLE
+
+    for name, numbers in {"sin": (-1.0, 1.0), "cos": (-1.0, 1.0), "tan": ANY}.items():
+        ALTERNATIVES[name, "f"] = is_large, numbers
+
+
 def alternatives(eqn: Any, args: Sequence[Any], out: Any) -> tuple[Any, tuple[float, ...]] | None:
     """Return where the result of an equation is not defined to a few units, and what it may be there."""
     where, numbers = ALTERNATIVES.get((eqn.primitive.name, np.dtype(out.dtype).kind), (None, ()))

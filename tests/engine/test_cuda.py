@@ -2,14 +2,16 @@
 
 import dataclasses
 
+import jax
 import pytest
 from cases import shared_sim
 
-from crazysim import Downwash, Sim, jaxcompat
-from crazysim.engine import Step, cuda, kernel
+from crazysim import ConfigError, Downwash, FreeBodies, Sim, jaxcompat
+from crazysim.engine import Step, explain
+from crazysim.engine.backends import cuda, kernel, native
+from crazysim.engine.backends.exchange import exchange_for
+from crazysim.engine.backends.source import Writer
 from crazysim.engine.errors import KernelError, UnsupportedError
-from crazysim.engine.exchange import exchange_for
-from crazysim.engine.source import Writer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,3 +105,49 @@ def test_records_that_do_not_fit_into_a_block_are_refused():
     exchange = exchange_for("cuda", 1024)
     with pytest.raises(UnsupportedError, match="a GPU's block has 49152"):
         exchange.publish(Writer(exchange), [("f32", "0")] * 13, [], 1)
+
+
+def lowered(sim, planned_for, platform):
+    """Return the text of a step that is planned for one platform and compiled for another."""
+    step = Step(sim.step_pipeline, "fused", planned_for)
+    return jax.jit(lambda data: step(data, 3)).trace(sim.data).lower(lowering_platforms=(platform,)).as_text()
+
+
+def test_a_step_has_a_kernel_on_platforms_that_it_was_not_planned_for():
+    if cuda.nvrtc() is None:
+        pytest.skip("no NVRTC here; CI has it")
+    sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
+    for planned_for in ("cpu", "gpu"):
+        for platform, target in (("cpu", "crazysim_advance"), ("cuda", cuda.TARGET)):
+            text = lowered(sim, planned_for, platform)
+            assert [text.count(name) for name in ("crazysim_advance", cuda.TARGET)] == [
+                int(name == target) for name in ("crazysim_advance", cuda.TARGET)
+            ]
+
+
+def test_compiling_for_one_platform_needs_no_compiler_of_another(monkeypatch):
+    sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
+    with monkeypatch.context() as patch:
+        patch.setattr(cuda, "nvrtc", lambda: None)
+        assert "crazysim_advance" in lowered(sim, "cpu", "cpu")
+    if cuda.nvrtc() is None:
+        pytest.skip("no NVRTC here; CI has it")
+    monkeypatch.setattr(native, "compiler", lambda: None)
+    assert cuda.TARGET in lowered(sim, "gpu", "cuda")
+
+
+def test_a_step_without_a_kernel_where_jax_compiles_it_is_an_error():
+    sim = Sim(n_worlds=1, n_drones=1025, control="rotor_vel")
+    sim.add(Downwash())
+    with pytest.raises(ConfigError, match=r"expected a kernel for the GPU, .*up to 1024 .*\. Use engine='lanes'"):
+        lowered(sim, "cpu", "cuda")
+
+
+def test_a_step_that_splits_is_described():
+    sim = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
+    sim.add(FreeBodies(2, size=(0.2, 0.2, 0.2), mass=0.2, pos=[(0, 0, 0.5), (0.02, 0, 0.8)]))
+    if cuda.nvrtc() is None:
+        pytest.skip("no NVRTC here; CI has it")
+    text = explain(Step(sim.step_pipeline, "fused", "gpu"), sim.data)
+    assert "splits the step: 'bodies_contacts' is not fused" in text
+    assert text.splitlines()[-1].startswith("kernel: ")

@@ -5,7 +5,7 @@ import pytest
 from fuzz import Case, Fuzzer
 from programs import Program
 
-from crazysim.engine.lower import RULES, constants
+from crazysim.engine.lowering.jaxprs import RULES, constants
 
 FOUND = {
     # A reduction to an array without elements has no size to be inferred.
@@ -45,7 +45,15 @@ FOUND = {
     "a product of bools": (("b3",), "jnp.outer(v0, v0) @ v0 | (v0 @ v0)"),
     "angles of any size": (("f33",), "jnp.sin(v0) + jnp.cos(v0 * 1e7)"),
     "lgamma of infinity": (("f3",), "lax.lgamma(v0)"),
+    # XLA's threads on a CPU take subnormal numbers for zero; those of NumPy do not by themselves.
+    "infinity times a subnormal number": (("f33",), "jnp.sort(jnp.deg2rad(v0), 0) * np.float32(np.inf)"),
+    "order of subnormal numbers": (("f4",), "jnp.argsort(v0 * np.float32([0.0, 0.5, -0.5, 1e-8]))"),
     "device_put": (("f3",), "jax.device_put(v0) + 1"),
+    # pmap of jax 0.10 and Brax's training begin with one; elements stay where they are.
+    "reshard": (
+        ("f3",),
+        "jax.sharding.reshard(v0, jax.sharding.NamedSharding(jax.make_mesh((1,), ('i',)), jax.P())) + 1",
+    ),
 }  # fmt: skip
 """Inputs and a line, by what was wrong."""
 

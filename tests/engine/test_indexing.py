@@ -9,7 +9,8 @@ from programs import Program
 
 from crazysim import PyTree, Sim, leaf
 from crazysim.core.stage import stage
-from crazysim.engine import Step, native
+from crazysim.engine import Step
+from crazysim.engine.backends import native
 from crazysim.errors import EngineWarning
 
 ENGINES = ("plain", "lanes", "auto", *(("fused",) if native.compiler() else ()))

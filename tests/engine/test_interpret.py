@@ -5,23 +5,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import shared_sim
-from jax.extend.random import threefry2x32_p
 
 from crazysim import Sim
+from crazysim.core.sharding import Location
 from crazysim.core.stage import as_stages, stage
-from crazysim.engine import fused, interpret, lanes, native
-from crazysim.engine.build import build_program
-from crazysim.engine.lower import lower_function
-from crazysim.engine.program import Segment
+from crazysim.engine.backends import fused, interpret, lanes, native
+from crazysim.engine.ir.program import Segment
+from crazysim.engine.lowering.jaxprs import lower_function
+from crazysim.engine.lowering.stages import lower_stages
+from crazysim.engine.optimise import optimise
 from crazysim.pytree import PyTree, leaf
 
+pytestmark = pytest.mark.fast
+
 ONE = jax.ShapeDtypeStruct((), np.float32)
-
-
-def test_random_bits_are_those_of_jax():
-    words = np.random.default_rng(0).integers(0, 2**32, (4, 100), dtype=np.uint32)
-    for found, expected in zip(interpret.threefry2x32(*words), threefry2x32_p.bind(*words), strict=True):
-        np.testing.assert_array_equal(found, expected)
 
 
 def test_lanes_leave_a_loop_one_by_one():
@@ -47,7 +44,9 @@ def test_an_observer_gets_every_operation_with_its_results():
 def step():
     """Return the program of a built-in step, and leaves with what it reads as one array behind them."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
-    program = build_program(as_stages(sim.step_pipeline), sim.data, watched=lambda data: jax.tree.leaves(data.states))
+    program = optimise(
+        lower_stages(as_stages(sim.step_pipeline), sim.data, watched=lambda data: jax.tree.leaves(data.states))
+    )
     leaves = jax.tree.leaves(sim.data)
     packed = jnp.concatenate([leaves[i].ravel() for i in program.packed])
     return program, [*leaves, packed]
@@ -108,7 +107,7 @@ def draw(data):
 
 
 def _kernel(program, leaves, n_steps):
-    return jax.jit(lambda leaves: fused.build(program, "cpu")(leaves, n_steps))(leaves)
+    return jax.jit(lambda leaves: fused.build(program, Location("cpu"))(leaves, n_steps))(leaves)
 
 
 @pytest.mark.parametrize("steps", [lanes.steps, interpret.steps, *([_kernel] if native.compiler() else [])])
@@ -116,7 +115,7 @@ def test_a_stage_may_write_random_keys(steps):
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
     own = Own(jax.random.split(jax.random.key(5), (3, 2)), jnp.zeros((3, 2)))
     data = sim.data.replace(plugins={"own": own})
-    program = build_program([draw], data)
+    program = optimise(lower_stages([draw], data))
     assert isinstance(program.segments[0], Segment)
     written, _ = steps(program, jax.tree.leaves(data), 2)
     expected = draw(draw(data)).plugins["own"]

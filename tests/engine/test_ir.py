@@ -6,9 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim.engine import interpret, ir
-from crazysim.engine.ir import Builder
-from crazysim.engine.verify import verify_block
+from crazysim.engine.backends import interpret
+from crazysim.engine.ir import blocks
+from crazysim.engine.ir.blocks import Builder
+from crazysim.engine.ir.verify import verify_block
+
+pytestmark = pytest.mark.fast
 
 F = np.float32
 
@@ -56,9 +59,9 @@ def test_a_block_does_not_change():
     with pytest.raises(dataclasses.FrozenInstanceError):
         block.outputs = ()
     with pytest.raises(dataclasses.FrozenInstanceError):
-        ir.Value(np.dtype(F)).dtype = np.dtype(int)
+        blocks.Value(np.dtype(F)).dtype = np.dtype(int)
     with pytest.raises(AttributeError):
-        ir.Operation("add", (), ()).name = "sub"
+        blocks.Operation("add", (), ()).name = "sub"
 
 
 def test_an_operation_that_is_not_in_the_table_is_a_defect():
@@ -72,10 +75,10 @@ def test_pruning_keeps_what_outputs_need_and_nothing_else():
     x, y = b.input(F), b.input(F)
     used = b.add("exp", (x,), F)
     b.add("log", (y,), F)
-    block = ir.prune(b.finish([used]), keep_inputs=False)
+    block = blocks.prune(b.finish([used]), keep_inputs=False)
     assert [op.name for op in block.operations] == ["exp"]
     assert block.inputs == (x,)
-    assert ir.prune(b.finish([used])).inputs == (x, y)
+    assert blocks.prune(b.finish([used])).inputs == (x, y)
 
 
 def test_pruning_looks_into_inner_blocks():
@@ -86,7 +89,7 @@ def test_pruning_looks_into_inner_blocks():
     inner.add("cos", (x,), F)
     block = inner.finish([inner.add("sin", (outside,), F)])
     (new,) = b.add_many("when", (mask, x), (F,), (), (block,))
-    pruned = ir.prune(b.finish([new]))
+    pruned = blocks.prune(b.finish([new]))
     assert [op.name for op in pruned.walk()] == ["exp", "when", "sin"]
 
 
@@ -96,7 +99,7 @@ def test_substitution_replaces_operands_everywhere():
     inner = Builder(b)
     block = inner.finish([inner.add("neg", (x,), F)])
     (new,) = b.add_many("when", (mask, x), (F,), (), (block,))
-    replaced = ir.substitute(b.finish([new, x]), {x: F(3.0)})
+    replaced = blocks.substitute(b.finish([new, x]), {x: F(3.0)})
     np.testing.assert_array_equal(interpret.run(replaced, [F(1.0), np.bool_(True)], ()), [-3.0, 3.0])
 
 
@@ -106,13 +109,13 @@ def test_inlining_simplifies_by_what_is_known():
     block = inner.finish([inner.add("mul", (inner.add("add", (x, F(1)), F), y), F)])
     b = Builder()
     z = b.input(F)
-    (out,) = ir.inline(b, block, {x: F(2.0), y: z})
+    (out,) = blocks.inline(b, block, {x: F(2.0), y: z})
     assert [(op.name, op.args[0]) for op in b.finish([out]).operations] == [("mul", F(3.0))]
     assert values_of(b.finish([out]), 5.0) == [15.0]
 
 
 def test_arrays_are_elements_in_row_major_order():
-    from crazysim.engine.lower import as_elements, constants, scalars
+    from crazysim.engine.lowering.jaxprs import as_elements, constants, scalars
 
     elements = constants(jnp.arange(6.0).reshape(2, 3), F)
     assert elements.shape == (2, 3)

@@ -8,12 +8,15 @@ from blocks import program_of
 from cases import shared_sim, with_states
 
 from crazysim.core.stage import stage
-from crazysim.engine import Step, compare, dump, lanes, listing, ops, source
-from crazysim.engine.build import build_program
+from crazysim.engine import Step
+from crazysim.engine.backends import lanes, source
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.ir import Builder
-from crazysim.engine.lower import lower_function
-from crazysim.engine.lower_stages import lower_stages
+from crazysim.engine.ir import dump, listing, ops
+from crazysim.engine.ir.blocks import Builder
+from crazysim.engine.lowering.jaxprs import lower_function
+from crazysim.engine.lowering.stages import lower_stages
+from crazysim.engine.optimise import optimise
+from crazysim.engine.tools import compare
 
 F = np.float32
 ONE = jax.ShapeDtypeStruct((), F)
@@ -44,7 +47,7 @@ def data():
 
 
 def test_a_program_is_listed_with_the_names_of_fields_and_stages(data):
-    text = str(lower_stages([sway], data))
+    text = listing.list_program(lower_stages([sway], data))
     assert text == (
         "segment of one drone, at each step: sway\n"
         "  %0: float32 = states.pos[2]\n"
@@ -57,22 +60,22 @@ def test_a_program_is_listed_with_the_names_of_fields_and_stages(data):
 
 
 def test_a_packed_number_keeps_the_name_of_its_field(data):
-    assert "= params.mass[0]\n" in str(build_program([sway], data))
-    rows = build_program([sway], data, rows=lambda written: written)
-    assert "states.force[0] = " in str(rows)
+    assert "= params.mass[0]\n" in listing.list_program(optimise(lower_stages([sway], data)))
+    rows = optimise(lower_stages([sway], data), rows=lambda written: written)
+    assert "states.force[0] = " in listing.list_program(rows)
 
 
 def test_segments_of_worlds_name_the_drone_and_unfused_stages_their_reason(data):
     from crazysim.core.stage import as_stages
 
-    text = str(build_program(as_stages({"follow": follow, "mine": undeclared}), data))
+    text = listing.list_program(optimise(lower_stages(as_stages({"follow": follow, "mine": undeclared}), data)))
     assert "states.force[0] of drone 1 = " in text
     assert "each stage mine of all worlds, unfused: it is not declared for one drone or one world\n" in text
     assert "  writes states.torque\n" in text
 
 
 def test_blocks_of_operations_are_indented():
-    text = listing.of_block(lower_function(lambda x: jax.lax.fori_loop(0, 70, lambda _, y: y * 0.5, x), ONE))
+    text = listing.list_block(lower_function(lambda x: jax.lax.fori_loop(0, 70, lambda _, y: y * 0.5, x), ONE))
     assert "loop(" in text
     assert "length=70) {\n" in text
     assert "\n    return " in text
@@ -83,7 +86,7 @@ def test_blocks_of_operations_are_indented():
 
 def test_a_dump_has_the_jaxprs_and_the_program_after_each_pass(data, tmp_path, monkeypatch):
     monkeypatch.setenv("CRAZYSIM_DUMP", str(tmp_path / "out"))
-    build_program([sway], data)
+    optimise(lower_stages([sway], data))
     names = [
         file.name.split("-", 2)[2] for file in sorted((tmp_path / "out").iterdir(), key=lambda f: f.name.split("-")[1])
     ]
@@ -147,17 +150,17 @@ def test_an_operation_without_source_is_refused_when_the_step_is_planned(data, m
     """The error names stage, operation and version, before any compiler runs."""
     import dataclasses
 
-    from crazysim.engine import kernel
+    from crazysim.engine.backends import kernel
 
     monkeypatch.setitem(ops.TABLE, "sin", dataclasses.replace(ops.TABLE["sin"], source=""))
-    program = build_program([sway], data)
+    program = optimise(lower_stages([sway], data))
     with pytest.raises(UnsupportedError, match=r"primitive 'sin'.*stage 'sway', jax") as error:
         kernel.write(program, "host")
     assert (error.value.stage, error.value.primitive) == ("sway", "sin")
 
 
 def test_a_leaf_of_a_type_that_kernels_do_not_have_is_named(x64):
-    from crazysim.engine import kernel
+    from crazysim.engine.backends import kernel
 
     builder = Builder(stage="all")
     x = builder.input(np.int64)

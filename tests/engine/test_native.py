@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import signal
 import subprocess
 import sys
 
@@ -9,10 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from browsing import wait_for
 from cases import shared_sim
 
-from crazysim.engine import Step, kernel, kernel_cache, native
+from crazysim.engine import Step
+from crazysim.engine.backends import kernel, kernel_cache, native
 from crazysim.engine.errors import KernelError
+from crazysim.errors import ConfigError
+from crazysim.sim import Sim
 
 COMPILER = native.compiler()
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
@@ -154,8 +159,8 @@ def test_nothing_partial_is_ever_seen(source, place, monkeypatch, tmp_path_facto
     """The name of a library appears when it is complete, and a compiler that fails leaves nothing behind."""
     listed = []
 
-    def run(words, text, real=native._run):
-        done = real(words, text)
+    def run(*args, real=native._run):
+        done = real(*args)
         listed.append([p.suffix for p in place.iterdir()])
         return done
 
@@ -164,10 +169,11 @@ def test_nothing_partial_is_ever_seen(source, place, monkeypatch, tmp_path_facto
     assert listed == [[], [".tmp"]]
     assert [p.suffix for p in place.iterdir()] == [".so"]
 
-    monkeypatch.setenv("CXXFLAGS", "-no-such-option")
+    monkeypatch.setenv("CXXFLAGS", "-std=c++98")
     with pytest.raises(KernelError, match="refused the kernel"):
         again(source)
     assert [p.suffix for p in place.iterdir()] == [".so"]
+    assert not any(p.is_dir() for p in kernel_cache.temporary().iterdir())
 
 
 def test_a_shared_folder_that_cannot_be_written_is_not_used(tmp_path, monkeypatch):
@@ -184,6 +190,121 @@ def test_boundaries_between_the_parts_of_a_key_count():
     assert kernel_cache.digest("ab", "c") != kernel_cache.digest("a", "bc")
     assert kernel_cache.digest("a", "b") != kernel_cache.digest("b", "a")
     assert len(kernel_cache.digest("a")) == kernel_cache.LENGTH
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "message"),
+    [
+        ("CXXFLAGS", "-no-such-option", "CXXFLAGS='-no-such-option'"),
+        ("CXXFLAGS", "-march=none-such", "CXXFLAGS='-march=none-such'"),
+        ("CXXFLAGS", "'-O2", "words in CXXFLAGS"),
+        ("CXX", "no-such-compiler", "a C\\+\\+ compiler in CXX, got 'no-such-compiler'"),
+        ("CXX", "'g++", "words in CXX"),
+        ("CXX", "false", "CXX='false'"),
+        ("CRAZYSIM_COMPILE_TIMEOUT", "soon", "seconds in CRAZYSIM_COMPILE_TIMEOUT, got 'soon'"),
+        ("CRAZYSIM_COMPILE_TIMEOUT", "0", "CRAZYSIM_COMPILE_TIMEOUT, got '0'"),
+        ("CRAZYSIM_COMPILE_TIMEOUT", "-3", "CRAZYSIM_COMPILE_TIMEOUT, got '-3'"),
+        ("CRAZYSIM_COMPILE_TIMEOUT", "nan", "CRAZYSIM_COMPILE_TIMEOUT, got 'nan'"),
+        ("CRAZYSIM_COMPILE_TIMEOUT", "inf", "CRAZYSIM_COMPILE_TIMEOUT, got 'inf'"),
+    ],
+)
+def test_wrong_settings_of_the_compiler_are_errors_that_name_them(place, monkeypatch, variable, value, message):
+    """With the default engine, which otherwise takes a slower one where the fastest is missing."""
+    native.compiler.cache_clear()
+    monkeypatch.setenv(variable, value)
+    try:
+        with pytest.raises(ConfigError, match=message):
+            Sim(n_worlds=2, control="rotor_vel").step()
+    finally:
+        native.compiler.cache_clear()
+
+
+def test_a_kernel_that_would_take_longer_than_the_limit_is_refused_by_its_size(
+    source, place, compilations, monkeypatch
+):
+    native.toolchain(tuple(native.command()))
+    monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "0.001")
+    monkeypatch.setattr(native, "_run", pytest.fail)
+    with pytest.raises(KernelError, match=r"a kernel of [\d,]+ lines takes .* longer than 0.001 s; use loops"):
+        native.target(source)
+    assert not list(place.iterdir())
+
+
+def test_lines_that_select_count_for_more(place, monkeypatch):
+    """They take the compiler longer, so fewer of them are refused before it is begun."""
+
+    def begin(*args):
+        raise LookupError
+
+    monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "1")
+    monkeypatch.setattr(native, "_run", begin)
+    for line, n_lines, error in (
+        ("x = mul_(a, b);", 9_999, LookupError),
+        ("x = max_(a, b);", 4_000, LookupError),
+        ("x = max_(a, b);", 4_200, KernelError),
+        ("x = select_n_(a, b, c);", 4_200, KernelError),
+    ):
+        with pytest.raises(error):
+            native._compile(["g++"], "key", f"{line}\n" * n_lines, place)
+
+
+def test_a_compiler_is_a_command_with_options(source, place, monkeypatch):
+    native.compiler.cache_clear()
+    monkeypatch.setenv("CXX", "g++ -DOTHER")
+    try:
+        assert native.command()[1] == "-DOTHER"
+        assert native.target(source)
+    finally:
+        native.compiler.cache_clear()
+
+
+COMPILE = """
+import sys
+from pathlib import Path
+from crazysim.engine.backends import native
+slow = "constexpr long f() { long s = 0; for (long i = 0; i < 1000000000; i++) s += i; return s; }"
+slow += "constexpr long x = f();"
+flags = ["-fconstexpr-ops-limit=1000000000000", "-fconstexpr-loop-limit=2000000000"]
+source = "int x;" if sys.argv[2] == "quick" else slow
+compile = lambda key: native._compile([*native.command(), *flags], key, source, Path(sys.argv[1]))
+if sys.argv[2] == "threads":
+    with native.compiling_threads(2) as pool:
+        list(pool.map(compile, "abcd"))
+else:
+    compile("a")
+"""
+
+
+def compile_in_another_process(folder, speed):
+    """Start a process that compiles a kernel into a folder."""
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "TMPDIR": str(folder)}
+    place = folder / "cache"
+    place.mkdir(exist_ok=True)
+    return subprocess.Popen([sys.executable, "-c", COMPILE, place, speed], env=environment, stderr=subprocess.DEVNULL)
+
+
+def compilers(folder):
+    """Return the commands of running compilers whose files are in a folder."""
+    done = subprocess.run(["ps", "-eww", "-o", "args"], capture_output=True, text=True, check=True)
+    return [line for line in done.stdout.splitlines() if str(folder) in line and "kernel.cpp" in line]
+
+
+@pytest.mark.parametrize(
+    ("end", "where"),
+    [(signal.SIGKILL, "threads"), (signal.SIGTERM, "slow"), (signal.SIGINT, "slow"), (signal.SIGINT, "threads")],
+)
+def test_compilers_end_with_their_process(tmp_path, end, where):
+    with compile_in_another_process(tmp_path, where) as process:
+        try:
+            wait_for(lambda: len(compilers(tmp_path)) >= 3)  # the script, the driver and the compiler
+            process.send_signal(end)
+            process.wait(60)
+        finally:
+            process.kill()
+    wait_for(lambda: not compilers(tmp_path))
+    assert compile_in_another_process(tmp_path, "quick").wait(60) == 0
+    assert [path.suffix for path in (tmp_path / "cache").iterdir()] == [".so"]
+    assert [path.name for path in tmp_path.iterdir()] == ["cache"]
 
 
 FLY = """
@@ -208,7 +329,7 @@ def test_two_machines_share_a_home(tmp_path):
     """
     other = tmp_path / "cpuinfo"
     other.write_text("flags : none of the first machine's\n")
-    swap = f"import pathlib, crazysim.engine.native as n; n.CPU_INFO = pathlib.Path({str(other)!r})\n"
+    swap = f"import pathlib, crazysim.engine.backends.native as n; n.CPU_INFO = pathlib.Path({str(other)!r})\n"
     speeds, files = [], []
     for begin in ("", swap, ""):
         done = subprocess.run(

@@ -9,13 +9,17 @@ import pytest
 from cases import shared_sim
 
 from crazysim.core.stage import as_stages, stage
-from crazysim.engine import interpret, passes
-from crazysim.engine.ir import Builder, Operation, Value
-from crazysim.engine.layout import as_rows, pack_shared
-from crazysim.engine.lower_stages import lower_stages
-from crazysim.engine.program import Leaf, Program, Segment
-from crazysim.engine.verify import VerificationError, verify
+from crazysim.engine.backends import interpret
+from crazysim.engine.ir.blocks import Builder, Operation, Value
+from crazysim.engine.ir.program import Leaf, Program, Segment
+from crazysim.engine.ir.verify import VerificationError, verify
+from crazysim.engine.lowering.stages import lower_stages
+from crazysim.engine.optimise import apply
+from crazysim.engine.passes import schedule
+from crazysim.engine.passes.layout import as_rows, pack_shared
 from crazysim.jaxcompat import is_key
+
+pytestmark = pytest.mark.fast
 
 N_WORLDS = 5
 F32 = np.float32
@@ -63,7 +67,7 @@ def pipeline(request):
 def test_fusing_changes_no_number(pipeline):
     """Bit by bit: the same operations in the same order."""
     program, numbers = pipeline
-    fused = verify(passes.fuse(program))
+    fused = verify(schedule.fuse(program))
     assert len(fused.segments) == 1 < len(program.segments)
     assert fused.segments[0].stages == tuple(s.stages[0] for s in program.segments)
     assert fused.segments[0].n_operations <= sum(s.n_operations for s in program.segments)
@@ -76,8 +80,8 @@ def test_fusing_changes_no_number(pipeline):
 def test_hoisting_takes_work_out_of_the_loop(pipeline):
     """Equal to the rounding of a product with an inverse instead of a division."""
     program, numbers = pipeline
-    fused = passes.fuse(program)
-    hoisted = verify(passes.hoist(fused))
+    fused = schedule.fuse(program)
+    hoisted = verify(schedule.hoist(fused))
     (before,), (after,) = fused.segments, hoisted.segments
     assert after.hoisted.outputs
     assert after.n_operations < before.n_operations
@@ -90,12 +94,12 @@ def test_hoisting_takes_work_out_of_the_loop(pipeline):
 
 def test_barriers_separate_runs_of_operations_and_change_no_number(pipeline):
     program, numbers = pipeline
-    fused = passes.fuse(program)
-    separated = verify(passes.separate(fused))
+    fused = schedule.fuse(program)
+    separated = verify(schedule.separate(fused))
     (before,), (after,) = fused.segments, separated.segments
     names = [op.name for op in after.block.operations]
     runs = "".join("|" if name == "barrier" else "." for name in names).split("|")
-    assert max(map(len, runs)) == passes.SPAN
+    assert max(map(len, runs)) == schedule.SPAN
     assert [name for name in names if name != "barrier"] == [
         op.name for op in before.block.operations if op.name != "barrier"
     ]
@@ -106,7 +110,7 @@ def test_barriers_separate_runs_of_operations_and_change_no_number(pipeline):
 
 def test_packing_moves_shared_numbers_into_one_leaf(pipeline):
     program, numbers = pipeline
-    fused = passes.fuse(program)
+    fused = schedule.fuse(program)
     packed = verify(pack_shared(fused))
     new = len(program.leaves)
     assert packed.leaves[new].shape == (sum(program.leaves[i].size for i in packed.packed),)
@@ -119,7 +123,7 @@ def test_packing_moves_shared_numbers_into_one_leaf(pipeline):
 
 def test_rows_hold_the_numbers_of_the_leaves_that_are_written(pipeline):
     program, numbers = pipeline
-    fused = passes.fuse(program)
+    fused = schedule.fuse(program)
     stored = verify(as_rows(fused, lambda written: written))
     rows = [leaf for leaf in stored.leaves if leaf.rows_of]
     assert sorted(i for leaf in rows for i in leaf.rows_of) == fused.written
@@ -154,7 +158,7 @@ def op(name):
 
 def test_what_one_stage_writes_the_next_reads_as_a_value():
     program = Program(LEAVES, 1, (segment("a", [X], [Y], op("exp")), segment("b", [Y], [Z], op("neg"))))
-    (fused,) = verify(passes.fuse(program)).segments
+    (fused,) = verify(schedule.fuse(program)).segments
     assert fused.reads == (X,)
     assert set(fused.writes) == {Y, Z}
     assert [x.name for x in fused.block.operations] == ["exp", "barrier", "neg", "barrier"]
@@ -177,8 +181,8 @@ def test_stages_of_the_same_ticks_are_joined(last):
     """The second reads what the first wrote, and may write it again; the numbers where nothing ticks stay."""
     half = guarded("half", [SHARED], Y, lambda b, x: b.add("mul", (x, np.float32(0.5)), np.float32))
     sine = guarded("sine", [Y, SHARED], last, lambda b, y, x: b.add("add", (b.add("sin", (y,), F32), x), F32))
-    fused = passes.fuse(Program(LEAVES, 1, (half, sine)))
-    joined = verify(passes.join_ticks(fused))
+    fused = schedule.fuse(Program(LEAVES, 1, (half, sine)))
+    joined = verify(schedule.join_ticks(fused))
     assert [op.name for op in fused.segments[0].block.operations].count("when") == 2
     assert [op.name for op in joined.segments[0].block.operations].count("when") == 1
     x = np.array([-1, 1, 0, 2, -3], np.float32)
@@ -191,7 +195,7 @@ def test_stages_of_the_same_ticks_are_joined(last):
 def test_constants_pass_from_stage_to_stage_of_the_same_ticks():
     zero = guarded("zero", [], Y, lambda b: np.float32(0))
     cosine = guarded("cosine", [Y], Z, lambda b, y: b.add("cos", (y,), F32))
-    joined = passes.join_ticks(passes.fuse(Program(LEAVES, 1, (zero, cosine))))
+    joined = schedule.join_ticks(schedule.fuse(Program(LEAVES, 1, (zero, cosine))))
     assert "cos" not in {op.name for op in joined.segments[0].block.walk()}
 
 
@@ -199,14 +203,14 @@ def test_stages_of_other_ticks_are_not_joined():
     first = guarded("first", [], Y, lambda b: np.float32(1))
     between = segment("between", [Y], [X], op("neg"))
     second = guarded("second", [Y], Z, lambda b, y: b.add("sin", (y,), F32))
-    joined = passes.join_ticks(passes.fuse(Program(LEAVES, 1, (first, between, second))))
+    joined = schedule.join_ticks(schedule.fuse(Program(LEAVES, 1, (first, between, second))))
     assert [op.name for op in joined.segments[0].block.operations].count("when") == 2
 
 
 def test_phases_and_scopes_are_not_joined():
     stages = [segment("a", [X], [Y], op("exp"), phase="first"), segment("b", [Y], [Z], op("neg")),
               segment("c", [Z], [X], op("exp"), scope="world"), segment("d", [X], [Y], op("exp"))]  # fmt: skip
-    assert len(passes.fuse(Program(LEAVES, 1, tuple(stages))).segments) == 4
+    assert len(schedule.fuse(Program(LEAVES, 1, tuple(stages))).segments) == 4
 
 
 def test_only_what_never_changes_is_hoisted():
@@ -215,12 +219,12 @@ def test_only_what_never_changes_is_hoisted():
         return [b.add("div", (product, b.add("add", (shared, np.float32(1)), np.float32)), np.float32)]
 
     program = Program(LEAVES, 1, (segment("a", [X, SHARED], [X], body),))
-    (after,) = verify(passes.hoist(program)).segments
+    (after,) = verify(schedule.hoist(program)).segments
     assert [x.name for x in after.hoisted.operations] == ["exp", "add", "div"]
     assert [x.name for x in after.block.operations] == ["exp", "mul", "mul"]
     numbers = {X: np.full(N_WORLDS, 0.5, np.float32), SHARED: np.float32(2.0)}
     np.testing.assert_allclose(
-        run(program, numbers, 1)[X], run(verify(passes.hoist(program)), numbers, 1)[X], rtol=3e-7
+        run(program, numbers, 1)[X], run(verify(schedule.hoist(program)), numbers, 1)[X], rtol=3e-7
     )
 
 
@@ -233,17 +237,17 @@ def test_the_inverse_of_a_number_is_computed_once():
         return [again, quotients[1], quotients[2]]
 
     program = Program(LEAVES, 1, (segment("a", [X, SHARED], [X, Y, Z], body),))
-    (after,) = verify(passes.hoist(program)).segments
+    (after,) = verify(schedule.hoist(program)).segments
     assert [x.name for x in after.hoisted.operations] == ["div"]
     assert [x.name for x in after.block.operations] == ["mul"] * 4
     numbers = {X: np.full(N_WORLDS, 3.0, np.float32), SHARED: np.float32(2.0)}
-    found = run(passes.hoist(program), numbers, 1)
+    found = run(schedule.hoist(program), numbers, 1)
     assert [found[slot][0] for slot in (X, Y, Z)] == [0.75, np.inf, -np.inf]
 
 
 def test_what_is_cheap_is_computed_again_instead_of_kept():
     program = Program(LEAVES, 1, (segment("a", [X, SHARED], [X], lambda b, x, s: op("mul")(b, x, *op("neg")(b, s))),))
-    assert passes.hoist(program).segments == program.segments
+    assert schedule.hoist(program).segments == program.segments
 
 
 # Verification -------------------------------------------------------------------------------------------------------
@@ -316,7 +320,7 @@ def test_verification_finds_phases_out_of_order():
 def test_every_pass_is_verified_if_that_is_asked_for(monkeypatch):
     monkeypatch.setenv("CRAZYSIM_VERIFY", "1")
     with pytest.raises(VerificationError):
-        passes.apply(Program(LEAVES, 1, (WELL_FORMED,)), [lambda program: broken(writes=(Y, Z))])
+        apply(Program(LEAVES, 1, (WELL_FORMED,)), [lambda program: broken(writes=(Y, Z))])
 
 
 # Stages to programs -------------------------------------------------------------------------------------------------

@@ -14,10 +14,14 @@ from cases import shared_sim
 from crazysim import ConfigError, Sim
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.core.stage import Stage, stage
-from crazysim.engine import Step, explain, kernel, lanes, native, tracing
-from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.lower import RULES
+from crazysim.engine import Step, explain
+from crazysim.engine.backends import lanes, native
+from crazysim.engine.lowering import tracing
+from crazysim.engine.lowering.jaxprs import RULES
 from crazysim.errors import EngineWarning
+from crazysim.pytree import PyTree, leaf
+
+pytestmark = pytest.mark.fast
 
 needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
 
@@ -175,6 +179,7 @@ def use_compiler(monkeypatch, folder, script):
     ('while [ "$1" != -o ]; do shift; done 2>/dev/null; echo junk > "$2"; exit 0', "cannot be loaded"),
 ])  # fmt: skip
 def test_a_compiler_that_fails_costs_speed_and_says_so(sim, monkeypatch, tmp_path, script, words):
+    monkeypatch.delenv("CXX", raising=False)  # a compiler that is named must accept its options
     use_compiler(monkeypatch, tmp_path, f'case "$*" in *fsyntax-only*) exit 0;; esac; {script}')
     step = Step(pipeline(sim, sway))
     with pytest.warns(EngineWarning, match=re.escape(words)) as caught:
@@ -214,14 +219,51 @@ def runs(pid):
         return False
 
 
-@needs_compiler
-def test_an_operation_without_source_runs_on_lanes(sim, monkeypatch):
-    def refuse(program, target):
-        raise UnsupportedError("operation 'zeta' has no source")
+class Bytes(PyTree):
+    """Small integers."""
 
-    monkeypatch.setattr(kernel, "write", refuse)
-    with pytest.warns(EngineWarning, match="operation 'zeta' has no source"):
-        assert Step(sim.step_pipeline).plan(sim.data).engine == "lanes"
+    counts: jax.Array = leaf("drone", 1)
+    names: jax.Array = leaf("drone")
+
+
+@stage("drone")
+def count(data):
+    """Count with numbers that overflow."""
+    record = data.plugins["bytes"]
+    counts = record.counts + record.counts.dtype.type(100)
+    return data.replace(plugins={"bytes": record.replace(counts=counts)})
+
+
+@stage("drone")
+def label(data):
+    """Write a number without an operation."""
+    record = data.plugins["bytes"]
+    return data.replace(plugins={"bytes": record.replace(names=jnp.asarray(7, record.names.dtype))})
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.uint8])
+@pytest.mark.parametrize("writes", [count, label])
+def test_small_integers_run_on_lanes_and_kernels_refuse_them_by_the_stage(sim, dtype, writes):
+    record = Bytes(jnp.full((3, 2, 2), 90, dtype), jnp.zeros((3, 2), dtype))
+    data = sim.data.replace(plugins={"bytes": record})
+    stages = {"sway": sway, writes.__name__: writes}
+    found = {
+        engine: Step(stages, engine)(data, jnp.int32(2)).plugins["bytes"] for engine in ("plain", "lanes", "interpret")
+    }
+    for after in found.values():
+        assert after.counts.dtype == after.names.dtype == dtype
+        np.testing.assert_array_equal(
+            after.counts, np.full((3, 2, 2), (290 if writes is count else 90) % 256).astype(dtype)
+        )
+        np.testing.assert_array_equal(after.names, 0 if writes is count else 7)
+    if native.compiler() is not None:
+        name = np.dtype(dtype).name
+        with pytest.raises(
+            ConfigError, match=rf"'fused' cannot run .* {name}.*\(stage '{writes.__name__}', jax.*Use 'lanes'"
+        ):
+            Step(stages, "fused").plan(data)
+        with pytest.warns(EngineWarning, match=f"stage '{writes.__name__}' has no kernel: .*{name}"):
+            assert Step(stages).plan(data).engine == "lanes"
 
 
 @needs_compiler

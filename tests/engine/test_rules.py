@@ -8,13 +8,17 @@ from blocks import program_of
 from rule_cases import CASES, N_LANES, RANDOM, ULP, agree, function, given, of_all, of_one
 
 from crazysim import Sim
+from crazysim.core.sharding import Location
 from crazysim.core.stage import as_stages, stage
-from crazysim.engine import Step, interpret, native
-from crazysim.engine.fused import build
-from crazysim.engine.lower import lower_function
-from crazysim.engine.lower_stages import lower_stages
-from crazysim.engine.verify import verify_block
+from crazysim.engine import Step
+from crazysim.engine.backends import interpret, native
+from crazysim.engine.backends.fused import build
+from crazysim.engine.ir.verify import verify_block
+from crazysim.engine.lowering.jaxprs import lower_function
+from crazysim.engine.lowering.stages import lower_stages
 from crazysim.errors import EngineWarning
+
+pytestmark = pytest.mark.fast
 
 
 def lanes_of(g):
@@ -46,7 +50,7 @@ def test_loops_branches_and_random_numbers_run_in_every_engine(engine):
     block = lower_function(all_of_them, of_one(g))
     program, leaves = program_of(block, lanes_of(g), N_LANES)
     expected = interpret.run(block, lanes_of(g), (N_LANES,))
-    run = build(program, "cpu") if engine == "fused" else lambda x, n: interpret.lanes.steps(program, x, n)
+    run = build(program, Location("cpu")) if engine == "fused" else lambda x, n: interpret.lanes.steps(program, x, n)
     written, _ = jax.jit(lambda leaves: run(leaves, 1))(leaves)
     for x, y in zip(written, expected, strict=True):
         agree(np.asarray(x).reshape(-1), y, engine)
@@ -95,10 +99,10 @@ def test_a_refused_stage_runs_as_it_is_written(data):
 
 
 def test_a_parameter_that_a_version_of_jax_does_not_have_makes_a_primitive_unsupported(monkeypatch):
-    from crazysim.engine import lower
     from crazysim.engine.errors import UnsupportedError
+    from crazysim.engine.lowering import jaxprs
 
-    monkeypatch.setitem(lower.RULES, "tanh", lambda ctx, eqn, args: [eqn.params["renamed"]])
+    monkeypatch.setitem(jaxprs.RULES, "tanh", lambda ctx, eqn, args: [eqn.params["renamed"]])
     with pytest.raises(UnsupportedError, match=r"primitive 'tanh'.*'renamed'"):
         lower_function(jnp.tanh, jax.ShapeDtypeStruct((2,), np.float32))
 
@@ -128,7 +132,7 @@ def test_powers_and_angles_of_special_numbers():
     one = jax.ShapeDtypeStruct((), np.float32)
     block = lower_function(lambda y, x, z: [jnp.arctan2(y, x), jnp.exp(z), jnp.arctan2(z, 2.0)], one, one, one)
     program, leaves = program_of(block, [y, x, z], len(y))
-    found, _ = jax.jit(lambda leaves: build(program, "cpu")(leaves, 1))(leaves)
+    found, _ = jax.jit(lambda leaves: build(program, Location("cpu"))(leaves, 1))(leaves)
     with np.errstate(all="ignore"):
         expected = [f.astype(np.float32) for f in (np.arctan2(*map(np.float64, (y, x))), np.exp(np.float64(z)),
                                                    np.arctan2(np.float64(z), 2.0))]  # fmt: skip

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from crazysim.engine import ops
-from crazysim.engine.ir import Builder
-from crazysim.engine.simplify import known_zero, simplify
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.algebra import known_zero, simplify
+from crazysim.engine.ir.blocks import Builder
+
+pytestmark = pytest.mark.fast
 
 F = np.float32
 

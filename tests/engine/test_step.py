@@ -16,8 +16,9 @@ from crazysim.core.random import drone_key
 from crazysim.core.sharding import put
 from crazysim.core.stage import stage
 from crazysim.dynamics import Dynamics
-from crazysim.engine import Step, cuda, explain, kernel, lanes, native, rollout
-from crazysim.engine.lower_stages import MAX_UNROLLED_DRONES
+from crazysim.engine import Step, explain, rollout
+from crazysim.engine.backends import cuda, kernel, lanes, native
+from crazysim.engine.lowering.stages import MAX_UNROLLED_DRONES
 from crazysim.pytree import PyTree, leaf
 
 FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
@@ -393,6 +394,40 @@ def test_vmap_over_commands_and_parameters_is_a_loop(engine):
                 np.testing.assert_allclose(getattr(many, name)[k], getattr(single, name), rtol=1e-5, atol=1e-6)
 
 
+# Leaves that share an array ------------------------------------------------------------------------------------------
+
+
+class Twins(PyTree):
+    """Leaves that hold arrays of other leaves."""
+
+    flags: jax.Array = leaf("world")
+    speeds: jax.Array = leaf("drone", 1)
+    synced: jax.Array = leaf("shared")
+
+
+@stage("drone")
+def speed_up(data):
+    """Make the speeds of a plugin infinite, which are no state."""
+    twins = data.plugins["twins"]
+    return data.replace(plugins={"twins": twins.replace(speeds=twins.speeds + jnp.inf)})
+
+
+@pytest.mark.parametrize("engine", ["plain", "interpret", *FAST])
+def test_leaves_that_share_an_array_are_not_confused(engine):
+    """The flags of worlds and of the scene are found by their paths, and so are states, whose NaN flag a world."""
+    sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
+    data = with_states(sim.data, pos=np.array([0.0, np.nan, 0.0])[:, None, None])
+    data = data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True)))
+    twins = Twins(flags=data.core.nonfinite, speeds=data.states.vel, synced=data.core.mjx_synced)
+    after = Step({"speed_up": speed_up}, engine)(data.replace(plugins={"twins": twins}), jnp.int32(1))
+    np.testing.assert_array_equal(after.core.nonfinite, [[False], [True], [False]])
+    assert not after.core.mjx_synced
+    assert not np.any(after.plugins["twins"].flags)
+    assert np.all(np.isinf(after.plugins["twins"].speeds))
+    assert after.plugins["twins"].synced
+    np.testing.assert_array_equal(after.states.vel, data.states.vel)
+
+
 # Rollouts ------------------------------------------------------------------------------------------------------------
 
 
@@ -420,6 +455,14 @@ def test_a_rollout_is_the_loop_it_stands_for():
     assert again.shape == (2, 3, 2, 3)
 
 
+def test_a_rollout_returns_its_last_command_where_leaves_share_an_array():
+    sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
+    attitude = sim.data.controls.attitude.replace(cmd=sim.data.controls.attitude.staged_cmd)
+    data = sim.data.replace(controls=sim.data.controls.replace(attitude=attitude))
+    after, _ = rollout(sim.step_fn, data, hold, jnp.float32(0.3), 1, 5)
+    np.testing.assert_array_equal(after.controls.attitude.staged_cmd, hold(jnp.float32(0.3), data))
+
+
 def test_a_rollout_has_a_gradient():
     sim = Sim(n_worlds=1, n_drones=1, dynamics="so_rpy", control="attitude", attitude_freq=100)
     data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + 0.5))
@@ -436,8 +479,8 @@ def test_a_rollout_has_a_gradient():
 
 
 @pytest.mark.parametrize("settings, words", [
-    ({"n_control_steps": 0}, "n_control_steps must be a positive int, not 0"),
-    ({"n_control_steps": 2.0}, "n_control_steps must be a positive int, not 2.0"),
+    ({"n_control_steps": 0}, "n_control_steps is 0; it must be a positive whole number"),
+    ({"n_control_steps": 2.0}, "n_control_steps is 2.0; it must be a positive whole number"),
     ({"n_control_steps": 10, "every": 3}, "every=3 does not divide n_control_steps=10"),
 ])  # fmt: skip
 def test_law_09_rollouts_refuse_what_cannot_be(settings, words):
@@ -466,7 +509,7 @@ def test_auto_takes_the_kernel_and_says_so():
 
 
 def test_without_a_compiler_auto_takes_lanes_and_says_why(monkeypatch):
-    monkeypatch.setattr("crazysim.engine.native.compiler", lambda: None)
+    monkeypatch.setattr("crazysim.engine.backends.native.compiler", lambda: None)
     sim = Sim(control="rotor_vel")
     assert sim.explain().startswith("engine: lanes (no C++ compiler was found")
     sim.step(2)

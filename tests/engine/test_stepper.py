@@ -7,8 +7,10 @@ import pytest
 from cases import shared_sim, trees_equal
 from jax.sharding import NamedSharding, PartitionSpec
 
+from crazysim import Sim
+from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
-from crazysim.engine import Stepper, flat
+from crazysim.engine import Stepper, flat, step
 from crazysim.engine.flat import PackCache, ZerosCache
 
 
@@ -46,9 +48,69 @@ def test_steps_in_a_row_flatten_once(stepper, monkeypatch):
     assert stepper.data.core.steps[0, 0] == 4
     stepper.advance(1)  # reading takes nothing away
     assert len(flattened) == 1
-    stepper.data = stepper.data
+    stepper.assign(stepper.data)  # nor does an assignment of what was read
+    stepper.advance(1)
+    assert len(flattened) == 1
+    stepper.assign(stepper.data.replace())
     stepper.advance(1)
     assert len(flattened) == 2
+
+
+LEVELS = [
+    {"control": "rotor_vel"},
+    {"control": "force_torque"},
+    {"control": "attitude"},
+    {"control": "state"},
+    {"control": "state", "controller": "geometric"},
+]
+
+
+@pytest.mark.parametrize("settings", LEVELS, ids=lambda s: "-".join(s.values()))
+def test_a_command_is_staged_in_flattened_data(settings, monkeypatch):
+    """It is what the pure function stages, and neither flattens nor builds a record; what was read stays as it was."""
+    sim = Sim(3, 2, **settings)
+    shape = F.command_shape(sim.data, sim.control)
+    command = np.random.default_rng(0).uniform(0.1, 0.4, shape).astype(np.float32)
+    send = getattr(F, f"{sim.control.value}_control")
+    sim.step(2)
+    before, kept = sim.data, [np.array(x) for x in jax.tree.leaves(sim.data.controls)]
+    made = []
+    monkeypatch.setattr(sim.step_fn, "flatten", None)
+    monkeypatch.setattr(step.FlatData, "data", lambda self, real=step.FlatData.data: made.append(1) or real(self))
+    getattr(sim, f"{sim.control.value}_control")(command)
+    n_made = len(made)
+    getattr(sim, f"{sim.control.value}_control")(command)
+    assert len(made) == n_made <= 1  # the first command reads shapes
+    assert trees_equal(sim.data, send(before, command))
+    sim.step(3)
+    monkeypatch.undo()
+    assert trees_equal(sim.data, sim.step_fn(send(before, command), jnp.int32(3)))
+    for x, y in zip(jax.tree.leaves(before.controls), kept, strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_a_feedforward_is_staged_in_flattened_data():
+    sim = Sim(control="state", controller="geometric")
+    sim.step()
+    before = sim.data
+    command, feedforward = np.zeros((1, 1, 16)), np.arange(8.0).reshape(1, 1, 8)
+    command[..., 12] = 1.0
+    sim.state_control(command, feedforward=feedforward)
+    assert trees_equal(sim.data, F.state_control(before, command, feedforward=feedforward))
+    np.testing.assert_array_equal(sim.data.controls.state.staged_feedforward, feedforward)
+
+
+def test_commands_to_flattened_data_are_checked_and_placed():
+    for device in jax.devices("cpu")[:2]:
+        sim = Sim(2, control="attitude", device=device)
+        sim.step()
+        for _ in range(2):
+            sim.attitude_control(np.full((2, 1, 4), 0.3))
+            assert sim.data.controls.attitude.staged_cmd.devices() == {device}
+        with pytest.raises(ValueError, match=r"expected \(2, 1, 4\)"):
+            sim.attitude_control(np.zeros((1, 1, 4)))
+        with pytest.raises(ValueError, match="takes 'attitude' commands"):
+            sim.body_rate_control(np.zeros((2, 1, 4)))
 
 
 def test_a_new_step_takes_over_the_data(stepper, sim):
@@ -69,6 +131,18 @@ def test_data_from_outside_is_placed_and_counts_as_unsynced(stepper):
     flag = stepper.data.core.mjx_synced
     stepper.assign(stepper.data.replace(states=states))
     assert stepper.data.core.mjx_synced is flag  # known to be false: nothing is transferred
+
+
+def test_commands_to_data_that_was_spread_since_are_spread():
+    sim = Sim(2, control="attitude")
+    command = np.full((2, 1, 4), 0.3)
+    for mesh in (None, world_mesh(jax.devices("cpu")[:2])):
+        if mesh is not None:
+            sim.shard(mesh)
+        sim.step()
+        sim.attitude_control(command)
+        assert sim.data.controls.attitude.staged_cmd.sharding == sim.data.states.pos.sharding
+        np.testing.assert_array_equal(sim.data.controls.attitude.staged_cmd, np.float32(0.3))
 
 
 def test_packed_parameters_are_made_again_only_for_other_arrays():

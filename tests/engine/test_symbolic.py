@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from rule_cases import CASES, given, of_one, random_numbers
 
-from crazysim.engine import symbolic
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.lower import lower_function
+from crazysim.engine.lowering.jaxprs import lower_function
+from crazysim.engine.tools import symbolic
 
-pytestmark = pytest.mark.usefixtures("casadi", "x64")
+pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("casadi", "x64")]
 
 REFUSED = {
     "integers": "'and' on int32",

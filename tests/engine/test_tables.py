@@ -9,10 +9,13 @@ import pytest
 
 from crazysim import PyTree, Sim, leaf, stage
 from crazysim.core.stage import as_stages
-from crazysim.engine import Step, cuda, interpret, kernel, native
-from crazysim.engine.build import build_program
-from crazysim.engine.ir import Builder, Numbers, Operation, Value
-from crazysim.engine.verify import VerificationError, verify, verify_block
+from crazysim.engine import Step
+from crazysim.engine.backends import cuda, interpret, kernel, native
+from crazysim.engine.ir.blocks import Builder, Numbers, Operation, Value
+from crazysim.engine.ir.listing import list_program
+from crazysim.engine.ir.verify import VerificationError, verify, verify_block
+from crazysim.engine.lowering.stages import lower_stages
+from crazysim.engine.optimise import optimise
 
 ENGINES = ("lanes", "interpret", *(("fused",) if native.compiler() else ()))
 RNG = np.random.default_rng(0)
@@ -136,7 +139,7 @@ def test_every_engine_reads_what_plain_reads(engine, scope):
             return {name: read(data).plugins["tables"].out for name, read in pipeline(chosen, scope).items()}
 
         for name, expected in jax.jit(each)(data()).items():
-            program = build_program(as_stages(pipeline([name], scope)), data())
+            program = optimise(lower_stages(as_stages(pipeline([name], scope)), data()))
             verify(program)
             assert program.fused, program.unfused_stages[0].unfused
             leaves = jax.tree.leaves(data())
@@ -163,18 +166,18 @@ def _packed(program, leaves):
 
 
 def test_a_table_is_read_where_it_is_and_never_selected_from():
-    program = build_program(as_stages(pipeline(["a matrix, then a row of it"])), data())
+    program = optimise(lower_stages(as_stages(pipeline(["a matrix, then a row of it"])), data()))
     (segment,) = program.fused_segments
     names = [op.name for op in segment.block.walk()]
     assert names.count("lookup") == 4
     assert names.count("select_n") < 4
-    assert "float32[180] = plugins['tables'].numbers[:]" in str(program)
-    assert "lookup(" in str(program)
+    assert "float32[180] = plugins['tables'].numbers[:]" in list_program(program)
+    assert "lookup(" in list_program(program)
     assert not program.packed
 
 
 def test_constants_that_are_the_same_everywhere_are_no_lookups():
-    program = build_program(as_stages(pipeline(["constants"])), data())
+    program = optimise(lower_stages(as_stages(pipeline(["constants"])), data()))
     (segment,) = program.fused_segments
     names = [op.name for op in segment.block.walk()]
     assert (names.count("table"), names.count("lookup")) == (1, 3)
@@ -182,7 +185,7 @@ def test_constants_that_are_the_same_everywhere_are_no_lookups():
 
 def test_the_source_for_gpus_is_well_formed():
     """All cases in one kernel, compiled by NVRTC where there is one."""
-    program = build_program(as_stages(pipeline(IN_KERNELS)), data())
+    program = optimise(lower_stages(as_stages(pipeline(IN_KERNELS)), data()))
     text = kernel.write(program, "cuda").text
     assert "TABLE f32 t" in text
     assert text.count("lookup(p") > 20

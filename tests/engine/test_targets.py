@@ -5,10 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim.engine import cuda, fused, interpret, kernel, lanes, native, ops, source, symbolic
+from crazysim.core.sharding import Location
+from crazysim.engine.backends import cuda, fused, interpret, kernel, lanes, native, source
 from crazysim.engine.errors import UnsupportedError
-from crazysim.engine.ir import Builder
-from crazysim.engine.program import Leaf, Program, Segment
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.blocks import Builder
+from crazysim.engine.ir.program import Leaf, Program, Segment
+from crazysim.engine.tools import symbolic
 
 FLOATS = [0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 0.49999997, 1.5, 2.5, -2.5, 1e-3, 3.7, -7.2, 88.0, 1e4, 2.0**31, -(2.0**31),
           3e9, -3e9, 5e9, 1e20, 1e30, np.inf, -np.inf, np.nan]  # fmt: skip
@@ -122,7 +125,7 @@ def test_a_kernel_computes_what_the_interpreter_does(everything, expected):
     if native.compiler() is None:
         pytest.skip("no C++ compiler here")
     program, arrays = everything
-    written, _ = jax.jit(lambda leaves: fused.build(program, "cpu")(leaves, 1))(arrays)
+    written, _ = jax.jit(lambda leaves: fused.build(program, Location("cpu"))(leaves, 1))(arrays)
     check(written, expected, "fused")
 
 

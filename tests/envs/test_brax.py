@@ -11,7 +11,6 @@ from crazysim.envs import AutoReset, make
 from crazysim.envs.brax import BraxEnv
 from crazysim.envs.state import flatten
 
-pytestmark = pytest.mark.xdist_group("brax")
 N_WORLDS, N_STEPS = 3, 5
 
 

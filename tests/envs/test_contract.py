@@ -21,30 +21,20 @@ from env_cases import (
 from gymnasium.vector.utils import batch_space
 
 from crazysim.dynamics import first_principles
+from crazysim.engine.backends import cuda
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
-from crazysim.envs.env import select_states
 from crazysim.envs.fused_step import FusedEnvStep
-from crazysim.envs.phases import act, all_worlds, observe
+from crazysim.envs.phases import all_worlds
 from crazysim.envs.spawn import flying
 from crazysim.envs.state import EnvState, bare
 from crazysim.envs.tasks.hover import Hover
-from crazysim.envs.wrappers import autoreset
 from crazysim.pytree import map_batched
 
-pytestmark = [pytest.mark.steady, pytest.mark.kernels]
 N_WORLDS = 4
 N_FLYING, N_STEPS = 32, 1250
 """Worlds and environment steps of the random flight: 40,000 steps, and at least two episodes in each world."""
 ENDS = np.array([True, False, True, False])
 """Worlds whose episode is made to end in the tests of automatic resets."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled_select():
-    """Compile the choice between a state and that of a new episode, for steps that are not compiled."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(autoreset, "select_states", jax.jit(select_states))
-        yield
 
 
 @pytest.fixture(scope="module", params=entries())
@@ -139,6 +129,19 @@ def test_an_episode_begins_with_nothing_done(env, begun):
     ahead = env.step(begun, jnp.zeros_like(begun.action))
     assert not ahead.done.any(), "no episode may end before a policy could do anything about it"
     assert int(ahead.data.core.steps[0, 0]) == env.n_substeps
+
+
+def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(env, begun):
+    """Whichever device the environment was made for: JAX runs what is compiled where its arguments are."""
+    if cuda.nvrtc() is None:
+        pytest.skip("no NVRTC here; CI has it")
+    step = jax.jit(env.base.step).trace(begun, begun.action)
+    kernels = {"cpu": "crazysim_advance", "cuda": cuda.TARGET}
+    for platform in kernels:
+        text = step.lower(lowering_platforms=(platform,)).as_text()
+        assert {name: target in text for name, target in kernels.items()} == {
+            name: name == platform for name in kernels
+        }
 
 
 def test_repeated_steps_are_traced_once(env, begun):
@@ -330,11 +333,11 @@ def test_the_gradient_of_the_reward_is_finite(env, begun, flown):
     @jax.grad
     def slope(wrt, state):
         action, states = wrt
-        state, action = act(env.env, state.replace(data=state.data.replace(states=states)), action, all_worlds)
+        state, action = env.env.phases.act(state.replace(data=state.data.replace(states=states)), action, all_worlds)
         data = state.data
         for stage in env.env.stages:
             data = stage(data)
-        return observe(env.env, state.replace(data=data), action, all_worlds).reward.sum()
+        return env.env.phases.observe(state.replace(data=data), action, all_worlds).reward.sum()
 
     end = first_worlds(flown.end.replace(info={}, memory={})).replace(info=begun.info)
     for state in (begun, end):

@@ -9,17 +9,14 @@ import pytest
 
 import crazysim.envs as envs
 from crazysim.core.stage import over_worlds
-from crazysim.engine import fused
+from crazysim.engine.backends import fused
 from crazysim.engine.errors import UnsupportedError
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import AutoReset, Wrapper
-from crazysim.errors import EngineWarning
-from crazysim.pytree import CORE_NDIM_KEY
+from crazysim.errors import ConfigError, EngineWarning
+from crazysim.pytree import CORE_NDIM_KEY, PyTree, leaf
 
-pytestmark = [
-    pytest.mark.kernels,
-    pytest.mark.skipif(fused.missing("cpu") is not None, reason="there is no C++ compiler"),
-]
+pytestmark = pytest.mark.skipif(fused.missing("cpu") is not None, reason="there is no C++ compiler")
 N = 6
 
 
@@ -27,7 +24,7 @@ class AsWritten(AutoReset):
     """The same without a kernel for the whole step."""
 
     def fused_step(self, *_, **__):
-        return "it was not requested"
+        return None
 
 
 def both(env, mode="SameStep"):
@@ -86,7 +83,7 @@ def test_a_whole_step_is_the_step_as_it_is_written(name):
     make, mode = CASES[name]
     one, written = both(make(), mode)
     state = jax.jit(written.reset)(jax.random.key(0))
-    assert one.explain(state) == "a step is one kernel"
+    assert one.explain().startswith("a step is one kernel\nits physics, as in sim.explain():\nengine: fused\n")
     step, expected = jax.jit(one.step), jax.jit(written.step)
     ended = 0
     for k in range(40):
@@ -136,6 +133,62 @@ def test_a_rollout_in_rows_is_a_loop_of_steps():
     np.testing.assert_allclose(slope, expected_slope, rtol=1e-3)
 
 
+def test_a_rollout_in_rows_takes_the_actions_of_each_step_where_a_wrapper_changes_them():
+    one, written = both(envs.ActionDelay(envs.make("hover", N, seconds=0.3, control="rotor_vel"), 2))
+    start = jax.jit(one.reset)(jax.random.key(0))
+
+    def act(state, key):
+        return jax.random.uniform(key, state.action.shape, minval=-0.3, maxval=0.3)
+
+    keep = lambda s: (s.reward, s.action, s.data.states.vel)  # noqa: E731
+    fly = lambda env: jax.jit(lambda: envs.rollout(env, start, act, jax.random.key(1), 20, keep))()  # noqa: E731
+    close(fly(one), fly(written))
+
+
+class Remembered(PyTree):
+    """Memory whose leaves declare their axes."""
+
+    of_drones: jax.Array = leaf("drone")
+    of_world: jax.Array = leaf("world", 1)
+
+
+class Remembers(Wrapper):
+    """Remembers as many numbers of the world as there are drones, and one for each drone."""
+
+    def after_reset(self, state):
+        return self.remember(state, (jnp.zeros(2), Remembered(jnp.zeros(2), jnp.zeros(2))))
+
+    def after_step(self, state):
+        plain, record = self.recall(state)
+        height = state.data.states.pos[:, 2]
+        return self.remember(state, (plain + height, Remembered(record.of_drones + height, record.of_world - height)))
+
+
+class Confused(Wrapper):
+    """Returns observations of the world."""
+
+    def after_reset(self, state):
+        return state.replace(obs={"pos": state.data.states.pos[0]})
+
+    after_step = after_reset
+
+
+def test_law_02_memory_is_of_drones_where_it_is_declared_so():
+    """An axis that is as long as there are drones is not theirs."""
+    env = envs.make("hover", N, n_drones=2, control="rotor_vel")
+    one, written = both(Remembers(env), "Disabled")
+    state = jax.jit(written.reset)(jax.random.key(0))
+    fused_step = one.fused_step(state, state.action)
+    scopes = {x.name: x.scope for x in fused_step.program.leaves if ".memory" in x.name}
+    assert sorted(scopes.values()) == ["drone", "world", "world"]
+    after = jax.jit(fused_step)(state, state.action)
+    close(after, jax.jit(written.step)(state, state.action))
+    assert after.memory["Remembers"][1].of_world.shape == (N, 1, 2)
+    state = jax.eval_shape(Confused(env).reset, jax.random.key(0))
+    with pytest.raises(ConfigError, match=r"expected obs\['pos'\] of shape \(n_drones, ...\).* 2 drones, got \(3,\)"):
+        AutoReset(Confused(env)).fused_step(state, state.action)
+
+
 class Fourier(Hover):
     """Rewards by an operation that the engine does not have."""
 
@@ -173,6 +226,20 @@ def with_other_defaults(env):
     return AutoReset(envs.DroneEnv(sim, env.task))
 
 
+class Numbers(PyTree):
+    """Numbers of worlds."""
+
+    number: jax.Array = leaf("world")
+
+
+def with_the_numbers_of_worlds(env):
+    """Return an environment with a record that holds the array of ``core.world_id``."""
+    sim = envs.make("hover", N).sim
+    sim.data = sim.data.replace(plugins=sim.data.plugins | {"numbers": Numbers(sim.data.core.world_id)})
+    sim.build_default_data()
+    return AutoReset(envs.DroneEnv(sim, env.task))
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Counts:
@@ -196,31 +263,43 @@ REFUSED = {
     "the engine is 'lanes'": lambda env: AutoReset(envs.make("hover", N, engine="lanes")),
     "'own' of the reset pipeline takes all worlds at once": with_reset_stage,
     "episodes begin from different data in different worlds": with_other_defaults,
+    "different data in different worlds": with_the_numbers_of_worlds,
 }
 
 
 @pytest.mark.parametrize("why", REFUSED)
 def test_a_step_that_is_not_one_kernel_says_why_in_one_line(hover, why):
     env = REFUSED[why](hover)
-    state = jax.eval_shape(env.reset, jax.random.key(0))
-    line = env.explain(state)
+    line, engine = env.explain().split("\n")[0:3:2]
     assert line.startswith("a step is not one kernel: ")
-    assert "\n" not in line
+    assert engine.startswith("engine: ")
     assert why in line
 
 
 def test_a_step_that_the_engine_cannot_lower_warns_once_or_raises(hover):
     env = AutoReset(envs.DroneEnv(hover.sim, Fourier()))
-    state = jax.eval_shape(env.reset, jax.random.key(0))
     with pytest.warns(
         EngineWarning, match=r"environment steps run unfused: primitive .*complex64 \(stage 'observations'"
     ):
-        line = env.explain(state)
+        line = env.explain()
     assert line.startswith("a step is not one kernel: primitive ")
-    assert env.explain(state) == line  # without another warning, which would be an error here
+    assert env.explain() == line  # without another warning, which would be an error here
     strict = AutoReset(envs.DroneEnv(envs.make("hover", N, strict=True).sim, Fourier()))
     with pytest.raises(UnsupportedError, match="complex64"):
-        strict.explain(state)
+        strict.explain()
+
+
+def test_every_environment_explains_its_step(hover):
+    """One without automatic resets is not one kernel; those of other libraries have it inside."""
+    assert hover.explain().startswith("a step is not one kernel: new episodes do not begin within it; see AutoReset\n")
+    for adapted in (
+        envs.DroneVectorEnv(hover),
+        envs.BraxEnv(hover),
+        envs.DroneSingleEnv(envs.make("hover")),
+        envs.make_parallel("swarm", n_drones=2),
+    ):
+        assert "engine: fused" in adapted.explain()
+    assert envs.DroneVectorEnv(hover).explain().startswith("a step is one kernel\n")
 
 
 def test_a_task_of_all_worlds_is_rewarded_across_them(hover):
@@ -270,6 +349,6 @@ def test_a_bug_in_a_task_is_not_taken_for_a_step_that_cannot_be_fused(hover):
     env = AutoReset(envs.DroneEnv(hover.sim, Buggy()))
     state = jax.eval_shape(env.reset, jax.random.key(0))
     with pytest.raises(TypeError, match="NoneType"):
-        env.explain(state)
+        env.explain()
     with pytest.raises(TypeError, match="NoneType"):
         jax.eval_shape(env.step, state, state.action)

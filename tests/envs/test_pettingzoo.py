@@ -15,8 +15,6 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from crazysim.envs.pettingzoo import DroneParallelEnv, make_parallel
 
-pytestmark = pytest.mark.xdist_group("pettingzoo")
-
 
 @pytest.fixture(scope="module")
 def functional():

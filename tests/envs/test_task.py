@@ -15,6 +15,8 @@ from crazysim.envs.task import total
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.tasks.land import Land
 
+pytestmark = pytest.mark.fast
+
 
 def test_making_a_task_changes_no_simulation_and_installing_it_does():
     sim = Sim(n_worlds=2, control="attitude")
@@ -138,6 +140,8 @@ WRONG = {
                r"reward term 'bad' of shape \(n_drones,\) = \(2,\), got shape \(2, 1\)"),
     "one for all": ("rewards", lambda s, d, a, b: {"any": jnp.sum(d.states.pos)},
                     r"reward term 'any' of shape \(n_drones,\) = \(2,\), got shape \(\) .*jnp.full"),
+    "info of the world": ("info", lambda s, d: {"wind": d.states.pos[0]},
+                          r"info 'wind' of shape \(\) or \(n_drones, ...\) = \(2, ...\), got shape \(3,\)"),
     "of actions": ("rewards", lambda s, d, a, b: {"a": a}, r"reward term 'a' of .* got shape \(2, 4\)"),
     "error": ("error", lambda s, d: d.states.pos, r"error of shape \(n_drones,\) = \(2,\), got shape \(2, 3\)"),
     "ends for each": ("terminated", lambda s, d: d.states.pos[:, 2] < 0,

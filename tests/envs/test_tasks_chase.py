@@ -45,7 +45,7 @@ def step(env):
 @pytest.fixture(scope="module")
 def place(env):
     """Return the function from data to place and velocity of the roof."""
-    return jax.jit(over_worlds(env.task.place))
+    return jax.jit(over_worlds(env.task.target_motion))
 
 
 @pytest.fixture(scope="module")

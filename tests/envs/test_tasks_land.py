@@ -10,7 +10,7 @@ from crazysim import ConfigError, Sim
 from crazysim.core.stage import over_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks.land import Land, pad_of
-from crazysim.train.evaluate import evaluate
+from crazysim.train.evaluation import evaluate
 
 N_SPAWNS, SPEED = 2048, 0.5
 CONTACT = 0.066

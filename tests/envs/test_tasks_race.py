@@ -13,7 +13,7 @@ from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks import race as task
 from crazysim.envs.tasks import race_rules as rules
 from crazysim.envs.tracks import Track, ranks
-from crazysim.train.evaluate import evaluate
+from crazysim.train.evaluation import evaluate
 
 TRACK = Track()
 CASES = {

@@ -10,7 +10,7 @@ from crazysim.core.stage import over_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks.transport import Transport, gate_axis, is_behind
 from crazysim.pytree import PyTree
-from crazysim.train.evaluate import evaluate
+from crazysim.train.evaluation import evaluate
 
 N_SPAWNS, LENGTH = 512, 0.3
 GATE, GOAL = np.array([0.0, 0.0, 1.3], np.float32), np.array([1.4, 0.0, 1.2], np.float32)

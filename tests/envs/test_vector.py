@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import trees_equal
+from gymnasium.utils.env_checker import check_env
 
 from crazysim import ConfigError
 from crazysim.envs import AutoReset, DroneVectorEnv, make
+from crazysim.envs.single import DroneSingleEnv
 from crazysim.envs.vector import make_vector
 
-pytestmark = pytest.mark.xdist_group("env hover")
 MODES = ("NextStep", "SameStep", "Disabled")
 N_STEPS = 5
 """Length of an episode, steps."""
@@ -55,6 +56,24 @@ def test_an_episode_takes_its_time_in_every_mode(env):
     expected[N_STEPS - 1] = True
     np.testing.assert_array_equal(ends, expected)
     assert not np.stack([terminated for _, _, terminated, _, _ in results]).any()
+
+
+def test_episodes_stay_on_the_device_that_was_asked_for():
+    """Compiled or not, where the key and the actions are on JAX's default device; a moved state stays there."""
+    default, device = jax.devices()
+    env = make("hover", 3, device="cpu:1")
+    state = jax.jit(env.reset)(jax.random.key(0))
+    action, both = np.zeros(state.action.shape, np.float32), np.array([True, False, True])
+    after = jax.jit(env.step)(state, jnp.asarray(action))
+    vec = gymnasium.make_vec(ID, num_envs=3, device="cpu:1")
+    begun = vec.reset(seed=0)
+    uncompiled = env.reset(jax.random.key(0)), env.step(state, action), env.restart(after, both)
+    for tree in (state, after, begun, vec.step(zeros(vec)), uncompiled, AutoReset(env).step(state, action)):
+        assert {x.device for x in jax.tree.leaves(tree)} == {device}
+    moved = env.step(jax.device_put(state, default), action)
+    assert {x.device for x in jax.tree.leaves(moved)} == {default}
+    with jax.default_device(device):
+        assert trees_equal(jax.jit(env.reset)(jax.random.key(0)), state)
 
 
 def test_next_step_gives_no_reward_for_the_step_that_begins(next_step):
@@ -233,6 +252,45 @@ def test_numpy_users_go_through_gymnasiums_wrappers(envs):
     assert all(type(x) is np.ndarray for x in (reward, terminated, truncated))
     np.testing.assert_array_equal(info["episode"]["l"], [N_STEPS] * 3)
     np.testing.assert_allclose(info["episode"]["r"], returns, rtol=1e-5)
+
+
+def test_numpy_results_may_be_written_to_as_wrappers_of_rewards_do():
+    vec = gymnasium.make_vec(ID, num_envs=2, numpy=True, seconds=1.0)
+    env = gymnasium.wrappers.vector.ClipReward(vec, -0.01, 0.01)
+    obs, info = env.reset(seed=0)
+    results = env.step(env.action_space.sample())
+    for x in jax.tree.leaves((obs, info, results)):
+        assert type(x) is np.ndarray
+        assert x.flags.writeable
+    np.testing.assert_array_less(np.abs(results[1]), 0.01 + 1e-9)
+    kept = obs["pos"].copy()
+    obs["pos"][:] = 9.0
+    np.testing.assert_array_equal(vec.unwrapped.state.obs["pos"].shape, (2, 1, 3))
+    np.testing.assert_array_equal(vec.reset(seed=0)[0]["pos"], kept)
+
+
+@pytest.mark.filterwarnings("ignore:.*infinity")
+def test_one_world_is_an_environment_that_gymnasium_accepts():
+    env = gymnasium.make(ID, seconds=1.0)
+    check_env(env.unwrapped, skip_render_check=True)
+    first = env.reset(seed=5)[0]
+    vec = gymnasium.make_vec(ID, num_envs=1, seconds=1.0, autoreset_mode="Disabled")
+    many = vec.reset(seed=5)[0]
+    truncated = False
+    for steps in range(1, 51):  # noqa: B007
+        for name, x in first.items():
+            np.testing.assert_allclose(x, np.asarray(many[name])[0], rtol=1e-5, atol=1e-5)
+        first, reward, terminated, truncated, _ = env.step(np.zeros(4, np.float32))
+        many, rewards, *_ = vec.step(np.zeros((1, 4), np.float32))
+        assert reward == pytest.approx(float(rewards[0]), rel=1e-5, abs=1e-5)
+        if terminated or truncated:
+            break
+    assert truncated
+    assert steps == 50
+    with pytest.raises(ConfigError, match="no options of reset"):
+        env.reset(options={"reset_mask": [True]})
+    with pytest.raises(ConfigError, match=r"Use gymnasium\.make_vec"):
+        DroneSingleEnv(make("hover", 2))
 
 
 def test_several_drones_have_an_axis_and_share_their_mean_reward():

@@ -27,7 +27,6 @@ from crazysim.envs.actions import hover_rotors
 from crazysim.envs.state import flatten
 from crazysim.envs.tasks.hover import Hover
 
-pytestmark = pytest.mark.xdist_group("env hover")
 FIRST = np.array([True, False, False, False])
 
 
@@ -189,12 +188,12 @@ def test_episode_statistics(env, mode):
         np.testing.assert_array_equal(after.info["episode_length"], [1, 0, 0, 0])
         again = auto.restart(after, jnp.asarray(FIRST))
         assert not again.info["episode_length"].any()
-        np.testing.assert_array_equal(again.memory["EpisodeStatistics"]["length"], [0, 4, 4, 4])
+        np.testing.assert_array_equal(again.memory["EpisodeStatistics"].length, [0, 4, 4, 4])
     else:
         assert not after.info["episode_length"].any()
         assert not after.info["episode_return"].any()
         begins = 0 if mode == "NextStep" else 1
-        np.testing.assert_array_equal(after.memory["EpisodeStatistics"]["length"], [begins, 4, 4, 4])
+        np.testing.assert_array_equal(after.memory["EpisodeStatistics"].length, [begins, 4, 4, 4])
 
 
 def test_observe_changes_what_is_seen_at_all_times(env):

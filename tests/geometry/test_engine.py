@@ -9,7 +9,8 @@ from oracle import SHAPES
 
 from crazysim import rotation
 from crazysim.core.stage import stage
-from crazysim.engine import Step, native
+from crazysim.engine import Step
+from crazysim.engine.backends import native
 from crazysim.geometry import Shape, distance, hull
 
 FAST = ("lanes", "fused") if native.compiler() else ("lanes",)

@@ -10,6 +10,8 @@ from oracle import rotations, unit
 from crazysim.geometry import manifold
 from crazysim.geometry.heightfield import FAR
 
+pytestmark = pytest.mark.fast
+
 HALF_A, HALF_B = (0.1, 0.05, 0.08), (0.12, 0.2, 0.06)
 EYE, ZERO = np.eye(3), np.zeros(3)
 N = 500
@@ -77,6 +79,24 @@ def test_a_box_on_a_box_rests_on_the_corners_of_their_overlap():
     expected = [(x, y) for x in (-0.07, 0.12) for y in (-0.03, 0.07)]
     np.testing.assert_allclose(sorted(points[:, :2].round(4).tolist()), expected, atol=1e-4)
     np.testing.assert_allclose(points[:, 2], 0.0595, atol=1e-6)
+
+
+def test_rounding_takes_no_face_for_an_edge(rng):
+    """Level faces that touch to rounding, apart and not: no point of two edges, and all points at the boxes."""
+    turned = rotations(np.array([[np.cos(x / 2), 0, 0, np.sin(x / 2)] for x in rng.uniform(0.05, 0.3, N)]))
+    world = rotations(unit(rng.normal(size=(N, 4))))
+    offset = np.stack([*rng.uniform(-0.01, 0.01, (2, N)), 0.2 + rng.uniform(-1e-7, 1e-7, N)], axis=-1)
+    first = (0.1, 0.1, 0.1), np.einsum("nij,nj->ni", world, offset), world @ turned
+    found = boxes(*first, (0.1, 0.1, 0.1), ZERO, world)
+    assert (found.gap[:, -1] == FAR).all()
+    assert (found.gap[:, :-1] < FAR).sum(axis=1).min() >= 4
+
+
+def test_points_that_do_not_exist_are_at_the_boxes_too(rng):
+    """Edges that are parallel to a face but for rounding: their ends were kilometres away, as levers of impulses."""
+    turned = rotations(unit(np.stack([np.ones(N), *rng.normal(size=(3, N)) * [[1e-8], [1.0], [1e-8]]], axis=-1)))
+    found = boxes((0.1, 0.1, 0.1), rng.uniform(-0.2, 0.2, (N, 3)), turned, (0.1, 0.08, 0.05), ZERO, EYE)
+    assert np.abs(found.point).max() < 1
 
 
 @pytest.mark.parametrize("above", [True, False])

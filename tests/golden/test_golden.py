@@ -68,6 +68,7 @@ def fly(stem, variant, as_the_peer=True):
         dynamics=dynamics,
         control=control,
         integrator=integrator,
+        controller="crazyflow",
         **rates,
     )
     if integrator == "rk4" and as_the_peer:

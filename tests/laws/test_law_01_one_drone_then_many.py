@@ -71,6 +71,7 @@ def arguments(module, function, model, rng, per_drone):
             rng.uniform(0, 2.5e4, (*BATCH, 4)) if module is not fitted else rng.uniform(0, 1, (*BATCH, 4))
         ),
         "rotor_acc": lambda: rng.normal(size=(*BATCH, 4)) * 1e4,
+        "inertia": lambda: rng.uniform(1e-5, 2e-5, (*BATCH, 3)),
         "thrust": lambda: rng.uniform(0, 0.2, (*BATCH, 4)),
         "drag_torque": lambda: rng.uniform(0, 1e-3, (*BATCH, 4)),
     }
@@ -78,6 +79,8 @@ def arguments(module, function, model, rng, per_drone):
     for name in inspect.signature(function).parameters:
         if name == "ctrl_freq":
             common[name] = 100.0
+        elif name == "dt":
+            common[name] = 0.002
         elif name == "params":
             (batched if per_drone else common)[name] = shared
         elif name in ("coefficients", "yaw_torque_sign") or hasattr(shared, name):
@@ -153,7 +156,7 @@ def test_the_cases_cover_dynamics_and_control():
     for place in CONTROLLERS.values():
         module = importlib.import_module(place.partition(":")[0])
         covered |= {module.__name__} | {getattr(x, "__module__", "") for x in vars(module).values()}
-    names = ("__init__", "core", "parameters", "protocol", "controllers", "setpoint", "switch")
+    names = ("__init__", "levels", "models", "parameters", "protocol", "controllers", "setpoint", "switch")
     for path in sources():
         name = "crazysim." + ".".join(path.relative_to(Path(crazysim.__file__).parent).with_suffix("").parts)
         assert name in covered or path.stem in names, name

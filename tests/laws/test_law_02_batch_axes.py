@@ -25,7 +25,8 @@ EQUAL, UNEQUAL = ([size for size in SIZES if (size[0] == size[1]) == same] for s
 def resized(sim, n_worlds, n_drones):
     """Return the data that ``Sim`` would build for so many worlds and drones, without another scene."""
     freqs, ids = dict.fromkeys(Control, 100), np.arange(n_drones)
-    return SimData.create(n_worlds, n_drones, sim.dynamics, sim.control, sim.airframe, sim.freq, freqs, ids, 0)
+    settings = sim.dynamics, sim.control, sim.airframe, sim.freq, freqs, ids, 0, sim.configuration.controller
+    return SimData.create(n_worlds, n_drones, *settings)
 
 
 def per_drone(data):
@@ -38,7 +39,7 @@ def per_drone(data):
     controls = data.controls
     changes = {
         level: record.replace(params=spread(record.params))
-        for level in LEVELS[:4]
+        for level in (*LEVELS[:4], "controller")
         if (record := getattr(controls, level)) is not None
     }
     return data.replace(params=spread(data.params), controls=controls.replace(**changes))
@@ -132,8 +133,9 @@ def test_a_mass_of_a_world_alone_is_refused(square, shape):
 
 def documented_shapes(record):
     """Return the shape that the docstring of every field of a record ends with, None where it has none."""
+    (base,) = record.__bases__
+    shapes = {} if base is PyTree else documented_shapes(base)
     body = ast.parse(inspect.getsource(record)).body[0].body
-    shapes = {}
     for field, text in itertools.pairwise(body):
         if isinstance(field, ast.AnnAssign):
             assert isinstance(text, ast.Expr), f"{record.__name__}.{field.target.id} has no docstring"

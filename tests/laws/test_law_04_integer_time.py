@@ -1,10 +1,13 @@
 """Law 4: time is an integer step; controllers fire when ``step % period == 0``, and their rates divide ``freq``."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from cases import PAIRS, command_in_force, hover_command, to_all, with_states
 
-from crazysim import ConfigError, Sim
+from crazysim import Cars, ConfigError, Sim
+from crazysim.trajectories import circle
 
 PERIOD = 5
 COMPILED = (("first_principles", "state"), ("so_rpy_rotor_drag", "state"))
@@ -12,7 +15,6 @@ COMPILED = (("first_principles", "state"), ("so_rpy_rotor_drag", "state"))
 RATES = {f"{level}_freq": 100 for level in ("state", "attitude", "body_rate", "force_torque")}
 
 
-@pytest.mark.kernels
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_a_command_is_taken_over_at_its_tick(dynamics, control):
     """Law 4: every step brings another command; in force is the last one that met a tick of its own world.
@@ -58,3 +60,55 @@ def test_a_rate_is_a_positive_whole_number(name, rate):
     """Law 4: no other rate has a period in steps."""
     with pytest.raises(ValueError, match=rf"{name}.*positive whole number"):
         Sim(**{name: rate})
+
+
+@pytest.mark.parametrize(
+    "settings, fragments",
+    [
+        ({"control": "state", "freq": 499}, ("near 100 Hz", "outer_freq", "got 499 Hz", "1 Hz", "freq=500")),
+        ({"control": "state", "freq": 5}, ("near 100 Hz", "outer_freq", "got 5 Hz", "freq=100")),
+        ({"control": "state", "freq": 125}, ("near 100 Hz", "got 125 Hz", "25 Hz", "freq=126")),
+        ({"freq": 5}, ("near 500 Hz", "freq of controller 'auto'", "got 5 Hz", "freq=100")),
+        ({"freq": 997}, ("near 500 Hz", "got 997 Hz", "1 Hz", "freq=998")),
+        ({"control": "body_rate", "freq": 50}, ("near 500 Hz", "freq of controller 'auto'", "freq=100")),
+        ({"control": "force_torque", "freq": 751}, ("near 500 Hz", "force_torque_freq", "freq=752")),
+        (
+            {"control": "state", "dynamics": "so_rpy", "freq": 5},
+            ("near 100 Hz", "freq of controller 'auto'", "freq=50"),
+        ),
+        ({"controller": "crazyflow", "freq": 5}, ("near 500 Hz", "attitude_freq", "freq=100", "or set attitude_freq")),
+        ({"control": "state", "controller": "pid", "freq": 499}, ("outer_freq of controller 'pid'", "freq=500")),
+        ({"control": "state", "controller": "mellinger", "freq": 997}, ("freq of controller 'mellinger'", "freq=998")),
+    ],
+)
+def test_a_default_rate_far_below_what_is_documented_names_the_nearest_good_freq(settings, fragments):
+    """Law 4: at 499 Hz, a prime number, the state controller would run once a second."""
+    with pytest.raises(ConfigError) as error:
+        Sim(**settings)
+    for fragment in fragments:
+        assert fragment in str(error.value)
+    Sim(**settings | {"freq": int(str(error.value).split("Use freq=")[1].split(",")[0])})
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"freq": 125},
+        {"freq": 240, "control": "state"},
+        {"freq": 499, "control": "state", "controller": "mellinger"},
+        {"freq": 499, "control": "state", "state_freq": 1},
+        {"freq": 20, "control": "rotor_vel"},
+        {"freq": 50, "dynamics": "so_rpy_rotor"},
+        {"freq": 20, "attitude_freq": 20},
+        {"freq": 20, "control": "force_torque"},
+    ],
+)
+def test_rates_near_the_default_and_rates_that_are_set_stay(settings):
+    assert Sim(**settings).control_freq > 0
+
+
+def test_a_default_rate_of_cars_is_checked_like_those_of_controllers():
+    cars, path = Cars(1), circle(radius=1.0)
+    with pytest.raises(ConfigError, match=r"near 50 Hz, the default of rate of 'cars', got 499 Hz.*1 Hz.*freq=500"):
+        Sim(freq=499, control="rotor_vel").add(dataclasses.replace(cars, path=path))
+    Sim(freq=499, control="rotor_vel").add(dataclasses.replace(cars, path=path, rate=1))

@@ -57,6 +57,22 @@ def test_ten_commands_one_trace(counted):
     assert int(sim.data.core.steps[0, 0]) == 10
 
 
+def test_commands_resets_and_edits_between_steps_one_trace(counted):
+    """Law 6: where nothing is read between, commands go into flattened data; after a reset into a record."""
+    sim, traces = counted
+    sim.reset()
+    for i, (name, command) in enumerate(INPUTS.items()):
+        sim.step(2)
+        sim.attitude_control(command)
+        if i % 4 == 1:
+            sim.reset(np.asarray([True, False]))
+        if i % 4 == 2:
+            sim.data = sim.data.replace(states=sim.data.states.replace(vel=np.zeros((2, 2, 3))))
+            sim.attitude_control(command)
+        sim.step()
+        assert (len(traces), compilations(sim.step_fn)) == (1, 1), name
+
+
 def test_any_number_of_steps_any_edit_any_reset_one_program(counted):
     """Law 6: the number of steps is no constant of the program, and edits and resets bring no new kind of array."""
     sim, traces = counted

@@ -54,12 +54,9 @@ def tilted(data):
 
 
 FITTED = ("so_rpy_rotor_drag", "attitude", "auto")
-ENGINES = [
-    pytest.param(*case, marks=pytest.mark.xdist_group(f"law 7 {' '.join(case)}"))
-    for case in [*((*pair, "stages") for pair in PAIRS[1:]), (*PAIRS[0], "plain"), (*PAIRS[0], "auto"), FITTED]
-]
+ENGINES = [*((*pair, "stages") for pair in PAIRS[1:]), (*PAIRS[0], "plain"), (*PAIRS[0], "auto"), FITTED]
 """Every pair, as its stages are written, without an engine; the longest pipeline on the plain engine, and on the one
-that users get, as well as one of fitted dynamics. Tests of one case share its flight, so one worker runs them."""
+that users get, as well as one of fitted dynamics."""
 
 
 @functools.cache

@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 from cases import LEVELS
 
-from crazysim import ConfigError, Sim, load_airframe
+from crazysim import Cars, ConfigError, Sim, SlungLoad, Terrain, Wind, load_airframe
+from crazysim.control.geometric import Geometric
 from crazysim.core import functional as F
 from crazysim.core.data import command_shape
 from crazysim.core.pipeline import append_fn, insert_fn_before, remove_fn, replace_fn
+from crazysim.envs.task_check import require_installed
+from crazysim.envs.tasks.race import Race
+from crazysim.media import View
+from crazysim.sim import use_box_collision
+from crazysim.sim.visualize import change_material, draw_capsule, draw_points
+
+pytestmark = pytest.mark.fast
 
 
 def broken(tmp_path, text):
@@ -53,9 +61,16 @@ WRONG_SETTINGS = [
     ({"device": "abacus"}, "'abacus' does not exist", "'cpu' or 'gpu'"),
     ({"device": "cpu:99"}, "'cpu:99' does not exist", "'cpu' or 'gpu'"),
     ({"device": None}, "got None", "jax.Device"),
+    ({"device": ""}, "got ''", "use device='cpu'"),
+    ({"device": "cpu:-1"}, "got 'cpu:-1'", "use device='cpu'"),
+    ({"drone": []}, "got an empty list", "a list with one for each drone"),
+    ({"drone": [], "n_drones": 3}, "got an empty list", "a list with one for each drone"),
     ({"mesh": 2}, "got 2", "world_mesh"),
     ({"xml_path": "/nowhere/scene.xml"}, "expected an existing MJCF file as xml_path", "/nowhere/scene.xml"),
     ({"xml_path": 3}, "as xml_path, got 3", "MJCF"),
+    ({"strict": "no"}, "expected strict as True or False", "got 'no'"),
+    ({"strict": 1}, "expected strict as True or False", "got 1"),
+    ({"control": "state", "controller": Geometric(feedforward="no")}, "feedforward of Geometric", "got 'no'"),
     ({"rng_key": "lucky"}, "'lucky'", "an integer"),
     ({"rng_key": 1.5}, "1.5", "an integer"),
     ({"rng_key": 2**70}, str(2**70), "64 bits"),
@@ -103,18 +118,18 @@ def airframe(**changes):
 @pytest.mark.parametrize(
     "changes, fragments",
     [
-        ({"rigid_body__mass": 0.0}, ("positive mass", "got 0.0 kg")),
-        ({"rigid_body__mass": -1.0}, ("positive mass", "got -1.0 kg")),
+        ({"rigid_body__mass": 0.0}, ("rigid_body.mass to be from 1e-6", "got 0.0")),
+        ({"rigid_body__mass": -1.0}, ("rigid_body.mass to be from 1e-6", "got -1.0")),
         ({"rigid_body__mass": "heavy"}, ("as a number", "got 'heavy'")),
-        ({"rigid_body__mass": np.nan}, ("expected rigid_body.mass to be finite", "got nan")),
+        ({"rigid_body__mass": np.nan}, ("rigid_body.mass to be from 1e-6", "got nan")),
         ({"rigid_body__mass": 5.0}, ("expected rotors that lift 5.0 kg", "got 4 rotors")),
         ({"rigid_body__mass": [1.0, 2.0]}, ("expected rigid_body.mass of shape ()", "got (2,)")),
         ({"rigid_body__inertia": [1e-5, -1e-5, 1e-5]}, ("-1e-05", "positive")),
-        ({"rigid_body__inertia": [1e-5, 1e-5]}, ("inertia", "three positive moments")),
+        ({"rigid_body__inertia": [1e-5, 1e-5]}, ("inertia of shape (3,)", "got (2,)")),
         ({"rotors__position": [[0.1, 0.1]]}, ("(1, 2)", "(n, 3)")),
         ({"rotors__yaw_torque_sign": [1, -1]}, ("yaw_torque_sign of shape (4,)", "got (2,)")),
         ({"rotors__thrust_min": 0.3}, ("0 <= thrust_min < thrust_max", "got 0.3 N")),
-        ({"rotors__thrust_max": -0.1}, ("0 <= thrust_min < thrust_max", "and -0.1 N")),
+        ({"rotors__thrust_max": -0.1}, ("rotors.thrust_max to be positive", "got -0.1")),
         ({"rotors__lag": [1.0, 2.0]}, ("rotors.lag of shape (4,)", "got (2,)")),
         ({"drag__coefficients": [1.0]}, ("drag.coefficients of shape (3,)", "got (1,)")),
     ],
@@ -148,7 +163,7 @@ def wrong_commands(shape):
     yield zeros[..., :-1], str((*shape[:2], shape[2] - 1)), needed
     yield np.zeros((2, 3, shape[2])), str((2, 3, shape[2])), needed
     yield 0.0, "()", "n_worlds, n_drones"
-    yield None, "()", "n_worlds, n_drones"
+    yield None, *(("no position", "16 numbers") if shape[-1] == 16 else ("()", "n_worlds, n_drones"))
     yield [[1.0, 2.0], [3.0]], "a regular array, got", "command"
     yield zeros[..., :0].tolist(), str((3, 2, 0)), needed
     yield np.full(shape, "up"), "<U2", "real numbers"
@@ -257,6 +272,32 @@ WRONG_CALLS = [
         "name=",
     ),
     (lambda sim: append_fn(sim.step_pipeline, None), "got None", "a function"),
+    (lambda sim: setattr(sim, "step_pipeline", []), "expected step_pipeline as a dict", "got []"),
+    (lambda sim: setattr(sim, "step_pipeline", {}), "expected step_pipeline as a dict", "got {}"),
+    (lambda sim: setattr(sim, "step_pipeline", {"still": 3}), "expected names and functions", "'still': 3"),
+    (lambda sim: setattr(sim, "reset_pipeline", None), "expected reset_pipeline as a dict", "got None"),
+    (lambda sim: sim.scene.add("box", rgba="red"), "expected rgba as numbers from 0 to 1", "got 'red'"),
+    (lambda sim: sim.scene.add("box", size="big"), "expected settings size=", "'big'"),
+    (lambda sim: sim.scene.add("box", size=(np.nan, 1, 1)), "expected positive lengths", "nan"),
+    (lambda sim: sim.scene.add("box", count=10**9), "count is 1000000000", "at most 100000"),
+    (lambda sim: sim.scene.add("box", mocap="no"), "expected mocap as True or False", "got 'no'"),
+    (lambda sim: sim.contact_report(floor="no"), "expected floor as True or False", "got 'no'"),
+    (lambda sim: sim.depth(hide_own=None), "expected hide_own as True or False", "got None"),
+    (lambda sim: sim.explain(measure="no"), "expected measure as True or False", "got 'no'"),
+    (lambda sim: sim.attitude_control(np.zeros((3, 1, 4)), "no"), "expected check_finite as True", "got 'no'"),
+    (lambda sim: use_box_collision(sim, "no"), "expected enable as True or False", "got 'no'"),
+    (lambda sim: draw_capsule(sim, [0, 0, 0], [0, 0, 1], cylinder="no"), "expected cylinder as True", "got 'no'"),
+    (lambda sim: sim.add(SlungLoad(0.01, cable="no")), "expected cable of SlungLoad as True", "got 'no'"),
+    (lambda sim: require_installed(sim, Race(practice="no")), "expected practice of Race as True", "got 'no'"),
+    (lambda sim: View(setpoints="no"), "expected setpoints of View as True or False", "got 'no'"),
+    (lambda sim: sim.add(SlungLoad(0.01, rgba="red")), "expected rgba as numbers", "got 'red'"),
+    (lambda sim: sim.add(Cars(1, rgba=(1, 0, 0))), "expected rgba as numbers", "got (1, 0, 0)"),
+    (lambda sim: sim.add(Terrain(np.zeros((2, 2)), (1, 1), rgba=(2, 0, 0, 1))), "expected rgba", "got (2, 0, 0, 1)"),
+    (lambda sim: draw_points(sim, [0, 0, 0], rgba="red"), "expected rgba as numbers", "got 'red'"),
+    (lambda sim: change_material(sim, "led_top", [0], rgba=(np.nan,) * 4), "expected rgba as numbers", "nan"),
+    (lambda sim: View(rgba="red"), "expected rgba as numbers", "'red'"),
+    (lambda sim: View(width=10**9), "width is 1000000000", "at most 16384"),
+    (lambda sim: sim.add(Wind((1e300, 0, 0))), "expected", "1e+300"),
 ]
 
 
@@ -301,6 +342,31 @@ def test_data_with_axes_of_its_own_is_refused_at_the_next_step(sim, edit, fragme
         assert fragment in str(error.value)
     assert sim.data is edited
     sim.data = before
+
+
+@pytest.mark.parametrize(
+    "wrong, fragments",
+    [
+        (lambda sim: None, ("got NoneType", "sim.data.replace")),
+        (lambda sim: sim.data.states, ("got SimState",)),
+        (lambda sim: sim.data.replace(core=None), ("got SimData",)),
+        (lambda sim: Sim(n_worlds=2).data, ("data of 3 worlds of 1 drones", "got data of 2 worlds of 1 drones")),
+        (lambda sim: Sim(n_worlds=3, n_drones=2).data, ("got data of 3 worlds of 2 drones",)),
+        (lambda sim: Sim(n_worlds=3, control="state").data, ("'attitude' commands", "'state' commands")),
+        (lambda sim: Sim(n_worlds=3, freq=250).data, ("at 500 Hz", "at 250 Hz")),
+        (lambda sim: Sim(n_worlds=3, dynamics="so_rpy").data, ("first-principles", "fitted")),
+        (lambda sim: Sim(n_worlds=3, controller="crazyflow").data, ("Crazyflow's cascade", "another controller")),
+    ],
+)
+@pytest.mark.parametrize("name", ["data", "default_data"])
+def test_data_of_another_simulation_is_refused_where_it_is_assigned(sim, name, wrong, fragments):
+    before, default, other = sim.data, sim.default_data, wrong(sim)
+    with pytest.raises(ConfigError) as error:
+        setattr(sim, name, other)
+    for fragment in fragments:
+        assert fragment in str(error.value)
+    assert sim.data is before
+    assert sim.default_data is default
 
 
 def test_a_spec_that_does_not_compile_leaves_the_old_scene():

@@ -56,7 +56,9 @@ def test_held_data_stays_readable_and_unchanged(sim, use):
 
 def test_a_command_array_stays_its_callers(sim):
     """Neither does the simulation keep a view of host memory: what is written into it later does not count."""
-    command = np.zeros((2, 2, 4), np.float32)
+    memory = np.zeros(128, np.uint8)
+    start = -memory.ctypes.data % 64  # JAX takes over memory that is aligned so
+    command = memory[start : start + 64].view(np.float32).reshape(2, 2, 4)
     on_device = jnp.full((2, 2, 4), 0.25)
     sim.attitude_control(on_device)
     sim.step()
@@ -64,6 +66,12 @@ def test_a_command_array_stays_its_callers(sim):
     sim.attitude_control(command)
     command[:] = 9.0
     np.testing.assert_array_equal(sim.data.controls.attitude.staged_cmd, 0.0)
+    sim.step()
+    command[:] = 0.5
+    sim.attitude_control(command)
+    command[:] = 9.0
+    sim.step()
+    np.testing.assert_array_equal(sim.data.controls.attitude.staged_cmd, 0.5)
 
 
 def test_default_data_survives_many_steps_and_resets(sim):

@@ -4,6 +4,8 @@ import logging
 import socket
 import threading
 import time
+from http.client import HTTPConnection
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -16,10 +18,9 @@ from crazysim.live.browser_scene import grid_offsets
 from crazysim.live.picture import PictureSource, quantities, quantity
 from crazysim.live.scene_bodies import SceneBodies
 from crazysim.media.web import FOV
+from crazysim.plugins.vehicles import Cars
 from crazysim.sim import Sim
-from crazysim.vehicles import Cars
 
-pytestmark = pytest.mark.xdist_group("browser")
 MAGENTA = (1, 0, 1)
 
 
@@ -90,13 +91,18 @@ SIZE = 4.0
 """Extent of the worlds of these tests, m: 2 m between the drones, and 1 m of margin on both sides."""
 
 
+MARKUP = "<img src=x onerror='window.hit = 1'> **bold** [link](javascript:alert())"
+"""A name that a page must show as it is."""
+
+
 def test_a_page_is_watched_and_used(chromium, live, caplog):
     pilot, clicked, values = Pilot(), [], []
     live.add(pilot)
     live.on_click = lambda live, world, point: clicked.append((world, point))
     live.button("Shoot", lambda live: values.append("shot"))
-    live.slider("wind", 0.0, 10.0, 5.0, lambda live, value: values.append(value))
-    page = live.show(Browser(port=0, trail=0.5))
+    live.slider(f"slider {MARKUP}", 0.0, 10.0, 5.0, lambda live, value: values.append(value))
+    live.quantities[f"quantity {MARKUP}"] = lambda live: 1.0
+    page = live.show(Browser(port=0, trail=0.5, plot=f"quantity {MARKUP}"))
     with Running(live):
         chromium.open(page.url, 1100, 360)
         wait_for(lambda: page.n_clients == 1 and chromium.box("canvas"))
@@ -126,6 +132,10 @@ def test_a_page_is_watched_and_used(chromium, live, caplog):
         wait_for(lambda: live.step > 50)
         text = "document.body.innerText"
         wait_for(lambda: "real time" in chromium.value(text) and "paused" not in chromium.value(text))
+
+        # Names are text, in labels and in the title of the plot.
+        wait_for(lambda: f"slider {MARKUP}" in chromium.value(text) and f"quantity {MARKUP}" in chromium.value(text))
+        assert chromium.value("!window.hit && !document.querySelector('img[src=x]')")
 
         # A key of the page flies the selected drone, upwards.
         before = float(live.command[0, 1, 2])
@@ -204,12 +214,84 @@ def test_a_port_in_use_is_named(viser, live, caplog):
 def test_closing_waits_for_no_unused_connection(viser, live):
     """Browsers open connections in advance."""
     page = live.show(Browser(port=0))
-    with socket.create_connection(("127.0.0.1", int(page.url.rpartition(":")[2]))):
+    with socket.create_connection(("127.0.0.1", urlsplit(page.url).port)):
         time.sleep(0.1)
         begin = time.monotonic()
         live.close()
         assert time.monotonic() - begin < 4
     assert not page.is_open
+
+
+@pytest.fixture
+def page(viser, live):
+    with live:
+        yield live.show(Browser(port=0))
+
+
+def connect(page, path=None, **headers):
+    """Return a connection to a page as its script opens one, with other headers."""
+    from websockets.sync.client import connect as open_websocket
+
+    parts = urlsplit(page.url)
+    address = f"ws://{parts.netloc}{parts.path if path is None else path}"
+    origin = headers.pop("origin", f"http://{parts.netloc}")
+    return open_websocket(address, origin=origin, subprotocols=["viser-v0"], additional_headers=headers)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"origin": "http://example.org"}, "got one of 'http://example.org'"),
+        ({"origin": "null"}, "got one of 'null'"),
+        ({"origin": "http://127.0.0.1:1"}, "got one of 'http://127.0.0.1:1'"),
+        ({"path": ""}, "address with its token"),
+        ({"path": "/"}, "address with its token"),
+        ({"path": "/AAAAAAAAAAAAAAAAAAAAAA"}, "address with its token"),
+    ],
+)
+def test_a_page_of_another_site_cannot_connect(page, caplog, change, message):
+    from websockets.exceptions import InvalidStatus
+
+    with pytest.raises(InvalidStatus) as refused:
+        connect(page, **change)
+    assert refused.value.response.status_code == 403
+    assert message in refused.value.response.body.decode()
+    assert message in caplog.text
+    assert page.n_clients == 0
+
+
+def test_the_page_itself_and_programs_connect(page):
+    for origin in (f"http://{urlsplit(page.url).netloc}", None):
+        connect(page, origin=origin).close()
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("example.org", 403),  # a name that its owner resolves to this machine
+        ("127.0.0.1.example.org", 403),
+        ("", 403),
+        ("[::1", 403),
+        ("localhost:9000", 200),  # a port that is forwarded
+        ("192.168.1.5:8080", 200),
+        ("[fe80::1]:8080", 200),
+        (f"{socket.gethostname()}:8080", 200),
+    ],
+)
+def test_the_page_is_served_under_names_of_this_machine(page, host, status):
+    parts = urlsplit(page.url)
+    connection = HTTPConnection(parts.netloc, timeout=20)
+    connection.putrequest("GET", parts.path, skip_host=True)
+    connection.putheader("Host", host)
+    connection.endheaders()
+    assert connection.getresponse().status == status
+    connection.close()
+
+
+def test_every_page_has_a_token_of_its_own():
+    assert Browser(port=1).url != Browser(port=1).url
+    assert Browser(port=1, host="0.0.0.0").url.startswith("http://127.0.0.1:1/")
+    assert Browser(port=1, host="::1").url.startswith("http://[::1]:1/")
 
 
 def test_wrong_settings(viser, live):

@@ -11,6 +11,7 @@ from crazysim.live import Live, Viewer
 from crazysim.live.crazyflie_py import Crazyswarm, use
 from crazysim.live.crazyflie_py.uav_trajectory import Trajectory
 from crazysim.live.swarm import Swarm
+from crazysim.plugins.effects import Battery
 
 OFFSET = 0.12
 """Height by which the default controller misses its setpoint after a take-off, m."""
@@ -106,6 +107,54 @@ def test_streamed_full_states(script):
     assert cf.position()[2] < 0.02
 
 
+def test_streamed_hover_setpoints(script):
+    timeHelper, cf = script.timeHelper, script.allcfs.crazyflies[0]
+    for _ in range(40):
+        cf.cmdHover(0.0, 0.0, 0.0, 0.6)
+        timeHelper.sleep(0.1)
+    assert cf.position()[2] == pytest.approx(0.6, abs=OFFSET)
+    for _ in range(20):
+        cf.cmdHover(0.3, 0.0, 0.0, 0.6)
+        timeHelper.sleep(0.1)
+    np.testing.assert_allclose(cf.position()[:2] - cf.initialPosition[:2], [0.6, 0.0], atol=0.1)
+    for _ in range(10):
+        cf.cmdHover(0.0, 0.0, 0.5, 0.6)  # rad/s
+        timeHelper.sleep(0.1)
+    assert script.swarm.state(0).rpy[2] == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_landing_ends_on_the_floor_with_an_offset_of_the_controller(script):
+    """The same for an offset of the default controller, and of one with a load."""
+    timeHelper, cf = script.timeHelper, script.allcfs.crazyflies[0]
+    cf.takeoff(targetHeight=0.5, duration=1.5)
+    timeHelper.sleep(2.0)
+    cf.land(targetHeight=0.04, duration=1.5)
+    heights = []
+    while script.swarm["cf231"].motors_on:
+        timeHelper.sleep(0.02)
+        heights.append(cf.position()[2])
+    assert heights[-1] < 0.06  # 1 cm above, and a control step of sinking
+    assert timeHelper.time() < 0.02 + 3.5 + 1.5
+
+
+def test_the_status_has_a_battery(script):
+    assert script.allcfs.crazyflies[1].get_status()["battery"] == 4.0
+    sim = Sim(control="state", drone="cf21B_500")
+    battery = sim.add(Battery(capacity=0.35, resistance=0.1, n_cells=1))
+    sim.build_default_data()
+    script = Crazyswarm(Swarm(sim))
+    cf = script.allcfs.crazyflies[0]
+    resting = cf.get_status()
+    cf.takeoff(targetHeight=0.5, duration=1.5)
+    script.timeHelper.sleep(2.0)
+    flying = cf.get_status()
+    assert flying["battery"] < resting["battery"] - 0.1  # sags
+    assert (flying["pm_state"], flying["rssi"], flying["num_rx_unicast"]) == (0, 0, 0)
+    record = battery.read(sim.data)
+    sim.data = battery.write(sim.data, record.replace(voltage=record.voltage.at[:].set(3.1)))
+    assert cf.get_status()["pm_state"] == 3
+
+
 def test_groups_parameters_and_lights(script):
     timeHelper, allcfs = script.timeHelper, script.allcfs
     first, second = allcfs.crazyflies
@@ -117,9 +166,15 @@ def test_groups_parameters_and_lights(script):
     assert second.position()[2] == pytest.approx(0.5, abs=OFFSET)
     first.setLEDColor(1, 0.5, 2)
     allcfs.setParam("ring.solidBlue", 51)
-    np.testing.assert_allclose(script.swarm.colors[0], [1, 0.5, 0.2])
+    np.testing.assert_allclose(script.swarm.colors[0], [1, 127 / 255, 0.2])
     assert second.getParam("ring.solidBlue") == 51
-    assert math.isnan(first.getParam("ring.effect"))
+    assert first.getParam("ring.effect") == 7
+    script.swarm.reports.latest.clear()
+    first.setParam("stabilizer.controller", 2)
+    first.setParam("no.thing", 2)
+    assert ["controller" in r.text or "no.thing" in r.text for r in script.swarm.reports.latest] == [True, True]
+    with pytest.raises(ConfigError, match=r"no\.thing"):
+        first.getParam("no.thing")
     assert not timeHelper.isShutdown()
 
 
@@ -201,7 +256,7 @@ def test_scripts_advance_a_live_loop_whose_viewers_show_the_lights():
         assert clock.time() == pytest.approx(3.5)
         assert live.time == pytest.approx(3.5)
     assert len(lamp.seen) > 5
-    np.testing.assert_allclose(lamp.seen[1], [[1.0, 0.5, 0.0], [0, 0, 0]])
+    np.testing.assert_allclose(lamp.seen[1], [[1.0, 127 / 255, 0.0], [0, 0, 0]])
     np.testing.assert_allclose(live.lights[0], [[0.0, 1.0, 0.0], [0, 0, 0]])
     with pytest.raises(ConfigError, match="loop of the swarm's simulation"):
         swarm.run_in(Live(Sim(control="state")))

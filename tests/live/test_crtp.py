@@ -16,6 +16,7 @@ from crazysim.live.crtp import CrtpDevice, CrtpServer, add_cflib_driver, remove_
 from crazysim.live.crtp.setpoints import unpack_quat
 from crazysim.live.crtp.tables import LOG_TYPES, Table, Variable, pack
 from crazysim.live.swarm import Swarm
+from crazysim.plugins.sensors.range_finder import RangeFinder
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:cflib", "ignore::DeprecationWarning:usb")
 
@@ -102,8 +103,10 @@ def test_parameters(running, uri):
         param, called = scf.cf.param, []
         param.add_update_callback("ring", "solidRed", lambda name, value: called.append((name, value)))
         assert param.get_value("stabilizer.estimator") == "2"
-        param.set_value("ring.solidRed", 51)
+        param.set_value("ring.effect", 7)
+        param.set_value("ring.solidBlue", 0)
         param.set_value_raw("ring.solidGreen", 0x08, 255)
+        param.set_value("ring.solidRed", 51)
         with pytest.raises(AttributeError, match="read-only"):
             param.set_value("deck.bcFlow2", 0)
         end = time.monotonic() + 5
@@ -113,13 +116,75 @@ def test_parameters(running, uri):
     np.testing.assert_allclose(running.colors[0], [0.2, 1.0, 0.0])
 
 
+def test_a_parameter_that_is_not_simulated_keeps_its_value_and_says_so(running, uri):
+    from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
+
+    with SyncCrazyflie(uri) as scf:
+        scf.wait_for_params()
+        read_back, lines = [], []
+        scf.cf.console.receivedChar.add_callback(lines.append)
+        scf.cf.param.add_update_callback("pid_attitude", "pitch_kd", lambda name, value: read_back.append(value))
+        scf.cf.param.set_value("pid_attitude.pitch_kd", 0.1234)
+        end = time.monotonic() + 5
+        while not (read_back and "\n" in "".join(lines)) and time.monotonic() < end:
+            time.sleep(0.01)
+        with pytest.raises(KeyError, match=r"no\.thing"):
+            scf.cf.param.set_value("no.thing", 1)
+    assert [float(value) for value in read_back] == [0.0]
+    assert "pid_attitude.pitch_kd = 0.1234; it stays 0. The guide" in "".join(lines)
+
+
+def test_the_initial_pose_is_that_of_the_estimate(running, uri):
+    """A drone at (-0.5, -0.5), yaw 0, that is told to be at (1, 1), yaw 90 degrees: its x is the world's -y."""
+    from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
+    from cflib.utils.reset_estimator import reset_estimator
+
+    with SyncCrazyflie(uri) as scf:
+        for name, value in {"X": 1.0, "Y": 1.0, "Z": 0.0, "Yaw": np.pi / 2}.items():
+            scf.cf.param.set_value(f"kalman.initial{name}", value)
+        reset_estimator(scf)
+        commander = scf.cf.high_level_commander
+        commander.takeoff(0.6, 1.5, yaw=None)
+        running.sleep(2.0)
+        commander.go_to(0.6, 1.0, 0.6, np.pi / 2, 1.5)
+        running.sleep(2.5)
+        np.testing.assert_allclose(running.state(0).pos[:2], [-0.5, -0.1], atol=0.05)
+        assert running.state(0).rpy[2] == pytest.approx(0.0, abs=0.05)
+        known = running["cf1"].estimate(running.state(0))
+        np.testing.assert_allclose(known.pos[:2], [0.6, 1.0], atol=0.05)
+        commander.stop()
+
+
+def test_decks_and_memories(running, uri):
+    from cflib.crazyflie.mem import MemoryElement
+    from cflib.crazyflie.mem.deck_memory import SyncDeckMemoryManager
+    from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
+
+    with SyncCrazyflie(uri) as scf:
+        scf.wait_for_params()
+        assert scf.cf.param.get_value("deck.bcColorLedBot") == "1"
+        assert scf.cf.param.get_value("deck.bcMultiranger") == "0"
+        (decks,) = scf.cf.mem.get_mems(MemoryElement.TYPE_DECK_MEMORY)
+        assert SyncDeckMemoryManager(decks).query_decks() == {}
+        (leds,) = scf.cf.mem.get_mems(MemoryElement.TYPE_DRIVER_LED)
+        scf.cf.param.set_value("ring.effect", 13)
+        for led in leds.leds:
+            led.set(255, 0, 255)
+        leds.write_data(None)
+        end = time.monotonic() + 5
+        while running.colors[0, 0] < 1 and time.monotonic() < end:
+            time.sleep(0.01)
+    np.testing.assert_allclose(running.colors[0], [1, 0, 1])
+
+
 @pytest.mark.parametrize("compressed", [False, True])
 def test_uploaded_trajectories(running, uri, compressed):
     from cflib.crazyflie.mem import CompressedSegment, CompressedStart, MemoryElement, Poly4D
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
     if compressed:
-        pieces = [CompressedStart(0, 0, 0, 0), CompressedSegment(1.5, [0, 0.6, 0.6], [], [], [])]
+        pieces = [CompressedStart(0, 0, 0, 0), CompressedSegment(1.5, [0, 0.6, 0.6], [], [], []),
+                  CompressedSegment(0, [], [], [], [])]  # fmt: skip
     else:
         x = Poly4D.Poly(np.array([0, 0, 0, 0, 35, -84, 70, -20]) * 0.6 / 1.5 ** np.arange(8))
         pieces = [Poly4D(1.5, x)]
@@ -128,14 +193,18 @@ def test_uploaded_trajectories(running, uri, compressed):
         memory.trajectory = pieces
         assert memory.write_data_sync(start_addr=0x40)
         commander = scf.cf.high_level_commander
-        commander.define_trajectory(1, 0x40, 1, type=int(compressed))
+        commander.define_trajectory(1, 0x40, len(pieces), type=int(compressed))
         commander.takeoff(0.6, 1.5)
         running.sleep(2.0)
         commander.start_trajectory(1, 1.0, relative_position=True)
         running.sleep(2.5)
         np.testing.assert_allclose(running.state(0).pos[:2], [0.1, -0.5], atol=0.05)
+        assert not running.reports.latest
+        commander.start_trajectory(1, 2.0, relative_position=True)
+        running.sleep(1.0)
         commander.stop()
-    assert not running.reports.latest
+    # As in the firmware, which does not stretch compressed trajectories.
+    assert ["timescale 2" in report.text for report in running.reports.latest] == [True] * compressed
 
 
 @pytest.mark.parametrize("running", [4.0], indirect=True)  # a stream must not be late
@@ -193,6 +262,22 @@ def test_scanning(running, uri):
         cflib.crtp.CLASSES[0]().connect("sim://cf9", None, None)
     with pytest.raises(cflib.crtp.WrongUriType):
         cflib.crtp.CLASSES[0]().connect("radio://0/80", None, None)
+
+
+def test_the_range_finder_is_a_multi_ranger():
+    sim = Sim(control="state")
+    sim.add(RangeFinder(directions=[[0, 0, -2.0], [1, 0, 0], [1, 1, 0]], max_range=2.0))
+    sim.build_default_data()
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.25)))
+    swarm = Swarm(sim)
+    device = CrtpDevice(swarm, 0)
+    swarm.advance(0.02)
+    assert device.values["deck.bcMultiranger"] == 1
+    assert sorted(name for name in device.log.ids if name.startswith("range.")) == ["range.front", "range.zrange"]
+    state = swarm.state(0)
+    assert device.readings["range.zrange"][1](state, swarm["cf1"]) == pytest.approx(1250, abs=5)
+    assert device.readings["range.front"][1](state, swarm["cf1"]) == 32767
 
 
 # Servers ------------------------------------------------------------------------------------------------------------

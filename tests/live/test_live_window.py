@@ -14,8 +14,8 @@ from crazysim.errors import ConfigError, RenderError
 from crazysim.live import Live, Window
 from crazysim.live.scene_bodies import SceneBodies
 from crazysim.live.window_program import Leds, Program
+from crazysim.plugins.vehicles import Cars
 from crazysim.sim import Sim
-from crazysim.vehicles import Cars
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from crazysim import Sim
 from crazysim.control import Control
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.live.paths import Path, paths_of
-from crazysim.live.swarm import Commander, Swarm
+from crazysim.live.swarm import Commander, DroneState, Swarm
 from crazysim.live.swarm.plan import Plan, move, nearest_yaw
 from crazysim.trajectories import Trajectory, circle, line, minimum_snap
 
@@ -84,8 +84,89 @@ def test_motors_are_off_before_take_off_and_after_landing():
     commander.take_off(1.5, 2.0, yaw=0.0)
     np.testing.assert_allclose(tick(commander, 2.0)[:3], [1, 2, 1.5])
     commander.land(0.1, 1.0)
-    assert tick(commander, 2.99) is not None
-    assert tick(commander, 3.0) is None
+    assert tick(commander, 2.99, pos=(1, 2, 0.1)) is not None
+    assert tick(commander, 3.0, pos=(1, 2, 0.1)) is None
+
+
+def test_a_landing_goes_on_where_the_drone_is_still_too_high():
+    """A controller with an offset, a load, or a pad that is higher than the target."""
+    commander = flying(land=(0.04, 1.0))
+    above = np.array([1.0, 2.0, 0.13])
+    heights = [commander.tick(now, above, np.array([0, 0, -0.2]), 0.5)[2] for now in (11.0, 11.1, 11.3, 20.0)]
+    np.testing.assert_allclose(heights, [0.04, 0.01, -0.05, -0.96], atol=1e-9)
+    assert commander.tick(20.1, above * [1, 1, 0.05 / 0.13], np.array([0, 0, -0.2]), 0.5) is None
+    standing = flying(land=(0.04, 1.0))
+    assert standing.tick(11.4, above, np.zeros(3), 0.5) is not None
+    assert standing.tick(11.6, above, np.zeros(3), 0.5) is None
+
+
+def test_commands_are_in_the_frame_of_the_estimate():
+    """A drone at (1, 2) with yaw 0.5 whose estimate is (5, 5) with yaw 0.5 + pi / 2: forward is to the left there."""
+    commander = flying()
+    commander.place_estimate(np.array([1.0, 2.0, 1.0]), 0.5, np.array([5.0, 5.0, 0.0, 0.5 + np.pi / 2]))
+    commander.go_to([5.0, 6.0, 0.5], 0.5 + np.pi / 2, 1.0)
+    tick(commander, 11.0)
+    command = tick(commander, 13.0)
+    np.testing.assert_allclose(command[:3], [2.0, 2.0, 1.5], atol=1e-9)
+    np.testing.assert_allclose(command[9:13], [0, 0, np.sin(0.25), np.cos(0.25)], atol=1e-9)
+    state = DroneState(0.0, np.array([2.0, 2.0, 1.0]), command[9:13], np.array([1.0, 0, 0]), np.zeros(3), np.zeros(3))
+    found = commander.estimate(state)
+    np.testing.assert_allclose([*found.pos, *found.vel], [5, 6, 0, 0, 1, 0], atol=1e-9)
+    assert found.rpy[2] == pytest.approx(0.5 + np.pi / 2)
+    level = flying("attitude")
+    level.place_estimate(np.zeros(3), 0.0, np.array([0.0, 0.0, 0.0, 1.0]))
+    level.command("attitude", [0.1, 0.2, 1.3, 0.4])
+    np.testing.assert_allclose(tick(level, 10.1), [0.1, 0.2, 0.3, 0.4])
+    commander.reset()
+    assert commander.estimate(state) is state
+
+
+def test_parameters_have_an_effect_or_are_refused():
+    swarm = Swarm(Sim(control="state"))
+    values = swarm.parameters[0]
+    kept = dict(values)
+    for name, value in {"stabilizer.controller": 2, "ring.effect": 6, "pid_attitude.pitch_kd": 0.1234}.items():
+        with pytest.raises(ConfigError, match="expected a value whose effect is simulated"):
+            swarm.set_parameter(0, name, value)
+    for name, value in {"deck.bcFlow2": 0, "ring.fadeTime": np.nan}.items():
+        with pytest.raises(ConfigError, match="can be written"):
+            swarm.set_parameter("cf1", name, value)
+    for name in ("sound.freq", "no.thing"):
+        with pytest.raises(ConfigError, match=r"has, got .*lists the parameters"):
+            swarm.set_parameter(0, name, 1)
+        with pytest.raises(ConfigError, match="lists the parameters"):
+            values.get_value(name)
+    for name, value in kept.items():
+        if not values.kinds[name].read_only:
+            swarm.set_parameter(0, name, np.float32(value))
+    assert dict(values) == pytest.approx(kept)
+    assert {"pid_attitude.roll_kp": 6.0, "pid_attitude.yaw_kd": 0.35}.items() <= kept.items()
+
+
+def test_lights_fade_and_shine_by_their_effect():
+    swarm = Swarm(Sim(control="state"))
+    swarm.set_parameter(0, "ring.solidRed", 255)
+    np.testing.assert_array_equal(swarm.colors[0], 0)
+    swarm.set_parameter(0, "ring.effect", 7)
+    np.testing.assert_allclose(swarm.colors[0], [1, 20 / 255, 20 / 255])
+    swarm.set_parameter(0, "ring.fadeTime", 0.0)
+    swarm.set_parameter(0, "ring.fadeColor", 0x000000)
+    swarm.set_parameter(0, "ring.effect", 14)
+    swarm.set_parameter(0, "ring.fadeTime", 1.0)
+    swarm.set_parameter(0, "ring.fadeColor", 0xFF3300)
+    np.testing.assert_array_equal(swarm.colors[0], 0)
+    swarm.advance(0.5)
+    np.testing.assert_allclose(swarm.colors[0], [0.5, 0.1, 0], atol=0.011)  # of a control step
+    swarm.advance(1.0)
+    np.testing.assert_allclose(swarm.colors[0], [1, 0.2, 0], atol=1e-12)
+    swarm.set_parameter(0, "colorLedBot.wrgb8888", 0x10200000)
+    np.testing.assert_allclose(swarm.colors[0], np.array([48, 16, 16]) / 255)
+    swarm.colors[0] = 0.5  # of a program
+    swarm.advance(0.1)
+    np.testing.assert_array_equal(swarm.colors[0], 0.5)
+    swarm.set_parameter(0, "ring.effect", 13)
+    swarm.set_leds(0, np.array([0xF800] * 6 + [0x001F] * 6))
+    np.testing.assert_allclose(swarm.colors[0], [0.5, 0, 0.5])
 
 
 def test_moves_continue_from_the_setpoint_in_force():

@@ -111,6 +111,13 @@ def test_given_images_are_frames(sim, tmp_path):
     np.testing.assert_allclose(frames.astype(int), 200, atol=3)
 
 
+def test_a_name_that_looks_like_an_option_is_a_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with Film("-y.mp4", view(), fps=10) as film:
+        film.write(np.full((HEIGHT, WIDTH, 3), 200, np.uint8), 2)
+    assert len(read(tmp_path / "-y.mp4")) == 2
+
+
 # Wrong input ----------------------------------------------------------------------------------------------------
 
 

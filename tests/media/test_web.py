@@ -4,7 +4,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+import urllib.error
+import urllib.request
 
 import jax.numpy as jnp
 import mujoco
@@ -18,7 +21,6 @@ from crazysim.media import Recorder, web
 from crazysim.media.web import FOV, camera_of, page
 from crazysim.sim import Sim
 
-pytestmark = pytest.mark.xdist_group("browser")
 START, END = np.array([-0.5, 0.0, 0.8]), np.array([0.5, 0.0, 1.2])
 """Where the drone of world 1 begins and ends, m."""
 BOX = np.array([0.25, 0.0, 0.05])
@@ -133,7 +135,7 @@ def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, caps
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere.npz"], "expected an existing file, got 'nowhere.npz'"),
+        (["nowhere.npz"], "expected an existing file with a recorded flight, got 'nowhere.npz'"),
         (["flight.npz", "--world", "5"], "expected a recorded world, one of [0, 1], got 5"),
         (["flight.npz", "--export", "flight.txt"], "to end with .html"),
         (["flight.npz", "--export", "nowhere/flight.html"], "expected an existing folder, got 'nowhere'"),
@@ -176,6 +178,21 @@ def test_a_served_page_says_who_can_watch(monkeypatch, capsys):
     assert capsys.readouterr().out == "serving the flight at http://127.0.0.1:8123; stop with Ctrl-C\n"
     web.serve_page("", 0, "0.0.0.0")
     assert "every machine of that network can watch" in capsys.readouterr().out
+
+
+def test_a_served_page_answers_to_names_of_this_machine():
+    with web.server_of("<p>flight</p>", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        address = f"http://127.0.0.1:{server.server_port}"
+        with urllib.request.urlopen(address) as answer:
+            assert answer.read() == b"<p>flight</p>"
+        foreign = urllib.request.Request(address, headers={"Host": "example.org"})
+        with pytest.raises(urllib.error.HTTPError, match="403") as refused:
+            urllib.request.urlopen(foreign)
+        refused.value.close()
+        server.shutdown()
+        thread.join()
 
 
 def test_a_port_in_use_is_named():

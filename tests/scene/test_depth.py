@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from cases import trees_equal
 
 from crazysim import ConfigError, RangeFinder, Sim, SlungLoad
 from crazysim.scene.depth import pixel_directions
@@ -162,7 +161,6 @@ def test_the_slope_of_depth_is_the_way_to_the_wall(room):
     assert float(jax.jit(jax.grad(middle))(0.0)) == pytest.approx(-1.0, abs=1e-5)
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize("engine", ["plain", "auto"])
 def test_a_range_finder_measures_in_the_step(engine):
     sim = Sim(n_worlds=2, n_drones=2, control="attitude", engine=engine)
@@ -183,7 +181,6 @@ def test_a_range_finder_measures_in_the_step(engine):
     assert "not fused" not in sim.explain()
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize("engine", ["plain", "auto"])
 def test_rays_in_a_step_meet_loads_where_they_are_now(engine):
     """No image was drawn since the load and its drone moved. The rod, which begins at the drone, is not measured."""
@@ -200,7 +197,9 @@ def test_rays_in_a_step_meet_loads_where_they_are_now(engine):
     look = jax.jit(sim.scene.depth_fn(sim.mj_model.cam("fpv_cam:0").id, 3, 3, drones=False))
     beside = np.asarray(sim.data.states.pos) + np.float32([1.1, 0, 0])
     aside = load.write(sim.data, load.read(sim.data).replace(pos=beside))
-    seen, placed_before = (np.asarray(look(d).distance)[:, 0, 1, 1] for d in (aside, sim.plugins.placed(aside)))
+    seen, placed_before = (
+        np.asarray(look(d).distance)[:, 0, 1, 1] for d in (aside, sim.plugins.with_placed_objects(aside))
+    )
     np.testing.assert_allclose(seen, placed_before)
     assert np.all(seen < 1.1)
 
@@ -227,7 +226,7 @@ def test_law_09_wrong_cameras_and_resolutions_are_refused(room):
         (lambda: sim.depth("fpv_cam", 4, 4, along="z"), "along='ray'"),
         (lambda: sim.add(RangeFinder([[0, 0, 0]])), "none of them zero"),
         (lambda: sim.add(RangeFinder(max_range=0)), "max_range to be positive"),
-        (lambda: sim.add(RangeFinder(freq=333)), "Use a divisor"),
+        (lambda: sim.add(RangeFinder(freq=333)), "Use the nearest rate below, 250 Hz"),
     ):
         with pytest.raises(ConfigError) as error:
             act()
@@ -246,7 +245,7 @@ def test_rays_are_those_of_c_mujoco(room, rng):
     rays = (np.tile(np.float32(x), (2, 1, 1)) for x in (origin, direction))
     hits = jax.jit(lambda data, *rays: cast(sim.scene.visual_model, data, *rays, drones=False))(data, *rays)
     distance = np.asarray(hits.distance)[0]
-    sim.scene.sync(data, 0)
+    sim.scene.sync_one(data, 0)
     group = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # drones are in groups 2 and 3
     geom = np.zeros(1, np.int32)
     met = 0
@@ -258,16 +257,3 @@ def test_rays_are_those_of_c_mujoco(room, rng):
             met += 1
             assert distance[k] == pytest.approx(far, rel=1e-4, abs=1e-4)
     assert 100 < met < n
-
-
-def test_the_old_range_finder_warns_and_adds_the_same():
-    from crazysim.scene import range_finder
-
-    old, new = Sim(), Sim()
-    new.add(RangeFinder(max_range=2.0))
-    with pytest.warns(DeprecationWarning, match=r"use sim.add\(RangeFinder"):
-        range_finder.add_range_finder(old, max_range=2.0)
-    with pytest.warns(DeprecationWarning, match="MULTI_RANGER"):
-        assert range_finder.RANGER is RangeFinder.MULTI_RANGER
-    assert list(old.step_pipeline) == list(new.step_pipeline)
-    assert trees_equal(old.data.plugins, new.data.plugins)

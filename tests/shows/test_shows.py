@@ -9,14 +9,23 @@ import time
 import jax
 import numpy as np
 import pytest
-from drawing import draw_coarsely
 from hypothesis import given
 from hypothesis import strategies as st
 from screens import screen_pixels, virtual_screen
 
 from crazysim.__main__ import main
 from crazysim.errors import ConfigError
-from crazysim.shows import collisions, film, fly, live_show, page, report, sampled_approaches, summary, tracking_rms
+from crazysim.shows import (
+    collisions,
+    film,
+    fly,
+    live_show,
+    page,
+    report,
+    sampled_approaches,
+    summary,
+    tracking_rms,
+)
 from crazysim.trajectories import Trajectory
 from crazysim.trajectories.files import Lights, Show, save_show
 
@@ -188,9 +197,8 @@ def test_part_of_a_show_and_wrong_settings():
         SHOW.replace(names=("a", "b"))
 
 
-def test_film_has_the_colours_of_the_lights(flight, tmp_path, monkeypatch, opengl):
-    draw_coarsely(monkeypatch)
-    from crazysim.media.recording import put
+def test_film_has_the_colours_of_the_lights(flight, tmp_path, opengl):
+    from crazysim.media.flight_recorder import put
     from crazysim.shows.view import media_flight, view_of
 
     view = view_of(flight, width=320, height=240, text=None)

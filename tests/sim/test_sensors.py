@@ -29,7 +29,6 @@ def test_depth_is_along_the_ray_and_minus_one_at_the_sky(sim):
     assert (depth == -1).mean() == 0.5
 
 
-@pytest.mark.compiled
 def test_camera_0_follows_the_first_drone_and_sees_45_degrees(sim):
     camera = sim.mj_model.camera(0)
     assert camera.name == "track_cam:0"

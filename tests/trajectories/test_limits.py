@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazysim import ConfigError, load_airframe
-from crazysim.trajectories import Limits, Trajectory, check, spline
+from crazysim.trajectories import Limits, Trajectory, check, circle, spline
 from crazysim.trajectories.peaks import QUANTITIES, peaks
 from crazysim.trajectories.piece_table import PieceTable
 
@@ -88,6 +88,15 @@ def test_violations_name_limit_drone_time_and_value():
     text = str(report)
     for part in ("2 drones, 2.00 s", "2 violations", "bob: speed 2 m/s at", "above the limit of 1", "ada and bob: sep"):
         assert part in text, text
+
+
+def test_several_starts_of_one_trajectory_are_as_many_drones():
+    """On a circle of 2 m in 8 s, 1 s is an eighth of a round: neighbours are 2 r sin(pi / 8) from each other."""
+    report = check(circle(2.0, period=8.0), Limits(separation=1.6), starts=-np.arange(3.0))
+    assert [pair.drones for pair in report.closest] in ([(0, 1), (1, 2), (0, 2)], [(1, 2), (0, 1), (0, 2)])
+    distances = [pair.distance for pair in report.closest]
+    np.testing.assert_allclose(distances, 4 * np.sin(np.pi / np.array([8, 8, 4])), atol=2e-3)  # tolerance of check
+    assert [v.limit for v in report.violations] == ["separation"] * 2
 
 
 def test_a_trajectory_at_its_limit_is_fine_and_one_above_is_not():

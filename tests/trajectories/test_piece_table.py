@@ -32,6 +32,19 @@ def test_it_evaluates_as_the_record_does(drone, t):
             np.testing.assert_allclose(TABLE.at(drone, t, order)[:3], expected, atol=5e-3, rtol=1e-3)
 
 
+EARLY = np.array([-1.3, -7.7, -60.0])
+BEGUN = PieceTable.of(TRAJECTORIES, EARLY, duration=12.0)
+
+
+@given(drone=st.integers(0, 2), t=st.floats(0.0, 12.0))
+def test_drones_that_started_before_zero_are_in_the_middle(drone, t):
+    """One that repeats is in one of its rounds, and one whose end is over rests there."""
+    setpoint = evaluate(drone, t - EARLY[drone])
+    np.testing.assert_allclose(BEGUN.at(drone, t), [*setpoint.pos, *setpoint.yaw], atol=1e-4)
+    assert BEGUN.start[BEGUN.first].tolist() == [0.0, 0.0, 0.0]
+    assert np.all(np.diff(BEGUN._keys) > 0)
+
+
 def test_many_at_once_are_those_one_by_one():
     drones, times = np.repeat([0, 1, 2], 7), np.tile(np.linspace(0, 12, 7), 3)
     together = TABLE.at(drones, times, 1)
@@ -54,7 +67,8 @@ def test_the_default_duration_ends_with_the_last_drone():
     [
         (([],), "at least one"),
         ((TRAJECTORIES, [0.0, 1.0]), "each of 3 drones"),
-        ((TRAJECTORIES, -1.0), "at least 0 s"),
+        ((TRAJECTORIES, np.nan), "finite start"),
+        ((TRAJECTORIES[:1], -100.0), "positive, finite duration.*end at -"),
         ((TRAJECTORIES, 0.0, np.nan), "positive, finite duration"),
     ],
 )

@@ -104,8 +104,48 @@ def test_one_after_the_other():
     t = np.linspace(0, d1.sum() + d2.sum() - 1e-9, 60)
     c = np.concatenate([np.pad(c1, ((0, 0), (0, 0), (0, 4))), c2])
     check_same(evaluate(both, t), np.concatenate([d1, d2]), c, t)
-    with pytest.raises(ConfigError, match="repeats"):
-        both.then(Trajectory.of_pieces(d1, c1, repeats=True))
+    endless = Trajectory.of_pieces(d1, c1, repeats=True)
+    with pytest.raises(ConfigError, match=r"got a second one that repeats.*repeat\(1\) for one round"):
+        both.then(endless)
+    with pytest.raises(ConfigError, match="got a first one that repeats"):
+        endless.then(both)
+
+
+def test_rounds_are_those_of_one_that_repeats_and_then_end():
+    durations, c = random_pieces(3, 5)
+    endless, end = Trajectory.of_pieces(durations, c, repeats=True), durations.sum()
+    three = endless.repeat(3)
+    t = np.concatenate([np.linspace(0, 3 * end, 50)[:-1], [3 * end + 1.0]])
+    check_same(evaluate(three, t[:-1]), durations, c, t[:-1] % end, rtol=1e-9)
+    np.testing.assert_allclose(evaluate(three, t).pos[-1], c[-1, :3] @ durations[-1] ** np.arange(6))
+    np.testing.assert_array_equal(evaluate(three, t).vel[-1], np.zeros(3))
+    np.testing.assert_allclose(evaluate(three.repeat(), t).pos, evaluate(endless, t).pos, atol=1e-9)
+    for wrong in (0, -1, 1.5, True):
+        with pytest.raises(ConfigError, match="number of rounds of at least 1"):
+            endless.repeat(wrong)
+
+
+@pytest.mark.parametrize("turns", [-3, 0, 2])
+def test_a_transition_connects_two_smoothly_and_turns_the_shorter_way(turns):
+    (d1, c1), (d2, c2) = random_pieces(2, 3, 1), random_pieces(3, 7, 2)
+    c2[:, 3, 0] += 2 * np.pi * turns
+    first, second = Trajectory.of_pieces(d1, c1).padded(4, 3), Trajectory.of_pieces(d2, c2)
+    both = first.then(second, transition=1.5)
+    meet = [d1.sum(), d1.sum() + 1.5]
+    assert float(both.duration) == pytest.approx(d1.sum() + 1.5 + d2.sum())
+    for t in meet:
+        setpoints = evaluate(both, np.array([t - 1e-8, t + 1e-8]))
+        for name in ("pos", "vel", "acc", "jerk", "yaw", "yaw_rate", "yaw_acc"):
+            before, after = getattr(setpoints, name)
+            np.testing.assert_allclose(before, after, atol=2e-4, err_msg=name)  # 2e-8 s of derivatives up to 1e4
+    at_start = evaluate(both, np.array([meet[1]]))
+    np.testing.assert_allclose(at_start.pos[0], c2[0, :3, 0], atol=1e-9)
+    turned = evaluate(both, np.array(meet)).yaw[:, 0]
+    assert abs(turned[1] - turned[0]) <= np.pi + 1e-9
+    np.testing.assert_allclose(np.exp(1j * turned[1]), np.exp(1j * c2[0, 3, 0]), atol=1e-9)
+    for wrong in (-1.0, np.inf, "long"):
+        with pytest.raises(ConfigError, match="transition of 0 s or more"):
+            first.then(second, transition=wrong)
 
 
 @pytest.mark.parametrize("traced", [False, True])

@@ -17,7 +17,7 @@ from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.core import install_rules, nearest, others_near, state_of, with_record
+from crazysim.envs.tasks.goals import install_rules, nearest, others_near, state_of, with_record
 from crazysim.envs.tracks import ranks
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, on_device, static

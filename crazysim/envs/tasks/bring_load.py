@@ -12,11 +12,11 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.core import with_record
-from crazysim.payloads import load_pos, load_vel
+from crazysim.envs.tasks.goals import with_record
+from crazysim.plugins.payloads import load_pos, load_vel
 from crazysim.pytree import PyTree, leaf, on_device
 
-SLOW = 0.2
+SETTLED_SPEED = 0.2
 """Largest speed of a load that is delivered, m/s."""
 
 
@@ -75,7 +75,7 @@ class BringLoad(Task):
     def at_goal(self, data: SimData) -> Array:
         """Return True where a load is near its goal and slow. (...)"""
         vel = load_vel(data)
-        return (rotation.dot(vel, vel)[..., 0] < SLOW**2) & (self.error(data) < self.tolerance)
+        return (rotation.dot(vel, vel)[..., 0] < SETTLED_SPEED**2) & (self.error(data) < self.tolerance)
 
     def terminated(self, data: SimData) -> Array:
         """Return True in worlds where a drone has crashed. ()"""

@@ -15,19 +15,19 @@ from crazysim.core.data import SimData, grid_2d
 from crazysim.core.plugin import Placement
 from crazysim.envs.random import between, draw, within
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.core import pick
+from crazysim.envs.tasks.goals import pick
 from crazysim.envs.tasks.touch_down import Landing, TouchDown, not_yet
 from crazysim.errors import ConfigError
+from crazysim.plugins.vehicles import Cars
+from crazysim.plugins.vehicles.car_data import CarData
+from crazysim.plugins.vehicles.model import load_vehicle
 from crazysim.sim.sim import Sim
-from crazysim.vehicles import Cars
-from crazysim.vehicles.car_data import CarData
-from crazysim.vehicles.model import load_vehicle
 
 CARS, VEHICLE = "cars", "f1tenth_ros"
 """Name of the population, and vehicle model."""
 SPACING = 6.0
 """Distance between the first places of the cars of several drones, m; a drone observes its own car only."""
-NEAR, CEILING = 3.0, 2.5
+FARTHEST, CEILING = 3.0, 2.5
 """Largest horizontal distance of a drone from its car, and largest height of a drone, m."""
 SLOWEST = 0.3
 """Smallest speed of a car, as a share of the largest."""
@@ -91,7 +91,7 @@ class Chase(TouchDown):
         pos = car.pos + within(x["start"], np.array([1.0, 1.0, 0.4])) + np.array([0.0, 0.0, 1.1])
         return flying(data, pos, rotation.from_rpy(within(x["rpy"], 0.2)), within(x["vel"], 0.3))
 
-    def place(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
+    def target_motion(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's roof, of one drone or one world. (..., 3) each"""
         del ahead
         car: CarData = data.plugins[CARS]
@@ -104,8 +104,8 @@ class Chase(TouchDown):
     def beyond(self, data: SimData) -> Array:
         """Return true where a drone is too far from its car, or too high. (...)"""
         pos = data.states.pos
-        away = (pos - self.place(data)[0])[..., :2]
-        return (rotation.dot(away, away)[..., 0] > NEAR**2) | (pos[..., 2] > CEILING)
+        away = (pos - self.target_motion(data)[0])[..., :2]
+        return (rotation.dot(away, away)[..., 0] > FARTHEST**2) | (pos[..., 2] > CEILING)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the way to its roof, m, the roof's relative velocity, m/s, and the car's turning.

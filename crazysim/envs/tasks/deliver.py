@@ -17,16 +17,16 @@ from crazysim.envs import terms
 from crazysim.envs.random import between, draw, within
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, not_yet
-from crazysim.envs.tasks.core import install_rules, pick, state_of, with_record
+from crazysim.envs.tasks.goals import install_rules, pick, state_of, with_record
 from crazysim.errors import ConfigError
-from crazysim.payloads import Hook
+from crazysim.plugins.payloads import Hook
+from crazysim.plugins.vehicles import Cars
+from crazysim.plugins.vehicles.car_data import CarData
+from crazysim.plugins.vehicles.model import load_vehicle
+from crazysim.plugins.vehicles.state import to_world
+from crazysim.plugins.vehicles.trailer import trailer_axles
 from crazysim.pytree import leaf, on_device
 from crazysim.sim.sim import Sim
-from crazysim.vehicles import Cars
-from crazysim.vehicles.car_data import CarData
-from crazysim.vehicles.model import load_vehicle
-from crazysim.vehicles.state import to_world
-from crazysim.vehicles.trailer import trailer_axles
 
 CARS, VEHICLE = "cars", "f1tenth_ros"
 """Name of the population, and vehicle model."""

@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.envs import terms
 from crazysim.envs.random import draw, within
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.core import GoalTask, with_goal
+from crazysim.envs.tasks.goals import GoalTask, with_goal
 
 MIDDLE = np.array([0.0, 0.0, 1.2])
 """Middle of the box that starts and goals are drawn from, m."""
@@ -59,4 +59,4 @@ class Hover(GoalTask):
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
-        return {"lookat": (0, 0, 1.2), "distance": 4.5, "elevation": -20}
+        return {"lookat": (0, 0, 1.2), "distance": 3.2, "elevation": -20}

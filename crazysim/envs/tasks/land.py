@@ -17,7 +17,7 @@ from crazysim.core.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME
-from crazysim.envs.tasks.core import pick, with_record
+from crazysim.envs.tasks.goals import pick, with_record
 from crazysim.envs.tasks.touch_down import Landing, TouchDown, landing_of, not_yet
 from crazysim.errors import ConfigError
 from crazysim.pytree import leaf, on_device, static
@@ -110,7 +110,7 @@ class Land(TouchDown):
         pos, along = pad_of(data, data.core.steps)
         return new.pads.set_pose(data, pos, vel=along) if self.speed > 0 else data
 
-    def place(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
+    def target_motion(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's pad, of one drone or one world. (..., 3) each"""
         return pad_of(data, data.core.steps + ahead if ahead else data.core.steps)
 

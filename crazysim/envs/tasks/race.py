@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import DTypeLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
@@ -18,12 +19,12 @@ from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import Task
 from crazysim.envs.tasks import race_rules as rules
-from crazysim.envs.tasks.core import install_rules, pick, with_record
+from crazysim.envs.tasks.goals import install_rules, pick, with_record
 from crazysim.envs.tasks.race_observations import observe, visited
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.tracks import Track, checked, n_random, random_course, start_offsets
 from crazysim.errors import ConfigError
-from crazysim.pytree import of_host, on_device
+from crazysim.pytree import host_array, on_device
 from crazysim.sim.sim import Sim
 
 SENSOR_RANGE = 0.7
@@ -108,7 +109,7 @@ class Race(Task):
             _one_per_drone(sim, {"mass": 1, "J": 2, "J_inv": 2})
         pos, shape = sim.data.states.pos, (sim.n_worlds, sim.n_drones)
 
-        def zeros(*shape: int, dtype: Any = pos.dtype) -> Array:
+        def zeros(*shape: int, dtype: DTypeLike = pos.dtype) -> Array:
             return on_device(np.zeros(shape), dtype)
 
         zero, none = zeros(*shape, dtype=np.int32), zeros(*shape, dtype=bool)
@@ -219,7 +220,7 @@ class Race(Task):
 
     def _gates_quat(self) -> np.ndarray:
         with jax.ensure_compile_time_eval():  # an array, also while a step is traced
-            return np.asarray(jax.jit(rotation.from_rpy)(of_host(self.track.gates_rpy, self.track.n_gates, 3)))
+            return np.asarray(jax.jit(rotation.from_rpy)(host_array(self.track.gates_rpy, self.track.n_gates, 3)))
 
     def _place(self, data: SimData, x: dict[str, Array]) -> tuple[SimData, Any]:
         """Return the data with gates and obstacles displaced from their nominal poses, and the start, m."""

@@ -8,7 +8,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.envs.tasks.core import nearest, others_near, pick
+from crazysim.envs.tasks.goals import nearest, others_near, pick
 from crazysim.envs.tasks.race_rules import OPENING, gates_of, obstacles_of, race_of
 
 CORNERS = OPENING / 2 * np.array([[0, 1, 1], [0, 1, -1], [0, -1, -1], [0, -1, 1]])

@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.envs import terms
 from crazysim.envs.task import NAME
-from crazysim.envs.tasks.core import pick
+from crazysim.envs.tasks.goals import pick
 from crazysim.pytree import PyTree, leaf, static
 from crazysim.scene.objects import Handle
 

@@ -14,7 +14,7 @@ from crazysim.envs import terms
 from crazysim.envs.random import draw, within
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import Task
-from crazysim.envs.tasks.core import Goal, goal_of, install_goal, on_floor, state_of, with_goal
+from crazysim.envs.tasks.goals import Goal, goal_of, install_goal, on_floor, state_of, with_goal
 from crazysim.sim.sim import Sim
 
 HEIGHT = 5.0
@@ -29,6 +29,7 @@ class ReachVel(Task):
     """
 
     name = "reach_vel"
+    unit = "m/s"
     Record = Goal
 
     speed: float = 1.0

@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import any_attitude, flying
-from crazysim.envs.tasks.core import GoalTask, with_goal
+from crazysim.envs.tasks.goals import GoalTask, with_goal
 
 GOAL = np.array([0.0, 0.0, 3.0])
 """Goal of every drone, m."""

@@ -18,7 +18,7 @@ from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.core import install_rules, on_floor, others_near, state_of, with_record
+from crazysim.envs.tasks.goals import install_rules, on_floor, others_near, state_of, with_record
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.sim.sim import Sim

@@ -14,9 +14,9 @@ from crazysim.core.data import SimData
 from crazysim.core.stage import Stage, stage
 from crazysim.envs import terms
 from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.core import state_of, with_record
+from crazysim.envs.tasks.goals import state_of, with_record
 from crazysim.pytree import PyTree, leaf, on_device
-from crazysim.scene.report import ContactFn
+from crazysim.scene.contact_report import ContactFn
 
 SOFT = 0.5
 """Largest speed relative to the place at touch-down, m/s."""
@@ -60,14 +60,14 @@ class TouchDown(Task):
     seconds: float = 6.0
     """Length of an episode, s."""
 
-    def place(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
+    def target_motion(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's place, of one drone or one world. (..., 3) each
 
         Args:
             data: Simulation.
             ahead: Steps that a place by time is ahead of the data: 1 in a stage behind the integration.
         """
-        raise NotImplementedError(self._undefined("place(data)"))
+        raise NotImplementedError(self._undefined("target_motion(data)"))
 
     def beyond(self, data: SimData) -> Array:
         """Return true where a drone has left its part of the arena. (...)"""
@@ -85,7 +85,7 @@ class TouchDown(Task):
         @stage(scope)
         def touch(data: SimData) -> SimData:
             own, s, report = landing_of(data), data.states, contacts(data)
-            pos, vel = self.place(data, ahead=1)
+            pos, vel = self.target_motion(data, ahead=1)
             if report.objects is None or report.floor is None:
                 raise TypeError("expected contacts with objects and floor, got None")
             mine = np.arange(data.core.n_drones) == data.core.drone_id[..., None]
@@ -108,7 +108,7 @@ class TouchDown(Task):
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, and the way to its place, m, and the place's relative velocity, m/s."""
-        pos, vel = self.place(data)
+        pos, vel = self.target_motion(data)
         return state_of(data) | {
             f"difference_to_{self.what}": pos - data.states.pos,
             f"difference_to_{self.what}_vel": vel - data.states.vel,
@@ -117,7 +117,7 @@ class TouchDown(Task):
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return progress and the outcome, and costs of speed near the place, of turning and of changing actions."""
         own, d = landing_of(data), self.error(data)
-        drift = rotation.safe_norm(self.place(data)[1] - data.states.vel)[..., 0]
+        drift = rotation.safe_norm(self.target_motion(data)[1] - data.states.vel)[..., 0]
         paid = {
             "progress": self.progress * (own.to_go_before - d),
             "speed": -0.1 * drift * jnp.exp(-4 * d),
@@ -142,7 +142,7 @@ class TouchDown(Task):
 
     def target(self, data: SimData) -> Array:
         """Return the middle of the place, m."""
-        return self.place(data)[0]
+        return self.target_motion(data)[0]
 
     def succeeded(self, data: SimData) -> Array:
         """Return which drones have landed."""

@@ -14,12 +14,12 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.deprecation import warn_renamed
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.core import on_floor, state_of, with_record
+from crazysim.envs.tasks.goals import on_floor, state_of, with_record
+from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Trajectory, figure_eight
@@ -64,9 +64,16 @@ class TrackTrajectory(Task):
     """Time at the end of an episode during which it must stay there, s."""
 
     def __post_init__(self) -> None:
-        """Accept functions of time, which this task took before there were trajectories."""
+        """Check the trajectory.
+
+        Raises:
+            ConfigError: If it is none.
+        """
         if not isinstance(self.trajectory, Trajectory):
-            warn_renamed("TrackTrajectory(trajectory=function)", "a crazysim.trajectories.Trajectory")
+            raise ConfigError(
+                f"expected a crazysim.trajectories.Trajectory, got {self.trajectory!r}. Use figure_eight(), or another "
+                "of its shapes."
+            )
 
     def install(self, sim: Sim) -> None:
         """Give every drone its time on the trajectory."""
@@ -88,8 +95,6 @@ class TrackTrajectory(Task):
 
     def motion(self, t: Array) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, at times on the trajectory, s. (...) to (..., 3) each"""
-        if not isinstance(self.trajectory, Trajectory):
-            return self.trajectory(t)
         pos, vel = self._derivatives(t, 1)
         return pos, vel
 

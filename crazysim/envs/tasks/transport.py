@@ -17,9 +17,9 @@ from crazysim.envs import terms
 from crazysim.envs.random import between, draw, within
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, not_yet
-from crazysim.envs.tasks.core import install_rules, pick, state_of, with_record
+from crazysim.envs.tasks.goals import install_rules, pick, state_of, with_record
 from crazysim.errors import ConfigError
-from crazysim.payloads import SlungLoad, direction, load_pos, load_vel
+from crazysim.plugins.payloads import SlungLoad, direction, load_pos, load_vel
 from crazysim.pytree import static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim

@@ -1,7 +1,8 @@
 """Wrappers: environments around environments, written for one world."""
 
+from crazysim.envs.reset_policy import AutoresetMode, ResetPolicy
 from crazysim.envs.wrappers.action import ActionDelay
-from crazysim.envs.wrappers.autoreset import AutoReset, AutoresetMode, ResetPolicy
+from crazysim.envs.wrappers.autoreset import AutoReset
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.envs.wrappers.observation import FrameStack, Normalize, ObservationNoise, Observe
 from crazysim.envs.wrappers.randomize import Randomize

@@ -9,6 +9,14 @@ from crazysim.core.settings import positive
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
+from crazysim.pytree import PyTree, leaf
+
+
+class ActionQueue(PyTree):
+    """Memory of ``ActionDelay``."""
+
+    actions: Array = leaf("drone", 2)
+    """Actions that have not arrived yet, the oldest first. (n_worlds, n_drones, n, k)"""
 
 
 class ActionDelay(Wrapper):
@@ -20,10 +28,12 @@ class ActionDelay(Wrapper):
         self.n = positive("n", n)
 
     def after_reset(self, state: EnvState) -> EnvState:
-        """Return the state with a queue of zeros. (n, n_drones, k)"""
-        return self.remember(state, jnp.zeros((self.n, *state.action.shape), state.action.dtype))
+        """Return the state with a queue of zeros."""
+        n_drones, size = state.action.shape
+        return self.remember(state, ActionQueue(jnp.zeros((n_drones, self.n, size), state.action.dtype)))
 
     def before_step(self, state: EnvState, action: Array) -> tuple[EnvState, Array]:
         """Return the state with the action queued, and the action that arrives. (n_drones, k)"""
-        queue = self.recall(state)
-        return self.remember(state, jnp.concatenate([queue[1:], action[None]])), queue[0]
+        queue = self.recall(state).actions
+        longer = jnp.concatenate([queue, action[:, None]], axis=1)
+        return self.remember(state, ActionQueue(longer[:, 1:])), longer[:, 0]

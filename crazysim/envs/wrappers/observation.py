@@ -16,6 +16,7 @@ from crazysim.envs.state import EnvState, Obs
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, leaf
 
 
 class Observe(Wrapper):
@@ -116,6 +117,13 @@ class Normalize(Wrapper):
         return self.remember(state, stats, obs={name: stats[name].normalize(x) for name, x in state.obs.items()})
 
 
+class Frames(PyTree):
+    """Memory of ``FrameStack``."""
+
+    obs: Obs = leaf("drone", 2)
+    """The last observations, the oldest first. (n_worlds, n_drones, n, k) each"""
+
+
 class FrameStack(Wrapper):
     """Observe the last few observations, the oldest first, concatenated along the last axis."""
 
@@ -130,9 +138,9 @@ class FrameStack(Wrapper):
 
     def after_step(self, state: EnvState) -> EnvState:
         """Return the state with the new observation in place of the oldest."""
-        old = self.recall(state)
+        old = self.recall(state).obs
         frames = jax.tree.map(lambda x, y: jnp.concatenate([y[..., 1:, :], x[..., None, :]], axis=-2), state.obs, old)
         return self._stacked(state, frames)
 
     def _stacked(self, state: EnvState, frames: Obs) -> EnvState:
-        return self.remember(state, frames, obs=jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1), frames))
+        return self.remember(state, Frames(frames), obs=jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1), frames))

@@ -11,6 +11,23 @@ from jax import Array
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
+from crazysim.pytree import PyTree, leaf
+
+
+class EpisodeSums(PyTree):
+    """Memory of ``EpisodeStatistics``."""
+
+    reward: Array = leaf("drone")
+    """Sum of the rewards of the episode. (n_worlds, n_drones)"""
+    length: Array = leaf("batched")
+    """Number of its steps. (n_worlds,)"""
+
+
+class LastAction(PyTree):
+    """Memory of ``RewardTerms``."""
+
+    action: Array = leaf("drone", 1)
+    """Action of the last step. (n_worlds, n_drones, k)"""
 
 
 class EpisodeStatistics(Wrapper):
@@ -21,20 +38,20 @@ class EpisodeStatistics(Wrapper):
 
     def after_reset(self, state: EnvState) -> EnvState:
         """Return the state with sums of zero."""
-        return self._recorded(state, {"return": jnp.zeros_like(state.reward), "length": jnp.zeros((), jnp.int32)})
+        return self._recorded(state, EpisodeSums(jnp.zeros_like(state.reward), jnp.zeros((), jnp.int32)))
 
     def after_step(self, state: EnvState) -> EnvState:
         """Return the state with the step added, and the sums in its info where the episode ended."""
         before = self.recall(state)
-        return self._recorded(state, {"return": before["return"] + state.reward, "length": before["length"] + 1})
+        return self._recorded(state, EpisodeSums(before.reward + state.reward, before.length + 1))
 
-    def _recorded(self, state: EnvState, sums: dict[str, Array]) -> EnvState:
+    def _recorded(self, state: EnvState, sums: EpisodeSums) -> EnvState:
         def where(over: Array, x: Array) -> Array:
             return jnp.where(over, x, jnp.zeros((), x.dtype))
 
         ended: Any = jax.tree.map(lambda x: where(state.done, x), sums)
         left = jax.tree.map(lambda x: where(~state.done, x), sums)
-        info = {"episode_return": ended["return"], "episode_length": ended["length"]}
+        info = {"episode_return": ended.reward, "episode_length": ended.length}
         return self.remember(state, left, info=state.info | info)
 
 
@@ -50,11 +67,11 @@ class RewardTerms(Wrapper):
         """Return the state with terms of zero."""
         shapes = jax.eval_shape(self.task.rewards, state.data, state.action, state.action)
         terms = {f"reward {name}": jnp.zeros(x.shape, state.reward.dtype) for name, x in shapes.items()}
-        return self.remember(state, state.action, info=state.info | terms)
+        return self.remember(state, LastAction(state.action), info=state.info | terms)
 
     def after_step(self, state: EnvState) -> EnvState:
         """Return the state with the terms of the step; zero in worlds that are not finite."""
-        terms = self.task.rewards(state.data, state.action, self.recall(state))
+        terms = self.task.rewards(state.data, state.action, self.recall(state).action)
         lost, dtype = state.data.core.nonfinite, state.reward.dtype
         info = {f"reward {k}": jnp.where(lost, jnp.zeros((), dtype), jnp.asarray(x, dtype)) for k, x in terms.items()}
-        return self.remember(state, state.action, info=state.info | info)
+        return self.remember(state, LastAction(state.action), info=state.info | info)

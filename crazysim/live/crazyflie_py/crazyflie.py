@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.live.crazyflie_py.uav_trajectory import Trajectory
 from crazysim.live.mocap.frames import from_rpy
 from crazysim.live.swarm import Commander, Swarm
+from crazysim.live.swarm.parameters import SOLID
+from crazysim.live.swarm.sensors import battery_of
 
 
 class TimeHelper:
@@ -100,34 +102,39 @@ class Crazyflie:
         """Arm or disarm."""
         self._commander.arm(arm)
 
-    def cmdFullState(self, pos: Any, vel: Any, acc: Any, yaw: float, omega: Any) -> None:
+    def cmdFullState(self, pos: ArrayLike, vel: ArrayLike, acc: Any, yaw: float, omega: Any) -> None:
         """Stream a state: position, m, velocity, m/s, acceleration, m/s^2, yaw, rad, body rates, rad/s."""
         self._command(lambda c: c.full_state(pos, vel, acc, from_rpy([0.0, 0.0, float(yaw)]), omega))
 
-    def cmdPosition(self, pos: Any, yaw: float = 0.0) -> None:
+    def cmdPosition(self, pos: ArrayLike, yaw: float = 0.0) -> None:
         """Stream a position, m, and yaw, rad."""
         self._command(lambda c: c.position(pos, yaw))
 
-    def cmdVelocityWorld(self, vel: Any, yawRate: float) -> None:
+    def cmdVelocityWorld(self, vel: ArrayLike, yawRate: float) -> None:
         """Stream a velocity, world frame, m/s, and yaw rate, degrees/s."""
         self._command(lambda c: c.velocity(vel, float(np.deg2rad(yawRate))))
 
+    def cmdHover(self, vx: float, vy: float, yaw_rate: float, z_distance: float) -> None:
+        """Stream a horizontal velocity in the axes of the drone's yaw, m/s, yaw rate, rad/s, and height, m."""
+        self._command(lambda c: c.hover(vx, vy, yaw_rate, z_distance))
+
     def setLEDColor(self, r: float, g: float, b: float) -> None:
-        """Set the colour of the light, 0 to 1."""
-        self._swarm.colors[self._index] = np.clip([r, g, b], 0.0, 1.0)
+        """Set the colour of the light, 0 to 1, by the effect for one colour of ``ring.effect``."""
+        self.setParam("ring.effect", SOLID)
+        for color, value in zip(("Red", "Green", "Blue"), np.clip([r, g, b], 0.0, 1.0).tolist(), strict=True):
+            self.setParam(f"ring.solid{color}", int(255 * value))
 
     def getParam(self, name: str) -> float:
-        """Return a parameter; NaN if it has not been set."""
-        return self._commander.params.get(name, float("nan"))
+        """Return a parameter.
+
+        Raises:
+            ConfigError: If the simulation has no such parameter.
+        """
+        return self._swarm.parameters[self._index].get_value(name)
 
     def setParam(self, name: str, value: float) -> None:
-        """Set a parameter; those of the light set its colour, others are stored."""
-        self._commander.params[name] = value
-        channel = {"ring.solidRed": 0, "ring.solidGreen": 1, "ring.solidBlue": 2}.get(name)
-        if channel is not None:
-            self._swarm.colors[self._index, channel] = np.clip(value / 255, 0.0, 1.0)
-        elif name == "hlCommander.groupmask":
-            self.setGroupMask(int(value))
+        """Set a parameter; one that the simulation lacks, or whose effect it does not simulate, is reported."""
+        self._command(lambda _: self._swarm.set_parameter(self._index, name, value))
 
     def position(self) -> NDArray:
         """Return the position, m. (3,)"""
@@ -143,15 +150,23 @@ class Crazyflie:
         return {"position": state.pos.copy(), "orientation": state.quat.copy()}
 
     def get_status(self) -> dict[str, Any]:
-        """Return name, time and whether the drone is armed and flies."""
+        """Return name, time, bits of the supervisor, battery voltage, V, state of the power management and radio.
+
+        The battery is that of the plugin ``Battery``, or never empty without it. There is no radio: its strength is
+        that of no loss, and no packets are counted.
+        """
         now, c = self._swarm.time, self._commander
         supervisor = (0 if c.locked else 1) | c.armed << 1 | c.armed << 3 | c.motors_on << 4 | c.locked << 6
-        seconds = int(now)
+        seconds, battery = int(now), battery_of(self._swarm.sim, self._index)
         return {
             "id": self.prefix[1:],
             "timestamp_sec": seconds,
             "timestamp_nsec": round((now - seconds) * 1e9),
             "supervisor": supervisor,
+            "battery": battery.voltage,
+            "pm_state": battery.state,
+            "rssi": 0,
+            **dict.fromkeys(("num_rx_broadcast", "num_tx_broadcast", "num_rx_unicast", "num_tx_unicast"), 0),
         }
 
     def _command(self, call: Any, group: int = 0) -> None:
@@ -217,7 +232,7 @@ class CrazyflieServer:
         """Set a parameter of all."""
         self._all(lambda cf: cf.setParam(name, value))
 
-    def cmdFullState(self, pos: Sequence[float], vel: Any, acc: Any, yaw: float, omega: Any) -> None:
+    def cmdFullState(self, pos: Sequence[float], vel: ArrayLike, acc: Any, yaw: float, omega: Any) -> None:
         """Stream one state to all."""
         self._all(lambda cf: cf.cmdFullState(pos, vel, acc, yaw, omega))
 

@@ -9,23 +9,22 @@ from __future__ import annotations
 import errno
 import math
 import struct
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazysim.control import Control
 from crazysim.errors import ConfigError
 from crazysim.live.crtp.setpoints import high_level, streamed
 from crazysim.live.crtp.tables import (
-    LOG,
     LOG_TYPES,
     PARAM_TYPES,
-    PARAMS,
     Reading,
     Table,
     Variable,
+    log_of,
     pack,
     supervisor_bits,
 )
@@ -41,8 +40,12 @@ MAX_LOG = 26
 """Largest number of bytes of the values of a log block."""
 MEMORY_SIZE = 4096
 """Size of the memory of trajectories, bytes."""
-TRAJECTORY_MEMORY = 0x12
-"""Type of the memory of trajectories."""
+TRAJECTORY_MEMORY, LED_MEMORY, DECK_MEMORY = 0x12, 0x10, 0x19
+"""Types of the memories of trajectories, of the LED ring and of decks (``MemoryElement`` of cflib)."""
+DECKS = bytes([3]) + bytes(8 * 32)
+"""Memory of decks: its version, and eight descriptions, none of which is valid, as no deck has a memory of its own."""
+MAX_LINES = 256
+"""Most packets of console text that wait for a client."""
 
 CONSOLE, PARAM, COMMANDER, MEM, LOGGING, LOCALIZATION, GENERIC, HIGH_LEVEL, SUPERVISOR, PLATFORM, LINK = (
     0, 2, 3, 4, 5, 6, 7, 8, 9, 13, 15,
@@ -83,11 +86,14 @@ class CrtpDevice:
         self.swarm = swarm
         self.drone = swarm.index(drone) if isinstance(drone, str) else drone
         self.name, self.commander = swarm.names[self.drone], swarm.commanders[self.drone]
-        self.readings = LOG | (log or {})
+        self.readings = log_of(swarm, self.drone) | (log or {})
         self.log = Table([Variable(name, kind) for name, (kind, _) in self.readings.items()], LOG_TYPES)
-        self.params = Table([Variable(name, t, ro) for name, (t, _, ro) in PARAMS.items()], PARAM_TYPES)
-        self.values = {name: value for name, (_, value, _) in PARAMS.items()}
+        self.values = swarm.parameters[self.drone]
+        kinds = self.values.kinds.items()
+        self.params = Table([Variable(name, kind.ctype, kind.read_only) for name, kind in kinds], PARAM_TYPES)
         self.memory = bytearray(MEMORY_SIZE)
+        self.memories = [(TRAJECTORY_MEMORY, self.memory), (LED_MEMORY, bytearray(24)), (DECK_MEMORY, DECKS)]
+        self._console: deque[bytes] = deque(maxlen=MAX_LINES)
         self.blocks: dict[int, LogBlock] = {}
         self._ports: dict[int, Callable[[int, bytes], list[Packet]]] = {
             PARAM: self._param, COMMANDER: self._setpoint, MEM: self._mem, LOGGING: self._logging,
@@ -118,10 +124,12 @@ class CrtpDevice:
             return []
 
     def due(self) -> list[bytes]:
-        """Return the log packets that have become due at the swarm's time."""
+        """Return the packets that have become due at the swarm's time: lines of the console, and logs."""
         now, found = self.swarm.time, []
         with self.swarm.lock:
-            state = self.swarm.state(self.drone)
+            while self._console:
+                found.append(bytes([CONSOLE << 4 | 0x0C]) + self._console.popleft())
+            state = self.commander.estimate(self.swarm.state(self.drone))
             for identity, block in self.blocks.items():
                 if block.period is None or now < block.due - 1e-9:
                     if block.period is not None and block.due - now > block.period:  # after a reset
@@ -138,12 +146,15 @@ class CrtpDevice:
         try:
             value = float(self.readings[name][1](state, self.commander))  # type: ignore[arg-type]
         except Exception as error:  # of a reading that a user has added
-            self._report(f"log variable {name} failed: {error}")
+            self.swarm.reports.add("refused", self.name, self.swarm.time, f"log variable {name} failed: {error}")
             value = math.nan
         return pack(layout, value)
 
     def _report(self, text: str) -> None:
+        """Report what was refused, on the drone's console too."""
         self.swarm.reports.add("refused", self.name, self.swarm.time, text)
+        line = f"{text}\n".encode("ascii", "replace")
+        self._console.extend(line[k : k + MAX_DATA] for k in range(0, len(line), MAX_DATA))
 
     # Connection -----------------------------------------------------------------------------------------------------
 
@@ -314,40 +325,42 @@ class CrtpDevice:
             return [(PARAM, 3, data[: -len(rest)] + bytes([code]))]
         (k,) = struct.unpack("<H", data[1:3])
         if command == 8 and k < len(self.params.variables):
-            value = PARAMS[self.params.variables[k].name][1]
+            value = self.values.kinds[self.params.variables[k].name].value
             return [(PARAM, 3, data[:3] + b"\0" + pack(self.params.format(k), value))]
         return [(PARAM, 3, data[:3] + bytes([errno.ENOENT]))]
 
     def _set(self, name: str, value: float) -> None:
-        """Set a parameter, and do what it means here: groups, the light."""
-        if PARAMS[name][2] or not math.isfinite(value):
-            self._report(f"parameter {name} was not set to {value}")
-            return
-        self.values[name] = self.commander.params[name] = value
-        if name == "hlCommander.groupmask":
-            self.commander.group = int(value)
-        channels: dict[str, int] = {"ring.solidRed": 0, "ring.solidGreen": 1, "ring.solidBlue": 2}
-        if name in channels:
-            colors: NDArray = self.swarm.colors
-            colors[self.drone, channels[name]] = value / 255
+        """Set a parameter; one that is refused keeps its value, which is the answer."""
+        try:
+            self.swarm.set_parameter(self.drone, name, value)
+        except ConfigError as error:
+            self._report(str(error))
 
     def _mem(self, channel: int, data: bytes) -> list[Packet]:
         if channel == 0:
             if data[0] == 1:
-                return [(MEM, 0, bytes([1, 1]))]
-            if data[0] == 2 and data[1] == 0:
-                return [(MEM, 0, bytes([2, 0]) + struct.pack("<BI8x", TRAJECTORY_MEMORY, MEMORY_SIZE))]
+                return [(MEM, 0, bytes([1, len(self.memories)]))]
+            if data[0] == 2 and data[1] < len(self.memories):
+                kind, content = self.memories[data[1]]
+                return [(MEM, 0, data[:2] + struct.pack("<BI8x", kind, len(content)))]
             return [(MEM, 0, data[:2])]
         identity, address = struct.unpack("<BI", data[:5])
+        kind, memory = self.memories[identity] if identity < len(self.memories) else (0, b"")
         content = data[5:]
         length = content[0] if channel == 1 else len(content)
-        ok = identity == 0 and address + length <= MEMORY_SIZE and length <= 24
+        ok = address + length <= len(memory) and length <= 24
         if channel == 1:
-            found = bytes(self.memory[address : address + length]) if ok else b""
+            found = bytes(memory[address : address + length]) if ok else b""
             return [(MEM, 1, data[:5] + bytes([0 if ok else errno.EIO]) + found)]
-        if channel == 2 and ok:
-            self.memory[address : address + length] = content
-        return [(MEM, 2, data[:5] + bytes([0 if ok else errno.EIO]))] if channel == 2 else []
+        if channel != 2:
+            return []
+        if not isinstance(memory, bytearray):
+            ok = False
+        elif ok:
+            memory[address : address + length] = content
+            if kind == LED_MEMORY:
+                self.swarm.set_leds(self.drone, np.frombuffer(memory, ">u2"))
+        return [(MEM, 2, data[:5] + bytes([0 if ok else errno.EIO]))]
 
 
 def _radians(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:

@@ -75,7 +75,8 @@ def high_level(commander: Commander, data: bytes, memory: bytes) -> None:
             raise ConfigError(
                 f"expected a trajectory in memory of type 0 or 1, got location {location}, type {encoding}"
             )
-        commander.upload(identity, (_compressed if encoding else _uncompressed)(memory, offset, n))
+        path = _compressed(memory, offset) if encoding else _uncompressed(memory, offset, n)
+        commander.upload(identity, path, compressed=bool(encoding))
         return
     if not commander.in_group(content[0]):
         return
@@ -116,28 +117,35 @@ def _uncompressed(memory: bytes, offset: int, n: int) -> Path:
         return _checked(durations, c * durations[:, None, None] ** np.arange(8))
 
 
-def _compressed(memory: bytes, offset: int, n: int) -> Path:
+def _compressed(memory: bytes, offset: int) -> Path:
     """Return the trajectory of Bezier curves in memory: a start, then segments of control points.
 
+    A segment without duration ends it, whatever number of pieces was sent with its definition (pptraj_compressed.c).
     Positions are in mm, yaw in tenths of degrees, durations in ms.
     """
     units = np.array([0.001, 0.001, 0.001, math.radians(0.1)])
-    last, at = np.array(struct.unpack_from("<4h", memory, offset)) * units, offset + 8
     durations, pieces = [], []
-    for _ in range(n):
-        kinds, ms = struct.unpack_from("<BH", memory, at)
-        at += 3
-        rows = []
-        for axis in range(4):
-            n_points = N_POINTS[kinds >> (2 * axis) & 3]
-            points = [last[axis], *np.array(struct.unpack_from(f"<{n_points}h", memory, at)) * units[axis]]
-            at += 2 * n_points
-            c = power_of(np.array(points)[:, None])[0]
-            rows.append(np.pad(c, (0, 8 - len(c))))
-            last[axis] = points[-1]
-        durations.append(ms / 1000)
-        pieces.append(rows)
-    _require_durations(np.array(durations))
+    try:
+        last, at = np.array(struct.unpack_from("<4h", memory, offset)) * units, offset + 8
+        while (head := struct.unpack_from("<BH", memory, at))[1] > 0:
+            kinds, ms = head
+            at += 3
+            rows = []
+            for axis in range(4):
+                n_points = N_POINTS[kinds >> (2 * axis) & 3]
+                points = [last[axis], *np.array(struct.unpack_from(f"<{n_points}h", memory, at)) * units[axis]]
+                at += 2 * n_points
+                c = power_of(np.array(points)[:, None])[0]
+                rows.append(np.pad(c, (0, 8 - len(c))))
+                last[axis] = points[-1]
+            durations.append(ms / 1000)
+            pieces.append(rows)
+    except struct.error:
+        raise ConfigError(
+            f"expected a compressed trajectory that a segment of duration 0 ends within {len(memory)} bytes, got none"
+        ) from None
+    if not pieces:  # the firmware stays at the start
+        durations, pieces = [0.001], [[[x] + [0.0] * 7 for x in last]]
     return _checked(np.array(durations), np.array(pieces))
 
 

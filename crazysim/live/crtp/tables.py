@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crazysim.errors import ConfigError
+from crazysim.live.swarm.sensors import battery_of, ranges_of
 
 if TYPE_CHECKING:
-    from crazysim.live.swarm import Commander, DroneState
+    from crazysim.live.swarm import Commander, DroneState, Swarm
 
 LOG_TYPES = {
     "uint8_t": (1, "<B"), "uint16_t": (2, "<H"), "uint32_t": (3, "<I"), "int8_t": (4, "<b"), "int16_t": (5, "<h"),
@@ -27,6 +28,10 @@ PARAM_TYPES = {
 """Number and format of the types of parameters (``ParamTocElement`` of cflib)."""
 READ_ONLY = 0x40
 """Bit of the type of a parameter that cannot be written."""
+OUT_OF_RANGE = 32767
+"""Distance where nothing is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
+RANGES = {"down": "zrange"}
+"""Log variables of directions that have another name."""
 GRAVITY = 9.81
 """Unit of log variables of acceleration, m/s^2."""
 
@@ -123,10 +128,9 @@ LOG: dict[str, tuple[str, Reading]] = {
     **{f"ctrltarget.{axis}": ("float", _goal(0, k)) for k, axis in enumerate("xyz")},
     **{f"ctrltarget.v{axis}": ("float", _goal(1, k)) for k, axis in enumerate("xyz")},
     "ctrltarget.yaw": ("float", lambda _s, commander: math.degrees(commander.goal()[0, 3])),
-    "pm.vbat": ("float", lambda _s, _c: 4.0),
-    "pm.state": ("uint8_t", lambda _s, _c: 0),
-    "pm.batteryLevel": ("uint8_t", lambda _s, _c: 100),
-    "radio.rssi": ("uint8_t", lambda _s, _c: 30),
+    "radio.rssi": ("uint8_t", lambda _s, _c: 0),
+    "colorLedBot.deckTemp": ("uint8_t", lambda _s, _c: 25),
+    "colorLedBot.throttlePct": ("uint8_t", lambda _s, _c: 0),
     "sys.canfly": ("uint8_t", lambda _s, commander: commander.armed and not commander.locked),
     "sys.isFlying": ("uint8_t", lambda _s, commander: commander.motors_on),
     "sys.isTumbled": ("uint8_t", lambda state, _c: np.cos(state.rpy[0]) * np.cos(state.rpy[1]) < 0),
@@ -134,34 +138,25 @@ LOG: dict[str, tuple[str, Reading]] = {
 }
 """Log variables that every simulated drone has, with their types and readings."""
 
-PARAMS: dict[str, tuple[str, float, bool]] = {
-    "stabilizer.estimator": ("uint8_t", 2, False),
-    "stabilizer.controller": ("uint8_t", 1, False),
-    "kalman.resetEstimation": ("uint8_t", 0, False),
-    "kalman.initialX": ("float", 0, False),
-    "kalman.initialY": ("float", 0, False),
-    "kalman.initialZ": ("float", 0, False),
-    "kalman.initialYaw": ("float", 0, False),
-    "commander.enHighLevel": ("uint8_t", 1, False),
-    "flightmode.stabModeRoll": ("uint8_t", 1, False),
-    "flightmode.stabModePitch": ("uint8_t", 1, False),
-    "flightmode.stabModeYaw": ("uint8_t", 0, False),
-    "locSrv.extPosStdDev": ("float", 0.01, False),
-    "locSrv.extQuatStdDev": ("float", 0.0045, False),
-    "hlCommander.groupmask": ("uint8_t", 0, False),
-    "ring.effect": ("uint8_t", 0, False),
-    "ring.solidRed": ("uint8_t", 0, False),
-    "ring.solidGreen": ("uint8_t", 0, False),
-    "ring.solidBlue": ("uint8_t", 0, False),
-    "ring.headlightEnable": ("uint8_t", 0, False),
-    "led.bitmask": ("uint8_t", 0, False),
-    "sound.effect": ("uint8_t", 0, False),
-    "deck.bcFlow2": ("uint8_t", 1, True),
-    "deck.bcMultiranger": ("uint8_t", 0, True),
-    "deck.bcLighthouse4": ("uint8_t", 0, True),
-    "deck.bcLedRing": ("uint8_t", 1, True),
-}
-"""Parameters that every simulated drone has: type, value at the start, and True where it cannot be written."""
+
+def log_of(swarm: Swarm, drone: int) -> dict[str, tuple[str, Reading]]:
+    """Return the log variables of a drone: those of every one, of its battery, and of its range finder."""
+    sim = swarm.sim
+
+    def distance(name: str) -> Reading:
+        def millimetres(_state: DroneState, _commander: Commander) -> float:
+            value = 1000 * ranges_of(sim, drone)[name]
+            return value if math.isfinite(value) else OUT_OF_RANGE
+
+        return millimetres
+
+    ranges = {f"range.{RANGES.get(name, name)}": ("uint16_t", distance(name)) for name in ranges_of(sim, drone)}
+    battery: dict[str, tuple[str, Reading]] = {
+        "pm.vbat": ("float", lambda _s, _c: battery_of(sim, drone).voltage),
+        "pm.state": ("uint8_t", lambda _s, _c: battery_of(sim, drone).state),
+        "pm.batteryLevel": ("uint8_t", lambda _s, _c: 100 * battery_of(sim, drone).charge),
+    }
+    return LOG | battery | ranges
 
 
 def supervisor_bits(commander: Commander) -> int:

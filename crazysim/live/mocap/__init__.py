@@ -3,9 +3,9 @@
 from crazysim.live.mocap.capture import SYSTEMS, MotionCaptureSource
 from crazysim.live.mocap.frames import Convention, Frame
 from crazysim.live.mocap.playback import Playback
-from crazysim.live.mocap.recording import MocapRecorder, ReplaySource, read_polls
-from crazysim.live.mocap.reports import Report, Reports
+from crazysim.live.mocap.poll_recording import MocapRecorder, ReplaySource, read_polls
 from crazysim.live.mocap.source import FunctionSource, MocapSource, Poll, RealTimeSource, ThreadSource, show_source
+from crazysim.live.mocap.source_events import Report, Reports
 from crazysim.live.mocap.tracker import Rules, Tracker
 from crazysim.live.mocap.twins import Twin, Twins, discover, twin_of
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
 
@@ -72,7 +72,7 @@ class Convention:
                 f"example."
             )
 
-    def to_world(self, pos: Any, quat: Any) -> tuple[NDArray, NDArray]:
+    def to_world(self, pos: ArrayLike, quat: ArrayLike) -> tuple[NDArray, NDArray]:
         """Return positions, m (..., 3), and attitudes, xyzw (..., 4), in the world frame, of poses of the source."""
         pos, quat = np.asarray(pos, float) * self.unit, np.asarray(quat, float)
         if self.quat == "wxyz":
@@ -82,7 +82,7 @@ class Convention:
             quat = quat[..., [0, 2, 1, 3]] * (1, -1, 1, 1)
         return pos, quat
 
-    def from_world(self, pos: Any, quat: Any) -> tuple[NDArray, NDArray]:
+    def from_world(self, pos: ArrayLike, quat: ArrayLike) -> tuple[NDArray, NDArray]:
         """Return positions (..., 3) and attitudes (..., 4) as the source sends them; the inverse of ``to_world``."""
         pos, quat = np.asarray(pos, float) / self.unit, np.asarray(quat, float)
         if self.up == "y":
@@ -114,7 +114,7 @@ def multiply(p: NDArray, q: NDArray) -> NDArray:
     return np.concatenate([vector, pw * qw - (pv * qv).sum(-1, keepdims=True)], axis=-1)
 
 
-def from_rpy(rpy: Any) -> NDArray:
+def from_rpy(rpy: ArrayLike) -> NDArray:
     """Return quaternions, xyzw, of roll, pitch and yaw, rad; on the host, in float64. (..., 4)"""
     half = np.asarray(rpy, float) / 2
     (sr, sp, sy), (cr, cp, cy) = (np.moveaxis(f(half), -1, 0) for f in (np.sin, np.cos))
@@ -130,8 +130,13 @@ def from_rpy(rpy: Any) -> NDArray:
 
 
 def to_rpy(quat: NDArray) -> NDArray:
-    """Return roll, pitch and yaw, rad, of unit quaternions, xyzw; on the host, in float64. (..., 3)"""
+    """Return roll, pitch and yaw, rad, of unit quaternions, xyzw; on the host, in float64. (..., 3)
+
+    As :func:`crazysim.rotation.to_rpy`, which explains the formula.
+    """
     x, y, z, w = np.moveaxis(np.asarray(quat, float), -1, 0)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    return np.stack([roll, pitch, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=-1)
+    half_sum, half_difference = np.arctan2(z + x, w - y), np.arctan2(z - x, w + y)
+    cos_pitch = np.hypot(1 - 2 * (y * y + z * z), 2 * (x * y + w * z))
+    pitch = np.arctan2(2 * (w * y - x * z), cos_pitch)
+    roll, yaw = (np.angle(np.exp(1j * angle)) for angle in (half_sum - half_difference, half_sum + half_difference))
+    return np.stack([roll, pitch, yaw], axis=-1)

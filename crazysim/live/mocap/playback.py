@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation
@@ -37,9 +38,9 @@ class Playback(Plugin):
 
     handles: Sequence[Handle]
     """Handles of one object each, in the order of the samples."""
-    pos: Any
+    pos: ArrayLike
     """Positions, world frame, m. (n_samples, n_objects, 3)"""
-    quat: Any
+    quat: ArrayLike
     """Attitudes, body to world, xyzw. (n_samples, n_objects, 4)"""
     freq: float
     """Samples per second, Hz."""

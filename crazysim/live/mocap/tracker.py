@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.live.mocap.frames import Frame
-from crazysim.live.mocap.reports import Reports
+from crazysim.live.mocap.source_events import Reports
 
 N_INTERVALS = 32
 """Number of intervals between frames whose median is the period of the source."""

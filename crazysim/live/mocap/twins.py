@@ -18,9 +18,9 @@ from crazysim.drones import load_airframe
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.live.mocap.frames import from_rpy, multiply, rotate, to_rpy
 from crazysim.live.mocap.playback import Playback
-from crazysim.live.mocap.recording import MocapRecorder
-from crazysim.live.mocap.reports import Reports
+from crazysim.live.mocap.poll_recording import MocapRecorder
 from crazysim.live.mocap.source import MocapSource
+from crazysim.live.mocap.source_events import Reports
 from crazysim.live.mocap.tracker import Rules, Tracker
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim

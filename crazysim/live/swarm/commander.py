@@ -8,7 +8,7 @@ commander.h of crazyflie-firmware). Until the first command, and after landing, 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,12 +16,21 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.control import Control
 from crazysim.errors import ConfigError
 from crazysim.live.paths import Path
+from crazysim.live.swarm.estimate import EstimateFrame
 from crazysim.live.swarm.plan import Plan, move, nearest_yaw
+
+if TYPE_CHECKING:
+    from crazysim.live.swarm.swarm import DroneState
 
 STABILIZE, SHUTDOWN = 0.5, 2.0
 """Time without a streamed setpoint after which the drone stays in its place, and after which its motors stop, s."""
 FARTHEST = 1e3
 """Largest coordinate of a command, m, and largest number of any command."""
+SINK, DEEPEST = 0.3, 1.0
+"""Speed at which the setpoint continues down where a landing has ended above its height, m/s, and its distance, m."""
+REACHED, RESTING, REST_TIME = 0.01, 0.02, 0.5
+"""Height above that of a landing at which the motors stop, m; or vertical speed below which a drone stands on ground,
+m/s, some time, s, after the end of the landing."""
 SHORTEST, LONGEST = 1e-3, 1e4
 """Limits of durations, s, and of factors of durations, 1."""
 N_TRAJECTORIES = 256
@@ -39,17 +48,18 @@ class Commander:
         """
         self.control = control
         self.group = 0
-        self.params: dict[str, float] = {}
         self.trajectories: dict[int, Path] = {}
+        self._compressed: set[int] = set()
         self.reset()
 
     def reset(self) -> None:
-        """Return to the floor with motors off; trajectories and parameters stay."""
+        """Return to the floor with motors off and an estimate in the world's frame; trajectories stay."""
         self.now = 0.0
         self.pos, self.vel, self.yaw = np.zeros(3), np.zeros(3), 0.0
         self.armed, self.locked = True, False
         self._plan: Plan | None = None
         self._held: tuple[Plan, NDArray] | None = None
+        self.estimate_frame: EstimateFrame | None = None
         self._stream: tuple[str, NDArray] | None = None
         self._stream_time, self._released = 0.0, math.inf
         self._reference = np.zeros(4)  # position and yaw that velocity setpoints move
@@ -72,7 +82,10 @@ class Commander:
         if self._stream is not None:
             return self._last
         if self._plan is not None:
-            return self._plan.at(self.now)
+            point = self._plan.at(self.now)
+            if self._plan.lands and self._plan.finished(self.now):  # the setpoint sinks until the drone has landed
+                point[:2, 2] += -min(SINK * (self.now - self._plan.end), DEEPEST), -SINK
+            return point
         return np.array([[*self.pos, self.yaw], [*self.vel, 0.0], [0.0] * 4])
 
     def in_group(self, mask: int) -> bool:
@@ -86,7 +99,10 @@ class Commander:
         self._vertical(height, duration, yaw, lands=False)
 
     def land(self, height: float, duration: float, yaw: float | None = None) -> None:
-        """Descend to a height, m, and stop the motors there; None keeps the yaw."""
+        """Descend to a height, m, and stop the motors there, or where the drone stands; None keeps the yaw.
+
+        A drone that is still higher at the end, because its controller lags or has an offset, descends further.
+        """
         self._vertical(height, duration, yaw, lands=True)
 
     def go_to(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, linear: bool = False) -> None:
@@ -103,8 +119,13 @@ class Commander:
         """Stop the motors."""
         self._plan = self._stream = None
 
-    def upload(self, identity: int, path: Path) -> None:
+    def upload(self, identity: int, path: Path, compressed: bool = False) -> None:
         """Receive a trajectory.
+
+        Args:
+            identity: Number of the trajectory.
+            path: Its path.
+            compressed: True for one that the firmware keeps compressed, and can neither stretch nor reverse.
 
         Raises:
             ConfigError: If its number is not from 0 to 255.
@@ -112,6 +133,7 @@ class Commander:
         if not 0 <= identity < N_TRAJECTORIES:
             raise ConfigError(f"expected the number of a trajectory from 0 to {N_TRAJECTORIES - 1}, got {identity}")
         self.trajectories[identity] = path
+        (self._compressed.add if compressed else self._compressed.discard)(identity)
 
     def start_trajectory(
         self,
@@ -131,7 +153,8 @@ class Commander:
             relative_yaw: True to begin at the present yaw too.
 
         Raises:
-            ConfigError: If there is none, or the factor is out of range.
+            ConfigError: If there is none, the factor is out of range, or a compressed one is to be stretched or
+                reversed.
         """
         if identity not in self.trajectories:
             raise ConfigError(
@@ -139,13 +162,18 @@ class Commander:
             )
         if not SHORTEST <= timescale <= LONGEST:
             raise ConfigError(f"expected a timescale from {SHORTEST:g} to {LONGEST:g}, got {timescale}")
+        if identity in self._compressed and (timescale != 1 or reversed):
+            raise ConfigError(
+                f"expected a compressed trajectory at its own speed and direction, got timescale {timescale:g}, "
+                f"reversed {bool(reversed)}. The firmware supports others for uncompressed trajectories alone."
+            )
         self._require(Control.state)
         plan = Plan(self.trajectories[identity], self.now, timescale, bool(reversed))
         begin, first = self.goal()[0], plan.at(self.now)[0]
         shift = np.zeros(4)
         if relative:
             shift[:3] = begin[:3] - first[:3]
-            if relative_yaw:
+            if relative_yaw and identity not in self._compressed:
                 shift[3] = begin[3] - nearest_yaw(begin[3], first[3])
         self._start(plan._replace(shift=shift))
 
@@ -209,17 +237,41 @@ class Commander:
         self.stop()
         self.locked = True
 
+    # The estimate ---------------------------------------------------------------------------------------------------
+
+    def place_estimate(self, pos: NDArray, yaw: float, pose: NDArray) -> None:
+        """Set the pose of the drone's estimate; commands are in the frame of that estimate from now on.
+
+        Args:
+            pos: Position, world frame, m. (3,)
+            yaw: Yaw, world frame, rad.
+            pose: Position, m, and yaw, rad, of the estimate. (4,)
+        """
+        self.estimate_frame = EstimateFrame.from_pose(pos, yaw, pose)
+
+    def estimate(self, state: DroneState) -> DroneState:
+        """Return the drone's estimate of its state."""
+        return state if self.estimate_frame is None else self.estimate_frame.state(state)
+
     # The loop -------------------------------------------------------------------------------------------------------
 
     def tick(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
-        """Return the command in force, of the simulation's level; None with the motors off.
+        """Return the command in force, of the simulation's level and in the world's frame; None with the motors off.
 
         Args:
             now: Time, s.
-            pos: Position, m. (3,)
-            vel: Velocity, m/s. (3,)
-            yaw: Yaw, rad.
+            pos: Position, world frame, m. (3,)
+            vel: Velocity, world frame, m/s. (3,)
+            yaw: Yaw, world frame, rad.
         """
+        frame = self.estimate_frame
+        if frame is None:
+            return self._command(now, pos, vel, yaw)
+        command = self._command(now, *frame.motion(pos, vel, yaw))
+        return None if command is None else frame.command(self.control, command)
+
+    def _command(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
+        """Return the command in force; all in the frame of the estimate."""
         dt, self.now = now - self.now, now
         self.pos, self.vel, self.yaw = pos, vel, yaw
         if self._stream is not None:
@@ -231,17 +283,22 @@ class Commander:
             elif age > STABILIZE and self._stream[0] != "stay":
                 self._stream = ("stay", np.append(pos, yaw))
         plan = self._plan
-        if self._stream is None and plan is not None and plan.lands and plan.finished(now):
+        if self._stream is None and plan is not None and plan.lands and plan.finished(now) and self._has_landed(plan):
             self.stop()
         if not self.motors_on:
             return None
         if self._stream is not None:
             return self._streamed(dt)
-        if plan is None or not plan.finished(now):
+        if plan is None or not plan.finished(now) or plan.lands:
             return _state_command(*self.goal())
         if self._held is None or self._held[0] is not plan:  # a drone that hovers costs nothing
             self._held = plan, _state_command(plan.at(now)[0], np.zeros(4), np.zeros(4))
         return self._held[1]
+
+    def _has_landed(self, plan: Plan) -> bool:
+        """Return True if the drone is as low as its landing goes, or stands on something."""
+        stands = self.now > plan.end + REST_TIME and abs(self.vel[2]) < RESTING
+        return stands or self.pos[2] <= plan.at(self.now)[0, 2] + REACHED
 
     def _streamed(self, dt: float) -> NDArray:
         kind, x = self._stream  # type: ignore[misc]

@@ -31,9 +31,14 @@ class Plan(NamedTuple):
     lands: bool = False
     """True where the motors are stopped at its end."""
 
+    @property
+    def end(self) -> float:
+        """Time at which it ends, s."""
+        return self.start + self.path.duration * self.timescale
+
     def finished(self, t: float) -> bool:
         """Return True from the end of the plan on."""
-        return not self.path.repeats and t >= self.start + self.path.duration * self.timescale
+        return not self.path.repeats and t >= self.end
 
     def at(self, t: float) -> NDArray:
         """Return position and yaw, their rates and second derivatives at a time, s. (3, 4)"""

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.dynamics import Dynamics
-from crazysim.effects import MotorFailure
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.live.mocap.frames import rotate, to_rpy
-from crazysim.live.mocap.reports import Reports
+from crazysim.live.mocap.source_events import Reports
 from crazysim.live.swarm.commander import Commander
+from crazysim.live.swarm.parameters import LIGHTS, Parameters, parameters_of
+from crazysim.live.swarm.sensors import ranges_of
+from crazysim.plugins.effects import MotorFailure
 from crazysim.sim.sim import Sim
 
 if TYPE_CHECKING:
@@ -64,6 +66,8 @@ class Swarm(Closing):
 
     reports: Reports
     """Refused commands and packets."""
+    parameters: list[Parameters]
+    """Parameters of each drone; ``set_parameter`` sets them."""
     colors: NDArray
     """Colour of the light of each drone, red, green, blue from 0 to 1. (n_drones, 3)"""
 
@@ -85,6 +89,8 @@ class Swarm(Closing):
             raise ConfigError(f"expected {sim.n_drones} different names, got {names}")
         self.sim, self.names, self.lock = sim, tuple(names), threading.RLock()
         self.commanders = [Commander(sim.control) for _ in names]
+        ranged = "front" in ranges_of(sim, 0)
+        self.parameters = [Parameters(parameters_of(airframe, ranged)) for airframe in sim.airframes]
         self.colors, self.reports = np.zeros((len(names), 3)), Reports()
         self.listeners: list[Callable[[], Any]] = []
         self._period = sim.freq // sim.control_freq
@@ -127,6 +133,38 @@ class Swarm(Closing):
         """Return the position of a drone when the swarm was made, m. (3,)"""
         return self._home[self.index(drone) if isinstance(drone, str) else drone].copy()
 
+    # Parameters -----------------------------------------------------------------------------------------------------
+
+    def set_parameter(self, drone: int | str, name: str, value: float) -> None:
+        """Set a parameter of a drone's firmware, with its effect on commands, estimate and light.
+
+        Raises:
+            ConfigError: If there is no such parameter, or its effect is not simulated.
+        """
+        k = self.index(drone) if isinstance(drone, str) else drone
+        parameters = self.parameters[k]
+        with self.lock:
+            parameters.set(name, float(value), self.time)
+            if name == "hlCommander.groupmask":
+                self.commanders[k].group = int(value)
+            elif name == "kalman.resetEstimation" and value and parameters.has_initial_pose:
+                self.commanders[k].place_estimate(self._states[k].pos, self._yaws[k], parameters.initial_pose)
+            elif name.startswith(LIGHTS):
+                self.colors[k] = parameters.light.color(self.time)
+
+    def set_leds(self, drone: int, packed: NDArray) -> None:
+        """Set the LEDs of a drone's ring, 16 bits of red, green and blue (5, 6, 5) each; ``ring.effect`` 13 shows them.
+
+        Args:
+            drone: Index of the drone.
+            packed: Colours. (12,)
+        """
+        bits = np.asarray(packed, int)[:, None]
+        parameters = self.parameters[drone]
+        parameters.light.memory = (bits >> [11, 5, 0] & [31, 63, 31]) / [31, 63, 31]
+        parameters.light.changed(parameters, "memory", self.time)
+        self.colors[drone] = parameters.light.color(self.time)
+
     # Time -----------------------------------------------------------------------------------------------------------
 
     def __call__(self, live: Any) -> None:
@@ -163,6 +201,9 @@ class Swarm(Closing):
         with self.lock:
             self._read()
             self._write()
+            for k, parameters in enumerate(self.parameters):
+                if parameters.light.fades(self.time - self._period / self.sim.freq):
+                    self.colors[k] = parameters.light.color(self.time)
             for listener in self.listeners:
                 listener()
 

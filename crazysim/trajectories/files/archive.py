@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
+from crazysim.storage import ZipReader, reading
 from crazysim.trajectories.files import checks
 
 MAX_MEMBERS = 20_100
@@ -17,8 +18,12 @@ MAX_MEMBER = 16 * 2**20
 """Largest file of an archive that is unpacked, bytes."""
 MAX_TOTAL = 512 * 2**20
 """Most bytes that are unpacked from an archive."""
+MIN_TOTAL, MAX_RATIO = 64 * 2**20, 100
+"""Bytes that are unpacked from any archive, and from a larger one as a multiple of its size."""
 MAX_CHAIN = 8
 """Longest chain of references."""
+REMEDY = "Export it again, or use another copy."
+"""Remedy for a damaged archive."""
 
 
 class Archive:
@@ -32,39 +37,29 @@ class Archive:
             place: Name of the file, for messages.
 
         Raises:
-            ConfigError: If it is no zip archive, or has too many files.
+            ConfigError: If it has too many files.
+            DamagedFileError: If it is no zip archive.
         """
-        self.place, self._unpacked = place, 0
+        self.place = place
         self._parsed: dict[str, Any] = {}
-        try:
-            self._zip = zipfile.ZipFile(io.BytesIO(content))
-            members = self._zip.infolist()
-        except Exception as error:  # damaged archives raise errors of any type
-            raise ConfigError(f"expected a zip archive, got {place!r}: {str(error)[:100]}") from error
-        if len(members) > MAX_MEMBERS:
-            checks.refuse(f"at most {MAX_MEMBERS} files", str(len(members)), place)
-        self._members = {str(PurePosixPath(member.filename)): member for member in members}
+        most = min(MAX_TOTAL, max(MIN_TOTAL, MAX_RATIO * len(content)))
+        with reading(place, "a zip archive", REMEDY):
+            self._zip = ZipReader(io.BytesIO(content), place, MAX_MEMBERS, MAX_MEMBER, most)
 
     def json(self, name: str) -> Any:
         """Return the contents of a JSON file of the archive.
 
         Raises:
-            ConfigError: If it is missing, too large, damaged, or not JSON.
+            ConfigError: If it is missing, too large, or not JSON.
+            DamagedFileError: If it cannot be unpacked.
         """
         if name in self._parsed:
             return self._parsed[name]
         place = f"{self.place}: {name}"
-        if name not in self._members:
+        if name not in self._zip.names:
             raise ConfigError(f"expected a file {name!r} in {self.place}, got an archive without it")
-        try:
-            with self._zip.open(self._members[name]) as file:
-                content = file.read(MAX_MEMBER + 1)  # what the archive states about its size may be wrong
-        except Exception as error:  # damaged archives raise errors of any type
-            raise ConfigError(f"expected a file that can be unpacked, got {place}: {str(error)[:100]}") from error
-        self._unpacked += len(content)
-        if len(content) > MAX_MEMBER or self._unpacked > MAX_TOTAL:
-            checks.refuse(f"files of at most {MAX_MEMBER} bytes, {MAX_TOTAL} in all", "more", place)
-        self._parsed[name] = checks.parse_json(content, place)
+        with reading(place, "a file that can be unpacked", REMEDY):
+            self._parsed[name] = checks.parse_json(self._zip.read(name), place)
         return self._parsed[name]
 
     def resolve(self, value: Any, place: str) -> tuple[Any, str]:
@@ -79,7 +74,7 @@ class Archive:
             reference = checks.text(value["$ref"], f"{place}, $ref", 1000)
             name, _, fragment = reference.partition("#")
             if fragment.strip("/"):
-                checks.refuse("a reference to a whole file, such as ./cues.json#", checks.shown(reference), place)
+                checks.refuse("a reference to a whole file, such as ./cues.json#", shown(reference), place)
             name = str(PurePosixPath(name))
             value, place = self.json(name), f"{self.place}: {name}"
         return checks.refuse(f"a chain of at most {MAX_CHAIN} references", "a longer one", place)

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 
 MAX_FILE = 256 * 2**20
 """Largest file that is read, bytes."""
@@ -36,31 +36,6 @@ def refuse(expected: str, got: str, place: str) -> NoReturn:
         ConfigError: Always.
     """
     raise ConfigError(f"expected {expected}, got {got} in {place}")
-
-
-def shown(value: Any) -> str:
-    """Return a value for a message, at most 60 characters of it."""
-    text = repr(value) if not isinstance(value, (list, dict, str)) or len(value) < 60 else f"a {type(value).__name__}"
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def read_bytes(path: str | Path) -> bytes:
-    """Return the contents of a file of at most ``MAX_FILE`` bytes.
-
-    Raises:
-        ConfigError: If it does not exist, cannot be read, or is larger.
-    """
-    path = Path(path)
-    try:
-        if not path.is_file():
-            raise ConfigError(f"expected an existing file, got {str(path)!r}")
-        if path.stat().st_size > MAX_FILE:
-            refuse(f"a file of at most {MAX_FILE} bytes", f"{path.stat().st_size}", str(path))
-        return path.read_bytes()
-    except (OSError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"expected a file that can be read, got {str(path)!r}: {error}") from error
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:

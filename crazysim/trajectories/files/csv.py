@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
+from crazysim.storage import read_text
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.pieces import trajectory_of
 from crazysim.trajectories.files.polynomials import of_rows, rows_of
@@ -30,12 +31,7 @@ def load_csv(path: str | Path) -> Trajectory:
     Raises:
         ConfigError: If the file does not exist, or a row is invalid, with its line.
     """
-    content = checks.read_bytes(path)
-    try:
-        lines = content.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"expected text in {path}, got other bytes: {error}") from error
-    rows = _table(lines, str(path))
+    rows = _table(read_text(path, checks.MAX_FILE).splitlines(), str(path))
     return of_rows(rows, str(path)) if rows.shape[1] > 5 else _of_samples(rows, str(path))
 
 
@@ -53,7 +49,7 @@ def _table(lines: list[str], place: str) -> NDArray:
         except ValueError:
             if not rows and any(cell[:1].isalpha() for cell in cells):
                 continue  # the header
-            checks.refuse("numbers", checks.shown(line), f"{place}, line {i}")
+            checks.refuse("numbers", shown(line), f"{place}, line {i}")
         if len(row) not in (4, 5, 25, 33) or (rows and len(row) != len(rows[0])):
             expected = f"{len(rows[0])} columns, as before" if rows else "4, 5, 25 or 33 columns"
             checks.refuse(expected, str(len(row)), f"{place}, line {i}")

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, floating, leaf
@@ -28,7 +29,7 @@ class Lights(PyTree):
     """Colour that each piece approaches at the start of the next; ``starts`` where it is constant. (n_pieces, 3)"""
 
     @staticmethod
-    def of_pieces(times: Any, starts: Any, ends: Any = None) -> Lights:
+    def of_pieces(times: ArrayLike, starts: Any, ends: ArrayLike | None = None) -> Lights:
         """Return the lights of one drone.
 
         Args:
@@ -98,7 +99,7 @@ class Lights(PyTree):
         a, b = jnp.asarray(self.starts)[i], jnp.asarray(self.ends)[i]
         return a + weight * (b - a)
 
-    def colors(self, times: Any) -> np.ndarray:
+    def colors(self, times: ArrayLike) -> np.ndarray:
         """Return the colours of several drones at several times, 0 to 1.
 
         Args:

@@ -9,6 +9,12 @@ from crazysim.errors import ConfigError
 from crazysim.trajectories.bezier import restricted
 from crazysim.trajectories.trajectory import Trajectory
 
+CONTINUOUS = np.array([1e-3, 1e-3, 1e-3, np.deg2rad(0.1)])
+"""Largest distance of a piece's beginning from the end of the one before that is no jump: x, y, z, m, and yaw, rad."""
+
+ROUNDING = 1e-5
+"""Share of a coordinate that may be rounding of float32."""
+
 
 def pieces_of(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     """Return the ends of a trajectory's pieces and their coefficients, in float64.
@@ -34,6 +40,29 @@ def pieces_of(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     times = np.array([float(str(x)) for x in ends])
     kept = np.diff(times, prepend=0.0) > 0
     return times[kept], np.asarray(trajectory.coefficients, float)[kept]
+
+
+def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:
+    """Check that every piece begins where the one before ends, for formats that hold only where pieces end.
+
+    Args:
+        ends: End of each piece, s. (n_pieces,)
+        coefficients: Of the pieces' times scaled to [0, 1], of x, y, z, m, and yaw, rad. (n_pieces, 4, degree + 1)
+
+    Raises:
+        ConfigError: If a piece begins more than a millimetre or a tenth of a degree from there.
+    """
+    ends_at = coefficients[:-1].sum(axis=-1)
+    jumps = np.abs(coefficients[1:, :, 0] - ends_at)
+    too_far = np.argwhere(jumps > CONTINUOUS[: jumps.shape[1]] + ROUNDING * np.abs(ends_at))
+    if len(too_far):
+        piece, axis = too_far[0]
+        size = jumps[piece, axis]
+        what = f"yaw of {np.rad2deg(size):.3g} degrees" if axis == 3 else f"{'xyz'[axis]} of {size:.3g} m"
+        raise ConfigError(
+            f"expected pieces that begin where the one before ends, which this format requires, got a jump in {what} "
+            f"at {ends[piece]:g} s. Use moved() to align the parts, or join them by a line."
+        )
 
 
 def split(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:

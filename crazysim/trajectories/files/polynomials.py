@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.storage import read_bytes
 from crazysim.trajectories.bezier import control_points, power_of, significant_degree
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.pieces import pieces_of, split, trajectory_of
+from crazysim.trajectories.files.pieces import pieces_of, require_no_jumps, split, trajectory_of
 from crazysim.trajectories.trajectory import Trajectory
 
 POLY4D_FLOATS = 33
@@ -111,9 +112,11 @@ def pack_compressed(trajectory: Trajectory) -> bytes:
         trajectory: Trajectory of one vehicle, of degree 7 at most.
 
     Raises:
-        ConfigError: If its degree is higher, or it leaves the 32.767 m and 3276.7 degrees that 16 bits can hold.
+        ConfigError: If its degree is higher, a piece does not begin where the one before ends, or it leaves the 32.767
+            m and 3276.7 degrees that 16 bits can hold.
     """
     ends, c = pieces_of(trajectory)
+    require_no_jumps(ends, c)
     if c.shape[2] > 8:
         raise ConfigError(
             f"expected polynomials of degree 7 at most, as the Crazyflie flies, got degree {c.shape[2] - 1}"
@@ -207,5 +210,5 @@ def load_memory(path: str | Path, compressed: bool = False) -> Trajectory:
     Raises:
         ConfigError: If the file does not exist or is not of that format.
     """
-    content = checks.read_bytes(path)
+    content = read_bytes(path, checks.MAX_FILE)
     return (unpack_compressed if compressed else unpack_poly4d)(content, str(path))

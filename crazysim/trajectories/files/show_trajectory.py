@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.trajectories.bezier import control_points, power_of, significant_degree
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.pieces import pieces_of, split, trajectory_of
+from crazysim.trajectories.files.pieces import pieces_of, require_no_jumps, split, trajectory_of
 from crazysim.trajectories.trajectory import Trajectory
 
 ENCODINGS = ("COMPRESSED", "POLY4D")
@@ -38,7 +38,7 @@ def parse_trajectory(value: Any, place: str, yaw_control: Any = None) -> tuple[T
     checks.version_one(value, place)
     encoding = value.get("type", ENCODINGS[0])
     if encoding not in ENCODINGS:
-        checks.refuse(f"type {' or '.join(ENCODINGS)}", checks.shown(encoding), place)
+        checks.refuse(f"type {' or '.join(ENCODINGS)}", shown(encoding), place)
     points = checks.sequence(value.get("points"), checks.MAX_POINTS, f"{place}, points")
     if not points:
         checks.refuse("at least one point", "none", place)
@@ -52,7 +52,7 @@ def parse_trajectory(value: Any, place: str, yaw_control: Any = None) -> tuple[T
     for i, point in enumerate(points):
         at = f"{place}, point {i}"
         if not _is_point(point):
-            checks.refuse("[time, [x, y, z], [control points]]", checks.shown(point), at)
+            checks.refuse("[time, [x, y, z], [control points]]", shown(point), at)
         times.append(checks.number(point[0], at, 0.0, checks.MAX_TIME))
         end = checks.numbers(point[1], [n_axes] if i else [3, 4], checks.MAX_COORDINATE, at)
         inner = checks.sequence(point[2], MAX_DEGREE - 1, f"{at}, control points") if len(point) > 2 else []
@@ -120,13 +120,15 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw:
         yaw: True to write the yaw as the fourth coordinate, degrees.
 
     Raises:
-        ConfigError: If the encoding does not exist, or the degree is higher than 7.
+        ConfigError: If the encoding does not exist, the degree is higher than 7, or a piece does not begin where the
+            one before ends.
     """
     if encoding not in ENCODINGS:
         raise ConfigError(f"expected type {' or '.join(ENCODINGS)}, got {encoding!r}. Use one of these.")
     ends, c = pieces_of(trajectory)
     degrees = (1, 3, 7) if encoding == "COMPRESSED" else range(1, MAX_DEGREE + 1)
     c = c if yaw else c[:, :3]
+    require_no_jumps(ends, c)
     digits = np.asarray(trajectory.coefficients).dtype
 
     def written(point: Any) -> list[float]:

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
+from crazysim.storage import read_bytes
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.archive import Archive, write_archive
 from crazysim.trajectories.files.led import MAX_REPEATED, decode_lights, encode_lights
@@ -42,7 +43,7 @@ def load_show(path: str | Path) -> Show:
     Raises:
         ConfigError: If the file is no valid show, with the place of the error.
     """
-    return parse_show(checks.read_bytes(path), str(path))
+    return parse_show(read_bytes(path, checks.MAX_FILE), str(path))
 
 
 def parse_show(content: bytes, place: str = "a show") -> Show:
@@ -77,11 +78,11 @@ def parse_show(content: bytes, place: str = "a show") -> Show:
         _bound(len(found) * len(lights[-1].times), f"{drone['at']}, lights")
     names = [drone["name"] for drone in found]
     if len(set(names)) < len(names):
-        checks.refuse("different names of the drones", f"{checks.shown(sorted(names))}", swarm_at)
+        checks.refuse("different names of the drones", f"{shown(sorted(names))}", swarm_at)
     environment = show.get("environment") or {}
     kind = checks.record(environment, f"{at}, environment").get("type", "outdoor")
     if kind not in ("indoor", "outdoor"):
-        checks.refuse("environment indoor or outdoor", checks.shown(kind), at)
+        checks.refuse("environment indoor or outdoor", shown(kind), at)
     return Show(
         names=tuple(names),
         trajectories=Trajectory.stack(trajectories),
@@ -137,7 +138,7 @@ def _parameters(value: Any, place: str) -> tuple[ParameterChange, ...]:
     changes = []
     for i, entry in enumerate(checks.sequence(value, checks.MAX_POINTS, place) if value is not None else []):
         if not isinstance(entry, list) or len(entry) != 3:
-            checks.refuse("[time, name, value]", checks.shown(entry), f"{place}, entry {i}")
+            checks.refuse("[time, name, value]", shown(entry), f"{place}, entry {i}")
         at = f"{place}, entry {i}"
         time = checks.number(entry[0], at, 0.0, checks.MAX_TIME)
         changes.append(ParameterChange(time, checks.text(entry[1], at), checks.number(entry[2], at)))
@@ -196,7 +197,7 @@ def parse_colors(value: Any, place: str) -> Lights:
     for i, entry in enumerate(entries):
         at = f"{place}, entry {i}"
         if not isinstance(entry, list) or len(entry) != 2:
-            checks.refuse("[time, [red, green, blue]] or ['red, green, blue', duration]", checks.shown(entry), at)
+            checks.refuse("[time, [red, green, blue]] or ['red, green, blue', duration]", shown(entry), at)
         first, second = entry
         if isinstance(first, str):
             channels: Any = [_integer(x, at) for x in first.split(",")[:4]]
@@ -207,7 +208,7 @@ def parse_colors(value: Any, place: str) -> Lights:
             times.append(checks.number(first, at, 0.0, checks.MAX_TIME))
         colors.append(checks.numbers(channels, [3], 255.0, at) / 255)
         if colors[-1].min() < 0:
-            checks.refuse("colours from 0 to 255", checks.shown(channels), at)
+            checks.refuse("colours from 0 to 255", shown(channels), at)
     if not entries:
         return Lights.constant((0.0, 0.0, 0.0))
     checks.ascending(np.array(times), 0.0, place)
@@ -219,7 +220,7 @@ def parse_colors(value: Any, place: str) -> Lights:
 def _integer(text: str, place: str) -> int:
     text = text.strip()
     if not (text.isascii() and text.isdigit() and len(text) <= 3):
-        checks.refuse("colours as 'red, green, blue', 0 to 255", checks.shown(text), place)
+        checks.refuse("colours as 'red, green, blue', 0 to 255", shown(text), place)
     return int(text)
 
 

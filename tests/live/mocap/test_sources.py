@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, DamagedFileError
 from crazysim.live.mocap import (
     Convention,
     Frame,
@@ -25,6 +25,7 @@ from crazysim.live.mocap import (
     show_source,
 )
 from crazysim.live.mocap import source as source_module
+from crazysim.media.journal import Journal
 from crazysim.trajectories import Trajectory, circle, line
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -263,12 +264,17 @@ def test_any_tail_is_refused_or_ignored(tail, tmp_path_factory):
 
 
 def test_wrong_files(tmp_path):
-    with pytest.raises(ConfigError, match="expected a recording"):
+    with pytest.raises(ConfigError, match="expected an existing file with a recording"):
         list(read_polls(tmp_path / "none"))
     (tmp_path / "other").write_text("hello")
-    with pytest.raises(ConfigError, match="which is none"):
+    with pytest.raises(ConfigError, match="first line is not"):
         ReplaySource(tmp_path / "other")
-    with pytest.raises(ConfigError, match="can be written"):
+    for kind, content in ((b"SAMP", b""), (b"POLL", b"x"), (b"NAME", b"{")):  # intact chunks of something else
+        with Journal(tmp_path / "other", replace=True) as journal:
+            journal.append(kind, content)
+        with pytest.raises(DamagedFileError, match=r"expected a recording of motion capture, got .*other', which"):
+            list(read_polls(tmp_path / "other"))
+    with pytest.raises(ConfigError, match="can be created"):
         MocapRecorder(tmp_path / "no" / "folder")
     with pytest.raises(ConfigError, match="'poll' or 'time'"):
         ReplaySource(recorded(tmp_path / "a.mocap"), by="day")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from crazysim.errors import ConfigError
-from crazysim.trajectories import Trajectory
+from crazysim.trajectories import Trajectory, line
 from crazysim.trajectories.files import (
     load_csv,
     load_memory,
@@ -23,6 +23,7 @@ from crazysim.trajectories.files import (
 )
 from crazysim.trajectories.files.csv import POLYNOMIALS
 from crazysim.trajectories.files.pieces import pieces_of
+from crazysim.trajectories.files.show_trajectory import format_trajectory
 
 FIGURE_EIGHT = (
     "1.050000,0.0,-0.0,0.0,-0.0,0.830443,-0.276140,-0.384219,0.180493,-0.0,0.0,-0.0,0.0,-1.356107,0.688430,0.587426,"
@@ -204,3 +205,17 @@ def test_any_csv_is_loaded_or_refused(tmp_path_factory, rows, newline):
     except ConfigError:
         return
     assert np.all(np.isfinite(t.coefficients))
+
+
+def test_a_jump_cannot_be_compressed():
+    """Compressed pieces begin where the one before ends: a second line 3 m further was flown as another path."""
+    first, second = (line((x, 0, 1), (x + 1, 0, 1), duration=1.0) for x in (0.0, 4.0))
+    with pytest.raises(ConfigError, match="got a jump in x of 3 m at 1 s"):
+        pack_compressed(first.then(second))
+    with pytest.raises(ConfigError, match="got a jump in x of 3 m at 1 s"):
+        format_trajectory(first.then(second))
+    turned = first.then(first.moved((1, 0, 0), yaw=np.pi / 2))
+    with pytest.raises(ConfigError, match="jump in"):
+        pack_compressed(turned)
+    pack_compressed(first.then(second.moved((-3, 0, 0))))
+    assert len(pack_poly4d(first.then(second))) == 2 * 132

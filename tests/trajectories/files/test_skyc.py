@@ -213,6 +213,9 @@ def test_bombs_are_refused():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 4 * 2**24  # not the whole of it
+    small = Archive(show_files.archive({f"{k}": b'"' + b"0" * 2**24 + b'"' for k in range(5)}), "small.skyc")
+    with pytest.raises(ConfigError, match="at most 16777216 bytes, 67108864 in all"):
+        [small.json(f"{k}") for k in range(5)]
     lying = bytearray(show_files.archive({"show.json": zeros}))
     for signature, offset in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):  # both state a size of 10 bytes
         at = lying.index(signature) + offset

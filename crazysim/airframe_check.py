@@ -1,0 +1,164 @@
+"""Abilities and gaps of an airframe as text, and a picture of its body, for ``crazysim airframe``."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crazysim.control import AllocationParams, AttitudeParams, StateParams
+from crazysim.control.allocation import hover_rotor_vel, yaw_arm
+from crazysim.control.auto import Auto
+from crazysim.control.bandwidth import rotor_rate
+from crazysim.control.controllers import CASCADE, find_controller
+from crazysim.drones import Airframe
+from crazysim.dynamics import Dynamics, supported_dynamics
+from crazysim.errors import ConfigError
+
+GRAVITY = 9.81
+"""Gravitational acceleration, m/s^2."""
+STATE = ("auto", "geometric", "indi", "lqr", "pid", "mellinger")
+"""Controllers that follow state commands, besides Crazyflow's cascade."""
+QUARTER_TURN = np.pi / 2
+"""Angle of the turn whose largest rate and duration are stated, rad."""
+WEAK = 1.5
+"""Thrust over weight below which a warning is given, 1."""
+
+
+def describe_airframe(airframe: Airframe) -> str:
+    """Return what an airframe can do, what it lacks for which controller, and warnings."""
+    rows = [("airframe", airframe.name), *_body(airframe)]
+    dynamics = supported_dynamics(airframe)
+    rows.append(("dynamics", ", ".join(dynamics) or "none"))
+    if Dynamics.first_principles in dynamics:
+        rows += _rotors(airframe)
+    rows += [("battery", _battery(airframe)), *_controllers(airframe, dynamics)]
+    rows += [("warning", text) for text in _warnings(airframe, dynamics)]
+    return "\n".join(f"{name:22}{text}" for name, text in rows)
+
+
+def draw_airframe(airframe: Airframe, path: Path) -> None:
+    """Write a picture of the body, seen from ahead and above.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+        RenderError: If there is no OpenGL.
+    """
+    from crazysim.sim import Sim
+
+    try:
+        from matplotlib.image import imsave
+    except ImportError as error:
+        raise ImportError(
+            "expected matplotlib, which pictures need, got none. Run pip install 'crazysim[demo]'."
+        ) from error
+
+    reach = float(np.max(np.linalg.norm(airframe.value("rotors.position")[:, :2], axis=-1)))
+    sim = Sim(drone=airframe, dynamics=supported_dynamics(airframe)[0], control="attitude", controller="auto")
+    try:
+        states = sim.data.states
+        sim.data = sim.data.replace(states=states.replace(pos=states.pos + np.array([0, 0, 3 * reach])))
+        view = {"lookat": [0, 0, 3 * reach], "distance": 5 * reach, "azimuth": 215, "elevation": -35}
+        image: Any = sim.render("rgb_array", cam_config=view, width=960, height=640)
+        imsave(path, image)
+    finally:
+        sim.close()
+
+
+def _ratio(airframe: Airframe) -> float:
+    return float(
+        airframe.n_rotors * airframe.value("rotors.thrust_max") / (airframe.value("rigid_body.mass") * GRAVITY)
+    )
+
+
+def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
+    """Yield mass, thrust and what follows from them and the rotors' positions."""
+    mass, ratio = float(airframe.value("rigid_body.mass")), _ratio(airframe)
+    most, least = (float(airframe.value(f"rotors.thrust_{end}")) for end in ("max", "min"))
+    hover = mass * GRAVITY / airframe.n_rotors
+    yield "mass", f"{mass:.4g} kg, {airframe.n_rotors} rotors of {least:.3g} to {most:.3g} N"
+    yield "thrust over weight", f"{ratio:.2f}"
+    yield "hover", f"{1 / ratio:.0%} of the largest thrust"
+    yield "tilt at full thrust", f"holds height up to {np.degrees(np.arccos(1 / ratio)):.0f} degrees"
+    arms = np.array([airframe.arm, airframe.arm, _yaw_arm(airframe)])
+    torques = min(hover - least, most - hover) * arms * np.sum(np.abs(airframe.mixing_matrix), axis=1)
+    accs = torques / np.diag(airframe.inertia)
+    for name, acc in zip(("roll", "pitch", "yaw"), accs, strict=True):
+        rate, seconds = np.sqrt(acc * QUARTER_TURN), 2 * np.sqrt(QUARTER_TURN / max(acc, 1e-9))
+        yield (
+            name,
+            f"up to {acc:.3g} rad/s^2 at hover; a turn by 90 degrees takes {seconds:.2g} s, at up to {rate:.3g} rad/s",
+        )
+
+
+def _yaw_arm(airframe: Airframe) -> float:
+    """Return torque over thrust of a rotor, m; 0 where it is unknown."""
+    known = airframe.values.get("controller.thrust2torque")
+    if {"rotors.thrust_curve", "rotors.torque_curve"} <= set(airframe.values):
+        return yaw_arm(airframe)
+    return 0.0 if known is None else float(known)
+
+
+def _rotors(airframe: Airframe) -> Iterator[tuple[str, str]]:
+    """Yield speeds, lag and the rates of the default controller."""
+    hover, top = float(np.max(hover_rotor_vel(airframe))), float(np.max(airframe.rotor_vel_limits))
+    yield "rotor speed", f"{hover:,.0f} rpm in hover, {hover / top:.0%} of {top:,.0f} rpm"
+    yield "rotor time constant", f"{1 / rotor_rate(airframe):.3g} s in hover"
+    gains: Any = Auto().params(airframe)
+    damping, stiffness = float(gains.damping[0]), float(gains.stiffness[0])
+    yield (
+        "default controller",
+        f"body rates follow with {damping:.3g} 1/s, attitudes with {np.sqrt(stiffness):.3g} rad/s",
+    )
+
+
+def _battery(airframe: Airframe) -> str:
+    keys = [key for key in ("cells", "capacity", "resistance") if f"battery.{key}" not in airframe.values]
+    if keys:
+        return f"lacks {', '.join(keys)} in [battery] for Battery() without arguments"
+    cells, capacity, resistance = (float(airframe.value(f"battery.{k}")) for k in ("cells", "capacity", "resistance"))
+    return f"{cells:.0f} cells, {capacity:.3g} A h, {resistance:.3g} ohm"
+
+
+def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+    """Yield which command levels each controller supports, or what it lacks."""
+    if Dynamics.first_principles not in dynamics:
+        if dynamics:
+            yield "auto", "state, above the response of the fitted model"
+            lack = _lack(lambda: StateParams.create(airframe))
+            yield CASCADE, f"state {lack}; attitude" if lack else "state, attitude"
+        return
+    for name in STATE:
+        found: Any = find_controller(name)
+        lack = _lack(functools.partial(found.params, airframe))
+        yield name, lack or ", ".join(level.value for level in found.levels)
+    stages = {"state": StateParams, "attitude, body_rate": AttitudeParams, "force_torque": AllocationParams}
+    lacks = {levels: _lack(functools.partial(params.create, airframe)) for levels, params in stages.items()}
+    yield CASCADE, "; ".join(f"{levels} {lack}" if lack else levels for levels, lack in lacks.items())
+
+
+def _lack(create: Callable[[], Any]) -> str:
+    """Return the reason for which parameters cannot be made; empty if they can."""
+    try:
+        create()
+    except ConfigError as error:
+        text = re.sub(r"^airframe '.*?' ", "", str(error).split(". ")[0])
+        return f"not: {text.split(', which ')[0]}"
+    return ""
+
+
+def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
+    """Yield what is allowed and probably not meant."""
+    positions, ratio = airframe.value("rotors.position"), _ratio(airframe)
+    if ratio < WEAK:
+        yield f"thrust over weight is {ratio:.2f}; below {WEAK:g} little is left for manoeuvres"
+    if np.linalg.norm(np.mean(positions[:, :2], axis=0)) > 0.05 * airframe.arm:
+        yield "the middle of the rotors is beside the centre of mass: rotors differ in hover"
+    if np.sum(airframe.value("rotors.yaw_torque_sign")):
+        yield "more rotors turn one way than the other: their drag turns the drone in hover"
+    if not dynamics:
+        yield "no dynamics: expected the curves of the rotors, or a table [fitted.NAME]"

@@ -1,0 +1,103 @@
+"""The default controller for fitted dynamics, which contain the response to attitudes: its position loop alone."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.control.levels import Control
+from crazysim.control.position import PositionMemory, PositionParams, specific_force
+from crazysim.control.protocol import Controller
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.dynamics import Dynamics
+from crazysim.dynamics.fitted import Params
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import cross, dot, matvec
+
+
+class FittedParams(PyTree):
+    """Gains of the position loop, and the response that it assumes, each shared or one per drone."""
+
+    model: Params
+    """Parameters of the fitted model that the controller assumes."""
+    angles: Array = leaf("parameter", 1)
+    """Commanded roll, pitch and yaw over those that the model settles at, 1. (3,)"""
+    ahead: Array = leaf("parameter", 1)
+    """Parts of jerk, s, and snap, s^2, by which commands precede the setpoint, as attitudes follow late. (2,)"""
+    position: PositionParams
+    """Gains and limits of the position loop."""
+
+    @staticmethod
+    def create(airframe: Airframe, dynamics: Dynamics, freq: int) -> FittedParams:
+        """Return the shared parameters of an airframe.
+
+        The delay below the position loop is the larger one of the attitude's, damping over stiffness, and of the
+        thrust's, and 1.5 periods of the controller.
+
+        Args:
+            airframe: The airframe.
+            dynamics: Fitted model.
+            freq: Rate of the controller, Hz.
+
+        Raises:
+            ConfigError: If the airframe has no fit of that model.
+        """
+        model = Params.create(airframe, dynamics)
+        attitude = float(np.max(np.asarray(model.rpy_rates_coef / model.rpy_coef)[:2]))
+        delays = [attitude]
+        if model.thrust_dyn_coef is not None:
+            delays.append(1 / float(np.max(model.thrust_dyn_coef)))
+        return FittedParams(
+            model=model,
+            angles=as_parameter(-model.rpy_coef / model.cmd_rpy_coef),
+            ahead=as_parameter([attitude + 0.5 / freq, float(np.max(-1 / np.asarray(model.rpy_coef)[:2]))]),
+            position=PositionParams.create(airframe, max(delays) + 1.5 / freq, freq),
+        )
+
+
+class FittedAuto(Controller):
+    """Position loop of ``Auto`` above the attitude response of a fitted model."""
+
+    name: ClassVar[str] = "auto"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state,)
+    output: ClassVar[Control] = Control.attitude
+    dynamics: Dynamics
+    """Fitted model."""
+    freq: int = 100
+    """Rate, Hz."""
+
+    def params(self, airframe: Airframe) -> FittedParams:
+        """Return gains and constants for an airframe."""
+        return FittedParams.create(airframe, self.dynamics, self.freq)
+
+    def memory(self, airframe: Airframe) -> PositionMemory:
+        """Return the memory before the first tick."""
+        return PositionMemory.at_rest()
+
+    def update(
+        self, data: Any, command: Setpoint | Array, memory: PositionMemory, params: FittedParams
+    ) -> tuple[Array, PositionMemory]:
+        """Return roll, pitch, yaw, rad, and collective thrust, N (4,), and the memory."""
+        s, p, model = data.states, params, params.model
+        present = data.controls.attitude.cmd[..., 3:] if model.thrust_dyn_coef is None else s.rotor_vel[..., :1]
+        matrix = rotation.matrix(s.quat)
+        force = rotation.along_z((model.acc_coef + model.cmd_f_coef * present)[..., 0])
+        drag = jnp.zeros_like(s.vel)
+        if model.drag_matrix is not None:
+            drag = matvec(model.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), s.vel))
+        known = matvec(matrix, force + drag) / model.mass
+        specific, memory = specific_force(s.pos, s.vel, known, command, memory, self.freq, p.position)  # type: ignore
+        specific = specific - matvec(matrix, drag) / model.mass
+
+        ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
+        later = specific + p.ahead[..., :1] * command.jerk + p.ahead[..., 1:] * command.snap
+        z = rotation.safe_normalize(later, jnp.asarray([0.0, 0.0, 1.0], specific.dtype))
+        y = rotation.safe_normalize(cross(z, ahead), left)
+        angles = p.angles * rotation.from_axes(cross(y, z), y, z)
+        thrust = (model.mass * dot(specific, matrix[..., 2]) - model.acc_coef) / model.cmd_f_coef
+        return jnp.concatenate([angles, jnp.maximum(thrust, model.thrust_min)], axis=-1), memory

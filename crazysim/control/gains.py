@@ -1,0 +1,35 @@
+"""Check that an airframe has the gains that a controller needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from crazysim.drones import Airframe
+from crazysim.drones.keys import GUIDE
+from crazysim.errors import ConfigError
+
+
+def require_gains(airframe: Airframe, paths: Iterable[str], controller: str) -> None:
+    """Check that an airframe has all values that a controller needs.
+
+    Args:
+        airframe: The airframe.
+        paths: Tables and keys of the values.
+        controller: Name of the controller, for the message.
+
+    Raises:
+        ConfigError: If it lacks values; all of them are named, by table.
+    """
+    missing = [path for path in dict.fromkeys(paths) if path not in airframe.values]
+    if not missing:
+        return
+    tables: dict[str, list[str]] = {}
+    for path in missing:
+        table, _, key = path.rpartition(".")
+        tables.setdefault(table, []).append(key)
+    listed = "; ".join(f"[{table}] {', '.join(keys)}" for table, keys in tables.items())
+    why = next(filter(None, map(airframe.why_missing, missing)), "")
+    raise ConfigError(
+        f"airframe {airframe.name!r} lacks {listed}, which controller {controller!r} needs. {why}Use "
+        f"controller='auto', which needs no gains, or add them to the airframe; {GUIDE} lists all keys."
+    )

@@ -1,0 +1,145 @@
+"""Position loop of the default controller: setpoint to specific force, with an estimate of unknown forces."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.control.setpoint import Setpoint
+from crazysim.drones import Airframe
+from crazysim.dynamics.models import GRAVITY
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import dot, safe_clip, safe_norm
+
+POSITION = 0.4
+"""Natural frequency of the position loop times the delay of the loop below it, 1."""
+OBSERVER = 1.5
+"""Rate of the estimate of unknown forces times the same delay, 1."""
+THROTTLE = 0.9
+"""Part of the largest thrust that the feedback uses, 1; the rest is for the attitude."""
+TILT = 1.0
+"""Largest horizontal acceleration by feedback over that of gravity, 1: a tilt of 45 degrees."""
+FALL = 0.5
+"""Largest downward acceleration by feedback over that of gravity, 1: rotors keep half of their thrust to turn with."""
+LEAST = 0.1
+"""Least acceleration that the feedback may use over that of gravity, 1, for drones that can hardly lift themselves."""
+DISTURBANCE = 0.5
+"""Largest acceleration by unknown forces that is compensated, along an axis, over that of gravity, 1."""
+
+
+class PositionParams(PyTree):
+    """Gains and limits of the position loop, each shared or one per drone."""
+
+    gravity_vec: Array = leaf("parameter", 1)
+    """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
+    stiffness: Array = leaf("parameter", 1, (1,))
+    """Acceleration per position error, 1/s^2. (1,)"""
+    damping: Array = leaf("parameter", 1, (1,))
+    """Acceleration per velocity error, 1/s. (1,)"""
+    reach: Array = leaf("parameter", 1)
+    """Largest position error that counts, horizontal and vertical, m. (2,)"""
+    acc_max: Array = leaf("parameter", 1)
+    """Largest acceleration by feedback, horizontal, up and down, m/s^2. (3,)"""
+    observer: Array = leaf("parameter", 1, (1,))
+    """Part of a new measurement in the estimate of unknown forces, 1. (1,)"""
+
+    @staticmethod
+    def create(airframe: Airframe, delay: float, freq: int) -> PositionParams:
+        """Return the shared parameters of an airframe.
+
+        The loop is critically damped at the natural frequency ``POSITION / delay``. Feedback accelerates no more than
+        the rotors can while they carry the drone. The position error counts up to twice the distance at which it alone
+        requires that, so that a far setpoint is approached at a limited speed from which the drone can stop.
+
+        Args:
+            airframe: The airframe.
+            delay: Delay of the loop that follows the specific force, s.
+            freq: Rate of the controller, Hz.
+
+        Raises:
+            ConfigError: If the airframe lacks a value.
+        """
+        g = -GRAVITY[2]
+        thrust = airframe.n_rotors * float(airframe.value("rotors.thrust_max", ()))
+        most = THROTTLE * thrust / float(airframe.value("rigid_body.mass", ()))
+        up, down = max(most - g, LEAST * g), FALL * g
+        side = min(TILT * g, np.sqrt(max(most**2 - g**2, (LEAST * g) ** 2)))
+        frequency = POSITION / delay
+        return PositionParams(
+            gravity_vec=as_parameter(GRAVITY),
+            stiffness=as_parameter(frequency**2),
+            damping=as_parameter(2 * frequency),
+            reach=as_parameter(2 * np.array([side, min(up, down)]) / frequency**2),
+            acc_max=as_parameter([side, up, down]),
+            observer=as_parameter(1 - np.exp(-OBSERVER / delay / freq)),
+        )
+
+
+class PositionMemory(PyTree):
+    """Memory of the position loop."""
+
+    vel: Array = leaf("drone", 1)
+    """Velocity expected at this tick from the known forces, world frame, m/s. (n_worlds, n_drones, 3)"""
+    disturbance: Array = leaf("drone", 1)
+    """Estimated acceleration by unknown forces, world frame, m/s^2. (n_worlds, n_drones, 3)"""
+
+    @staticmethod
+    def at_rest() -> PositionMemory:
+        """Return the memory of one drone before the first tick."""
+        return PositionMemory(as_parameter(np.zeros(3)), as_parameter(np.zeros(3)))
+
+
+def specific_force(
+    pos: Array,
+    vel: Array,
+    known: Array,
+    setpoint: Setpoint,
+    memory: PositionMemory,
+    freq: float,
+    params: PositionParams,
+) -> tuple[Array, PositionMemory]:
+    """Return the specific force that leads to a setpoint, and the memory.
+
+    The difference between the velocity and the one expected from the known forces, over one tick, is a measurement of
+    the unknown ones. It is limited (``DISTURBANCE``) and then filtered, so that neither a drone that is held nor one
+    that is moved by hand or by a reset winds the estimate up. A drone at rest is one that the floor holds: forces along
+    the floor are not measured, as they would tilt it further.
+
+    Args:
+        pos: Position, world frame, m. (..., 3)
+        vel: Velocity, world frame, m/s. (..., 3)
+        known: Acceleration by the known forces other than gravity, world frame, m/s^2. (..., 3)
+        setpoint: Setpoint with the leading axes of the state.
+        memory: Memory of the last tick.
+        freq: Rate of the controller, Hz.
+        params: Gains and limits, shared or with the leading axes of the state.
+
+    Returns:
+        Desired acceleration by all known forces other than gravity, world frame, m/s^2 (..., 3); the memory.
+    """
+    p = params
+    limit = -DISTURBANCE * GRAVITY[2]
+    measured = safe_clip((vel - memory.vel) * freq, -limit, limit)
+    sideways = jnp.where(dot(vel, vel) == 0, 0.0, measured[..., :2])
+    measured = _with_height(sideways, measured[..., 2:])
+    disturbance = memory.disturbance + p.observer * (measured - memory.disturbance)
+
+    error, reach = setpoint.pos - pos, p.reach[..., 1:]
+    error = _with_height(_within(error[..., :2], p.reach[..., :1]), safe_clip(error[..., 2:], -reach, reach))
+    acc = p.stiffness * error + p.damping * (setpoint.vel - vel)
+    height = safe_clip(acc[..., 2:], -p.acc_max[..., 2:], p.acc_max[..., 1:2])
+    acc = _with_height(_within(acc[..., :2], p.acc_max[..., :1]), height)
+    specific = setpoint.acc + acc - p.gravity_vec - disturbance
+    return specific, PositionMemory(vel + (known + p.gravity_vec) / freq, disturbance)
+
+
+def _within(x: Array, limit: Array) -> Array:
+    """Return a vector shortened to a length. (..., n)"""
+    norm = safe_norm(x)
+    return x * jnp.where(norm > limit, limit / jnp.where(norm > limit, norm, 1.0), 1.0)
+
+
+def _with_height(horizontal: Array, height: Array) -> Array:
+    """Return the vector of its horizontal part and its height. (..., 3)"""
+    return jnp.concatenate([horizontal, height], axis=-1)

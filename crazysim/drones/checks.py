@@ -1,0 +1,168 @@
+"""Check that the numbers of an airframe are those of a drone that can fly."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.drones.keys import GUIDE, KEYS
+from crazysim.errors import ConfigError, shown
+from crazysim.tables import INERTIA, check_numbers
+
+if TYPE_CHECKING:
+    from crazysim.drones.airframe import Airframe
+
+GRAVITY = 9.81
+"""Gravitational acceleration, m/s^2."""
+MAX_THRUST_TO_WEIGHT = 1000
+"""Largest ratio of thrust to weight; that of racers is about 20."""
+MAX_ANG_ACC = 1e6
+"""Largest angular acceleration by the rotors, rad/s^2; that of the built-in airframes is up to 14,000."""
+MAX_ROTOR_VEL = 1e6
+"""Largest rotor speed, rpm; that of the built-in airframes is up to 40,000."""
+TOLERANCE = 0.01
+"""Relative error of moments of inertia, which are often published with two digits."""
+
+
+def check_airframe(airframe: Airframe) -> None:
+    """Check shapes, ranges and the consistency of an airframe's numbers.
+
+    Raises:
+        ConfigError: If they cannot be those of a drone that flies.
+    """
+    for table in ("rigid_body", "rotors"):
+        airframe.table(table)
+    owner, position = f"airframe {airframe.name!r}", airframe.value("rotors.position")
+    if position.ndim != 2 or position.shape[1] != 3:
+        raise ConfigError(f"{owner}: expected rotors.position of shape (n, 3), got {position.shape}")
+    n = len(position)
+    for path, value in airframe.values.items():
+        check_numbers(owner, path, value, KEYS[path], n)
+    for path in ("rigid_body.mass", "rotors.yaw_torque_sign", "rotors.thrust_min", "rotors.thrust_max"):
+        airframe.value(path)
+    for problem in (_inertia, _rotors, _curves, _forces, _controller, _camera):
+        found = problem(airframe)
+        if found:
+            raise ConfigError(f"{owner}: {found}. Check the number; {GUIDE} has the units.")
+
+
+def _inertia(airframe: Airframe) -> str | None:
+    inertia = airframe.inertia
+    moments = np.sort(np.linalg.eigvalsh(inertia))
+    if not np.allclose(inertia, inertia.T, atol=0) or not np.all((moments >= INERTIA.low) & (moments <= INERTIA.high)):
+        return (
+            f"expected an inertia of three positive moments {INERTIA.text}, or a symmetric positive definite 3 x 3 "
+            f"matrix, got {shown(inertia.tolist())}"
+        )
+    if moments[0] + moments[1] < moments[2] * (1 - TOLERANCE):
+        return (
+            f"expected an inertia whose largest moment is at most the sum of the others, as that of every body is, got "
+            f"moments of {', '.join(f'{m:.4g}' for m in moments)} kg m^2"
+        )
+    return None
+
+
+def _rotors(airframe: Airframe) -> str | None:
+    value = airframe.value
+    n, mass = airframe.n_rotors, float(value("rigid_body.mass"))
+    low, high, signs = value("rotors.thrust_min"), value("rotors.thrust_max"), value("rotors.yaw_torque_sign")
+    if not low < high:
+        return f"expected 0 <= thrust_min < thrust_max, got {low} N and {high} N"
+    if not n * low < mass * GRAVITY < n * high <= MAX_THRUST_TO_WEIGHT * mass * GRAVITY:
+        return (
+            f"expected rotors that lift {mass} kg, between their least and largest thrust and with at most "
+            f"{MAX_THRUST_TO_WEIGHT} times its weight, got {n} rotors of {low} to {high} N"
+        )
+    if set(signs.tolist()) != {-1.0, 1.0}:
+        return f"expected yaw_torque_sign as 1 or -1 for each rotor, and not all equal, got {shown(signs.tolist())}"
+    if not airframe.arm > 0:
+        return "expected rotors beside the centre of mass, got all of them at x = y = 0"
+    moments = np.linalg.eigvalsh(airframe.inertia)
+    if airframe.arm * n * high / moments[0] > MAX_ANG_ACC:
+        return (
+            f"expected rotors that turn the body with at most {MAX_ANG_ACC:g} rad/s^2, got {high} N on arms of "
+            f"{airframe.arm:g} m for moments of inertia from {moments[0]:.4g} kg m^2"
+        )
+    spun = np.sum(np.broadcast_to(airframe.values.get("rotors.inertia", 0.0), n))
+    if spun > moments[-1]:
+        return (
+            f"expected propellers with a smaller inertia than the whole drone, got {spun:.4g} and at most "
+            f"{moments[-1]:.4g} kg m^2"
+        )
+    return None
+
+
+def _curves(airframe: Airframe) -> str | None:
+    """Check the curves of the rotors: thrust that rises over the speed, drag torque, lag."""
+    numbers = airframe.values
+    if "rotors.thrust_curve" in numbers:
+        curves = np.atleast_2d(numbers["rotors.thrust_curve"])
+        with np.errstate(all="ignore"):
+            low, high = airframe.rotor_vel_limits
+        if np.any(curves[:, 2] <= 0) or not np.all((low >= 0) & (low < high) & (high <= MAX_ROTOR_VEL)):
+            return (
+                f"expected thrust_curve with a positive quadratic term, that rises from thrust_min to thrust_max "
+                f"between 0 and {MAX_ROTOR_VEL:g} rpm, got {shown(curves.tolist())}"
+            )
+        if "rotors.torque_curve" in numbers:
+            k0, k1, k2 = np.atleast_2d(numbers["rotors.torque_curve"]).T
+            torques = np.array([k0 + speed * (k1 + speed * k2) for speed in (low, high)])
+            most = MAX_ANG_ACC * np.min(np.linalg.eigvalsh(airframe.inertia)) / airframe.n_rotors
+            if not np.all((torques >= 0) & (torques <= most)):
+                return (
+                    f"expected torque_curve of at least 0 N m at the speeds of thrust_min and thrust_max, and at most "
+                    f"{most:.4g} N m, got {torques.min():.4g} to {torques.max():.4g} N m"
+                )
+    if "rotors.lag" in numbers:
+        lag = np.atleast_2d(numbers["rotors.lag"])
+        if np.any(lag[:, 0::2] + lag[:, 1::2] == 0):
+            return (
+                f"expected lag with a positive linear or quadratic term on spin-up and on spin-down, without which a "
+                f"rotor never reaches its speed, got {shown(lag.tolist())}"
+            )
+    return None
+
+
+def _forces(airframe: Airframe) -> str | None:
+    """Check drag, and the forces of the fitted models and the battery."""
+    numbers, n = airframe.values, airframe.n_rotors
+    weight, most = numbers["rigid_body.mass"] * GRAVITY, n * numbers["rotors.thrust_max"]
+    for path in ("drag.coefficients", "fitted.so_rpy_rotor_drag.drag_coefficients"):
+        if path in numbers and np.max(np.linalg.eigvalsh(_symmetric(numbers[path]))) > 1e-12:
+            return f"expected {path} that brakes, so negative or zero, got {shown(numbers[path].tolist())}"
+    for model in airframe.tables.get("fitted", {}):
+        known = [numbers.get(f"fitted.{model}.{key}") for key in ("acc_coef", "cmd_f_coef")]
+        if known[0] is not None and known[1] is not None and known[0] + known[1] * most <= weight:
+            return (
+                f"expected acc_coef and cmd_f_coef of fitted.{model} to lift {weight:.4g} N, got "
+                f"{known[0] + known[1] * most:.4g} N at the largest thrust"
+            )
+    if numbers.get("battery.cells", 1.0) % 1:
+        return f"expected battery.cells as a whole number, got {numbers['battery.cells']}"
+    if "battery.thrust_over_voltage" in numbers and airframe.full_thrust_voltage is None:
+        return (
+            "expected battery.thrust_over_voltage to reach thrust_max at a positive voltage, got a curve that does not"
+        )
+    return None
+
+
+def _controller(airframe: Airframe) -> str | None:
+    low, high = (airframe.values.get(f"controller.pwm_{end}") for end in ("min", "max"))
+    if low is not None and high is not None and not low < high:
+        return f"expected pwm_min below pwm_max, got {low} and {high}"
+    return None
+
+
+def _camera(airframe: Airframe) -> str | None:
+    camera = airframe.values.get("shape.track_camera")
+    if camera is not None and not abs(camera[0]) > 0:
+        return f"expected track_camera behind or ahead of the drone, with x other than 0, got {camera.tolist()}"
+    return None
+
+
+def _symmetric(drag: NDArray) -> NDArray:
+    """Return the symmetric part of drag coefficients, on which the power depends. (3, 3)"""
+    matrix = np.diag(drag) if drag.ndim == 1 else drag
+    return (matrix + matrix.T) / 2

@@ -1,0 +1,377 @@
+"""Estimates of the constants of an airframe from a few numbers, as a commented TOML file.
+
+Every number of the file states its formula and source. Measured numbers replace estimates in the file, one by one.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.drones.checks import GRAVITY
+from crazysim.errors import ConfigError, shown
+from crazysim.storage import is_file
+
+AIR_DENSITY = 1.225
+"""Density of air at sea level in the standard atmosphere, kg/m^3."""
+PITCH = 0.5
+"""Pitch over diameter of a propeller whose pitch is not given, 1."""
+OUTER_MASS = 0.4
+"""Part of the mass that sits at the rotors, 1; the built-in airframes have 0.31 to 0.52."""
+MERIT_DIAMETERS, MERITS = (0.127, 0.254), (0.44, 0.68)
+"""Figures of merit in hover of a propeller of 5 and one of 10 inches, and their diameters, m."""
+DRAG_RATE = 0.45
+"""Linear drag over mass, 1/s; the built-in airframes that were identified from flights have 0.35 to 0.58."""
+ROTOR_TIME = 0.05
+"""Time constant of rotors up to 10 inches, s."""
+IDLE = 0.05
+"""Smallest over largest thrust of a rotor that is on, 1."""
+MOTOR_EFFICIENCY = 0.75
+"""Mechanical power over electric power of a motor with its speed controller, 1."""
+BATTERY_SHARE = 0.22
+"""Mass of the battery over that of the drone, 1; that of a Crazyflie 2.1 Brushless is 0.21."""
+BATTERY_ENERGY = 153.0
+"""Energy per mass of lithium-polymer batteries, W h/kg."""
+CELL_VOLTAGE = 3.7
+"""Nominal voltage of a lithium-polymer cell, V."""
+CELL_RESISTANCE = 0.015
+"""Resistance of a cell times its capacity, ohm A h."""
+COLUMNS = {
+    "throttle": ("throttle", 1.0),
+    "thrust_n": ("thrust", 1.0),
+    "thrust_g": ("thrust", 1e-3 * GRAVITY),
+    "rpm": ("rpm", 1.0),
+    "torque_nm": ("torque", 1.0),
+    "power_w": ("power", 1.0),
+}
+"""Columns of a motor table, with the quantity and its factor to SI units."""
+SOURCES = {
+    "given": "Given to crazysim airframe new",
+    "layout": "{n} rotors at equal angles, {arm:g} m from the centre, numbered clockwise from the one at or right "
+    "of the nose; rotors 1, 3, ... turn counter-clockwise seen from above",
+    "spins": "Rotors that turn counter-clockwise seen from above have -1: their drag turns the body clockwise",
+    "inertia": f"estimate: {OUTER_MASS:g} of the mass as points at the rotors, the rest at the centre; inertias of the "
+    "built-in airframes correspond to 0.31 to 0.52",
+    "thrust_to_weight": "Thrust over weight of {ratio:g}: ratio mass g / number of rotors",
+    "thrust_min": f"estimate: {IDLE:g} thrust_max, rotors that idle",
+    "thrust_curve": "estimate: T = C_T rho n^2 D^4 with n in 1/s, rho = 1.225 kg/m^3, C_T = 0.0427 + 0.144 pitch / D = "
+    "{ct:.4f}, a fit to APC multirotor propellers in SizingLab/FAST-UAV, surrogate_models.py; {pitch}",
+    "torque_curve": "estimate: ideal power T^1.5 / sqrt(2 rho A) over a figure of merit of {merit:.2f}, interpolated "
+    "over the diameter between 0.44 (5 inch DA4052, C_T 0.148, C_P 0.103) and 0.68 (10 inch APC SF 10x4.7, C_T 0.119, "
+    "C_P 0.048), averages of static tests in the UIUC Propeller Database",
+    "rotor_inertia": "estimate: thin rod, m D^2 / 12, of the propeller's mass m = 0.015 kg (D / 0.279 m)^2 (0.53 oz at "
+    "11 inch, scaled as in SizingLab/FAST-UAV); the motor's bell is neglected",
+    "lag": f"estimate: first order with {ROTOR_TIME:g} s, longer in proportion to the diameter beyond 0.254 m; thrust "
+    "of cf21B_500 has 0.06 s around hover, that of hb_x500 (10 inch) 0.045 to 0.071 s",
+    "drag": f"estimate: {DRAG_RATE:g} 1/s times the mass; airframes identified from flights (cf21B_500, cf2x_L250, "
+    "hb_x500) have 0.35 to 0.58 1/s",
+    "cells": "estimate: 1 cell below 0.1 kg, 3 below 0.5 kg, 4 below 3 kg, else 6",
+    "battery_mass": f"estimate: capacity times {CELL_VOLTAGE:g} V per cell over {BATTERY_ENERGY:g} W h/kg, that of a "
+    "pack of 3.4 A h, 4 cells and 0.329 kg (MK-quadro)",
+    "capacity": f"estimate: battery of {BATTERY_SHARE:g} of the mass with {BATTERY_ENERGY:g} W h/kg",
+    "resistance": f"estimate: cells times {CELL_RESISTANCE:g} ohm A h / capacity; good cells of several A h have "
+    "1 to 4 mohm when new (rchelicopterfun.com, LiPo Internal Resistance)",
+    "propeller": "Radius of the propeller that was given",
+}
+"""Descriptions of the sources of a file, filled in where they are used."""
+
+
+def estimate_airframe(
+    mass: float,
+    propeller: float,
+    *,
+    arm: float | None = None,
+    n_rotors: int = 4,
+    layout: str = "x",
+    positions: ArrayLike | None = None,
+    spins: Sequence[int] | None = None,
+    thrust_to_weight: float | None = None,
+    motor_table: str | Path | Mapping[str, ArrayLike] | None = None,
+    pitch: float | None = None,
+    inertia: ArrayLike | None = None,
+    time_constant: float | None = None,
+    cells: int | None = None,
+    capacity: float | None = None,
+    resistance: float | None = None,
+    name: str = "my_drone",
+) -> str:
+    """Return the TOML text of an airframe whose constants are estimated from a few numbers.
+
+    The file has what first principles, the battery and the controllers that follow from physics need, and no gains.
+    Each estimate states its formula and source.
+
+    Args:
+        mass: Mass with the battery, kg.
+        propeller: Diameter of the propellers, m.
+        arm: Distance of the rotors from the centre, m; with ``n_rotors`` and ``layout``.
+        n_rotors: Number of rotors on a circle, even.
+        layout: ``"x"``: the nose is between two rotors, ``"+"``: the first rotor is at the nose.
+        positions: Positions of the rotors from the centre of mass, m, instead of ``arm``; x ahead, y left, z up. (n, 3)
+            or (n, 2)
+        spins: 1 for rotors that turn counter-clockwise seen from above, -1 for the others; by default they alternate,
+            beginning with 1. (n,)
+        thrust_to_weight: Largest thrust of all rotors over the weight.
+        motor_table: Data sheet of motor and propeller instead of ``thrust_to_weight``: a CSV file, or a dict of
+            columns, ``thrust_n`` or ``thrust_g``, and optionally ``rpm``, ``torque_nm``, ``power_w`` (electric) and
+            ``throttle``, which is not used.
+        pitch: Pitch of the propellers, m; by default half the diameter.
+        inertia: Moments of inertia, kg m^2, or a matrix. (3,) or (3, 3)
+        time_constant: Time constant of the rotors' speeds, s.
+        cells: Number of battery cells in series.
+        capacity: Charge of the battery, A h.
+        resistance: Internal resistance of the battery, ohm.
+        name: Name of the airframe.
+
+    Raises:
+        ConfigError: If a number is missing or cannot be that of a drone.
+    """
+    for key, value in (
+        ("mass", mass),
+        ("propeller", propeller),
+        ("arm", arm),
+        ("pitch", pitch),
+        ("thrust_to_weight", thrust_to_weight),
+        ("time_constant", time_constant),
+        ("cells", cells),
+        ("capacity", capacity),
+        ("resistance", resistance),
+    ):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise ConfigError(f"expected {key} to be positive, got {shown(value)}")
+    file = _File(name)
+    places, signs = _rotors(file, arm, n_rotors, layout, positions, spins, propeller)
+    file.add("rigid_body", "mass", mass, "kg", "given")
+    if inertia is None:
+        file.add("rigid_body", "inertia", _inertia(mass, places), "kg m^2", "inertia")
+    else:
+        file.add("rigid_body", "inertia", np.asarray(inertia, float), "kg m^2", "given")
+    file.add(
+        "rotors",
+        "position",
+        places,
+        "m; x ahead, y left, z up, from the centre of mass",
+        "layout" if positions is None else "given",
+    )
+    file.add("rotors", "yaw_torque_sign", signs, "1", "spins" if positions is not None or spins else "layout")
+    thrust = _thrusts(file, mass, len(places), propeller, thrust_to_weight, motor_table, pitch)
+    file.add("rotors", "thrust_min", IDLE * thrust, "N", "thrust_min")
+    blade = 0.015 * (propeller / 0.279) ** 2
+    file.add("rotors", "inertia", blade * propeller**2 / 12, "kg m^2", "rotor_inertia")
+    tau = ROTOR_TIME * max(1.0, propeller / 0.254) if time_constant is None else time_constant
+    lag_unit = "1/s, 1/(s rpm) on spin-up; 1/s, 1/(s rpm) on spin-down"
+    file.add("rotors", "lag", np.array([1 / tau, 0, 1 / tau, 0]), lag_unit, "given" if time_constant else "lag")
+    file.add("drag", "coefficients", -DRAG_RATE * mass * np.ones(3), "N s/m", "drag")
+    _battery(file, mass, cells, capacity, resistance)
+    file.add("shape", "propeller_radius", propeller / 2, "m", "propeller")
+    return file.text()
+
+
+class _File:
+    """Text of an airframe: tables of numbers with units and sources."""
+
+    def __init__(self, name: str) -> None:
+        """Start an empty airframe."""
+        self.name = name
+        self.tables: dict[str, list[str]] = {}
+        self.sources: dict[str, str] = {}
+
+    def add(self, table: str, key: str, value: Any, unit: str, source: str, **numbers: Any) -> None:
+        """Add a number with its unit and a source of ``SOURCES``, which ``numbers`` are filled into."""
+        if source not in self.sources:
+            self.describe(source, SOURCES[source].format(**numbers) if numbers else SOURCES[source])
+        line = f'{key} = {{ value = {_toml(value)}, unit = "{unit}", source = "{source}" }}'
+        self.tables.setdefault(table, []).append(line)
+
+    def describe(self, source: str, text: str) -> None:
+        """Set the description of a source."""
+        self.sources[source] = text
+
+    def text(self) -> str:
+        """Return the file."""
+        lines = [
+            f"# {self.name}, written by crazysim airframe new. Every number is {{ value, unit, source }}; [sources]",
+            "# has the formula and the origin of each. Replace estimates by what you measure.",
+            "",
+            f"name = {_string(self.name)}",
+            "",
+            "[sources]",
+            *(f"{key} = {_string(text)}" for key, text in self.sources.items()),
+        ]
+        for table, entries in self.tables.items():
+            lines += ["", f"[{table}]", *entries]
+        return "\n".join(lines) + "\n"
+
+
+def _string(text: str) -> str:
+    """Return a TOML string."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    if not escaped.isprintable():
+        raise ConfigError(f"expected a name of printable characters, got {shown(text)}")
+    return f'"{escaped}"'
+
+
+def _toml(value: Any) -> str:
+    """Return a number or an array with six digits, as TOML."""
+    if np.ndim(value):
+        return f"[{', '.join(_toml(each) for each in value)}]"
+    return f"{float(value):.6g}" if isinstance(value, (float, np.floating)) else str(int(value))
+
+
+def _rotors(
+    file: _File, arm: Any, n_rotors: int, layout: str, positions: Any, spins: Any, propeller: float
+) -> tuple[NDArray, NDArray]:
+    """Return positions and signs of the yaw torques of the rotors."""
+    if (arm is None) == (positions is None):
+        raise ConfigError("expected either arm, with n_rotors and layout, or positions. Use arm=0.11 for a quadrotor.")
+    if positions is None:
+        if layout not in ("x", "+"):
+            raise ConfigError(f"expected layout as 'x' or '+', got {shown(layout)}. Use positions for any other.")
+        if n_rotors < 4 or n_rotors % 2:
+            raise ConfigError(
+                f"expected an even number of rotors from 4, which alternate, got {n_rotors}. Use positions and spins."
+            )
+        turn = 2 * np.pi / n_rotors
+        angles = -turn * (np.arange(n_rotors) + (0.5 if layout == "x" else 0.0))
+        places = arm * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=-1)
+        file.describe("layout", SOURCES["layout"].format(n=n_rotors, arm=arm))
+    else:
+        places = np.asarray(positions, float)
+        if places.ndim != 2 or places.shape[1] not in (2, 3) or len(places) < 3:
+            raise ConfigError(f"expected positions of shape (n, 3) or (n, 2) of at least 3 rotors, got {places.shape}")
+        places = np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
+    places = np.where(np.abs(places) < 1e-9, 0.0, places)
+    gaps = places[:, None] - places[None]
+    beside = (np.abs(gaps[..., 2]) < 0.1 * propeller) & ~np.eye(len(places), dtype=bool)
+    closest = np.min(np.linalg.norm(gaps[..., :2], axis=-1)[beside], initial=np.inf)
+    if closest < propeller * (1 - 1e-6):
+        raise ConfigError(
+            f"expected propellers that do not touch, got a diameter of {propeller:g} m and rotors {closest:.3g} m "
+            f"apart. Use a longer arm, a smaller propeller, or other heights of the rotors."
+        )
+    if spins is None:
+        if len(places) % 2:
+            raise ConfigError(
+                f"expected spins for {len(places)} rotors, which cannot alternate. Use spins=[1, -1, ...]."
+            )
+        spins = [1, -1] * (len(places) // 2)
+    turning = np.asarray(spins)
+    if turning.shape != (len(places),) or not np.all(np.isin(turning, (1, -1))) or abs(np.sum(turning)) == len(places):
+        raise ConfigError(f"expected spins of 1 and -1 for {len(places)} rotors, and not all equal, got {shown(spins)}")
+    return places, -turning
+
+
+def _inertia(mass: float, places: NDArray) -> NDArray:
+    """Return the inertia of points at the rotors: moments, or a matrix where its axes are not those of the body."""
+    squares = np.einsum("ni,nj->ij", places, places) / len(places)
+    matrix = OUTER_MASS * mass * (np.trace(squares) * np.eye(3) - squares)
+    off = matrix - np.diag(np.diag(matrix))
+    return np.diag(matrix) if np.max(np.abs(off)) < 1e-6 * np.max(matrix) else matrix
+
+
+def _thrusts(file: _File, mass: float, n: int, diameter: float, ratio: Any, table: Any, pitch: float | None) -> float:
+    """Add the thrust and its curves; return the largest thrust of one rotor, N."""
+    if (ratio is None) == (table is None):
+        raise ConfigError(
+            "expected either thrust_to_weight or motor_table. Use thrust_to_weight=2 for a drone that carries things, "
+            "4 for an agile one."
+        )
+    rows = {} if table is None else _motor_table(table)
+    named = f"motor table {Path(table).name}" if isinstance(table, (str, Path)) else "motor table that was given"
+    if table is None:
+        thrust = ratio * mass * GRAVITY / n
+        file.add("rotors", "thrust_max", thrust, "N", "thrust_to_weight", ratio=ratio)
+    else:
+        thrust = float(np.max(rows["thrust"]))
+        file.describe("motor_thrust", f"Largest thrust of the {named}")
+        file.add("rotors", "thrust_max", thrust, "N", "motor_thrust")
+    beta = PITCH if pitch is None else pitch / diameter
+    ct = 0.0427 + 0.144 * beta
+    if "rpm" in rows:
+        k, error = _quadratic(rows["rpm"], rows["thrust"])
+        file.describe("motor_curve", f"Least squares T = k rpm^2 to the {named}, off by at most {error:.2g} N")
+        source = "motor_curve"
+    else:
+        k, source = ct * AIR_DENSITY * diameter**4 / 3600, "thrust_curve"
+    pitched = f"pitch {beta:g} D" + (" assumed" if pitch is None else "")
+    file.add("rotors", "thrust_curve", np.array([0, 0, k]), "N, N/rpm, N/rpm^2", source, ct=ct, pitch=pitched)
+
+    area, to_rad = np.pi * diameter**2 / 4, 2 * np.pi / 60
+    merit = float(np.interp(diameter, MERIT_DIAMETERS, MERITS))
+    torque, source = k**1.5 / np.sqrt(2 * AIR_DENSITY * area) / merit / to_rad, "torque_curve"
+    if "rpm" in rows and "torque" in rows:
+        torque, error = _quadratic(rows["rpm"], rows["torque"])
+        file.describe("motor_torque", f"Least squares Q = k rpm^2 to the {named}, off by at most {error:.2g} N m")
+        source = "motor_torque"
+    elif "rpm" in rows and "power" in rows:
+        shaft = MOTOR_EFFICIENCY * rows["power"] / (rows["rpm"] * to_rad)
+        torque, error = _quadratic(rows["rpm"], shaft)
+        file.describe(
+            "motor_power",
+            f"estimate: least squares Q = k rpm^2 to the {named}, with {MOTOR_EFFICIENCY:g} of the electric power at "
+            f"the propeller, off by at most {error:.2g} N m",
+        )
+        source = "motor_power"
+    file.add("rotors", "torque_curve", np.array([0, 0, torque]), "N m, N m/rpm, N m/rpm^2", source, merit=merit)
+    return thrust
+
+
+def _quadratic(rpm: NDArray, values: NDArray) -> tuple[float, float]:
+    """Return the factor k of values = k rpm^2 by least squares, and the largest error."""
+    squares = rpm**2
+    k = float(squares @ values / (squares @ squares))
+    return k, float(np.max(np.abs(values - k * squares)))
+
+
+def _motor_table(table: Any) -> dict[str, NDArray]:
+    """Return the columns of a motor table by quantity, in SI units and rpm."""
+    columns = table if isinstance(table, Mapping) else _read_columns(Path(table))
+    known = ", ".join(COLUMNS)
+    found: dict[str, NDArray] = {}
+    for key, values in columns.items():
+        if str(key).strip().lower() not in COLUMNS:
+            raise ConfigError(f"expected columns of a motor table among {known}, got {shown(key)}")
+        quantity, factor = COLUMNS[str(key).strip().lower()]
+        try:
+            array = np.asarray(values, float) * factor
+        except ValueError as error:
+            raise ConfigError(f"expected numbers in column {key!r} of the motor table, got {error}") from error
+        if array.ndim != 1 or not len(array) or not np.all(np.isfinite(array)) or np.any(array < 0):
+            raise ConfigError(f"expected finite numbers of at least 0 in column {key!r}, got {shown(array.tolist())}")
+        found[quantity] = array
+    if "thrust" not in found or not np.max(found["thrust"]) > 0:
+        raise ConfigError(f"expected a motor table with a column thrust_n or thrust_g, got {shown(list(columns))}")
+    if len({len(array) for array in found.values()}) != 1:
+        raise ConfigError("expected columns of equal lengths in the motor table")
+    if "rpm" in found:
+        running = found["rpm"] > 0
+        if not np.any(running):
+            raise ConfigError("expected a speed above 0 in column 'rpm' of the motor table, got none")
+        found = {quantity: array[running] for quantity, array in found.items()}
+    return found
+
+
+def _read_columns(path: Path) -> dict[str, list[str]]:
+    """Return the columns of a CSV file whose first line has their names."""
+    if not is_file(path):
+        raise ConfigError(f"expected a motor table as an existing CSV file, got {str(path)!r}")
+    lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip() and line[0] != "#"]
+    header, *rows = csv.reader(lines) if lines else [[]]
+    if not header or not rows or any(len(row) != len(header) for row in rows):
+        raise ConfigError(f"expected a line of names and lines of as many numbers in {str(path)!r}")
+    return {key: [row[i] for row in rows] for i, key in enumerate(header)}
+
+
+def _battery(file: _File, mass: float, cells: int | None, capacity: float | None, resistance: float | None) -> None:
+    """Add the battery."""
+    n = cells or next(n for n, limit in ((1, 0.1), (3, 0.5), (4, 3.0), (6, np.inf)) if mass < limit)
+    charge = capacity or BATTERY_SHARE * mass * BATTERY_ENERGY / (n * CELL_VOLTAGE)
+    file.add("battery", "cells", n, "1, in series", "given" if cells else "cells")
+    file.add("battery", "capacity", charge, "A h", "given" if capacity else "capacity")
+    own = resistance or n * CELL_RESISTANCE / charge
+    file.add("battery", "resistance", own, "ohm, of all cells", "given" if resistance else "resistance")
+    file.add("battery", "mass", n * charge * CELL_VOLTAGE / BATTERY_ENERGY, "kg, part of the drone's", "battery_mass")

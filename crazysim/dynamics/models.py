@@ -1,0 +1,96 @@
+"""Names of the dynamics models, and which airframes support them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crazysim.drones import Airframe, Drone, load_airframe
+from crazysim.errors import ConfigError, UnknownNameError
+
+RINGING = 1.5
+"""Largest product of a rate and a step: Euler steps diverge from 2 on, and a lag overshoots by half its error here."""
+GRAVITY = (0.0, 0.0, -9.81)
+"""Gravitational acceleration, world frame, m/s^2: the value with which the airframes were identified."""
+
+
+class Dynamics(StrEnum):
+    """Dynamics model."""
+
+    first_principles = "first_principles"
+    """Rotors with lag, thrust and torque curves, gyroscopic and reaction torque, drag, full inertia."""
+    so_rpy = "so_rpy"
+    """Second-order response of roll, pitch and yaw, fitted to flights; thrust without lag."""
+    so_rpy_rotor = "so_rpy_rotor"
+    """``so_rpy`` with a first-order lag of the collective thrust."""
+    so_rpy_rotor_drag = "so_rpy_rotor_drag"
+    """``so_rpy_rotor`` with linear drag in the body frame."""
+    default = first_principles
+
+
+def supported_dynamics(drone: str | Path | Mapping[str, Any] | Airframe) -> tuple[Dynamics, ...]:
+    """Return the models for which an airframe, or a source of one as in ``load_airframe``, has parameters."""
+    airframe = load_airframe(drone)
+    fitted = airframe.tables.get("fitted", {})
+    full = "thrust_curve" in airframe.table("rotors")
+    return tuple(d for d in Dynamics if (full if d == Dynamics.first_principles else d.value in fitted))
+
+
+def supported_drones(dynamics: Dynamics | str) -> tuple[Drone, ...]:
+    """Return the built-in airframes that have parameters for a model.
+
+    Raises:
+        UnknownNameError: If the model does not exist.
+    """
+    if dynamics not in tuple(Dynamics):
+        raise UnknownNameError(f"expected dynamics as one of {', '.join(Dynamics)}, got {dynamics!r}")
+    return tuple(drone for drone in Drone if dynamics in supported_dynamics(drone))
+
+
+def require_support(airframe: Airframe, dynamics: Dynamics) -> None:
+    """Check that an airframe has the parameters of a model.
+
+    Raises:
+        ConfigError: If it lacks them; the message lists the supported models.
+    """
+    supported = supported_dynamics(airframe)
+    if dynamics not in supported:
+        raise ConfigError(
+            f"expected dynamics that drone {airframe.name!r} has parameters for ({', '.join(supported) or 'none'}), "
+            f"got {dynamics.value!r}. Pass one of these as dynamics=, or add the missing numbers to the airframe."
+        )
+
+
+def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
+    """Check that the lags and the damping of an airframe are slow enough for the rate of the physics.
+
+    Raises:
+        ConfigError: If steps diverge; the message has the least rate.
+    """
+    numbers, mass = airframe.values, airframe.value("rigid_body.mass")
+    found: dict[str, Any] = {}
+    if dynamics == Dynamics.first_principles:
+        drag = "drag.coefficients"
+        if "rotors.lag" in numbers:
+            lag, fastest = np.atleast_2d(numbers["rotors.lag"]), airframe.rotor_vel_limits[1]
+            found["rotors.lag"] = lag[:, 0::2] + 2 * lag[:, 1::2] * fastest[:, None]
+    else:
+        fit = f"fitted.{dynamics.value}."
+        drag = f"{fit}drag_coefficients"
+        found = {path: numbers[path] for path in (f"{fit}rpy_rates_coef", f"{fit}thrust_dyn_coef") if path in numbers}
+        if f"{fit}rpy_coef" in numbers and f"{fit}rpy_rates_coef" in numbers:
+            found[f"{fit}rpy_coef"] = numbers[f"{fit}rpy_coef"] / numbers[f"{fit}rpy_rates_coef"]
+    if drag in numbers:
+        found[drag] = numbers[drag] / mass
+    for path, rates in found.items():
+        rate = float(np.max(np.abs(rates)))
+        if rate > RINGING * freq:
+            raise ConfigError(
+                f"expected {path} of airframe {airframe.name!r} to be slow for steps of 1/{freq} s, got a rate of "
+                f"{rate:.4g} 1/s. Use freq={math.ceil(rate / RINGING)} or more, or a smaller number."
+            )

@@ -1,0 +1,209 @@
+"""Kernels on NVIDIA GPUs: CUDA source compiled by NVRTC, launched by XLA itself.
+
+NVRTC comes with JAX's CUDA packages. The PTX that it makes is part of the compiled step, as a custom call of XLA
+(``TARGET``), which hands it to the driver; so JAX's own cache never finds a kernel for another GPU. It needs no other
+package, no compiler on the machine, and no Python at run time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import functools
+import importlib.util
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from crazysim import jaxcompat
+from crazysim.engine.backends.kernel import Kernel
+from crazysim.engine.backends.native import Launch
+from crazysim.engine.errors import KernelError
+from crazysim.engine.ir import dump
+
+TARGET = "__gpu$xla.gpu.ptx"
+"""XLA's name for a kernel that is passed to it as PTX."""
+
+OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false", "--device-as-default-execution-space")
+"""Division and square root to 2 and 1 units in the last place, as XLA has them; no other shortcut."""
+
+THREADS_AT_ONCE = (512, 384)
+"""Numbers of threads of a multiprocessor to try, the most first: they leave 128 or 168 registers to each thread."""
+
+DEFAULT_ARCHITECTURE = "compute_90"
+"""Architecture to compile for on a machine without a GPU."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Resources:
+    """Registers and memory of one thread of a compiled kernel."""
+
+    registers: int
+    """Number of registers."""
+    spilled: int
+    """Local memory, bytes: variables that did not fit into registers."""
+
+
+def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Launch:
+    """Compile a kernel for some GPUs, and return the function that launches it.
+
+    Args:
+        kernel: The kernel.
+        devices: GPUs that will run it; None for those of this machine.
+
+    Raises:
+        KernelError: If NVRTC is missing, or refuses the source, with its message.
+    """
+    device = weakest(devices)
+    kernel = kernel if device is None else fitted(kernel, device)
+    text = ptx(kernel, architecture(device))
+
+    def launch(n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
+        grid = {"grid_x": -(-n_lanes // kernel.lanes), "grid_y": 1, "grid_z": 1}
+        block = {"block_x": kernel.threads, "block_y": 1, "block_z": 1}
+        run = jax.ffi.ffi_call(TARGET, list(outputs), input_output_aliases=kernel.aliases())
+        return list(
+            run(
+                np.asarray([n_lanes], np.int32),
+                count,
+                *inputs,
+                name="advance",
+                kernel_type="ptx",
+                kernel_data=text,
+                shared_mem_bytes=np.int32(0),
+                **{name: np.int32(size) for name, size in (grid | block).items()},
+            )
+        )
+
+    return launch
+
+
+def weakest(devices: Sequence[jax.Device] | None = None) -> jax.Device | None:
+    """Return the GPU of the lowest compute capability, whose code runs on all; None without a GPU.
+
+    Args:
+        devices: GPUs to choose from; None for those of this machine.
+    """
+    if devices is None:
+        try:
+            devices = jax.local_devices(backend="gpu")
+        except RuntimeError:
+            return None
+    gpus = [d for d in devices if d.platform == "gpu"]
+    return min(gpus, key=jaxcompat.compute_capability) if gpus else None
+
+
+def architecture(device: jax.Device | None) -> str:
+    """Return the virtual architecture of a GPU; ``DEFAULT_ARCHITECTURE`` where there is none."""
+    return DEFAULT_ARCHITECTURE if device is None else f"compute_{jaxcompat.compute_capability(device)}"
+
+
+@functools.cache
+def fitted(kernel: Kernel, device: jax.Device) -> Kernel:
+    """Return a kernel with as many blocks at once on a multiprocessor as its registers allow without spilling.
+
+    More blocks hide more latency, until registers that no longer fit cost more than that.
+    """
+    numbers = dict.fromkeys(n // kernel.threads for n in THREADS_AT_ONCE if n > kernel.threads)
+    candidates = [kernel, *(kernel.with_blocks(n) for n in numbers)]
+    with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
+        least, *found = pool.map(lambda c: resources(c, device), candidates)
+    bearable = 16 if least.registers <= 224 else 256  # measured on an H200: docs/concepts/engine.md
+    suitable = (c for c, r in zip(candidates[1:], found, strict=True) if r.spilled <= least.spilled + bearable)
+    return next(suitable, kernel)
+
+
+@functools.cache
+def ptx(kernel: Kernel, arch: str) -> str:
+    """Return a kernel's PTX.
+
+    Raises:
+        KernelError: If NVRTC is missing, or refuses the source, with its message.
+    """
+    if dump.enabled():
+        dump.write(f"kernel.{arch}.cu", f"// NVRTC --gpu-architecture={arch} {' '.join(OPTIONS)}\n{kernel.text}")
+    return _compile(kernel.text, arch, "PTX").decode()
+
+
+@functools.cache
+def resources(kernel: Kernel, device: jax.Device) -> Resources:
+    """Return the registers and memory that a kernel takes on a GPU, as its driver reports them."""
+    image = _compile(kernel.text, architecture(device).replace("compute", "sm"), "CUBIN")
+    try:
+        driver, number = ctypes.CDLL("libcuda.so.1"), device.local_hardware_id
+    except OSError as error:
+        raise KernelError(f"the CUDA driver was not found: {error}") from error
+    module, function, value = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
+    jax.block_until_ready(jax.device_put(np.zeros(1), device))  # the driver's context exists from here on
+    handle, context = ctypes.c_int(), ctypes.c_void_p()
+    _check(driver.cuDeviceGet(ctypes.byref(handle), number))
+    _check(driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), handle))
+    _check(driver.cuCtxPushCurrent_v2(context))
+    try:
+        _check(driver.cuModuleLoadData(ctypes.byref(module), image))
+        _check(driver.cuModuleGetFunction(ctypes.byref(function), module, b"advance"))
+        found = []
+        for attribute in (4, 3):  # CU_FUNC_ATTRIBUTE_NUM_REGS, CU_FUNC_ATTRIBUTE_LOCAL_SIZE_BYTES
+            _check(driver.cuFuncGetAttribute(ctypes.byref(value), attribute, function))
+            found.append(value.value)
+        _check(driver.cuModuleUnload(module))
+    finally:
+        driver.cuCtxPopCurrent_v2(ctypes.byref(context))
+        driver.cuDevicePrimaryCtxRelease(handle)
+    return Resources(*found)
+
+
+def _check(result: int) -> None:
+    if result:
+        raise KernelError(f"the CUDA driver answered error {result}")
+
+
+@functools.cache
+def nvrtc() -> ctypes.CDLL | None:
+    """Return NVIDIA's run-time compiler, from JAX's CUDA packages or the system; None if it is missing."""
+    found: list[str] = []
+    for package in ("nvidia.cu13", "nvidia.cuda_nvrtc"):
+        try:
+            spec = importlib.util.find_spec(package)
+        except ModuleNotFoundError:
+            continue
+        for folder in (spec.submodule_search_locations or []) if spec else []:
+            found += sorted(map(str, Path(folder).glob("lib/libnvrtc.so.*")))
+    for name in [*found, "libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so"]:
+        if "builtins" in name or ".alt." in name:
+            continue
+        try:
+            return ctypes.CDLL(name)
+        except OSError:
+            continue
+    return None
+
+
+def _compile(source: str, arch: str, kind: str) -> bytes:
+    library = nvrtc()
+    if library is None:
+        raise KernelError("NVRTC was not found; it comes with pip install 'jax[cuda13]' or 'jax[cuda12]'")
+    program = ctypes.c_void_p()
+    library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"advance.cu", 0, None, None)
+    try:
+        options = [f"--gpu-architecture={arch}", *OPTIONS]
+        result = library.nvrtcCompileProgram(
+            program, len(options), (ctypes.c_char_p * len(options))(*(o.encode() for o in options))
+        )
+        size = ctypes.c_size_t()
+        if result:
+            library.nvrtcGetProgramLogSize(program, ctypes.byref(size))
+            log = ctypes.create_string_buffer(size.value)
+            library.nvrtcGetProgramLog(program, log)
+            raise KernelError(f"NVRTC refused the kernel:\n{log.value.decode()[:2000]}")
+        getattr(library, f"nvrtcGet{kind}Size")(program, ctypes.byref(size))
+        out = ctypes.create_string_buffer(size.value)
+        getattr(library, f"nvrtcGet{kind}")(program, out)
+        return out.raw if kind == "CUBIN" else out.value
+    finally:
+        library.nvrtcDestroyProgram(ctypes.byref(program))

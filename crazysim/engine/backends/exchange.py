@@ -1,0 +1,254 @@
+"""Exchange of numbers between the lanes of a kernel: drones of one world are in one warp, block or set of vectors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir.blocks import Value
+
+Read = Callable[[str], str]
+"""From the number of a drone in its world to the expression of what it published."""
+
+Published = Sequence[tuple[str, str]]
+"""Types of numbers, as they are called in the source, and their expressions."""
+
+Live = Sequence[tuple[Value, str]]
+"""Values, and their types as they are called in the source."""
+
+SIZES = {"f64": 8, "f32": 4, "i32": 4, "u32": 4, "b1": 1}
+"""Sizes of numbers, bytes."""
+
+WARP = 32
+"""Threads of a GPU that run together."""
+
+MAX_THREADS = 1024
+"""Most threads of a block on a GPU."""
+
+SHARED_MEMORY = 48 * 1024
+"""Memory that the threads of a block share, bytes."""
+
+MAX_IN_VECTOR = 8
+"""Most drones of a world that are lanes of one vector of the host."""
+
+
+class Lines(Protocol):
+    """Source that is being written, line by line; ``source.Writer``."""
+
+    names: dict[Value, str]
+    """Expression of each value."""
+
+    def line(self, text: str, depth: int) -> None:
+        """Write a line."""
+        ...
+
+    def new(self, prefix: str = ...) -> str:
+        """Return a name that nothing has."""
+        ...
+
+    def forget(self) -> None:
+        """Forget shared intermediate results: their variables are not defined behind this place."""
+        ...
+
+
+class Exchange(Protocol):
+    """A way in which lanes read each other's numbers."""
+
+    depth: int
+    """Blocks of source around the code of a lane."""
+
+    def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
+        """Write what passes numbers to the other drones of a world, and return how they are read.
+
+        Args:
+            writer: Takes the lines.
+            values: The numbers.
+            live: Values that are defined, and used behind this place, with their types.
+            depth: Depth of the lines.
+        """
+        ...
+
+    def variable(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+        """Define a number of a lane that changes, and return the expression for it."""
+        ...
+
+    def keep(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+        """Define a number of a lane that does not change, and return the expression for it in all later code."""
+        ...
+
+    def begin(self, writer: Lines, depth: int) -> None:
+        """Begin the code of a lane."""
+        ...
+
+    def end(self, writer: Lines, depth: int) -> None:
+        """End the code of a lane."""
+        ...
+
+    @property
+    def declarations(self) -> list[str]:
+        """Lines in front of the kernel."""
+        ...
+
+
+class OneLane:
+    """Code that is written once for a lane, whose variables hold in all of it."""
+
+    depth = 0
+
+    def variable(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+        """Write a variable, and return its name."""
+        writer.line(f"auto {name} = {value};", depth)
+        return name
+
+    def keep(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+        """Write a constant, and return its name."""
+        writer.line(f"const auto {name} = {value};", depth)
+        return name
+
+    def begin(self, writer: Lines, depth: int) -> None:
+        """Write nothing."""
+
+    def end(self, writer: Lines, depth: int) -> None:
+        """Write nothing."""
+
+
+class Registers(OneLane):
+    """Lanes of one warp or vector, which read each other's registers."""
+
+    def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
+        """Return how numbers are read from the registers of another lane."""
+        names = []
+        for kind, value in values:
+            names.append(writer.new())
+            writer.line(f"const auto {names[-1]} = {kind}_lanes({value});", depth)
+        return [lambda j, x=x: f"of_drone({x}, {j})" for x in names]
+
+    @property
+    def declarations(self) -> list[str]:
+        """Return no lines."""
+        return []
+
+
+class SharedMemory(OneLane):
+    """Threads of one block of a GPU, which read what the others wrote to the block's memory."""
+
+    def __init__(self, lanes: int):
+        """Exchange numbers between so many lanes.
+
+        Raises:
+            UnsupportedError: If a block has not as many threads.
+        """
+        if lanes > MAX_THREADS:
+            raise UnsupportedError(f"the drones of a world read each other's numbers, up to {MAX_THREADS} on a GPU")
+        self.lanes = lanes
+        self._records: dict[str, int] = {}
+
+    def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
+        """Write a record of numbers for each thread, and return how those of another are read."""
+        order = sorted(range(len(values)), key=lambda k: -SIZES[values[k][0]])
+        text = "".join(f"{values[k][0]} x{n}; " for n, k in enumerate(order))
+        record = f"Record{self._records.setdefault(text, len(self._records))}"
+        size = sum(math.ceil(_size(text) / 16) * 16 for text in self._records) * self.lanes
+        if size > SHARED_MEMORY:
+            raise UnsupportedError(
+                f"the drones of a world publish {size} bytes for each other, and a GPU's block has {SHARED_MEMORY}"
+            )
+        where = f"shared_{record}"
+        numbers = ", ".join(values[k][1] for k in order)
+        writer.line("__syncthreads();", depth)
+        writer.line(f"if (threadIdx.x < {self.lanes}) {where}[threadIdx.x] = {record}{{{numbers}}};", depth)
+        writer.line("__syncthreads();", depth)
+        place = {k: n for n, k in enumerate(order)}
+        return [lambda j, n=place[k]: f"{where}[world + {j}].x{n}" for k in range(len(values))]
+
+    @property
+    def declarations(self) -> list[str]:
+        """Return the records, and the memory for them."""
+        lines = []
+        for text, k in self._records.items():
+            lines.append(f"struct __align__(16) Record{k} {{ {text}}};")
+            lines.append(f"static __shared__ Record{k} shared_Record{k}[{self.lanes}];")
+        return lines
+
+
+class Sweeps:
+    """Several vectors of the host for a world: each part of a step is computed for all before the next part begins.
+
+    What a part passes on to the next is in memory.
+    """
+
+    depth = 1
+
+    def __init__(self) -> None:
+        """Begin without numbers in memory."""
+        self.kept: list[str] = []
+
+    def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
+        """Store numbers and everything that is live, begin the next part, and return how numbers are read."""
+        arrays = []
+        for kind, value in values:
+            arrays.append(writer.new("g"))
+            self.keep(writer, arrays[-1], kind, value, depth)
+        for x, kind in live:
+            writer.names[x] = self.keep(writer, writer.new("m"), kind, writer.names[x], depth)
+        self.end(writer, depth - 1)
+        self.begin(writer, depth - 1)
+        writer.forget()
+        return [lambda j, x=x: f"of_place(w.{x}, {j})" for x in arrays]
+
+    def variable(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+        """Write a number of the lanes to memory, and return its place."""
+        self.kept.append(f"{kind}v {name}[VECTORS];")
+        writer.line(f"w.{name}[v] = {kind}_lanes({value});", depth)
+        return f"w.{name}[v]"
+
+    def keep(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+        """Write a number of the lanes to memory, and return its place."""
+        return self.variable(writer, name, kind, value, depth)
+
+    def begin(self, writer: Lines, depth: int) -> None:
+        """Begin a loop over the vectors of the world."""
+        writer.line("SWEEP {", depth)
+
+    def end(self, writer: Lines, depth: int) -> None:
+        """End the loop."""
+        writer.line("}", depth)
+
+    @property
+    def declarations(self) -> list[str]:
+        """Return the numbers of a world in memory."""
+        return ["struct World {", *(f"  {line}" for line in self.kept), "};"]
+
+
+def exchange_for(target: str, group: int) -> Exchange:
+    """Return how the drones of a world read each other's numbers on a target.
+
+    Raises:
+        UnsupportedError: If there are too many drones.
+    """
+    if target == "cuda":
+        return Registers() if group <= WARP else SharedMemory(lanes_of_block(group)[1])
+    return Registers() if group <= MAX_IN_VECTOR else Sweeps()
+
+
+def lanes_of_block(group: int, usual: int = 64) -> tuple[int, int]:
+    """Return the number of threads of a block on a GPU, and how many of them are lanes.
+
+    Worlds of up to a warp stay in one. Larger ones fill a block: of up to 256 threads, the size that leaves the fewest
+    without a drone.
+
+    Args:
+        group: Drones of a world that read each other's numbers.
+        usual: Threads of a block where it makes no difference.
+    """
+    if group <= WARP:
+        return usual, usual // WARP * (WARP // group * group)
+    least = math.ceil(group / WARP) * WARP
+    sizes = range(least, max(least, 256) + 1, WARP)
+    return max(((n, n // group * group) for n in sizes), key=lambda x: (round(x[1] / x[0], 2), -x[0]))
+
+
+def _size(record: str) -> int:
+    return sum(SIZES.get(word, 0) for word in record.split())

@@ -1,0 +1,242 @@
+"""Fused: one kernel for all steps, in which a drone's numbers stay in registers.
+
+A call of a kernel is a primitive of its own, which becomes the kernel of the platform that JAX lowers it for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import jaxcompat
+from crazysim.core.sharding import Location
+from crazysim.core.stage import with_leaves
+from crazysim.engine.backends import Run, cuda, kernel, lanes, native
+from crazysim.engine.backends.native import Launch
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir.program import Program
+from crazysim.errors import ConfigError
+
+CountedRun = Callable[[list[Any], Array], tuple[list[Any], Array]]
+"""A ``Run`` whose number of steps is an array."""
+
+
+class Kernels:
+    """Kernels of one program: that of the platform it is planned for, and those of others once JAX lowers it there."""
+
+    def __init__(self, program: Program, location: Location):
+        """Compile the kernel for some devices.
+
+        Args:
+            program: The program, which one kernel can run.
+            location: The devices.
+
+        Raises:
+            UnsupportedError: If an operation or type has no source.
+            KernelError: If the compiler refuses the kernel or takes too long.
+        """
+        self.program = program
+        self.inputs, self.outputs = kernel.needed(program), tuple(program.written)
+        self._launches = {location.platform: self._compiled(location)}
+
+    def on(self, platform: str) -> Launch:
+        """Return the function that calls the kernel of a platform.
+
+        Raises:
+            ConfigError: If it has none.
+        """
+        if platform not in self._launches:
+            try:
+                self._launches[platform] = self._compiled(Location(platform))
+            except UnsupportedError as error:
+                raise ConfigError(
+                    f"expected a kernel for the {platform.upper()}, which JAX compiles this step for, got none: "
+                    f"{error}. Use engine='lanes', or data on another device."
+                ) from error
+        return self._launches[platform]
+
+    def _compiled(self, location: Location) -> Launch:
+        if location.platform == "gpu":
+            return cuda.compiled(kernel.write(self.program, "cuda"), location.devices)
+        return native.compiled(kernel.write(self.program, "host"))
+
+    def results(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
+        """Return shapes and types of what the kernel writes: leaves, and flags of drones if it checks."""
+        flags = [jax.ShapeDtypeStruct((n_worlds, self.program.n_drones), np.bool_)] if self.program.check else []
+        return [*(lanes.shape_of(self.program, i, n_worlds) for i in self.outputs), *flags]
+
+
+def _results(*args: Any, kernels: Kernels, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
+    del args
+    return kernels.results(n_worlds)
+
+
+def _launch(platform: str, count: Array, *inputs: Array, kernels: Kernels, n_worlds: int) -> list[Array]:
+    launch = kernels.on(platform)
+    return launch(n_worlds * kernels.program.n_drones, count, inputs, kernels.results(n_worlds))
+
+
+launch_p = jaxcompat.primitive_by_platform(
+    "crazysim_kernel", _results, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
+)
+"""Call of a kernel: number of steps and its inputs, to what it writes."""
+
+
+def missing(platform: str) -> str | None:
+    """Return the reason why kernels cannot run on a platform, or None."""
+    if platform == "gpu":
+        return (
+            None if cuda.nvrtc() else "NVRTC was not found, which comes with pip install 'jax[cuda13]' or 'jax[cuda12]'"
+        )
+    if platform != "cpu":
+        return f"there are no kernels for {platform}"
+    return None if native.compiler() else "no C++ compiler was found (g++, clang++, or the variable CXX)"
+
+
+def build(program: Program, location: Location) -> Run:
+    """Compile a program to kernels, and return the function that runs them.
+
+    Raises:
+        UnsupportedError: If an operation or type has no source.
+        KernelError: If the compiler refuses a kernel or takes too long.
+    """
+
+    def compiled(part: Program) -> Kernels:
+        return Kernels(part, location)
+
+    run = _one_kernel(compiled(program)) if program.fused else _split(program, compiled)
+    return differentiable(_over_batches(program, run), lanes.build(program, location))
+
+
+def differentiable(run: CountedRun, on_lanes: Run) -> Run:
+    """Return a function that runs a program, with the derivative of the same program on lanes."""
+
+    def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+        @jax.custom_jvp
+        def forward(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+            return run(leaves, count)
+
+        def derivative(primals: Any, tangents: Any) -> Any:
+            (values, _), (slopes, _) = primals, tangents
+            changing = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
+
+            def of(some: list[Any]) -> Any:
+                return on_lanes(with_leaves(values, changing, some), n_steps)
+
+            return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
+
+        forward.defjvp(derivative, symbolic_zeros=True)  # constant leaves have no derivative to be computed
+        return forward(leaves, jnp.asarray(n_steps, jnp.int32))
+
+    return steps
+
+
+def describe(program: Program, platform: str, devices: Sequence[jax.Device] | None = None) -> list[str]:
+    """Return the compiler of the kernels of a program, or on a GPU the registers that each takes, in lines."""
+    if platform != "gpu":
+        return [f"kernel: compiled by {native.compiler()}"]
+    device = cuda.weakest(devices)
+    if device is None:
+        return [f"kernel: compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"]
+    sources = [kernel.write(part, "cuda") for part in _parts(program) if part.fused]
+    used = [cuda.resources(cuda.fitted(source, device), device) for source in sources]
+    return [
+        f"kernel: {source.threads} threads a block, {x.registers} registers, {x.spilled} bytes spilled"
+        for source, x in zip(sources, used, strict=True)
+    ]
+
+
+def _over_batches(program: Program, run: CountedRun) -> CountedRun:
+    """Return a kernel call with a rule for vmap: a batch of the same worlds is more worlds."""
+
+    def batched(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
+        of_leaves, of_count = in_batched
+        own = [leaf.scope in ("drone", "world") for leaf in program.leaves]
+        out_batched = ([True] * len(program.written), True)
+        if of_count or not program.fused or any(b and not o for b, o in zip(of_leaves, own, strict=True)):
+            # Shared parameters that differ between batches: one batch after the other.
+            full = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
+                    for x, b in zip(leaves, of_leaves, strict=True)]  # fmt: skip
+            counts = count if of_count else jnp.broadcast_to(count, (size,))
+            return jax.lax.map(lambda xs: run(*xs), (full, counts)), out_batched
+
+        def join(x: Any, b: bool, in_rows: bool) -> Any:
+            x = x if b else jnp.broadcast_to(x, (size, *x.shape))
+            return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1) if in_rows else x.reshape(-1, *x.shape[2:])
+
+        def part(x: Any, in_rows: bool) -> Any:
+            if in_rows:
+                return jnp.moveaxis(x.reshape(x.shape[0], size, -1), 1, 0)
+            return x.reshape(size, -1, *x.shape[1:])
+
+        rows = [i in program.rows for i in range(len(leaves))]
+        joined = [
+            join(x, b, in_rows) if o and x is not None else x
+            for x, b, o, in_rows in zip(leaves, of_leaves, own, rows, strict=True)
+        ]
+        written, flagged = run(joined, count)
+        return (
+            [part(x, rows[i]) for i, x in zip(program.written, written, strict=True)],
+            part(flagged, False),
+        ), out_batched
+
+    return jaxcompat.batched_rule(run, batched)
+
+
+def _one_kernel(kernels: Kernels) -> CountedRun:
+    return partial(_call, kernels)
+
+
+def _parts(program: Program) -> list[Program]:
+    """Return programs that run one after the other: those of one kernel each, and those of one unfused stage each."""
+    return [program] if program.fused else list(program.parts())
+
+
+def _split(program: Program, compiled: Callable[[Program], Kernels]) -> CountedRun:
+    """Return the same for a step that unfused stages split: a kernel for the stages between them."""
+    parts = _parts(program)
+    with native.compiling_threads() as pool:
+        runs = list(pool.map(lambda part: _one_kernel(compiled(part)) if part.fused else None, parts))
+    written = program.written
+
+    def turn(leaves: list[Any]) -> list[Any]:
+        for part, run in zip(parts, runs, strict=True):
+            out, _ = lanes.steps(part, leaves, 1) if run is None else run(leaves, jnp.asarray(1, jnp.int32))
+            leaves = with_leaves(leaves, part.written, out)
+        return leaves
+
+    def run(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+        def body(_: Any, values: list[Any]) -> list[Any]:
+            after = turn(with_leaves(leaves, written, values))
+            return [after[i] for i in written]
+
+        out = jax.lax.fori_loop(0, count, body, [leaves[i] for i in written])
+        return out, lanes.nonfinite(program, lanes.LeafValues(program, with_leaves(leaves, written, out)))
+
+    return run
+
+
+def _call(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+    """Return what a kernel writes: leaves, and the worlds that are flagged."""
+    program = kernels.program
+    n_worlds, n_drones = lanes.batch(program, leaves)
+    inputs = [_as_numbers(leaves[i]) for i in kernels.inputs]
+    out = launch_p.bind(count.reshape(1), *inputs, kernels=kernels, n_worlds=n_worlds)
+    written = [
+        jax.random.wrap_key_data(x) if jaxcompat.is_key(program.leaves[i]) else x
+        for i, x in zip(kernels.outputs, out[: len(kernels.outputs)], strict=True)
+    ]
+    if not program.check:
+        return written, jnp.zeros((n_worlds, 1), bool)
+    return written, out[-1] if n_drones == 1 else jnp.any(out[-1], axis=1, keepdims=True)
+
+
+def _as_numbers(x: Any) -> Array:
+    """Return an array of numbers; random keys as their 32-bit integers."""
+    return jax.random.key_data(x) if jaxcompat.is_key(x) else x

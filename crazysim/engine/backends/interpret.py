@@ -1,0 +1,280 @@
+"""An interpreter: programs in NumPy, one operation after the other, with nothing compiled.
+
+It is the meaning of the table of operations (``ops``), and slow. Passes, rules and other engines are tested against it,
+and ``Sim(engine="interpret")`` steps with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.sharding import Location
+from crazysim.core.stage import with_leaves
+from crazysim.engine.backends import Run, lanes, subnormals
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.blocks import Block, Operation, Value
+from crazysim.engine.ir.program import Program
+from crazysim.jaxcompat import is_key
+
+Observer = Callable[[Operation, Sequence[np.ndarray]], None]
+"""Gets every operation with its results."""
+
+
+def run(
+    block: Block, inputs: Sequence[Any], shape: tuple[int, ...], observe: Observer | None = None
+) -> list[np.ndarray]:
+    """Return the outputs of a block.
+
+    Args:
+        block: The block.
+        inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
+        shape: Shape of the lanes.
+        observe: Gets every operation with its results.
+
+    Returns:
+        Its outputs, of the lanes' shape.
+    """
+    if block not in _PREPARED:
+        places: dict[Any, int] = {}
+        constants: list[Any] = []
+        _PREPARED[block] = _prepare(block, places, constants), constants
+    prepared, constants = _PREPARED[block]
+    given = [np.asarray(x, v.dtype) for x, v in zip(inputs, block.inputs, strict=True)]
+    with np.errstate(all="ignore"):
+        out = prepared.run(constants.copy(), given, shape, observe)
+    return [_broadcast(x, shape) for x in out]
+
+
+def _broadcast(x: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a value broadcast to all lanes; NumPy's own call takes as long as an operation."""
+    return x if np.shape(x) == shape else np.broadcast_to(x, shape)
+
+
+class _Call(NamedTuple):
+    """An operation of a prepared block."""
+
+    op: Operation
+    fn: Callable[..., Any] | None
+    """NumPy's function; None for a structured operation."""
+    args: list[int]
+    """Places of the operands."""
+    results: list[int]
+    """Places of the results."""
+    dtype: np.dtype
+    """Type of the first result."""
+    blocks: list[_Prepared]
+    """Blocks that it runs."""
+
+
+class _Prepared(NamedTuple):
+    """A block whose values have places in a list, with the functions of its operations at hand."""
+
+    inputs: list[int]
+    """Places of the inputs."""
+    calls: list[_Call]
+    """Operations in order."""
+    outputs: list[int]
+    """Places of the outputs."""
+
+    def run(self, values: list[Any], given: Sequence[Any], shape: tuple[int, ...], observe: Observer | None) -> list:
+        """Return the outputs for some inputs.
+
+        Args:
+            values: Constants, and values of the blocks around it, at their places. It gets those of this block: of the
+                lanes' shape, or scalars, or tables.
+            given: Its inputs.
+            shape: Shape of the lanes.
+            observe: Gets every operation with its results.
+        """
+        for place, x in zip(self.inputs, given, strict=True):
+            values[place] = x
+        for op, fn, args, results, dtype, blocks in self.calls:
+            if fn is not None:
+                x = fn(*[values[k] for k in args])
+                values[results[0]] = x if x.dtype == dtype else np.asarray(x).astype(dtype)
+            else:
+                runs = [lambda given, block=block: block.run(values, given, shape, observe) for block in blocks]
+                for place, x in zip(results, _structured(op, [values[k] for k in args], shape, runs), strict=True):
+                    values[place] = x
+            if observe is not None:
+                observe(op, [values[k] for k in results])
+        return [values[k] for k in self.outputs]
+
+
+_Run = Callable[[Sequence[Any]], list[Any]]
+"""Runs a block: from its inputs to its outputs."""
+
+_PREPARED: WeakKeyDictionary[Block, tuple[_Prepared, list[Any]]] = WeakKeyDictionary()
+"""Blocks that were run, prepared, with the constants at their places and None elsewhere."""
+
+
+def _prepare(block: Block, places: dict[Any, int], constants: list[Any]) -> _Prepared:
+    """Return a block prepared, and add places of its values and constants to those of the blocks around it."""
+
+    def place(x: Any) -> int:
+        if isinstance(x, Value):
+            if x not in places:
+                places[x] = len(constants)
+                constants.append(None)
+            return places[x]
+        constants.append(x)
+        return len(constants) - 1
+
+    inputs = [place(x) for x in block.inputs]
+    calls = []
+    for op in block.operations:
+        args = [place(x) for x in op.args]
+        blocks = [_prepare(inner, places, constants) for inner in op.blocks]
+        results = [place(x) for x in op.results]
+        dtype = op.dtype if op.results else np.dtype(bool)
+        calls.append(_Call(op, _numpy(op), args, results, dtype, blocks))
+    return _Prepared(inputs, calls, [place(x) for x in block.outputs])
+
+
+def _numpy(op: Operation) -> Callable[..., Any] | None:
+    """Return the NumPy function of an operation; None for a structured one."""
+    row = ops.TABLE[op.name]
+    if row.structured:
+        return None
+    if row.numpy is None:
+        raise RuntimeError(f"operation {op.name!r} has no NumPy function; give it one in ops.TABLE")
+    params = dict(op.params)
+    if op.name in ("convert_element_type", "bitcast_convert_type"):
+        params["dtype"] = op.dtype
+    return functools.partial(row.numpy, **params) if params else row.numpy
+
+
+def _structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Sequence[_Run]) -> list[Any]:
+    """Return the results of an operation that runs blocks, looks something up, or has several results.
+
+    Args:
+        op: The operation.
+        args: Its operands.
+        shape: Shape of the lanes.
+        runs: Functions that run its blocks.
+    """
+    match op.name:
+        case "barrier":
+            return []
+        case "when":
+            mask, *old = args
+            new = runs[0]([]) if mask.any() else old
+            return [np.where(mask, x, y) for x, y in zip(new, old, strict=True)]
+        case "loop":
+            for _ in range(op.param("length")):
+                args = runs[0](args)
+            return args
+        case "while":
+            test, body = runs
+            while (mask := test(args)[0]).any():
+                args = [np.where(mask, x, y) for x, y in zip(body(args), args, strict=True)]
+            return args
+        case "over_others":
+            return _over_others(op, args, shape, runs[0])
+        case "custom_jvp":
+            return runs[0](args)
+        case "table":
+            return [op.param("numbers").array]
+        case "lookup":
+            return [args[0][args[1] + op.param("offset")]]
+        case "threefry2x32":
+            return list(threefry2x32(*args))
+    raise RuntimeError(
+        f"expected a structured operation that is interpreted, got {op.name!r}; add a case to _structured"
+    )
+
+
+def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], run: _Run) -> list[np.ndarray]:
+    """Combine the results of a block for each drone of the world, one after the other."""
+    n = op.param("n_members")
+    own = np.arange(shape[0]) % n
+    combine: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
+    found = [np.full(shape, ops.neutral(name, x.dtype)) for name, x in zip(op.param("reduce"), op.results, strict=True)]
+    for j in range(n):
+        other = [np.repeat(np.broadcast_to(x, shape).reshape(-1, n)[:, j], n) for x in args]
+        new = run([*other, own == j])
+        found = [fn(x, y) for fn, x, y in zip(combine, found, new, strict=True)]
+    return found
+
+
+ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+"""Bits that a round rotates by: J. K. Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC 2011, table 2."""
+
+
+def threefry2x32(k0: np.ndarray, k1: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the two integers of 32 bits that 20 rounds of Threefry make of two, under a key of two."""
+    keys = (k0, k1, k0 ^ k1 ^ np.uint32(0x1BD11BDA))
+    x0, x1 = x0 + keys[0], x1 + keys[1]
+    for n in range(5):
+        for r in ROTATIONS[n % 2]:
+            x0 = x0 + x1
+            x1 = (x1 << np.uint32(r)) | (x1 >> np.uint32(32 - r))
+            x1 = x1 ^ x0
+        x0, x1 = x0 + keys[(n + 1) % 3], x1 + keys[(n + 2) % 3] + np.uint32(n + 1)
+    return x0, x1
+
+
+def call(block: Block, inputs: Sequence[Any], shape: tuple[int, ...]) -> list[Array]:
+    """Return what ``run`` does, inside a function that JAX traces or compiles; it has no derivative."""
+    results = [jax.ShapeDtypeStruct(shape, x.dtype) for x in block.outputs]
+
+    def of_arrays(*inputs: Any) -> list[np.ndarray]:
+        return [np.array(x) for x in run(block, [np.asarray(x) for x in inputs], shape)]
+
+    return list(jax.pure_callback(of_arrays, results, *inputs, vmap_method="sequential"))
+
+
+def build(program: Program, location: Location) -> Run:
+    """Return the function that runs a program in NumPy."""
+    return functools.partial(steps, program, on_cpu=location.platform == "cpu")
+
+
+def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: bool = True) -> tuple[list[Any], Any]:
+    """Return what ``lanes.steps`` does, all in NumPy: at once, or in a callback where arguments are traced.
+
+    If stages are not fused, only blocks are interpreted, and the rest runs in XLA.
+
+    Args:
+        program: The program.
+        leaves: Leaves of all worlds.
+        n_steps: Number of steps.
+        on_cpu: True to take subnormal numbers for zero, as XLA does on a CPU and not on a GPU.
+    """
+    if not program.fused:
+        return lanes.steps(program, leaves, n_steps, call)
+    n_worlds, _ = lanes.batch(program, leaves)
+    given = [i for i, x in enumerate(leaves) if x is not None]
+    written = [lanes.shape_of(program, i, n_worlds) for i in program.written]
+    flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
+
+    def of_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], Any]:
+        arrays = with_leaves([None] * len(leaves), given, [np.asarray(x) for x in values])
+        with subnormals.flushed() if on_cpu else contextlib.nullcontext():
+            return _steps(program, arrays, int(n_steps))
+
+    values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in given]
+    if any(isinstance(x, jax.core.Tracer) for x in (n_steps, *values)):
+        out, flags = jax.pure_callback(of_arrays, (written, flagged), n_steps, *values, vmap_method="sequential")
+    else:
+        out, flags = of_arrays(n_steps, *values)
+    keys = [is_key(program.leaves[i]) for i in program.written]
+    return [jax.random.wrap_key_data(jnp.asarray(x)) if key else x for x, key in zip(out, keys, strict=True)], flags
+
+
+def _steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.ndarray], Any]:
+    now = lanes.LeafValues(program, leaves, run, np)
+    constants = lanes.prepare(program, now)
+    for _ in range(n_steps):
+        lanes.run(program, now, "each", constants)
+    flagged = lanes.nonfinite(program, now)
+    lanes.run(program, now, "last", {})
+    return [np.ascontiguousarray(now.array(i)) for i in program.written], flagged

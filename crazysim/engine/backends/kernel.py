@@ -1,0 +1,362 @@
+"""One kernel for many steps: the source of a program, from loads to stores.
+
+The numbers of one drone stay in variables, which are registers as long as there are enough, from the first step to
+the last.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from importlib import resources
+
+from crazysim.engine.backends.exchange import exchange_for, lanes_of_block
+from crazysim.engine.backends.source import TYPES, Writer, require, type_name
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir.blocks import Block
+from crazysim.engine.ir.program import TABLE, Phase, Program, Segment, Slot
+
+UNBOUNDED = "1 /* blocks at least */"
+
+BLOCK = 64
+"""Threads of a block on a GPU."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel:
+    """Source, with its inputs and outputs."""
+
+    text: str
+    """The source."""
+    inputs: tuple[int, ...]
+    """Leaves that it reads."""
+    outputs: tuple[int, ...]
+    """Leaves that it writes; behind them comes one bool per drone, whether its world is flagged, if that is checked."""
+    in_place: tuple[int, ...] = ()
+    """Leaves of rows that it updates in place: input and output of each must be the same memory."""
+    threads: int = BLOCK
+    """Threads of a block on a GPU."""
+    lanes: int = BLOCK
+    """Threads of a block that are lanes: as many as make whole worlds, where drones read each other's numbers."""
+
+    def aliases(self) -> dict[int, int]:
+        """Return the result that each operand in place is, by number; two numbers precede the operands."""
+        return {2 + self.inputs.index(i): self.outputs.index(i) for i in self.in_place}
+
+    def with_blocks(self, n: int) -> Kernel:
+        """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
+        return dataclasses.replace(self, text=self.text.replace(UNBOUNDED, f"{n}"))
+
+
+def preamble(target: str) -> str:
+    """Return the types and functions of a target."""
+    files = resources.files("crazysim.engine.backends").joinpath("targets")
+    text = files.joinpath(f"{target}.h").read_text()
+    return text.replace('#include "scalar.h"\n', files.joinpath("scalar.h").read_text())
+
+
+def epilogue(target: str) -> str:
+    """Return the code through which a target calls the kernel."""
+    if target == "cuda":
+        return ""
+    return resources.files("crazysim.engine.backends").joinpath("targets", "host_call.h").read_text()
+
+
+def write(program: Program, target: str) -> Kernel:
+    """Return the source of a program for ``cuda`` or ``host``.
+
+    A kernel takes the number of steps as an array of one number.
+
+    Args:
+        program: The program.
+        target: ``"cuda"`` or ``"host"``.
+
+    Raises:
+        UnsupportedError: If there is no source for an operation or a type; the error names the stage.
+    """
+    require_source(program)
+    body = _Body(program, target)
+    hoisted = body.write_loads()
+    body.write_loop(hoisted)
+    body.write_stores()
+
+    inputs, outputs, rank = needed(program), tuple(program.written), program.ranks
+    pointers = [f"const {_type(program, i)}* __restrict__ p{rank[i]}" for i in inputs]
+    pointers += [f"{_type(program, i)}* __restrict__ q{rank[i]}" for i in outputs]
+    pointers += ["b1* __restrict__ flagged"] if program.check is not None else []
+    threads, lanes = lanes_of_block(program.group)
+    code = "\n".join(body.writer.lines)
+    in_memory = body.exchange.depth > 0
+    frame = _cuda(pointers, code, threads, lanes) if target == "cuda" else _host(pointers, code, in_memory)
+    widest = 8 if any(_type(program, i) == "f64" for i in (*inputs, *outputs)) else 4
+    defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n#define BLOCK_THREADS {threads}\n"
+    defines += f"#define OPERATIONS {sum(_n_operations(s.block) for s in body.each)}\n"
+    declared = "".join(f"{line}\n" for line in (*body.writer.tables, *body.exchange.declarations))
+    text = defines + preamble(target) + declared + frame + epilogue(target)
+    in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
+    return Kernel(text, inputs, outputs, in_place, threads, lanes)
+
+
+class _Body:
+    """The code of a kernel between its braces: loads and the stages before the steps, the loop, checks and stores."""
+
+    def __init__(self, program: Program, target: str):
+        self.program = program
+        self.exchange = exchange_for(target, program.group)
+        self.writer = Writer(self.exchange)
+        self.each = [s for s in program.fused_segments if s.phase == "each"]
+        self.stored = _stored(program)
+        self._depth = 1 + self.exchange.depth
+        self._names: dict[Slot, str] = {}
+        """Expression of each number."""
+
+    def write_loads(self) -> list[list[str]]:
+        """Write loads and the stages before the steps; return the hoisted values of each segment of the loop."""
+        program, exchange, writer, names = self.program, self.exchange, self.writer, self._names
+        written, slots = self._slots()
+        loaded, deferred, rank = _loaded(program), _deferred(program), program.ranks
+        names.update({(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots})
+        shared = [slot for slot in slots if program.leaves[slot[0]].scope not in ("drone", "world")]
+        for slot in shared:
+            if slot[1] == TABLE:
+                names[slot] = f"p{rank[slot[0]]}"
+            elif slot in self.stored or slot not in deferred:
+                writer.line(f"const auto {names[slot]} = {_load(program, slot)};", 1)
+            else:
+                names[slot] = _load(program, slot)
+        exchange.begin(writer, 1)
+        for slot in slots:
+            kind, access = _type(program, slot[0]), _load(program, slot)
+            if slot in shared:
+                continue
+            if slot in written:
+                start = access if slot in loaded else f"{kind}(0)"
+                names[slot] = exchange.variable(writer, names[slot], kind, f"{kind}_lanes({start})", self._depth)
+            elif slot not in self.stored and slot in deferred:
+                names[slot] = access
+            else:
+                names[slot] = exchange.keep(writer, names[slot], kind, access, self._depth)
+        self._write_phase("first")
+        hoisted = [self._hoisted(segment) for segment in self.each]
+        exchange.end(writer, 1)
+        return hoisted
+
+    def write_loop(self, hoisted: list[list[str]]) -> None:
+        """Write the steps."""
+        self.writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
+        self.exchange.begin(self.writer, 2)
+        for segment, constants in zip(self.each, hoisted, strict=True):
+            _write_segment(self.writer, self.program, segment, self._names, constants, 1 + self._depth)
+        self.exchange.end(self.writer, 2)
+        self.writer.line("}", 1)
+
+    def write_stores(self) -> None:
+        """Write the check, the stages after the steps, and the stores."""
+        program, writer, check = self.program, self.writer, self.program.check
+        self.exchange.begin(writer, 1)
+        if check is not None:
+            (flagged,) = writer.block(check.block, [self._names[slot] for slot in check.reads], self._depth)
+            writer.line(f"STORE(1, 1, flagged, 0, b1_lanes({flagged}))", self._depth)
+        self._write_phase("last")
+        for slot in self.stored:
+            value = f"{_type(program, slot[0])}_lanes({self._names[slot]})"
+            writer.line(_store(program, slot, value), self._depth)
+        self.exchange.end(writer, 1)
+
+    def _slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:
+        """Return the numbers that the stages write, and all that the kernel uses."""
+        program, segments = self.program, self.program.fused_segments
+        written = dict.fromkeys(slot for s in segments for slot in program.per_drone(s, s.writes))
+        read = dict.fromkeys(slot for s in segments for slot in [*program.per_drone(s, s.reads), *s.hoisted_reads])
+        checked = program.check.reads if program.check else ()
+        return written, dict.fromkeys([*read, *written, *checked, *self.stored])
+
+    def _hoisted(self, segment: Segment) -> list[str]:
+        """Write what a segment computes once, and return the names of the results."""
+        writer, keep = self.writer, self.exchange.keep
+        outs = writer.block(segment.hoisted, [self._names[slot] for slot in segment.hoisted_reads], self._depth)
+        kinds = [type_name(x.dtype) for x in segment.hoisted.outputs]
+        return [keep(writer, writer.new("h"), kind, x, self._depth) for kind, x in zip(kinds, outs, strict=True)]
+
+    def _write_phase(self, phase: Phase) -> None:
+        for segment in self.program.of(phase):
+            _write_segment(self.writer, self.program, segment, self._names, [], self._depth)
+
+
+def _n_operations(block: Block) -> int:
+    """Return the number of operations of a block, with those for each of the others of a world."""
+    inner = [dict(op.params).get("n_members", 1) * sum(map(_n_operations, op.blocks)) for op in block.operations]
+    return len(block.operations) + sum(inner)
+
+
+def require_source(program: Program) -> None:
+    """Check that a program has source.
+
+    Raises:
+        UnsupportedError: If it has none; the error names the stage.
+    """
+    for segment in program.fused_segments:
+        require(segment.hoisted)
+        require(segment.block)
+        for i in {*segment.read, *segment.written}:
+            leaf = program.leaves[i]
+            if leaf.number not in TYPES:
+                why = f"kernels have no numbers of type {leaf.number}, which {leaf.name} has"
+                raise UnsupportedError(why, stage=", ".join(segment.stages))
+
+
+def needed(program: Program) -> tuple[int, ...]:
+    """Return the leaves that a kernel reads."""
+    return tuple(sorted({leaf for leaf, _ in _loaded(program)}))
+
+
+def _stored(program: Program) -> list[Slot]:
+    """Return the numbers that a kernel writes: all of a leaf of which some are written."""
+    return [(leaf, k) for leaf in program.written for k in range(program.leaves[leaf].size)]
+
+
+def _loaded(program: Program) -> set[Slot]:
+    """Return the slots whose numbers at the beginning matter: they are used before they are written for certain."""
+    loaded: set[Slot] = set()
+    known: set[Slot] = set()
+
+    def use(slots: Iterable[Slot]) -> None:
+        loaded.update(slot for slot in slots if slot not in known)
+
+    def run(segment: Segment) -> None:
+        use(program.per_drone(segment, segment.reads))
+        drones: dict[Slot, int] = {}
+        for (leaf, _), slot in zip(segment.writes, program.per_drone(segment, segment.writes), strict=True):
+            of_world = segment.scope == "world" and program.leaves[leaf].scope == "drone"
+            drones[slot] = drones.get(slot, 0) + (1 if of_world else program.n_drones)
+        known.update(slot for slot, n in drones.items() if n >= program.n_drones)
+
+    for segment in program.of("first"):
+        run(segment)
+    for segment in program.of("each"):  # there may be no step
+        use([*program.per_drone(segment, [*segment.reads, *segment.writes]), *segment.hoisted_reads])
+    if program.check is not None:
+        use(program.check.reads)
+    for segment in program.of("last"):
+        run(segment)
+    use(_stored(program))
+    return loaded
+
+
+def _write_segment(
+    writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str], depth: int
+) -> None:
+    inputs = [names[slot] for slot in program.per_drone(segment, segment.reads)]
+    if segment.scope == "world":  # a drone's numbers come from its lane
+        for k, (leaf, number) in enumerate(segment.reads):
+            if program.leaves[leaf].scope == "drone":
+                name = writer.new()
+                writer.line(f"const auto {name} = of_drone({inputs[k]}, {number // program.leaves[leaf].size});", depth)
+                inputs[k] = name
+    outs = writer.block(segment.block, [*inputs, *constants], depth)
+    fresh = [writer.new() for _ in outs]
+    for name, out in zip(fresh, outs, strict=True):
+        writer.line(f"const auto {name} = {out};", depth)
+    for (leaf, number), slot, new in zip(
+        segment.writes, program.per_drone(segment, segment.writes), fresh, strict=True
+    ):
+        kind, name = _type(program, leaf), names[slot]
+        if segment.scope == "world" and program.leaves[leaf].scope == "drone":  # every lane computes all of them
+            mine = f"eq_(own, i32({number // program.leaves[leaf].size}))"
+            writer.line(f"{name} = select_n_({mine}, {name}, {kind}_lanes({new}));", depth)
+        else:
+            writer.line(f"{name} = {kind}_lanes({new});", depth)
+
+
+def _deferred(program: Program) -> set[Slot]:
+    """Return the numbers that only stages below the step rate use, or only the check behind the loop.
+
+    If none changes them, they are loaded there, and take no register in between.
+    """
+    below_rate: set[Slot] = set()
+    at_each_step: set[Slot] = set()
+    for segment in program.fused_segments:
+        block = segment.block
+        now = {x for op in block.operations for x in op.args} | set(block.outputs)
+        now = now.union(*(x.uses() for op in block.operations if op.name == "over_others" for x in op.blocks))
+        at_each_step.update(segment.hoisted_reads)
+        for x, slot in zip(block.inputs, program.per_drone(segment, segment.reads), strict=False):
+            (at_each_step if segment.scope == "world" or x in now else below_rate).add(slot)
+    in_check = set(program.check.reads) if program.check is not None else set()
+    return (below_rate ^ in_check) - at_each_step
+
+
+def _type(program: Program, leaf: int) -> str:
+    return type_name(program.leaves[leaf].number)
+
+
+def _load(program: Program, slot: Slot) -> str:
+    (leaf, k), rank = slot, program.ranks[slot[0]]
+    if program.leaves[leaf].scope not in ("drone", "world"):
+        return f"p{rank}[{k}]"
+    if leaf in program.rows:
+        return f"LOAD_ROW({'q' if leaf in program.written else 'p'}{rank}, {k})"
+    return f"LOAD({program.leaves[leaf].size}, {_drones(program, leaf)}, p{rank}, {k})"
+
+
+def _store(program: Program, slot: Slot, value: str) -> str:
+    (leaf, k), rank = slot, program.ranks[slot[0]]
+    if leaf in program.rows:
+        return f"STORE_ROW(q{rank}, {k}, {value})"
+    return f"STORE({program.leaves[leaf].size}, {_drones(program, leaf)}, q{rank}, {k}, {value})"
+
+
+def _drones(program: Program, leaf: int) -> int:
+    """Return how many lanes have the same number of a leaf."""
+    return program.n_drones if program.leaves[leaf].scope == "world" else 1
+
+
+def _cuda(pointers: Sequence[str], body: str, threads: int, lanes: int) -> str:
+    scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
+    arguments = ", ".join([*scalars, *pointers])
+    return f"""
+extern "C" __global__ void __launch_bounds__({threads}, {UNBOUNDED}) advance({arguments}) {{
+  const int n_lanes = sizes[0], n_steps = count[0];
+  const int thread = threadIdx.x % THREADS, place = threadIdx.x / THREADS * LANES + thread;
+  const int wanted = blockIdx.x * {lanes} + place;
+  const bool active = thread < LANES && wanted < n_lanes;
+  const int lane = wanted < n_lanes ? wanted : n_lanes - 1;
+  const int own = lane % GROUP;
+  const int world = active ? place / GROUP * GROUP : 0;
+{body}
+}}
+"""
+
+
+def _host(pointers: Sequence[str], body: str, in_memory: bool) -> str:
+    arguments = ", ".join(pointers)
+    kinds = [p.split("*")[0].removeprefix("const ") for p in pointers]
+    n_in = sum(p.startswith("const") for p in pointers)
+    buffers = [f"({kind}*)in[{k + 2}]->data" if k < n_in else f"({kind}*)out[{k - n_in}]->data"
+               for k, kind in enumerate(kinds)]  # fmt: skip
+    call = f"n_lanes, n_steps, {', '.join(buffers)}"
+    sizes = "int64_t n_lanes, int n_steps"
+    if in_memory:
+        block = f"static void advance_world(World& w, int64_t begin, {sizes}, {arguments}) {{\n"
+        each = f"""    World* const w = static_cast<World*>(aligned_alloc(64, (sizeof(World) + 63) / 64 * 64));
+    for (int64_t first = begin; first < end; first += GROUP) advance_world(*w, first, {call});
+    free(w);"""
+    else:
+        block = f"""static void advance_block(int64_t first, {sizes}, {arguments}) {{
+  const int n_active = n_lanes - first < LANES ? int(n_lanes - first) : LANES;
+  const i32v own = numbers() % GROUP;
+"""
+        each = f"    for (int64_t first = begin; first < end; first += LANES) advance_block(first, {call});"
+    return f"""
+{block}{body}
+}}
+
+static void advance(XLA_FFI_Buffer** in, XLA_FFI_Buffer** out) {{
+  const int64_t n_lanes = *(int*)in[0]->data;
+  const int n_steps = *(int*)in[1]->data;
+  const auto run = [=](int64_t begin, int64_t end) {{
+{each}
+  }};
+  in_parallel(n_lanes, n_steps, run);
+}}
+"""

@@ -1,0 +1,176 @@
+"""Files of compiled kernels, safe to share between the processes and machines of one user.
+
+A file is named by its key, which holds everything that the code depends on, and by the hash of its contents. A file
+that was cut short or damaged does not match its name and is not used. Two processes may write the same kernel at the
+same time: each file appears complete, by renaming.
+
+Loading a file executes it. A folder or file that another user could have written is therefore not used.
+
+A file or folder that is not yet, or never, shared holds the name of its process, so that the next one removes what a
+process that was killed has left.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import functools
+import hashlib
+import os
+import platform
+import re
+import shutil
+import stat
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+from crazysim import jaxcompat
+from crazysim.trust import REMEDY, distrust, make_private
+
+LENGTH = 24
+"""Hexadecimal digits of a hash in a name: 96 bits."""
+
+DAY = 86400.0
+"""Age of remains of another machine, s, at which they are removed."""
+
+
+def digest(*parts: str | bytes) -> str:
+    """Return the hash of some texts; the order and the boundaries between them count."""
+    state = hashlib.sha256()
+    for part in parts:
+        raw = part.encode() if isinstance(part, str) else part
+        state.update(len(raw).to_bytes(8, "little") + raw)
+    return state.hexdigest()[:LENGTH]
+
+
+def folder() -> Path:
+    """Return the folder of compiled kernels: beside JAX's compilation cache, or of this process alone."""
+    cache = jaxcompat.cache_folder()
+    if cache is not None:
+        shared = Path(cache) / "crazysim"
+        with contextlib.suppress(OSError):
+            make_private(shared)
+        if shared.is_dir():
+            if reason := distrust(shared):
+                _refuse(shared, reason)
+            elif os.access(shared, os.W_OK | os.R_OK):
+                _swept(shared)
+                return shared
+    return temporary()
+
+
+@functools.cache
+def _refuse(shared: Path, reason: str) -> None:
+    """Warn, once, that a folder is not used."""
+    warnings.warn(
+        f"expected a folder of kernels that only this user can write, got {str(shared)!r}: {reason}, so kernels are "
+        f"compiled again in every process. {REMEDY}",
+        stacklevel=2,
+    )
+
+
+@functools.cache
+def _swept(shared: Path) -> None:
+    """Remove the remains in a folder, once."""
+    sweep(shared, "*.tmp")
+
+
+def temporary() -> Path:
+    """Return a folder of this process, which is removed when it ends; a forked process has one of its own."""
+    folder = _temporary(os.getpid())
+    make_private(folder)  # once more, if the system has removed it since
+    return folder
+
+
+@functools.cache
+def _temporary(pid: int) -> Path:
+    place = Path(tempfile.gettempdir())
+    sweep(place, "crazysim-*")
+    folder = Path(tempfile.mkdtemp(prefix=f"crazysim-{owner()}-", dir=place))
+
+    def remove() -> None:
+        if os.getpid() == pid:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(remove)
+    return folder
+
+
+def owner() -> str:
+    """Return the name of this process in the names of its files: machine and number."""
+    return f"{_machine()}-{os.getpid()}"
+
+
+@functools.cache
+def _machine() -> str:
+    """Return a short name of this machine, or of the container whose processes are numbered like this one."""
+    try:
+        numbering = os.readlink("/proc/self/ns/pid")
+    except OSError:
+        numbering = ""
+    return digest(platform.node(), numbering)[:8]
+
+
+def sweep(place: Path, pattern: str) -> None:
+    """Remove files and folders of processes that have ended without removing them.
+
+    Args:
+        place: Folder that holds them.
+        pattern: Pattern of their names.
+    """
+    for path in place.glob(pattern):
+        with contextlib.suppress(OSError):
+            status = path.lstat()
+            if not _abandoned(path.name, time.time() - status.st_mtime) or distrust(path):
+                continue
+            if stat.S_ISDIR(status.st_mode):
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink()
+
+
+def _abandoned(name: str, age: float) -> bool:
+    """Return True if no process needs a file or folder any more.
+
+    Args:
+        name: Its name, with that of its process.
+        age: Time since it was written, s.
+    """
+    named = re.search(r"[.-]([0-9a-f]{8})-(\d+)-", name)
+    if named is None:
+        return name.endswith(".tmp") and age > DAY
+    machine, pid = named.groups()
+    if machine != _machine():
+        return age > DAY
+    try:
+        os.kill(int(pid), 0)
+    except OSError:  # there is none, or it belongs to another user
+        return True
+    return False
+
+
+def find(place: Path, key: str) -> Iterator[Path]:
+    """Yield the intact files of a key; damaged ones are removed, and those of other users are left out."""
+    for path in sorted(place.glob(f"{key}-*.so")):
+        if distrust(path):
+            continue
+        try:
+            intact = path.stem == f"{key}-{digest(path.read_bytes())}"
+        except OSError:
+            continue
+        if intact:
+            yield path
+        else:
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def store(place: Path, key: str, made: Path) -> Path:
+    """Move a file that was made in the same folder to the name of its key and contents, and return it."""
+    path = place / f"{key}-{digest(made.read_bytes())}.so"
+    made.chmod(0o700)
+    made.replace(path)
+    return path

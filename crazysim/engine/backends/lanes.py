@@ -1,0 +1,278 @@
+"""Lanes: every number of a drone as a vector with a lane for each drone: XLA gets element-wise arithmetic only.
+
+Between fused stages nothing has the shape of a small vector or matrix. An unfused stage gets ordinary arrays, and
+splits the step at its place.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import jaxcompat
+from crazysim.core.sharding import Location
+from crazysim.engine.backends import Run, xla
+from crazysim.engine.ir.blocks import Block
+from crazysim.engine.ir.program import TABLE, Phase, Program, Segment, Slot, UnfusedStage
+from crazysim.engine.passes.schedule import separate
+from crazysim.jaxcompat import is_key
+
+Execute = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
+"""Runs a block: from the block, its inputs and the lanes' shape to its outputs."""
+
+
+class LeafValues:
+    """Leaves of all drones, each as an array or as vectors over lanes, in the form that was last used."""
+
+    def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run, library: Any = jnp):
+        """Hold leaves as arrays.
+
+        Args:
+            program: The program.
+            leaves: Leaves of all worlds; None for one that is written before it is read.
+            execute: Runs the blocks.
+            library: Library of the arrays: ``jax.numpy``, or ``numpy``, where random keys are 32-bit integers.
+        """
+        self.program, self.execute, self.library = program, execute, library
+        self.n_worlds, self.n_drones = batch(program, leaves)
+        self.arrays: dict[int, Any] = dict(enumerate(leaves))
+        self.vectors: dict[Slot, Any] = {}
+
+    def copy(self) -> LeafValues:
+        """Return the same leaves, to be written to."""
+        new = copy.copy(self)
+        new.arrays, new.vectors = dict(self.arrays), dict(self.vectors)
+        return new
+
+    @property
+    def shape(self) -> tuple[int]:
+        """Shape of a vector: a lane for each drone, world after world."""
+        return (self.n_worlds * self.n_drones,)
+
+    def get(self, slot: Slot) -> Any:
+        """Return a number of every drone, or the one number that all share, or a table."""
+        if slot[1] == TABLE:
+            return self.arrays[slot[0]].reshape(-1)
+        if slot not in self.vectors:
+            self._split(slot[0])
+        return self.vectors[slot]
+
+    def set(self, slot: Slot, value: Any) -> None:
+        """Write a number of every drone."""
+        if slot not in self.vectors:
+            self._split(slot[0])
+        self.vectors[slot] = value if np.shape(value) == self.shape else self.library.broadcast_to(value, self.shape)
+        self.arrays.pop(slot[0], None)
+
+    def array(self, leaf: int) -> Any:
+        """Return a leaf as the array that it is outside."""
+        if leaf not in self.arrays:
+            example = self.program.leaves[leaf]
+            items = [self.vectors[leaf, k] for k in range(example.size)]
+            self.arrays[leaf] = self.library.stack(items) if example.rows_of else self._stacked(leaf, items)
+        return self.arrays[leaf]
+
+    def _stacked(self, leaf: int, items: list[Any]) -> Any:
+        example, key = self.program.leaves[leaf], is_key(self.program.leaves[leaf])
+        shape = (*example.shape[2:], 2) if key else example.shape[2:]
+        array = self.library.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *shape)
+        array = jax.random.wrap_key_data(array) if key and self.library is jnp else array
+        return array[:, :1] if example.scope == "world" else array
+
+    def set_array(self, leaf: int, value: Any) -> None:
+        """Write a leaf."""
+        self.arrays[leaf] = value
+        for k in range(self.program.leaves[leaf].size):
+            self.vectors.pop((leaf, k), None)
+
+    def _split(self, leaf: int) -> None:
+        x, example = self.arrays[leaf], self.program.leaves[leaf]
+        size = example.size
+        if example.rows_of or x is None:  # what is not given is written before it is read
+            self.vectors.update(((leaf, k), self.library.zeros(self.shape) if x is None else x[k]) for k in range(size))
+            return
+        if is_key(x):
+            x = jax.random.key_data(x)
+        if example.scope == "world":
+            x = self.library.broadcast_to(x, (self.n_worlds, self.n_drones, *x.shape[2:]))
+        batch = self.shape if example.scope in ("drone", "world") else ()
+        x = x.reshape(*batch, size)
+        self.vectors.update(((leaf, k), x[..., k]) for k in range(size))
+
+
+def batch(program: Program, leaves: list[Any]) -> tuple[int, int]:
+    """Return the number of worlds and drones: under a mesh, of those on this device."""
+    drone = next(
+        i
+        for i, (leaf, x) in enumerate(zip(program.leaves, leaves, strict=True))
+        if leaf.scope == "drone" and x is not None and not leaf.rows_of
+    )
+    return leaves[drone].shape[0], leaves[drone].shape[1]
+
+
+def shape_of(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct:
+    """Return shape and type of a leaf of all worlds that a program writes; of random keys those of their integers."""
+    example = program.leaves[leaf]
+    of_leaf = (n_worlds, *example.shape[1:])
+    if leaf in program.rows:
+        of_leaf = (program.rows[leaf], n_worlds * program.n_drones)
+    return jax.ShapeDtypeStruct((*of_leaf, *([2] if is_key(example) else [])), example.number)
+
+
+LONG = 256
+"""Number of steps from which a gradient keeps only some of their beginnings."""
+
+Constants = dict[int, Sequence[Any]]
+"""Hoisted numbers, by the segment that uses them."""
+
+
+def prepare(program: Program, values: LeafValues) -> Constants:
+    """Run what comes before the first step, and compute what no step changes."""
+    run(program, values, "first", {})
+    return {
+        k: values.execute(s.hoisted, [values.get(slot) for slot in s.hoisted_reads], values.shape)
+        for k, s in enumerate(program.of("each"))
+        if isinstance(s, Segment) and s.hoisted.outputs
+    }
+
+
+def run(program: Program, values: LeafValues, phase: Phase, constants: Constants) -> None:
+    """Run the segments of a phase."""
+    for k, segment in enumerate(program.of(phase)):
+        if isinstance(segment, UnfusedStage):
+            _run_unfused(segment, values)
+        elif segment.scope == "world":
+            _run_worlds(segment, values)
+        else:
+            _run_drones(segment, values, constants.get(k, []))
+
+
+def _run_drones(segment: Segment, values: LeafValues, constants: Sequence[Any]) -> None:
+    outs = values.execute(segment.block, [*(values.get(slot) for slot in segment.reads), *constants], values.shape)
+    for slot, value in zip(segment.writes, outs, strict=True):
+        values.set(slot, value)
+
+
+def _run_worlds(segment: Segment, values: LeafValues) -> None:
+    """Run a segment of worlds: a drone's numbers are those of its world, at its place."""
+    leaves, shape, library = values.program.leaves, (values.n_worlds, values.n_drones), values.library
+
+    def of_world(slot: Slot) -> Any:
+        leaf, k = slot
+        if leaves[leaf].scope == "drone":
+            drone, k = divmod(k, leaves[leaf].size)
+            return values.get((leaf, k)).reshape(shape)[:, drone]
+        value = values.get(slot)
+        return value.reshape(shape)[:, 0] if library.ndim(value) and k != TABLE else value
+
+    outs = values.execute(segment.block, [of_world(slot) for slot in segment.reads], shape[:1])
+    new: dict[Slot, dict[int, Any]] = {}
+    for (leaf, k), value in zip(segment.writes, outs, strict=True):
+        value = library.broadcast_to(value, shape[:1])
+        if leaves[leaf].scope == "drone":
+            drone, k = divmod(k, leaves[leaf].size)
+            new.setdefault((leaf, k), {})[drone] = value
+        else:
+            new[leaf, k] = dict.fromkeys(range(values.n_drones), value)
+    for slot, columns in new.items():
+        old = values.get(slot)
+        old = library.broadcast_to(old, values.shape).reshape(shape)
+        rows = [columns.get(d, old[:, d]) for d in range(values.n_drones)]
+        values.set(slot, library.stack(rows, axis=-1).reshape(values.shape))
+
+
+def _run_unfused(stage: UnfusedStage, values: LeafValues) -> None:
+    after = jaxcompat.jaxpr_as_fun(stage.jaxpr)(*(values.array(i) for i in stage.used))
+    for i, value in zip(stage.written, after, strict=True):
+        values.set_array(i, value)
+
+
+def build(program: Program, location: Location) -> Run:
+    """Return the function that runs a program in XLA."""
+    return functools.partial(steps, separate(program) if location.platform == "cpu" else program)
+
+
+def steps(
+    program: Program, leaves: list[Any], n_steps: int | Array, execute: Execute = xla.run
+) -> tuple[list[Any], Array]:
+    """Return the written leaves after some steps, and which worlds are flagged as not finite. (n_worlds, 1)
+
+    A step count that is a Python number makes a loop that can be differentiated.
+
+    Args:
+        program: The program.
+        leaves: Leaves of all worlds.
+        n_steps: Number of steps.
+        execute: Runs the blocks.
+    """
+    start = LeafValues(program, leaves, execute)
+    constants = prepare(program, start)
+    each = program.of("each")
+    by_array = sorted({i for s in each if isinstance(s, UnfusedStage) for i in s.written})
+    fused = [s for s in each if isinstance(s, Segment)]
+    by_slot = sorted({slot for s in fused for slot in program.per_drone(s, s.writes) if slot[0] not in by_array})
+
+    def turn(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
+        values = after(carry)
+        run(program, values, "each", constants)
+        return [values.get(slot) for slot in by_slot], [values.array(leaf) for leaf in by_array]
+
+    def after(carry: tuple[list[Any], list[Any]]) -> LeafValues:
+        values = start.copy()
+        for slot, value in zip(by_slot, carry[0], strict=True):
+            values.set(slot, value)
+        for leaf, value in zip(by_array, carry[1], strict=True):
+            values.set_array(leaf, value)
+        return values
+
+    carry = ([jnp.broadcast_to(start.get(slot), start.shape) for slot in by_slot],
+             [start.array(leaf) for leaf in by_array])  # fmt: skip
+    for segment in fused:  # what is only read is split into vectors once, outside the loop
+        for slot in program.per_drone(segment, segment.reads):
+            start.get(slot)
+    if isinstance(n_steps, int):
+        carry = repeat(turn, carry, n_steps)
+    else:
+        carry = jax.lax.fori_loop(0, n_steps, lambda _, c: turn(c), carry)
+    end = after(carry)
+    flagged = nonfinite(program, end)
+    run(program, end, "last", {})
+    return [end.array(i) for i in program.written], flagged
+
+
+def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
+    """Return a carry after ``n`` iterations, in a form whose gradient takes little memory.
+
+    Only the carry at the beginning of a step is kept, and the rest computed again on the way back, which costs less
+    than fetching it from memory. From ``LONG`` steps on only every k-th carry is kept, k being the root of n: the
+    memory of a gradient then grows with the root of the horizon, at the price of one more pass.
+    """
+    turn = jax.checkpoint(turn, prevent_cse=False)  # a scan does that anyway
+
+    def turns(carry: Any, n: int) -> Any:
+        return jax.lax.scan(lambda c, _: (turn(c), None), carry, length=n)[0]
+
+    if n < LONG:
+        return turns(carry, n)
+    inner = math.isqrt(n)
+    outer = jax.checkpoint(lambda c: turns(c, inner), prevent_cse=False)
+    carry, _ = jax.lax.scan(lambda c, _: (outer(c), None), carry, length=n // inner)
+    return turns(carry, n % inner) if n % inner else carry
+
+
+def nonfinite(program: Program, values: LeafValues) -> Array:
+    """Return True for worlds that were flagged before, or have a watched number that is not finite. (n_worlds, 1)"""
+    check = program.check
+    if check is None:
+        return values.library.zeros((values.n_worlds, 1), bool)
+    (flagged,) = values.execute(check.block, [values.get(slot) for slot in check.reads], values.shape)
+    flagged = values.library.broadcast_to(flagged, values.shape).reshape(values.n_worlds, values.n_drones)
+    return flagged.any(axis=1, keepdims=True)

@@ -1,0 +1,327 @@
+"""Kernels on the host: source compiled by the C++ compiler that is there, called by XLA."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import math
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import IO, Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from crazysim import jaxcompat
+from crazysim.engine.backends import kernel_cache
+from crazysim.engine.backends.kernel import Kernel
+from crazysim.engine.errors import KernelError
+from crazysim.engine.ir import dump
+from crazysim.errors import ConfigError
+from crazysim.version import __version__
+
+FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-shared",
+         "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
+"""Options of the compiler, before those of the variable CXXFLAGS. Products and sums may be contracted; no option
+assumes that there is no NaN."""
+
+TIMEOUT = 300.0
+"""Time that the compiler may take, s, unless the variable CRAZYSIM_COMPILE_TIMEOUT says otherwise."""
+
+LINES = 10_000
+"""Lines of a kernel that is compiled in 1 s at best; the time grows with the square of their number.
+
+Measured with g++ 12 on one core: 20,000 lines of matrix products take 5 s, of maxima 38 s, 40,000 of conditions 94 s.
+"""
+SELECTING = re.compile(r"^.*\b(?:select_n_|max_|min_|clamp_|at_least|at_most)\(.*$", re.MULTILINE)
+"""Lines of a kernel that select between numbers."""
+SELECTION = 2.4
+"""Lines that a selecting line counts for: by the same measurements those of conditions take 5.9 s for 10,000."""
+
+SHELL = """exec 3<&0 </dev/null
+(read -r _ <&3; kill -9 0) >/dev/null 2>&1 &
+"$@" 3<&-
+status=$?
+kill -9 $!
+exit $status"""
+"""Script that runs a command whose input is a pipe to this process. When the pipe closes, which is at the latest when
+this process ends, however it ends, it kills the command with all its children."""
+
+CPU_INFO = Path("/proc/cpuinfo")
+"""File in which Linux lists the features of the CPU."""
+
+Launch = Callable[[int, Array, Sequence[Array], Sequence[Any]], list[Array]]
+"""Number of lanes, number of steps (1,), inputs, and shapes and types of outputs, to outputs."""
+
+
+def compiled(kernel: Kernel) -> Launch:
+    """Compile a kernel, and return the function that calls it.
+
+    Raises:
+        KernelError: If the compiler refuses it or takes too long, with its message.
+    """
+    name = target(kernel)
+
+    def launch(n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
+        run = jax.ffi.ffi_call(name, list(outputs), input_output_aliases=kernel.aliases())
+        return list(run(np.asarray([n_lanes], np.int32), count, *inputs))
+
+    return launch
+
+
+@functools.cache
+def compiler() -> str | None:
+    """Return the C++ compiler: that of the variable CXX, else the first that is found; None if there is none.
+
+    Raises:
+        ConfigError: If there is no such program as CXX names.
+    """
+    chosen = _words("CXX")
+    if not chosen:
+        return next((path for name in ("g++", "clang++") if (path := shutil.which(name))), None)
+    path = shutil.which(chosen[0])
+    if path is None:
+        raise ConfigError(f"expected a C++ compiler in CXX, got {os.environ['CXX']!r}. Install it, or unset CXX.")
+    return shlex.join([path, *chosen[1:]])
+
+
+def command(options: bool = True) -> list[str]:
+    """Return the compiler's command up to the names of files.
+
+    Args:
+        options: False to leave out those of CXXFLAGS.
+
+    Raises:
+        ConfigError: If CXX or CXXFLAGS is wrong.
+        KernelError: If there is no compiler.
+    """
+    program = compiler()
+    if program is None:
+        raise KernelError("no C++ compiler was found; install g++ or clang++, or set CXX")
+    return [*shlex.split(program), *FLAGS, *_words("CXXFLAGS" if options else ""), "-I", jaxcompat.ffi_include_folder()]
+
+
+def _words(variable: str) -> list[str]:
+    """Return the words of an environment variable, none if it is not set.
+
+    Raises:
+        ConfigError: If a quotation does not end.
+    """
+    text = os.environ.get(variable, "")
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise ConfigError(f"expected words in {variable}, got {text!r}: {error}. Correct the quotation.") from None
+
+
+def limit() -> float:
+    """Return the time that the compiler may take, s.
+
+    Raises:
+        ConfigError: If the variable CRAZYSIM_COMPILE_TIMEOUT is no such number.
+    """
+    given = os.environ.get("CRAZYSIM_COMPILE_TIMEOUT", TIMEOUT)
+    try:
+        seconds = float(given)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise ConfigError(f"expected seconds in CRAZYSIM_COMPILE_TIMEOUT, got {given!r}; set a number above 0")
+    return seconds
+
+
+def target(kernel: Kernel) -> str:
+    """Compile a kernel, unless that was done before, and return the name that XLA calls it by.
+
+    The name holds the key, so that a program in JAX's own cache never finds a kernel for another machine.
+
+    Raises:
+        KernelError: If the compiler refuses it or takes too long, or the library cannot be loaded.
+    """
+    words = command()
+    if dump.enabled():
+        dump.write("kernel.cpp", f"// {shlex.join(words)} kernel.cpp\n{kernel.text}")
+    key = kernel_cache.digest(*words, toolchain(tuple(words)), kernel.text)
+    name = f"crazysim_advance_{key}"
+    if name not in _LOADED:
+        library = _library(words, key, kernel.text)
+        with _LOCK:
+            if name not in _LOADED:
+                jaxcompat.register_host_target(name, library.crazysim_advance)
+                _LOADED[name] = library
+    return name
+
+
+_LOADED: dict[str, ctypes.CDLL] = {}
+"""Libraries by the name of their kernel."""
+_LOCK = threading.Lock()
+
+
+@functools.cache
+def toolchain(words: tuple[str, ...]) -> str:
+    """Return everything besides source and options that compiled code depends on.
+
+    That is the compiler's version, the instruction set that ``-march=native`` stands for here, the C library, and the
+    versions of JAX and of this package.
+    """
+    # Asked for its steps, a compiler prints its version and the options that -march=native is replaced by.
+    steps = _run([*words, "-fsyntax-only", "-x", "c++", os.devnull, "-###"], kernel_cache.temporary(), TIMEOUT)
+    libc = " ".join(platform.libc_ver())
+    return "\n".join([steps.stdout, steps.stderr, cpu_features(), libc, jaxcompat.versions(), __version__])
+
+
+def cpu_features() -> str:
+    """Return the architecture of the CPU and, where the system lists them, its features."""
+    try:
+        lines = CPU_INFO.read_text().splitlines()
+    except OSError:
+        lines = []
+    listed = next((line for line in lines if line.split(":")[0].strip().lower() in ("flags", "features")), "")
+    return f"{platform.machine()} {platform.processor()} {listed}"
+
+
+def _library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
+    """Return a kernel's library: from the cache, or compiled."""
+    place = kernel_cache.folder()
+    for path in kernel_cache.find(place, key):
+        library = _loaded(path)
+        if library is not None:
+            return library
+    for where in dict.fromkeys((place, kernel_cache.temporary())):  # code in a shared folder may not be executable
+        library = _loaded(_compile(words, key, source, where))
+        if library is not None:
+            return library
+    raise KernelError(f"the kernel that {words[0]} compiled cannot be loaded; check that it compiles for this machine")
+
+
+def _loaded(path: Path) -> ctypes.CDLL | None:
+    """Return a library, or None if it cannot be loaded or holds no kernel."""
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError:
+        return None
+    return library if hasattr(library, "crazysim_advance") else None
+
+
+def _compile(words: Sequence[str], key: str, source: str, place: Path) -> Path:
+    """Compile a kernel into a folder, and return the file.
+
+    Raises:
+        ConfigError: If CXX, CXXFLAGS or the limit of time is wrong.
+        KernelError: If the compiler refuses it or takes too long.
+    """
+    seconds, n_lines = limit(), source.count("\n")
+    if n_lines + (SELECTION - 1) * len(SELECTING.findall(source)) > LINES * math.sqrt(seconds):
+        raise KernelError(
+            f"a kernel of {n_lines:,} lines takes {words[0]} longer than {seconds:g} s; use loops (lax.fori_loop) for "
+            f"what is unrolled, or set CRAZYSIM_COMPILE_TIMEOUT to a larger number of seconds"
+        )
+    made = place / f"{key}.{kernel_cache.owner()}-{threading.get_ident()}.tmp"
+    work = Path(tempfile.mkdtemp(dir=kernel_cache.temporary()))
+    try:
+        (work / "kernel.cpp").write_text(source)
+        done = _run([*words, str(work / "kernel.cpp"), "-o", str(made)], work, seconds)
+        if done.returncode:
+            _check_settings(work)
+            raise KernelError(f"{words[0]} refused the kernel: {done.stderr.strip()[:2000]}")
+        return kernel_cache.store(place, key, made)
+    except OSError as error:
+        raise KernelError(f"{words[0]} left no library: {error}") from error
+    finally:
+        made.unlink(missing_ok=True)
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _check_settings(work: Path) -> None:
+    """Raise an error if it is due to CXX or CXXFLAGS that the compiler does not compile anything.
+
+    Args:
+        work: Folder for its files.
+
+    Raises:
+        ConfigError: With the variable, and the compiler's message.
+    """
+    (work / "empty.cpp").write_text("")
+
+    def error(options: bool) -> str:
+        words = [*command(options), str(work / "empty.cpp"), "-o", str(work / "empty.so")]
+        done = _run(words, work, TIMEOUT)
+        return (done.stderr.strip()[:500] or f"exit status {done.returncode}") if done.returncode else ""
+
+    message = error(options=True)
+    if not message:
+        return
+    variable = "CXX" if error(options=False) else "CXXFLAGS"
+    if os.environ.get(variable):
+        raise ConfigError(
+            f"expected a C++ compiler and options that it accepts, got {variable}={os.environ[variable]!r}: {message}. "
+            f"Correct or unset it."
+        )
+
+
+@contextlib.contextmanager
+def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
+    """Give a block threads that compile; interrupting it ends their compilers rather than wait for them.
+
+    Args:
+        n: Number of threads; None for the default.
+    """
+    with ThreadPoolExecutor(n) as pool:
+        try:
+            yield pool
+        except (KeyboardInterrupt, SystemExit):
+            pool.shutdown(wait=False, cancel_futures=True)
+            for alive in list(_RUNNING):
+                alive.close()
+            raise
+
+
+_RUNNING: set[IO[str]] = set()
+"""Pipes of the compilers that run; one that is closed ends its compiler."""
+
+
+def _run(words: Sequence[str], work: Path, seconds: float) -> subprocess.CompletedProcess[str]:
+    """Run the compiler, which ends with all its children when its time is over or this process ends.
+
+    Args:
+        words: Its command.
+        work: Folder of its temporary files.
+        seconds: Time that it may take, s.
+
+    Raises:
+        KernelError: If it cannot be run, or takes too long.
+    """
+    pipe = subprocess.PIPE
+    reader, writer = os.pipe()
+    with os.fdopen(reader) as watched, os.fdopen(writer, "w") as alive:
+        try:
+            process = subprocess.Popen(
+                ["/bin/sh", "-c", SHELL, "sh", *words], stdin=watched, stdout=pipe, stderr=pipe, text=True,
+                start_new_session=True, env=os.environ | {"TMPDIR": str(work)},
+            )  # fmt: skip
+        except OSError as error:
+            raise KernelError(f"{words[0]} cannot be run: {error}") from error
+        with process:
+            _RUNNING.add(alive)
+            try:
+                out, err = process.communicate(timeout=seconds)
+            except subprocess.TimeoutExpired:
+                raise KernelError(
+                    f"{words[0]} took longer than {seconds:g} s; set CRAZYSIM_COMPILE_TIMEOUT to a larger number of "
+                    f"seconds"
+                ) from None
+            finally:
+                _RUNNING.discard(alive)
+                alive.close()
+    return subprocess.CompletedProcess(list(words), process.returncode, out, err)

@@ -1,0 +1,104 @@
+"""The reference: a pipeline as batched XLA, jitted and scanned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim import jaxcompat
+from crazysim.core.data import SimData
+from crazysim.core.pipeline import Pipeline
+from crazysim.core.settings import as_mask
+from crazysim.core.stage import Axes, Stage, with_leaves
+from crazysim.core.stages import nonfinite
+from crazysim.engine.backends import Run
+
+
+def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
+    """Return a loop over steps on leaves, and which of them it writes.
+
+    The loop carries only the leaves that some stage writes. The others, parameters above all, are its constants.
+
+    Args:
+        stages: The stages.
+        data: Data of the structure that is stepped.
+
+    Returns:
+        The loop, and the numbers of the written leaves.
+    """
+    axes = Axes(data)
+
+    def single(leaves: list[Any]) -> list[Any]:
+        for stage in stages:
+            with jax.named_scope(stage.__name__):
+                after = stage(axes.treedef.unflatten(leaves))
+                written = axes.written(leaves, after, stage)
+                new = jax.tree.leaves(after)
+                # XLA's CPU backend would compute what a later stage reads again for each of its results.
+                leaves = with_leaves(leaves, written, jax.lax.optimization_barrier([new[i] for i in written]))
+        return leaves
+
+    jaxpr = jax.make_jaxpr(single)(jax.tree.leaves(data))
+    step = jaxcompat.jaxpr_as_fun(jaxpr)  # the stages are traced once
+    pairs = zip(jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars, strict=True)
+    written = [i for i, (before, after) in enumerate(pairs) if before is not after]
+
+    def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+        def turn(values: list[Any]) -> list[Any]:
+            after = step(*with_leaves(leaves, written, values))
+            return [after[i] for i in written]
+
+        start = [leaves[i] for i in written]
+        if isinstance(n_steps, int):
+            out, _ = jax.lax.scan(lambda x, _: (turn(x), None), start, length=n_steps)
+        else:
+            out = jax.lax.fori_loop(0, n_steps, lambda _, x: turn(x), start)
+        data = axes.treedef.unflatten(with_leaves(leaves, written, out))
+        return out, nonfinite(data)
+
+    return steps, written
+
+
+class Reset:
+    """``reset(data, default_data, mask=None) -> data``, pure and compiled.
+
+    A compiled call copies the arrays that it returns unchanged. For use inside another compiled function, ``plain``
+    is not compiled itself.
+    """
+
+    def __init__(self, pipeline: Pipeline):
+        """Take the functions of a pipeline as they are now."""
+        self._stages = tuple(pipeline.items())
+        self._compiled = jax.jit(self.plain)
+
+    def __call__(self, data: SimData, default_data: SimData, mask: Any = None) -> SimData:
+        """Return the data after a reset.
+
+        Args:
+            data: The simulation.
+            default_data: The data to return to.
+            mask: True in the worlds to reset; None for all. (n_worlds,)
+
+        Raises:
+            ConfigError: If the mask has another shape or type.
+        """
+        return self._compiled(data, default_data, as_mask(mask, data.core.steps.shape[:1]))
+
+    def plain(self, data: SimData, default_data: SimData, mask: Any = None) -> SimData:
+        """Return the same, without a compiled call."""
+        for name, fn in self._stages:
+            with jax.named_scope(name):
+                data = fn(data, default_data, mask)
+        return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(False)))
+
+    def lower(self, data: SimData, default_data: SimData, mask: Any = None) -> Any:
+        """Return the reset lowered for this data, as ``jax.jit(...).lower`` does."""
+        return self._compiled.lower(data, default_data, as_mask(mask, data.core.steps.shape[:1]))
+
+    def _cache_size(self) -> int:
+        """Return the number of compiled programs, as for a jitted function; the tests of law 6 count them."""
+        return jaxcompat.n_compilations(self._compiled)

@@ -1,0 +1,298 @@
+"""C++ and CUDA source of a block.
+
+A value is a variable that is assigned once, an operation an operator or a call of an inline function. Types and
+functions are defined by a preamble for each target (``targets/``); the source of a block is the same for both.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from crazysim.engine.backends.exchange import Exchange, Registers
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.blocks import Block, Element, Operation, Value, is_constant
+
+TYPES = {np.dtype(name): short for name, short in
+         {"float32": "f32", "float64": "f64", "int32": "i32", "uint32": "u32", "bool": "b1"}.items()}  # fmt: skip
+"""Types of numbers, and what they are called in the source."""
+
+
+def require(block: Block) -> None:
+    """Check that there is source for all operations and types of a block.
+
+    Raises:
+        UnsupportedError: If there is none for one; the error names the stage.
+    """
+    for op in block.walk():
+        row = ops.TABLE[op.name]
+        other = next((x.dtype.name for x in (*op.args, *op.results) if x.dtype not in TYPES), None)
+        if other is not None:
+            raise UnsupportedError(f"kernels have no numbers of type {other}", op.name, op.stage)
+        if not row.source and not row.structured:
+            raise UnsupportedError("kernels have no such operation", op.name, op.stage)
+
+
+INDENT = "  "
+
+
+class Writer:
+    """Lines of source of blocks."""
+
+    def __init__(self, exchange: Exchange | None = None) -> None:
+        """Begin without lines.
+
+        Args:
+            exchange: Exchange of numbers between lanes; None for registers.
+        """
+        self.exchange = Registers() if exchange is None else exchange
+        self.lines: list[str] = []
+        self.names: dict[Value, str] = {}
+        self.pairs: dict[str, str] = {}
+        self.tests: dict[Value, Operation] = {}
+        self.tables: list[str] = []
+        self.fours: dict[tuple[Element, Element, int], str] = {}
+        self._count = 0
+
+    def new(self, prefix: str = "v") -> str:
+        """Return a name that is not in use."""
+        self._count += 1
+        return f"{prefix}{self._count}"
+
+    def line(self, text: str, depth: int) -> None:
+        """Write a line."""
+        self.lines.append(INDENT * depth + text)
+
+    def block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
+        """Write a block's operations, and return the names of its outputs."""
+        self.names.update(zip(block.inputs, inputs, strict=True))
+        outside = dict(self.pairs), self.fours  # what is computed inside a block is not defined outside
+        self.fours = dict.fromkeys(_fours(block), "")
+        for position, op in enumerate(block.operations):
+            if op.name == "over_others":
+                self._over_others(op, depth, _live(block, position))
+            else:
+                self._operation(op, depth)
+        self.pairs, self.fours = outside
+        return [self.element(x) for x in block.outputs]
+
+    def forget(self) -> None:
+        """Forget shared intermediate results: their variables are not defined behind this place."""
+        self.pairs, self.fours = {}, dict.fromkeys(self.fours, "")
+
+    def element(self, x: Element) -> str:
+        """Return an element as an expression."""
+        return self.names[x] if isinstance(x, Value) else literal(x)
+
+    def _operation(self, op: Operation, depth: int) -> None:
+        args = [self.element(a) for a in op.args]
+        match op.name:
+            case "barrier":
+                pass
+            case "when":
+                self._when(op, args, depth)
+            case "loop":
+                self._loop(op, args, depth)
+            case "while":
+                self._while(op, args, depth)
+            case "threefry2x32":
+                name = self._results(op)
+                self.line(f"auto {name}_0 = u32_lanes({args[2]}), {name}_1 = u32_lanes({args[3]});", depth)
+                self.line(f"threefry2x32({args[0]}, {args[1]}, {name}_0, {name}_1);", depth)
+            case "table":
+                self._table(op)
+            case "lookup":
+                self._lookup(op, args, depth)
+            case "sin" | "cos":
+                self._sin_cos(op, args[0], depth)
+            case "custom_jvp":  # no derivative is taken of a kernel
+                outs = self.block(op.blocks[0], args, depth)
+                name = self._results(op)
+                for k, out in enumerate(outs):
+                    self.line(f"const auto {name}_{k} = {out};", depth)
+            case _:
+                if op.name in ("lt", "gt"):
+                    self.tests[op.results[0]] = op
+                limit = _limit(op, self.tests)
+                text = expression(op, args) if limit is None else f"{limit}({args[1]}, {args[2]})"
+                name = self.names[op.results[0]] = self.new()
+                self.line(f"const auto {name} = {text};", depth)
+
+    def _results(self, op: Operation, name: str | None = None) -> str:
+        """Name the results of an operation that has several, and return what their names begin with."""
+        name = name or self.new()
+        self.names.update((x, f"{name}_{k}") for k, x in enumerate(op.results))
+        return name
+
+    def _table(self, op: Operation) -> None:
+        """Write a table of constants, in front of the kernel."""
+        name = self.names[op.results[0]] = self.new("t")
+        numbers = ", ".join(_entry(x) for x in op.param("numbers").array)
+        self.tables.append(f"TABLE {type_name(op.dtype)} {name}[] = {{{numbers}}};")
+
+    def _lookup(self, op: Operation, args: list[str], depth: int) -> None:
+        """Write a read of an entry, with its three neighbours if those are read too."""
+        offset, key = op.param("offset"), _four_of(op)
+        if key not in self.fours:
+            name = self.names[op.results[0]] = self.new()
+            self.line(f"const auto {name} = lookup({args[0]}, {args[1]}, {offset});", depth)
+            return
+        if not self.fours[key]:
+            name = self.fours[key] = self.new()
+            self.line(f"const auto {name} = lookup_four({args[0]}, {args[1]}, {offset // 4 * 4});", depth)
+        self.names[op.results[0]] = f"{self.fours[key]}.x[{offset % 4}]"
+
+    def _sin_cos(self, op: Operation, x: str, depth: int) -> None:
+        """Write sine and cosine at once: most of the work for one of the two is that for the other."""
+        if x not in self.pairs:
+            pair = self.pairs[x] = self.new()
+            kind = "auto" if isinstance(op.args[0], Value) else type_name(op.dtype)
+            self.line(f"{kind} {pair}_0 = {x}, {pair}_1 = {x};", depth)
+            self.line(f"sin_cos({x}, {pair}_0, {pair}_1);", depth)
+        self.names[op.results[0]] = f"{self.pairs[x]}_{0 if op.name == 'sin' else 1}"
+
+    def _when(self, op: Operation, args: list[str], depth: int) -> None:
+        mask, *old = args
+        name = self._carry(op, old, depth)
+        self.line(f"if (any({mask})) {{", depth)
+        for k, out in enumerate(self.block(op.blocks[0], [], depth + 1)):
+            self.line(f"{name}_{k} = select_n_({mask}, {name}_{k}, {out});", depth + 1)
+        self.line("}", depth)
+
+    def _loop(self, op: Operation, args: list[str], depth: int) -> None:
+        (body,) = op.blocks
+        name = self._carry(op, args, depth)
+        turn = self.new("n")
+        self.line(f"for (int {turn} = 0; {turn} < {op.param('length')}; ++{turn}) {{", depth)
+        outs = self.block(body, [f"{name}_{k}" for k in range(len(args))], depth + 1)
+        self._assign(name, outs, None, depth + 1)
+        self.line("}", depth)
+
+    def _over_others(self, op: Operation, depth: int, live: Sequence[tuple[Value, str]]) -> None:
+        """Write a loop over the drones of the world, which reads what they published."""
+        (body,) = op.blocks
+        published = [(type_name(x.dtype), self.element(x)) for x in op.args]
+        reads = self.exchange.publish(self, published, live, depth)
+        first = [ops.neutral(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
+        name, turn = self._carry(op, [literal(x) for x in first], depth), self.new("j")
+        self.line(f"UNROLL for (int {turn} = 0; {turn} < GROUP; ++{turn}) {{", depth)
+        inputs = [self.new() for _ in body.inputs]
+        for variable, read in zip(inputs, reads, strict=False):
+            self.line(f"const auto {variable} = {read(turn)};", depth + 1)
+        self.line(f"const auto {inputs[-1]} = eq_(own, i32({turn}));", depth + 1)
+        outs = self.block(body, inputs, depth + 1)
+        for k, (combine, out) in enumerate(zip(op.param("reduce"), outs, strict=True)):
+            text = f"{name}_{k} + {out}" if combine == "add" else f"{combine}_({name}_{k}, {out})"
+            self.line(f"{name}_{k} = {text};", depth + 1)
+        self.line("}", depth)
+
+    def _while(self, op: Operation, args: list[str], depth: int) -> None:
+        test, body = op.blocks
+        name = self._carry(op, args, depth)
+        carry = [f"{name}_{k}" for k in range(len(args))]
+        self.line("for (;;) {", depth)
+        (continues,) = self.block(test, carry, depth + 1)
+        self.line(f"if (!any({continues})) break;", depth + 1)
+        self._assign(name, self.block(body, carry, depth + 1), continues, depth + 1)
+        self.line("}", depth)
+
+    def _carry(self, op: Operation, start: Sequence[str], depth: int) -> str:
+        """Write a variable for each result of an operation that changes them, with the numbers it starts from."""
+        name = self._results(op)
+        for k, (x, value) in enumerate(zip(op.results, start, strict=True)):
+            self.line(f"auto {name}_{k} = {type_name(x.dtype)}_lanes({value});", depth)
+        return name
+
+    def _assign(self, name: str, outs: Sequence[str], mask: str | None, depth: int) -> None:
+        """Assign all results of a turn at once: one may be what another was."""
+        fresh = [self.new() for _ in outs]
+        for k, (f, out) in enumerate(zip(fresh, outs, strict=True)):
+            self.line(f"const auto {f} = {out if mask is None else f'select_n_({mask}, {name}_{k}, {out})'};", depth)
+        for k, f in enumerate(fresh):
+            self.line(f"{name}_{k} = {f};", depth)
+
+
+def _live(block: Block, position: int) -> list[tuple[Value, str]]:
+    """Return the values of a block that are computed before an operation, and used in its blocks or after it."""
+    before = [x for op in block.operations[:position] for x in op.results if not x.size]
+    used = dataclasses.replace(block, operations=block.operations[position + 1 :]).uses()
+    used = used.union(*(inner.uses() for inner in block.operations[position].blocks))
+    return [(x, type_name(x.dtype)) for x in before if x in used]
+
+
+def _four_of(op: Operation) -> tuple[Element, Element, int]:
+    """Return the table, index and number of the four entries that a lookup is one of."""
+    return op.args[0], op.args[1], op.param("offset") // 4
+
+
+def _fours(block: Block) -> list[tuple[Element, Element, int]]:
+    """Return the aligned groups of four entries in float32 of which a block reads at least three."""
+    lookups = [op for op in block.operations if op.name == "lookup" and op.param("aligned") and op.dtype == np.float32]
+    counts = collections.Counter(_four_of(op) for op in lookups if isinstance(op.args[1], Value))
+    sizes = {_four_of(op): op.args[0].size for op in lookups}
+    return [key for key, n in counts.items() if n >= 3 and key[2] * 4 + 4 <= sizes[key]]
+
+
+def expression(op: Operation, args: Sequence[str]) -> str:
+    """Return the result of an operation as an expression of its operands."""
+    source = ops.TABLE[op.name].source
+    if not isinstance(source, str):
+        source = next(text for kinds, text in source.items() if op.dtype.kind in kinds)
+    return source.format(*args, name=op.name, all=", ".join(args), type=type_name(op.dtype), **dict(op.params))
+
+
+def _limit(op: Operation, tests: Mapping[Value, Operation]) -> str | None:
+    """Return the function that a selection is that keeps its first case above or below its second.
+
+    Such is ``x < low ? low : x``, for which a target may have one instruction.
+
+    Args:
+        op: The selection.
+        tests: Comparisons by their results.
+    """
+    if op.name != "select_n" or op.dtype.kind != "f" or op.args[0] not in tests:
+        return None
+    test, (x, limit) = tests[op.args[0]], op.args[1:]
+    if test.args[0] is not x or not _same(test.args[1], limit):
+        return None
+    return "at_least" if test.name == "lt" else "at_most"
+
+
+def _same(a: Element, b: Element) -> bool:
+    return a is b or (is_constant(a) and is_constant(b) and literal(a) == literal(b))
+
+
+def type_name(dtype: DTypeLike) -> str:
+    """Return what a type is called in the source.
+
+    Raises:
+        UnsupportedError: If it has no name there.
+    """
+    dtype = np.dtype(dtype)
+    if dtype not in TYPES:
+        raise UnsupportedError(f"kernels have no numbers of type {dtype.name}")
+    return TYPES[dtype]
+
+
+def _entry(x: np.generic) -> str:
+    """Return a finite constant without a call, for an initialiser."""
+    return f"{float(x).hex()}{'f' * (x.dtype == np.float32)}" if x.dtype.kind == "f" else f"{int(x)}"
+
+
+def literal(x: np.generic) -> str:
+    """Return a constant, exactly."""
+    kind = type_name(x.dtype)
+    if kind == "b1":
+        return "b1(1)" if bool(x) else "b1(0)"
+    if kind in ("f32", "f64"):
+        if not np.isfinite(x):
+            return f"{kind}_nan()" if np.isnan(x) else f"{'-' if float(x) < 0 else ''}{kind}_infinity()"
+        return f"{kind}({float(x).hex()})"
+    if kind == "i32":
+        return f"i32({int(x)})" if int(x) != -(2**31) else "i32(-2147483647 - 1)"
+    return f"u32({int(x)}u)"

@@ -1,0 +1,221 @@
+"""XLA operations of a block: every value is a vector over drones, a lane each."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from crazysim import jaxcompat
+from crazysim.core.others import largest, smallest
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.blocks import Block, Element, Operation, Value
+
+Env = dict[Value, Any]
+"""Arrays by the values that they are."""
+
+
+def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: Env | None = None) -> list[Any]:
+    """Return the outputs of a block.
+
+    Args:
+        block: The block.
+        inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
+        shape: Shape of the lanes.
+        env: Values of the blocks around it.
+
+    Returns:
+        Its outputs, of the lanes' shape or scalars.
+    """
+    env = dict(env or {})
+    env.update(zip(block.inputs, inputs, strict=True))
+    last_use = _last_uses(block)
+    for position, op in enumerate(block.operations):
+        if op.name == "barrier":
+            _separate(env, block, position, last_use)
+        else:
+            env.update(zip(op.results, _apply(op, [_get(env, a) for a in op.args], shape, env), strict=True))
+    return [_get(env, x) for x in block.outputs]
+
+
+def _get(env: Env, x: Element) -> Any:
+    return env[x] if isinstance(x, Value) else x
+
+
+def _last_uses(block: Block) -> dict[Value, int]:
+    """Return where each value is used last; an output is used after the end."""
+    last: dict[Value, int] = {}
+    for position, op in enumerate(block.operations):
+        used = {x for x in op.args if isinstance(x, Value)}.union(*(b.uses() for b in op.blocks))
+        last.update(dict.fromkeys(used, position))
+    last.update((x, len(block.operations)) for x in block.outputs if isinstance(x, Value))
+    return last
+
+
+def _separate(env: Env, block: Block, position: int, last_use: dict[Value, int]) -> None:
+    """Compute once what is used beyond this point: XLA's CPU backend repeats shared arithmetic for every result."""
+    results = [x for op in block.operations[:position] for x in op.results]
+    live = [x for x in results if last_use.get(x, -1) > position and not x.size and np.ndim(env[x])]
+    env.update(zip(live, lax.optimization_barrier([env[x] for x in live]), strict=True))
+
+
+def _apply(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> Sequence[Any]:
+    if op.name in STRUCTURE:
+        return STRUCTURE[op.name](op, args, shape, env)
+    if op.name in ("convert_element_type", "bitcast_convert_type"):
+        return [getattr(lax, op.name)(args[0], op.dtype)]
+    fn = ops.TABLE[op.name].xla or op.name
+    return [(getattr(lax, fn) if isinstance(fn, str) else fn)(*_broadcast(args), **dict(op.params))]
+
+
+def _broadcast(args: Sequence[Any]) -> list[Array]:
+    shape = jnp.broadcast_shapes(*map(np.shape, args))
+    return [x if isinstance(x, jax.Array) and x.shape == shape else jnp.full(shape, jnp.asarray(x)) for x in args]
+
+
+def _lanes(x: Any, shape: tuple[int, ...]) -> Array:
+    return jnp.broadcast_to(x, shape)
+
+
+def _loop(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    (body,) = op.blocks
+    carry = [_lanes(x, shape) for x in args]
+
+    def turn(carry: list[Any], _: Any) -> tuple[list[Any], None]:
+        return [_lanes(x, shape) for x in run(body, carry, shape, env)], None
+
+    return lax.scan(turn, carry, length=op.param("length"))[0]
+
+
+def _while(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    """Repeat until no lane continues; lanes that are finished keep their values."""
+    test, body = op.blocks
+
+    def goes_on(carry: list[Any]) -> Array:
+        return _lanes(run(test, carry, shape, env)[0], shape)
+
+    def turn(carry: list[Any]) -> list[Any]:
+        mask = goes_on(carry)
+        new = run(body, carry, shape, env)
+        return [jnp.where(mask, _lanes(x, shape), old) for x, old in zip(new, carry, strict=True)]
+
+    return lax.while_loop(lambda carry: jnp.any(goes_on(carry)), turn, [_lanes(x, shape) for x in args])
+
+
+def _when(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    """Compute a block only if some lane needs it."""
+    (body,) = op.blocks
+    mask, old = args[0], [_lanes(x, shape) for x in args[1:]]
+
+    def act(mask: Array, old: list[Array]) -> list[Array]:
+        new = run(body, [], shape, env)
+        return [jnp.where(mask, _lanes(x, shape), o) for x, o in zip(new, old, strict=True)]
+
+    return lax.cond(jnp.any(mask), act, lambda _, old: old, mask, old)
+
+
+def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    (body,) = op.blocks
+    slope = op.param("slope")
+
+    @jax.custom_jvp
+    def call(*args: Any) -> list[Any]:
+        return run(body, args, shape, env)
+
+    @call.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        outs = call(*primals)
+        changes = run(slope(), [*primals, *tangents], shape)
+        return outs, [_lanes(t, np.shape(o)) for t, o in zip(changes, outs, strict=True)]
+
+    return call(*(jnp.asarray(x) for x in args))
+
+
+MAX_UNROLLED = 8
+"""Most drones of a world whose loop over the others is unrolled; the pairs of more have an axis."""
+
+
+def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    """Combine the results of a block for each drone of the world."""
+    (block,), n = op.blocks, op.param("n_members")
+    n_worlds = shape[0] // n
+    used = [v for v in block.uses() if v in env]
+    own = {v: env[v] for v in used if not v.size and np.ndim(env[v])}
+    fixed = {v: env[v] for v in used if v not in own}
+    rows = [jnp.reshape(x, (n_worlds, n)) if np.ndim(x) else x for x in args]
+    if n <= MAX_UNROLLED:
+        number = lax.broadcasted_iota(np.int32, (n_worlds, n), 1)
+        mine = {v: jnp.reshape(x, (n_worlds, n)) for v, x in own.items()}
+        turns = []
+        for j in range(n):
+            other = [x[:, j : j + 1] if np.ndim(x) else x for x in rows]
+            turns.append(run(block, [*other, number == j], (n_worlds, n), fixed | mine))
+        combine = [COMBINE[name] for name in op.param("reduce")]
+        found = [functools.reduce(fn, [_lanes(x, (n_worlds, n)) for x in some])
+                 for fn, some in zip(combine, zip(*turns, strict=True), strict=True)]  # fmt: skip
+        return [jnp.reshape(x, shape) for x in found]
+    columns = [jnp.reshape(x, (n_worlds, n)).T[..., None] for x in own.values()]  # (n, n_worlds, 1)
+
+    def of_one(xs: tuple[Array, list[Array]]) -> list[Array]:
+        i, some = xs
+        mine = dict(zip(own, some, strict=True))
+        outs = run(block, [*rows, jnp.arange(n)[None] == i], (n_worlds, n), fixed | mine)
+        return [
+            REDUCE[name](_lanes(x, (n_worlds, n)), axis=1) for name, x in zip(op.param("reduce"), outs, strict=True)
+        ]
+
+    numbers = jnp.arange(n)
+    if n_worlds * n * n <= MAX_PAIRS:
+        found = jax.vmap(of_one)((numbers, columns))
+    else:
+        at_once = max(1, MAX_PAIRS // (n_worlds * n))
+        found = lax.map(jax.checkpoint(of_one), (numbers, columns), batch_size=at_once)
+    return [x.T.reshape(shape) for x in found]
+
+
+COMBINE: dict[str, Callable[..., Array]] = {
+    "add": lax.add, "min": lax.min, "max": lax.max, "or": lax.bitwise_or, "and": lax.bitwise_and,
+}  # fmt: skip
+"""Operations on two numbers that reductions are made of."""
+
+REDUCE: dict[str, Callable[..., Array]] = {
+    "add": jnp.sum,
+    "min": smallest,
+    "max": largest,
+    "or": jnp.any,
+    "and": jnp.all,
+}
+"""Reductions of an axis by the names of operations."""
+
+MAX_PAIRS = 2**24
+"""Pairs of drones of all worlds that are computed at once; the memory of a gradient grows with them."""
+
+
+def _table(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    return [jnp.asarray(op.param("numbers").array)]
+
+
+def _lookup(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    table, index = args
+    return [jnp.asarray(table).at[index + op.param("offset")].get(mode="promise_in_bounds")]
+
+
+def _threefry(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    return jaxcompat.threefry2x32_p.bind(*_broadcast(args))
+
+
+STRUCTURE: dict[str, Callable[..., Any]] = {
+    "loop": _loop,
+    "while": _while,
+    "when": _when,
+    "custom_jvp": _custom_jvp,
+    "over_others": _over_others,
+    "table": _table,
+    "lookup": _lookup,
+    "threefry2x32": _threefry,
+}

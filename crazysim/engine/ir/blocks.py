@@ -1,0 +1,273 @@
+"""The intermediate representation: a block of scalar operations in single-assignment form.
+
+The engine does not compile arrays. Every element of every small array is a value of its own, constants are folded,
+and a common subexpression is computed once. Blocks are immutable; a ``Builder`` makes one. What operations there are
+is in ``ops``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.algebra import constant_key, is_known_zero, simplify
+
+Element = Any
+"""A ``Value``, or a NumPy scalar for a constant."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False, slots=True)
+class Value:
+    """One number that is computed at run time, or a table of numbers; equal only to itself."""
+
+    dtype: np.dtype
+    """Type of the number."""
+    size: int = 0
+    """Number of entries of a table, which only ``lookup`` reads; 0 for a single number."""
+
+
+class Numbers:
+    """Entries of a table that are known before the program runs; equal to those of the same type and bits."""
+
+    def __init__(self, array: np.ndarray):
+        """Hold a flat array."""
+        self.array = array
+        self._key = (array.dtype, array.tobytes())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Numbers) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __repr__(self) -> str:
+        return f"{self.array.dtype}[{self.array.size}]"
+
+
+class Operation(NamedTuple):
+    """Results computed from operands."""
+
+    name: str
+    """Name in ``ops.TABLE``."""
+    args: tuple[Element, ...]
+    """Operands."""
+    results: tuple[Value, ...]
+    """Values that it defines."""
+    params: tuple[tuple[str, Any], ...] = ()
+    """Static parameters, as pairs of name and value."""
+    blocks: tuple[Block, ...] = ()
+    """Blocks that it runs. Their operations may use the values that are defined before this one."""
+    stage: str = ""
+    """Stage of the pipeline that it comes from."""
+
+    def param(self, name: str) -> Any:
+        """Return a static parameter."""
+        return dict(self.params)[name]
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of the first result."""
+        return self.results[0].dtype
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Block:
+    """Operations in order, from inputs to outputs. An inner block may use the values of those around it."""
+
+    inputs: tuple[Value, ...] = ()
+    operations: tuple[Operation, ...] = ()
+    outputs: tuple[Element, ...] = ()
+
+    def walk(self) -> Iterator[Operation]:
+        """Iterate over all operations, those of inner blocks included."""
+        for operation in self.operations:
+            yield operation
+            for block in operation.blocks:
+                yield from block.walk()
+
+    def blocks(self) -> Iterator[Block]:
+        """Iterate over the block and its inner blocks."""
+        yield self
+        for operation in self.operations:
+            for block in operation.blocks:
+                yield from block.blocks()
+
+    def uses(self) -> set[Value]:
+        """Return the values that operations and outputs use, those of inner blocks included."""
+        used = {x for x in self.outputs if isinstance(x, Value)}
+        for operation in self.operations:
+            used.update(x for x in operation.args if isinstance(x, Value))
+            for block in operation.blocks:
+                used |= block.uses()
+        return used
+
+
+class Builder:
+    """Builds a block, operation by operation."""
+
+    def __init__(self, outer: Builder | None = None, stage: str = ""):
+        """Begin an empty block, inside another one if that is given.
+
+        Args:
+            outer: Builder of the block around it.
+            stage: Stage that the operations come from.
+        """
+        self.outer = outer
+        self.stage = outer.stage if outer is not None else stage
+        self.inputs: list[Value] = []
+        self.operations: list[Operation] = []
+        self._known: dict[Any, tuple[Value, ...]] = {}
+
+    def input(self, dtype: DTypeLike, size: int = 0) -> Value:
+        """Add an input, a table if a size is given."""
+        value = Value(np.dtype(dtype), size)
+        self.inputs.append(value)
+        return value
+
+    def add(self, name: str, args: Sequence[Element], dtype: DTypeLike, params: tuple = ()) -> Element:
+        """Return the result of an operation: a new value, one that is known already, or a constant."""
+        args, dtype = tuple(args), np.dtype(dtype)
+        simple = simplify(name, args, dtype, params)
+        if simple is not None:
+            return simple
+        if name == "sub" and is_known_zero(args[0]):  # a negative operand costs nothing in a product or a sum
+            name, args = "neg", args[1:]
+        return self._add(name, args, (dtype,), params)[0]
+
+    def add_many(
+        self,
+        name: str,
+        args: Sequence[Element],
+        dtypes: Sequence[Any],
+        params: tuple = (),
+        blocks: tuple[Block, ...] = (),
+    ) -> tuple[Value, ...]:
+        """Return the results of an operation that has any number of them, or runs blocks."""
+        args, types = tuple(args), tuple(map(np.dtype, dtypes))
+        return self._new(name, args, types, params, blocks) if blocks else self._add(name, args, types, params)
+
+    def barrier(self) -> None:
+        """Mark a place before which everything that is used after it should be computed once."""
+        if self.operations and self.operations[-1].name != "barrier":
+            self._new("barrier", (), (), (), ())
+
+    def finish(self, outputs: Sequence[Element]) -> Block:
+        """Return the block with these outputs."""
+        return Block(tuple(self.inputs), tuple(self.operations), tuple(outputs))
+
+    def _add(self, name: str, args: tuple, dtypes: tuple[np.dtype, ...], params: tuple) -> tuple[Value, ...]:
+        # NaN differs from itself, and -0.0 equals 0.0: constants are compared by their bytes.
+        key = (name, dtypes, params, *[x if isinstance(x, Value) else constant_key(x) for x in args])
+        builder: Builder | None = self
+        while builder is not None:
+            known = builder._known.get(key)
+            if known is not None:
+                return known
+            builder = builder.outer
+        results = self._known[key] = self._new(name, args, dtypes, params, ())
+        return results
+
+    def _new(self, name: str, args: tuple, dtypes: tuple, params: tuple, blocks: tuple) -> tuple[Value, ...]:
+        if name not in ops.TABLE:
+            raise KeyError(f"operation {name!r} is not in ops.TABLE")
+        size = dict(params)["numbers"].array.size if name == "table" else 0
+        results = tuple([Value(dtype, size) for dtype in dtypes])
+        self.operations.append(Operation(name, args, results, params, blocks, self.stage))
+        return results
+
+
+def constant(value: Any, dtype: DTypeLike) -> np.generic:
+    """Return a constant element."""
+    return np.dtype(dtype).type(value)
+
+
+def is_constant(x: Element) -> bool:
+    """Return True where an element is known before the program runs."""
+    return isinstance(x, np.generic)
+
+
+def prune(block: Block, keep_inputs: bool = True) -> Block:
+    """Return a block without the operations that no output needs.
+
+    Args:
+        block: The block.
+        keep_inputs: False to remove inputs as well that nothing uses.
+    """
+    block = _prune(block, set())
+    if keep_inputs:
+        return block
+    used = block.uses()
+    return dataclasses.replace(block, inputs=tuple([x for x in block.inputs if x in used]))
+
+
+def _prune(block: Block, needed: set[Value]) -> Block:
+    needed.update(x for x in block.outputs if isinstance(x, Value))
+    kept = []
+    for op in reversed(block.operations):
+        if op.name == "barrier":
+            kept.append(op)
+        elif not needed.isdisjoint(op.results):
+            needed.update(x for x in op.args if isinstance(x, Value))
+            if op.blocks:
+                blocks = tuple([_prune(inner, needed) for inner in op.blocks])
+                kept.append(op._replace(blocks=blocks))
+            else:
+                kept.append(op)
+    return dataclasses.replace(block, operations=tuple(kept[::-1]))
+
+
+def substitute(block: Block, new: Mapping[Value, Element]) -> Block:
+    """Return a block in which operands and outputs are replaced; what defines them stays."""
+
+    def replaced(x: Element) -> Element:
+        return new.get(x, x) if isinstance(x, Value) else x
+
+    operations = [
+        op._replace(
+            args=tuple([replaced(x) for x in op.args]),
+            blocks=tuple([substitute(inner, new) for inner in op.blocks]),
+        )
+        for op in block.operations
+    ]
+    return Block(block.inputs, tuple(operations), tuple([replaced(x) for x in block.outputs]))
+
+
+def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
+    """Add a block's operations to a builder once more, simplified by what is known there, and return its outputs.
+
+    Args:
+        builder: Takes the operations.
+        block: The block.
+        values: Elements that stand for the block's inputs and for values around it; those of its own values are added.
+    """
+
+    def mapped(x: Element) -> Element:
+        return values.get(x, x) if isinstance(x, Value) else x
+
+    for op in block.operations:
+        args = [mapped(x) for x in op.args]
+        if op.name == "barrier":
+            builder.barrier()
+        elif len(op.results) == 1 and not op.blocks:
+            (old,) = op.results
+            # What was simplified when it was built can be simplified further only if a value has become a constant.
+            if any([isinstance(x, np.generic) for x in args]):
+                values[old] = builder.add(op.name, args, old.dtype, op.params)
+            else:
+                (values[old],) = builder.add_many(op.name, args, (old.dtype,), op.params)
+        else:
+            blocks = tuple([_inlined(builder, inner, values) for inner in op.blocks])
+            results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, blocks)
+            values.update(zip(op.results, results, strict=True))
+    return [mapped(x) for x in block.outputs]
+
+
+def _inlined(outer: Builder, block: Block, values: dict[Value, Element]) -> Block:
+    builder = Builder(outer)
+    inside = values | {x: builder.input(x.dtype) for x in block.inputs}
+    return builder.finish(inline(builder, block, inside))

@@ -1,0 +1,135 @@
+"""Programs and blocks as text, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import cast
+
+import numpy as np
+
+from crazysim.engine.ir.blocks import Block, Element, Operation, Value
+from crazysim.engine.ir.program import PACKED, Program, Segment, Slot, UnfusedStage
+
+INDENT = "  "
+
+
+def list_program(program: Program) -> str:
+    """Return a program as text: what each segment reads, computes and writes, under the names of the fields."""
+    lines = []
+    for segment in program.segments:
+        lines.append("")
+        if segment in program.unfused_stages:
+            stage = cast(UnfusedStage, segment)
+            lines.append(f"{stage.phase} stage {stage.name} of all worlds, unfused: {stage.error.reason}")
+            lines += [f"{INDENT}reads {program.leaves[i].name}" for i in stage.used]
+            lines += [f"{INDENT}writes {program.leaves[i].name}" for i in stage.written]
+        else:
+            lines += _of_segment(program, cast(Segment, segment), _Names())
+    if program.check is not None:
+        lines += ["", *_of_segment(program, program.check, _Names())]
+    return "\n".join(lines[1:]) + "\n"
+
+
+def list_block(block: Block) -> str:
+    """Return a block as text."""
+    names = _Names()
+    inputs = ", ".join(f"{names.new(x)}: {_type(x)}" for x in block.inputs)
+    lines = list(_of_operations(block, names, 1))
+    outputs = ", ".join(names.of(x) for x in block.outputs)
+    return "\n".join([f"block({inputs})", *lines, f"return {outputs}"]) + "\n"
+
+
+def list_operation(program: Program, operation: Operation) -> str:
+    """Return the line that an operation has in the listing of a program."""
+    for segment in program.fused_segments:
+        names = _Names()
+        list(_of_segment(program, segment, names))
+        if any(op is operation for op in segment.block.walk()):
+            return f"{_line(operation, names)} of stage {operation.stage!r}"
+    raise ValueError("expected an operation of the program, got one of another program")
+
+
+def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
+    """Return a place as the field and the element, such as ``states.pos[2]``; of a world, with the drone."""
+    (i, k), leaf = slot, program.leaves[slot[0]]
+    if k < 0:  # all of it, a table
+        return f"{leaf.name}[:]"
+    drone = ""
+    if segment.scope == "world" and leaf.scope == "drone":
+        number, k = divmod(k, leaf.size)
+        drone = f" of drone {number}"
+    for member in program.packed if leaf.name == PACKED else leaf.rows_of:  # the field that the number belongs to
+        if k < program.leaves[member].size:
+            return f"{program.leaves[member].name}[{k}]{drone}"
+        k -= program.leaves[member].size
+    return f"{program.leaves[i].name}[{k}]{drone}"
+
+
+def _of_segment(program: Program, segment: Segment, names: _Names) -> Iterator[str]:
+    when = {"first": "before the first step", "each": "at each step", "last": "after the last step"}[segment.phase]
+    yield f"segment of one {segment.scope}, {when}: {', '.join(segment.stages)}"
+    if segment.hoisted.outputs:
+        yield f"{INDENT}hoisted, once before the first step:"
+        for x, slot in zip(segment.hoisted.inputs, segment.hoisted_reads, strict=True):
+            yield f"{INDENT * 2}{names.new(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
+        yield from _of_operations(segment.hoisted, names, 2)
+        for x, y in zip(segment.block.inputs[len(segment.reads) :], segment.hoisted.outputs, strict=True):
+            yield f"{INDENT * 2}{names.new(x)} = {names.of(y)}"
+    for x, slot in zip(segment.block.inputs, segment.reads, strict=False):
+        yield f"{INDENT}{names.new(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
+    yield from _of_operations(segment.block, names, 1)
+    if segment is program.check:
+        yield f"{INDENT}flagged = {names.of(segment.block.outputs[0])}"
+        return
+    for x, slot in zip(segment.block.outputs, segment.writes, strict=True):
+        yield f"{INDENT}{slot_name(program, segment, slot)} = {names.of(x)}"
+
+
+def _type(x: Value) -> str:
+    return f"{x.dtype}[{x.size}]" if x.size else f"{x.dtype}"
+
+
+class _Names:
+    """Names of values, in order of definition."""
+
+    def __init__(self) -> None:
+        self._names: dict[Value, str] = {}
+
+    def new(self, x: Value) -> str:
+        return self._names.setdefault(x, f"%{len(self._names)}")
+
+    def of(self, x: Element) -> str:
+        return self._names.get(x, "%?") if isinstance(x, Value) else _constant(x)
+
+
+def _constant(x: np.generic) -> str:
+    return f"{x.item()!r}" if x.dtype.kind != "b" else str(bool(x)).lower()
+
+
+def _of_operations(block: Block, names: _Names, depth: int) -> Iterator[str]:
+    stage = ""
+    for op in block.operations:
+        if op.name == "barrier":
+            yield f"{INDENT * depth}barrier"
+            continue
+        if depth == 1 and op.stage != stage:
+            stage = op.stage
+            yield f"{INDENT * depth}# {stage}"
+        inner = [line for b in op.blocks for line in _of_inner(b, names, depth + 1)]
+        yield f"{INDENT * depth}{_line(op, names)}" + (" {" if inner else "")
+        yield from inner
+        if inner:
+            yield f"{INDENT * depth}}}"
+
+
+def _line(op: Operation, names: _Names) -> str:
+    params = [f"{k}={v}" for k, v in op.params if not callable(v)]
+    results = ", ".join(f"{names.new(x)}: {_type(x)}" for x in op.results)
+    return f"{results} = {op.name}({', '.join([*map(names.of, op.args), *params])})"
+
+
+def _of_inner(block: Block, names: _Names, depth: int) -> Iterator[str]:
+    if block.inputs:
+        yield f"{INDENT * depth}block({', '.join(names.new(x) for x in block.inputs)})"
+    yield from _of_operations(block, names, depth)
+    yield f"{INDENT * depth}return {', '.join(names.of(x) for x in block.outputs)}"

@@ -1,0 +1,122 @@
+"""NumPy's forms of operations where NumPy itself differs from XLA; the table is in ``ops``.
+
+Operands are arrays or scalars of NumPy's types.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+
+def divide(a: Any, b: Any) -> Any:
+    """Divide; integers towards zero, by zero to all bits set, the least by -1 to itself."""
+    if a.dtype.kind == "f":
+        return np.divide(a, b)
+    if a.dtype.kind == "u":
+        return np.where(b == 0, np.iinfo(a.dtype).max, a // np.where(b == 0, b.dtype.type(1), b))
+    unsafe = (b == 0) | (b == -1)
+    safe = np.where(unsafe, b.dtype.type(1), b)
+    floor = a // safe
+    quotient = floor + ((a % safe != 0) & ((a < 0) != (safe < 0)))
+    return np.where(b == 0, a.dtype.type(-1), np.where(b == -1, np.negative(a), quotient))
+
+
+def remainder(a: Any, b: Any) -> Any:
+    """Return the remainder with the sign of the dividend; of a division by zero the dividend."""
+    if a.dtype.kind == "f":
+        return np.fmod(a, b)
+    unsafe = (b == 0) if b.dtype.kind == "u" else (b == 0) | (b == -1)
+    return np.where(b == 0, a, np.where(unsafe, a.dtype.type(0), np.fmod(a, np.where(unsafe, b.dtype.type(1), b))))
+
+
+def sign(x: Any) -> Any:
+    """Return the sign; of zeros, and of NaN, the operand."""
+    return np.where(x > 0, x.dtype.type(1), np.where(x < 0, x.dtype.type(-1 if x.dtype.kind != "u" else 0), x))
+
+
+def round_away(x: Any) -> Any:
+    """Round to the nearest integer, halves away from zero."""
+    whole = np.trunc(x)
+    return np.copysign(np.where(np.abs(x - whole) >= 0.5, np.abs(whole) + 1, np.abs(whole)), x)
+
+
+def shift(shift: Callable[[Any, Any], Any], outside: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+    """Return a shift that is defined for any number of bits."""
+
+    def shifted(x: Any, n: Any) -> Any:
+        bits = 8 * x.dtype.itemsize
+        inside = (n >= 0) & (n < bits) if n.dtype.kind == "i" else n < bits
+        return np.where(inside, shift(x, np.where(inside, n, n.dtype.type(0))), outside(x))
+
+    return shifted
+
+
+def shift_logical(x: Any, n: Any) -> Any:
+    """Shift to the right and fill with zeros."""
+    unsigned = np.dtype(f"u{x.dtype.itemsize}")
+    return np.right_shift(np.asarray(x).view(unsigned), np.asarray(n).view(unsigned)).view(x.dtype)
+
+
+def shift_arithmetic(x: Any, n: Any) -> Any:
+    """Shift to the right and fill with the sign."""
+    signed = np.dtype(f"i{x.dtype.itemsize}")
+    return np.right_shift(np.asarray(x).view(signed), np.asarray(n).view(signed)).view(x.dtype)
+
+
+def sign_bits(x: Any) -> Any:
+    """Return all bits set for negative numbers, and zero for others."""
+    return shift_arithmetic(x, x.dtype.type(8 * x.dtype.itemsize - 1))
+
+
+def convert(x: Any, dtype: DTypeLike) -> Any:
+    """Convert numbers as XLA does: a float to the nearest integer there is, NaN to 0."""
+    x, dtype = np.asarray(x), np.dtype(dtype)
+    if x.dtype.kind == "f" and dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        low, high = float(limits.min), float(limits.max) + 1  # both are exact
+        inside = (x > low - 1) & (x < high) if dtype.itemsize < 8 else (x >= low) & (x < high)
+        whole = np.where(inside, x, 0).astype(dtype)
+        outside = np.where(np.isnan(x), 0, np.where(x >= high, limits.max, limits.min)).astype(dtype)
+        return np.where(inside, whole, outside)
+    return x != 0 if dtype.kind == "b" else x.astype(dtype)
+
+
+def bitcast(x: Any, dtype: DTypeLike) -> Any:
+    """Return the same bits as another type."""
+    return np.asarray(x).view(dtype)
+
+
+def power(a: Any, b: Any) -> Any:
+    """Raise to a power; for an exponent of 0.5 NumPy takes the root, which differs at -inf and -0."""
+    root = (b == 0.5) & ((a == 0) | np.isneginf(a))
+    return np.where(root, np.abs(a), np.power(a, b))
+
+
+def integer_pow(x: Any, y: int) -> Any:
+    """Raise to a power that is a Python integer."""
+    return x**y if y >= 0 else 1 / x**-y
+
+
+def log_gamma(x: Any) -> Any:
+    """Return the logarithm of the absolute value of the gamma function; SciPy has -inf at -inf, XLA inf."""
+    return np.where(np.isinf(x), np.abs(x), special("gammaln")(x))
+
+
+def special(name: str) -> Callable[..., Any]:
+    """Return a function of ``scipy.special``, which JAX depends on; it is imported when it is called."""
+
+    def call(*args: Any) -> Any:
+        from scipy import special
+
+        return getattr(special, name)(*args)
+
+    return call
+
+
+def digamma(x: Any) -> Any:
+    """Return the derivative of the logarithm of the gamma function; XLA has NaN at its poles."""
+    return np.where((x <= 0) & (x == np.floor(x)), x.dtype.type(np.nan), special("digamma")(x))

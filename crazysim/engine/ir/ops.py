@@ -1,0 +1,258 @@
+"""The table of operations: what each one means, and what it is called, in every target.
+
+A program has no operation that is not here. One row says which numbers an operation takes, how NumPy computes it (for
+constants and for the interpreter), what it is in XLA, in C++ and CUDA, and in CasADi, and what it costs. A target
+refuses a program with an operation that has no entry for it when the step is planned (``unsupported``).
+
+Integers and conversions follow XLA, which defines what C leaves open: a division by zero gives -1 (all bits set), its
+remainder the dividend; a shift by 32 bits or more gives 0, or the sign; a float becomes the nearest integer there is,
+NaN becomes 0. ``max``, ``min`` and ``clamp`` pass NaN on; the sign of a zero they return is not defined.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import numpy_forms as forms
+
+DTYPES = frozenset(map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split()))
+"""Types of numbers. In half precision XLA keeps more digits where it fuses, so that no two engines could agree."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Row:
+    """One operation."""
+
+    name: str
+    """Name in programs, and of JAX's primitive if there is one."""
+    operands: str
+    """A letter for each operand: T for one type, the same wherever it stands, b for bool, u for uint32, * for any."""
+    results: str = "T"
+    """The same for each result."""
+    kinds: str = "f"
+    """Kinds that T may be: f for float, i and u for signed and unsigned integer, b for bool."""
+    numpy: Callable[..., Any] | None = None
+    """NumPy's form, on arrays or scalars, with static parameters as keywords."""
+    exact: bool = False
+    """True where NumPy and XLA agree to the last bit, so that constants are computed at once."""
+    xla: str | Callable[..., Any] = ""
+    """Name in ``jax.lax``, or a function of the operands. By default the name of the row."""
+    source: str | Mapping[str, str] = "{name}_({all})"
+    """Expression in C++ and CUDA, by kind where that matters: {0}, {1}, ... and {all} are operands, {type} is the
+    result's type, and static parameters go by their names. The functions are in ``targets/``."""
+    casadi: str | Callable[..., Any] | None = None
+    """Name in ``casadi``, or a function of that module and the operands; None where it has no form."""
+    casadi_kinds: str = "fib"
+    """Kinds for which CasADi's form is right; its numbers are float64, and 32 bits without a sign are not."""
+    cost: float = 1
+    """Cost in multiply-adds."""
+    structured: bool = False
+    """True where each target has code of its own for the operation, because it runs blocks or has several results."""
+
+    def accepts(self, dtypes: Sequence[np.dtype]) -> bool:
+        """Return True where operands of these types fit."""
+        if "..." in self.operands:
+            return True
+        kinds = {x for x, letter in zip(dtypes, self.operands, strict=False) if letter == "T"}
+        rest = [(x, letter) for x, letter in zip(dtypes, self.operands, strict=False) if letter in "bu"]
+        return (
+            len(dtypes) == len(self.operands)
+            and len(kinds) <= 1
+            and all(x.kind in self.kinds for x in kinds)
+            and all(x == {"b": np.dtype(bool), "u": np.dtype(np.uint32)}[letter] for x, letter in rest)
+        )
+
+
+EXPENSIVE = 2
+"""Cost from which a number is worth a register, to be computed once instead of at every step."""
+
+
+def unsupported(name: str, dtypes: Sequence[np.dtype], result: Any = bool) -> UnsupportedError | None:
+    """Return the error of an operation that is not defined for operands and a result of these types, or None."""
+    other = next((x.name for x in (*dtypes, np.dtype(result)) if x not in DTYPES), None)
+    if other is not None:
+        return UnsupportedError(f"numbers of type {other}")
+    if TABLE[name].accepts(dtypes):
+        return None
+    return UnsupportedError(f"operation {name!r} on {', '.join(dict.fromkeys(x.name for x in dtypes))}")
+
+
+# CasADi's forms ------------------------------------------------------------------------------------------------------
+
+
+def _casadi_erf_inv(ca: Any, x: Any) -> Any:
+    """Return the inverse of the error function; CasADi has six digits, and each step of Newton doubles them."""
+    y = ca.erfinv(x)
+    for _ in range(2):
+        y = y - (ca.erf(y) - x) * (np.sqrt(np.pi) / 2) * ca.exp(y * y)
+    return y
+
+
+def _casadi_round_even(ca: Any, x: Any) -> Any:
+    up = ca.floor(x + 0.5)
+    return up - ca.logic_and(up == x + 0.5, ca.fmod(up, 2) != 0)
+
+
+_LARGEST = float(np.finfo(np.float64).max)
+"""CasADi has no operation that tests for finite numbers."""
+
+
+def _rows() -> list[Row]:
+    """Return the rows, operations of a kind together."""
+    any_number, integer = "fiu", "iu"
+
+    def unary(name: str, numpy: Any, cost: float, casadi: Any = None, **more: Any) -> Row:
+        return Row(name=name, operands="T", numpy=numpy, cost=cost, casadi=casadi, **more)
+
+    def binary(name: str, numpy: Any, kinds: str, cost: float = 1, **more: Any) -> Row:
+        return Row(name=name, operands="TT", numpy=numpy, kinds=kinds, cost=cost, **more)
+
+    def comparison(name: str, numpy: Any, casadi: Any, kinds: str = any_number) -> Row:  # counted with the selection
+        return binary(name, numpy, kinds, 0, results="b", exact=True, casadi=casadi, casadi_kinds="fiub")
+
+    arithmetic = [
+        binary("add", np.add, any_number, exact=True, source="{0} + {1}",
+               casadi=lambda _, a, b: a + b, casadi_kinds="fiu"),
+        binary("sub", np.subtract, any_number, exact=True, source="{0} - {1}",
+               casadi=lambda _, a, b: a - b, casadi_kinds="fiu"),
+        binary("mul", np.multiply, any_number, exact=True, source="{0} * {1}", casadi=lambda _, a, b: a * b),
+        binary("div", forms.divide, any_number, 4, exact=True, source={"f": "{0} / {1}", "iu": "div_({all})"},
+               casadi=lambda _, a, b: a / b, casadi_kinds="fiu"),
+        binary("rem", forms.remainder, any_number, 8, exact=True, casadi="fmod", casadi_kinds="fiu"),
+        binary("max", np.maximum, any_number, exact=True, casadi="fmax", casadi_kinds="fiu"),
+        binary("min", np.minimum, any_number, exact=True, casadi="fmin", casadi_kinds="fiu"),
+        Row(name="clamp", operands="TTT", kinds=any_number, exact=True, casadi_kinds="fi",
+            numpy=lambda low, x, high: np.minimum(np.maximum(x, low), high),
+            casadi=lambda ca, low, x, high: ca.fmin(ca.fmax(x, low), high)),
+        unary("neg", np.negative, 0, lambda _, x: -x, kinds=any_number, exact=True),
+        unary("abs", np.abs, 0, "fabs", kinds="fi", exact=True),
+        unary("sign", forms.sign, 1, "sign", kinds=any_number, exact=True),
+        binary("nextafter", np.nextafter, "f", 4),
+        unary("integer_pow", forms.integer_pow, 4, lambda _, x, y: x**y, kinds=any_number,
+              source="integer_pow({0}, {y})"),
+    ]  # fmt: skip
+    rounding = [
+        unary("floor", np.floor, 4, "floor", exact=True),
+        unary("ceil", np.ceil, 4, "ceil", exact=True),
+        unary("round_even", np.rint, 4, _casadi_round_even, exact=True,
+              xla=lambda x: _lax().round(x, _lax().RoundingMethod.TO_NEAREST_EVEN)),
+        unary("round_away", forms.round_away, 4, lambda ca, x: ca.sign(x) * ca.floor(ca.fabs(x) + 0.5), exact=True,
+              xla=lambda x: _lax().round(x, _lax().RoundingMethod.AWAY_FROM_ZERO)),
+        unary("is_finite", np.isfinite, 1, lambda ca, x: ca.fabs(x) <= _LARGEST, results="b", exact=True),
+    ]  # fmt: skip
+    functions = [
+        unary("sqrt", np.sqrt, 4, "sqrt", exact=True),
+        unary("rsqrt", lambda x: 1 / np.sqrt(x), 2, lambda ca, x: 1 / ca.sqrt(x)),
+        unary("cbrt", np.cbrt, 4, lambda ca, x: ca.sign(x) * ca.power(ca.fabs(x), 1 / 3)),
+        unary("exp", np.exp, 8, "exp"),
+        unary("exp2", np.exp2, 8, lambda ca, x: ca.power(2.0, x)),
+        unary("expm1", np.expm1, 16, "expm1"),
+        unary("log", np.log, 8, "log"),
+        unary("log1p", np.log1p, 16, "log1p"),
+        unary("logistic", lambda x: 1 / (1 + np.exp(-x)), 8, lambda ca, x: 1 / (1 + ca.exp(-x))),
+        unary("sin", np.sin, 8, "sin"),  # most of the work for one of the two is that for the other:
+        unary("cos", np.cos, 8, "cos"),  # the source computes them together
+        unary("tan", np.tan, 16, "tan"),
+        unary("asin", np.arcsin, 16, "asin"),
+        unary("acos", np.arccos, 16, "acos"),
+        unary("atan", np.arctan, 16, "atan"),
+        binary("atan2", np.arctan2, "f", 16, casadi="atan2"),
+        unary("sinh", np.sinh, 16, "sinh"),
+        unary("cosh", np.cosh, 16, "cosh"),
+        unary("tanh", np.tanh, 8, "tanh"),
+        unary("asinh", np.arcsinh, 16, "asinh"),
+        unary("acosh", np.arccosh, 16, "acosh"),
+        unary("atanh", np.arctanh, 16, "atanh"),
+        binary("pow", forms.power, "f", 16, casadi="power"),
+        unary("erf", forms.special("erf"), 16, "erf"),
+        unary("erfc", forms.special("erfc"), 16, lambda ca, x: 1 - ca.erf(x)),
+        unary("erf_inv", forms.special("erfinv"), 16, _casadi_erf_inv),
+        unary("lgamma", forms.log_gamma, 32),
+        unary("digamma", forms.digamma, 32),
+    ]
+    comparisons = [
+        comparison("eq", np.equal, lambda _, a, b: a == b, "fiub"),
+        comparison("ne", np.not_equal, lambda _, a, b: a != b, "fiub"),
+        comparison("lt", np.less, lambda _, a, b: a < b),
+        comparison("le", np.less_equal, lambda _, a, b: a <= b),
+        comparison("gt", np.greater, lambda _, a, b: a > b),
+        comparison("ge", np.greater_equal, lambda _, a, b: a >= b),
+        Row(name="select_n", operands="bTT", kinds="fiub", exact=True, casadi_kinds="fiub",
+            numpy=lambda which, no, yes: np.where(which, yes, no),
+            casadi=lambda ca, which, no, yes: ca.if_else(which, yes, no)),
+    ]  # fmt: skip
+    bits = [
+        binary("and", np.bitwise_and, "iub", exact=True, xla="bitwise_and", casadi="logic_and", casadi_kinds="b"),
+        binary("or", np.bitwise_or, "iub", exact=True, xla="bitwise_or", casadi="logic_or", casadi_kinds="b"),
+        binary("xor", np.bitwise_xor, "iub", exact=True, xla="bitwise_xor",
+               casadi=lambda _, a, b: a != b, casadi_kinds="b"),
+        unary("not", np.invert, 1, "logic_not", kinds="iub", exact=True, xla="bitwise_not", casadi_kinds="b"),
+        binary("shift_left", forms.shift(np.left_shift, np.zeros_like), integer, exact=True),
+        binary("shift_right_logical", forms.shift(forms.shift_logical, np.zeros_like), integer, exact=True),
+        binary("shift_right_arithmetic", forms.shift(forms.shift_arithmetic, forms.sign_bits), integer, exact=True),
+        Row(name="convert_element_type", operands="*", results="*", numpy=forms.convert, exact=True,
+            source="to_{type}({0})"),
+        Row(name="bitcast_convert_type", operands="*", results="*", numpy=forms.bitcast, exact=True,
+            source="bits_{type}({0})"),
+    ]  # fmt: skip
+    structured = [
+        Row(name="barrier", operands="", results="", cost=0, structured=True),
+        Row(name="table", operands="", results="*", cost=0, structured=True),
+        Row(name="lookup", operands="**", results="*", structured=True),
+        Row(name="threefry2x32", operands="uuuu", results="uu", cost=60, structured=True),
+        *(Row(name=name, operands="...", results="...", cost=0, structured=True)
+          for name in ("when", "loop", "while", "custom_jvp", "over_others")),
+    ]  # fmt: skip
+    return [*arithmetic, *rounding, *functions, *comparisons, *bits, *structured]
+
+
+def _lax() -> Any:
+    from jax import lax
+
+    return lax
+
+
+TABLE: Mapping[str, Row] = {row.name: row for row in _rows()}
+"""All operations by name.
+
+``barrier`` separates stages: what is used behind it is computed once. ``when(mask, *old)`` has the outputs of its block
+where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)`` runs its block that often;
+``while(*carry)`` runs its second block as long as its first is true. ``custom_jvp(*args, slope=)`` runs its block, and
+has a derivative of its own. ``over_others(*published, reduce=, n_members=)`` runs its block for each drone of the
+world: the block's inputs are what that drone published, and whether it is the drone itself; ``reduce`` names the
+operation that combines its outputs. It stands in no inner block. ``threefry2x32`` is the cipher of JAX's random
+numbers.
+``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=, aligned=)`` the entry at the sum of an
+int32, which is a multiple of four if that is aligned, and a constant; whoever makes one ensures that there is one.
+
+Costs are counted with what decides them: comparisons with selections, signs with what takes them. Functions cost what
+hardware that approximates them and a step that refines take, or the shortest polynomial that is exact to float32;
+twenty rounds of add, rotate and xor make a random number. An operation that runs a block costs what that does.
+"""
+
+REDUCTIONS: Mapping[str, str] = {"sum": "add", "min": "min", "max": "max"}
+"""Operations that combine the results of ``over_others``."""
+
+
+def neutral(name: str, dtype: np.dtype) -> np.generic:
+    """Return the number that an operation of ``REDUCTIONS`` begins with; ``or`` and ``and`` stand for max and min."""
+    if name in ("add", "or", "and"):
+        return dtype.type(name == "and")
+    limits = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    return dtype.type(limits[name == "min"])
+
+
+BOOLEAN_FORM: Mapping[str, tuple[str, int | None]] = {
+    "lt": ("and", 0),
+    "gt": ("and", 1),
+    "le": ("or", 0),
+    "ge": ("or", 1),
+    "max": ("or", None),
+    "min": ("and", None),
+}
+"""Order of bools as logic, and which operand is negated for it."""

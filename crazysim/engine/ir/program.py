@@ -1,0 +1,235 @@
+"""Programs: what the stages of a step do to the numbers of one drone or one world, ready for an engine.
+
+A program is immutable. Stages are lowered to one (``lower_stages``), and passes make another of it (``passes``,
+``layout``). ``listing.list_program`` shows it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir.blocks import Block
+from crazysim.jaxcompat import is_key
+
+Slot = tuple[int, int]
+"""Place of a number: which leaf, and which element of the part of it that belongs to one drone (or one world)."""
+
+Phase = Literal["first", "each", "last"]
+"""When a segment runs: once before the first step, at each step, once after the last."""
+
+TABLE = -1
+"""Element of a slot that means the whole leaf, a table: only shared leaves are tables."""
+
+PACKED = "packed"
+"""Name of the leaf of shared numbers."""
+
+PHASES: tuple[Phase, ...] = ("first", "each", "last")
+
+Zeros = tuple[tuple[int, frozenset[int]], ...]
+"""Leaves with the elements of them that are known to be zero."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Leaf:
+    """One array of the data."""
+
+    name: str
+    """Path of the field in ``SimData``."""
+    scope: str
+    """Scope of the field: ``drone``, ``world``, ``shared``, or that of an opaque leaf."""
+    shape: tuple[int, ...]
+    """Shape, for all worlds."""
+    dtype: Any
+    """Type."""
+    rows_of: tuple[int, ...] = ()
+    """Leaves whose numbers are the rows of this one, (n_rows, n_lanes), from the first row on; empty if it is none."""
+
+    @functools.cached_property
+    def size(self) -> int:
+        """Number of scalars per drone (or world); a key is two 32-bit integers."""
+        if self.rows_of:
+            return self.shape[0]
+        shape = self.shape[2:] if self.scope in ("drone", "world") else self.shape
+        return int(np.prod(shape, dtype=int)) * (2 if is_key(self) else 1)
+
+    @functools.cached_property
+    def number(self) -> np.dtype:
+        """Type of its numbers."""
+        return np.dtype(np.uint32 if is_key(self) else self.dtype)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Segment:
+    """Stages that run together, as a block of scalar operations."""
+
+    scope: Literal["drone", "world"]
+    """Whose numbers the block computes on."""
+    stages: tuple[str, ...]
+    """Names of the stages."""
+    phase: Phase
+    """When they run."""
+    block: Block
+    """The block. Its inputs are ``reads``, then the outputs of ``hoisted``; its outputs are ``writes``."""
+    reads: tuple[Slot, ...]
+    """Places of its inputs. In a segment of worlds, a leaf of drones has its numbers drone after drone."""
+    writes: tuple[Slot, ...]
+    """Places of its outputs."""
+    hoisted: Block = dataclasses.field(default_factory=Block)
+    """Computations hoisted out of the steps, run once before the first step."""
+    hoisted_reads: tuple[Slot, ...] = ()
+    """Places of the inputs of ``hoisted``."""
+
+    @property
+    def written(self) -> list[int]:
+        """Leaves that it writes."""
+        return sorted({leaf for leaf, _ in self.writes})
+
+    @property
+    def read(self) -> set[int]:
+        """Leaves that it reads."""
+        return {leaf for leaf, _ in (*self.reads, *self.hoisted_reads)}
+
+    @functools.cached_property
+    def couples(self) -> bool:
+        """True if drones of a world read each other's numbers."""
+        return self.scope == "world" or any(op.name == "over_others" for op in self.block.operations)
+
+    @property
+    def n_operations(self) -> int:
+        """Number of operations of a step."""
+        return sum(op.name != "barrier" for op in self.block.walk())
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class UnfusedStage:
+    """A stage that runs as it is written, on the arrays of all worlds."""
+
+    name: str
+    """Name of the stage."""
+    phase: Phase
+    """When it runs."""
+    jaxpr: Any
+    """The stage, from the leaves in ``used`` to those in ``written``."""
+    used: tuple[int, ...]
+    """Leaves that it reads."""
+    written: tuple[int, ...]
+    """Leaves that it writes."""
+    error: UnsupportedError
+    """Reason for which the stage is not fused."""
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of the stages."""
+        return (self.name,)
+
+    @property
+    def read(self) -> set[int]:
+        """Leaves that it reads."""
+        return set(self.used)
+
+    @property
+    def unfused(self) -> str:
+        """Reason as a sentence."""
+        return f"{self.name!r} is not fused: {self.error.reason}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Program:
+    """Program of a step, and of the stages that run before the first step and after the last."""
+
+    leaves: tuple[Leaf, ...]
+    """Arrays of the data; behind them those that passes add."""
+    n_drones: int
+    """Drones of a world."""
+    segments: tuple[Segment | UnfusedStage, ...]
+    """Segments in order, phase by phase."""
+    check: Segment | None = None
+    """Segment that flags a drone whose watched numbers are not finite, after the last step."""
+    scratch: frozenset[int] = frozenset()
+    """Leaves that only carry numbers from one stage to another: what is written there is not kept."""
+    packed: tuple[int, ...] = ()
+    """Shared leaves whose numbers are also those of one leaf, one after the other."""
+    population: str = "drone"
+    """Population whose members it computes side by side; here they are called drones, with scope ``drone``."""
+    views: frozenset[int] = frozenset()
+    """Leaves of other populations, viewed as leaves of the world (``relative``)."""
+
+    @functools.cached_property
+    def fused(self) -> bool:
+        """True where one kernel can run all of it."""
+        return not self.unfused_stages
+
+    @functools.cached_property
+    def unfused_stages(self) -> tuple[UnfusedStage, ...]:
+        """Stages that run as they are written."""
+        return tuple([s for s in self.segments if isinstance(s, UnfusedStage)])
+
+    @functools.cached_property
+    def fused_segments(self) -> tuple[Segment, ...]:
+        """Segments that have a block."""
+        return tuple([s for s in self.segments if isinstance(s, Segment)])
+
+    @functools.cached_property
+    def written(self) -> list[int]:
+        """Numbers of the leaves that are written."""
+        return sorted({i for s in self.segments for i in s.written} - self.scratch)
+
+    @functools.cached_property
+    def read(self) -> list[int]:
+        """Numbers of the leaves that are read."""
+        return sorted({i for s in self.segments for i in s.read})
+
+    @functools.cached_property
+    def ranks(self) -> dict[int, int]:
+        """Ranks of the leaves that take part, by which kernels name them; equal steps have equal ranks."""
+        checked = [leaf for leaf, _ in self.check.reads] if self.check is not None else []
+        used = {*checked, *(i for s in self.segments for i in (*s.read, *s.written))}
+        return {leaf: n for n, leaf in enumerate(sorted(used))}
+
+    @functools.cached_property
+    def tables(self) -> set[int]:
+        """Leaves that are read as tables."""
+        segments = self.fused_segments
+        return {leaf for s in segments for leaf, k in (*s.reads, *s.hoisted_reads) if k == TABLE}
+
+    @functools.cached_property
+    def rows(self) -> dict[int, int]:
+        """Leaves that are rows, and how many rows they have."""
+        return {i: leaf.shape[0] for i, leaf in enumerate(self.leaves) if leaf.rows_of}
+
+    @functools.cached_property
+    def group(self) -> int:
+        """Number of drones that read each other's numbers: those of a world, if a segment needs that; otherwise 1."""
+        return self.n_drones if any(s.couples for s in self.fused_segments) else 1
+
+    def of(self, phase: Phase) -> list[Any]:
+        """Return the segments that run in a phase."""
+        return [segment for segment in self.segments if segment.phase == phase]
+
+    def per_drone(self, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
+        """Return the slots of a segment as those of one drone: in a segment of worlds they count all its drones."""
+        if segment.scope == "drone":
+            return list(slots)
+        return [(i, k if k == TABLE else k % self.leaves[i].size) for i, k in slots]
+
+    def changing(self) -> set[Slot]:
+        """Return the numbers that a step may change."""
+        changing: set[Slot] = set()
+        for segment in self.of("each"):
+            if isinstance(segment, Segment):
+                changing.update(self.per_drone(segment, segment.writes))
+            else:
+                changing.update((leaf, k) for leaf in segment.written for k in range(TABLE, self.leaves[leaf].size))
+        return changing
+
+    def parts(self) -> Iterator[Program]:
+        """Iterate over programs that run one after the other: what one kernel can run, and each unfused stage."""
+        for _, segments in itertools.groupby(self.segments, lambda s: id(s) if isinstance(s, UnfusedStage) else 0):
+            yield dataclasses.replace(self, segments=tuple(segments), check=None)

@@ -1,0 +1,117 @@
+"""Populations that do not depend on each other: stages in groups, each of which becomes a program of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+
+from crazysim.core.stage import Axes, Stage
+from crazysim.engine.lowering.tracing import TracedStage, Tracer
+from crazysim.pytree import has_members
+
+
+class Group(NamedTuple):
+    """Stages that run together, step by step."""
+
+    population: str
+    """Population whose members the engine computes side by side; those of others are unrolled for each world."""
+    stages: tuple[Stage, ...]
+    """The stages, in order."""
+    owned: frozenset[int] | None
+    """Leaves whose new values are taken from this group; None for all."""
+
+
+class _Access(NamedTuple):
+    """Leaves that a stage reads and writes, and the populations that it is for."""
+
+    read: frozenset[int]
+    written: frozenset[int]
+    populations: frozenset[str]
+
+    @property
+    def touched(self) -> frozenset[int]:
+        """Leaves that it reads or writes."""
+        return self.read | self.written
+
+
+def independent(stages: Sequence[Stage], data: Any, tracer: Tracer) -> list[Group]:
+    """Return the groups of populations that do not depend on each other, that of the drones first.
+
+    Two stages depend on each other if one reads or writes what the other writes. Stages of worlds alone, such as the
+    clock, are repeated in every group that reads their results.
+
+    Args:
+        stages: Stages of a step, in order.
+        data: Data of the simulation, or its shapes and types.
+        tracer: Cache of traced stages.
+    """
+    axes, leaves = Axes(data), jax.tree.leaves(data)
+    if all(scope == "drone" or not has_members(scope) for scope in axes.scopes):
+        return [Group("drone", tuple(stages), None)]
+    access = [_access(tracer(stage, axes, leaves), stage, axes) for stage in stages]
+    clocks = _clocks(access, axes)
+    members = {scope: x.shape[1] for scope, x in zip(axes.scopes, leaves, strict=True) if has_members(scope)}
+    parts = _components([k for k in range(len(stages)) if k not in clocks], access)
+    parts = [(some, frozenset().union(*(access[k].populations for k in some))) for some in parts]
+    parts.sort(key=lambda part: "drone" not in part[1])
+    if not parts or "drone" not in parts[0][1]:
+        parts.insert(0, (set(), frozenset({"drone"})))
+    parts = [(_with_clocks(some, clocks, access), populations) for some, populations in parts]
+    parts[0] = (parts[0][0] | clocks, parts[0][1])  # the drones' program is what it is without other populations
+    groups, taken = [], frozenset()
+    for some, populations in parts:
+        written = frozenset().union(*(access[k].written for k in some))
+        main = "drone" if "drone" in populations else max(sorted(populations), key=members.__getitem__)
+        groups.append(Group(main, tuple([stages[k] for k in sorted(some)]), written - taken))
+        taken |= written
+    return groups
+
+
+def _access(traced: TracedStage, stage: Stage, axes: Axes) -> _Access:
+    populations = {axes.scopes[i] for i in traced.written if has_members(axes.scopes[i])}
+    populations |= {stage.scope} if stage.scope in axes.scopes and has_members(stage.scope) else set()
+    return _Access(frozenset(traced.used), frozenset(traced.written), frozenset(populations))
+
+
+def _clocks(access: Sequence[_Access], axes: Axes) -> set[int]:
+    """Return the stages that read and write leaves of worlds alone, which no other stage writes."""
+    found = {k for k, a in enumerate(access) if not any(has_members(axes.scopes[i]) for i in a.touched)}
+    while True:
+        others = frozenset().union(*(a.written for k, a in enumerate(access) if k not in found))
+        depending = {k for k in found if access[k].touched & others}
+        if not depending:
+            return found
+        found -= depending
+
+
+def _components(some: Iterable[int], access: Sequence[_Access]) -> list[set[int]]:
+    """Return sets of stages that depend on each other, or write the same populations."""
+    parts: list[set[int]] = []
+    for k in some:
+        joined, rest = {k}, []
+        for part in parts:
+            if any(_depend(access[k], access[j]) for j in part):
+                joined |= part
+            else:
+                rest.append(part)
+        parts = [*rest, joined]
+    return parts
+
+
+def _depend(a: _Access, b: _Access) -> bool:
+    # Stages of worlds that write no population's leaf go with the drones, if nothing joins them to others.
+    populations = (a.populations or {"drone"}) & (b.populations or {"drone"})
+    return bool(populations or a.written & b.touched or b.written & a.touched)
+
+
+def _with_clocks(some: Collection[int], clocks: Collection[int], access: Sequence[_Access]) -> set[int]:
+    """Return stages with the clocks whose results they read."""
+    out = set(some)
+    while True:
+        read = frozenset().union(*(access[k].read for k in out))
+        more = {k for k in clocks if access[k].written & read} - out
+        if not more:
+            return out
+        out |= more

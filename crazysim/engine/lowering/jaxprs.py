@@ -1,0 +1,207 @@
+"""From a jaxpr to a block of scalar operations.
+
+A function that is written for one drone is traced by JAX, and its jaxpr lowered equation by equation. An array is a
+NumPy object array of elements (``ir``). A rule says what a primitive means for elements; there are four kinds, and
+most primitives need no rule of their own:
+
+- element-wise: the same operation for every element;
+- movement: nothing is computed, so the primitive is run once on the indices of the elements;
+- reduction: unrolled;
+- structure: calls are inlined, branches become selections, loops stay loops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from crazysim import jaxcompat
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.algebra import known_zero
+from crazysim.engine.ir.blocks import Block, Builder, Element, Value, constant
+from crazysim.jaxcompat import ClosedJaxpr, Literal, is_key
+
+Elements = np.ndarray
+"""An array of elements, of type object. A random key is a pair of elements."""
+
+Rule = Callable[["Lowering", Any, list[Elements]], Sequence[Elements]]
+RULES: dict[str, Rule] = {}
+
+MAX_UNROLL = 64
+"""Longest scan with inputs or outputs per iteration, and largest range of a run-time index, that is unrolled."""
+
+
+def rule(*names: str) -> Callable[[Rule], Rule]:
+    """Register a function as the rule of primitives."""
+
+    def register(fn: Rule) -> Rule:
+        RULES.update(dict.fromkeys(names, fn))
+        return fn
+
+    return register
+
+
+class Entry(NamedTuple):
+    """Place of a number in a table: its index is the sum of a computed base and a constant."""
+
+    table: Value
+    """The table."""
+    base: Element
+    """Computed part of the index; the constant 0 if there is none."""
+    offset: int
+    """Constant part."""
+    aligned: bool = True
+    """True where the base is a multiple of four."""
+
+
+class Lowering:
+    """Lowers jaxprs into a block of scalar operations."""
+
+    def __init__(self, builder: Builder | None = None, entries: dict[Value, Entry] | None = None, n_members: int = 0):
+        """Add operations to a block, to a new one if none is given.
+
+        Args:
+            builder: Builder of the block.
+            entries: Numbers that can also be looked up in tables, to which others are added.
+            n_members: Number of drones of a world, for a function of one drone; 0 where it has no others.
+        """
+        self.builder = Builder() if builder is None else builder
+        self.entries = {} if entries is None else entries
+        self.n_members = n_members
+        self.shared: set[Value] = set()
+
+    def lower(self, jaxpr: ClosedJaxpr, args: Sequence[Elements]) -> list[Elements]:
+        """Return the results of a jaxpr for arrays of elements.
+
+        Raises:
+            UnsupportedError: If it has a primitive without a rule.
+        """
+        env: dict[Any, Elements] = {}
+
+        def value(v: Any) -> Elements:
+            return constants(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
+
+        inner = jaxpr.jaxpr
+        env.update(zip(inner.constvars, (constants(x, x.dtype) for x in jaxpr.consts), strict=True))
+        env.update(zip(inner.invars, args, strict=True))
+        for eqn in inner.eqns:
+            outs = self.lower_eqn(eqn, [value(v) for v in eqn.invars])
+            env.update(zip(eqn.outvars, outs, strict=True))
+        return [value(v) for v in inner.outvars]
+
+    def lower_eqn(self, eqn: Any, args: list[Elements]) -> Sequence[Elements]:
+        """Return the results of one equation of a jaxpr."""
+        name = eqn.primitive.name
+        if name not in RULES:
+            raise UnsupportedError(f"primitive {name!r} has no rule", name)
+        try:
+            with jaxcompat.reading(eqn) as equation:
+                return RULES[name](self, equation, args)
+        except UnsupportedError as error:
+            raise error.located(name) from None
+
+    def elementwise(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:
+        """Return an operation on every element; scalars stand for arrays of any shape.
+
+        Raises:
+            UnsupportedError: If the operation is not defined for elements of these types.
+        """
+        shapes = {x.shape for x in args}
+        shape = args[0].shape if len(shapes) == 1 else np.broadcast_shapes(*shapes)
+        rows = [(x if x.shape == shape else np.broadcast_to(x, shape)).reshape(-1) for x in args]
+        if not rows[-1].size:
+            return np.empty(shape, object)
+        first = [row[0] for row in rows]
+        if isinstance(first[-1], tuple):  # keys: both halves alike
+            halves = [[self.scalar(op, c[0], *(k[i] for k in c[1:])) for i in (0, 1)] for c in zip(*rows, strict=True)]
+            return as_elements([(a, b) for a, b in halves], shape)
+        dtypes = [x.dtype for x in first]
+        if op in ops.BOOLEAN_FORM and dtypes[0].kind == "b":
+            op, negated = ops.BOOLEAN_FORM[op]
+            args = [self.elementwise("not", [x], bool) if k == negated else x for k, x in enumerate(args)]
+            return self.elementwise(op, args, bool)
+        error = ops.unsupported(op, dtypes, dtype)
+        if error is not None:
+            raise error
+        return as_elements([self.builder.add(op, column, dtype, params) for column in zip(*rows, strict=True)], shape)
+
+    def scalar(self, op: str, *args: Element, dtype: Any = None) -> Element:
+        """Return an operation on single elements; of the last operand's type, unless another is given."""
+        return self.builder.add(op, args, args[-1].dtype if dtype is None else dtype)
+
+    def inner(self) -> Lowering:
+        """Return a lowering into a new block inside this one."""
+        return Lowering(Builder(self.builder), self.entries, self.n_members)
+
+    def lookup(self, table: Value, base: Element, offset: int, aligned: bool) -> Element:
+        """Return a number of a table, whose base is a multiple of four if it is aligned."""
+        found = self.builder.add("lookup", (table, base), table.dtype, (("offset", offset), ("aligned", aligned)))
+        self.entries[found] = Entry(table, base, offset, aligned)
+        return found
+
+    def finish(self, outputs: Sequence[Elements]) -> Block:
+        """Return the block, with these outputs."""
+        return self.builder.finish(scalars(*outputs))
+
+
+def as_elements(items: Sequence[Element], shape: tuple[int, ...]) -> Elements:
+    """Return a flat sequence of elements as an array. NumPy must not convert them."""
+    out = np.empty(len(items), dtype=object)
+    for i, item in enumerate(items):
+        out[i] = item
+    return out.reshape(shape)
+
+
+def scalars(*arrays: Elements) -> list[Element]:
+    """Return the single elements of arrays, one after the other; a random key is two 32-bit integers."""
+    items = [x for array in arrays for x in np.asarray(array, object).reshape(-1)]
+    return [half for x in items for half in (x if isinstance(x, tuple) else (x,))]
+
+
+def constants(x: Any, dtype: Any) -> Elements:
+    """Return an array of numbers, or of random keys, as elements."""
+    if jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key):
+        halves = np.asarray(jax.random.key_data(x)).reshape(-1, 2)
+        return as_elements([(constant(a, np.uint32), constant(b, np.uint32)) for a, b in halves], np.shape(x))
+    array = np.asarray(x)
+    return as_elements([constant(item, dtype) for item in array.reshape(-1)], array.shape)
+
+
+def inputs(builder: Builder, aval: Any, zeros: frozenset[int] = frozenset()) -> Elements:
+    """Return an array as new inputs of a block.
+
+    Args:
+        builder: Takes the inputs.
+        aval: Shape and type of the array.
+        zeros: Flat indices of elements that are known to be zero: they are no inputs.
+
+    Raises:
+        UnsupportedError: If the engine has no numbers of this type.
+    """
+    size = int(np.prod(aval.shape, dtype=int))
+    if is_key(aval):
+        return as_elements([(builder.input(np.uint32), builder.input(np.uint32)) for _ in range(size)], aval.shape)
+    if aval.dtype not in ops.DTYPES:
+        raise UnsupportedError(f"numbers of type {aval.dtype.name}")
+    zero = known_zero(aval.dtype)
+    items = [zero if k in zeros and zero is not None else builder.input(aval.dtype) for k in range(size)]
+    return as_elements(items, aval.shape)
+
+
+def lower_function(fn: Callable[..., Any], *avals: Any) -> Block:
+    """Return the block of a function of small arrays.
+
+    Args:
+        fn: From arrays to an array, or to any tree of arrays.
+        avals: Shapes and types of the arguments.
+
+    Raises:
+        UnsupportedError: If it has a primitive without a rule.
+    """
+    lowering = Lowering()
+    args = [inputs(lowering.builder, x) for x in jax.tree.leaves(avals)]
+    return lowering.finish(lowering.lower(jax.make_jaxpr(fn)(*avals), args))

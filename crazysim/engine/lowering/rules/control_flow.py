@@ -1,0 +1,169 @@
+"""Rules for calls, which are inlined, for branches, which become selections, and for loops, which stay loops."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+
+from crazysim.engine.ir.blocks import Block, Element, constant, is_constant
+from crazysim.engine.lowering.jaxprs import (
+    MAX_UNROLL,
+    Elements,
+    Lowering,
+    UnsupportedError,
+    as_elements,
+    constants,
+    rule,
+    scalars,
+)
+from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn, as_function, closed, expanded
+
+
+@rule("jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_lin", "run_state")
+def _call(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    return ctx.lower(closed(eqn.params.get("jaxpr") or eqn.params["call_jaxpr"]), args)
+
+
+@rule("custom_jvp_call")
+def _custom_jvp(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    return _with_derivative(ctx, eqn, args, closed(eqn.params["call_jaxpr"]))
+
+
+@rule("call_hi_primitive")
+def _high_level(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Expand a primitive that is defined by others, which JAX has from 0.12 on.
+
+    Results without a derivative, such as the places that ``jnp.searchsorted`` finds, are computed as in any call, from
+    tables where the operands are tables.
+    """
+    avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+    called = jax.make_jaxpr(expanded(eqn))(*avals)
+    if not any(jax.numpy.issubdtype(v.aval.dtype, np.inexact) for v in eqn.outvars):
+        return ctx.lower(called, args)
+    return _with_derivative(ctx, eqn, args, called)
+
+
+def _with_derivative(ctx: Lowering, eqn: JaxprEqn, args: list[Elements], called: ClosedJaxpr) -> list[Elements]:
+    """Lower a call with a custom derivative, which is lowered only when a derivative is requested."""
+    body = ctx.inner()
+    block = body.finish(body.lower(called, [_inputs(body, x) for x in args]))
+
+    @functools.cache
+    def slope() -> Block:
+        """Return the block from operands and their tangents to the tangents of the results."""
+        single = as_function(eqn)
+        avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+        traced = jax.make_jaxpr(lambda x, dx: jax.jvp(single, x, dx)[1])(avals, avals)
+        fresh = Lowering()
+        inputs = [_inputs(fresh, x) for x in (*args, *args)]
+        return fresh.finish(fresh.lower(traced, inputs))
+
+    return _results(ctx, "custom_jvp", eqn, scalars(*args), (block,), (("slope", slope),))
+
+
+@rule("custom_linear_solve")
+def _linear_solve(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
+    n_before = lengths.matvec + lengths.vecmat
+    solve = args[n_before : n_before + lengths.solve]
+    n_all = n_before + lengths.solve + lengths.transpose_solve
+    return ctx.lower(closed(jaxprs.solve), [*solve, *args[n_all:]])
+
+
+@rule("cond")
+def _cond(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Compute all branches and select one: lanes differ in which."""
+    which, *operands = args
+    branches = [closed(b) for b in eqn.params["branches"]]
+    index = which[()]
+    if is_constant(index):
+        return ctx.lower(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
+    outs = [ctx.lower(b, operands) for b in branches]
+    results = []
+    for k, v in enumerate(eqn.outvars):
+        taken = outs[-1][k]
+        for i in range(len(branches) - 2, -1, -1):
+            here = ctx.scalar("le", index, constant(i, index.dtype), dtype=bool)
+            taken = ctx.elementwise("select_n", [as_elements([here], ()), taken, outs[i][k]], v.aval.dtype)
+        results.append(taken)
+    return results
+
+
+@rule("platform_index")
+def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Take the default branch: a program is lowered once for all platforms."""
+    platforms = list(eqn.params["platforms"])
+    own = sorted({name for names in platforms for name in names or ()} & {"cpu", "gpu", "cuda", "rocm"})
+    if own or None not in platforms:
+        raise UnsupportedError(
+            f"primitive 'platform_index' with a branch for {', '.join(own) or 'some platforms only'}"
+        )
+    return [constants(platforms.index(None), np.int32)]
+
+
+@rule("scan")
+def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    p, length = eqn.params, eqn.params["length"]
+    body = closed(p["jaxpr"])
+    # Versions of JAX name the groups differently; operands per iteration have one axis more than in the body.
+    n_carry = sum(o.aval.ndim == v.aval.ndim for o, v in zip(eqn.outvars, body.jaxpr.outvars, strict=True))
+    n_stacked = sum(o.aval.ndim > v.aval.ndim for o, v in zip(eqn.invars, body.jaxpr.invars, strict=True))
+    n_consts = len(eqn.invars) - n_carry - n_stacked
+    fixed, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
+    if len(body.jaxpr.outvars) == n_carry and not xs and length > 1:
+        inner = ctx.inner()
+        inputs = [_inputs(inner, x) for x in carry]
+        block = inner.finish(inner.lower(body, [*fixed, *inputs]))
+        return _results(ctx, "loop", eqn, scalars(*carry), (block,), (("length", length),))
+    if length > MAX_UNROLL:
+        raise UnsupportedError(
+            f"primitive 'scan' with operands for each of {length} iterations; at most {MAX_UNROLL} are unrolled"
+        )
+    stacked: list[list[Elements]] = []
+    for i in range(length)[::-1] if p["reverse"] else range(length):
+        outs = ctx.lower(body, [*fixed, *carry, *(x[i, ...] for x in xs)])
+        carry = outs[:n_carry]
+        stacked.append(outs[n_carry:])
+    if p["reverse"]:
+        stacked.reverse()
+    if not length:
+        return [*carry, *(np.empty(v.aval.shape, object) for v in eqn.outvars[n_carry:])]
+    ys = [np.stack([turn[k] for turn in stacked]) for k in range(len(body.jaxpr.outvars) - n_carry)]
+    return [*carry, *ys]
+
+
+@rule("while")
+def _while(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    p = eqn.params
+    n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
+    cond_fixed, body_fixed, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
+    test, body = ctx.inner(), ctx.inner()
+    goes_on = test.finish(test.lower(closed(p["cond_jaxpr"]), [*cond_fixed, *(_inputs(test, x) for x in carry)]))
+    turn = body.finish(body.lower(closed(p["body_jaxpr"]), [*body_fixed, *(_inputs(body, x) for x in carry)]))
+    return _results(ctx, "while", eqn, scalars(*carry), (goes_on, turn))
+
+
+def _inputs(ctx: Lowering, like: Elements) -> Elements:
+    def new(x: Any) -> Any:
+        return tuple(map(new, x)) if isinstance(x, tuple) else ctx.builder.input(x.dtype)
+
+    return as_elements([new(x) for x in like.reshape(-1)], like.shape)
+
+
+def _results(
+    ctx: Lowering, op: str, eqn: JaxprEqn, args: list[Element], blocks: tuple[Block, ...], params: tuple = ()
+) -> list[Elements]:
+    """Return the results of an operation that has many."""
+    keys = [jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in eqn.outvars]
+    sizes = [int(np.prod(v.aval.shape)) * (2 if is_key else 1) for v, is_key in zip(eqn.outvars, keys, strict=True)]
+    dtypes = [np.uint32 if is_key else v.aval.dtype for v, is_key in zip(eqn.outvars, keys, strict=True)]
+    of_all = [dtype for dtype, size in zip(dtypes, sizes, strict=True) for _ in range(size)]
+    flat = iter(ctx.builder.add_many(op, tuple(args), of_all, params, blocks))
+    out = []
+    for v, is_key, size in zip(eqn.outvars, keys, sizes, strict=True):
+        items = [next(flat) for _ in range(size)]
+        out.append(as_elements(list(zip(items[::2], items[1::2], strict=True)) if is_key else items, v.aval.shape))
+    return out

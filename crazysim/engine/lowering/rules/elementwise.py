@@ -1,0 +1,204 @@
+"""Rules for primitives that do the same to every element."""
+
+from __future__ import annotations
+
+import numpy as np
+from jax.lax import RoundingMethod
+from numpy.typing import DTypeLike
+
+from crazysim import jaxcompat
+from crazysim.engine.ir import ops
+from crazysim.engine.lowering.jaxprs import Elements, Lowering, UnsupportedError, constants, rule
+from crazysim.jaxcompat import JaxprEqn
+
+OWN_RULE = frozenset(
+    "convert_element_type bitcast_convert_type select_n integer_pow pow round_even round_away digamma".split()
+)
+"""Operations that no primitive maps to one to one."""
+
+
+@rule(*(name for name, row in ops.TABLE.items() if not row.structured and name not in OWN_RULE))
+def _each(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    return [ctx.elementwise(eqn.primitive.name, args, eqn.outvars[0].aval.dtype)]
+
+
+@rule("pow")
+def _pow(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Raise to a power; JAX converts one that is an integer."""
+    dtype = eqn.outvars[0].aval.dtype
+    return [ctx.elementwise("pow", [args[0], ctx.elementwise("convert_element_type", [args[1]], dtype)], dtype)]
+
+
+@rule("digamma")
+def _digamma(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Return the digamma function, whose value at zero depends on the version of JAX."""
+    dtype = eqn.outvars[0].aval.dtype
+    at_zero = ctx.elementwise("eq", [args[0], constants(0, dtype)], bool)
+    regular = ctx.elementwise("digamma", args, dtype)
+    return [ctx.elementwise("select_n", [at_zero, regular, constants(jaxcompat.DIGAMMA_AT_ZERO, dtype)], dtype)]
+
+
+@rule("round")
+def _round(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    even = RoundingMethod(eqn.params["rounding_method"]) == RoundingMethod.TO_NEAREST_EVEN
+    return [ctx.elementwise("round_even" if even else "round_away", args, eqn.outvars[0].aval.dtype)]
+
+
+@rule("convert_element_type")
+def _convert(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    return [ctx.elementwise("convert_element_type", args, eqn.params["new_dtype"])]
+
+
+@rule("select_n")
+def _select_n(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Select one of two cases by a bool, or one of several by an integer."""
+    which, *cases = args
+    dtype, kind = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
+    if np.dtype(kind).kind == "b":
+        return [ctx.elementwise("select_n", args, dtype)]
+    taken = cases[-1]
+    for k in range(len(cases) - 2, -1, -1):
+        here = ctx.elementwise("le", [which, constants(k, kind)], bool)
+        taken = ctx.elementwise("select_n", [here, taken, cases[k]], dtype)
+    return [taken]
+
+
+@rule("bitcast_convert_type")
+def _bitcast(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    before, after = eqn.invars[0].aval.dtype, eqn.params["new_dtype"]
+    if before == after:
+        return args
+    if before.itemsize != np.dtype(after).itemsize:
+        raise UnsupportedError(f"primitive 'bitcast_convert_type' from {before} to {after}, of another size")
+    return [ctx.elementwise("bitcast_convert_type", args, after)]
+
+
+@rule("square")
+def _square(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    return [ctx.elementwise("mul", [args[0], args[0]], eqn.outvars[0].aval.dtype)]
+
+
+@rule("integer_pow")
+def _integer_pow(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    y, dtype = eqn.params["y"], eqn.outvars[0].aval.dtype
+    if y not in (2, 3, 4):
+        return [ctx.elementwise("integer_pow", args, dtype, (("y", y),))]
+    squared = ctx.elementwise("mul", [args[0], args[0]], dtype)
+    return [squared if y == 2 else ctx.elementwise("mul", [squared, squared if y == 4 else args[0]], dtype)]
+
+
+@rule("one_minus_square")
+def _one_minus_square(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    dtype = eqn.outvars[0].aval.dtype
+    return [ctx.elementwise("sub", [constants(1, dtype), ctx.elementwise("mul", [args[0], args[0]], dtype)], dtype)]
+
+
+@rule("add_any")
+def _add_any(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    return [ctx.elementwise("add", args, eqn.outvars[0].aval.dtype)]
+
+
+@rule("lt_to", "le_to", "eq_to")
+def _total_order(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Compare in an order in which NaN is the largest number, and equal to itself."""
+    name = eqn.primitive.name.removesuffix("_to")
+    if eqn.invars[0].aval.dtype.kind != "f":
+        return [ctx.elementwise(name, args, bool)]
+    a_nan, b_nan = (ctx.elementwise("ne", [x, x], bool) for x in args)
+    of_nan = {
+        "lt": lambda: ctx.elementwise("and", [b_nan, ctx.elementwise("not", [a_nan], bool)], bool),
+        "le": lambda: b_nan,
+        "eq": lambda: ctx.elementwise("and", [a_nan, b_nan], bool),
+    }[name]()
+    return [ctx.elementwise("or", [ctx.elementwise(name, args, bool), of_nan], bool)]
+
+
+@rule("optimization_barrier")
+def _barrier(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    ctx.builder.barrier()
+    return args
+
+
+@rule("device_put")
+def _device_put(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    if any(device is not None for device in eqn.params["devices"]):
+        raise UnsupportedError("primitive 'device_put' to a device that is named")
+    return args
+
+
+@rule("copy", "copy_p", "stop_gradient", "pvary", "reshard", "random_clone", "name")
+def _identity(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    return args
+
+
+class _Bits:
+    """Arithmetic on the bits of numbers, as unsigned integers of their size."""
+
+    def __init__(self, ctx: Lowering, dtype: DTypeLike):
+        self.ctx, self.dtype = ctx, np.dtype(f"u{np.dtype(dtype).itemsize}")
+        self.n_bits = 8 * self.dtype.itemsize
+
+    def of(self, x: Elements) -> Elements:
+        return self.ctx.elementwise("bitcast_convert_type", [x], self.dtype)
+
+    def do(self, op: str, a: Elements, b: Elements | int) -> Elements:
+        b = constants(b, self.dtype) if isinstance(b, int) else b
+        return self.ctx.elementwise(op, [a, b], self.dtype)
+
+    def count(self, x: Elements) -> Elements:
+        """Return how many bits are set: sums of pairs, of fours, and of eights, which a product adds up."""
+        pairs, fours, eights, ones = (self.mask(byte) for byte in (0x55, 0x33, 0x0F, 0x01))
+        x = self.do("sub", x, self.do("and", self.do("shift_right_logical", x, 1), pairs))
+        x = self.do("add", self.do("and", x, fours), self.do("and", self.do("shift_right_logical", x, 2), fours))
+        x = self.do("and", self.do("add", x, self.do("shift_right_logical", x, 4)), eights)
+        return self.do("shift_right_logical", self.do("mul", x, ones), self.n_bits - 8)
+
+    def mask(self, byte: int) -> int:
+        return int.from_bytes(bytes([byte] * self.dtype.itemsize), "little")
+
+
+@rule("population_count")
+def _population_count(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    dtype = eqn.outvars[0].aval.dtype
+    bits = _Bits(ctx, dtype)
+    return [ctx.elementwise("bitcast_convert_type", [bits.count(bits.of(args[0]))], dtype)]
+
+
+@rule("clz")
+def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Set all bits behind the first one, and count those that are left."""
+    dtype = eqn.outvars[0].aval.dtype
+    bits = _Bits(ctx, dtype)
+    x, shift = bits.of(args[0]), 1
+    while shift < bits.n_bits:
+        x = bits.do("or", x, bits.do("shift_right_logical", x, shift))
+        shift *= 2
+    left = bits.do("sub", constants(bits.n_bits, bits.dtype), bits.count(x))
+    return [ctx.elementwise("bitcast_convert_type", [left], dtype)]
+
+
+@rule("reduce_precision")
+def _reduce_precision(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Round the mantissa to nearest even; what the exponent cannot hold becomes infinite, or a zero with its sign."""
+    dtype, exponent, mantissa = eqn.outvars[0].aval.dtype, eqn.params["exponent_bits"], eqn.params["mantissa_bits"]
+    if dtype not in ops.DTYPES:
+        raise UnsupportedError(f"numbers of type {dtype.name}")
+    info, bits = np.finfo(dtype), _Bits(ctx, dtype)
+    x = bits.of(args[0])
+    dropped = info.nmant - mantissa
+    if dropped > 0:
+        odd = bits.do("and", bits.do("shift_right_logical", x, dropped), 1)
+        x = bits.do("add", x, bits.do("add", odd, (1 << (dropped - 1)) - 1))
+        x = bits.do("and", x, (1 << bits.n_bits) - (1 << dropped))
+    if exponent < info.nexp:
+        bias, largest = (1 << (info.nexp - 1)) - 1, (1 << (exponent - 1)) - 1
+        infinite = ((1 << info.nexp) - 1) << info.nmant
+        sign = bits.do("and", x, 1 << (bits.n_bits - 1))
+        size = bits.do("and", x, infinite)
+        over = ctx.elementwise("gt", [size, constants((bias + largest) << info.nmant, bits.dtype)], bool)
+        under = ctx.elementwise("le", [size, constants((bias - largest) << info.nmant, bits.dtype)], bool)
+        x = ctx.elementwise("select_n", [over, x, bits.do("or", sign, infinite)], bits.dtype)
+        x = ctx.elementwise("select_n", [under, x, sign], bits.dtype)
+    rounded = ctx.elementwise("bitcast_convert_type", [x], dtype)
+    is_nan = ctx.elementwise("ne", [args[0], args[0]], bool)
+    return [ctx.elementwise("select_n", [is_nan, rounded, args[0]], dtype)]

@@ -1,0 +1,266 @@
+"""Rules for indexing: a known index moves elements, a computed one selects among all places that it may mean."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from jax.lax import GatherScatterMode
+from numpy.typing import DTypeLike
+
+from crazysim.engine.ir.blocks import Element, constant, is_constant
+from crazysim.engine.lowering.jaxprs import (
+    MAX_UNROLL,
+    Elements,
+    Lowering,
+    UnsupportedError,
+    as_elements,
+    constants,
+    rule,
+)
+from crazysim.engine.lowering.rules import tables
+from crazysim.engine.lowering.rules.movement import move_many, run_now
+from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn
+
+
+@rule("dynamic_slice")
+def _dynamic_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    x, sizes = args[0], eqn.params["slice_sizes"]
+    for axis, (start, size) in enumerate(zip(args[1:], sizes, strict=True)):
+        x = _take(ctx, x, start[()], size, axis)
+    return [x]
+
+
+def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> Elements:
+    """Return ``size`` elements along an axis from a start that is clamped to the array."""
+    last = x.shape[axis] - size
+    if is_constant(start) or last == 0:
+        k = int(np.clip(start, 0, last)) if last else 0
+        return np.take(x, range(k, k + size), axis)
+    table = tables.find(ctx, x, (axis,), last + 1)
+    if table is not None:
+        offsets = np.take(table.offsets, range(size), axis)
+        return table.look_up(offsets, [table.base_at([start], [last])] * offsets.size)
+    _check_range(last + 1)
+    pieces = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
+    taken = pieces[last]
+    for k in range(last - 1, -1, -1):
+        here = as_elements([ctx.scalar("le", start, constant(k, start.dtype), dtype=bool)], ())
+        taken = _select(ctx, here, pieces[k], taken)
+    return taken
+
+
+@rule("dynamic_update_slice")
+def _dynamic_update_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    x, update = args[:2]
+    starts = [a[()] for a in args[2:]]
+    ranges = []
+    for start, size, length in zip(starts, update.shape, x.shape, strict=True):
+        last = length - size
+        ranges.append([last and int(np.clip(start, 0, last))] if not last or is_constant(start) else range(last + 1))
+    _check_range(int(np.prod([len(options) for options in ranges])))
+    out = x
+    for corner in itertools.product(*ranges):
+        here = _all(ctx, (_at(ctx, s, k, options[-1]) for s, k, options in zip(starts, corner, ranges, strict=True)
+                        if len(options) > 1))  # fmt: skip
+        place = tuple(slice(k, k + size) for k, size in zip(corner, update.shape, strict=True))
+        out = out.copy()
+        out[place] = update if here is None else _select(ctx, here, update, out[place])
+    return [out]
+
+
+def _at(ctx: Lowering, index: Element, k: int, last: int) -> Elements:
+    """Return True where an index, clamped to 0 to ``last``, is ``k``."""
+    op = "le" if k == 0 else "ge" if k == last else "eq"
+    return as_elements([ctx.scalar(op, index, constant(k, index.dtype), dtype=bool)], ())
+
+
+def _all(ctx: Lowering, conditions: Iterable[Elements]) -> Elements | None:
+    out = None
+    for condition in conditions:
+        out = condition if out is None else ctx.elementwise("and", [out, condition], bool)
+    return out
+
+
+def _select(ctx: Lowering, condition: Elements, yes: Elements, no: Elements) -> Elements:
+    first = no.reshape(-1)[0] if no.size else constant(0, np.float32)
+    dtype = np.uint32 if isinstance(first, tuple) else first.dtype
+    return ctx.elementwise("select_n", [condition, no, yes], dtype)
+
+
+def _check_range(n: int) -> None:
+    if n > MAX_UNROLL:
+        raise UnsupportedError(
+            f"an index that is computed at run time, into {n} places; selected from are at most {MAX_UNROLL}"
+        )
+
+
+@rule("gather")
+def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    x, indices = args
+    if known(indices):
+        p = eqn.params
+        if p["mode"] == GatherScatterMode.FILL_OR_DROP:
+            return [_gather_filled(eqn, x, values(indices))]
+        return move_many(eqn, [x], [values(indices)])
+    dims, mode, sizes = eqn.params["dimension_numbers"], eqn.params["mode"], eqn.params["slice_sizes"]
+    limits = [x.shape[axis] - sizes[axis] for axis in dims.start_index_map]
+    n_places = int(np.prod([limit + 1 for limit in limits]))
+    rows = indices.reshape(-1, indices.shape[-1])
+    out = eqn.outvars[0].aval
+    # Which row of indices an element of the result belongs to: the axes of the result that are no offsets.
+    row_shape = indices.shape[:-1]
+    batch_axes = [axis for axis in range(len(out.shape)) if axis not in dims.offset_dims]
+    shape = [1] * len(out.shape)
+    for axis, size in zip(batch_axes, row_shape, strict=True):
+        shape[axis] = size
+    row_of = np.broadcast_to(np.arange(len(rows)).reshape(shape), out.shape).reshape(-1)
+
+    table = tables.find(ctx, x, dims.start_index_map, n_places)
+    if table is not None:
+        zeros = np.zeros(indices.shape, np.int32)
+        offsets = move_many(eqn, [table.offsets.astype(object)], [zeros])[0].reshape(-1)
+        bases = [table.base_at(list(row), limits) for row in rows]
+        result = list(table.look_up(offsets, [bases[k] for k in row_of]))
+    else:
+        result = _select_windows(ctx, eqn, x, indices.shape, rows, row_of, limits)
+    if mode == GatherScatterMode.FILL_OR_DROP:
+        inside = [_inside(ctx, row, limits) for row in rows]
+        fill = eqn.params["fill_value"]
+        fill = _fill_value(out.dtype) if fill is None else fill
+        result = [_select(ctx, inside[row_of[o]], as_elements([item], ()), constants(fill, out.dtype))[()]
+                  for o, item in enumerate(result)]  # fmt: skip
+    return [as_elements(result, out.shape)]
+
+
+def _select_windows(
+    ctx: Lowering,
+    eqn: JaxprEqn,
+    x: Elements,
+    shape: tuple[int, ...],
+    rows: Elements,
+    row_of: np.ndarray,
+    limits: Sequence[int],
+) -> list[Element]:
+    """Return the elements of a gather, selected among all places that the indices may mean."""
+    _check_range(int(np.prod([limit + 1 for limit in limits])))
+    result: list[Element] = []
+    for corner in itertools.product(*(range(limit + 1) for limit in limits)):
+        static = np.broadcast_to(np.array(corner, np.int32), shape)
+        here = move_many(eqn, [x], [static])[0].reshape(-1)
+        if not result:
+            result = list(here)
+            continue
+        hit = [
+            _all(ctx, (_at(ctx, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0)) for row in rows
+        ]
+        for o, item in enumerate(here):
+            condition = hit[row_of[o]]
+            if condition is not None and item is not result[o]:
+                result[o] = _select(ctx, condition, as_elements([item], ()), as_elements([result[o]], ()))[()]
+    return result
+
+
+def _gather_filled(eqn: JaxprEqn, x: Elements, indices: np.ndarray) -> Elements:
+    """Gather at known places; those outside the array are filled."""
+    numbers = np.arange(x.size, dtype=np.int32).reshape(x.shape)
+    (places,) = run_now(eqn, [numbers, indices], fill_value=-1)
+    fill = eqn.params["fill_value"]
+    outside = constants(_fill_value(eqn.outvars[0].aval.dtype) if fill is None else fill, eqn.outvars[0].aval.dtype)[()]
+    flat = x.reshape(-1)
+    return as_elements([outside if i < 0 else flat[i] for i in places.reshape(-1)], places.shape)
+
+
+def _fill_value(dtype: DTypeLike) -> Any:
+    """Return the fill value of JAX: NaN, the smallest signed or the largest unsigned integer, True."""
+    kind = np.dtype(dtype).kind
+    if kind == "f":
+        return np.nan
+    return np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max if kind == "u" else True
+
+
+def _inside(ctx: Lowering, row: Elements, limits: list[int]) -> Elements:
+    tests = []
+    for i, limit in zip(row, limits, strict=True):
+        tests.append(as_elements([ctx.scalar("ge", i, constant(0, i.dtype), dtype=bool)], ()))
+        tests.append(as_elements([ctx.scalar("le", i, constant(limit, i.dtype), dtype=bool)], ()))
+    inside = _all(ctx, tests)
+    return constants(True, bool) if inside is None else inside
+
+
+@rule("scatter", *(f"scatter{mark}{op}" for mark in "-_" for op in ("add", "sub", "mul", "min", "max")))
+def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Write windows of ``updates`` into the operand, one row of ``indices`` after the other.
+
+    A window whose place is computed at run time is compared with every place it may have. A window that is partly
+    outside is dropped as a whole, or moved inside in mode ``clip``, as XLA does.
+    """
+    x, indices, updates = args
+    dims, clip = eqn.params["dimension_numbers"], eqn.params["mode"] == GatherScatterMode.CLIP
+    window_axes = dims.update_window_dims
+    row_axes = [axis for axis in range(updates.ndim) if axis not in window_axes]
+    collapsed = {*dims.inserted_window_dims, *dims.operand_batching_dims}
+    sizes = iter(updates.shape[axis] for axis in window_axes)
+    window = [1 if axis in collapsed else next(sizes) for axis in range(x.ndim)]
+    starts_of = dims.scatter_dims_to_operand_dims
+    limits = [x.shape[axis] - window[axis] for axis in starts_of]
+    blocks = updates.transpose(*row_axes, *window_axes)
+    out = x.copy()
+    for row in np.ndindex(indices.shape[:-1]):
+        start, block = indices[row], blocks[(*row, ...)]
+        options = [_options(i, limit, clip) for i, limit in zip(start, limits, strict=True)]
+        _check_range(int(np.prod([len(places) for places in options])))
+        corner = [0] * x.ndim
+        for axis, batch_axis in zip(dims.operand_batching_dims, dims.scatter_indices_batching_dims, strict=True):
+            corner[axis] = row[batch_axis]
+        for places in itertools.product(*options):
+            for axis, k in zip(starts_of, places, strict=True):
+                corner[axis] = k
+            here = _all(
+                ctx,
+                (
+                    _at(ctx, i, k, limit)
+                    if clip
+                    else as_elements([ctx.scalar("eq", i, constant(k, i.dtype), dtype=bool)], ())
+                    for i, k, limit in zip(start, places, limits, strict=True)
+                    if not is_constant(i) and not (clip and limit == 0)
+                ),
+            )
+            place = tuple(slice(k, k + size) for k, size in zip(corner, window, strict=True))
+            old = out[place]
+            new = _combined(ctx, eqn, old, block.reshape(old.shape))
+            out[place] = new if here is None else _select(ctx, here, new, old)
+    return [out]
+
+
+def _options(index: Element, limit: int, clip: bool) -> Sequence[int]:
+    """Return the places that a window may have along an axis; none if it is known to be outside."""
+    if not is_constant(index):
+        return range(limit + 1)
+    if clip:
+        return [int(np.clip(int(index), 0, limit))]
+    return [int(index)] if 0 <= index <= limit else []
+
+
+def _combined(ctx: Lowering, eqn: JaxprEqn, old: Elements, new: Elements) -> Elements:
+    """Return what a scatter writes where ``old`` was: ``new``, their sum and the like, or a function of ``old``."""
+    combination = eqn.params["update_jaxpr"]
+    if combination is None:
+        return new
+    called = ClosedJaxpr(combination, eqn.params["update_consts"])
+    pairs = zip(old.reshape(-1), new.reshape(-1), strict=True)
+    return as_elements(
+        [ctx.lower(called, [as_elements([a], ()), as_elements([b], ())])[0][()] for a, b in pairs], old.shape
+    )
+
+
+def known(x: Elements) -> bool:
+    """Return True where all elements are constants."""
+    return all(map(is_constant, x.reshape(-1)))
+
+
+def values(x: Elements) -> np.ndarray:
+    """Return known elements as numbers."""
+    return np.array(x.reshape(-1).tolist(), x.reshape(-1)[0].dtype if x.size else np.int32).reshape(x.shape)

@@ -1,0 +1,115 @@
+"""Rules for small linear algebra, unrolled."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from crazysim.engine.ir.blocks import constant
+from crazysim.engine.lowering.jaxprs import Elements, Lowering, UnsupportedError, as_elements, rule
+from crazysim.jaxcompat import JaxprEqn
+
+LARGEST_SYSTEM = 6
+"""Largest matrix that is factorised; beyond it the unrolled arithmetic is longer than the rest of a step."""
+
+
+def _check_size(eqn: JaxprEqn, n: int) -> None:
+    if n > LARGEST_SYSTEM:
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; at most {LARGEST_SYSTEM} is supported")
+
+
+def _matrices(x: Elements) -> list[Elements]:
+    return list(x.reshape(-1, *x.shape[-2:]))
+
+
+@rule("cholesky")
+def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Return the lower factor; all of it is NaN if the matrix is not positive definite, as in LAPACK."""
+    n, dtype = args[0].shape[-1], eqn.outvars[0].aval.dtype
+    _check_size(eqn, n)
+    zero = constant(0, dtype)
+    out = []
+    for a in _matrices(args[0]):
+        low, fails = np.full((n, n), zero, object), constant(False, bool)
+        for j in range(n):
+            for i in range(j, n):
+                rest = a[i, j]
+                for k in range(j):
+                    rest = ctx.scalar("sub", rest, ctx.scalar("mul", low[i, k], low[j, k]))
+                low[i, j] = ctx.builder.add("sqrt", (rest,), dtype) if i == j else ctx.scalar("div", rest, low[j, j])
+                if i == j:
+                    fails = ctx.scalar("or", fails, ctx.scalar("le", rest, zero, dtype=bool))
+        for j, i in itertools.combinations_with_replacement(range(n), 2):
+            low[i, j] = ctx.scalar("select_n", fails, low[i, j], constant(np.nan, dtype))
+        out.append(low)
+    return [as_elements([x for low in out for x in low.reshape(-1)], args[0].shape)]
+
+
+@rule("triangular_solve")
+def _triangular_solve(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    p = eqn.params
+    _check_size(eqn, args[0].shape[-1])
+    out = []
+    for a, b in zip(_matrices(args[0]), _matrices(args[1]), strict=True):
+        a = a.T if p["transpose_a"] else a
+        lower = p["lower"] != p["transpose_a"]
+        if not p["left_side"]:  # x a = b is a' x' = b'
+            a, b, lower = a.T, b.T, not lower
+        x = _substitute(ctx, a, b, lower, p["unit_diagonal"])
+        out.append(x if p["left_side"] else x.T)
+    return [as_elements([e for x in out for e in x.reshape(-1)], args[1].shape)]
+
+
+def _substitute(ctx: Lowering, a: Elements, b: Elements, lower: bool, unit: bool) -> Elements:
+    n, x = len(a), np.empty(b.shape, object)
+    order = list(range(n)) if lower else list(range(n))[::-1]
+    for column in range(b.shape[1]):
+        for done, i in enumerate(order):
+            rest = b[i, column]
+            for k in order[:done]:
+                rest = ctx.scalar("sub", rest, ctx.scalar("mul", a[i, k], x[k, column]))
+            x[i, column] = rest if unit else ctx.scalar("div", rest, a[i, i])
+    return x
+
+
+@rule("lu")
+def _lu(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Eliminate with the largest pivot of each column; rows are exchanged by selection."""
+    n, m = args[0].shape[-2:]
+    if n != m:
+        raise UnsupportedError("primitive 'lu' of a matrix that is not square")
+    _check_size(eqn, n)
+    zero = constant(0, eqn.outvars[0].aval.dtype)
+    factors, all_pivots, permutations = [], [], []
+    for a in _matrices(args[0]):
+        a = a.copy()
+        rows = np.array([constant(i, np.int32) for i in range(n)], object)
+        pivots = []
+        for j in range(n):
+            pivot, largest = constant(j, np.int32), ctx.scalar("abs", a[j, j])
+            for i in range(j + 1, n):
+                size = ctx.scalar("abs", a[i, j])
+                wins = ctx.scalar("gt", size, largest, dtype=bool)
+                pivot = ctx.scalar("select_n", wins, pivot, constant(i, np.int32))
+                largest = ctx.scalar("select_n", wins, largest, size)
+            pivots.append(pivot)
+            for i in range(j + 1, n):
+                here = ctx.scalar("eq", pivot, constant(i, np.int32), dtype=bool)
+                for x in (*a.T, rows):  # every column, and the list of rows
+                    x[i], x[j] = ctx.scalar("select_n", here, x[i], x[j]), ctx.scalar("select_n", here, x[j], x[i])
+            is_zero = ctx.scalar("eq", a[j, j], zero, dtype=bool)  # then the column is zero, and stays
+            divisor = ctx.scalar("select_n", is_zero, a[j, j], constant(1, a[j, j].dtype))
+            for i in range(j + 1, n):
+                a[i, j] = ctx.scalar("div", a[i, j], divisor)
+                for k in range(j + 1, n):
+                    a[i, k] = ctx.scalar("sub", a[i, k], ctx.scalar("mul", a[i, j], a[j, k]))
+        factors.append(a)
+        all_pivots.append(pivots)
+        permutations.append(rows)
+    shape = args[0].shape
+    return [
+        as_elements([x for a in factors for x in a.reshape(-1)], shape),
+        as_elements([x for pivots in all_pivots for x in pivots], shape[:-1]),
+        as_elements([x for rows in permutations for x in rows], shape[:-1]),
+    ]

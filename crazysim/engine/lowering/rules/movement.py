@@ -1,0 +1,105 @@
+"""Rules for primitives that only move elements: they are run once, on the indices of the elements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from crazysim.engine.lowering.jaxprs import Elements, Lowering, as_elements, constants, rule
+from crazysim.jaxcompat import JaxprEqn, bind
+
+MOVEMENT = (
+    "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "split", "unstack",
+    "concatenate", "stack", "pad", "tile",
+)  # fmt: skip
+
+
+@rule(*MOVEMENT)
+def _move(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    return move_many(eqn, args) if eqn.primitive.multiple_results else [move(eqn, args)]
+
+
+def move(eqn: JaxprEqn, args: list[Elements]) -> Elements:
+    """Return the result of a primitive that only moves elements."""
+    p, x = eqn.params, args[0]
+    match eqn.primitive.name:
+        case "reshape" if p.get("dimensions") is None:
+            return x.reshape(eqn.outvars[0].aval.shape)
+        case "squeeze" | "expand_dims":
+            return x.reshape(eqn.outvars[0].aval.shape)
+        case "transpose":
+            return x.transpose(p["permutation"])
+        case "slice":
+            strides = p["strides"] or (1,) * x.ndim
+            return x[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
+        case "broadcast_in_dim":
+            shape = [1] * len(p["shape"])
+            for size, axis in zip(x.shape, p["broadcast_dimensions"], strict=True):
+                shape[axis] = size
+            return np.broadcast_to(x.reshape(shape), p["shape"])
+        case "concatenate":
+            return np.concatenate(args, axis=p["dimension"])
+        case "stack":
+            return np.stack(args, axis=p["axis"])
+    return move_many(eqn, args)[0]
+
+
+def move_many(eqn: JaxprEqn, args: list[Elements], fixed: Sequence[Any] = ()) -> list[Elements]:
+    """Return the results of a primitive that only moves elements, by running it on their indices.
+
+    Args:
+        eqn: The operation.
+        args: The arrays that are moved.
+        fixed: Known indices, the operands behind them.
+    """
+    numbers, elements = [], []
+    for x in args:
+        numbers.append(np.arange(len(elements), len(elements) + x.size, dtype=np.int32).reshape(x.shape))
+        elements.extend(x.reshape(-1))
+    places = _sources(eqn, [*numbers, *fixed])
+    return [as_elements([elements[i] for i in p.reshape(-1)], p.shape) for p in places]
+
+
+def _sources(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
+    """Return, for each result, the indices of the elements that it takes; what NumPy can do needs no compilation."""
+    p, x = eqn.params, args[0]
+    match eqn.primitive.name:
+        case "split":
+            return np.split(x, np.cumsum(p["sizes"])[:-1], p["axis"])
+        case "unstack":
+            return list(np.moveaxis(x, p["axis"], 0))
+        case "rev":
+            return [np.flip(x, p["dimensions"])]
+        case "pad":
+            return [_padded(x, args[1], p["padding_config"])]
+        case "gather":
+            return run_now(eqn, args, fill_value=0)  # never used: all places are inside
+    return run_now(eqn, args)
+
+
+def _padded(x: np.ndarray, value: np.ndarray, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
+    """Return an array padded before, behind and between its elements; a negative number removes some."""
+    for axis, (low, high, interior) in enumerate(config):
+        n = x.shape[axis]
+        length = max(low + n + max(n - 1, 0) * interior + high, 0)
+        places = low + np.arange(n) * (interior + 1)
+        inside = (places >= 0) & (places < length)
+        padded = np.full((length, *np.delete(x.shape, axis)), value)
+        padded[places[inside]] = np.moveaxis(x, axis, 0)[inside]
+        x = np.moveaxis(padded, 0, axis)
+    return x
+
+
+def run_now(eqn: JaxprEqn, args: Sequence[Any], **params: Any) -> list[np.ndarray]:
+    """Return the results of an operation on known numbers."""
+    with jax.ensure_compile_time_eval(), jax.default_device(jax.local_devices(backend="cpu")[0]):
+        return [np.asarray(x) for x in bind(eqn, *(jax.numpy.asarray(x) for x in args), **params)]
+
+
+@rule("iota", "iota_2x32_shape")
+def _iota(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    outs = run_now(eqn, [])
+    return [constants(x, x.dtype) for x in outs]

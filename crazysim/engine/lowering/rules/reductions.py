@@ -1,0 +1,192 @@
+"""Rules for reductions, unrolled: sums, scans, sorts and products of arrays."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from crazysim.engine.ir.blocks import Element, constant
+from crazysim.engine.lowering.jaxprs import (
+    MAX_UNROLL,
+    Elements,
+    Lowering,
+    UnsupportedError,
+    as_elements,
+    constants,
+    rule,
+)
+from crazysim.engine.lowering.rules.movement import run_now
+from crazysim.jaxcompat import JaxprEqn
+
+COMBINE = {
+    "reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min",
+    "reduce_and": "and", "reduce_or": "or", "reduce_xor": "xor",
+}  # fmt: skip
+
+
+@rule(*COMBINE)
+def _reduce(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    op, dtype, axes = COMBINE[eqn.primitive.name], eqn.outvars[0].aval.dtype, eqn.params["axes"]
+    x = np.moveaxis(args[0], axes, range(len(axes)))
+    rest = x.shape[len(axes) :]
+    rows = list(x.reshape(math.prod(x.shape[: len(axes)]), *rest))
+    if not rows:
+        return [constants(run_now(eqn, [np.zeros(args[0].shape, dtype)])[0], dtype)]
+    return [
+        functools.reduce(lambda a, b: ctx.elementwise(op, [a, b], dtype), [np.asarray(row, object) for row in rows])
+    ]
+
+
+@rule("reduce")
+def _reduce_by(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Reduce by a function of accumulated and new operands, beginning with initial values."""
+    axes, n = eqn.params["dimensions"], len(args) // 2
+    arrays = [np.moveaxis(x, axes, range(len(axes))) for x in args[:n]]
+    rest = arrays[0].shape[len(axes) :]
+    rows = [x.reshape(math.prod(x.shape[: len(axes)]), *rest) for x in arrays]
+    results = [np.empty(rest, object) for _ in arrays]
+    for place in np.ndindex(rest):
+        reduced = args[n:]
+        for k in range(len(rows[0])):
+            reduced = ctx.lower(eqn.params["jaxpr"], [*reduced, *(x[(k, *place, ...)] for x in rows)])
+        for result, value in zip(results, reduced, strict=True):
+            result[place] = value[()]
+    return results
+
+
+@rule("cumsum", "cumprod", "cummax", "cummin")
+def _cumulate(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    op = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}[eqn.primitive.name]
+    x = np.moveaxis(args[0], eqn.params["axis"], 0).copy()
+    order = range(len(x))[::-1] if eqn.params["reverse"] else range(len(x))
+    for last, i in itertools.pairwise(order):
+        x[i, ...] = ctx.elementwise(op, [x[last, ...], x[i, ...]], eqn.outvars[0].aval.dtype)
+    return [np.moveaxis(x, 0, eqn.params["axis"])]
+
+
+@rule("argmax", "argmin")
+def _argmax(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Return the index of the first extreme element, or of the first NaN, as XLA does."""
+    (axis,), index = eqn.params["axes"], eqn.params["index_dtype"]
+    better = "gt" if eqn.primitive.name == "argmax" else "lt"
+    rows = [np.asarray(row, object) for row in np.moveaxis(args[0], axis, 0)]
+    best, where = rows[0], np.broadcast_to(constants(0, index), rows[0].shape)
+    for i, row in enumerate(rows[1:], 1):
+        best_is_number = ctx.elementwise("eq", [best, best], bool)
+        wins = ctx.elementwise(
+            "or", [ctx.elementwise(better, [row, best], bool), ctx.elementwise("ne", [row, row], bool)], bool
+        )
+        wins = ctx.elementwise("and", [wins, best_is_number], bool)
+        best = ctx.elementwise("select_n", [wins, best, row], eqn.invars[0].aval.dtype)
+        where = ctx.elementwise("select_n", [wins, where, constants(i, index)], index)
+    return [where]
+
+
+@rule("sort")
+def _sort(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    return _sorted(ctx, eqn, args, eqn.params["dimension"], eqn.params["num_keys"])
+
+
+@rule("top_k")
+def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Return the largest in descending order, of equal ones the first.
+
+    XLA orders floats by their bits: -NaN, -inf, ..., -0, 0, ..., inf, NaN.
+    """
+    (x,), k, axis, dtype = args, eqn.params["k"], eqn.params["axis"], eqn.invars[0].aval.dtype
+    numbers = np.arange(x.shape[axis]).reshape([-1 if i == axis else 1 for i in range(x.ndim)])
+    places = constants(np.broadcast_to(numbers, x.shape), np.int32)
+    key = x
+    if dtype.kind == "f":  # the bits are in order but for negative numbers, of which the larger have the larger bits
+        ctx.builder.barrier()  # the sign of a NaN that XLA computes again, for another exchange, may be another
+        whole = np.dtype(f"i{dtype.itemsize}")
+        key = ctx.elementwise("bitcast_convert_type", [x], whole)
+        turned = ctx.elementwise("xor", [key, constants(np.iinfo(whole).max, whole)], whole)
+        negative = ctx.elementwise("lt", [key, constants(0, whole)], bool)
+        key = ctx.elementwise("select_n", [negative, key, turned], whole)
+    columns = _sorted(ctx, eqn, [key, x, places], axis, 1, descending=True)
+    return [np.take(y, range(k), axis) for y in columns[1:]]
+
+
+def _sorted(
+    ctx: Lowering, eqn: JaxprEqn, args: list[Elements], axis: int, n_keys: int, descending: bool = False
+) -> list[Elements]:
+    """Sort by odd-even transposition: it only exchanges neighbours, so it is stable. NaN goes last.
+
+    Args:
+        ctx: Lowering that takes the operations.
+        eqn: Equation, for messages.
+        args: Keys, then the other operands, which are permuted with them.
+        axis: Axis to sort along.
+        n_keys: Number of operands that are keys.
+        descending: True to sort the largest first; the keys must then contain no NaN.
+    """
+    columns = [np.moveaxis(x, axis, 0).copy() for x in args]
+    n = len(columns[0])
+    if n > MAX_UNROLL:
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of {n} elements; at most {MAX_UNROLL} are unrolled")
+    for turn in range(n):
+        for i in range(turn % 2, n - 1, 2):
+            first = [c[i, ...].copy() for c in columns]
+            second = [c[i + 1, ...].copy() for c in columns]
+            low, high = (first, second) if descending else (second, first)
+            swap = _precedes(ctx, low[:n_keys], high[:n_keys]) if first[0].size else constants(False, bool)
+            for c, a, b in zip(columns, first, second, strict=True):
+                if a.size:
+                    dtype = a.reshape(-1)[0].dtype
+                    c[i, ...] = ctx.elementwise("select_n", [swap, a, b], dtype)
+                    c[i + 1, ...] = ctx.elementwise("select_n", [swap, b, a], dtype)
+    return [np.moveaxis(c, 0, axis) for c in columns]
+
+
+def _precedes(ctx: Lowering, first: Sequence[Elements], second: Sequence[Elements]) -> Elements:
+    """Return where the first of two sets of keys precedes the second in ascending order, in which NaN is last."""
+    before, tied = constants(False, bool), constants(True, bool)
+    for a, b in zip(first, second, strict=True):
+        less, equal = ctx.elementwise("lt", [a, b], bool), ctx.elementwise("eq", [a, b], bool)
+        if a.reshape(-1)[0].dtype.kind == "f":
+            a_nan, b_nan = ctx.elementwise("ne", [a, a], bool), ctx.elementwise("ne", [b, b], bool)
+            only_b = ctx.elementwise("and", [b_nan, ctx.elementwise("not", [a_nan], bool)], bool)
+            less = ctx.elementwise("or", [less, only_b], bool)
+            equal = ctx.elementwise("or", [equal, ctx.elementwise("and", [a_nan, b_nan], bool)], bool)
+        before = ctx.elementwise("or", [before, ctx.elementwise("and", [tied, less], bool)], bool)
+        tied = ctx.elementwise("and", [tied, equal], bool)
+    return before
+
+
+@rule("dot_general")
+def _dot(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    (lhs_axes, rhs_axes), (lhs_batch, rhs_batch) = eqn.params["dimension_numbers"]
+    dtype, (a, b) = eqn.outvars[0].aval.dtype, args
+    if any(v.aval.dtype.kind == "f" for v in eqn.invars) and dtype.kind != "f":
+        raise UnsupportedError(f"primitive 'dot_general' of floating-point numbers with a result of type {dtype}")
+
+    def arranged(x: Elements, batch: Sequence[int], summed: Sequence[int]) -> tuple[Elements, tuple[int, ...]]:
+        free = [i for i in range(x.ndim) if i not in (*batch, *summed)]
+        sizes = tuple(x.shape[i] for i in free)
+        x = x.transpose(*batch, *free, *summed)
+        n_batch, n_free = int(np.prod(x.shape[: len(batch)])), int(np.prod(sizes))
+        return x.reshape(n_batch, n_free, -1), sizes
+
+    batch = tuple(a.shape[i] for i in lhs_batch)
+    a, a_sizes = arranged(a, lhs_batch, lhs_axes)
+    b, b_sizes = arranged(b, rhs_batch, rhs_axes)
+    times, plus = ("and", "or") if dtype.kind == "b" else ("mul", "add")
+    out = []
+    for n in range(a.shape[0]):
+        for row in a[n]:
+            for column in b[n]:
+                terms = [
+                    ctx.scalar(times, *(_cast(ctx, x, dtype) for x in pair)) for pair in zip(row, column, strict=True)
+                ]
+                out.append(functools.reduce(lambda s, t: ctx.scalar(plus, s, t), terms, constant(0, dtype)))
+    return [as_elements(out, (*batch, *a_sizes, *b_sizes))]
+
+
+def _cast(ctx: Lowering, x: Element, dtype: DTypeLike) -> Element:
+    return ctx.builder.add("convert_element_type", (x,), dtype)

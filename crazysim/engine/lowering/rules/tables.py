@@ -1,0 +1,108 @@
+"""Tables: arrays that all drones share, or constants, read at computed places from memory instead of selected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from crazysim.engine.ir.blocks import Element, Numbers, Value, constant, is_constant
+from crazysim.engine.lowering.jaxprs import MAX_UNROLL, Elements, Entry, Lowering, as_elements
+
+MAX_SELECTED = 4
+"""Most places from which an entry of a shared array is selected: its numbers are in registers already."""
+MAX_SELECTED_CONSTANTS = 8
+"""The same for constants, which are parts of instructions."""
+
+ZERO = constant(0, np.int32)
+
+
+class Table:
+    """An array whose elements are entries of a table in memory, each at a computed base plus a constant offset."""
+
+    def __init__(self, ctx: Lowering, entry: Entry, offsets: np.ndarray, strides: dict[int, int]):
+        """Describe where the elements stand.
+
+        Args:
+            ctx: The lowering.
+            entry: First element, with its table and base.
+            offsets: Index of each element in the table, less the base.
+            strides: Growth of the index along each axis that is indexed.
+        """
+        self.ctx, self.table, self.base, self.offsets, self.strides = ctx, entry.table, entry.base, offsets, strides
+        self.aligned = entry.aligned and all(stride % 4 == 0 for stride in strides.values())
+        self.same: dict[int, Element] = {}
+        """Constants that are equal along the indexed axes, by the offset of the first; they are not looked up."""
+
+    def base_at(self, index: Sequence[Element], limits: Sequence[int]) -> Element:
+        """Return the base of the elements at an index along the axes, each clamped to 0 and its limit."""
+        base = self.base
+        for i, limit, stride in zip(index, limits, self.strides.values(), strict=True):
+            if limit == 0:
+                continue
+            largest = constant(min(limit, np.iinfo(i.dtype).max), i.dtype)
+            clamped = self.ctx.scalar("clamp", constant(0, i.dtype), i, largest)
+            place = self.ctx.scalar("convert_element_type", clamped, dtype=np.int32)
+            step = self.ctx.scalar("mul", place, constant(stride, np.int32))
+            base = self.ctx.scalar("add", base, step)
+        return base
+
+    def look_up(self, offsets: np.ndarray, bases: Sequence[Element]) -> Elements:
+        """Return the entries with these offsets, each from its base."""
+        flat = [int(k) for k in offsets.reshape(-1)]
+        found = [
+            self.same[k] if k in self.same else self.ctx.lookup(self.table, base, k, self.aligned)
+            for k, base in zip(flat, bases, strict=True)
+        ]
+        return as_elements(found, offsets.shape)
+
+
+def find(ctx: Lowering, x: Elements, axes: Sequence[int], n_places: int) -> Table | None:
+    """Return an array as a table in which an index along some axes moves all entries alike, or None.
+
+    Args:
+        ctx: The lowering.
+        x: The array.
+        axes: The axes along which it is indexed.
+        n_places: Number of places that an index may mean.
+    """
+    items = x.reshape(-1)
+    if not len(items) or isinstance(items[0], tuple):
+        return None
+    if all(map(is_constant, items)):
+        return _of_constants(ctx, x, axes) if n_places > MAX_SELECTED_CONSTANTS else None
+    places = [ctx.entries.get(item) if isinstance(item, Value) else None for item in items]
+    first = places[0]
+    if first is None or not all(p is not None and p.table is first.table and p.base is first.base for p in places):
+        return None
+    if n_places <= MAX_SELECTED and first.table.size <= MAX_UNROLL:
+        return None
+    offsets = np.array([p.offset for p in places if p is not None]).reshape(x.shape)
+    strides = _strides(offsets, axes)
+    return None if strides is None else Table(ctx, first, offsets, strides)
+
+
+def _of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> Table | None:
+    """Return an array of constants as a table; those that are the same at all places stay constants."""
+    numbers = np.array([item.item() for item in x.reshape(-1)], x.reshape(-1)[0].dtype)
+    if not np.all(np.isfinite(numbers)):
+        return None
+    offsets = np.arange(x.size).reshape(x.shape)
+    (value,) = ctx.builder.add_many("table", (), (numbers.dtype,), (("numbers", Numbers(numbers)),))
+    table = Table(ctx, Entry(value, ZERO, 0), offsets, _strides(offsets, axes) or {})
+    first = tuple([slice(0, 1) if axis in axes else slice(None) for axis in range(x.ndim)])
+    bits = numbers.view(f"u{numbers.itemsize}").reshape(x.shape)
+    same = np.all(bits == bits[first], tuple(axes), keepdims=True)
+    table.same = {int(k): x.reshape(-1)[k] for k in offsets[first][same]}
+    return table
+
+
+def _strides(offsets: np.ndarray, axes: Sequence[int]) -> dict[int, int] | None:
+    """Return by how much an offset grows along each axis, or None where it does not do so evenly."""
+    strides = {}
+    for axis in axes:
+        steps = np.diff(offsets, axis=axis)
+        strides[axis] = int(steps.reshape(-1)[0]) if steps.size else 0
+        if np.any(steps != strides[axis]):
+            return None
+    return strides

@@ -1,0 +1,199 @@
+"""From the stages of a pipeline to a program: a segment for each."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
+from crazysim.core.others import reduce_over_others_p
+from crazysim.core.stage import Axes, Stage
+from crazysim.engine.errors import LimitError, UnsupportedError
+from crazysim.engine.ir.blocks import Builder, Element, Value, constant, prune
+from crazysim.engine.ir.program import TABLE, Leaf, Phase, Program, Segment, Slot, UnfusedStage, Zeros
+from crazysim.engine.lowering.jaxprs import Elements, Entry, Lowering, as_elements, inputs, scalars
+from crazysim.engine.lowering.relative import RelativeAxes, viewed
+from crazysim.engine.lowering.tracing import TracedStage, Tracer
+from crazysim.jaxcompat import equations, is_key
+
+MAX_UNROLLED_DRONES = 8
+"""Most drones of a world for which a stage of one world is lowered; its block grows with their square."""
+
+
+def lower_stages(
+    stages: Sequence[Stage],
+    data: Any,
+    zeros: Zeros = (),
+    watched: Callable[[Any], list[Any]] | None = None,
+    first: Sequence[Stage] = (),
+    last: Sequence[Stage] = (),
+    scratch: Collection[int] = (),
+    population: str = "drone",
+    tracer: Tracer | None = None,
+) -> Program:
+    """Return the program of a step, each stage a segment of its own.
+
+    A stage that cannot be lowered becomes an ``UnfusedStage``, which says why.
+
+    Args:
+        stages: Stages of a step, in order.
+        data: Data of the simulation, or its shapes and types.
+        zeros: Leaves with the elements that are known to be zero: their terms are left out.
+        watched: Picks the leaves that are checked for NaN and infinity after the last step; called with a tree of the
+            structure of the data.
+        first: Stages that run once, before the first step.
+        last: Stages that run once, after the last step.
+        scratch: Leaves that only carry numbers from one stage to another; what is written there is not kept.
+        population: Population whose members are computed side by side; below they are called drones.
+        tracer: Cache of traced stages; None for a new one.
+    """
+    tracer = tracer or Tracer()
+    axes = RelativeAxes(data, population)
+    leaves = viewed(axes.views, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(data)])
+    known = dict(zeros)
+    n_drones = next(x.shape[1] for x, scope in zip(leaves, axes.scopes, strict=True) if scope == "drone")
+    segments = []
+    phases: dict[Phase, Sequence[Stage]] = {"first": first, "each": stages, "last": last}
+    for phase, some in phases.items():
+        segments += [_lower_stage(axes.stage(stage), phase, axes, leaves, known, n_drones, tracer) for stage in some]
+    described = tuple([
+        Leaf(name, scope, tuple(x.shape), x.dtype)
+        for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
+    ])  # fmt: skip
+    program = Program(described, n_drones, tuple(segments), None, frozenset(scratch), (), population, axes.views)
+    if watched is None:
+        return program
+    own = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
+    checked = sorted((own | axes.views & set(program.written)) & set(watched(axes.numbers)))
+    core = axes.numbers.core
+    return dataclasses.replace(program, check=_finite_check(axes, leaves, core.nonfinite, core.steps, checked))
+
+
+def _lower_stage(
+    stage: Stage,
+    phase: Phase,
+    axes: RelativeAxes,
+    leaves: Sequence[Any],
+    zeros: Mapping[int, frozenset[int]],
+    n_drones: int,
+    tracer: Tracer,
+) -> Segment | UnfusedStage:
+    try:
+        if stage.scope == "batch":
+            raise LimitError("it is not declared for one drone or one world")
+        traced = tracer(stage, axes, leaves)
+        # Where no leaf of a drone takes part, every drone can do it for its world.
+        of_drones = any(axes.scopes[i] == "drone" for i in (*traced.used, *traced.written))
+        scope: Literal["drone", "world"] = "world" if stage.scope == "world" and of_drones else "drone"
+        if scope == "world" and n_drones > MAX_UNROLLED_DRONES:
+            raise LimitError(f"a stage of one world is unrolled for at most {MAX_UNROLLED_DRONES} drones")
+        others = [leaves[i].shape[2] for i in (*traced.used, *traced.written) if i in axes.views]
+        if max(others, default=0) > MAX_UNROLLED_DRONES:
+            raise LimitError(f"other populations are unrolled for at most {MAX_UNROLLED_DRONES} members")
+        shared = [i for i in traced.used if axes.scopes[i] == "shared" and not is_key(traced.avals[i])]
+        known = {i: zeros[i] for i in traced.used if i in zeros}
+        n_members = n_drones if scope == "drone" else 0
+        key = (stage.__name__, scope, phase, n_members, frozenset(known.items()))
+        if key not in traced.segments:
+            traced.segments[key] = _segment(stage, scope, phase, traced, known, shared, n_members)
+        return traced.segments[key]
+    except UnsupportedError as error:
+        traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)
+        traced.dump(stage.__name__)
+        why = error.located(stage=stage.__name__)
+        return UnfusedStage(stage.__name__, phase, traced.fn, tuple(traced.used), tuple(traced.written), why)
+
+
+def _segment(
+    stage: Stage,
+    scope: Literal["drone", "world"],
+    phase: Phase,
+    traced: TracedStage,
+    zeros: Mapping[int, frozenset[int]],
+    shared: Sequence[int],
+    n_members: int,
+) -> Segment:
+    lowering = Lowering(Builder(stage=stage.__name__), n_members=n_members)
+    before = {i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.used}
+    tables = {_table(lowering, before[i]): (i, TABLE) for i in shared if i in before and before[i].size > 1}
+    lowering.shared.update(x for i in shared for x in scalars(before[i]) if isinstance(x, Value))
+    args = [before[i] for i in traced.used]
+    if traced.when is None:
+        after = lowering.lower(traced.fn, args)
+    else:
+        mask = lowering.lower(traced.when, args)[0][()]
+        for i in traced.written:
+            if i not in before:
+                before[i] = inputs(lowering.builder, traced.avals[i])
+        after = _guarded(lowering, mask, traced, args, [before[i] for i in traced.written])
+    writes: dict[Slot, Element] = {}
+    for i, new in zip(traced.written, after, strict=True):
+        old = scalars(before[i]) if i in before else [None] * len(scalars(new))
+        writes.update({(i, k): b for k, (a, b) in enumerate(zip(old, scalars(new), strict=True)) if a is not b})
+    slots = {x: (i, k) for i, elements in before.items() for k, x in enumerate(scalars(elements))} | tables
+    block = prune(lowering.builder.finish(tuple(writes.values())), keep_inputs=False)
+    return Segment(scope, (stage.__name__,), phase, block, tuple([slots[x] for x in block.inputs]), tuple(writes))
+
+
+def _table(lowering: Lowering, elements: Elements) -> Value:
+    """Return a table of the numbers of a shared array, which can also be looked up there."""
+    items = elements.reshape(-1)
+    table = lowering.builder.input(items[0].dtype, len(items))
+    zero = constant(0, np.int32)
+    lowering.entries.update((x, Entry(table, zero, k)) for k, x in enumerate(items) if isinstance(x, Value))
+    return table
+
+
+def _guarded(
+    lowering: Lowering, mask: Element, traced: TracedStage, args: list[Elements], old: list[Elements]
+) -> list[Elements]:
+    """Return what the written leaves become of a stage that acts where a mask is true.
+
+    Drones whose stages act at different steps still publish values for each other, so that such a stage is computed
+    at every step, and selected.
+    """
+    together = any(eqn.primitive is reduce_over_others_p for eqn in equations(traced.fn))
+    inner = lowering if together else lowering.inner()
+    new = inner.lower(traced.fn, args)
+    pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(scalars(x), scalars(y), strict=True)]
+    if together:
+        results = iter([a if a is b else lowering.scalar("select_n", mask, a, b) for a, b in pairs])
+        return [_with_scalars(x, [next(results) for _ in scalars(x)]) for x in old]
+    changed = [(a, b) for a, b in pairs if a is not b]
+    block = inner.builder.finish([b for _, b in changed])
+    before = [a for a, _ in changed]
+    results = iter(lowering.builder.add_many("when", (mask, *before), [a.dtype for a in before], (), (block,)))
+    flat = iter([a if a is b else next(results) for a, b in pairs])
+    return [_with_scalars(x, [next(flat) for _ in scalars(x)]) for x in old]
+
+
+def _with_scalars(like: Elements, items: Sequence[Element]) -> Elements:
+    """Return elements of the same shape; of a key, two integers."""
+    row = iter(items)
+    pairs = [(next(row), next(row)) if isinstance(x, tuple) else next(row) for x in like.reshape(-1)]
+    return as_elements(pairs, like.shape)
+
+
+def _finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watched: Sequence[int]) -> Segment:
+    """Return a segment that flags a drone: its world was flagged, or a watched number is not finite.
+
+    Or the world has taken more than ``MAX_STEPS``: as a call takes at most that many, its count is then negative.
+    """
+    builder = Builder(stage="finite_check")
+    reads: list[Slot] = []
+    finite: Element = constant(True, bool)
+    avals = axes.shapes_of_one(list(leaves), "drone")
+    for i in watched:
+        if avals[i].dtype.kind == "f":
+            for k, item in enumerate(scalars(inputs(builder, avals[i]))):
+                reads.append((i, k))
+                finite = builder.add("and", (finite, builder.add("is_finite", (item,), bool)), bool)
+    reads += [(steps, 0), (flag, 0)]
+    too_long = builder.add("lt", (builder.input(avals[steps].dtype), constant(0, avals[steps].dtype)), bool)
+    bad = builder.add("or", (too_long, builder.add("not", (finite,), bool)), bool)
+    flagged = builder.add("or", (builder.input(bool), bad), bool)
+    return Segment("drone", ("finite_check",), "last", builder.finish([flagged]), tuple(reads), ())

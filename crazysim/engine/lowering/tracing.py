@@ -1,0 +1,103 @@
+"""Stages as jaxprs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+
+from crazysim import jaxcompat
+from crazysim.core.stage import Axes, Stage
+from crazysim.engine.ir import dump
+
+
+class TracedStage:
+    """A stage as jaxprs on flat lists of leaves: its function, and its condition if it has one."""
+
+    def __init__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]):
+        """Trace a stage for the one drone, the one world or the batch that it is declared for.
+
+        Args:
+            stage: The stage.
+            axes: Batch axes of the leaves.
+            leaves: Leaves of all worlds, or their shapes and types.
+        """
+        self.avals = axes.shapes_of_one(list(leaves), stage.scope)
+        """Shapes and types of all leaves, as the stage receives them."""
+        self.written: list[int] = []
+        """Leaves that it writes: the outputs of ``fn``."""
+
+        def apply(values: list[Any]) -> list[Any]:
+            after = stage.fn(axes.treedef.unflatten(values))
+            self.written = axes.written(values, after, stage)
+            new = jax.tree.leaves(after)
+            return [new[i] for i in self.written]
+
+        def condition(values: list[Any]) -> list[Any]:
+            mask = stage.when(axes.treedef.unflatten(values)) if stage.when is not None else None
+            return [] if mask is None else [mask]
+
+        fn = jax.make_jaxpr(apply)(self.avals)
+        when = jax.make_jaxpr(condition)(self.avals) if stage.when is not None else None
+        if when is not None and not when.jaxpr.outvars:  # it acts at every step
+            when = None
+        used = _used(fn) | (_used(when) if when is not None else set())
+        self.used = sorted(used)
+        """Leaves that it reads: the inputs of ``fn`` and ``when``."""
+        self.fn = jaxcompat.with_inputs(fn, self.used)
+        self.when = jaxcompat.with_inputs(when, self.used) if when is not None else None
+        self.segments: dict[Any, Any] = {}
+        """Segments that it was lowered to, by what they depend on besides."""
+
+    def dump(self, name: str) -> None:
+        """Write the jaxprs to the folder of dumps, if there is one."""
+        if dump.enabled():
+            dump.write(f"{name}.jaxpr", f"{self.fn}\n" + (f"\nwhen\n{self.when}\n" if self.when else ""))
+
+
+class Tracer:
+    """Cache of traced stages: each is traced once for leaves of the same shapes and types."""
+
+    def __init__(self) -> None:
+        """Begin with an empty cache."""
+        self._found: dict[Any, tuple[Stage, TracedStage]] = {}  # the stage keeps its functions, whose ids are keys
+
+    def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:
+        """Return ``TracedStage(stage, axes, leaves)``, traced now or before."""
+        shapes = tuple([(x.shape, x.dtype) for x in axes.shapes_of_one(list(leaves), stage.scope)])
+        key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
+        if key not in self._found:
+            if stage.fixed:
+                traced = _traced_once(stage, axes, leaves, shapes)
+            else:
+                traced = TracedStage(stage, axes, leaves)
+            traced.dump(stage.__name__)
+            self._found[key] = stage, traced
+        return self._found[key][1]
+
+
+_FIXED: dict[Any, TracedStage] = {}
+"""Traced stages that always do the same, for all simulations of this process."""
+MAX_FIXED = 256
+"""Largest number of them."""
+
+
+def _traced_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
+    """Return a fixed stage, traced now or before in this process. It must not read the numbers of worlds and drones."""
+    data = axes.treedef.unflatten(leaves)
+    kind = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))
+    key = (stage.fn, stage.when, kind, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)
+    traced = _FIXED.get(key)
+    if traced is None:
+        traced = _FIXED[key] = TracedStage(stage, axes, leaves)
+        for oldest in list(_FIXED)[:-MAX_FIXED]:
+            _FIXED.pop(oldest, None)
+    return traced
+
+
+def _used(jaxpr: jaxcompat.ClosedJaxpr) -> set[int]:
+    inner = jaxpr.jaxpr
+    used = {v for eqn in inner.eqns for v in eqn.invars if not isinstance(v, jaxcompat.Literal)}
+    used |= {v for v in inner.outvars if not isinstance(v, jaxcompat.Literal)}
+    return {i for i, v in enumerate(inner.invars) if v in used}

@@ -1,0 +1,49 @@
+"""The passes that make of a lowered program the one that a backend runs, in order."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Iterable
+
+from crazysim.engine.ir import dump, listing
+from crazysim.engine.ir.program import Program
+from crazysim.engine.ir.verify import verify
+from crazysim.engine.passes.layout import as_rows, pack_shared
+from crazysim.engine.passes.schedule import fuse, hoist, join_ticks
+
+Pass = Callable[[Program], Program]
+
+VERIFY = "CRAZYSIM_VERIFY"
+"""Environment variable that, set to 1, has every program verified after every pass."""
+
+
+def optimise(program: Program, rows: Callable[[list[int]], list[int]] | None = None, pack: bool = True) -> Program:
+    """Return a lowered program after all passes, ready for a backend.
+
+    Args:
+        program: The program, from ``lower_stages``.
+        rows: From the leaves that are written to those that are stored as rows of one number of all drones each.
+        pack: True to read shared numbers from one leaf.
+    """
+    passes: list[Pass] = [fuse, join_ticks, hoist, *([pack_shared] if pack else [])]
+    if rows is not None:
+        stored = functools.partial(as_rows, select=rows)
+        passes.append(functools.update_wrapper(stored, as_rows))
+    return apply(program, passes)
+
+
+def apply(program: Program, passes: Iterable[Pass]) -> Program:
+    """Return a program after some passes, verified and dumped after each where the environment variables say so."""
+    _inspect(program, "lowered")
+    for one in passes:
+        program = one(program)
+        _inspect(program, getattr(one, "__name__", "pass"))
+    return program
+
+
+def _inspect(program: Program, name: str) -> None:
+    if os.environ.get(VERIFY) == "1":
+        verify(program)
+    if dump.enabled():
+        dump.write(f"program.{name}", listing.list_program(program))

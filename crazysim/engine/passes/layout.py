@@ -1,0 +1,76 @@
+"""Passes that change where the numbers of a program are stored."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from crazysim.engine.ir.program import PACKED, Leaf, Program, Segment, Slot
+from crazysim.jaxcompat import is_key
+
+
+def pack_shared(program: Program) -> Program:
+    """Read the numbers that all drones share from one leaf, behind the others, in which they follow each other.
+
+    A call of a compiled step costs by the number of its arrays. A leaf that an unfused stage reads, or that is
+    a table, stays one.
+    """
+    leaves = program.leaves
+    direct = {leaf for stage in program.unfused_stages for leaf in stage.used} | program.tables
+    shared = [i for i in program.read if leaves[i].scope == "shared" and i not in direct and i not in program.written]
+    shared = [i for i in shared if leaves[i].dtype == leaves[0].dtype]
+    if not shared:
+        return program
+    starts, size = {}, 0
+    for i in shared:
+        starts[i] = size
+        size += leaves[i].size
+    packed = Leaf(PACKED, "shared", (size,), leaves[0].dtype)
+    moved = _moved(program, lambda slot: (len(leaves), starts[slot[0]] + slot[1]) if slot[0] in starts else slot)
+    return dataclasses.replace(moved, leaves=(*leaves, packed), packed=tuple(shared))
+
+
+def as_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Program:
+    """Store leaves of drones and worlds as rows of one leaf for each type, behind the others.
+
+    A row is one number of all drones, which follow each other there as a kernel's lanes do.
+
+    Args:
+        program: The program.
+        select: From the leaves that are written to those that become rows; random keys stay as they are.
+    """
+    leaves = list(program.leaves)
+    chosen = [i for i in sorted(select(program.written)) if not is_key(leaves[i])]
+    # The only drone of a world is all that the world has.
+    kinds = {i: ("drone" if program.n_drones == 1 else leaves[i].scope, leaves[i].dtype) for i in chosen}
+    places: dict[int, tuple[int, int, int]] = {}
+    for kind in dict.fromkeys(kinds.values()):
+        members = tuple([i for i in chosen if kinds[i] == kind])
+        n_rows = sum(leaves[i].size for i in members)
+        first = 0
+        for i in members:
+            places[i] = (len(leaves), first, n_rows)
+            first += leaves[i].size
+        n_lanes = leaves[members[0]].shape[0] * program.n_drones
+        leaves.append(Leaf("rows", kind[0], (n_rows, n_lanes), kind[1], members))
+
+    def move(slot: Slot) -> Slot:
+        leaf, k = slot
+        if leaf not in places:
+            return slot
+        new, first, n_rows = places[leaf]
+        drone, k = divmod(k, program.leaves[leaf].size)
+        return new, drone * n_rows + first + k
+
+    return dataclasses.replace(_moved(program, move), leaves=tuple(leaves))
+
+
+def _moved(program: Program, move: Callable[[Slot], Slot]) -> Program:
+    """Return a program whose numbers are elsewhere."""
+
+    def segment(s: Segment) -> Segment:
+        reads, writes, hoisted = ([move(slot) for slot in x] for x in (s.reads, s.writes, s.hoisted_reads))
+        return dataclasses.replace(s, reads=tuple(reads), writes=tuple(writes), hoisted_reads=tuple(hoisted))
+
+    segments = tuple([segment(s) if isinstance(s, Segment) else s for s in program.segments])
+    return dataclasses.replace(program, segments=segments, check=program.check and segment(program.check))

@@ -1,5 +1,0 @@
-"""Meaning of each JAX primitive on scalars; importing this package fills the table of rules in ``lower``."""
-
-from crazysim.engine.rules import control_flow, elementwise, indexing, linalg, movement, others, random, reductions
-
-__all__ = ["control_flow", "elementwise", "indexing", "linalg", "movement", "others", "random", "reductions"]

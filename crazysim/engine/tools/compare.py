@@ -1,0 +1,163 @@
+"""The first place at which two engines differ.
+
+``first_difference(sim.step_pipeline, sim.data, engines=("plain", "fused"))`` finds the stage, the field and the world,
+and between engines that run programs the operation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from crazysim.core.sharding import Location
+from crazysim.core.stage import Axes, as_stages
+from crazysim.engine.backends import Build, fused, interpret, lanes
+from crazysim.engine.ir import listing
+from crazysim.engine.ir.blocks import Block, Operation, Value
+from crazysim.engine.ir.program import Leaf, Program
+from crazysim.engine.lowering.stages import lower_stages
+from crazysim.engine.passes.schedule import fuse
+
+TOLERANCE = 1e-5
+"""Largest difference that passes for rounding, relative to the largest component of a drone's vector."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """A difference between two engines."""
+
+    stage: str
+    """First stage after which the engines differ."""
+    leaf: str
+    """Field that the stage wrote."""
+    index: tuple[int, ...]
+    """Index of the element that differs most."""
+    values: tuple[Any, Any]
+    """That element, from the first engine and from the second."""
+    engines: tuple[str, str]
+    """Names of the engines."""
+    operation: str = ""
+    """First operation of the stage whose result is not the interpreter's; empty if none, or if neither engine runs
+    operations of a program."""
+
+    def __str__(self) -> str:
+        """Return a sentence."""
+        (a, b), (x, y) = self.engines, self.values
+        where = f"{self.leaf}{list(self.index)}"
+        text = f"stage {self.stage!r}: {where} is {x} by {a!r} and {y} by {b!r}"
+        return f"{text}; first at {self.operation}" if self.operation else text
+
+
+def first_difference(
+    pipeline: Mapping[str, Callable[..., Any]],
+    data: Any,
+    engines: tuple[str, str] = ("plain", "fused"),
+    tolerance: float = TOLERANCE,
+) -> Difference | None:
+    """Return the first difference between two engines in one step, or None.
+
+    Both run each stage from the same data, that of the first engine before it: a difference is of that stage alone.
+    Between engines of programs the stage is then run with every value as a result, to find the operation.
+
+    Args:
+        pipeline: Stages of a step.
+        data: Data to begin from.
+        engines: Two of ``ENGINES``.
+        tolerance: Largest difference that passes for rounding, relative to the largest component of a vector. NaN is
+            equal to NaN.
+    """
+    from crazysim.engine.step import Step
+
+    axes = Axes(data)
+    for name, stage in pipeline.items():
+        after = [Step({name: stage}, engine)(data, jnp.int32(1)) for engine in engines]
+        for i, (x, y) in enumerate(zip(*map(jax.tree.leaves, after), strict=True)):
+            index = _differs(x, y, tolerance)
+            if index is not None:
+                values = (np.asarray(x)[index], np.asarray(y)[index])
+                operation = _operation(pipeline[name], name, data, engines, tolerance)
+                return Difference(name, axes.names[i], index, values, engines, operation)
+        data = after[0]
+    return None
+
+
+def _differs(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | None:
+    """Return the index at which arrays differ most, or None if nowhere beyond the tolerance."""
+    if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+        x, y = jax.random.key_data(x), jax.random.key_data(y)
+    x, y = np.asarray(x), np.asarray(y)
+    if x.dtype.kind != "f":
+        wrong = np.asarray(x != y, float)
+    else:
+        finite = np.where(np.isfinite(x), np.abs(x), 0)
+        size = finite.max(axis=-1, keepdims=True) if x.ndim > 2 else finite
+        with np.errstate(all="ignore"):
+            apart = np.abs(x.astype(np.float64) - y) / np.maximum(size, np.finfo(x.dtype).tiny)
+        same = (x == y) | (np.isnan(x) & np.isnan(y))
+        wrong = np.where(same, 0.0, np.where(np.isnan(apart), np.inf, apart)) > tolerance
+        wrong = np.where(wrong, np.where(np.isfinite(apart), apart, np.inf), 0.0)
+    if not wrong.any():
+        return None
+    return tuple(int(k) for k in np.unravel_index(int(wrong.argmax()), wrong.shape))
+
+
+def _operation(stage: Any, name: str, data: Any, engines: Sequence[str], tolerance: float) -> str:
+    """Return the first operation of a stage at which an engine of programs leaves the interpreter."""
+    program = fuse(lower_stages(as_stages({name: stage}), data))
+    builds: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "auto": fused.build}
+    for engine in engines:
+        if engine in builds and program.fused and program.segments:
+            found = first_operation(program, jax.tree.leaves(data), builds[engine], tolerance)
+            if found is not None:
+                return f"{engine}: {found}"
+    return ""
+
+
+def first_operation(program: Program, leaves: list[Any], build: Build, tolerance: float = TOLERANCE) -> str | None:
+    """Return the listing of the first operation whose result differs from the interpreter's, or None.
+
+    Args:
+        program: A program of one segment.
+        leaves: Its leaves, for all worlds.
+        build: Builds what runs the program.
+        tolerance: As in ``first_difference``.
+    """
+    seen, operations = with_all_values(program)
+    n_worlds = lanes.batch(program, leaves)[0]
+    more = [jnp.zeros((n_worlds, *leaf.shape[1:]), leaf.dtype) for leaf in seen.leaves[len(leaves) :]]
+    location = Location("cpu" if jax.default_backend() == "cpu" else "gpu")
+    written = [builder(seen, location)([*leaves, *more], 1)[0] for builder in (interpret.build, build)]
+    results = [dict(zip(seen.written, some, strict=True)) for some in written]
+    (segment,) = seen.fused_segments
+    for op, (leaf, _) in zip(operations, segment.writes, strict=True):
+        expected, found = (np.asarray(result[leaf]) for result in results)
+        index = _differs(expected, found, tolerance)
+        if index is not None:
+            numbers = f"{expected[index]} by 'interpret' and {found[index]} by the engine"
+            return f"{listing.list_operation(program, op)} ({numbers}, index {list(index)})"
+    return None
+
+
+def with_all_values(program: Program) -> tuple[Program, list[Operation]]:
+    """Return a program of one segment with a further leaf for every result in it, and the operations of those.
+
+    Results inside blocks of operations are left out: their block may not have run.
+    """
+    (segment,) = program.fused_segments
+    operations = [op for op in segment.block.operations for _ in op.results]
+    values: list[Value] = [x for op in segment.block.operations for x in op.results]
+    n_worlds = next(leaf.shape[0] for leaf in program.leaves if leaf.scope == "drone")
+    shape = (n_worlds, program.n_drones if segment.scope == "drone" else 1)
+    further = [Leaf(f"value {k}", segment.scope, shape, x.dtype) for k, x in enumerate(values)]
+    first = len(program.leaves)
+    seen = dataclasses.replace(
+        segment,
+        block=Block(segment.block.inputs, segment.block.operations, tuple(values)),
+        writes=tuple([(first + k, 0) for k in range(len(values))]),
+    )
+    return dataclasses.replace(program, leaves=(*program.leaves, *further), segments=(seen,)), operations

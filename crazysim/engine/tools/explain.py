@@ -1,0 +1,60 @@
+"""A description of how a step is executed."""
+
+from __future__ import annotations
+
+import time
+
+import jax
+import jax.numpy as jnp
+
+from crazysim.core.data import SimData
+from crazysim.engine.backends import fused
+from crazysim.engine.ir.program import UnfusedStage
+from crazysim.engine.step import Step
+
+
+def explain(step: Step, data: SimData, measure: bool = False) -> str:
+    """Return in a few lines which engine runs the step, which stages it fuses, and which it does not and why.
+
+    Args:
+        step: The step.
+        data: Data to step.
+        measure: True to measure the cost of stages that are not fused, which compiles the step once more without them
+            and takes 256 steps.
+    """
+    plan = step.plan(data)
+    lines = [f"engine: {plan.engine}" + (f" ({plan.why})" if plan.why else "")]
+    if plan.program is None:
+        return "\n".join([*lines, f"stages: {', '.join(s.__name__ for s in step.stages)}"])
+    for program in plan.programs:
+        for segment in program.segments:
+            if isinstance(segment, UnfusedStage):
+                lines.append(f"splits the step: {segment.unfused}")
+            else:
+                names, own = ", ".join(segment.stages), segment.scope == "drone"
+                one = f"member of {program.population!r}" if own and program.population != "drone" else segment.scope
+                lines.append(f"fused, for one {one}: {names} ({segment.n_operations} operations)")
+    split = [stage.name for program in plan.programs for stage in program.unfused_stages]
+    if split and measure:
+        lines.append(_cost_of_split(step, data, split))
+    if plan.engine == "fused":
+        where = plan.location.platform, plan.location.devices
+        lines += dict.fromkeys(line for program in plan.programs for line in fused.describe(program, *where))
+    return "\n".join(lines)
+
+
+def _cost_of_split(step: Step, data: SimData, split: list[str]) -> str:
+    """Return the cost of the stages that split a step, measured against the same step without them."""
+
+    def seconds(step: Step, n: int = 64) -> float:
+        jax.block_until_ready(step(data, jnp.int32(n)))  # compiles
+        begin = time.perf_counter()
+        jax.block_until_ready(step(data, jnp.int32(n)))
+        return (time.perf_counter() - begin) / n
+
+    rest = {s.__name__: s for s in step.stages if s.__name__ not in split}
+    with_them, without = seconds(step), seconds(Step(rest, step.engine, step.platform, step.mesh))
+    return (
+        f"cost of the split, measured: a step takes {1e6 * with_them:.0f} us, and {1e6 * without:.0f} us without "
+        f"{', '.join(split)}"
+    )

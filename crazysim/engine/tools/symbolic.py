@@ -1,0 +1,156 @@
+"""CasADi expressions of a block: every value is an expression of single numbers.
+
+CasADi computes in float64 whatever the program's types are. Integers are whole numbers without overflow. A number is
+never NaN, so that tests for NaN are false.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.blocks import Block, Element, Operation, Value
+from crazysim.engine.ir.program import Segment, Slot
+
+RANDOM = "it draws random numbers"
+
+Expression = Any
+"""A ``casadi.SX`` of one number."""
+
+MAX_LOOP = 256
+"""Most iterations of a loop that is unrolled."""
+
+
+def step(segment: Segment, number: Callable[[Slot], Expression]) -> dict[Slot, Expression]:
+    """Return the expressions that a step writes.
+
+    Args:
+        segment: A segment of one drone.
+        number: Returns the number in a place before the step.
+
+    Raises:
+        UnsupportedError: If CasADi has no form for an operation; the error names the stage.
+    """
+    require(segment.hoisted)
+    require(segment.block)
+    hoisted = run(segment.hoisted, [number(slot) for slot in segment.hoisted_reads])
+    outputs = run(segment.block, [*(number(slot) for slot in segment.reads), *hoisted])
+    return dict(zip(segment.writes, outputs, strict=True))
+
+
+def require(block: Block) -> None:
+    """Check that CasADi has a form for all operations of a block.
+
+    Raises:
+        UnsupportedError: If it has none for one; the error names the stage.
+    """
+    refused = [(op.stage, why) for op in block.walk() if (why := _refusal(op)) is not None]
+    if refused:
+        drawn = [(stage, why) for stage, why in refused if why == RANDOM]  # says more than the arithmetic around it
+        stage, why = (drawn or refused)[0]
+        raise UnsupportedError(why, stage=stage)
+
+
+def _refusal(op: Operation) -> str | None:
+    match op.name:
+        case "threefry2x32":
+            return RANDOM
+        case "while":
+            return "a loop that runs until a condition fails cannot be unrolled"
+        case "lookup":
+            return "it looks a number up in a table, at a place that is computed"
+        case "loop" if op.param("length") > MAX_LOOP:
+            return f"a loop of {op.param('length')} iterations is too long; at most {MAX_LOOP} are unrolled"
+    row = ops.TABLE[op.name]
+    if row.structured or op.name == "convert_element_type":
+        return None
+    shared = next((x.dtype for x, letter in zip(op.args, row.operands, strict=True) if letter == "T"), op.dtype)
+    if row.casadi is None or shared.kind not in row.casadi_kinds:
+        return f"operation {op.name!r} on {shared.name} has no form in CasADi"
+    return None
+
+
+def run(block: Block, inputs: Sequence[Expression]) -> list[Expression]:
+    """Return the outputs of a block whose operations all have a form."""
+    return _Interpreter().run(block, inputs)
+
+
+class _Interpreter:
+    """Expressions of values."""
+
+    def __init__(self) -> None:
+        import casadi  # an extra
+
+        self.casadi = casadi
+        self.env: dict[Value, Expression] = {}
+        self.in_custom_jvp = False
+
+    def run(self, block: Block, inputs: Sequence[Expression]) -> list[Expression]:
+        self.env.update(zip(block.inputs, inputs, strict=True))
+        for op in block.operations:
+            if op.name != "barrier":
+                self.env.update(zip(op.results, self._results(op, [self._element(x) for x in op.args]), strict=True))
+        return [self._element(x) for x in block.outputs]
+
+    def _element(self, x: Element) -> Expression:
+        return self.env[x] if isinstance(x, Value) else self.casadi.SX(float(x))
+
+    def _results(self, op: Operation, args: list[Expression]) -> list[Expression]:
+        match op.name:
+            case "when":
+                mask, *old = args
+                new = self.run(op.blocks[0], [])
+                return [self.casadi.if_else(mask, x, y) for x, y in zip(new, old, strict=True)]
+            case "loop":
+                for _ in range(op.param("length")):
+                    args = self.run(op.blocks[0], args)
+                return args
+            case "custom_jvp":
+                outside, self.in_custom_jvp = self.in_custom_jvp, True
+                outputs = self.run(op.blocks[0], args)
+                self.in_custom_jvp = outside
+                return outputs
+            case "convert_element_type":
+                return [self._convert(op, args[0])]
+            case "sqrt" if self.in_custom_jvp:
+                return [self._guarded_sqrt(args[0])]
+        form = ops.TABLE[op.name].casadi
+        if form is None:
+            raise UnsupportedError(f"operation {op.name!r} has no form in CasADi", stage=op.stage)
+        named = isinstance(form, str)
+        out = getattr(self.casadi, form)(*args) if named else form(self.casadi, *args, **dict(op.params))
+        if op.name == "div" and op.dtype.kind in "iu":
+            return [self._towards_zero(out)]
+        return [self._wrap(out) if op.dtype.kind == "u" and op.name in ("add", "sub") else out]
+
+    def _convert(self, op: Operation, x: Expression) -> Expression:
+        before, after = op.args[0].dtype, op.dtype
+        if after.kind == "b":
+            return x != 0
+        if after.kind not in "iu" or before.kind == "b":
+            return x
+        limits = np.iinfo(after)
+        if before.kind == "f":
+            return self.casadi.fmin(self.casadi.fmax(self._towards_zero(x), limits.min), limits.max)
+        fits = np.iinfo(before).min >= limits.min and np.iinfo(before).max <= limits.max
+        return x if fits else self._wrap(x, float(limits.min), 2.0 ** (8 * after.itemsize))
+
+    def _wrap(self, x: Expression, low: float = 0.0, length: float = 2.0**32) -> Expression:
+        """Return a whole number as one of ``length`` from ``low`` on, as integers of limited size hold it."""
+        return x - length * self.casadi.floor((x - low) / length)
+
+    def _towards_zero(self, x: Expression) -> Expression:
+        return self.casadi.if_else(x < 0, self.casadi.ceil(x), self.casadi.floor(x))
+
+    def _guarded_sqrt(self, x: Expression) -> Expression:
+        """Return a root whose slope at zero is zero.
+
+        A function with a derivative of its own has it for places where that of its arithmetic is infinite, such as a
+        norm at zero.
+        """
+        ca = self.casadi
+        return ca.if_else(x > 0, ca.sqrt(ca.if_else(x > 0, x, 1.0)), 0.0)

@@ -1,0 +1,190 @@
+"""Tasks in files of users: ``FILE.py:NAME`` or ``MODULE:NAME``, and the list of those that this user has named.
+
+A file that is loaded is executed. Files of a training run hold the reference of their task, and may come from others.
+Therefore a reference that was read from them is only followed if this user has named it before, in a call or on the
+command line: each such reference is noted in the user's folder of caches.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import inspect
+import os
+import sys
+from collections.abc import Container
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from crazysim.envs.task import Task
+from crazysim.errors import ConfigError
+from crazysim.trust import distrust, make_private
+
+GUIDE = "docs/guides/tasks.md"
+_CLASSES: dict[str, type[Task]] = {}
+"""Classes of which this process has made tasks, by their references."""
+_LOADED: set[str] = set()
+"""References that were named in this process."""
+
+
+def is_reference(name: str) -> bool:
+    """Return true if the name of a task refers to a file or a module."""
+    return ":" in name or name.endswith(".py")
+
+
+def split(reference: str) -> tuple[str, str]:
+    """Return the file or module of a reference, and the name in it, which may be empty."""
+    if reference.endswith(".py"):
+        return reference, ""
+    place, _, name = reference.rpartition(":")
+    return place, name
+
+
+def absolute(reference: str) -> str:
+    """Return a reference with the absolute path of its file; one of a module as it is."""
+    place, name = split(reference)
+    return f"{Path(place).expanduser().resolve()}:{name}" if place.endswith(".py") else reference
+
+
+def reference_of(task: type[Task]) -> str:
+    """Return the reference of a class; other processes can use it if the class is in a file, and then it is noted."""
+    module, name = sys.modules.get(task.__module__), task.__qualname__
+    file = getattr(module, "__file__", None)
+    is_in_file = file is not None and file.endswith(".py") and getattr(module, name, None) is task
+    in_package = "." in task.__module__
+    place = str(Path(file).resolve()) if file is not None and is_in_file and not in_package else task.__module__
+    reference = f"{place}:{name}"
+    _CLASSES[reference] = task
+    if is_in_file:
+        _note(reference)
+    return reference
+
+
+def load(reference: str, names: Container[str]) -> type[Task] | str:
+    """Execute the file or module of a reference that a user has written, and note the reference.
+
+    Args:
+        reference: ``FILE.py:NAME``, ``MODULE:NAME``, or ``FILE.py`` for the only task in it.
+        names: Names of the registered tasks, to which the file may add.
+
+    Returns:
+        The class, or its name if the reference has the name of a registered task.
+
+    Raises:
+        ConfigError: If there is no such file, module or task.
+    """
+    reference = absolute(reference)
+    if reference in _CLASSES:
+        return _CLASSES[reference]
+    place, name = split(reference)
+    module = _from_file(Path(place)) if place.endswith(".py") else _from_module(place)
+    classes = {k: x for k, x in vars(module).items() if _is_task(x) and x.__module__ == module.__name__}
+    if not name and len(classes) == 1:
+        name = next(iter(classes))
+    found = getattr(module, name, None) if name else None
+    if not _is_task(found) and name not in names:
+        there = ", ".join(classes) or "none"
+        raise ConfigError(
+            f"expected the name of a task in {place}, got {name!r}; it defines {there}. Write {place}:NAME with a "
+            f"subclass of Task, or a name that the file registers; {GUIDE} has an example."
+        )
+    _LOADED.add(reference)
+    _note(reference)
+    return found if _is_task(found) else name  # type: ignore[return-value]
+
+
+def follow(reference: str, names: Container[str]) -> type[Task] | str:
+    """Return what ``load`` does, for a reference that was read from the files of a run.
+
+    Raises:
+        ConfigError: If this user has not named it before, if others could have changed its file, or if ``load`` fails.
+    """
+    place, name = split(reference)
+    if reference in _CLASSES or reference in _LOADED:
+        return load(reference, names)
+    remedy = (
+        f"Read the code of the task, and name it yourself: --task FILE.py:{name or 'NAME'} in a command, or "
+        f"load_policy(folder, task=...)."
+    )
+    if reference not in _noted():
+        raise ConfigError(
+            f"expected a task that you have named on this machine, got {reference!r} from the files of a run, which "
+            f"others could have made. {remedy}"
+        )
+    if place.endswith(".py") and (reason := distrust(Path(place))):
+        raise ConfigError(f"expected a file that only you can write, got {place!r}: {reason}. {remedy}")
+    return load(reference, names)
+
+
+def code_digest(reference: str) -> str:
+    """Return the hash of the file of a reference, as text; empty if it is not a file."""
+    place, _ = split(reference)
+    with contextlib.suppress(OSError):
+        return hashlib.sha256(Path(place).read_bytes()).hexdigest() if place.endswith(".py") else ""
+    return ""
+
+
+def _is_task(x: Any) -> bool:
+    return inspect.isclass(x) and issubclass(x, Task) and x is not Task
+
+
+def _from_file(path: Path) -> ModuleType:
+    """Return the module of a file, executed once for each version of the file, with its folder on the path."""
+    try:
+        source = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"expected a file with a task, got {str(path)!r}: {error.strerror}. Write the path of a Python file."
+        ) from error
+    name = f"{path.stem}_{hashlib.sha256(str(path).encode() + source).hexdigest()[:12]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    module = ModuleType(name)
+    module.__file__ = str(path)
+    sys.modules[name] = module  # dataclasses look their module up there
+    sys.path.insert(0, str(path.parent))
+    try:
+        exec(compile(source, path, "exec", dont_inherit=True), vars(module))
+    except BaseException:
+        del sys.modules[name]
+        raise
+    finally:
+        sys.path.remove(str(path.parent))
+    return module
+
+
+def _from_module(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        if name in sys.modules or error.name not in (name, name.partition(".")[0]):
+            raise
+        raise ConfigError(
+            f"expected a module with a task, got {name!r}, which cannot be imported: {error}. Write FILE.py:NAME, or "
+            f"install its package; a task from a notebook or a prompt has to be put into a file."
+        ) from error
+
+
+def _list_path() -> Path:
+    """Return the file with the references that this user has named, a line each."""
+    return Path.home() / ".cache" / "crazysim" / "tasks"
+
+
+def _noted() -> list[str]:
+    path = _list_path()
+    if not path.is_file() or distrust(path):
+        return []
+    return path.read_text(encoding="utf-8").splitlines()
+
+
+def _note(reference: str) -> None:
+    """Add a reference to the list; where that is impossible, it is to be named again in another process."""
+    path = _list_path()
+    with contextlib.suppress(OSError):
+        make_private(path.parent)
+        if distrust(path.parent) or reference in _noted():
+            return
+        with open(path, "a", encoding="utf-8", opener=lambda p, flags: os.open(p, flags, 0o600)) as file:
+            file.write(f"{reference}\n")

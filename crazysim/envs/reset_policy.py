@@ -1,0 +1,51 @@
+"""When and how new episodes begin within a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+
+from jax import Array
+
+from crazysim.envs.state import EnvState
+
+
+class AutoresetMode(StrEnum):
+    """When a new episode begins; the names are Gymnasium's."""
+
+    next_step = "NextStep"
+    """In the step after the last, which ignores its action and gives no reward."""
+    same_step = "SameStep"
+    """At the end of the last step itself: ``obs`` belongs to the new episode, reward and ``info`` to that step, and the
+    last observation is in ``info["final_obs"]``."""
+    disabled = "Disabled"
+    """When the user calls ``restart``."""
+
+
+@dataclass(frozen=True)
+class ResetPolicy:
+    """Rule by which new episodes begin within a step; all functions are of one world."""
+
+    is_over: Callable[[Array, EnvState], Array]
+    """``is_over(was_done, ended)``: true where a new episode begins; ``was_done`` is ``done`` before the step. ()"""
+    end: Callable[[EnvState], EnvState]
+    """``end(state)``: the state after a step, whether a new episode begins or not."""
+    begin: Callable[[EnvState, EnvState], EnvState]
+    """``begin(ended, new)``: the state where a new episode begins, from those before and after its reset."""
+
+
+def _with_final_obs(state: EnvState) -> EnvState:
+    return state.replace(info=state.info | {"final_obs": state.obs})
+
+
+def _with_results(ended: EnvState, new: EnvState) -> EnvState:
+    return new.replace(**{name: getattr(ended, name) for name in ("reward", "terminated", "truncated", "info")})
+
+
+POLICIES: dict[AutoresetMode, ResetPolicy | None] = {
+    AutoresetMode.disabled: None,
+    AutoresetMode.next_step: ResetPolicy(lambda was_done, _: was_done, lambda state: state, lambda _, new: new),
+    AutoresetMode.same_step: ResetPolicy(lambda _, ended: ended.done, _with_final_obs, _with_results),
+}
+"""Reset policy of each mode; None for no automatic resets."""

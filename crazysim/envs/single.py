@@ -1,0 +1,107 @@
+"""One world as an environment of ``gymnasium.make``, with NumPy arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.envs.env import DroneEnv
+from crazysim.envs.registry import make
+from crazysim.envs.rendering import RENDER_MODES
+from crazysim.envs.vector import DroneVectorEnv
+from crazysim.errors import ConfigError
+
+
+class DroneSingleEnv(gymnasium.Env):
+    """Environment of Gymnasium over one world of a functional environment.
+
+    It is for programs that take nothing else, and for looking at one drone: a step costs nearly the time of a step of
+    thousands of worlds. Observations and rewards are NumPy arrays that belong to the caller.
+    """
+
+    def __init__(self, env: DroneEnv, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
+        """Take the functional environment, without automatic resets.
+
+        Args:
+            env: The environment, of one world.
+            render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws into a window.
+            render_size: Width and height of an image, pixels.
+
+        Raises:
+            ConfigError: If there are several worlds, there is no such mode, or the environment resets automatically.
+        """
+        if env.sim.n_worlds != 1:
+            raise ConfigError(
+                f"expected an environment of one world, got {env.sim.n_worlds} worlds. Use gymnasium.make_vec."
+            )
+        self.vector = DroneVectorEnv(env, AutoresetMode.DISABLED, render_mode, render_size=render_size, numpy=True)
+        self.sim, self.render_mode = env.sim, render_mode
+        self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": self.vector.metadata["render_fps"]}
+        self.observation_space = self.vector.single_observation_space
+        self.action_space = self.vector.single_action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start a new episode.
+
+        Without a seed the random numbers continue those before; the first ones come from the system.
+
+        Raises:
+            ConfigError: If the seed is not an integer, or there are options.
+        """
+        if options:
+            raise ConfigError(f"expected no options of reset, got {', '.join(options)}")
+        super().reset(seed=seed)
+        obs, info = self.vector.reset(seed=int(self.np_random.integers(2**31)) if seed is None else seed)
+        return _first(obs), _first(info)
+
+    def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Advance the world.
+
+        Args:
+            action: (k,), or (n_drones, k) with several drones.
+
+        Raises:
+            ConfigError: If the environment was not reset, or the action is not finite.
+            ValueError: If the action has another shape.
+        """
+        obs, reward, terminated, truncated, info = self.vector.step(np.asarray(action)[None])
+        return _first(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
+
+    def render(self) -> NDArray | None:
+        """Return an image (height, width, 3), or draw into a window.
+
+        Raises:
+            ConfigError: If the environment was made without ``render_mode``, or was not reset.
+            RenderError: If this machine cannot render.
+        """
+        images = self.vector.render()
+        return None if images is None else images[0]
+
+    def explain(self) -> str:
+        """Return how a step is executed, as ``Env.explain`` does."""
+        return self.vector.explain()
+
+    def close(self) -> None:
+        """Close the window."""
+        self.vector.close()
+
+
+def _first(tree: Any) -> Any:
+    """Return the arrays of the only world."""
+    return jax.tree.map(lambda x: x[0], tree)
+
+
+def make_single(task: str, render_mode: str | None = None, **options: Any) -> DroneSingleEnv:
+    """Return one world of a task, for ``gymnasium.make``.
+
+    Args:
+        task: One of ``crazysim.envs.TASKS``.
+        render_mode: Mode of ``render``.
+        options: Options of ``crazysim.envs.make``.
+    """
+    return DroneSingleEnv(make(task, 1, **options), render_mode)

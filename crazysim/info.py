@@ -1,0 +1,146 @@
+"""Everything about an installation that a report of a bug needs, as plain text."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "gymnasium")
+"""Packages that crazysim needs."""
+OPTIONAL = ("optax", "viser", "websockets", "matplotlib", "imageio-ffmpeg", "casadi", "onnx", "pettingzoo", "warp-lang",
+            "cflib", "motioncapture")  # fmt: skip
+"""Packages of the extras."""
+VARIABLES = ("JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "XLA_FLAGS", "CUDA_VISIBLE_DEVICES",
+             "CXX", "CXXFLAGS", "CRAZYSIM_CACHE", "CRAZYSIM_COMPILE_TIMEOUT", "CRAZYSIM_RENDERING",
+             "XDG_CACHE_HOME", "MUJOCO_GL")  # fmt: skip
+"""Environment variables that change what runs."""
+
+
+def info() -> str:
+    """Return versions, devices, compiler, caches and rendering of this installation, a line each.
+
+    A part that is missing or broken is a line with the reason.
+    """
+    text = "\n".join(f"{name + ':':<14}{_or_reason(value)}" for name, value in _parts())
+    return text.replace(f"{Path.home()}{os.sep}", f"~{os.sep}")  # reports are public
+
+
+def _parts() -> Iterator[tuple[str, Callable[[], str]]]:
+    """Yield the name of every line, and the function that returns the rest."""
+    yield "crazysim", _own_version
+    yield "Python", lambda: f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}"
+    yield "system", lambda: f"{platform.platform()}, {_cores()} CPU cores"
+    for name in PACKAGES:
+        yield name, lambda name=name: importlib.metadata.version(name)
+    yield "extras", _extras
+    yield "devices", _devices
+    yield "C++ compiler", _compiler
+    yield "NVRTC", _nvrtc
+    yield "caches", _caches
+    yield "rendering", _rendering
+    yield "variables", _variables
+
+
+def _or_reason(value: Callable[[], str]) -> str:
+    """Return the value of a line, or why there is none."""
+    try:
+        return value()
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+    except Exception as error:  # whatever is broken must not hide the other lines
+        return f"{type(error).__name__}: {_first_line(str(error))}".removesuffix(": ")
+
+
+def _first_line(text: str) -> str:
+    return text.strip().partition("\n")[0][:300]
+
+
+def _own_version() -> str:
+    from crazysim.version import __version__
+
+    return f"{__version__}, {Path(__file__).parent}"
+
+
+def _cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _extras() -> str:
+    found = []
+    for name in OPTIONAL:
+        try:
+            found.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return ", ".join(found) or "none"
+
+
+def _devices() -> str:
+    import jax
+
+    return ", ".join(f"{device.platform} {device.device_kind} ({device.id})" for device in jax.devices())
+
+
+def _compiler() -> str:
+    from crazysim.engine.backends import native
+
+    program = native.compiler()
+    if program is None:
+        return "none; steps run on a slower engine. Install g++ or clang++."
+    done = subprocess.run([*shlex.split(program), "--version"], capture_output=True, text=True, timeout=20, check=False)
+    return f"{program}, {_first_line(done.stdout or done.stderr)}; {shlex.join(native.command()[1:])}"
+
+
+def _nvrtc() -> str:
+    from crazysim.engine.backends import cuda
+
+    library = cuda.nvrtc()
+    return "not found; needed for GPUs only" if library is None else str(library._name)
+
+
+def _caches() -> str:
+    from crazysim import jaxcompat
+    from crazysim.cache import default_cache
+    from crazysim.trust import distrust
+
+    default, used = default_cache(), jaxcompat.cache_folder()
+    folders = {} if default is None else {default: ""}
+    if used is not None:
+        folders[Path(used)] = " (in use)"
+    described = []
+    for folder, remark in folders.items():
+        reason = distrust(folder / "crazysim") if (folder / "crazysim").is_dir() else ""
+        size = _size(folder) if folder.is_dir() else "not there"
+        described.append(f"{folder}{remark}: {size}" + (f", kernels refused: {reason}" if reason else ""))
+    return "; ".join(described) or "none"
+
+
+def _size(folder: Path) -> str:
+    """Return the size of the files in a folder, for reading."""
+    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+    return f"{sum(sizes) / 1e6:.1f} MB in {len(sizes)} files"
+
+
+def _rendering() -> str:
+    """Return the backend of OpenGL, and whether it draws; tried in a process of its own, which it can end."""
+    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
+    try:
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    except subprocess.TimeoutExpired:
+        return f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')}, gave no answer in 60 s"
+    lines = [line for line in done.stderr.strip().splitlines() if line and not line.startswith(" ")]
+    result = "works" if done.returncode == 0 else f"fails: {lines[-1][:300] if lines else f'exit {done.returncode}'}"
+    return f"{os.environ.get('MUJOCO_GL') or 'MUJOCO_GL is not set'}, {result}"
+
+
+def _variables() -> str:
+    given = [f"{name}={os.environ[name]}" for name in VARIABLES if name in os.environ]
+    return ", ".join(given) or "none"

@@ -1,0 +1,189 @@
+"""Parameters of a simulated Crazyflie: their types and values, and the light that some of them set."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.drones import Airframe
+from crazysim.errors import ConfigError
+
+OFF, SOLID, MEMORY, FADE = 0, 7, 13, 14
+"""Effects of the LED ring (``effectsFct`` in ledring12.c of crazyflie-firmware): dark, ``ring.solidRed`` and so on, the
+memory of 12 LEDs, ``ring.fadeColor``."""
+LIGHTS = ("ring.", "colorLedBot.")
+"""Groups of parameters of lights."""
+INITIAL = ("kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
+"""Pose that ``kalman.resetEstimation`` gives to the estimate, m and rad."""
+
+
+class Parameter(NamedTuple):
+    """One parameter."""
+
+    ctype: str
+    """Type in C."""
+    value: float = 0.0
+    """Value at the start."""
+    read_only: bool = False
+    """True where it cannot be written."""
+    simulated: bool = True
+    """True where another value has its effect; others keep their value."""
+
+
+PARAMETERS: dict[str, Parameter] = {
+    "stabilizer.estimator": Parameter("uint8_t", 2, simulated=False),
+    "stabilizer.controller": Parameter("uint8_t", 1, simulated=False),
+    "kalman.resetEstimation": Parameter("uint8_t"),
+    **{name: Parameter("float") for name in INITIAL},
+    "commander.enHighLevel": Parameter("uint8_t", 1, simulated=False),
+    **{f"flightmode.stabMode{axis}": Parameter("uint8_t", axis != "Yaw") for axis in ("Roll", "Pitch", "Yaw")},
+    "locSrv.extPosStdDev": Parameter("float", 0.01, simulated=False),
+    "locSrv.extQuatStdDev": Parameter("float", 0.0045, simulated=False),
+    "hlCommander.groupmask": Parameter("uint8_t"),
+    "ring.effect": Parameter("uint8_t", OFF),
+    "ring.neffect": Parameter("uint32_t", 18, read_only=True),
+    **{f"ring.solid{color}": Parameter("uint8_t", 20) for color in ("Red", "Green", "Blue")},
+    "ring.fadeColor": Parameter("uint32_t"),
+    "ring.fadeTime": Parameter("float", 0.5),
+    "ring.headlightEnable": Parameter("uint8_t", simulated=False),
+    "colorLedBot.wrgb8888": Parameter("uint32_t"),
+    "colorLedBot.brightCorr": Parameter("uint8_t", 1, simulated=False),
+    "led.bitmask": Parameter("uint8_t", simulated=False),
+    "sound.effect": Parameter("uint8_t", simulated=False),
+    "deck.bcFlow2": Parameter("uint8_t", 1, read_only=True),
+    "deck.bcLighthouse4": Parameter("uint8_t", read_only=True),
+    "deck.bcLedRing": Parameter("uint8_t", 1, read_only=True),
+    "deck.bcColorLedBot": Parameter("uint8_t", 1, read_only=True),
+    "deck.bcColorLedTop": Parameter("uint8_t", read_only=True),
+}
+"""Parameters that every simulated drone has."""
+
+
+def parameters_of(airframe: Airframe, multi_ranger: bool) -> dict[str, Parameter]:
+    """Return the parameters of a drone: those of every one, its deck of ranges, and its gains of attitude.
+
+    Args:
+        airframe: Airframe; one without the gains of ``controller="pid"`` has no group ``pid_attitude``.
+        multi_ranger: True for a drone with a multi-ranger deck.
+    """
+    found = PARAMETERS | {"deck.bcMultiranger": Parameter("uint8_t", multi_ranger, read_only=True)}
+    if "pid.attitude.kp" in airframe.values:
+        for gain in ("kp", "ki", "kd"):
+            values = np.asarray(airframe.value(f"pid.attitude.{gain}"), float)
+            for axis, value in zip(("roll", "pitch", "yaw"), values.tolist(), strict=True):
+                found[f"pid_attitude.{axis}_{gain}"] = Parameter("float", value, simulated=False)
+    return found
+
+
+class Parameters(Mapping[str, float]):
+    """Values of the parameters of one drone."""
+
+    def __init__(self, kinds: Mapping[str, Parameter]):
+        """Take the parameters, with their values at the start."""
+        self.kinds = dict(kinds)
+        self._values = {name: float(kind.value) for name, kind in kinds.items()}
+        self.light = Light()
+        self.has_initial_pose = False
+
+    def __getitem__(self, name: str) -> float:
+        """Return a value."""
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Return the names."""
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        """Return the number of parameters."""
+        return len(self._values)
+
+    @property
+    def initial_pose(self) -> NDArray:
+        """Position, m, and yaw, rad, that a reset gives to the estimate. (4,)"""
+        return np.array([self._values[name] for name in INITIAL])
+
+    def get_value(self, name: str) -> float:
+        """Return a value.
+
+        Raises:
+            ConfigError: If there is no such parameter.
+        """
+        self._require(name)
+        return self._values[name]
+
+    def _require(self, name: str) -> None:
+        if name not in self.kinds:
+            raise ConfigError(f"expected a parameter that the simulation has, got {name!r}. {PAGE}")
+
+    def set(self, name: str, value: float, now: float) -> None:
+        """Set a value.
+
+        Raises:
+            ConfigError: If there is no such parameter, it is read-only, not finite, or its effect is not simulated.
+        """
+        self._require(name)
+        kind = self.kinds[name]
+        if kind.read_only or not math.isfinite(value):
+            raise ConfigError(f"expected a finite value of a parameter that can be written, got {name} = {value:g}")
+        # Clients read values in their format, so 0.0045 comes back with the rounding of float32.
+        is_same = math.isclose(value, self._values[name], rel_tol=1e-6)
+        is_effect = name != "ring.effect" or value in (OFF, SOLID, MEMORY, FADE)
+        if not (is_effect and (kind.simulated or is_same)):
+            raise ConfigError(
+                f"expected a value whose effect is simulated, got {name} = {value:g}; it stays {self._values[name]:g}. "
+                f"{PAGE}"
+            )
+        self._values[name] = value
+        self.has_initial_pose |= name in INITIAL
+        if name.startswith(LIGHTS):
+            self.light.changed(self._values, name, now)
+
+
+PAGE = 'The guide "Real drones and their scripts" lists the parameters.'
+
+
+class Light:
+    """Colour of the LED ring or of the colour LED deck; that which was set last shines."""
+
+    def __init__(self) -> None:
+        """Begin dark."""
+        self.memory = np.zeros((12, 3))
+        self._begin, self._target = np.zeros(3), np.zeros(3)
+        self._start, self._duration = 0.0, 0.0
+
+    def color(self, now: float) -> NDArray:
+        """Return the colour at a time, s: red, green, blue from 0 to 1. (3,)"""
+        share = (now - self._start) / self._duration if self.fades(now) and self._duration > 0 else 1.0
+        return self._begin + share * (self._target - self._begin)
+
+    def fades(self, now: float) -> bool:
+        """Return True until the end of a fade; time that has gone back to zero ends it."""
+        return self._start <= now < self._start + self._duration
+
+    def changed(self, values: Mapping[str, float], name: str, now: float) -> None:
+        """Take the colour of new values of parameters.
+
+        Args:
+            values: Values by name.
+            name: Parameter that was set, or ``memory`` for the LEDs of the ring's memory.
+            now: Time, s.
+        """
+        effect, duration = values["ring.effect"], 0.0
+        sets = {SOLID: ("ring.solidRed", "ring.solidGreen", "ring.solidBlue"), FADE: ("ring.fadeColor",)}
+        if name.startswith("colorLedBot."):
+            white, *color = int(values["colorLedBot.wrgb8888"]).to_bytes(4, "big")
+            target = np.minimum(np.array(color) + white, 255) / 255
+        elif name not in ("ring.effect", *sets.get(int(effect), ("memory",))):
+            return
+        elif effect == SOLID:
+            target = np.array([values[color] for color in sets[SOLID]]) / 255
+        elif effect == FADE:
+            target = np.array(list((int(values["ring.fadeColor"]) & 0xFFFFFF).to_bytes(3, "big"))) / 255
+            duration = max(values["ring.fadeTime"], 0.0)
+        else:
+            target = self.memory.mean(axis=0) if effect == MEMORY else np.zeros(3)
+        self._begin, self._target, self._start, self._duration = self.color(now), target, now, duration

@@ -1,0 +1,65 @@
+"""Readings of a drone's plugins, as the decks and the power management of a Crazyflie have them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from crazysim.plugins.effects import Battery
+from crazysim.plugins.sensors.range_finder import MULTI_RANGER, RangeFinder
+from crazysim.sim.sim import Sim
+
+ON_BATTERY, LOW_POWER = 0, 3
+"""States of the power management (pm.h of crazyflie-firmware)."""
+LOW_VOLTAGE = 3.2
+"""Voltage of a cell below which the power is low, V (``DEFAULT_BAT_LOW_VOLTAGE`` in platform_defaults_cf2.h)."""
+IDEAL_VOLTAGE = 4.0
+"""Voltage that drones without the plugin ``Battery`` report, V."""
+
+P = TypeVar("P")
+
+
+class BatteryState(NamedTuple):
+    """State of a battery."""
+
+    voltage: float
+    """Voltage, V."""
+    charge: float
+    """State of charge, 0 to 1."""
+    state: int
+    """State of the power management."""
+
+
+def battery_of(sim: Sim, drone: int) -> BatteryState:
+    """Return the state of a drone's ``Battery``; without one, that of a battery which is never empty."""
+    plugin = _plugin(sim, Battery)
+    if plugin is None:
+        return BatteryState(IDEAL_VOLTAGE, 1.0, ON_BATTERY)
+    record = plugin.read(sim.data)
+    voltage, charge = float(record.voltage[0, drone, 0]), float(record.charge[0, drone, 0])
+    return BatteryState(voltage, charge, LOW_POWER if voltage < LOW_VOLTAGE * record.n_cells else ON_BATTERY)
+
+
+def ranges_of(sim: Sim, drone: int) -> dict[str, float]:
+    """Return the distances that a drone's ``RangeFinder`` measures along ``MULTI_RANGER``, m, by name.
+
+    They are infinite where nothing is within its range. Other directions, and drones without one, have none.
+    """
+    plugin = _plugin(sim, RangeFinder)
+    if plugin is None:
+        return {}
+    record = plugin.read(sim.data)
+    far, distances = float(record.max_range), np.asarray(record.distance)[0, drone].tolist()
+    found = {}
+    for direction, distance in zip(np.asarray(record.direction), distances, strict=True):
+        name = next((name for name, axis in MULTI_RANGER.items() if np.allclose(axis, direction, atol=1e-6)), None)
+        if name is not None:
+            found[name] = distance if distance < far else math.inf
+    return found
+
+
+def _plugin(sim: Sim, kind: type[P]) -> P | None:
+    """Return the plugin of a class; None if there is none."""
+    return next((plugin for plugin in sim.plugins.values() if isinstance(plugin, kind)), None)

@@ -1,0 +1,153 @@
+"""Access to pages: an address with a token, and servers of viser that check every request."""
+
+from __future__ import annotations
+
+import hmac
+import http
+import ipaddress
+import logging
+import secrets
+import socket
+import threading
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from crazysim.errors import RenderError
+
+EVERYWHERE = ("0.0.0.0", "::")
+"""Addresses to listen at that stand for every network."""
+LOCAL = ("127.0.0.1", "localhost", "::1")
+"""Addresses that other machines cannot reach."""
+
+log = logging.getLogger(__name__)
+
+
+class Access:
+    """Address of a live page, and the check of its requests.
+
+    A page of another site can send requests to this machine, with the name of its own site as ``Origin``, or, once that
+    name is resolved to this machine, as ``Host``. Both are refused, and so is who does not have the token.
+    """
+
+    def __init__(self, host: str, port: int):
+        """Make a new token.
+
+        Args:
+            host: Address that the server listens at.
+            port: Its port.
+        """
+        self.host, self.port = host, port
+        self._token = secrets.token_urlsafe(16)
+        self._reported: set[str] = set()
+
+    @property
+    def url(self) -> str:
+        """Address for a browser, with the token."""
+        host = "127.0.0.1" if self.host in EVERYWHERE else self.host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self._token}"
+
+    def refusal(self, path: str, headers: Mapping[str, str]) -> str:
+        """Return the reason why a request is refused; empty if it is accepted.
+
+        Args:
+            path: Path that is requested.
+            headers: Headers of the request.
+        """
+        host, origin = headers.get("Host", ""), headers.get("Origin")
+        if not is_own_name(host, self.host):
+            return wrong_name(host)
+        if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
+            return f"expected a request of this page itself, got one of {origin!r}. Open the page in a tab of its own."
+        if not hmac.compare_digest(self._first(path).encode(errors="replace"), self._token.encode()):
+            return "expected the address with its token, got another one. Use the address that the program printed."
+        return ""
+
+    def answer(self, connection: Any, request: Any) -> Any:
+        """Return the response of websockets that refuses a request, or None, with the token taken out of its path."""
+        reason = self.refusal(request.path, request.headers)
+        if not reason:
+            request.path = request.path.removeprefix(f"/{self._token}") or "/"
+            return None
+        if "Upgrade" in request.headers and reason not in self._reported:
+            self._reported.add(reason)
+            log.warning("refused a connection: %s", reason)
+        return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
+
+    @staticmethod
+    def _first(path: str) -> str:
+        return path.partition("?")[0].split("/")[1] if path.startswith("/") else ""
+
+
+def is_own_name(host: str, listening: str) -> bool:
+    """Return True if a ``Host`` header names this machine as no other site can.
+
+    That is by a number, as ``localhost``, by the machine's name, or by the address that the server listens at.
+
+    Args:
+        host: Value of the header.
+        listening: Address that the server listens at.
+    """
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return False
+    own = socket.gethostname().lower()
+    if name in ("localhost", own, f"{own}.local", listening.lower()):
+        return True
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def wrong_name(host: str) -> str:
+    """Return the message for a ``Host`` header that is refused."""
+    return f"expected an address of this machine, got {host!r}. Use its number, its name or localhost."
+
+
+def guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
+    """Return a running server of viser that answers only accepted requests.
+
+    viser has no setting for that. Its server is one of websockets, which is given the check while viser makes it.
+
+    Args:
+        viser: The module.
+        access: Address and check.
+        **settings: Further arguments of ``viser.ViserServer``.
+
+    Raises:
+        RenderError: If this version of viser makes its server in another way.
+    """
+    import websockets.asyncio.server as library
+
+    guarded = False
+
+    def serve(handler: Any, *args: Any, process_request: Any = None, **options: Any) -> Any:
+        nonlocal guarded
+        if not handler.__module__.startswith("viser."):
+            return original(handler, *args, process_request=process_request, **options)
+
+        def checked(connection: Any, request: Any) -> Any:
+            refused = access.answer(connection, request)
+            return process_request(connection, request) if refused is None else refused
+
+        guarded = True
+        return original(handler, *args, process_request=checked, **options)
+
+    with _LOCK:
+        original, library.serve = library.serve, serve
+        try:
+            server = viser.ViserServer(host=access.host, port=access.port, verbose=False, **settings)
+        finally:
+            library.serve = original
+    if not guarded:
+        server.stop()
+        raise RenderError(
+            f"expected a server of viser that can be guarded, got viser {viser.__version__}. Use viser 1.1."
+        )
+    return server
+
+
+_LOCK = threading.Lock()

@@ -1,0 +1,248 @@
+"""Recording of a simulation, and replay of a recorded flight in one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim.eager import to_host
+from crazysim.errors import ConfigError
+from crazysim.media.flight import SAMPLE, SCENE, Flight, pack_sample, pack_scene
+from crazysim.media.journal import Journal
+from crazysim.media.poses import mocap_poses
+from crazysim.media.worlds import world_indices
+from crazysim.scene.visual_geoms import visual_geoms
+from crazysim.sim.sim import Sim
+
+
+class Clock:
+    """Time since the start of a recording, which resets of the world do not set back."""
+
+    def __init__(self) -> None:
+        """Begin at zero."""
+        self.elapsed = 0.0
+        self._last: float | None = None
+
+    def at(self, time: float) -> float:
+        """Return the time since the first call, s, given the world's time since its last reset, s."""
+        if self._last is not None:
+            self.elapsed += time - self._last if time >= self._last else time
+        self._last = time
+        return self.elapsed
+
+
+class Recorder:
+    """Recorder of poses, in memory or in a file.
+
+        recorder = Recorder(sim, worlds=[0, 1])
+        for _ in range(100):
+            sim.step(10)
+            recorder.add()
+        recorder.flight().save("flight.npz")
+
+    With a path every sample is appended to that file as it is added, and none is kept in memory: the process may crash
+    at any moment, and ``Flight.load`` returns the flight up to there.
+    """
+
+    def __init__(self, sim: Sim, worlds: Sequence[int] | None = None, path: str | Path | None = None):
+        """Prepare to record; ``add`` records the first sample.
+
+        Args:
+            sim: Simulation.
+            worlds: Indices of the worlds to record; None for all.
+            path: New file; None to record in memory.
+
+        Raises:
+            ConfigError: If a world does not exist, or the file exists or cannot be created.
+        """
+        self._sim = sim
+        self._worlds = world_indices(sim, worlds)
+        self._scene = _scene(sim, self._worlds)
+        self._clock = Clock()
+        self._samples: list[dict[str, Any]] = []
+        self._n, self._last = 0, -np.inf
+        self._journal = None if path is None else Journal(path)
+        if self._journal is not None:
+            self._journal.append(SCENE, pack_scene(self._scene))
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return self._n
+
+    def add(self, time: float | None = None) -> None:
+        """Record the poses as they are now.
+
+        A second sample at the same time replaces the first, or in a file is left out.
+
+        Args:
+            time: Time since the start of the recording, s; None for that of the first recorded world, which resets of
+                the world do not set back.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        sim, worlds = self._sim, self._worlds
+        if time is None:
+            time = self._clock.at(float(sim.time[self._worlds[0], 0]))
+        if self._n and self._last == time:
+            if self._journal is not None:
+                return
+            self._samples.pop()
+            self._n -= 1
+        states, state = sim.data.states, sim.data.controls.state
+        body_pos, body_quat = _bodies(sim, self._worlds)
+        sample = {
+            "time": time,
+            "pos": np.asarray(states.pos, float)[worlds],
+            "quat": np.asarray(states.quat, float)[worlds],
+            "body_pos": body_pos,
+            "body_quat": body_quat,
+            "setpoint": np.zeros((len(worlds), 0, 3))
+            if state is None
+            else np.asarray(state.staged_cmd, float)[worlds, :, :3],
+        }
+        if self._journal is None:
+            self._samples.append(sample)
+        else:
+            self._journal.append(SAMPLE, pack_sample(sample))
+        self._n, self._last = self._n + 1, time
+
+    def flight(self) -> Flight:
+        """Return the flight up to the last sample.
+
+        Raises:
+            ConfigError: If there is no sample.
+        """
+        if not self._n:
+            raise ConfigError("expected at least one sample, got none. Call recorder.add() between steps.")
+        if self._journal is not None:
+            return Flight.load(self._journal.path)
+        return Flight(
+            **{name: np.stack([sample[name] for sample in self._samples]) for name in self._samples[0]}, **self._scene
+        )
+
+    def close(self) -> None:
+        """Close the file, if there is one; samples in memory stay."""
+        if self._journal is not None:
+            self._journal.close()
+
+
+def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = None) -> Flight:
+    """Return the flight of states that ``sim.rollout`` returned.
+
+    Args:
+        sim: Simulation of the rollout; other bodies are recorded at their present poses.
+        states: Record with ``pos`` (n, n_worlds, n_drones, 3) and ``quat`` (n, n_worlds, n_drones, 4).
+        dt: Time between two states, s.
+        worlds: Indices of the worlds to record; None for all.
+
+    Raises:
+        ConfigError: If the states have other shapes, or a world does not exist.
+    """
+    indices, needed = world_indices(sim, worlds), (sim.n_worlds, sim.n_drones)
+    if np.shape(states.pos)[1:] != (*needed, 3) or np.shape(states.quat) != (len(states.pos), *needed, 4):
+        raise ConfigError(
+            f"expected positions of shape (n, *{(*needed, 3)}) and quaternions of shape (n, *{(*needed, 4)}), as "
+            f"sim.rollout returns them, got {np.shape(states.pos)} and {np.shape(states.quat)}"
+        )
+    if not np.isfinite(dt) or dt <= 0:
+        raise ConfigError(f"expected a positive dt, s, got {dt!r}")
+    n = len(states.pos)
+    if not n:
+        raise ConfigError("expected at least one state, got none")
+    body_pos, body_quat = _bodies(sim, indices)
+    return Flight(
+        time=dt * np.arange(n),
+        pos=np.asarray(to_host(states.pos, (slice(None), indices)), float),
+        quat=np.asarray(to_host(states.quat, (slice(None), indices)), float),
+        body_pos=np.broadcast_to(body_pos, (n, *body_pos.shape)),
+        body_quat=np.broadcast_to(body_quat, (n, *body_quat.shape)),
+        setpoint=np.zeros((n, len(indices), 0, 3)),
+        **_scene(sim, indices),
+    )
+
+
+def put(sim: Sim, flight: Flight, time: float) -> None:
+    """Set poses, setpoints and clock of a simulation to those of a flight, to draw them.
+
+    Bodies are drawn as they were recorded, also those that plugins place, such as loads. Velocities, controllers and
+    records of plugins stay as they are. To continue a simulation, keep ``data = sim.data`` and restore it.
+
+    Args:
+        sim: Simulation with the drones, worlds and bodies of the one that was recorded.
+        flight: Flight.
+        time: Time of the flight, s.
+
+    Raises:
+        ConfigError: If the simulation has other drones, worlds or bodies.
+    """
+    worlds = flight.worlds
+    world_indices(sim, worlds.tolist())
+    found, recorded = (sim.n_drones, sim.mj_model.nmocap - sim.n_drones), (flight.n_drones, len(flight.body_ids))
+    if found != recorded:
+        raise ConfigError(
+            f"expected a simulation of {recorded[0]} drones and {recorded[1]} other mocap bodies, as the flight has, "
+            f"got {found[0]} and {found[1]}"
+        )
+    now, data = flight.at(time), sim.data
+    controls, objects = data.controls, data.objects
+    old = {"pos": data.states.pos, "quat": data.states.quat, "steps": data.core.steps}
+    new = {"pos": now["pos"], "quat": now["quat"], "steps": np.full((len(worlds), 1), round(time * sim.freq), np.int32)}
+    if controls.state is not None and now["setpoint"].size:
+        old["setpoint"], new["setpoint"] = controls.state.staged_cmd, now["setpoint"]
+    if objects is not None:
+        columns = np.searchsorted(flight.body_ids, np.asarray(objects.mocap_ids))
+        old |= {"body_pos": objects.pos, "body_quat": objects.quat}
+        new |= {name: now[name][:, None, columns] for name in ("body_pos", "body_quat")}
+    changed = _with_worlds(old, worlds, new)
+    states = data.states.replace(pos=changed["pos"], quat=changed["quat"])
+    core = data.core.replace(steps=changed["steps"])
+    if "setpoint" in changed:
+        controls = controls.replace(state=controls.state.replace(staged_cmd=changed["setpoint"]))
+    if objects is not None:
+        recorded = any(plugin.places for plugin in sim.plugins.values())
+        objects = objects.replace(pos=changed["body_pos"], quat=changed["body_quat"], recorded=recorded)
+    sim.data = data.replace(states=states, core=core, controls=controls, objects=objects)
+    body_pos, body_quat = _bodies(sim, worlds)
+    if not (np.allclose(body_pos, now["body_pos"], atol=1e-6) and np.allclose(body_quat, now["body_quat"], atol=1e-6)):
+        ids = np.ix_(worlds, _body_ids(sim))  # some are moved through mjx_data
+        sim.mjx_data = sim.mjx_data.replace(
+            mocap_pos=sim.mjx_data.mocap_pos.at[ids].set(now["body_pos"]),
+            mocap_quat=sim.mjx_data.mocap_quat.at[ids].set(np.roll(now["body_quat"], 1, axis=-1)),
+        )
+
+
+@jax.jit
+def _with_worlds(old: dict[str, Array], worlds: Array, new: dict[str, Array]) -> dict[str, Array]:
+    """Return arrays with other numbers in some worlds; the first ones of the last axis if there are fewer."""
+    return {name: x.at[worlds, ..., : new[name].shape[-1]].set(new[name]) for name, x in old.items()}
+
+
+def _body_ids(sim: Sim) -> NDArray:
+    """Return the mocap ids of bodies other than drones."""
+    return np.setdiff1d(np.arange(sim.mj_model.nmocap), np.asarray(sim.data.core.drone_mocap_ids))
+
+
+def _scene(sim: Sim, worlds: NDArray) -> dict[str, Any]:
+    """Return the fields of a flight that do not change with time."""
+    ids = _body_ids(sim)
+    sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), worlds[0])
+    return {
+        "worlds": worlds,
+        "drone_ids": np.asarray(sim.data.core.drone_mocap_ids),
+        "body_ids": ids,
+        "shapes": visual_geoms(sim.mj_model, sim.mj_data),
+    }
+
+
+def _bodies(sim: Sim, worlds: NDArray) -> tuple[NDArray, NDArray]:
+    """Return poses of bodies other than drones. (n_worlds, n_bodies, 3) and (n_worlds, n_bodies, 4), xyzw"""
+    ids = _body_ids(sim)
+    pos, quat = mocap_poses(sim, worlds)
+    return pos[:, ids], quat[:, ids]

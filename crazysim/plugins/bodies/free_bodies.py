@@ -1,0 +1,248 @@
+"""Free rigid bodies: a population of balls and boxes with contact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import Objects, SimData
+from crazysim.core.integration import Integrator, limit_ang_vel
+from crazysim.core.plugin import Placement, Simulation, parameter
+from crazysim.core.population import Population, Rates
+from crazysim.core.settings import as_rgba, check_contacts
+from crazysim.core.stage import Stage
+from crazysim.dynamics.rigid_body import free_rotation
+from crazysim.errors import ConfigError, shown
+from crazysim.geometry import Shape
+from crazysim.plugins.contacts.rigid_bodies import Touching, require_few_contacts
+from crazysim.plugins.effects.ground import TerrainData
+from crazysim.plugins.payloads.body import shape_of
+from crazysim.plugins.payloads.load import with_poses
+from crazysim.pytree import Members, host_array, leaf
+from crazysim.scene.contact_report import ObjectSelection
+from crazysim.tables import MASS, as_numbers
+
+GRAVITY = (0.0, 0.0, -9.81)
+"""Gravity, world frame, m/s^2, as the airframes have it."""
+MAX_BODIES = 1000
+"""Most bodies in a world."""
+GAP = 0.5
+"""Distance of neighbours that start in a row, m."""
+
+
+class FreeBodiesData(Members):
+    """States and parameters of free bodies."""
+
+    pos: Array = leaf("member", 1)
+    """Position of the centre of mass, world frame, m. (n_worlds, n_members, 3)"""
+    quat: Array = leaf("member", 1)
+    """Attitude, body to world, unit, xyzw. (n_worlds, n_members, 4)"""
+    vel: Array = leaf("member", 1)
+    """Velocity of the centre of mass, world frame, m/s. (n_worlds, n_members, 3)"""
+    ang_vel: Array = leaf("member", 1)
+    """Angular velocity, body frame, rad/s. (n_worlds, n_members, 3)"""
+    force: Array = leaf("member", 1)
+    """External force on the centre of mass, world frame, N; kept until it is changed. (n_worlds, n_members, 3)"""
+    torque: Array = leaf("member", 1)
+    """External torque, world frame, N m; kept until it is changed. (n_worlds, n_members, 3)"""
+    impulse: Array = leaf("member", 1)
+    """Impulse of all contacts in the last step, world frame, N s. (n_worlds, n_members, 3)"""
+    press: Array = leaf("world", 1)
+    """Impulses of the last step along the normals of the contact points, N s, with which the next begins.
+    (n_worlds, 1, n_contacts)"""
+    drag: Array = leaf("world", 2)
+    """The same across the normals, world frame, N s. (n_worlds, 1, n_contacts, 3)"""
+    mass: Array = leaf("member", 1)
+    """Mass, kg. (n_worlds, n_members, 1)"""
+    inertia: Array = leaf("member", 1)
+    """Moments of inertia about the axes of the body, kg m^2. (n_worlds, n_members, 3)"""
+    friction: Array = leaf("member", 1)
+    """Coulomb's coefficient of the surface, 1. (n_worlds, n_members, 1)"""
+    restitution: Array = leaf("member", 1)
+    """Ratio of the speeds after and before a bounce, 1. (n_worlds, n_members, 1)"""
+
+
+class FreeBodies(Population):
+    """Balls and boxes that fall, slide, roll, bounce and stack.
+
+    They touch the ground, objects of the scene, other populations with shapes, drones and each other. Drones and bodies
+    are pushed back; objects and other populations are not. One ``FreeBodies`` holds all free bodies of a simulation.
+    """
+
+    members: int | Sequence[str] = 1
+    """Number of bodies in each world, or their names."""
+    size: Any = (0.2, 0.2, 0.2)
+    """Full lengths of a box, m (3,), or radius of a ball, m, for all; or a list of one for each body."""
+    mass: Any = parameter(default=0.1)
+    """Mass, kg. (), (n_members,) or (n_worlds, n_members)"""
+    pos: Any = parameter(default=None)
+    """Positions at the start, world frame, m; None for a row along x on the floor. (3,), (n_members, 3) or (n_worlds,
+    n_members, 3)"""
+    quat: Any = parameter(default=(0.0, 0.0, 0.0, 1.0))
+    """Attitudes at the start, xyzw, normalised here. (4,), (n_members, 4) or (n_worlds, n_members, 4)"""
+    vel: Any = parameter(default=(0.0, 0.0, 0.0))
+    """Velocities at the start, world frame, m/s. (3,), (n_members, 3) or (n_worlds, n_members, 3)"""
+    friction: Any = parameter(default=0.6)
+    """Coulomb's coefficient; of two bodies the larger counts. (), (n_members,) or (n_worlds, n_members)"""
+    restitution: Any = parameter(default=0.0)
+    """Ratio of the speeds after and before a bounce, 0 to 1; of two bodies the larger counts. (), (n_members,) or
+    (n_worlds, n_members)"""
+    objects: ObjectSelection = None
+    """Handles, or names of objects that the bodies touch; None for all at the time of adding, () for the ground."""
+    drones: bool = True
+    """True for contact with drones."""
+    softness: float = 0.03
+    """Time constant with which an overlap is pushed out, s; at least two steps."""
+    iterations: int = 30
+    """Iterations of the solver."""
+    rgba: Any = None
+    """Colour, one or one for each body; None for the default. (4,) or (n_members, 4)"""
+    name: str = "bodies"
+    prefix: ClassVar[str] = "Box"
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """Shape of each body.
+
+        Raises:
+            ConfigError: If a size is neither a radius nor three lengths.
+        """
+        n, size = self.n_members, self.size
+        if n > MAX_BODIES:
+            raise ConfigError(f"expected at most {MAX_BODIES} bodies in a world, got {n}. Use fewer, and more worlds.")
+        listed = isinstance(size, list) or np.ndim(size) == 2
+        if listed and len(size) != n:
+            raise ConfigError(f"expected one size for all {n} bodies or a list of {n}, got a list of {len(size)}")
+        return tuple(shape_of(tuple(s) if np.ndim(s) else s) for s in (size if listed else [size] * n))
+
+    @property
+    def pushes_drones(self) -> bool:
+        """True if the contacts of this plugin are those with drones, so that ``ContactResponse`` leaves them out."""
+        return self.drones
+
+    @property
+    def placed_kinds(self) -> tuple[str, ...]:
+        """Name of the bodies in the scene."""
+        return (self.name,)
+
+    def record(self, sim: Simulation) -> FreeBodiesData:
+        """Return the bodies where they start, and put them into the scene."""
+        shapes = self.shapes
+        others = [p.name for p in sim.scene.plugins() if isinstance(p, FreeBodies) and p.name != self.name]
+        if others:
+            raise ConfigError(
+                f"expected one FreeBodies in a simulation, got a second beside {others[0]!r}. Use "
+                f"FreeBodies(n, size=[...]) with a size for each body."
+            )
+        check_contacts(sim.data.core.freq, self.friction, self.restitution, self.softness, self.iterations)
+        pos = row(shapes) if self.pos is None else self.pos
+        numbers = {}
+        for name in ("mass", "friction", "restitution"):
+            numbers[name] = as_numbers(f"plugin {self.name!r}", name, getattr(self, name))[..., None]
+        if not np.all((numbers["mass"] >= MASS.low) & (numbers["mass"] <= MASS.high)):
+            raise ConfigError(f"expected mass to be {MASS.text}, got {shown(self.mass)}")
+        quat = np.asarray(self.quat, np.float64)
+        if quat.shape[-1:] != (4,) or not np.all(np.linalg.norm(quat, axis=-1) > 0):
+            raise ConfigError(f"expected quat as quaternions xyzw, not zero, got {self.quat!r}")
+        for name, value in (("pos", pos), ("vel", self.vel)):
+            if not np.all(np.isfinite(np.asarray(value, np.float64))):
+                raise ConfigError(f"expected {name} to be finite, got {value!r}")
+        self.check(sim)
+        self._add_to_scene(sim, shapes)
+        terrains = [name for name, x in sim.data.plugins.items() if isinstance(x, TerrainData)]
+        n_contacts = require_few_contacts(Touching(sim, self).n_contacts(terrains), f"{len(shapes)} bodies")
+        zero = np.zeros(3)
+        return self.create(
+            sim,
+            FreeBodiesData,
+            pos=np.asarray(pos, np.float64),
+            quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+            vel=np.asarray(self.vel, np.float64),
+            ang_vel=zero,
+            force=zero,
+            torque=zero,
+            impulse=zero,
+            press=host_array(0.0, sim.n_worlds, 1, n_contacts),
+            drag=host_array(0.0, sim.n_worlds, 1, n_contacts, 3),
+            inertia=numbers["mass"] * np.stack([inertia_per_mass(shape) for shape in shapes]),
+            **numbers,
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages of the integration and of the contacts."""
+        touching = Touching(sim, self)
+        contact = Stage(lambda data: touching.respond(data), "batch", name=f"{self.name}_contacts")
+        return [*super().stages(sim), Placement(contact, before="increment_steps", name=f"{self.name}_contacts")]
+
+    def derivative(self, data: SimData) -> Mapping[str, Array]:
+        """Return the rates of one body under gravity and the external wrench (Newton and Euler)."""
+        body = self.read(data)
+        torque = rotation.rotate_inverse(body.quat, body.torque)
+        spin = body.inertia * body.ang_vel
+        return {
+            "pos": body.vel,
+            "quat": 0.5 * rotation.multiply(body.quat, jnp.concatenate([body.ang_vel, 0 * body.mass])),
+            "vel": jnp.asarray(GRAVITY, body.pos.dtype) + body.force / body.mass,
+            "ang_vel": (torque - rotation.cross(body.ang_vel, spin)) / body.inertia,
+        }
+
+    def scheme(self, integrator: Integrator) -> Callable[..., FreeBodiesData]:
+        """Return the scheme of the simulation; with those of Euler bodies turn by ``free_rotation``."""
+        scheme = super().scheme(integrator)
+
+        def moved(body: FreeBodiesData, rates: Rates, dt: float) -> FreeBodiesData:
+            if integrator == Integrator.rk4:
+                after = scheme(body, rates, dt)
+                return after.replace(ang_vel=limit_ang_vel(after.ang_vel, 1 / dt))
+            after = scheme(body, lambda at: {name: rates(at)[name] for name in ("pos", "vel")}, dt)
+            torque = rotation.rotate_inverse(body.quat, body.torque)
+            ang_vel = limit_ang_vel(body.ang_vel + dt * torque / body.inertia, 1 / dt)
+            quat, ang_vel = free_rotation(body.quat, ang_vel, body.inertia, dt)
+            return after.replace(quat=quat, ang_vel=ang_vel)
+
+        return moved
+
+    def finish(self, record: FreeBodiesData) -> FreeBodiesData:
+        """Return the record of one body with its quaternion at unit length."""
+        identity = jnp.asarray([0.0, 0.0, 0.0, 1.0], record.quat.dtype)
+        return record.replace(quat=rotation.safe_normalize(record.quat, identity))
+
+    def place(self, data: SimData) -> Objects:
+        """Return the scene's objects with the bodies at their poses; of one world."""
+        record = self.read(data)
+        return with_poses(data.objects, {self.name: (record.pos, record.quat)})  # type: ignore[arg-type]
+
+    def _add_to_scene(self, sim: Simulation, shapes: Sequence[Shape]) -> None:
+        """Add the bodies to the scene, if they are not there yet."""
+        objects = sim.data.objects
+        if objects is not None and f"{self.name}:0" in objects.names:
+            return
+        rgba = (0.25, 0.5, 0.75, 1.0) if self.rgba is None else self.rgba
+        colors = np.broadcast_to(as_rgba(rgba, len(shapes)), (len(shapes), 4))
+        geoms = [bodies_geom(shape, rgba) for shape, rgba in zip(shapes, colors, strict=True)]
+        sim.scene.add(geoms, self.name, count=len(shapes))
+
+
+def row(shapes: Sequence[Shape]) -> np.ndarray:
+    """Return positions in a row along x from 1 m on, on the floor, m. (n, 3)"""
+    return np.array([[1.0 + GAP * k, 0.0, shape.size[-1]] for k, shape in enumerate(shapes)])
+
+
+def inertia_per_mass(shape: Shape) -> np.ndarray:
+    """Return the moments of inertia of a homogeneous ball or box over its mass, m^2. (3,)"""
+    if shape.kind == "sphere":
+        return np.full(3, 0.4 * shape.size[0] ** 2)
+    x, y, z = np.square(shape.size)
+    return np.array([y + z, z + x, x + y]) / 3
+
+
+def bodies_geom(shape: Shape, rgba: Any) -> str:
+    """Return MJCF of the geom of a body, which drones touch."""
+    size, color = (" ".join(f"{float(x):.9g}" for x in values) for values in (shape.size, rgba))
+    geom = f'<geom type="{shape.kind}" size="{size}" contype="0" conaffinity="2" rgba="{color}"/>'
+    return f"<mujoco><worldbody>{geom}</worldbody></mujoco>"

@@ -1,0 +1,110 @@
+"""Contact log: contacts checked at every step, and the drones that have touched something since their last reset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation
+from crazysim.core.stage import Stage, StageScope
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, leaf, on_device, static
+from crazysim.scene.contact_report import ContactReport, ObjectSelection, choose
+from crazysim.scene.placement import placed_by
+
+
+class ContactLogData(PyTree):
+    """Contacts of each drone since its world's last reset."""
+
+    floor: Array = leaf("drone", 0)
+    """True where it has touched the floor. (n_worlds, n_drones)"""
+    objects: Array = leaf("drone", 1)
+    """True where it has touched an object. (n_worlds, n_drones, n_objects)"""
+    drones: Array = leaf("drone", 0)
+    """True where it has touched another drone. (n_worlds, n_drones)"""
+    first: Array = leaf("drone", 0)
+    """Step at the end of which it first touched anything; -1 before. (n_worlds, n_drones)"""
+    object_names: tuple[str, ...] = static()
+    """Names of the objects' bodies."""
+
+    @property
+    def any(self) -> Array:
+        """True where it has touched anything. (n_worlds, n_drones)"""
+        return self.first >= 0
+
+
+class ContactLog(Plugin):
+    """Log of contacts, checked at the end of every step within the compiled step.
+
+    A reset of a world clears its log. ObjectSelection that are added to the scene later are not checked.
+    """
+
+    objects: ObjectSelection = None
+    """Handles, or names of bodies; None for all at the time of adding, () for none."""
+    floor: bool = True
+    """True to check the floor. Drones that start on it touch it at once."""
+    drones: bool = True
+    """True to check drones against each other."""
+    name: str = "contacts"
+
+    def record(self, sim: Simulation) -> ContactLogData:
+        """Return an empty log."""
+        names = self._names(sim)
+        if not (names or self.floor or self.drones):
+            raise ConfigError("expected something to check for contacts, got nothing. Use floor, drones or objects.")
+        shape = (sim.n_worlds, sim.n_drones)
+        return ContactLogData(
+            floor=on_device(np.zeros(shape), bool),
+            objects=on_device(np.zeros((*shape, len(names))), bool),
+            drones=on_device(np.zeros(shape), bool),
+            first=on_device(np.full(shape, -1), np.int32),
+            object_names=names,
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return a stage of one drone, and one of one world for loads and other objects that plugins place.
+
+        Two, because a stage of one world computes everything for all its drones.
+        """
+        names, found = self._names(sim), []
+        placed = placed_by(sim.scene.plugins(), names)
+        others = [name for name in names if name not in placed]
+        if others or self.floor or self.drones:
+            alone = self._stage(sim.scene.contact_fn(others, self.floor, self.drones), "drone")
+            found.append(Placement(alone, before="increment_steps"))
+        if placed:
+            together = self._stage(sim.scene.contact_fn(list(placed), floor=False, drones=False), "world")
+            found.append(Placement(together, before="increment_steps", name=f"{self.name}_of_placed"))
+        return found
+
+    def _names(self, sim: Simulation) -> tuple[str, ...]:
+        return tuple(body.name for body in choose(sim.scene.collision_model, self.objects))
+
+    def _stage(self, contacts: Callable[[SimData], ContactReport], scope: StageScope) -> Stage:
+        def check(data: SimData) -> SimData:
+            log, report = self.read(data), contacts(data)
+            new = log.replace(
+                floor=_or(log.floor, report.floor),
+                objects=_with_objects(log, report),
+                drones=_or(log.drones, report.drones),
+                first=jnp.where((log.first < 0) & report.any, data.core.steps + 1, log.first),
+            )
+            return self.write(data, new)
+
+        return Stage(check, scope)
+
+
+def _with_objects(log: ContactLogData, report: ContactReport) -> Array:
+    """Return the log's objects with those of a report, which may be some of them. (..., n_objects)"""
+    if report.objects is None or report.object_names == log.object_names:
+        return _or(log.objects, report.objects)
+    columns = np.array([log.object_names.index(name) for name in report.object_names])
+    return log.objects | jnp.zeros_like(log.objects).at[..., columns].set(report.objects)
+
+
+def _or(before: Array, now: Array | None) -> Array:
+    return before if now is None else before | now

@@ -1,0 +1,241 @@
+"""Contact points: the places of a drone's collision box that touch floor and objects, or may touch them next.
+
+They are the corners of the box, and the points of its upper and lower plate that are nearest to each object.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Collection
+from itertools import product
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation
+from crazysim.core.population import populations
+from crazysim.geometry import Shape, distance, point_distance
+from crazysim.geometry.heightfield import field_gap
+from crazysim.plugins.effects.ground import TerrainData
+from crazysim.plugins.payloads.body import LoadBody
+from crazysim.scene.collision import CollisionGeom
+from crazysim.scene.contact_report import ObjectSelection, choose
+
+FLAT = ("plane", "box", "cylinder")
+"""Kinds with faces, on which a drone stands by its corners."""
+THIN = 0.05
+"""Height of the upper and lower plate of a drone's box, as a share of the box; both touch an object along its side."""
+
+
+class Surface(NamedTuple):
+    """Surface of a geom."""
+
+    geom: CollisionGeom
+    """The geom, in the frame of its object or of the world."""
+    row: int | None
+    """Row of the movable object that carries it in ``data.objects``, or number of the member; None for a fixed one."""
+    population: str | None = None
+    """Name of the population of which a member carries it; None for an object."""
+
+
+def surfaces_of(sim: Simulation, objects: ObjectSelection, loads: Collection[str] = ()) -> list[Surface]:
+    """Return the surfaces of the floor, of some objects, and of members of populations, such as cars.
+
+    Loads are left out, and bodies that exchange impulses with drones in a stage of their own.
+    """
+    model = sim.scene.collision_model
+    found = [Surface(geom, None) for geom in model.floor]
+    placing = {kind: plugin for plugin in sim.scene.plugins() for kind in plugin.placed_kinds or ()}
+    members = populations(sim.data)
+    for body in choose(model, objects):
+        kind, _, number = body.name.rpartition(":")
+        if kind in members and hasattr(members[kind], "ang_vel"):
+            if not getattr(placing.get(kind), "pushes_drones", False):
+                found += [Surface(geom, int(number), kind) for geom in body.geoms]
+        elif body.name not in loads and kind not in placing:
+            found += [Surface(geom, body.row) for geom in body.geoms]
+    return found
+
+
+def is_ground(surface: Surface) -> bool:
+    """Return True for the plane z = 0, at which every load stops without a contact response."""
+    geom = surface.geom
+    return surface.row is None and geom.shape.kind == "plane" and geom.rot is None and geom.pos[2] == 0
+
+
+class ContactPoints(NamedTuple):
+    """Points that are or may come into contact, in the body frame of a drone, or for loads in the world frame."""
+
+    gap: Array
+    """Distance to the surface, m. (..., n)"""
+    normal: Array
+    """Outward normal of the surface. (..., n, 3)"""
+    point: Array | None
+    """Position on the drone, from its centre of mass, m; None for a load, which is a point mass. (..., n, 3)"""
+    vel: Array
+    """Velocity of the surface, m/s. (..., n, 3)"""
+
+
+def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> ContactPoints:
+    """Return all contact points of every drone.
+
+    Args:
+        data: The simulation, or one drone of it.
+        surfaces: Surfaces of floor and objects.
+        box: Centre and half extents of the drone's collision box, body frame, m. (6,)
+    """
+    pos, quat = data.states.pos, data.states.quat
+    dtype = pos.dtype
+    corners = jnp.asarray(box[:3] + box[3:] * np.array(list(product((-1, 1), repeat=3))), dtype)
+    plate = Shape("box", (*box[3:5].tolist(), THIN * box[5]))
+    middles = [jnp.asarray(box[:3] + np.array([0, 0, side * (1 - THIN) * box[5]]), dtype) for side in (-1, 1)]
+    turn = quat[..., None, :]
+    in_world = pos[..., None, :] + rotation.rotate(turn, corners)
+    found = []
+    for surface in surfaces:
+        geom = surface.geom
+        into, back, vel = _frame(data, surface)
+        still = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(turn, vel(in_world))
+        if geom.shape.kind == "hfield":
+            gap, normal = _above(data, geom, in_world, into, back)
+            normal = rotation.rotate_inverse(turn, normal)
+            found.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
+        if geom.shape.kind in FLAT:
+            gap, pull = jax.vjp(lambda p, s=geom.shape: point_distance(s, p), into(in_world, True))
+            normal = rotation.rotate_inverse(turn, back(pull(jnp.ones_like(gap))[0]))
+            found.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
+        if geom.shape.kind not in ("plane", "hfield"):
+            found += [_nearest(data, geom, into, plate, middle, still[..., :1, :]) for middle in middles]
+    joined = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True)))
+    return ContactPoints(*joined)
+
+
+def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surface]) -> ContactPoints:
+    """Return the points of loads that are nearest to each surface.
+
+    Args:
+        data: One drone or one world.
+        body: Its loads.
+        shape: Their shape.
+        surfaces: At least one surface.
+    """
+    pos, quat = body.pos[..., None, :], body.quat[..., None, :]
+    axes = [rotation.rotate(quat, jnp.eye(3, dtype=pos.dtype)[k]) for k in range(3)]
+    gaps, normals, vels = [], [], []
+    for surface in surfaces:
+        geom = surface.geom
+        into, back, vel = _frame(data, surface)
+        if geom.shape.kind == "hfield":
+            gap, normal = _above(data, geom, pos, into, back)
+            gap = gap - _reach(shape, jnp.stack([rotation.dot(axis, normal)[..., 0] for axis in axes], axis=-1))
+        else:
+            rot = jnp.stack([into(axis, False) for axis in axes], axis=-1)
+            gap, pull = jax.vjp(lambda x, s=geom.shape, f=into, r=rot: distance(shape, s, f(x, True), r), pos)
+            normal = pull(jnp.ones_like(gap))[0]
+        gaps.append(gap)
+        normals.append(normal)
+        vels.append(jnp.zeros_like(pos) if vel is None else vel(pos))
+    return ContactPoints(
+        jnp.concatenate(gaps, axis=-1), jnp.concatenate(normals, axis=-2), None, jnp.concatenate(vels, axis=-2)
+    )
+
+
+def _above(data: SimData, geom: CollisionGeom, points: Array, into: Callable, back: Callable) -> tuple[Array, Array]:
+    """Return the distance of points to the plane below them of a height field, m, and its normal, world frame."""
+    terrain = data.plugins.get(geom.name)
+    if isinstance(terrain, TerrainData):
+        return terrain.gap_at(points)
+    gap, normal = field_gap(geom.shape, into(points, True))
+    return gap, back(normal)
+
+
+def _reach(shape: Shape, direction: Array) -> Array:
+    """Return the distance of the outermost point of a ball or box along a direction in its frame, m. (...)"""
+    if shape.kind == "sphere":
+        return jnp.full(direction.shape[:-1], shape.size[0], direction.dtype)
+    return jnp.sum(jnp.abs(direction) * jnp.asarray(shape.size, direction.dtype), axis=-1)
+
+
+def _nearest(
+    data: SimData, geom: CollisionGeom, into: Callable, shape: Shape, middle: Array, vel: Array
+) -> ContactPoints:
+    """Return the point of a plate that is nearest to a geom.
+
+    The gradient of the gap with respect to the drone's position is the normal, and that with respect to its attitude is
+    the lever times the normal, which is all that turns the drone. The position along the normal affects friction only;
+    the plate's face is used.
+    """
+    pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
+
+    def pose(move: Array, turned: Array) -> tuple[Array, Array]:
+        q = rotation.turn(quat, turned, 1.0, normalize=False)
+        columns = [into(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
+        return into(pos + move + rotation.rotate(q, middle), True), jnp.stack(columns, axis=-1)
+
+    at, pull_back = jax.vjp(pose, jnp.zeros_like(pos), jnp.zeros_like(pos))
+    gap, slopes = _distance_and_slopes(shape, geom.shape, *at)
+    force, torque = pull_back(slopes)
+    normal = rotation.rotate_inverse(quat, force)
+    reach = jnp.sum(jnp.abs(normal) * jnp.asarray(shape.size, pos.dtype), axis=-1, keepdims=True)
+    point = rotation.cross(normal, torque) - reach * normal
+    return ContactPoints(gap, normal, point, jnp.broadcast_to(vel, normal.shape))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
+def _distance_and_slopes(shape: Shape, other: Shape, pos: Array, rot: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Return ``distance``, m, (...), and its gradients with respect to position and rotation matrix.
+
+    It is traced only once for both plates and all geoms of one shape, such as the wheels of cars.
+
+    Args:
+        shape: Shape of the plate.
+        other: Shape of the geom.
+        pos: Position of the plate, frame of the geom, m. (..., 3)
+        rot: Rotation matrix from the plate to the geom. (..., 3, 3)
+    """
+    gap, pull_back = jax.vjp(lambda pos, rot: distance(shape, other, pos, rot), pos, rot)
+    return gap, pull_back(jnp.ones_like(gap))
+
+
+def _frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Callable | None]:
+    """Return functions that take points and directions into a geom's frame, and directions back, and its velocity.
+
+    The last one takes points in the world frame; it is None for a fixed surface.
+    """
+    geom, row = surface.geom, surface.row
+    dtype = data.states.pos.dtype
+    at = jnp.asarray(geom.pos, dtype)
+    rot = None if geom.rot is None else jnp.asarray(geom.rot, dtype)
+    own_pos = own_quat = vel = spin = None
+    if surface.population is not None:
+        record = data.plugins[surface.population]
+        own_pos, own_quat, vel, ang_vel = (
+            getattr(record, name)[..., row, :] for name in ("pos", "quat", "vel", "ang_vel")
+        )
+        spin = rotation.rotate(own_quat, ang_vel)
+    elif row is not None:
+        objects: Any = data.objects
+        own_pos, own_quat, vel = (x[..., row, :] for x in (objects.pos, objects.quat, objects.vel))
+
+    def into(x: Array, is_point: bool) -> Array:
+        if own_quat is not None and own_pos is not None:
+            x = rotation.rotate_inverse(own_quat[..., None, :], x - own_pos[..., None, :] if is_point else x)
+        x = x - at if is_point else x
+        return x if rot is None else rotation.matvec(rot.T, x)
+
+    def back(x: Array) -> Array:
+        x = x if rot is None else rotation.matvec(rot, x)
+        return x if own_quat is None else rotation.rotate(own_quat[..., None, :], x)
+
+    def moving(x: Array) -> Array:
+        out = jnp.broadcast_to(vel[..., None, :], x.shape)  # type: ignore[index]
+        if spin is None or own_pos is None:
+            return out
+        return out + rotation.cross(jnp.broadcast_to(spin[..., None, :], x.shape), x - own_pos[..., None, :])
+
+    return into, back, None if vel is None else moving

@@ -1,0 +1,96 @@
+"""Collisions of drones with each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.settings import check_contacts
+from crazysim.core.stage import Stage, over_worlds
+from crazysim.errors import ConfigError
+from crazysim.geometry.manifold import N_OF_BOXES
+from crazysim.plugins.contacts.pairs import Solids, between, joined
+from crazysim.plugins.contacts.rigid_bodies import (
+    boxes_of_drones,
+    drones_as_bodies,
+    drones_as_boxes,
+    moved,
+    require_few_contacts,
+)
+from crazysim.plugins.contacts.solver import Impulses, solve_contacts
+from crazysim.plugins.effects.moving_air import zeros
+from crazysim.pytree import PyTree, leaf, on_device
+
+
+class DroneCollisionsData(PyTree):
+    """Parameters of the collisions, and the last impulses."""
+
+    friction: Array = leaf("shared", 1)
+    """Coulomb's coefficient between drones, 1. (1,)"""
+    restitution: Array = leaf("shared", 1)
+    """Ratio of the speeds after and before a bounce, 1. (1,)"""
+    impulse: Array = leaf("drone", 1)
+    """Impulse of the other drones in the last step, world frame, N s. (n_worlds, n_drones, 3)"""
+    press: Array = leaf("world", 1)
+    """Impulses along the normals of the contact points, N s, with which the next step begins.
+    (n_worlds, 1, n_contacts)"""
+    drag: Array = leaf("world", 2)
+    """The same across the normals, world frame, N s. (n_worlds, 1, n_contacts, 3)"""
+
+
+class DroneCollisions(Plugin):
+    """Drones of a world that push each other where their collision boxes meet.
+
+    All pairs are checked: it is for small swarms. Momentum and angular momentum are kept.
+    """
+
+    friction: float = parameter(default=0.6)
+    """Coulomb's coefficient between drones."""
+    restitution: float = parameter(default=0.2)
+    """Ratio of the speeds after and before a bounce, 0 to 1."""
+    softness: float = 0.03
+    """Time constant with which an overlap is pushed out, s; at least two steps."""
+    iterations: int = 12
+    """Iterations of the solver."""
+    name: str = "drone_collisions"
+
+    def record(self, sim: Simulation) -> DroneCollisionsData:
+        """Return the parameters, and no impulse."""
+        n = sim.n_drones
+        if n < 2:
+            raise ConfigError(f"expected at least two drones, which can collide, got {n}. Use Sim(n_drones=...).")
+        check_contacts(sim.data.core.freq, self.friction, self.restitution, self.softness, self.iterations)
+        n_contacts = require_few_contacts(N_OF_BOXES * n * (n - 1) // 2, f"{n} drones")
+        return DroneCollisionsData(
+            friction=on_device([self.friction]),
+            restitution=on_device([self.restitution]),
+            impulse=zeros(sim, 3),
+            press=on_device(np.zeros((sim.n_worlds, 1, n_contacts))),
+            drag=on_device(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage of the collisions."""
+        boxes, n = boxes_of_drones(sim), sim.n_drones
+        pairs = np.array(list(combinations(range(n), 2)))
+
+        def of_world(data: SimData) -> SimData:
+            record = self.read(data)
+            pos, rot = drones_as_boxes(data, boxes)
+            solids = Solids(np.arange(n), np.zeros(n, bool), boxes[:, 3:], pos, rot)
+            each = (jnp.broadcast_to(x, (n,)) for x in (record.friction, record.restitution))
+            contacts = joined(between(solids, pairs), *each)
+            before, dt = Impulses(record.press, record.drag), 1 / data.core.freq
+            solved = solve_contacts(drones_as_bodies(data), contacts, before, dt, self.softness, self.iterations)
+            changes: Any = {"impulse": solved.impulse, "press": solved.at.press, "drag": solved.at.drag}
+            states = moved(data.states, solved, slice(n))
+            return self.write(data.replace(states=states), record.replace(**changes))
+
+        return [Placement(Stage(over_worlds(of_world), "batch"), before="increment_steps")]

@@ -1,0 +1,206 @@
+"""Contacts of loads and hooks: with surfaces of the scene, with drones, and with each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import combinations_with_replacement
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation
+from crazysim.geometry import Shape, distance
+from crazysim.plugins.contacts.contact_points import Surface, load_points
+from crazysim.plugins.contacts.drone_boxes import Boxes, of_kind
+from crazysim.plugins.contacts.impulse import (
+    BOUNCE_SPEED,
+    FASTEST_PUSH,
+    STICKING,
+    Material,
+    after_contact,
+    inertia_matrix,
+)
+from crazysim.plugins.payloads.body import Collider, Colliding
+
+OWN_GAP = 1e3
+"""Distance that stands for that of a body to itself, m."""
+
+
+def loads_of(sim: Simulation) -> list[Any]:
+    """Return the plugins whose loads are objects of the scene, and collide."""
+    names = () if sim.data.objects is None else sim.data.objects.names
+    return [p for p in sim.scene.plugins() if isinstance(p, Colliding) and f"{p.name}:0" in names]
+
+
+def names_of(sim: Simulation, plugins: Sequence[Any]) -> set[str]:
+    """Return the names of the loads and hooks of some plugins in the scene."""
+    kinds = {kind for p in plugins for kind in p.solid_kinds}
+    return {name for name in (sim.data.objects.names if plugins else ()) if name.rpartition(":")[0] in kinds}
+
+
+def stop_loads(
+    data: SimData, collider: Collider, surfaces: list[Surface], material: Material, iterations: int
+) -> SimData:
+    """Return the data with the velocities of bodies after the impulses of surfaces; of one drone or one world.
+
+    The velocity after contact does not depend on the mass. What the impulse does to a drone on a taut link follows in
+    the next step, from the constraint.
+    """
+    body = collider.body(data)
+    # A load of a whole world takes the material of its first drone.
+    material = Material(*(x[:1] if x.ndim > 1 else x for x in material))
+    points, one = load_points(data, body, collider.shape, surfaces), jnp.ones_like(body.mass)
+    vel = after_contact(points, body.vel, one, inertia_matrix(one), material, iterations)
+    vel = vel if body.exists is None else jnp.where(body.exists[..., None], vel, body.vel)
+    return collider.with_vel(data, vel)
+
+
+def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Boxes) -> tuple[SimData, Any]:
+    """Return one world after the impulses between loads or hooks and drones, and the impulses on the drones, N s.
+
+    The impulse acts at the load's centre, on both: momentum and angular momentum are kept. First the normal impulse,
+    with restitution, then friction, limited by Coulomb's law and by what stops the slip. Where a body has several
+    contacts, each counts by its share, so that together they create no energy. A load and a drone that a rod joins do
+    not touch.
+
+    Args:
+        data: One world.
+        collider: The loads, or the hooks.
+        material: Parameters of the contacts.
+        boxes: Collision boxes of the drones.
+    """
+    body, s, p = collider.body(data), data.states, data.params
+    mass, quat = body.mass[:, None], s.quat[None]
+    # Axes are (n_loads, n_drones), vectors are in the body frame of the drone.
+    lever = rotation.rotate_inverse(quat, body.pos[:, None] - s.pos)
+    eye = jnp.eye(3, dtype=lever.dtype)
+    axes = [rotation.rotate_inverse(quat, rotation.rotate(body.quat[:, None], eye[k])) for k in range(3)]
+    shape, rot = collider.shape, jnp.stack(axes, axis=-1)
+
+    def to_box(box: np.ndarray) -> tuple[Array, Array]:
+        target = Shape("box", tuple(map(float, box[3:])))
+        gap, pull = jax.vjp(lambda x: distance(shape, target, x - jnp.asarray(box[:3], x.dtype), rot), lever)
+        return gap[..., None], pull(jnp.ones_like(gap))[0]
+
+    gap, normal = of_kind([(kind, to_box(box)) for kind, box in boxes], data.core.drone_id)
+    gap = gap[..., 0]
+    touches = (gap < 0) & ~collider.joined(data)
+    touches = touches if body.exists is None else touches & body.exists[:, None]
+
+    def response(change: Any) -> Any:
+        """Return the change of the relative velocity at the lever where the load's velocity changes, m/s."""
+        turned = rotation.matvec(p.J_inv, rotation.cross(lever, change))
+        return change + mass * (change / p.mass + rotation.cross(turned, lever))
+
+    vel = rotation.rotate_inverse(quat, body.vel[:, None] - s.vel) - rotation.cross(s.ang_vel[None], lever)
+    change = velocity_change(gap, normal, vel, material, response)
+    n_load, n_drone = (jnp.sum(touches, axis=axis, keepdims=True, dtype=gap.dtype) for axis in (1, 0))
+    share = jnp.where(touches, 1 / jnp.maximum(jnp.maximum(n_load, n_drone), 1.0), 0.0)[..., None]
+    change = share * change
+
+    turned = rotation.matvec(p.J_inv, rotation.cross(lever, change))
+    change = rotation.rotate(quat, change)
+    impulse = -jnp.sum(mass * change, axis=0)
+    states = s.replace(vel=s.vel + impulse / p.mass, ang_vel=s.ang_vel - jnp.sum(mass * turned, axis=0))
+    data = collider.with_vel(data, body.vel + jnp.sum(change, axis=1))
+    return data.replace(states=states), impulse
+
+
+def velocity_change(
+    gap: Array, normal: Array, vel: Array, material: Material, response: Callable[[Array], Array]
+) -> Array:
+    """Return what a contact changes of the velocity of a body; the other body responds to it. (..., 3)
+
+    Args:
+        gap: Distance of the bodies, negative where they overlap, m. (...)
+        normal: Outward normal of the other body. (..., 3)
+        vel: Velocity relative to the other body, m/s. (..., 3)
+        material: Parameters of the contact.
+        response: Returns the change of the relative velocity for a change of the body's velocity, both m/s.
+    """
+    out = rotation.dot(vel, normal)
+    pushed_out = jnp.clip(-gap[..., None] / material.softness, 0.0, FASTEST_PUSH)
+    wanted = jnp.where(out < -BOUNCE_SPEED, -material.restitution * out, pushed_out)
+    moved = response(normal)
+    # At least one, except where the normal is zero: between balls with one centre.
+    speed = jnp.maximum(wanted - out, 0.0) / jnp.maximum(rotation.dot(normal, moved), 1.0)
+    vel = vel + speed * moved
+    slip = vel - rotation.dot(vel, normal) * normal
+    fast = rotation.safe_norm(slip)
+    along = slip / (fast + STICKING)
+    brake = jnp.minimum(material.friction * speed, fast / jnp.maximum(rotation.dot(along, response(along)), 1.0))
+    return speed * normal - brake * along
+
+
+class _Pairs(NamedTuple):
+    """Changes of velocity by the contacts of two groups of bodies with each other."""
+
+    touches: Array
+    """True where two touch. (n, m)"""
+    first: Array
+    """Change of each body of the first group, m/s. (n, m, 3)"""
+    second: Array
+    """Change of each body of the second group, m/s. (n, m, 3)"""
+
+
+def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Material) -> SimData:
+    """Return one world after the impulses of loads and hooks on each other.
+
+    They are point masses, so an impulse changes velocities and turns nothing. Momentum is kept. The impulse has a
+    normal part with restitution, and friction, limited by Coulomb's law and by what stops the slip. Where a body has
+    several contacts, each counts by its share, so that together they create no energy. What the impulse does to a
+    drone on a taut link follows in the next step, from the constraint.
+
+    Args:
+        data: One world.
+        colliders: Loads, and hooks.
+        material: Parameters of the contacts.
+    """
+    groups = list(combinations_with_replacement(range(len(colliders)), 2))
+    material = Material(*(x.reshape(-1)[:1] for x in material))
+    found = {(a, b): _pairs(data, colliders[a], colliders[b], material, same=a == b) for a, b in groups}
+    n_touches: list[Any] = [
+        sum(pairs.touches.sum(axis=1) for (a, _), pairs in found.items() if a == k)
+        + sum(pairs.touches.sum(axis=0) for (_, b), pairs in found.items() if b == k)
+        for k in range(len(colliders))
+    ]
+    changes: list[Any] = [0.0] * len(colliders)
+    for (a, b), pairs in found.items():
+        n = jnp.maximum(n_touches[a][:, None], n_touches[b][None])
+        share = jnp.where(pairs.touches, 1 / jnp.maximum(n, 1), 0.0)[..., None].astype(pairs.first.dtype)
+        changes[a] = changes[a] + jnp.sum(share * pairs.first, axis=1)
+        changes[b] = changes[b] + jnp.sum(share * pairs.second, axis=0)
+    vels = [collider.body(data).vel + change for collider, change in zip(colliders, changes, strict=True)]
+    for collider, vel in zip(colliders, vels, strict=True):
+        data = collider.with_vel(data, vel)
+    return data
+
+
+def _pairs(data: SimData, first: Collider, second: Collider, material: Material, same: bool) -> _Pairs:
+    """Return the contacts of two groups of bodies, or of one group, each pair of which counts once."""
+    a, b = first.body(data), second.body(data)
+    turn = b.quat[None]
+    offset = rotation.rotate_inverse(turn, a.pos[:, None] - b.pos[None])
+    if same:
+        offset = offset + OWN_GAP * np.eye(len(offset), dtype=offset.dtype)[..., None]
+    eye = jnp.eye(3, dtype=offset.dtype)
+    axes = [rotation.rotate_inverse(turn, rotation.rotate(a.quat[:, None], eye[k])) for k in range(3)]
+    rot = jnp.stack(axes, axis=-1)
+    gap, pull = jax.vjp(lambda x: distance(first.shape, second.shape, x, rot), offset)
+    normal = rotation.rotate(turn, pull(jnp.ones_like(gap))[0])
+    touches = gap < 0
+    if same:
+        touches = touches & np.triu(np.ones(gap.shape, bool), 1)
+    for exists in (None if a.exists is None else a.exists[:, None], b.exists):
+        touches = touches if exists is None else touches & exists
+
+    vel = a.vel[:, None] - b.vel[None]
+    change = velocity_change(gap, normal, vel, material, lambda change: change)
+    total = a.mass[:, None] + b.mass[None]
+    weight = 1 / jnp.where(total > 0, total, 1.0)
+    return _Pairs(touches, b.mass[None] * weight * change, -a.mass[:, None] * weight * change)

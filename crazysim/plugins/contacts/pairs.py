@@ -1,0 +1,164 @@
+"""Contact points between the balls and boxes of a world, and with its ground and other objects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.geometry import Shape, distance, point_distance
+from crazysim.geometry.linear import apply
+from crazysim.geometry.manifold import Manifold, ball_on_box, balls, boxes
+from crazysim.plugins.contacts.solver import Contacts
+from crazysim.scene.collision import CollisionGeom
+
+GapFn = Callable[[Array], tuple[Array, Array]]
+"""From points (n, 3) to gaps (n,) and normals (n, 3)."""
+CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+"""Corners of a box of half lengths one. (8, 3)"""
+
+
+class Solids(NamedTuple):
+    """Balls and boxes of a world: shapes and owners are static, poses are data."""
+
+    body: np.ndarray
+    """Number of the body that carries each. (n,)"""
+    is_ball: np.ndarray
+    """True for balls. (n,)"""
+    size: np.ndarray
+    """Half lengths of boxes, and the radius of balls three times, m. (n, 3)"""
+    pos: Array
+    """Positions of the centres, world frame, m. (n, 3)"""
+    rot: Array
+    """Rotation matrices to the world frame. (n, 3, 3)"""
+
+
+class Found(NamedTuple):
+    """Contact points of some pairs, of each the same number."""
+
+    first: np.ndarray
+    """Numbers of the first bodies. (n_pairs,)"""
+    second: np.ndarray
+    """Numbers of the second bodies. (n_pairs,)"""
+    points: Manifold
+    """Gaps (k,), normals (k, 3) and points (k, 3), those of a pair as neighbours."""
+
+
+def between(solids: Solids, pairs: np.ndarray) -> list[Found]:
+    """Return the contact points of pairs of solids. (n_pairs, 2)"""
+    found = []
+    kinds = solids.is_ball[pairs]
+    for first, second in ((True, True), (True, False), (False, True), (False, False)):
+        of_kind = pairs[(kinds[:, 0] == first) & (kinds[:, 1] == second)]
+        if not len(of_kind):
+            continue
+        if second and not first:
+            of_kind = of_kind[:, ::-1]
+        a, b = of_kind.T
+        size = jnp.asarray(solids.size, solids.pos.dtype)
+        if first and second:
+            points = jax.vmap(balls)(size[a, 0], solids.pos[a], size[b, 0], solids.pos[b])
+        elif first or second:
+            points = jax.vmap(ball_on_box)(size[a, 0], solids.pos[a], size[b], solids.pos[b], solids.rot[b])
+        else:
+            points = jax.vmap(boxes)(size[a], solids.pos[a], solids.rot[a], size[b], solids.pos[b], solids.rot[b])
+        found.append(Found(solids.body[a], solids.body[b], _flat(points)))
+    return found
+
+
+def on_surface(solids: Solids, number: int, geom: CollisionGeom, carrier: int, pose: tuple[Array, Array]) -> Found:
+    """Return the contact points of a solid with a geom of any kind: corners and the nearest point.
+
+    Args:
+        solids: The solids.
+        number: Number of the solid.
+        geom: The geom.
+        carrier: Number of the body that carries it.
+        pose: Position, m (3,), and rotation matrix (3, 3) of the geom, world frame.
+    """
+    at, turn = pose
+    is_ball, dtype = bool(solids.is_ball[number]), solids.pos.dtype
+    pos, rot = solids.pos[number], solids.rot[number]
+    shape = geom.shape
+    if is_ball:
+        radius = float(solids.size[number, 0])
+        gap, normal = _height(shape, apply(turn.T, pos - at))
+        normal, gap = apply(turn, normal), gap - radius
+        found = Manifold(gap[None], normal[None], (pos - normal * (radius + 0.5 * gap))[None])
+    else:
+        corners = pos + apply(rot, jnp.asarray(CORNERS * solids.size[number], dtype))
+        gap, normal = _height(shape, apply(turn.T, corners - at))
+        found = Manifold(gap, apply(turn, normal), corners)
+        if shape.kind != "plane":
+            nearest = _nearest(Shape("box", tuple(map(float, solids.size[number]))), pos, rot, shape, at, turn)
+            found = Manifold(*(jnp.concatenate(x) for x in zip(found, nearest, strict=True)))
+    return Found(solids.body[number : number + 1], np.array([carrier]), found)
+
+
+def on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> Found:
+    """Return the contact points of a solid with terrain, of which ``gap_at(points)`` gives gaps and normals."""
+    pos, rot = solids.pos[number], solids.rot[number]
+    if solids.is_ball[number]:
+        radius = float(solids.size[number, 0])
+        gap, normal = gap_at(pos[None])
+        gap = gap - radius
+        found = Manifold(gap, normal, pos - normal * (radius + 0.5 * gap[:, None]))
+    else:
+        corners = pos + apply(rot, jnp.asarray(CORNERS * solids.size[number], pos.dtype))
+        found = Manifold(*gap_at(corners), corners)
+    return Found(solids.body[number : number + 1], np.array([carrier]), found)
+
+
+def joined(found: list[Found], friction: Array, restitution: Array) -> Contacts:
+    """Return all contact points, each with the larger friction and restitution of its two bodies, as MuJoCo combines.
+
+    Args:
+        found: Contact points.
+        friction: Coulomb's coefficients of the bodies, 1. (n,)
+        restitution: Their coefficients of restitution, 1. (n,)
+    """
+    found = sorted(found, key=_n_points)
+    first, second = (np.concatenate([f[k] for f in found]) for k in range(2))
+    n_points = np.concatenate([np.full(len(f.first), _n_points(f)) for f in found])
+    gap, normal, point = (jnp.concatenate([f.points[k] for f in found]) for k in range(3))
+    mixed = (
+        jnp.maximum(x[first], x[second])[np.repeat(np.arange(len(first)), n_points)] for x in (friction, restitution)
+    )
+    return Contacts(first, second, n_points, gap, normal, point, *mixed)
+
+
+def _n_points(found: Found) -> int:
+    """Return the number of points of each pair."""
+    return found.points.gap.shape[0] // len(found.first)
+
+
+def _height(shape: Shape, point: Array) -> tuple[Array, Array]:
+    """Return the distance of points to a shape, and its normal there, in the shape's frame."""
+    gap, pull = jax.vjp(lambda p: point_distance(shape, p), point)
+    return gap, pull(jnp.ones_like(gap))[0]
+
+
+def _nearest(box: Shape, pos: Array, rot: Array, shape: Shape, at: Array, turn: Array) -> Manifold:
+    """Return the nearest point of a box and a shape; the gradient of the gap is the normal, and the lever times it."""
+
+    def gap_at(move: Array, turned: Array) -> Array:
+        spun = rot + jnp.stack([rotation.cross(turned, rot[:, k]) for k in range(3)], axis=-1)
+        columns = [apply(turn.T, spun[:, k]) for k in range(3)]
+        return distance(box, shape, apply(turn.T, pos + move - at), jnp.stack(columns, axis=-1))
+
+    gap, pull = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
+    normal, torque = pull(jnp.ones_like(gap))
+    half = jnp.asarray(box.size, pos.dtype)
+    reach = jnp.sum(jnp.abs(apply(rot.T, normal)) * half)
+    point = pos + rotation.cross(normal, torque) - reach * normal
+    return Manifold(gap[None], normal[None], point[None])
+
+
+def _flat(points: Manifold) -> Manifold:
+    """Return manifolds of several pairs as one."""
+    return Manifold(points.gap.reshape(-1), points.normal.reshape(-1, 3), points.point.reshape(-1, 3))

@@ -1,0 +1,154 @@
+"""Contact response: floor and objects push, brake and bounce drones. Without it the floor only stops them.
+
+Time stepping on velocities (Moreau 1988; the convex form of Todorov 2014): after a step, impulses at the contact points
+change the velocity into one that no longer approaches. An overlap is pushed out with a time constant, so that the
+ground is soft and no drone is thrown out of it. The points are those of ``contact_points``, and the
+impulses those of ``impulse``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData, SimState
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.settings import check_contacts
+from crazysim.core.stage import Stage
+from crazysim.plugins.contacts.contact_points import Surface, contact_points, is_ground, surfaces_of
+from crazysim.plugins.contacts.drone_boxes import Boxes, boxes_of, of_kind
+from crazysim.plugins.contacts.impulse import Material, after_contact, inertia_matrix
+from crazysim.plugins.contacts.load_contacts import hit_drones, hit_each_other, loads_of, names_of, stop_loads
+from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.scene.contact_report import ObjectSelection, choose
+
+
+class ContactResponseData(PyTree):
+    """Parameters of the surfaces, and the last impulse on each drone."""
+
+    friction: Array = leaf("parameter", 1, (1,))
+    """Coulomb's coefficient between drone and surface. (1,)"""
+    restitution: Array = leaf("parameter", 1, (1,))
+    """Ratio of the speeds after and before a bounce. (1,)"""
+    softness: Array = leaf("parameter", 1, (1,))
+    """Time constant with which an overlap is pushed out, s. (1,)"""
+    impulse: Array = leaf("drone", 1)
+    """Impulse of all surfaces and loads in the last step, world frame, N s. (n_worlds, n_drones, 3)"""
+
+    @property
+    def material(self) -> Material:
+        """Parameters of the contacts."""
+        return Material(self.friction, self.restitution, self.softness)
+
+
+class ContactResponse(Plugin):
+    """Response of floor and objects to contacts with drones and loads; replaces the stage ``clip_floor_pos``.
+
+    Drones do not push each other (``DroneCollisions``), and objects do not move; drones ride on members of populations,
+    such as cars, that are in the scene at the time of adding. A drone that stands on the floor has its centre half its
+    collision box above it. Loads, and hooks that carry none, that are objects of the scene at the time of adding are
+    stopped by all objects but the flat floor, where they stop without it too. If they are among ``objects``, they
+    exchange impulses with drones and with each other.
+    """
+
+    objects: ObjectSelection = None
+    """Handles, or names of bodies; None for all at the time of adding, () for the floor alone."""
+    friction: float = parameter(default=0.6)
+    """Coulomb's coefficient."""
+    restitution: float = parameter(default=0.2)
+    """Ratio of the speeds after and before a bounce, 0 to 1."""
+    softness: float = parameter(default=0.03)
+    """Time constant with which an overlap is pushed out, s; at least two steps."""
+    iterations: int = 8
+    """Iterations of the solver, for simultaneous contact points."""
+    name: str = "contact_response"
+
+    def record(self, sim: Simulation) -> ContactResponseData:
+        """Return the parameters, and no impulse."""
+        check_contacts(sim.data.core.freq, self.friction, self.restitution, self.softness, self.iterations)
+        return ContactResponseData(
+            friction=on_device([self.friction]),
+            restitution=on_device([self.restitution]),
+            softness=on_device([self.softness]),
+            impulse=on_device(np.zeros((sim.n_worlds, sim.n_drones, 3))),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that applies the impulses."""
+        boxes = boxes_of(sim)
+        plugins = loads_of(sim)
+        names = names_of(sim, plugins)
+        surfaces = surfaces_of(sim, self.objects, names)
+
+        def respond(data: SimData) -> SimData:
+            found = [(kind, _respond(data, self.read(data), surfaces, box, self.iterations)) for kind, box in boxes]
+            states, record = of_kind(found, data.core.drone_id)
+            return self.write(data.replace(states=states), record)
+
+        found = [Placement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
+        obstacles = [surface for surface in surfaces if not is_ground(surface)]
+        hits = any(body.name in names for body in choose(sim.scene.collision_model, self.objects))
+        for plugin in plugins:
+            found += self._load_stages(plugin, obstacles, boxes if hits else [], sim.n_drones)
+        return found
+
+    def _load_stages(self, plugin: Any, obstacles: list[Surface], boxes: Boxes, n_drones: int) -> list[Placement]:
+        """Return the stages of a plugin's loads: with obstacles, with drones and with each other.
+
+        Args:
+            plugin: Plugin with the loads.
+            obstacles: Surfaces of objects.
+            boxes: Collision boxes of the drones; empty for obstacles only.
+            n_drones: Number of drones in a world.
+        """
+        colliders = plugin.colliders()
+        meet = len(colliders) > 1 or (plugin.coupling == "drone" and n_drones > 1)
+
+        def stop(data: SimData) -> SimData:
+            if plugin.name not in data.plugins:
+                return data
+            for collider in colliders:
+                data = stop_loads(data, collider, obstacles, self.read(data).material, self.iterations)
+            return data
+
+        def hit(data: SimData) -> SimData:
+            if plugin.name not in data.plugins:
+                return data
+            record = self.read(data)
+            impulse = record.impulse
+            for collider in colliders:
+                data, part = hit_drones(data, collider, record.material, boxes)
+                impulse = impulse + part
+            return self.write(data, record.replace(impulse=impulse))
+
+        def hit_others(data: SimData) -> SimData:
+            if plugin.name not in data.plugins:
+                return data
+            return hit_each_other(data, colliders, self.read(data).material)
+
+        found = []
+        if obstacles:
+            found.append((Stage(stop, plugin.coupling), f"{self.name}_of_{plugin.name}"))
+        if boxes:
+            found.append((Stage(hit, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
+            if meet:
+                found.append((Stage(hit_others, "world"), f"{self.name}_between_{plugin.name}"))
+        return [Placement(stage, before="increment_steps", name=name) for stage, name in found]
+
+
+def _respond(
+    data: SimData, record: ContactResponseData, surfaces: list[Surface], box: np.ndarray, iterations: int
+) -> tuple[SimState, ContactResponseData]:
+    """Return the states with the velocity after contact, and the record with the impulse."""
+    states, params = data.states, data.params
+    before = jnp.concatenate([rotation.rotate_inverse(states.quat, states.vel), states.ang_vel], axis=-1)
+    points, inertia = contact_points(data, surfaces, box), inertia_matrix(params.mass, params.J)
+    after = after_contact(points, before, params.mass, inertia, record.material, iterations)
+    impulse = params.mass * rotation.rotate(states.quat, after[..., :3] - before[..., :3])
+    states = states.replace(vel=rotation.rotate(states.quat, after[..., :3]), ang_vel=after[..., 3:])
+    return states, record.replace(impulse=impulse)

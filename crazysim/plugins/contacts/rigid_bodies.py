@@ -1,0 +1,247 @@
+"""Contact of free bodies within a step: which solids there are, and what their impulses change."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from itertools import combinations, product
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation
+from crazysim.core.population import populations
+from crazysim.core.stage import over_worlds
+from crazysim.errors import ConfigError
+from crazysim.geometry.linear import apply, matmul
+from crazysim.geometry.manifold import N_OF_BOXES
+from crazysim.plugins.contacts.pairs import CORNERS, Found, Solids, between, joined, on_ground, on_surface
+from crazysim.plugins.contacts.solver import Bodies, Impulses, Solved, solve_contacts
+from crazysim.plugins.effects.ground import TerrainData
+from crazysim.scene.collision import CollisionGeom
+from crazysim.scene.contact_report import choose
+
+MAX_CONTACTS = 250_000
+"""Most contact points in a world: those of 250 drones or boxes."""
+EXACT = ("sphere", "box")
+"""Kinds of geoms whose contact with balls and boxes is that of bodies; others touch corners and the nearest point."""
+
+
+class Carrier(NamedTuple):
+    """A body that moves and is not pushed, with its geoms."""
+
+    population: str | None
+    """Name of the population that it belongs to; None for an object of the scene."""
+    row: int | None
+    """Number of the member or of the movable object; None for a fixed object."""
+    geoms: tuple[CollisionGeom, ...]
+    """Its geoms, in its frame; in the world frame if it is fixed."""
+
+
+class Touching:
+    """Contacts of the free bodies of a simulation."""
+
+    def __init__(self, sim: Simulation, plugin: Any):
+        """Collect the solids of the scene as they are now."""
+        self.plugin, self.shapes = plugin, plugin.shapes
+        self.n_drones = sim.n_drones if plugin.drones else 0
+        self.boxes = boxes_of_drones(sim)
+        model = sim.scene.collision_model
+        self.carriers = [Carrier(None, None, tuple(model.floor))] if model.floor else []
+        kinds = {kind: p for p in sim.scene.plugins() for kind in p.placed_kinds or ()}
+        members = populations(sim.data)
+        for body in choose(model, plugin.objects):
+            kind, _, number = body.name.rpartition(":")
+            if kind == plugin.name:
+                continue
+            if kind in members and hasattr(members[kind], "ang_vel"):
+                self.carriers.append(Carrier(kind, int(number), body.geoms))
+            elif kind not in kinds:
+                self.carriers.append(Carrier(None, body.row, body.geoms))
+
+    def n_contacts(self, terrains: Collection[str]) -> int:
+        """Return the number of contact points, of which most are out of contact.
+
+        Args:
+            terrains: Names of the plugins whose height fields are terrain.
+        """
+        balls = [shape.kind == "sphere" for shape in self.shapes]
+        geoms = [geom for carrier in self.carriers for geom in carrier.geoms]
+        others = [False] * self.n_drones + [g.shape.kind == "sphere" for g in geoms if g.shape.kind in EXACT]
+        pairs = [*combinations(balls, 2), *product(balls, others)]
+        n = sum(1 if any(pair) else N_OF_BOXES for pair in pairs)
+        for geom in geoms:
+            if geom.shape.kind not in EXACT:
+                only_corners = geom.shape.kind == "plane" or geom.name in terrains
+                n += sum(1 if ball else len(CORNERS) + (not only_corners) for ball in balls)
+        return n
+
+    def respond(self, data: SimData) -> SimData:
+        """Return the data of all worlds with the velocities after contact."""
+        return over_worlds(self.of_world)(data)
+
+    def of_world(self, data: SimData) -> SimData:
+        """Return the data of one world with the velocities of bodies and drones after contact."""
+        plugin, record, s = self.plugin, self.plugin.read(data), data.states
+        n_free, n_drones = record.pos.shape[0], self.n_drones
+        bodies, first_carrier = self._bodies(data, record), n_free + n_drones
+        solids = self._solids(data, record)
+        dynamic = [k for k, body in enumerate(solids.body) if body < n_free]
+        found = between(solids, self._pairs(solids, n_free))
+        for k, carrier in enumerate(self.carriers):
+            found += self._on(data, solids, dynamic, carrier, first_carrier + k)
+        if not found:
+            return data
+        size = bodies.pos.shape[0]
+        friction, restitution = (
+            jnp.concatenate([x[:, 0], jnp.zeros(size - n_free, x.dtype)]) for x in (record.friction, record.restitution)
+        )
+        contacts = joined(found, friction, restitution)
+        before = Impulses(record.press, record.drag)
+        solved = solve_contacts(bodies, contacts, before, 1 / data.core.freq, plugin.softness, plugin.iterations)
+        record = moved(record, solved, slice(n_free))
+        changes: Any = {"impulse": solved.impulse[:n_free], "press": solved.at.press, "drag": solved.at.drag}
+        data = plugin.write(data, record.replace(**changes))
+        if n_drones:
+            data = data.replace(states=moved(s, solved, slice(n_free, first_carrier)))
+        return data
+
+    def _bodies(self, data: SimData, record: Any) -> Bodies:
+        """Return the bodies: free ones, drones, then those that are not pushed."""
+        dtype = record.pos.dtype
+        rows = [(record.pos, record.vel, rotation.rotate(record.quat, record.ang_vel), 1 / record.mass[:, 0],
+                 _turned(record.quat, 1 / record.inertia))]  # fmt: skip
+        if self.n_drones:
+            rows.append(drones_as_bodies(data))
+        for carrier in self.carriers:
+            pos, quat, vel, ang_vel = _motion(data, carrier)
+            spin = rotation.rotate(quat, ang_vel)
+            rows.append((pos[None], vel[None], spin[None], jnp.zeros(1, dtype), jnp.zeros((1, 3, 3), dtype)))
+        return Bodies(*(jnp.concatenate(column) for column in zip(*rows, strict=True)))
+
+    def _solids(self, data: SimData, record: Any) -> Solids:
+        """Return the shapes of free bodies and drones, and the balls and boxes of objects, at their poses."""
+        n_free = record.pos.shape[0]
+        dtype = record.pos.dtype
+        owners, balls, sizes = list(range(n_free)), [x.kind == "sphere" for x in self.shapes], []
+        sizes = [np.resize(x.size, 3) for x in self.shapes]
+        pos, rot = [record.pos], [rotation.matrix(record.quat)]
+        if self.n_drones:
+            owners += range(n_free, n_free + self.n_drones)
+            balls += [False] * self.n_drones
+            sizes += list(self.boxes[:, 3:])
+            for whole, part in zip((pos, rot), drones_as_boxes(data, self.boxes), strict=True):
+                whole.append(part)
+        for k, carrier in enumerate(self.carriers):
+            for geom in carrier.geoms:
+                if geom.shape.kind in EXACT:
+                    at, turn = _pose(data, carrier, geom, dtype)
+                    owners.append(n_free + self.n_drones + k)
+                    balls.append(geom.shape.kind == "sphere")
+                    sizes.append(np.resize(geom.shape.size, 3))
+                    pos.append(at[None])
+                    rot.append(turn[None])
+        return Solids(np.array(owners), np.array(balls), np.array(sizes), jnp.concatenate(pos), jnp.concatenate(rot))
+
+    def _pairs(self, solids: Solids, n_free: int) -> np.ndarray:
+        """Return the pairs of solids of which at least one is a free body. (n_pairs, 2)"""
+        pairs = [pair for pair in combinations(range(len(solids.body)), 2) if solids.body[pair[0]] < n_free]
+        return np.array(pairs, np.int64).reshape(-1, 2)
+
+    def _on(self, data: SimData, solids: Solids, dynamic: list[int], carrier: Carrier, number: int) -> list[Found]:
+        """Return the contacts of free bodies with the geoms of a carrier that are neither balls nor boxes."""
+        found = []
+        for geom in carrier.geoms:
+            terrain = data.plugins.get(geom.name) if carrier.row is None else None
+            for k in dynamic if geom.shape.kind not in EXACT else ():
+                if isinstance(terrain, TerrainData):
+                    found.append(on_ground(solids, k, number, terrain.gap_at))
+                else:
+                    found.append(on_surface(solids, k, geom, number, _pose(data, carrier, geom, solids.pos.dtype)))
+        return found
+
+
+def require_few_contacts(n_contacts: int, among: str) -> int:
+    """Return a number of contact points.
+
+    Args:
+        n_contacts: Number of contact points in a world.
+        among: Bodies that they are of, for the message.
+
+    Raises:
+        ConfigError: If it is larger than ``MAX_CONTACTS``.
+    """
+    if n_contacts > MAX_CONTACTS:
+        raise ConfigError(
+            f"expected at most {MAX_CONTACTS} contact points in a world, got {n_contacts} of {among}. Use fewer bodies "
+            f"or fewer objects: every pair has up to {N_OF_BOXES}."
+        )
+    return n_contacts
+
+
+def moved(states: Any, solved: Solved, rows: slice) -> Any:
+    """Return states of bodies or drones after contact.
+
+    Args:
+        states: Record with ``pos``, ``quat``, ``vel`` and ``ang_vel``. (n, ...)
+        solved: Bodies after contact.
+        rows: Their numbers among these.
+    """
+    ang_vel, turned = (rotation.rotate_inverse(states.quat, x[rows]) for x in (solved.bodies.ang_vel, solved.turned))
+    quat = rotation.turn(states.quat, turned, 1.0)
+    return states.replace(pos=solved.bodies.pos[rows], quat=quat, vel=solved.bodies.vel[rows], ang_vel=ang_vel)
+
+
+def drones_as_bodies(data: SimData) -> Bodies:
+    """Return the drones of one world as bodies."""
+    s, p, n = data.states, data.params, data.states.pos.shape[0]
+    rot, inverse = rotation.matrix(s.quat), jnp.broadcast_to(p.J_inv, (n, 3, 3))
+    inverse = matmul(matmul(rot, inverse), jnp.swapaxes(rot, -1, -2))
+    inv_mass = jnp.broadcast_to(1 / p.mass, (n, 1))[:, 0]
+    return Bodies(s.pos, s.vel, rotation.rotate(s.quat, s.ang_vel), inv_mass, inverse)
+
+
+def boxes_of_drones(sim: Simulation) -> np.ndarray:
+    """Return centre and half extents of each drone's collision box, body frame, m. (n_drones, 6)"""
+    return np.array([airframe.value("shape.collision_box") for airframe in sim.airframes], np.float64)
+
+
+def drones_as_boxes(data: SimData, boxes: np.ndarray) -> tuple[Array, Array]:
+    """Return positions, m (n, 3), and attitudes (n, 3, 3) of the drones' collision boxes; of one world.
+
+    Args:
+        data: One world.
+        boxes: Centre and half extents of each drone's box, body frame, m. (n_drones, 6)
+    """
+    s = data.states
+    return s.pos + rotation.rotate(s.quat, jnp.asarray(boxes[:, :3], s.pos.dtype)), rotation.matrix(s.quat)
+
+
+def _motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Array, Array]:
+    """Return position, attitude, velocity, world frame, and angular velocity, body frame, of a carrier."""
+    dtype = data.states.pos.dtype
+    zero = jnp.zeros(3, dtype)
+    if carrier.population is not None:
+        record = data.plugins[carrier.population]
+        return tuple(getattr(record, name)[carrier.row] for name in ("pos", "quat", "vel", "ang_vel"))  # type: ignore[return-value]
+    if carrier.row is None:
+        return zero, jnp.asarray([0.0, 0.0, 0.0, 1.0], dtype), zero, zero
+    objects: Any = data.objects
+    return objects.pos[carrier.row], objects.quat[carrier.row], objects.vel[carrier.row], zero
+
+
+def _pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: Any) -> tuple[Array, Array]:
+    """Return position and rotation matrix of a geom, world frame."""
+    pos, quat, _, _ = _motion(data, carrier)
+    rot = rotation.matrix(quat)
+    at = pos + apply(rot, jnp.asarray(geom.pos, dtype))
+    return at, rot if geom.rot is None else matmul(rot, jnp.asarray(geom.rot, dtype))
+
+
+def _turned(quat: Array, diagonal: Array) -> Array:
+    """Return the matrices ``R diag(d) R^T``. (n, 3, 3)"""
+    rot = rotation.matrix(quat)
+    return matmul(rot * diagonal[:, None, :], jnp.swapaxes(rot, -1, -2))

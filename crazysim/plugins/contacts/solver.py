@@ -1,0 +1,238 @@
+"""Impulses at the contacts of several bodies, for one world.
+
+Projected Jacobi iterations with momentum (Nesterov's method, as Mazhar et al. 2015 use it for contact), preconditioned
+by shares of the bodies' masses, one for each contact (mass splitting: Tonge, Benevolenski and Voroshilov 2012), so that
+all contacts act at once. Impulses act on both bodies at one point: momentum and angular momentum are kept.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.geometry.linear import apply, matmul
+from crazysim.plugins.contacts.impulse import BOUNCE_SPEED, FASTEST_PUSH
+
+ACTING_GAP = 1e-3
+"""Gap up to which a contact may act in a step beyond the distance of approach, m."""
+
+
+class Bodies(NamedTuple):
+    """Bodies of a world, world frame; those that cannot be pushed have zero inverse mass and inertia."""
+
+    pos: Array
+    """Position of the centre of mass, m. (n, 3)"""
+    vel: Array
+    """Velocity, m/s. (n, 3)"""
+    ang_vel: Array
+    """Angular velocity, rad/s. (n, 3)"""
+    inv_mass: Array
+    """Inverse of the mass, 1/kg. (n,)"""
+    inv_inertia: Array
+    """Inverse of the moment of inertia, 1/(kg m^2). (n, 3, 3)"""
+
+
+class Contacts(NamedTuple):
+    """Contact points between pairs of bodies, world frame; the points of a pair are neighbours."""
+
+    first: np.ndarray
+    """Number of the body that the normals point to. (n_pairs,)"""
+    second: np.ndarray
+    """Number of the body that they point from. (n_pairs,)"""
+    n_points: np.ndarray
+    """Number of points of each pair, ascending. (n_pairs,)"""
+    gap: Array
+    """Distance, m, negative where they overlap. (k,)"""
+    normal: Array
+    """Unit normal. (k, 3)"""
+    point: Array
+    """Position, m. (k, 3)"""
+    friction: Array
+    """Coulomb's coefficient, 1. (k,)"""
+    restitution: Array
+    """Ratio of the speeds after and before a bounce, 1. (k,)"""
+
+    def of_pairs(self, values: Array) -> Array:
+        """Return the sums of values of the points over the points of every pair. (n_pairs, m)"""
+        found, end = [], 0
+        for n_points, n_pairs in zip(*np.unique(self.n_points, return_counts=True), strict=True):
+            start, end = end, end + n_points * n_pairs
+            found.append(jnp.sum(values[start:end].reshape(n_pairs, n_points, -1), axis=1))
+        return jnp.concatenate(found)
+
+
+class Impulses(NamedTuple):
+    """Impulses at the contacts, on the first bodies."""
+
+    press: Array
+    """Along the normals, N s. (k,)"""
+    drag: Array
+    """Across them, world frame, N s. (k, 3)"""
+
+
+class Solved(NamedTuple):
+    """Bodies after contact."""
+
+    bodies: Bodies
+    """The bodies with other velocities and positions."""
+    turned: Array
+    """Rotations that remove overlaps, world frame, rad. (n, 3)"""
+    at: Impulses
+    """Impulses at the contacts, with which the next step begins."""
+    impulse: Array
+    """Their sum on each body, world frame, N s. (n, 3)"""
+
+
+def solve_contacts(
+    bodies: Bodies, contacts: Contacts, before: Impulses, dt: float, softness: float, iterations: int
+) -> Solved:
+    """Return the bodies after contact.
+
+    At every contact the speed of separation becomes at least the one that closes a gap within the step, and
+    ``restitution`` times the speed of an approach faster than 0.1 m/s. Friction opposes slip up to Coulomb's limit.
+    Where impacts of several bodies with restitution and friction would gain energy (Kane 1984), or too few iterations
+    would, all impulses are scaled to keep it.
+
+    Overlaps are removed within ``softness`` seconds, at up to 0.25 m/s, by moving the bodies. That changes no velocity,
+    so that it does not feed the motion of a stack.
+
+    Args:
+        bodies: The bodies.
+        contacts: The contacts, each with at least one body that can be pushed.
+        before: Impulses to begin with: those of the last step bring bodies at rest to rest at once.
+        dt: Step, s.
+        softness: Time constant with which an overlap is pushed out, s.
+        iterations: Iterations of the solver.
+    """
+    n, k = bodies.pos.shape[0], len(contacts.gap)
+    dtype = bodies.pos.dtype
+    a, b = contacts.first, contacts.second
+    pair = np.repeat(np.arange(len(a)), contacts.n_points)
+    sums = [jnp.asarray(np.eye(n)[:, numbers], dtype) for numbers in (a, b)]  # (n, n_pairs)
+    normal = contacts.normal
+    offset = bodies.pos[a] - bodies.pos[b]
+    arm = contacts.point - bodies.pos[a][pair]
+
+    def slip(vel: Array, ang_vel: Array) -> Array:
+        """Return the velocities of the first bodies relative to the second at the contacts, m/s. (k, 3)"""
+        between = vel[a] - vel[b] - rotation.cross(ang_vel[b], offset)
+        return between[pair] + rotation.cross((ang_vel[a] - ang_vel[b])[pair], arm)
+
+    def change(impulse: Array) -> tuple[Array, Array]:
+        """Return the changes of the velocities by impulses on the first bodies, and against the second."""
+        force, torque = contacts.of_pairs(impulse), contacts.of_pairs(rotation.cross(arm, impulse))
+        against = torque + rotation.cross(offset, force)
+        force, torque = _gather(sums[0] - sums[1], force), _gather(sums[0], torque) - _gather(sums[1], against)
+        return bodies.inv_mass[:, None] * force, apply(bodies.inv_inertia, torque)
+
+    start = slip(bodies.vel, bodies.ang_vel)
+    out = rotation.dot(start, normal)[:, 0]
+    near = contacts.gap < ACTING_GAP + dt * jnp.abs(out)
+    closes = jnp.minimum(-contacts.gap / dt, 0.0)
+    bounces = (out < -BOUNCE_SPEED) & (contacts.gap + dt * out < 0)
+    wanted = jnp.where(bounces, -contacts.restitution * out, closes)
+
+    along, across = jnp.zeros(k, dtype), jnp.zeros(k, dtype)
+    for numbers, sum_of, lever in ((a, sums[0], arm), (b, sums[1], arm + offset[pair])):
+        turn = rotation.cross_matrix(lever)
+        inverse, inv_mass = bodies.inv_inertia[numbers][pair], bodies.inv_mass[numbers][pair]
+        spun = matmul(inverse, turn)
+        of_normal = inv_mass + rotation.dot(rotation.cross(lever, normal), apply(spun, normal))[:, 0]
+        of_slip = 0.5 * (3 * inv_mass + jnp.sum(turn * spun, axis=(-2, -1)) - of_normal)
+        acts = near & (of_normal > 0)
+        n_weight, s_weight = (jnp.where(acts, 1 / jnp.where(acts, x, 1.0), 0.0) for x in (of_normal, of_slip))
+        together = _together(bodies, sum_of, contacts, normal, turn, n_weight, s_weight)[numbers][pair]
+        along, across = along + together * of_normal, across + together * of_slip
+    along, across = (jnp.where(x > 0, x, 1.0) for x in (along, across))
+
+    def turn_once(_: int, carry: tuple[Impulses, Impulses, Array]) -> tuple[Impulses, Impulses, Array]:
+        (press, drag), old, age = carry
+        ahead = age / (age + 3)
+        y, z = press + ahead * (press - old.press), drag + ahead * (drag - old.drag)
+        moving = start + slip(*change(y[:, None] * normal + z))
+        speed = rotation.dot(moving, normal)[:, 0]
+        new = jnp.where(near, jnp.maximum(y + (wanted - speed) / along, 0.0), 0.0)
+        held = z - (moving - speed[:, None] * normal) / across[:, None]
+        size, limit = rotation.safe_norm(held), (contacts.friction * new)[:, None]
+        held = jnp.where(size > limit, held * (limit / jnp.where(size > 0, size, 1.0)), held)
+        # Momentum that points uphill is dropped (O'Donoghue and Candes 2015).
+        rise = jnp.sum((y - new) * along * (new - press)) + jnp.sum((z - held) * across[:, None] * (held - drag))
+        return Impulses(new, held), Impulses(press, drag), jnp.where(rise > 0, 0.0, age + 1)
+
+    press = jnp.where(near, before.press, 0.0)
+    drag = jnp.where(near[:, None], before.drag - rotation.dot(before.drag, normal) * normal, 0.0)
+    first = Impulses(press, drag)
+    at, *_ = jax.lax.fori_loop(0, iterations, turn_once, (first, first, jnp.zeros((), dtype)))
+    total = at.press[:, None] * normal + at.drag
+    vel, ang_vel = change(total)
+    share = _share_that_keeps_energy(total, start, slip(vel, ang_vel))
+    at, total, vel, ang_vel = jax.tree.map(lambda x: share * x, (at, total, vel, ang_vel))
+
+    # One step down the gradient, as far as the overlaps shrink; the next time step continues.
+    leaves = out + rotation.dot(slip(vel, ang_vel), normal)[:, 0]
+    push = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, FASTEST_PUSH) - jnp.maximum(leaves, 0.0)
+    push = jnp.maximum(push, 0.0)
+    moved, turned = change((push / along)[:, None] * normal)
+    apart = jnp.sum(push / along * rotation.dot(slip(moved, turned), normal)[:, 0])
+    size = dt * jnp.sum(push / along * push) / jnp.where(apart > 0, apart, 1.0)
+    after = bodies._replace(pos=bodies.pos + size * moved, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel)
+    impulse = _gather(sums[0] - sums[1], contacts.of_pairs(total))
+    return Solved(after, size * turned, at, impulse)
+
+
+def _together(
+    bodies: Bodies, sum_of: Array, contacts: Contacts, normal: Array, turn: Array, along: Array, across: Array
+) -> Array:
+    """Return for each body how many times more its contacts respond to all their impulses than each to its own. (n,)
+
+    It is a bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, at most a quarter above it. ``M`` is the inertia
+    of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` holds the inverse responses.
+
+    Args:
+        bodies: The bodies.
+        sum_of: One where a pair is of the body. (n, n_pairs)
+        contacts: The contacts.
+        normal: Normals. (k, 3)
+        turn: Torque of impulses about the body. (k, 3, 3)
+        along: Inverse responses to impulses along the normals, kg; zero where nothing acts. (k,)
+        across: The same across the normals. (k,)
+    """
+    eye = jnp.eye(3, dtype=normal.dtype)
+    weight = across[:, None, None] * eye + (along - across)[:, None, None] * normal[:, :, None] * normal[:, None]
+    turned = matmul(turn, weight)
+    upper = jnp.concatenate([weight, jnp.swapaxes(turned, -1, -2)], axis=-1)
+    lower = jnp.concatenate([turned, matmul(turned, jnp.swapaxes(turn, -1, -2))], axis=-1)
+    both = jnp.concatenate([upper, lower], axis=-2).reshape(-1, 36)
+    total = _gather(sum_of, contacts.of_pairs(both)).reshape(-1, 6, 6)
+    response = jnp.concatenate(
+        [bodies.inv_mass[:, None, None] * total[:, :3], matmul(bodies.inv_inertia, total[:, 3:])], axis=-2
+    )
+    fourth = matmul(matmul(response, response), matmul(response, response))
+    trace = jnp.sum(fourth * jnp.swapaxes(fourth, -1, -2), axis=(-2, -1))
+    return jnp.where(trace > 0, jnp.where(trace > 0, trace, 1.0) ** 0.125, 1.0)
+
+
+def _share_that_keeps_energy(impulse: Array, before: Array, change: Array) -> Array:
+    """Return the share of impulses, at most one, with which they add no kinetic energy. ()
+
+    The energy that they add, in the frame of what cannot be pushed, is the sum of their products with the means of the
+    contacts' velocities before and after them.
+
+    Args:
+        impulse: Impulses on the first bodies, N s. (k, 3)
+        before: Velocities of the contacts before, m/s. (k, 3)
+        change: Their changes by the impulses, m/s. (k, 3)
+    """
+    first, second = jnp.sum(impulse * before), jnp.sum(impulse * change)
+    gains = first + 0.5 * second > 0
+    return jnp.where(gains, jnp.maximum(-2 * first, 0.0) / jnp.where(gains, second, 1.0), 1.0)
+
+
+def _gather(sums: Array, values: Array) -> Array:
+    """Return the sums of the pairs' values for every body; by components, as a GPU may round products. (n, m)"""
+    return jnp.sum(sums[:, :, None] * values[None], axis=1)

@@ -1,0 +1,171 @@
+"""Terrain: a height field as the ground of all worlds."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.settings import as_rgba
+from crazysim.core.stage import Stage
+from crazysim.core.stages import FLOOR
+from crazysim.errors import ConfigError
+from crazysim.plugins.contacts.response import ContactResponse
+from crazysim.plugins.effects.grid import LARGEST_FUSED
+from crazysim.plugins.effects.ground import TerrainData, ground_height
+from crazysim.plugins.effects.moving_air import zeros
+from crazysim.pytree import on_device
+from crazysim.storage import read_bytes
+
+PNG = b"\x89PNG\r\n\x1a\n"
+"""First bytes of a PNG image; its width and height are bytes 16 to 24."""
+MAX_FILE = 256 * 2**20
+"""Largest file of an image, bytes."""
+MAX_PIXELS = 2**24
+"""Most pixels of an image: 4096 x 4096. It takes 0.5 GB."""
+DEPTH = 1.0
+"""Thickness of the ground below the lowest height, m."""
+FLATTEST = 1e-3
+"""Least range of heights of a height field of MuJoCo, m: a flat terrain is given one."""
+
+
+class Terrain(Plugin):
+    """A height field on which drones and loads land; replaces the stage ``clip_floor_pos``.
+
+    It is part of the scene: images, range finders and depth cameras include it, and it is the floor in contact reports
+    and for a ``ContactResponse`` that is added later.
+    """
+
+    heights: Any = parameter()
+    """Heights, m, rows along y and columns along x (n_rows, n_columns); or the path of a PNG image, whose brightness is
+    the height, from its darkest to its brightest pixel, and whose upper edge lies at the largest y."""
+    size: Any
+    """Full lengths along x and y, m (2,); with an image also the height of the brightest over the darkest (3,)."""
+    pos: Any = (0.0, 0.0, 0.0)
+    """Middle of the terrain at height zero, world frame, m. (3,)"""
+    floor: bool = True
+    """True to keep the flat floor around it; False to remove it, which depressions below z = 0 need. The heights of the
+    border then extend outwards without end."""
+    rgba: Any = None
+    """Colour; None for that of the floor. (4,)"""
+    name: str = "terrain"
+
+    def record(self, sim: Simulation) -> TerrainData:
+        """Return the heights, and put the height field into the scene."""
+        heights, size, pos = self._checked(sim)
+        dtype = sim.data.states.pos.dtype
+        record = TerrainData(
+            heights=on_device(heights, dtype),
+            middle=on_device(pos, dtype),
+            half=on_device(size / 2, dtype),
+            below=zeros(sim, 1),
+            floor=self.floor,
+        )
+        _put(sim.scene, self, heights, size, pos)
+        return record.replace(below=record.surface_at(sim.data.states.pos)[0])
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that stops drones at the ground."""
+        scope = "drone" if self._checked(sim)[0].size <= LARGEST_FUSED else "batch"
+        stop = Stage(self.stop, scope, batched=True)
+        return [Placement(stop, before="increment_steps", replaces="clip_floor_pos")]
+
+    def stop(self, data: SimData) -> SimData:
+        """Stop drones at the ground: one that is below it, or on it and not rising, is set on it, at rest."""
+        s = data.states
+        ground = ground_height(data, s.pos)
+        lowest, height = ground + FLOOR, s.pos[..., 2:]
+        stopped = (height < lowest) | ((height == lowest) & (s.vel[..., 2:] <= 0))
+        states = s.replace(
+            pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(height, lowest)], axis=-1),
+            vel=jnp.where(stopped, 0.0, s.vel),
+            ang_vel=jnp.where(stopped, 0.0, s.ang_vel),
+        )
+        return self.write(data.replace(states=states), self.read(data).replace(below=ground))
+
+    def _checked(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return heights, full lengths along x and y, and the middle, m."""
+        is_image = isinstance(self.heights, (str, Path))
+        size, pos = np.asarray(self.size, np.float64), np.asarray(self.pos, np.float64)
+        n = 3 if is_image else 2
+        if size.shape != (n,) or not np.all(np.isfinite(size)) or not np.all(size > 0):
+            raise ConfigError(
+                f"expected size as {n} positive lengths, m, {'along x, y and z' if is_image else 'along x and y'}, "
+                f"got {self.size!r}"
+            )
+        if pos.shape != (3,) or not np.all(np.isfinite(pos)):
+            raise ConfigError(f"expected pos as three finite numbers, m, got {self.pos!r}")
+        heights = size[2] * read_image(self.heights) if is_image else np.asarray(self.heights, np.float64)
+        if heights.ndim != 2 or min(heights.shape) < 2 or not np.all(np.isfinite(heights)):
+            raise ConfigError(
+                f"expected heights of two or more rows and columns, finite, m, got shape {np.shape(heights)}"
+            )
+        if self.floor and heights.min() + pos[2] < 0:
+            raise ConfigError(
+                f"expected heights of at least 0 m above the flat floor, got {heights.min() + pos[2]:.4g} m. Use "
+                f"floor=False to remove the flat floor, or a higher pos."
+            )
+        if any(isinstance(plugin, ContactResponse) for plugin in sim.scene.plugins()):
+            raise ConfigError(
+                "expected terrain before contact response, whose surfaces are those of the scene when it is added, "
+                "got a ContactResponse. Use sim.remove, then add Terrain and ContactResponse in this order."
+            )
+        return heights, size[:2], pos
+
+
+def read_image(path: str | Path) -> np.ndarray:
+    """Return the brightness of a PNG image, its lowest row first, from 0 at the darkest pixel to 1. (n_rows, n_columns)
+
+    MuJoCo reads it, with 8 bits per pixel.
+
+    Raises:
+        ConfigError: If it is no image that MuJoCo can read.
+    """
+    content = read_bytes(path, MAX_FILE)
+    size = struct.unpack(">II", content[16:24]) if content[:8] == PNG and len(content) >= 24 else (0, 0)
+    if not 0 < size[0] * size[1] <= MAX_PIXELS:
+        raise ConfigError(
+            f"expected a PNG image of heights of at most {MAX_PIXELS} pixels, got {str(path)!r} of "
+            f"{size[0]} x {size[1]} pixels. Use a smaller image, or convert it to PNG."
+        )
+    spec = mujoco.MjSpec()
+    spec.add_hfield(name="image", file=str(path), size=[1, 1, 1, 1])
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="image")
+    try:
+        model = spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise ConfigError(f"expected a PNG image of heights, got {str(path)!r}: {error}") from error
+    return np.asarray(model.hfield_data, np.float64).reshape(int(model.hfield_nrow[0]), int(model.hfield_ncol[0]))
+
+
+def _put(scene: Any, plugin: Terrain, heights: np.ndarray, size: np.ndarray, pos: np.ndarray) -> None:
+    """Put the height field into the scene, or change it where it is there already."""
+    spec, lowest = scene.spec, float(heights.min())
+    rise = max(float(np.ptp(heights)), FLATTEST)
+    shares = ((heights - lowest) / rise).astype(np.float32)
+    field, geom = spec.hfield(plugin.name), spec.geom(plugin.name)
+    if (field is None) != (geom is None):
+        raise ConfigError(f"expected a new name, got {plugin.name!r}, which the scene has. Use name=.")
+    if field is None:
+        field = spec.add_hfield(name=plugin.name)
+        geom = spec.worldbody.add_geom(name=plugin.name, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=plugin.name)
+    field.size = [*(size / 2), rise, DEPTH]
+    field.nrow, field.ncol = heights.shape
+    field.userdata = shares.ravel()
+    geom.pos = [pos[0], pos[1], pos[2] + lowest]
+    if plugin.rgba is not None:
+        geom.rgba = as_rgba(plugin.rgba)
+    elif spec.material("floor") is not None:
+        geom.material = "floor"
+    if not plugin.floor:
+        for other in [g for g in spec.worldbody.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+            spec.delete(other)
+    scene.edited = True
+    scene.revision += 1

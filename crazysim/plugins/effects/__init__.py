@@ -1,0 +1,25 @@
+"""Effects: optional physics, each a plugin that ``sim.add`` adds."""
+
+from crazysim.plugins.effects.battery import Battery
+from crazysim.plugins.effects.downwash import Downwash
+from crazysim.plugins.effects.grid import Grid, load_wind_grid
+from crazysim.plugins.effects.ground import ground_at, ground_height
+from crazysim.plugins.effects.ground_effect import GroundEffect
+from crazysim.plugins.effects.latency import Latency
+from crazysim.plugins.effects.motors import MotorFailure
+from crazysim.plugins.effects.wind import Wind
+from crazysim.plugins.effects.wind_field import WindField
+
+__all__ = [
+    "Battery",
+    "Downwash",
+    "Grid",
+    "GroundEffect",
+    "Latency",
+    "MotorFailure",
+    "Wind",
+    "WindField",
+    "ground_at",
+    "ground_height",
+    "load_wind_grid",
+]

@@ -1,0 +1,182 @@
+"""Battery with a charge, a voltage that sags under load, and rotor speeds limited by that voltage."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter
+from crazysim.core.stage import stage
+from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
+from crazysim.eager import compiled
+from crazysim.plugins.effects.moving_air import controls_of, per_drone, require_rotors, zeros
+from crazysim.pytree import PyTree, leaf
+
+NOMINAL_VOLTAGE = 3.7
+"""Nominal voltage of a lithium-polymer cell, V, as printed on cells: assumed for full rotor speed where an airframe has
+no table ``[battery]``."""
+
+
+class BatteryData(PyTree):
+    """State and parameters of the battery of every drone."""
+
+    charge: Array = leaf("drone", 1)
+    """State of charge, 0 to 1. (n_worlds, n_drones, 1)"""
+    rounding: Array = leaf("drone", 1)
+    """Rounding error of the charge, subtracted at the next step, 1. (n_worlds, n_drones, 1)"""
+    voltage: Array = leaf("drone", 1)
+    """Voltage under load, V. (n_worlds, n_drones, 1)"""
+    current: Array = leaf("drone", 1)
+    """Current, A. (n_worlds, n_drones, 1)"""
+    capacity: Array = leaf("parameter", 1, (1,))
+    """Charge of the full battery, A h. (1,)"""
+    resistance: Array = leaf("parameter", 1, (1,))
+    """Internal resistance, ohm. (1,)"""
+    efficiency: Array = leaf("parameter", 1, (1,))
+    """Mechanical power of the propellers per electric power of the motors, 0 to 1. (1,)"""
+    base_power: Array = leaf("parameter", 1, (1,))
+    """Electric power of everything but the motors, W. (1,)"""
+    full_speed_voltage: Array = leaf("parameter", 1, (1,))
+    """Least voltage at which the rotors reach the airframe's largest speed, V. (1,)"""
+    n_cells: Array = leaf("parameter", 1, (1,))
+    """Number of cells in series. (1,)"""
+
+
+class Battery(Plugin):
+    """Batteries: rotors draw power, the voltage sags, and the largest rotor speed with it; needs rotors.
+
+    The no-load speed of a DC motor is proportional to its voltage, and so is taken to be the largest rotor speed below
+    ``full_speed_voltage``. An empty battery turns no rotor. Parameters are for all drones, (), or for each,
+    (n_worlds, n_drones).
+    """
+
+    capacity: Any = parameter(default=None)
+    """Charge of the full battery, A h; None for that of the airframe's table ``[battery]``."""
+    resistance: Any = parameter(default=None)
+    """Internal resistance of the whole battery, ohm; None for that of the airframe's table ``[battery]``."""
+    n_cells: Any = parameter(default=None)
+    """Number of lithium-polymer cells in series; None for that of the airframe's table ``[battery]``, or else 1."""
+    efficiency: Any = parameter(default=1.0)
+    """Mechanical power of the propellers per electric power of the motors, above 0, up to 1."""
+    base_power: Any = parameter(default=0.0)
+    """Electric power of everything but the motors, W."""
+    full_speed_voltage: Any = parameter(default=None)
+    """Least voltage at which the rotors reach the airframe's largest speed, V; None for that of the airframe's table
+    ``[battery]`` (2.8 to 3.4 V for Crazyflies), or else 3.7 V per cell."""
+    charge: ArrayLike = parameter(default=1.0)
+    """State of charge at the beginning of an episode, 0 to 1."""
+    name: str = "battery"
+
+    def record(self, sim: Simulation) -> BatteryData:
+        """Return batteries with the initial charge and no load."""
+        require_rotors(sim, "battery sag")
+        n_cells = self.n_cells
+        if n_cells is None:
+            n_cells = of_airframes(sim, lambda a: a.values.get("battery.cells", np.ones(())).astype(int))
+        counts = check_parameter(sim, "n_cells", n_cells, (1,), 1, dtype=jnp.int32)
+        cells = counts.astype(sim.data.states.pos.dtype)
+        full_speed_voltage = self.full_speed_voltage
+        if full_speed_voltage is None:
+            known = of_airframes(sim, lambda a: a.full_thrust_voltage or 0.0)
+            full_speed_voltage = np.where(known[..., None] > 0, known[..., None], NOMINAL_VOLTAGE * np.asarray(cells))
+        charge = per_drone(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0))
+        return BatteryData(
+            charge=charge,
+            rounding=zeros(sim, 1),
+            voltage=open_circuit_voltage(charge, cells),
+            current=zeros(sim, 1),
+            capacity=check_parameter(sim, "capacity", self._own(sim, "capacity"), positive=True),
+            resistance=check_parameter(sim, "resistance", self._own(sim, "resistance"), positive=True),
+            efficiency=check_parameter(sim, "efficiency", self.efficiency, high=1.0, positive=True),
+            base_power=check_parameter(sim, "base_power", self.base_power, low=0.0),
+            full_speed_voltage=check_parameter(sim, "full_speed_voltage", full_speed_voltage, positive=True),
+            n_cells=cells,
+        )
+
+    def _own(self, sim: Simulation, key: str) -> Any:
+        """Return a setting, or else the airframes' number."""
+        given = getattr(self, key)
+        return of_airframes(sim, lambda a: a.value(f"battery.{key}", ())) if given is None else given
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that discharges the batteries."""
+        return [Placement(stage("drone")(self.discharge))]
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with rotor commands limited by the voltage."""
+        battery, controls = self.read(data), controls_of(data)
+        share = battery.voltage / battery.full_speed_voltage
+        share = jnp.where(battery.charge > 0, jnp.where(share < 1, share, 1.0), 0.0)
+        limit = share * data.params.rotor_vel_max
+        rotor_vel = jnp.where(controls.rotor_vel > limit, limit, controls.rotor_vel)
+        return data.replace(controls=controls.replace(rotor_vel=rotor_vel))
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the voltage, V, and the state of charge."""
+        battery = self.read(data)
+        return {"voltage": battery.voltage, "charge": battery.charge}
+
+    def discharge(self, data: SimData) -> SimData:
+        """Draw the energy of one step for the rotors and electronics of one drone.
+
+        The power of a rotor is drag torque times angular velocity; the power that accelerates it is neglected. An
+        empty battery supplies nothing.
+        """
+        battery, p, rotor_vel = self.read(data), data.params, data.states.rotor_vel
+        mechanical = jnp.sum(curve(rotor_vel, p.rpm2torque) * rotor_vel * RPM_TO_RAD_S, axis=-1, keepdims=True)
+        power = jnp.where(mechanical > 0, mechanical, 0.0) / battery.efficiency + battery.base_power
+        power = jnp.where(battery.charge > 0, power, 0.0)
+        voltage, current = under_load(power, open_circuit_voltage(battery.charge, battery.n_cells), battery.resistance)
+
+        # Compensated summation (Kahan 1965): a step draws some millionths of the charge, mostly lost in float32.
+        drawn = current / (3600.0 * data.core.freq * battery.capacity) + battery.rounding
+        charge = battery.charge - drawn
+        rounding = drawn - (battery.charge - charge)
+        empty = charge <= 0
+        battery = battery.replace(
+            charge=jnp.where(empty, 0.0, charge),
+            rounding=jnp.where(empty, 0.0, rounding),
+            voltage=voltage,
+            current=current,
+        )
+        return self.write(data, battery)
+
+
+@compiled()
+def open_circuit_voltage(charge: Array, n_cells: Array) -> Array:
+    """Return the open-circuit voltage of lithium-polymer cells in series, V.
+
+    Chen and Rincon-Mora 2006 (IEEE Trans. Energy Conversion 21(2)), equation 2, fitted to one cell: 4.10 V when full,
+    3.8 V at half charge, with a steep fall below a tenth.
+
+    Args:
+        charge: State of charge, 0 to 1. (..., 1)
+        n_cells: Number of cells. (1,) or (..., 1)
+    """
+    polynomial = 3.685 + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201))
+    return n_cells * (polynomial - 1.031 * jnp.exp(-35.0 * charge))
+
+
+def under_load(power: Array, open_circuit: Array, resistance: Array) -> tuple[Array, Array]:
+    """Return the voltage, V, and current, A, of a source with internal resistance that supplies a power.
+
+    The upper root of ``V = V_0 - R P / V``. The source supplies ``V_0^2 / (4 R)`` at most, at half the open-circuit
+    voltage; larger loads get that.
+
+    Args:
+        power: Power of the load, W. (..., 1)
+        open_circuit: Voltage without load, V. (..., 1)
+        resistance: Internal resistance, ohm. (..., 1)
+    """
+    spare = open_circuit * open_circuit - 4 * resistance * power
+    enough = spare > 0
+    root = jnp.where(enough, jnp.sqrt(jnp.where(enough, spare, 1.0)), 0.0)
+    voltage = 0.5 * (open_circuit + root)
+    most = open_circuit * open_circuit / (4 * resistance)
+    return voltage, jnp.where(enough, power, most) / voltage

@@ -1,0 +1,173 @@
+"""Downwash: the jets of air below the drones of a world, acting on the others through their drag."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.others import reduce_over_others
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter
+from crazysim.core.stage import stage
+from crazysim.dynamics import first_principles
+from crazysim.dynamics.rotor import curve
+from crazysim.plugins.effects.moving_air import Exposed, checked_propeller_radius, require_drag, with_moving_air, zeros
+from crazysim.pytree import PyTree, leaf, on_device
+
+DECAY, SPREAD = 5.8, 0.094
+"""Velocity decay constant B and spreading rate S of a round turbulent jet, 1 (Hussein, Capp and George 1994; Pope,
+Turbulent Flows, 2000, table 5.1)."""
+AIR_DENSITY = 1.225
+"""Density of air at sea level, kg/m^3 (ISO 2533)."""
+
+
+class DownwashData(PyTree):
+    """Velocity of the air from the other drones of its world at every drone."""
+
+    diameter: Array = leaf("parameter", 1, (1,))
+    """Diameter of the fully contracted jet of a drone, m. (1,)"""
+    air_density: Array = leaf("parameter", 1, (1,))
+    """Density of air, kg/m^3. (1,)"""
+    air_vel: Array = leaf("drone", 1)
+    """Velocity of the air from other drones, world frame, m/s. (n_worlds, n_drones, 3)"""
+
+
+class Downwash(Plugin):
+    """Downwash of the other drones of a world, as drag of the velocity relative to the air; needs a model with drag."""
+
+    propeller_radius: ArrayLike = parameter(default=None)
+    """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
+    air_density: ArrayLike = parameter(default=AIR_DENSITY)
+    """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
+    name: str = "downwash"
+
+    def record(self, sim: Simulation) -> DownwashData:
+        """Return still air."""
+        require_drag(sim, "downwash")
+        radius = checked_propeller_radius(sim, self.propeller_radius)
+        density = check_parameter(sim, "air_density", self.air_density, positive=True)
+        # Far below a rotor the cross-section of its stream is half the rotor's disc (momentum theory).
+        return DownwashData(stream_diameter(sim, radius), density, zeros(sim, 3))
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that computes the air velocity."""
+        return [Placement(stage("drone")(self.sum_jets))]
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the force that the air from other drones adds to the drag."""
+        return with_moving_air(data, self.read(data).air_vel)
+
+    def sum_jets(self, data: SimData) -> SimData:
+        """Add up the jets of all drones of the world at one drone; a jet does not act on its own drone.
+
+        They are added up at its load too, where the jet of the drone above counts.
+        """
+        record, s = self.read(data), data.states
+        bodies = {name: x for name, x in data.plugins.items() if isinstance(x, Exposed) and x.air_vel is not None}
+        places = {self.name: s.pos} | {name: x.pos for name, x in bodies.items()}
+        axis = rotation.z_axis(s.quat)
+        own = jet_source(collective_thrust(data), record.diameter, record.air_density)
+
+        def at_places(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
+            origin, axis, source = other
+            return {name: jet_speed(pos - origin, axis, source) * axis for name, pos in places.items()}
+
+        against = reduce_over_others(at_places, (s.pos, axis, own))
+        moved = {name: x.replace(air_vel=-against[name]) for name, x in bodies.items()}
+        data = data.replace(plugins=data.plugins | moved)
+        return self.write(data, record.replace(air_vel=-against[self.name]))
+
+
+def stream_diameter(sim: Simulation, radius: Array) -> Array:
+    """Return the diameter of the contracted stream of drones with propellers of a radius, m. (1,) or one per drone"""
+    factor = np.sqrt(2 * of_airframes(sim, lambda airframe: airframe.n_rotors))
+    factor = factor[..., None] if factor.ndim else factor
+    return on_device(factor * np.asarray(radius), radius.dtype)
+
+
+def jet(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density: Array) -> Array:
+    """Return the speed of the air in the jet of a hovering drone, m/s.
+
+    From 2.5 drone diameters downwards the mean flow below a quadrotor is that of one round turbulent jet (Bauersfeld
+    et al., Robotics meets Fluid Dynamics, RA-L 2025), whose speed falls as one over the distance and whose profile
+    keeps its shape (Pope 2000, sections 5.1 and 5.2):
+
+        u = u_0 / (1 + s / (B d)) / (1 + (sqrt(2) - 1) (r / b)^2)^2,  b = S (s + B d)
+
+    at s below the rotors and r off their axis. Momentum theory gives the speed at the start, ``u_0^2 = 4 T / (pi rho
+    d^2)`` with d the diameter of the contracted stream. Two assumptions: the virtual origin lies where the speed of the
+    jet is u_0 in the plane of the rotors, and the jet starts smoothly from zero within one diameter below. There is no
+    jet above the drone.
+
+    Args:
+        offset: Position relative to the drone, world frame, m. (..., 3)
+        axis: The drone's body z axis, along which it thrusts, world frame. (..., 3)
+        thrust: Its collective thrust, N; below zero counts as none. (..., 1)
+        diameter: Diameter d of its contracted stream, m. (..., 1)
+        air_density: Density of air, kg/m^3. (..., 1)
+
+    Returns:
+        Speed against the axis. (..., 1)
+    """
+    return jet_speed(offset, axis, jet_source(thrust, diameter, air_density))
+
+
+class JetSource(NamedTuple):
+    """The part of a jet's speed that does not depend on the place."""
+
+    strength: Array
+    """``u_0 B d``, m^2/s; zero without thrust. (..., 1)"""
+    origin: Array
+    """Distance ``B d`` of the virtual origin above the rotors, m. (..., 1)"""
+    per_diameter: Array
+    """``1 / d``, 1/m. (..., 1)"""
+
+
+def jet_source(thrust: Array, diameter: Array, air_density: Array) -> JetSource:
+    """Return the source of a drone's jet; the arguments are those of ``jet``."""
+    pushes = thrust > 0
+    impulse = jnp.where(pushes, jnp.sqrt(jnp.where(pushes, thrust, 1.0) * 4 / (math.pi * air_density)), 0.0)
+    return JetSource(DECAY * impulse, DECAY * diameter, 1 / diameter)
+
+
+def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:
+    """Return the speed of the air in a jet, m/s. (..., 1)
+
+    The formula of ``jet`` with one division: for ``q = s + B d`` and ``w = q / (q^2 + (sqrt(2) - 1) (r / S)^2)`` the
+    speed is ``u_0 B d q w^2``.
+    """
+    below = -rotation.dot(offset, axis)
+    off_axis = offset + below * axis
+    # Only below: above, the distance to the virtual origin would pass through zero.
+    down = jnp.where(below < 0, 0.0, below)
+    q = down + source.origin
+    w = q / (q * q + (math.sqrt(2) - 1) / SPREAD**2 * rotation.dot(off_axis, off_axis))
+    x = down * source.per_diameter
+    x = jnp.where(x > 1, 1.0, x)
+    begins = x * x * (3 - 2 * x)
+    return begins * source.strength * q * w * w
+
+
+def mean_rotor_vel(data: SimData) -> Array:
+    """Return the mean speed of the rotors that a drone has, rpm. (..., 1)"""
+    rotor_vel, limit = data.states.rotor_vel, data.params.rotor_vel_max  # type: ignore[union-attr]
+    if limit.shape[-1] == 1:
+        return jnp.mean(rotor_vel, axis=-1, keepdims=True)
+    return jnp.sum(rotor_vel, axis=-1, keepdims=True) / jnp.sum(limit > 0, axis=-1, keepdims=True)
+
+
+def collective_thrust(data: SimData) -> Array:
+    """Return the collective thrust of a drone, N, from its rotor speeds or by the fitted model. (..., 1)"""
+    p: Any = data.params
+    rotor_vel = data.states.rotor_vel
+    if isinstance(p, first_principles.Params):
+        return jnp.sum(curve(rotor_vel, p.rpm2thrust), axis=-1, keepdims=True)
+    thrust = data.controls.attitude.cmd[..., 3:] if p.thrust_dyn_coef is None else rotor_vel[..., :1]
+    return p.acc_coef + p.cmd_f_coef * thrust

@@ -1,0 +1,179 @@
+"""Values at the nodes of regular grids, and their interpolation at any place."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim.errors import ConfigError
+from crazysim.rotation import safe_clip
+from crazysim.storage import read_text
+from crazysim.tables import LARGEST
+
+LARGEST_FUSED = 400_000
+"""Most numbers of a table that a fused kernel reads; compiling the step takes 8 µs for each."""
+MAX_FILE = 2**30
+"""Largest file of a grid, bytes."""
+UNEVEN = 1e-3
+"""Largest relative difference between the distances of nodes along an axis of a regular grid."""
+
+
+class Grid(NamedTuple):
+    """Values at the nodes of a regular grid, along x, y and z."""
+
+    values: Any
+    """Values. (n_x, n_y, n_z) or (n_x, n_y, n_z, k)"""
+    origin: ArrayLike = (0.0, 0.0, 0.0)
+    """Position of the node of the smallest x, y and z, m. (3,)"""
+    spacing: Any = 1.0
+    """Distance between neighbouring nodes, m: () or (3,)."""
+
+    def checked(self, name: str, k: int | None = None) -> Grid:
+        """Return the grid as arrays of the host, with one spacing for each axis.
+
+        Args:
+            name: Name in messages.
+            k: Length of a vector; None for a grid of numbers.
+
+        Raises:
+            ConfigError: If a shape or a number is invalid.
+        """
+        values = np.asarray(self.values, np.float64)
+        core = () if k is None else (k,)
+        if values.ndim != 3 + len(core) or values.shape[3:] != core or min(values.shape) < 1:
+            what = "one number" if k is None else f"{k} numbers"
+            shape = f"(n_x, n_y, n_z{', ' if core else ''}{', '.join(map(str, core))})"
+            raise ConfigError(
+                f"expected {name} as values of shape {shape}, got {values.shape}. Give each node of the grid {what}."
+            )
+        origin, spacing = np.asarray(self.origin, np.float64), np.asarray(self.spacing, np.float64)
+        if origin.shape != (3,) or spacing.shape not in ((), (3,)) or not np.all(spacing > 0):
+            raise ConfigError(
+                f"expected {name} with an origin of shape (3,) and a positive spacing of shape () or (3,), m, got "
+                f"{self.origin!r} and {self.spacing!r}. Use origin=(0, 0, 0) and spacing=0.5, for example."
+            )
+        if not all(np.all(np.isfinite(x)) for x in (values, origin, spacing)):
+            raise ConfigError(
+                f"expected finite numbers in {name}, got NaN or infinity. Fill the gaps, with zeros for example."
+            )
+        return Grid(values, origin, np.broadcast_to(spacing, (3,)))
+
+
+def interpolate(values: Array, position: Array) -> Array:
+    """Return values between the nodes of a grid, linear along each axis (trilinear along three).
+
+    A place outside takes the value of the nearest place inside. The gradient with respect to the position is that
+    within the cell, and zero outside.
+
+    Args:
+        values: Values at the nodes. (n_1, ..., n_d, *core)
+        position: Place in units of cells, 0 to n - 1 along each axis. (..., d)
+
+    Returns:
+        (..., *core)
+    """
+    n_axes = position.shape[-1]
+    shares, nodes = [], []
+    for k in range(n_axes):
+        last = values.shape[k] - 1
+        place = safe_clip(position[..., k], 0.0, float(last))
+        low = jnp.clip(jnp.floor(place), 0, max(last - 1, 0))
+        share, low = place - low, low.astype(jnp.int32)
+        nodes.append((low, jnp.minimum(low + 1, last)))
+        shares.append((1 - share, share))
+    core = (1,) * (values.ndim - n_axes)
+    total: Any = 0.0
+    for corner in product((0, 1), repeat=n_axes):
+        node = values.at[tuple(nodes[k][c] for k, c in enumerate(corner))]
+        weight: Any = 1.0
+        for k, c in enumerate(corner):
+            weight = weight * shares[k][c]
+        found = node.get(mode="promise_in_bounds", wrap_negative_indices=False)
+        total = total + weight.reshape(weight.shape + core) * found
+    return total
+
+
+def is_inside(shape: tuple[int, ...], position: Array) -> Array:
+    """Return True for places within a grid.
+
+    Args:
+        shape: Numbers of nodes along the axes. (d,)
+        position: Place in units of cells. (..., d)
+
+    Returns:
+        (...)
+    """
+    last = jnp.asarray(np.array(shape) - 1, position.dtype)
+    return jnp.all((position >= 0) & (position <= last), axis=-1)
+
+
+def load_wind_grid(path: str | Path) -> Grid:
+    """Return a grid of velocities from a CSV file, as ParaView exports the points of a flow on a regular grid.
+
+    The columns ``Points:0``, ``Points:1``, ``Points:2`` are positions, m, and ``U:0``, ``U:1``, ``U:2`` velocities,
+    m/s, with one row for each node, in any order. Other columns are ignored.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ConfigError: If the file cannot be read, a column is missing, or the points are not the nodes of a regular grid.
+    """
+    header, *rows = read_text(path, MAX_FILE).splitlines() or [""]
+    names = [name.strip().strip('"') for name in header.split(",")]
+    columns = [f"{kind}:{k}" for kind in ("Points", "U") for k in range(3)]
+    missing = [name for name in columns if name not in names]
+    if missing:
+        raise ConfigError(
+            f"expected columns {', '.join(columns)} in {str(path)!r}, got none named {missing[0]!r}. Export points "
+            f"and the vector U from ParaView, or rename the columns."
+        )
+    if not any(map(str.strip, rows)):
+        raise ConfigError(f"expected one row for each node of a grid in {str(path)!r}, got the names of columns only")
+    try:
+        table = np.loadtxt(rows, delimiter=",", usecols=[names.index(name) for name in columns], ndmin=2)
+    except ValueError as error:
+        raise ConfigError(
+            f"expected numbers in the columns of {str(path)!r}, got: {error}. Correct or remove that row."
+        ) from error
+    if not np.all(np.abs(table) <= LARGEST):
+        raise ConfigError(
+            f"expected finite numbers in {str(path)!r}, got NaN, infinity or a larger one. Fill the gaps."
+        )
+    axes, places = zip(*(_nodes(table[:, k]) for k in range(3)), strict=True)
+    shape = tuple(map(len, axes))
+    is_full = len(table) == math.prod(shape)  # before anything of that size is allocated
+    values = np.full((*shape, 3), np.nan) if is_full else np.array(np.nan)
+    if is_full:
+        values[places] = table[:, 3:]
+    if np.isnan(values).any():
+        raise ConfigError(
+            f"expected one row for each of the {' x '.join(map(str, shape))} nodes of a regular grid in {str(path)!r}, "
+            f"got {len(table)} rows. Resample the flow to an image in ParaView before the export."
+        )
+    spacing = []
+    for axis in axes:
+        steps = np.diff(axis) if len(axis) > 1 else np.ones(1)
+        if np.ptp(steps) > UNEVEN * steps.mean():
+            raise ConfigError(
+                f"expected nodes at equal distances in {str(path)!r}, got {steps.min()} to {steps.max()} m. Resample "
+                f"the flow to an image in ParaView before the export."
+            )
+        spacing.append(float(steps.mean()))
+    return Grid(values, tuple(float(axis[0]) for axis in axes), tuple(spacing))
+
+
+def _nodes(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct coordinates along an axis, in order, and the index of each point's."""
+    order = np.sort(coordinates)
+    size = max(order[-1] - order[0], 1e-9)
+    axis = order[np.concatenate([[True], np.diff(order) > 1e-6 * size])]
+    middles = (axis[1:] + axis[:-1]) / 2
+    return axis, np.searchsorted(middles, coordinates)

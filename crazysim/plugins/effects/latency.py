@@ -1,0 +1,139 @@
+"""Latency: commands that reach the drone a fixed number of steps after they were sent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim.control import Control
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.stage import Stage, as_stages, stage
+from crazysim.errors import ConfigError, shown
+from crazysim.plugins.effects.moving_air import controls_of
+from crazysim.pytree import PyTree, leaf, on_device
+
+MAX_DELAY = 100_000
+"""Longest delay, steps: the queue of each drone has a row for each."""
+
+
+class LatencyData(PyTree):
+    """Commands in transit."""
+
+    delay: Array = leaf("parameter", 1, (1,))
+    """Steps from sending a command to its arrival. (1,)"""
+    queue: Array = leaf("drone", 2)
+    """Commands of the last steps, that of step i in row i modulo n_rows. (n_worlds, n_drones, n_rows, k)"""
+    arrived: Array = leaf("drone", 1)
+    """Latest command that has arrived. (n_worlds, n_drones, k)"""
+
+
+class Latency(Plugin):
+    """Commands of the simulation's own level that arrive late.
+
+    A command that is sent before step i is the staged command of the controller at step i + delay; with rotor commands
+    it is the command of the motors in that step. Until the first command arrives, the one that was staged when the
+    plugin was added (after a reset, that of the default data) stays in force.
+    """
+
+    delay: ArrayLike = parameter()
+    """Delay, steps, whole numbers. () or (n_worlds, n_drones)"""
+    max_delay: int | None = None
+    """Largest delay that the record can take later on, steps; None for the largest of ``delay``."""
+    name: str = "latency"
+    order: ClassVar[int] = -1  # a late command is limited as any other
+
+    def record(self, sim: Simulation) -> LatencyData:
+        """Return a queue filled with the command that is staged now."""
+        return self._filled(sim, sim.data)
+
+    def default_record(self, sim: Simulation) -> LatencyData:
+        """Return a queue filled with the command that is staged in the default data."""
+        return self._filled(sim, sim.default_data)
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that moves the queue, and the controller that gets the commands which have arrived."""
+        queue = stage("drone")(self.move_queue)
+        if sim.data.controls.mode == Control.rotor_vel:
+            return [Placement(queue)]
+        name = _controller(sim)
+        (controller,) = as_stages({name: sim.step_pipeline[name]})
+        return [Placement(queue, before=name), Placement(self._late(controller), replaces=name, name=name)]
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the rotor commands that have arrived."""
+        return _send(data, self.read(data).arrived) if data.controls.mode == Control.rotor_vel else data
+
+    def move_queue(self, data: SimData) -> SimData:
+        """Put the command of one drone into its queue, and take out the one that arrives."""
+        latency, step = self.read(data), data.core.steps
+        length = latency.queue.shape[0]
+        queue = latency.queue.at[step % length].set(_sent(data))
+        arrived = queue[(step - latency.delay[0]) % length]
+        return self.write(data, latency.replace(queue=queue, arrived=arrived))
+
+    def _late(self, controller: Stage) -> Stage:
+        """Return a controller that gets the command that has arrived, and leaves the one that was sent staged."""
+        scope: Any = controller.scope
+
+        def late(data: SimData) -> SimData:
+            return _send(controller.fn(_send(data, self.read(data).arrived)), _sent(data))
+
+        return Stage(late, scope, controller.when, controller.batched, controller.__name__)
+
+    def _filled(self, sim: Simulation, data: SimData) -> LatencyData:
+        delay, longest = np.asarray(self.delay), self.max_delay
+        if longest is None and delay.size and delay.dtype.kind in "iu":
+            longest = int(np.max(delay))
+        if (
+            isinstance(longest, bool)
+            or not isinstance(longest, (int, np.integer))
+            or not 0 <= longest <= MAX_DELAY
+            or delay.dtype.kind not in "iu"
+        ):
+            raise ConfigError(
+                f"expected delay and max_delay as whole numbers of steps from 0 to {MAX_DELAY}, got "
+                f"{shown(self.delay)} and {shown(self.max_delay)}"
+            )
+        steps, command = check_parameter(sim, "delay", delay, (1,), 0, longest, jnp.int32), _sent(data)
+        queue = np.repeat(np.asarray(command)[..., None, :], int(longest) + 1, axis=-2)
+        return LatencyData(steps, on_device(queue, command.dtype), command)
+
+
+def _controller(sim: Simulation) -> str:
+    """Return the name of the stage that takes over commands of the simulation's own level."""
+    mode = sim.data.controls.mode.value
+    for name in (f"{mode}_controller", f"commit_{mode}"):
+        if name in sim.step_pipeline:
+            return name
+    raise ConfigError(
+        f"expected a stage '{mode}_controller', whose commands could be delayed, got a step pipeline without it"
+    )
+
+
+def _sent(data: SimData) -> Array:
+    """Return the staged command of the simulation's own level, with the feedforward of a setpoint. (..., k)"""
+    controls = controls_of(data)
+    if controls.mode == Control.rotor_vel:
+        return controls.rotor_vel
+    level = getattr(controls, controls.mode)
+    feedforward = getattr(level, "staged_feedforward", None)
+    return level.staged_cmd if feedforward is None else jnp.concatenate([level.staged_cmd, feedforward], axis=-1)
+
+
+def _send(data: SimData, command: Array) -> SimData:
+    """Return the data with another command of the simulation's own level."""
+    controls = controls_of(data)
+    if controls.mode == Control.rotor_vel:
+        return data.replace(controls=controls.replace(rotor_vel=command))
+    level = getattr(controls, controls.mode)
+    n = level.staged_cmd.shape[-1]
+    changes = {"staged_cmd": command[..., :n]}
+    if command.shape[-1] > n:
+        changes["staged_feedforward"] = command[..., n:]
+    return data.replace(controls=controls.replace(**{controls.mode.value: level.replace(**changes)}))

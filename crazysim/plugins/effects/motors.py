@@ -1,0 +1,101 @@
+"""Motor failure: rotors that are weaker than the airframe's, or fail in flight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.random import drone_key
+from crazysim.core.settings import as_mask
+from crazysim.core.stage import stage
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.moving_air import controls_of, per_drone, require_rotors
+from crazysim.pytree import PyTree, leaf, select_worlds
+
+
+class MotorFailureData(PyTree):
+    """Effectiveness of every rotor, and when it fails."""
+
+    effectiveness: Array = leaf("drone", 1)
+    """Fraction of thrust and drag torque left to a rotor, 1. (n_worlds, n_drones, n_rotors)"""
+    fail_step: Array | None = leaf("parameter", 1)
+    """Step of the episode in which a rotor fails, negative for never; None if none is set. (n_rotors,)"""
+    rate: Array | None = leaf("parameter", 1)
+    """Failures per second of a rotor that works, 1/s; None if none fails by chance. (n_rotors,)"""
+
+
+class MotorFailure(Plugin):
+    """Rotors that are weaker than the airframe's, or fail; needs rotors.
+
+    A rotor of effectiveness e gives e times the thrust and the drag torque of its speed. A failed one gives none, takes
+    no command and runs down. Controllers keep the airframe's parameters.
+    """
+
+    effectiveness: Any = parameter(default=1.0)
+    """Fraction of thrust and drag torque at the beginning of an episode, 0 to 1.
+    (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
+    fail_step: Any = parameter(default=None)
+    """Step of the episode in which a rotor fails, a whole number, negative for never; None if no rotor does.
+    (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
+    rate: Any = parameter(default=None)
+    """Random failures per second of a working rotor, 1/s; None for no random failures.
+    (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
+    name: str = "motors"
+
+    def record(self, sim: Simulation) -> MotorFailureData:
+        """Return the rotors at their initial effectiveness."""
+        require_rotors(sim, "motor failure")
+        core, step, rate = (sim.data.states.rotor_vel.shape[-1],), self.fail_step, self.rate
+        return MotorFailureData(
+            effectiveness=per_drone(sim, check_parameter(sim, "effectiveness", self.effectiveness, core, 0.0, 1.0)),
+            fail_step=None if step is None else check_parameter(sim, "fail_step", step, core, dtype=jnp.int32),
+            rate=None if rate is None else check_parameter(sim, "rate", rate, core, 0.0),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that makes rotors fail, if any can."""
+        can_fail = self.fail_step is not None or self.rate is not None
+        return [Placement(stage("drone")(self.fail_in_flight))] if can_fail else []
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the curves and commands of weak and failed rotors."""
+        effectiveness = self.read(data).effectiveness
+        p, scale, controls = data.params, effectiveness[..., None], controls_of(data)
+        params = p.replace(rpm2thrust=scale * p.rpm2thrust, rpm2torque=scale * p.rpm2torque)
+        rotor_vel = jnp.where(effectiveness > 0, controls.rotor_vel, 0.0)
+        return data.replace(params=params, controls=controls.replace(rotor_vel=rotor_vel))
+
+    def fail_in_flight(self, data: SimData) -> SimData:
+        """Make rotors of one drone fail, in their step or at random with probability ``1 - exp(-rate dt)`` a step."""
+        motors = self.read(data)
+        effectiveness = motors.effectiveness
+        if motors.fail_step is not None:
+            due = (motors.fail_step >= 0) & (data.core.steps >= motors.fail_step)
+            effectiveness = jnp.where(due, 0.0, effectiveness)
+        if motors.rate is not None:
+            uniform = jax.random.uniform(drone_key(data, self.name), effectiveness.shape, effectiveness.dtype)
+            effectiveness = jnp.where(uniform < jnp.exp(-motors.rate / data.core.freq), effectiveness, 0.0)
+        return self.write(data, motors.replace(effectiveness=effectiveness))
+
+    def fail(self, data: SimData, mask: Any) -> SimData:
+        """Return the data with failed rotors; a reset of their world restores them.
+
+        Args:
+            data: The simulation, all worlds of it.
+            mask: True for rotors that fail; None for all. (n_worlds, n_drones, n_rotors)
+
+        Raises:
+            ConfigError: If this plugin has not been added, or the mask has another shape or type.
+        """
+        if self.name not in data.plugins:
+            raise ConfigError(f"{self.name} is not enabled. Use sim.add(MotorFailure(...)) first.")
+        motors = self.read(data)
+        before = motors.effectiveness
+        mask = as_mask(mask, before.shape, each="rotor (n_worlds, n_drones, n_rotors)")
+        return self.write(data, motors.replace(effectiveness=select_worlds(mask, jnp.zeros_like(before), before)))

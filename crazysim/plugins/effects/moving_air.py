@@ -1,0 +1,89 @@
+"""Helpers that effects share: requirements on the model, forces of moving air, arrays per drone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation, check_parameter, of_airframes
+from crazysim.dynamics import first_principles
+from crazysim.dynamics.drag import drag_force
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, leaf, on_device
+
+
+class Exposed(PyTree):
+    """Record of bodies that wind and downwash act on: one for each drone, such as its load."""
+
+    pos: Array = leaf("drone", 1)
+    """Position of the body, world frame, m. (n_worlds, n_drones, 3)"""
+    air_vel: Array | None = leaf("drone", 1)
+    """Velocity of the air at the body from the jets of all drones, world frame, m/s; None without drag.
+    (n_worlds, n_drones, 3)"""
+    wind_vel: Array | None = leaf("drone", 1)
+    """Velocity of the air at the body from all wind fields, world frame, m/s; None without drag.
+    (n_worlds, n_drones, 3)"""
+
+
+def with_moving_air(data: SimData, air_vel: Array) -> SimData:
+    """Return the data with the force that moving air adds to the drag.
+
+    The drag is linear: that of the velocity relative to the air is the drag of the velocity plus the drag of
+    ``-air_vel``.
+
+    Args:
+        data: The simulation, of a model with drag.
+        air_vel: Velocity of the air, world frame, m/s. (..., 3)
+    """
+    s = data.states
+    force = s.force + drag_force(s.quat, -air_vel, data.params.drag_matrix)
+    return data.replace(states=s.replace(force=force))
+
+
+def require_drag(sim: Simulation, effect: str) -> None:
+    """Check that moving air would push the drones.
+
+    Raises:
+        ConfigError: If the model has no drag, or the airframe's is zero.
+    """
+    drag = getattr(sim.data.params, "drag_matrix", None)
+    if drag is None or not np.any(np.asarray(drag)):
+        raise ConfigError(
+            f"{effect} acts through drag, and drone {sim.airframes[0].name!r} has none in this model. Use "
+            f"dynamics='first_principles' or 'so_rpy_rotor_drag' and an airframe with drag coefficients."
+        )
+
+
+def require_rotors(sim: Simulation, effect: str) -> None:
+    """Check that the model has rotors.
+
+    Raises:
+        ConfigError: If it is a fitted one.
+    """
+    if not isinstance(sim.data.params, first_principles.Params):
+        raise ConfigError(f"{effect} acts on single rotors, which only dynamics='first_principles' has")
+
+
+def checked_propeller_radius(sim: Simulation, radius: Any) -> Array:
+    """Return the radius of propellers as ``check_parameter`` does, m; of None that of the airframes."""
+    if radius is None:
+        radius = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
+    return check_parameter(sim, "propeller_radius", radius, positive=True)
+
+
+def controls_of(data: SimData) -> Any:
+    """Return the controls untyped: the command level and the model determine which of their fields are None."""
+    return data.controls
+
+
+def per_drone(sim: Simulation, value: Array) -> Array:
+    """Return a parameter with one entry per drone. (n_worlds, n_drones, *core)"""
+    return on_device(np.broadcast_to(value, (*sim.data.states.pos.shape[:2], value.shape[-1])), value.dtype)
+
+
+def zeros(sim: Simulation, n: int) -> Array:
+    """Return zeros for every drone, of the states' type. (n_worlds, n_drones, n)"""
+    return on_device(np.zeros((*sim.data.states.pos.shape[:2], n)), sim.data.states.pos.dtype)

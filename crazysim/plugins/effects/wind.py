@@ -1,0 +1,243 @@
+"""Wind with a mean that is constant or grows with height, and Dryden gusts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.random import drone_key
+from crazysim.core.stage import stage
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.ground import ground_below
+from crazysim.plugins.effects.moving_air import require_drag, with_moving_air, zeros
+from crazysim.pytree import PyTree, leaf
+from crazysim.rotation import dot, safe_clip, safe_normalize
+
+FOOT = 0.3048
+"""Metres per foot: the low-altitude model is stated in feet."""
+LOWEST, HIGHEST = 10.0, 1000.0
+"""Range of heights in which the low-altitude model holds, ft; heights outside are clipped to it."""
+GROUND = 0.01
+"""Height below which the wind of a power law stays the same, m: its slope would be infinite at zero."""
+MIN_AIRSPEED = 1.0
+"""Airspeed at which gusts pass a drone that drifts with the mean wind, m/s. An assumption: in the model's frozen field
+the gust at such a drone would never change."""
+
+
+class WindData(PyTree):
+    """Velocity of the air at every drone."""
+
+    velocity: Array = leaf("parameter", 1, (3,))
+    """Mean wind, at the reference height if it depends on the height, world frame, m/s. (3,)"""
+    roughness: Array | None = leaf("parameter", 1, (1,))
+    """Roughness length of the logarithmic profile, m; None for another. (1,)"""
+    exponent: Array | None = leaf("parameter", 1, (1,))
+    """Exponent of the power-law profile, 1; None for another. (1,)"""
+    reference_height: Array | None = leaf("parameter", 1, (1,))
+    """Height of the mean wind, m; None for a wind that is the same at all heights. (1,)"""
+    speed_20ft: Array | None = leaf("parameter", 1, (1,))
+    """Mean wind speed 20 ft above ground, which sets the strength of gusts, m/s; None without gusts. (1,)"""
+    filters: Array | None = leaf("drone", 1)
+    """States of the shaping filters at unit variance, 1; None without gusts. (n_worlds, n_drones, 5)"""
+    gust: Array | None = leaf("drone", 1)
+    """Gust, world frame, m/s; None without gusts. (n_worlds, n_drones, 3)"""
+
+    def mean_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
+        """Return the mean wind at a place, above ground of some height, m (..., 1), world frame, m/s. (..., 3)"""
+        if self.reference_height is None:
+            return self.velocity
+        height = pos[..., 2:] - ground
+        if self.roughness is not None:
+            return log_profile(height, self.reference_height, self.roughness) * self.velocity
+        return power_profile(height, self.reference_height, self.exponent) * self.velocity  # type: ignore[arg-type]
+
+    def velocity_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
+        """Return the velocity of the air at a place, with the drone's gust, world frame, m/s. (..., 3)"""
+        mean = self.mean_at(pos, ground)
+        return mean if self.gust is None else mean + self.gust
+
+
+class Wind(Plugin):
+    """Wind that acts through the drag of the velocity relative to the air; needs a model with drag.
+
+    The gusts have the Dryden spectra of MIL-F-8785C (3.7.1.2): white noise through filters, ``1 / (1 + t s)`` along the
+    mean wind, ``(1 + sqrt(3) t s) / (1 + t s)^2`` across and vertically, ``t = L / V``. MIL-HDBK-1797 writes 2 L for L
+    across and vertically and halves these lengths, which is equivalent at low altitude. An episode begins with gusts
+    at full strength, not with calm air.
+    """
+
+    velocity: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
+    """Mean wind, at the reference height with a profile, world frame, m/s. (3,) or (n_worlds, n_drones, 3)"""
+    speed_20ft: ArrayLike = parameter(default=None)
+    """Mean wind speed 20 ft above ground, m/s, which sets the strength of gusts: 15 knots (7.7 m/s) is light, 30
+    moderate, 45 severe turbulence (MIL-F-8785C, 3.7.3.4). None for no gusts. () or (n_worlds, n_drones)"""
+    roughness: ArrayLike = parameter(default=None)
+    """Roughness length of the ground, m, for a mean that grows with the logarithm of the height: 0.15 ft (0.046 m) in
+    MIL-F-8785C near airfields, 2 ft (0.61 m) elsewhere. None for none. () or (n_worlds, n_drones)"""
+    exponent: Any = parameter(default=None)
+    """Exponent of a mean that grows with a power of the height, 1, such as 0.2 over land (IEC 61400-1) and 0.14 over
+    the sea (IEC 61400-3). None for none. () or (n_worlds, n_drones)"""
+    reference_height: Any = parameter(default=20 * FOOT)
+    """Height at which a mean that grows is ``velocity``, m. () or (n_worlds, n_drones)"""
+    name: str = "wind"
+
+    def record(self, sim: Simulation) -> WindData:
+        """Return the wind, with filters at rest."""
+        require_drag(sim, "wind")
+        if self.roughness is not None and self.exponent is not None:
+            raise ConfigError(
+                "expected a roughness or an exponent of the wind's profile, got both. Use roughness for the "
+                "logarithmic profile, exponent for the power law."
+            )
+
+        def optional(name: str, is_used: bool = True, **limits: Any) -> Array | None:
+            value = getattr(self, name)
+            return check_parameter(sim, name, value, **limits) if is_used and value is not None else None
+
+        grows = self.roughness is not None or self.exponent is not None
+        speed = optional("speed_20ft", low=0.0)
+        record = WindData(
+            velocity=check_parameter(sim, "velocity", self.velocity, (3,)),
+            roughness=optional("roughness", positive=True),
+            exponent=optional("exponent", low=0.0),
+            reference_height=optional("reference_height", grows, positive=True),
+            speed_20ft=speed,
+            filters=None if speed is None else zeros(sim, 5),
+            gust=None if speed is None else zeros(sim, 3),
+        )
+        if record.roughness is not None and np.any(np.asarray(record.roughness) >= np.asarray(record.reference_height)):
+            raise ConfigError(
+                f"expected a roughness below the reference height, got {self.roughness} m and "
+                f"{self.reference_height} m. The roughness length is about a tenth of the height of grass or bushes."
+            )
+        return record
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that advances the gusts, if there are any."""
+        return [] if self.speed_20ft is None else [Placement(stage("drone")(self.advance_gust))]
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the force that the wind adds to the drag."""
+        return with_moving_air(data, self.read(data).velocity_at(data.states.pos, ground_below(data)))
+
+    def advance_gust(self, data: SimData) -> SimData:
+        """Advance the gust at one drone by a step."""
+        wind, s = self.read(data), data.states
+        ground = ground_below(data)
+        mean = wind.mean_at(s.pos, ground)
+        length, deviation = low_altitude(s.pos[..., 2:] - ground, wind.speed_20ft)
+        relative = s.vel - mean
+        airspeed = jnp.sqrt(dot(relative, relative) + MIN_AIRSPEED**2)
+        step = airspeed / (data.core.freq * length)
+
+        noise = jax.random.normal(drone_key(data, self.name), (6,), s.vel.dtype)
+        begins = data.core.steps == 0
+        first, second = wind.filters[:3], wind.filters[3:]
+        first = jnp.where(begins, noise[3:], first)
+        filters = shape_noise(first, second, noise[:3], jnp.where(begins, 1.0, step / (1 + step / 2)))
+
+        first, second = filters[:3], filters[3:]
+        across = (3**0.5 * first[1:] + (1 - 3**0.5) * second) / 2**0.5
+        gust = from_wind_axes(deviation * jnp.concatenate([first[:1], across]), mean)
+        return self.write(data, wind.replace(filters=filters, gust=gust))
+
+
+def wind_at(data: SimData, pos: Array) -> Array:
+    """Return the velocity of the air at a place near a drone, the sum over all ``Wind``, world frame, m/s; of one
+    drone. (3,)
+    """
+    total = jnp.zeros_like(pos)
+    for record in data.plugins.values():
+        if isinstance(record, WindData):
+            total = total + record.velocity_at(pos, ground_below(data))
+    return total
+
+
+def log_profile(height: Array, reference_height: Array, roughness: Array) -> Array:
+    """Return the ratio of the mean wind at a height to that at the reference height.
+
+    ``ln(z / z_0) / ln(z_ref / z_0)``, zero below the roughness length z_0: the wind shear of MIL-F-8785C with z_ref =
+    20 ft, stated for 3 to 1000 ft (quoted by MathWorks, Aerospace Blockset, Wind Shear Model).
+
+    Args:
+        height: Height above ground, m. (..., 1)
+        reference_height: Height at which the ratio is one, m. (..., 1)
+        roughness: Roughness length, m. (..., 1)
+    """
+    height = jnp.where(height > roughness, height, roughness)
+    return jnp.log(height / roughness) / jnp.log(reference_height / roughness)
+
+
+def power_profile(height: Array, reference_height: Array, exponent: Array) -> Array:
+    """Return the ratio of the mean wind at a height to that at the reference height.
+
+    ``(z / z_ref)^alpha``, as in the normal wind profile of IEC 61400-1; heights below ``GROUND`` count as that.
+
+    Args:
+        height: Height above ground, m. (..., 1)
+        reference_height: Height at which the ratio is one, m. (..., 1)
+        exponent: Exponent, 1. (..., 1)
+    """
+    height = jnp.where(height > GROUND, height, GROUND)
+    return jnp.exp(exponent * jnp.log(height / reference_height))
+
+
+def low_altitude(height: Array, speed_20ft: Array) -> tuple[Array, Array]:
+    """Return the scale lengths and standard deviations of gusts near the ground.
+
+    MIL-F-8785C, 3.7.3.4: with h in ft, ``L_w = h``, ``L_u = L_v = h / (0.177 + 0.000823 h)^1.2``,
+    ``sigma_w = 0.1 W_20``, ``sigma_u = sigma_v = sigma_w / (0.177 + 0.000823 h)^0.4``.
+
+    Args:
+        height: Height above ground, m. (..., 1)
+        speed_20ft: Mean wind speed 20 ft above ground, m/s. (..., 1)
+
+    Returns:
+        Scale lengths along the mean wind, across and vertically, m, and standard deviations, m/s. (..., 3) each
+    """
+    h = safe_clip(height / FOOT, LOWEST, HIGHEST)
+    log = jnp.log(0.177 + 0.000823 * h)
+    horizontal, sigma = h * jnp.exp(-1.2 * log), 0.1 * speed_20ft
+    length = FOOT * jnp.concatenate([horizontal, horizontal, h], axis=-1)
+    sigma_h = sigma * jnp.exp(-0.4 * log)
+    return length, jnp.concatenate([sigma_h, sigma_h, sigma + jnp.zeros_like(h)], axis=-1)
+
+
+def shape_noise(first: Array, second: Array, noise: Array, loss: Array) -> Array:
+    """Return the states of the shaping filters one step later.
+
+    ``x1' + x1 / t = sqrt(2 / t) w`` and ``x2' = (x1 - x2) / t``, both by the trapezoidal rule, which preserves the
+    covariance of the continuous filters, ((1, 1/2), (1/2, 1/2)), exactly for steps of any and of varying length.
+
+    Args:
+        first: x1 along the mean wind, across and vertically, 1. (..., 3)
+        second: x2 across and vertically, 1. (..., 2)
+        noise: Standard normal numbers. (..., 3)
+        loss: Fraction of a filter's state that is lost in the step, ``h / (1 + h / 2)`` with h = dt / t; at 1 the new
+            state is independent of the old. (..., 3)
+
+    Returns:
+        x1, then x2. (..., 5)
+    """
+    new = first - loss * first + jnp.sqrt(loss * (2 - loss)) * noise
+    mean = 0.5 * (first + new)[..., 1:]
+    return jnp.concatenate([new, second - loss[..., 1:] * (second - mean)], axis=-1)
+
+
+def from_wind_axes(vector: Array, velocity: Array) -> Array:
+    """Transform a vector from wind axes (along the mean wind, to its left, up) to the world frame. (..., 3)
+
+    The axes are level, as in MIL-F-8785C at low altitude; without mean wind they are the world's.
+    """
+    along = safe_normalize(velocity[..., :2], jnp.asarray([1.0, 0.0], velocity.dtype))
+    c, s = along[..., 0], along[..., 1]
+    u, v = vector[..., 0], vector[..., 1]
+    return jnp.stack([c * u - s * v, s * u + c * v, vector[..., 2]], axis=-1)

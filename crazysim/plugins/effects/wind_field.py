@@ -1,0 +1,117 @@
+"""Wind that varies in space: velocities of the air on a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.random import world_key
+from crazysim.core.stage import Stage
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.grid import LARGEST_FUSED, Grid, interpolate
+from crazysim.plugins.effects.moving_air import Exposed, require_drag, with_moving_air, zeros
+from crazysim.pytree import PyTree, leaf, on_device
+
+
+class WindFieldData(PyTree):
+    """Velocities of the air on a grid, and at every drone."""
+
+    field: Array = leaf("shared", 4)
+    """Velocities at the nodes, world frame, m/s. (n_x, n_y, n_z, 3)"""
+    origin: Array = leaf("shared", 1)
+    """Position of the first node, world frame, m. (3,)"""
+    spacing: Array = leaf("shared", 1)
+    """Distance between nodes along x, y and z, m. (3,)"""
+    offset: Array = leaf("parameter", 1, (3,))
+    """Displacement of the grid, world frame, m. (3,)"""
+    scale: Array = leaf("parameter", 1, (1,))
+    """Factor of all velocities, 1. (1,)"""
+    spread: Array | None = leaf("parameter", 1, (3,))
+    """Largest random displacement along each axis, m; None for none. (3,)"""
+    shift: Array | None = leaf("drone", 1)
+    """Random displacement in this episode, the same for all drones of a world, m; None for none.
+    (n_worlds, n_drones, 3)"""
+    air_vel: Array = leaf("drone", 1)
+    """Velocity of the air at the drone, world frame, m/s. (n_worlds, n_drones, 3)"""
+
+    def velocity_at(self, pos: Array) -> Array:
+        """Return the velocity of the air at a place, world frame, m/s. (..., 3)"""
+        moved = pos - self.origin - self.offset
+        moved = moved if self.shift is None else moved - self.shift
+        return self.scale * interpolate(self.field, moved / self.spacing)
+
+
+class WindField(Plugin):
+    """Wind from velocities on a grid, as drag of the velocity relative to the air; needs a model with drag.
+
+    Velocities are trilinear between the nodes and constant outside. They are looked up once a step, at drones and at
+    loads with drag. Winds add up.
+    """
+
+    field: Any = parameter()
+    """Velocities of the air, world frame, m/s: values (n_x, n_y, n_z, 3) of a grid."""
+    offset: Any = parameter(default=(0.0, 0.0, 0.0))
+    """Displacement of the grid, world frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    scale: Any = parameter(default=1.0)
+    """Factor of all velocities, 1. () or (n_worlds, n_drones)"""
+    spread: ArrayLike = parameter(default=None)
+    """Largest random displacement along each axis, m, uniform, drawn for each world and episode; None for none. (3,)
+    or (n_worlds, n_drones, 3)"""
+    name: str = "wind_field"
+
+    def record(self, sim: Simulation) -> WindFieldData:
+        """Return the field, and still air at the drones until the first step."""
+        require_drag(sim, "wind")
+        if not isinstance(self.field, Grid):
+            raise ConfigError(
+                f"expected field as a Grid of velocities, got {type(self.field).__name__}. Use "
+                f"WindField(Grid(velocities, origin, spacing)) or WindField(load_wind_grid(path))."
+            )
+        grid = self.field.checked("field", 3)
+        dtype = sim.data.states.pos.dtype
+        spread = None if self.spread is None else check_parameter(sim, "spread", self.spread, (3,), 0.0)
+        return WindFieldData(
+            field=on_device(grid.values, dtype),
+            origin=on_device(grid.origin, dtype),
+            spacing=on_device(grid.spacing, dtype),
+            offset=check_parameter(sim, "offset", self.offset, (3,)),
+            scale=check_parameter(sim, "scale", self.scale),
+            spread=spread,
+            shift=None if spread is None else zeros(sim, 3),
+            air_vel=zeros(sim, 3),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages that displace the grid at the beginning of an episode, and look up the air."""
+        is_small = np.size(self.field.values) <= LARGEST_FUSED
+        found = [Placement(Stage(self.look_up, "drone" if is_small else "batch", batched=True))]
+        if self.spread is None:
+            return found
+        begins = Stage(self.displace, "drone", when=lambda data: data.core.steps == 0)
+        return [Placement(begins, name=f"{self.name}_displacement"), *found]
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the force that the wind adds to the drag."""
+        return with_moving_air(data, self.read(data).air_vel)
+
+    def displace(self, data: SimData) -> SimData:
+        """Draw the displacement of the grid for an episode; of one drone."""
+        record = self.read(data)
+        uniform = jax.random.uniform(world_key(data, self.name), (3,), record.shift.dtype, -1.0, 1.0)
+        return self.write(data, record.replace(shift=record.spread * uniform))
+
+    def look_up(self, data: SimData) -> SimData:
+        """Look up the velocity of the air at drones and loads."""
+        record = self.read(data)
+        data = self.write(data, record.replace(air_vel=record.velocity_at(data.states.pos)))
+        fields = [x for x in data.plugins.values() if isinstance(x, WindFieldData)]
+        loads = {name: x for name, x in data.plugins.items() if isinstance(x, Exposed) and x.wind_vel is not None}
+        moved = {name: x.replace(wind_vel=sum(f.velocity_at(x.pos) for f in fields)) for name, x in loads.items()}
+        return data.replace(plugins=data.plugins | moved)

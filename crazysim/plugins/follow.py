@@ -1,0 +1,263 @@
+"""Following trajectories in the compiled step."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.control.setpoint import Setpoint
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.stage import stage
+from crazysim.core.stages import tick
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, leaf, on_device, static
+from crazysim.trajectories.trajectory import Trajectory
+
+DEGREE = 7
+"""Least degree of slots that are kept for later trajectories: that of minimum snap, and of shows."""
+AHEAD = 2.0
+"""Time of the path ahead that is drawn, s."""
+N_DRAWN = 40
+"""Number of lines of that path."""
+GREEN = (0.1, 0.9, 0.3, 0.8)
+"""Colour of paths and setpoints, rgba."""
+
+
+class FollowData(PyTree):
+    """Trajectories in slots, and the slot, start and rate of every drone."""
+
+    ends: Array = leaf("shared", 2)
+    """End of each piece of the trajectory in each slot, s since its start. (n_slots, max_pieces)"""
+    coefficients: Array = leaf("shared", 4)
+    """Coefficients as in ``Trajectory``. (n_slots, max_pieces, 4, degree + 1)"""
+    repeats: Array = leaf("shared", 1)
+    """True where a trajectory starts again after its end. (n_slots,)"""
+    index: Array = leaf("parameter", 1, (1,))
+    """Slot that a drone follows. (1,)"""
+    start: Array = leaf("parameter", 1, (1,))
+    """Time of the world at which a drone starts, s. (1,)"""
+    rate: Array = leaf("parameter", 1, (1,))
+    """Speed at which a drone goes through its trajectory, 1: at 2 it takes half the time. (1,)"""
+    degrees: tuple[int, ...] = static()
+    """Largest degrees of x, y, z and yaw in the slots, -1 for zero; no trajectory in them may exceed them. (4,)"""
+
+    @property
+    def trajectories(self) -> Trajectory:
+        """The trajectories in all slots, with a leading axis over slots."""
+        return Trajectory(self.ends, self.coefficients, self.repeats)
+
+    def setpoint(self, t: Array) -> Setpoint:
+        """Return the setpoint of one drone at a time of its world, s. ()"""
+        rate = self.rate[0]
+        return self.trajectories.evaluate_at_rate(self.index[0], (t - self.start[0]) * rate, rate, self.degrees)
+
+
+class Follow(Plugin):
+    """State commands from trajectories, each drone with its own trajectory, start and rate.
+
+    At every tick of the state controller it stages the setpoint of that time. A drone waits at the first point of its
+    trajectory until it starts, and stays at the last one after the end. Needs ``Sim(control="state")``.
+    """
+
+    trajectories: Trajectory | Sequence[Trajectory]
+    """Trajectories in the first slots: one, a sequence, or one record with a leading axis."""
+    index: Any = parameter(default=None)
+    """Slot that a drone follows; None for drone i the trajectory i modulo their number. (), (n_drones,) or (n_worlds,
+    n_drones)"""
+    start: Any = parameter(default=0.0)
+    """Time since the reset of the world at which a drone starts, s. A drone with a negative start is in the middle of
+    its trajectory at the reset: with -2 and a rate of 1, at 2 s. (), (n_drones,) or (n_worlds, n_drones)"""
+    rate: Any = parameter(default=1.0)
+    """Speed at which a drone goes through its trajectory, 1. (), (n_drones,) or (n_worlds, n_drones)"""
+    n_slots: int | None = None
+    """Number of slots; None for one of each trajectory. The others hold the first trajectory until ``upload``."""
+    max_pieces: int | None = None
+    """Most pieces of a trajectory in a slot; None for the most of the given ones."""
+    visible: bool = True
+    """True to draw the path ahead and the setpoint of every drone."""
+    name: str = "follow"
+
+    def record(self, sim: Simulation) -> FollowData:
+        """Return the trajectories in their slots."""
+        if sim.data.controls.state is None:
+            raise ConfigError(
+                f"expected state commands for {self.name!r} to replace, got control={sim.data.controls.mode.value!r}. "
+                f"Use Sim(control='state')."
+            )
+        given = self._given()
+        n_slots = len(given) if self.n_slots is None else _count("n_slots", self.n_slots, len(given))
+        most = max(t.n_pieces for t in given)
+        n_pieces = most if self.max_pieces is None else _count("max_pieces", self.max_pieces, most)
+        has_room = self.n_slots is not None or self.max_pieces is not None
+        first = given[0].padded(n_pieces, DEGREE if has_room else 0)
+        slots = Trajectory.stack([first, *given[1:], *[first] * (n_slots - len(given))])
+        index = np.int32(0) if self.index is None else self.index
+        if self.index is None and len(given) > 1 and sim.n_drones > 1:
+            index = np.broadcast_to(np.arange(sim.n_drones) % len(given), (sim.n_worlds, sim.n_drones))
+        ends, coefficients, repeats = (on_device(x, x.dtype) for x in jax.tree.leaves(slots))
+        return FollowData(
+            ends=ends,
+            coefficients=coefficients,
+            repeats=repeats,
+            index=_checked(sim, "index", index, n_slots),
+            start=_checked(sim, "start", self.start, n_slots),
+            rate=_checked(sim, "rate", self.rate, n_slots),
+            degrees=(slots.degree,) * 4 if has_room else slots.degrees(),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that stages the setpoints, in front of the state controller."""
+        ticks = stage("drone", when=lambda data: tick(data, data.controls.state.freq))
+        return [Placement(ticks(self.stage_setpoint), before="state_controller")]
+
+    def stage_setpoint(self, data: SimData) -> SimData:
+        """Stage the setpoint of one drone."""
+        state, s = data.controls.state, self.setpoint(data)
+        state = state.replace(staged_cmd=s.command())
+        if state.staged_feedforward is not None:
+            state = state.replace(staged_feedforward=s.feedforward())
+        return data.replace(controls=data.controls.replace(state=state))
+
+    def setpoint(self, data: SimData) -> Setpoint:
+        """Return the setpoint of one drone now."""
+        return self.read(data).setpoint(data.core.steps / data.core.freq)
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the errors of position, m, and velocity, m/s: desired minus actual, world frame. (3,) each"""
+        s = self.setpoint(data)
+        return {"pos_error": s.pos - data.states.pos, "vel_error": s.vel - data.states.vel}
+
+    def uploaded(self, data: SimData, slot: int, trajectory: Trajectory) -> SimData:
+        """Return data with another trajectory in a slot; all arrays keep their shapes, so that nothing recompiles.
+
+        Args:
+            data: The data of the simulation.
+            slot: The slot.
+            trajectory: The trajectory, for one vehicle.
+
+        Raises:
+            ConfigError: If there is no such slot, or the trajectory does not fit into it.
+        """
+        record = self.read(data)
+        n_slots, n_pieces, _, n_coefficients = record.coefficients.shape
+        if not 0 <= operator.index(slot) < n_slots:
+            raise ConfigError(f"expected a slot from 0 to {n_slots - 1}, got {slot}. Use Follow(..., n_slots=...).")
+        if trajectory.ends.ndim != 1 or trajectory.n_pieces > n_pieces or trajectory.degree >= n_coefficients:
+            raise ConfigError(
+                f"expected one trajectory of at most {n_pieces} pieces and degree {n_coefficients - 1}, got ends of "
+                f"shape {trajectory.ends.shape} and degree {trajectory.degree}. Use Follow(..., max_pieces=...)."
+            )
+        degrees = trajectory.degrees()
+        if any(degree > most for degree, most in zip(degrees, record.degrees, strict=True)):
+            raise ConfigError(
+                f"expected degrees of x, y, z and yaw up to {record.degrees}, those of the first trajectories, got "
+                f"{degrees}. Use Follow(..., n_slots=...) to keep room for others."
+            )
+        leaves = jax.tree.leaves(trajectory.padded(n_pieces, n_coefficients - 1))
+        old = [record.ends, record.coefficients, record.repeats]
+        ends, coefficients, repeats = _with_slot(old, leaves, np.int32(slot))
+        return self.write(data, record.replace(ends=ends, coefficients=coefficients, repeats=repeats))
+
+    def upload(self, sim: Simulation, slot: int, trajectory: Trajectory) -> None:
+        """Put another trajectory into a slot of a simulation, between two steps and without compiling it again.
+
+        A full reset brings the default data's trajectories back; ``sim.build_default_data()`` makes this one theirs.
+
+        Raises:
+            ConfigError: If there is no such slot, or the trajectory does not fit into it.
+        """
+        with sim.lock:
+            sim.data = self.uploaded(sim.data, slot, trajectory)
+
+    def assign(self, sim: Simulation, index: Any = None, start: Any = None, rate: Any = None) -> None:
+        """Give drones other slots, starts or rates; whatever is None stays as it is.
+
+        Nothing is compiled again, except where a number of all drones becomes one per drone.
+
+        Args:
+            sim: The simulation.
+            index: Slots. (), (n_drones,) or (n_worlds, n_drones)
+            start: Times of the worlds at which the drones start, s; may be negative. (), (n_drones,) or (n_worlds,
+                n_drones)
+            rate: Speeds at which they go through their trajectories, 1. (), (n_drones,) or (n_worlds, n_drones)
+
+        Raises:
+            ConfigError: If a shape or a value is invalid.
+        """
+        new = {name: value for name, value in (("index", index), ("start", start), ("rate", rate)) if value is not None}
+        with sim.lock:
+            record = self.read(sim.data)
+            numbers = {name: _checked(sim, name, value, len(record.ends)) for name, value in new.items()}
+            shapes = {name: np.broadcast_shapes(x.shape, getattr(record, name).shape) for name, x in numbers.items()}
+            record = record.replace(**{name: jnp.broadcast_to(x, shapes[name]) for name, x in numbers.items()})
+            sim.data = self.write(sim.data, record)
+
+    def draw(self, sim: Simulation, world: int) -> None:
+        """Draw the path ahead and the setpoint of every drone."""
+        if not self.visible:
+            return
+        record = self.read(sim.data)
+        now = float(sim.data.core.steps[world, 0]) / sim.data.core.freq
+        of_drones = [
+            np.broadcast_to(np.asarray(x)[world] if np.ndim(x) > 1 else np.asarray(x), (sim.n_drones, 1))
+            for x in (record.index, record.start, record.rate)
+        ]
+        paths = np.asarray(_paths(record, of_drones, now + np.linspace(0.0, AHEAD, N_DRAWN + 1)))
+        overlays = sim.scene.renderer.overlays
+        overlays.points(paths[:, 0], GREEN, 0.02)
+        for path in paths:
+            if np.any(path != path[0]):
+                overlays.line(path, GREEN, 2.0, 2.0)
+
+    def _given(self) -> list[Trajectory]:
+        """Return the given trajectories, one by one."""
+        given = self.trajectories
+        if isinstance(given, Trajectory):
+            some = given if np.ndim(given.ends) > 1 else jax.tree.map(lambda x: x[None], given)
+            given = [jax.tree.map(lambda x, k=k: x[k], some) for k in range(len(some.ends))]
+        if not given or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in given):
+            raise ConfigError(f"expected one or more trajectories of one vehicle each, got {self.trajectories!r}")
+        return list(given)
+
+
+def _checked(sim: Simulation, name: str, value: Any, n_slots: int) -> Array:
+    """Return an index, start or rate as ``check_parameter`` does; one axis is that of the drones, in all worlds."""
+    if np.shape(value) == (sim.n_drones,):
+        value = np.broadcast_to(np.asarray(value), (sim.n_worlds, sim.n_drones))
+    elif np.ndim(value) == 1 and np.shape(value) != (1,):
+        raise ConfigError(f"expected {name} for each of {sim.n_drones} drones, got {np.size(value)} numbers")
+    if name == "index":
+        return check_parameter(sim, name, value, low=0, high=n_slots - 1, dtype=jnp.int32)
+    return check_parameter(sim, name, value, positive=name == "rate")
+
+
+def _count(name: str, value: Any, least: int) -> int:
+    """Return a setting, checked to be an integer of at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ConfigError(
+            f"expected {name} as an integer of at least {least}, which the trajectories need, got {value!r}"
+        )
+    return int(value)
+
+
+@jax.jit
+def _with_slot(old: list[Array], new: list[Array], slot: Array) -> list[Array]:
+    return [x.at[slot].set(y) for x, y in zip(old, new, strict=True)]
+
+
+@jax.jit
+def _paths(record: FollowData, of_drones: list[Array], times: Array) -> Array:
+    """Return the positions of all drones of a world at some times. (n_drones, n_times, 3)"""
+
+    def of_one(index: Array, start: Array, rate: Array) -> Array:
+        one = record.replace(index=index, start=start, rate=rate)
+        return jax.vmap(lambda t: one.setpoint(t).pos)(times)
+
+    return jax.vmap(of_one)(*of_drones)

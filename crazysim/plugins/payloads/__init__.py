@@ -1,0 +1,27 @@
+"""Loads that hang from drones, on rods, cables and hooks or below several drones, and jets of rotors on them."""
+
+from crazysim.plugins.payloads.flatness import LoadedState, load_flat_state
+from crazysim.plugins.payloads.hook import Hook, HookData
+from crazysim.plugins.payloads.jet_table import JetTable, load_jet_table
+from crazysim.plugins.payloads.load import LoadData, direction, load_pos, load_vel
+from crazysim.plugins.payloads.rotor_jet import RotorJet, RotorJetData
+from crazysim.plugins.payloads.shared import SharedLoad, SharedLoadData
+from crazysim.plugins.payloads.slung import SlungLoad
+
+__all__ = [
+    "Hook",
+    "HookData",
+    "JetTable",
+    "LoadData",
+    "LoadedState",
+    "RotorJet",
+    "RotorJetData",
+    "SharedLoad",
+    "SharedLoadData",
+    "SlungLoad",
+    "direction",
+    "load_flat_state",
+    "load_jet_table",
+    "load_pos",
+    "load_vel",
+]

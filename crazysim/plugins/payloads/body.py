@@ -1,0 +1,112 @@
+"""Loads and hooks as bodies that collide: point masses with a shape."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.errors import ConfigError, shown
+from crazysim.geometry import Shape
+from crazysim.tables import LENGTH, as_numbers
+
+
+class LoadBody(NamedTuple):
+    """State of point masses with the poses of their shapes, world frame.
+
+    Leading axes are () for one drone, else (n_loads,).
+    """
+
+    pos: Array
+    """Centre of the shape, m. (..., 3)"""
+    quat: Array
+    """Attitude of the shape, xyzw. (..., 4)"""
+    vel: Array
+    """Velocity of the point mass, m/s. (..., 3)"""
+    mass: Array
+    """Mass, kg. (..., 1)"""
+    exists: Array | None = None
+    """True where it collides; None for always. (...)"""
+
+
+class Collider(NamedTuple):
+    """Bodies of one shape, one for each load, as contacts use them. Its functions take one drone or one world."""
+
+    shape: Shape
+    """Shape of each."""
+    body: Callable[[SimData], LoadBody]
+    """Returns their state."""
+    with_vel: Callable[[SimData, Array], SimData]
+    """Returns the data with other velocities of them. (..., 3)"""
+    joined: Callable[[SimData], Array]
+    """Returns True where a rigid rod joins a body to a drone, and the two cannot touch; of one world.
+    (n_loads, n_drones)"""
+
+
+class Colliding:
+    """Interface of plugins whose loads collide; mixed into a ``Plugin``."""
+
+    coupling: Any
+    """``"drone"`` for loads of one drone each, ``"world"`` for loads of a world."""
+    name: Any
+    """Name of the plugin, and of its loads in the scene: ``name:0``, ..."""
+    size: Any
+    """Radius of a ball, or full lengths of a box, m: () or (3,)."""
+
+    @property
+    def solid_kinds(self) -> tuple[str, ...]:
+        """Names of the objects of the scene that stand for its bodies, without their numbers."""
+        return (self.name,)
+
+    @property
+    def placed_kinds(self) -> tuple[str, ...]:
+        """Names of the loads and their links in the scene."""
+        return (*self.solid_kinds, f"{self.name}_link")
+
+    def colliders(self) -> tuple[Collider, ...]:
+        """Return all bodies that collide: the loads."""
+        return (Collider(self.shape(), self.body, self.with_vel, self.joined),)
+
+    def shape(self) -> Shape:
+        """Return the shape of a load."""
+        return shape_of(self.size)
+
+    def body(self, data: SimData) -> LoadBody:
+        """Return the loads; of one drone or of one world."""
+        raise NotImplementedError
+
+    def with_vel(self, data: SimData, vel: Array) -> SimData:
+        """Return the data with other velocities of the loads; of one drone or of one world. (..., 3)"""
+        raise NotImplementedError
+
+    def joined(self, data: SimData) -> Array:
+        """Return True where a rigid rod joins a load to a drone, and the two cannot touch. (n_loads, n_drones)"""
+        raise NotImplementedError
+
+
+def shape_of(size: Any) -> Shape:
+    """Return a ball of a radius, or a box of three full lengths, m.
+
+    Raises:
+        ConfigError: If the size is neither.
+    """
+    lengths = as_numbers("a body", "size", size)
+    if lengths.shape not in ((), (3,)) or not np.all((lengths >= LENGTH.low) & (lengths <= LENGTH.high)):
+        raise ConfigError(
+            f"expected size as a positive radius, or as three positive lengths of a box, {LENGTH.text}, got "
+            f"{shown(size)}. Use size=0.05 or size=(0.1, 0.1, 0.05)."
+        )
+    kind = "box" if lengths.ndim else "sphere"
+    return Shape(kind, tuple((lengths / 2).tolist()) if kind == "box" else (float(lengths),))
+
+
+def rest_height(size: Any) -> float:
+    """Return the height of the middle of a ball or box above the floor on which it stands, m.
+
+    Raises:
+        ConfigError: If the size is neither a radius nor three lengths.
+    """
+    return shape_of(size).size[-1]

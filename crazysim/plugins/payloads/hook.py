@@ -1,0 +1,309 @@
+"""A hook on a rod below each drone, which picks up a load and sets it down."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import Objects, SimData, SimStateDeriv
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.settings import as_mask
+from crazysim.core.stage import Stage
+from crazysim.errors import ConfigError, shown
+from crazysim.geometry import Shape
+from crazysim.plugins.effects.ground import ground_height
+from crazysim.plugins.payloads.body import Collider, Colliding, LoadBody, rest_height
+from crazysim.plugins.payloads.link import SMALLEST_MASS, Link, couple, end_relative_motion, relative
+from crazysim.plugins.payloads.load import (
+    HEAD_HEIGHT,
+    HEAD_RADIUS,
+    LoadData,
+    air_and_gravity,
+    hanging,
+    on_floor,
+    turned_z,
+    with_poses,
+)
+from crazysim.plugins.payloads.slung import load_record, place_loads, upward
+from crazysim.pytree import leaf, on_device, select_worlds
+from crazysim.rotation import dot
+
+
+class HookData(LoadData):
+    """State and parameters of the hook of each drone, and of its load."""
+
+    tip_pos: Array = leaf("drone", 1)
+    """Position of the hook, world frame, m. (n_worlds, n_drones, 3)"""
+    tip_vel: Array = leaf("drone", 1)
+    """Velocity of the hook, world frame, m/s. (n_worlds, n_drones, 3)"""
+    grip: Array = leaf("drone", 0)
+    """Command: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones)"""
+    hook_mass: Array = leaf("parameter", 1, (1,))
+    """Mass of the hook, kg. (1,)"""
+    reach: Array = leaf("parameter", 1, (1,))
+    """Distance of the hook from the ring below which it picks up, m. (1,)"""
+    max_speed: Array = leaf("parameter", 1, (1,))
+    """Speed of the hook relative to the ring below which it picks up, m/s. (1,)"""
+
+
+class Hook(Colliding, Plugin):
+    """A hook on a rigid rod, with one load for each drone.
+
+    With two degrees of freedom the rod swings freely. With one it turns about the body's y axis, and passes roll and
+    yaw torque to the drone. A load is a point mass in its ring. It is picked up where the hook is near and slow, with
+    the impulse of two bodies that stay together; a load that is let go falls freely.
+    """
+
+    mass: Any = parameter()
+    """Mass of the load, kg; zero for none. () or (n_worlds, n_drones)"""
+    dof: int = 2
+    """Degrees of freedom of the rod, 1 or 2."""
+    length: Any = parameter(default=0.4)
+    """Length of the rod, m. () or (n_worlds, n_drones)"""
+    attach: Any = parameter(default=(0.0, 0.0, 0.0))
+    """Joint, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    hook_mass: Any = parameter(default=0.0203)
+    """Mass of the hook, kg. () or (n_worlds, n_drones)"""
+    damping: Any = parameter(default=0.001)
+    """Viscous torque of the joint over its angular velocity, N m s. () or (n_worlds, n_drones)"""
+    reach: Any = parameter(default=0.05)
+    """Distance of the hook from the ring below which it picks up, m. () or (n_worlds, n_drones)"""
+    max_speed: Any = parameter(default=0.5)
+    """Speed of the hook relative to the ring below which it picks up, m/s. () or (n_worlds, n_drones)"""
+    drag: Any = parameter(default=0.0)
+    """Linear drag coefficient of the load, N s/m. () or (n_worlds, n_drones)"""
+    friction: Any = parameter(default=0.6)
+    """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
+    size: Any = (0.14, 0.14, 0.08)
+    """Radius of a ball, or full lengths of a box, m: () or (3,)."""
+    ring: float = 0.1275
+    """Height of the ring above the middle of the load, m."""
+    load_at: Any = None
+    """Initial position of the loads' rings, world frame, m; None for loads on the hooks. (3,) or (n_worlds, n_drones,
+    3)"""
+    rgba: Any = None
+    """Colour of the loads; None for the default. (4,)"""
+    in_scene: bool = True
+    """True to put loads and rods into the scene."""
+    name: str = "load"
+
+    @staticmethod
+    def bumblebee(mass: Any = 0.2, dof: int = 2, **settings: Any) -> Hook:
+        """Return the hook of AIMotionLab's Bumblebee with a load; the rod turns about the drone's centre of mass.
+
+        Rod of 0.4 m, hook of 0.0203 kg, joint damping 0.001 N m s, ring 0.1275 m above the load's middle (facts of
+        AIMotionLab-Virtual, July 2026; the joint lies at (0.0085, 0, 0) of the lab's body frame, as the centre of mass
+        does).
+
+        Args:
+            mass: Mass of the load, kg.
+            dof: Degrees of freedom of the rod, 1 or 2.
+            **settings: Other settings.
+        """
+        return Hook(mass, dof, **settings)
+
+    def record(self, sim: Simulation) -> HookData:
+        """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
+        if self.dof not in (1, 2):
+            raise ConfigError(f"expected dof as 1 or 2, got {self.dof!r}. Use Hook(mass, dof=2).")
+        load = load_record(self, sim, False, rest_height(self.size) + self.ring, self.ring)
+
+        def check(name: str) -> Array:
+            return check_parameter(sim, name, getattr(self, name), low=0.0)
+
+        values = {field: getattr(load, field) for field in load.__dataclass_fields__}
+        tip_pos, tip_vel = load.pos, load.vel
+        if self.load_at is not None:
+            at = check_parameter(sim, "load_at", self.load_at, (3,))
+            pos = np.array(np.broadcast_to(at, load.pos.shape))
+            pos[..., 2] = np.maximum(pos[..., 2], np.asarray(load.clearance)[..., 0])
+            vel, attached = np.zeros_like(pos), np.zeros(load.attached.shape, bool)
+            values |= {"pos": on_device(pos), "vel": on_device(vel), "attached": on_device(attached, bool)}
+            no_clearance = on_device(np.zeros(load.clearance.shape))
+            tip_pos, tip_vel = hanging(sim.data.states, load.attach, load.length, no_clearance, False)
+        return HookData(
+            **values,
+            tip_pos=on_device(tip_pos),
+            tip_vel=on_device(tip_vel),
+            grip=on_device(values["attached"], bool),
+            hook_mass=check("hook_mass"),
+            reach=check("reach"),
+            max_speed=check("max_speed"),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages of picking up and letting go, and of the floor."""
+        return [
+            Placement(Stage(self.pick_up_and_release, "drone"), "integration", name=f"{self.name}_grip"),
+            Placement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor"),
+        ]
+
+    def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
+        """Return the derivative with the pull of hook and load, and their rates; of one drone."""
+        load, p = self.read(data), data.params
+        falling = air_and_gravity(data, load, self.name, dt)
+        link = self._link(load)
+        free = jnp.where(
+            load.attached,
+            p.gravity_vec + load.mass / (link.mass + SMALLEST_MASS) * (falling - p.gravity_vec),
+            p.gravity_vec,
+        )
+        linked = couple(data.states, deriv, p.mass, p.J_inv, link, load.tip_pos, load.tip_vel, free, dt, data.core.freq)
+        loose = load.vel if dt is None else load.vel + dt * falling
+        rates = {
+            "tip_pos": linked.rate,
+            "tip_vel": linked.acc,
+            "pos": jnp.where(load.attached, linked.rate, loose),
+            "vel": jnp.where(load.attached, linked.acc, falling),
+        }
+        return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
+
+    def pick_up_and_release(self, data: SimData) -> SimData:
+        """Pick up a load that is near and slow, or let go, as ``grip`` of the record commands; of one drone.
+
+        Hook and ring stay together after an impact that keeps momentum: the mean of their velocities by mass, then the
+        impulse along the rod that a rigid rod passes on to the drone.
+        """
+        load, p, s = self.read(data), data.params, data.states
+        apart, speed = load.pos - load.tip_pos, load.vel - load.tip_vel
+        near = (dot(apart, apart) < load.reach**2) & (dot(speed, speed) < load.max_speed**2) & (load.mass > 0)
+        picks = load.grip & ~load.attached & near[..., 0]
+        held = load.replace(attached=load.grip & (load.attached | picks))
+        link = self._link(held)
+        joint = load.tip_vel + load.mass / (link.mass + SMALLEST_MASS) * speed
+        after, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, load.tip_pos, joint)
+
+        def change(new: Array, old: Array) -> Array:
+            return jnp.where(picks, new, old)
+
+        tip_vel = change(tip_vel, load.tip_vel)
+        held = held.replace(tip_vel=tip_vel, vel=change(tip_vel, load.vel), pos=change(load.tip_pos, load.pos))
+        states = s.replace(vel=change(after.vel, s.vel), ang_vel=change(after.ang_vel, s.ang_vel))
+        return self.write(data.replace(states=states), held)
+
+    def stop_at_floor(self, data: SimData) -> SimData:
+        """Stop hook and load at the floor; of one drone."""
+        load = self.read(data)
+        height = jnp.where(load.attached, load.clearance, jnp.zeros_like(load.clearance))
+        height = height + ground_height(data, load.tip_pos)
+        tip_pos, tip_vel = on_floor(load.tip_pos, load.tip_vel, height, load.friction)
+        pos, vel = on_floor(load.pos, load.vel, load.clearance + ground_height(data, load.pos), load.friction)
+        pos, vel = jnp.where(load.attached, tip_pos, pos), jnp.where(load.attached, tip_vel, vel)
+        return self.write(data, load.replace(pos=pos, vel=vel, tip_pos=tip_pos, tip_vel=tip_vel))
+
+    def command(self, data: SimData, grip: Any) -> SimData:
+        """Return the data with another command to the hooks.
+
+        Args:
+            data: Simulation.
+            grip: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones), or
+                broadcast to that
+
+        Raises:
+            ConfigError: If it has another shape or type.
+        """
+        load = self.read(data)
+        flags = grip if isinstance(grip, jax.Array) else np.asarray(grip)
+        lengths = zip(flags.shape[::-1], load.grip.shape[::-1], strict=False)
+        fits = flags.ndim <= load.grip.ndim and all(n in (1, length) for n, length in lengths)
+        if flags.dtype != bool or not fits:
+            raise ConfigError(
+                f"expected grip as True or False, or a bool for each drone {load.grip.shape} = (n_worlds, n_drones), "
+                f"got {shown(grip)}"
+            )
+        return self.write(data, load.replace(grip=jnp.broadcast_to(flags, load.grip.shape)))
+
+    def hang(self, data: SimData, mask: Any = None) -> SimData:
+        """Return the data with hooks, and the loads on them, at rest below their drones; of all worlds.
+
+        Use it after moving drones.
+
+        Args:
+            data: Simulation.
+            mask: True in the worlds to change; None for all. (n_worlds,)
+
+        Raises:
+            ConfigError: If the mask has another shape or type.
+        """
+        load, mask = self.read(data), as_mask(mask, data.core.steps.shape[:1])
+        height = jnp.where(load.attached[..., None], load.clearance, 0.0)
+        tip_pos, tip_vel = hanging(data.states, load.attach, load.length, height, False)
+        tip_pos, tip_vel = select_worlds(mask, tip_pos, load.tip_pos), select_worlds(mask, tip_vel, load.tip_vel)
+        on_hook = load.attached[..., None]
+        new = load.replace(
+            tip_pos=tip_pos,
+            tip_vel=tip_vel,
+            pos=jnp.where(on_hook, tip_pos, load.pos),
+            vel=jnp.where(on_hook, tip_vel, load.vel),
+        )
+        return self.write(data, new)
+
+    def place(self, data: SimData) -> Objects:
+        """Return the scene's objects with loads and rods at their poses; of one world."""
+        if not self.in_scene:
+            return data.objects  # type: ignore[return-value]
+        load = self.read(data)
+        holds = np.ones(load.tip_pos.shape[0], bool)
+        objects = place_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring, bare=True)  # type: ignore[arg-type]
+        heads = {f"{self.name}_hook": (load.tip_pos, turned_z(-self._along(data, load)))}
+        return with_poses(objects, heads)
+
+    @property
+    def solid_kinds(self) -> tuple[str, ...]:
+        """Names of the objects of the scene that stand for loads and hooks, without their numbers."""
+        return (self.name, f"{self.name}_hook")
+
+    def colliders(self) -> tuple[Collider, ...]:
+        """Return all bodies that collide: the loads, and balls around the hooks that carry none."""
+        head = Collider(Shape("sphere", (HEAD_RADIUS,)), self.head, self.with_head_vel, self.joined_head)
+        return (*super().colliders(), head)
+
+    def body(self, data: SimData) -> LoadBody:
+        """Return the loads, with the hooks that hold them; of one drone or of one world."""
+        load = self.read(data)
+        up = upward(data, load, load.tip_pos)
+        return LoadBody(load.pos - self.ring * up, turned_z(up), load.vel, load.mass + self._held(load, load.hook_mass))
+
+    def with_vel(self, data: SimData, vel: Array) -> SimData:
+        """Return the data with other velocities of loads and of hooks that hold them. (..., 3)"""
+        load = self.read(data)
+        return self.write(data, load.replace(vel=vel, tip_vel=jnp.where(load.attached[..., None], vel, load.tip_vel)))
+
+    def joined(self, data: SimData) -> Array:
+        """Return True where a load is on the hook of a drone; of one world. (n_drones, n_drones)"""
+        return np.eye(data.states.pos.shape[0], dtype=bool) & self.read(data).attached
+
+    def head(self, data: SimData) -> LoadBody:
+        """Return the hooks, which collide while they carry nothing; of one drone or of one world."""
+        load = self.read(data)
+        up = -self._along(data, load)
+        mass = jnp.broadcast_to(load.hook_mass, (*load.tip_pos.shape[:-1], 1))
+        return LoadBody(load.tip_pos + HEAD_HEIGHT * up, turned_z(up), load.tip_vel, mass, ~load.attached)
+
+    def with_head_vel(self, data: SimData, vel: Array) -> SimData:
+        """Return the data with other velocities of hooks that carry nothing. (..., 3)"""
+        load = self.read(data)
+        return self.write(data, load.replace(tip_vel=jnp.where(load.attached[..., None], load.tip_vel, vel)))
+
+    def joined_head(self, data: SimData) -> Array:
+        """Return True for a hook and its drone; of one world. (n_drones, n_drones)"""
+        return np.eye(data.states.pos.shape[0], dtype=bool)  # type: ignore[return-value]
+
+    @staticmethod
+    def _along(data: SimData, load: HookData) -> Array:
+        """Return the unit vectors along the rods, world frame. (..., 3)"""
+        return relative(data.states, load.tip_pos, load.tip_vel, load.attach).direction
+
+    @staticmethod
+    def _held(load: HookData, mass: Array) -> Array:
+        """Return a mass where the load is on the hook, else zero. (..., 1)"""
+        return jnp.where(load.attached[..., None], mass, jnp.zeros_like(mass))
+
+    def _link(self, load: HookData) -> Link:
+        mass = load.hook_mass + jnp.where(load.attached, load.mass, jnp.zeros_like(load.mass))
+        return Link(load.attach, load.length, mass, load.damping, is_hinge=self.dof == 1)

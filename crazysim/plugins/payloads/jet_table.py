@@ -1,0 +1,138 @@
+"""Tables of the air below a drone: pressure or velocity on a grid in its frame, for several rotor speeds."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from crazysim.errors import ConfigError
+
+CENTIMETRE = 0.01
+"""Edge of a voxel of AIMotionLab's tables, m."""
+LAB_SIDE = 81
+"""Voxels along x and y of AIMotionLab's later tables (facts of AIMotionLab-Virtual, July 2026)."""
+
+
+class JetTable(NamedTuple):
+    """Air around a hovering drone on a regular grid that moves and turns with it, by rotor speed."""
+
+    speeds: Any
+    """Mean rotor speeds of the tables, rad/s, ascending. (k,)"""
+    pressure: Any = None
+    """Pressures, Pa; None for none. (k, n_x, n_y, n_z)"""
+    velocity: Any = None
+    """Velocities of the air, body frame, m/s; None for none. (k, n_x, n_y, n_z, 3)"""
+    origin: Any = (0.0, 0.0, 0.0)
+    """Node of the smallest x, y and z, from the drone's centre of mass, body frame, m. (3,)"""
+    spacing: Any = CENTIMETRE
+    """Distance between neighbouring nodes, m: () or (3,)."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Numbers of tables and of nodes along x, y and z. (4,)"""
+        return np.shape(self.velocity if self.pressure is None else self.pressure)[:4]
+
+    def checked(self) -> JetTable:
+        """Return the table as arrays of the host, with one spacing for each axis.
+
+        Raises:
+            ConfigError: If a shape or a number is invalid.
+        """
+        speeds = np.asarray(self.speeds, np.float64)
+        if speeds.ndim != 1 or not len(speeds) or np.any(speeds <= 0) or np.any(np.diff(speeds) <= 0):
+            raise ConfigError(f"expected positive rotor speeds in ascending order, rad/s, got {self.speeds!r}")
+        if self.pressure is None and self.velocity is None:
+            raise ConfigError(
+                "expected a table of pressure or velocity, got neither. Use pressure=, velocity= or both."
+            )
+        found: dict[str, Any] = {}
+        for name, core in (("pressure", ()), ("velocity", (3,))):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            value = np.asarray(value, np.float64)
+            if value.ndim != 4 + len(core) or len(value) != len(speeds) or value.shape[4:] != core:
+                shape = f"({len(speeds)}, n_x, n_y, n_z{', 3' if core else ''})"
+                raise ConfigError(f"expected {name} of shape {shape} for {len(speeds)} speeds, got {value.shape}")
+            found[name] = value
+        if len({x.shape[:4] for x in found.values()}) > 1:
+            raise ConfigError(
+                f"expected pressure and velocity on the same grid, got {found['pressure'].shape} and "
+                f"{found['velocity'].shape}. Use two RotorJet with a name each for two grids."
+            )
+        origin, spacing = np.asarray(self.origin, np.float64), np.asarray(self.spacing, np.float64)
+        if origin.shape != (3,) or spacing.shape not in ((), (3,)) or not np.all(spacing > 0):
+            raise ConfigError(
+                f"expected an origin of shape (3,) and a positive spacing of shape () or (3,), m, got "
+                f"{self.origin!r} and {self.spacing!r}"
+            )
+        if not all(np.all(np.isfinite(x)) for x in (speeds, origin, spacing, *found.values())):
+            raise ConfigError("expected finite numbers in the table of a jet, got NaN or infinity")
+        return JetTable(speeds, found.get("pressure"), found.get("velocity"), origin, np.broadcast_to(spacing, (3,)))
+
+
+def load_jet_table(
+    folder: str | Path, shape: tuple[int, int, int] | None = None, spacing: float = CENTIMETRE, origin: Any = None
+) -> JetTable:
+    """Return the table in a folder of text files as AIMotionLab writes them.
+
+    Each file ``*_NNNN.txt`` is the air at NNNN rad/s, the mean of the rotors' speeds: one row per node, z fastest, then
+    y, then x, with one number for a pressure, Pa, or three for a velocity, m/s. A folder may have both.
+
+    Args:
+        folder: The folder.
+        shape: Nodes along x, y and z; None for a cube if the number of rows is one, and otherwise 81 x 81 x n.
+        spacing: Distance between nodes, m.
+        origin: First node from the drone's centre of mass, m (3,); None for a box centred below the drone, as in the
+            lab.
+
+    Raises:
+        ConfigError: If there is no such file, or the sizes do not match.
+    """
+    files = sorted(Path(folder).glob("*.txt"))
+    named = [(path, int(match[1])) for path in files if (match := re.fullmatch(r".*_(\d+)", path.stem))]
+    if not named:
+        raise ConfigError(
+            f"expected files named NAME_SPEED.txt with the rotor speed in rad/s, such as pressure_1500.txt, in "
+            f"{str(folder)!r}, got {', '.join(path.name for path in files) or 'none'}"
+        )
+    found: dict[int, dict[int, np.ndarray]] = {1: {}, 3: {}}
+    for path, speed in named:
+        try:
+            rows = np.loadtxt(path, ndmin=2)
+        except (ValueError, OSError) as error:
+            raise ConfigError(f"expected a table of numbers in {str(path)!r}, got: {error}") from error
+        if rows.shape[1] not in found:
+            raise ConfigError(f"expected one or three columns in {str(path)!r}, got {rows.shape[1]}")
+        if speed in found[rows.shape[1]]:
+            raise ConfigError(f"expected one table for each speed, got a second for {speed} rad/s, {str(path)!r}")
+        found[rows.shape[1]][speed] = rows
+    pressure, velocity = found[1], found[3]
+    speeds = sorted(pressure or velocity)
+    if pressure and velocity and sorted(velocity) != speeds:
+        raise ConfigError(f"expected velocities at the speeds of the pressures, {speeds}, got {sorted(velocity)}")
+    n_rows = {len(rows) for tables in (pressure, velocity) for rows in tables.values()}
+    if len(n_rows) > 1:
+        raise ConfigError(f"expected the same number of rows in all files of {str(folder)!r}, got {sorted(n_rows)}")
+    dims = _dims(n_rows.pop(), shape)
+    at = np.array([-dims[0] / 2, -dims[1] / 2, -dims[2]]) * spacing if origin is None else origin
+    return JetTable(
+        speeds=np.array(speeds, np.float64),
+        pressure=np.stack([pressure[s].reshape(dims) for s in speeds]) if pressure else None,
+        velocity=np.stack([velocity[s].reshape(*dims, 3) for s in speeds]) if velocity else None,
+        origin=tuple(map(float, at)),
+        spacing=spacing,
+    ).checked()
+
+
+def _dims(n_rows: int, shape: tuple[int, int, int] | None) -> tuple[int, int, int]:
+    """Return the nodes along x, y and z of a table with some number of rows."""
+    side = round(n_rows ** (1 / 3))
+    if shape is None:
+        shape = (side, side, side) if side**3 == n_rows else (LAB_SIDE, LAB_SIDE, n_rows // LAB_SIDE**2)
+    if len(shape) != 3 or int(np.prod(shape)) != n_rows:
+        raise ConfigError(f"expected {' x '.join(map(str, shape))} rows, got {n_rows}. Use shape=(n_x, n_y, n_z).")
+    return tuple(map(int, shape))  # type: ignore[return-value]

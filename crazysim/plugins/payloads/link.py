@@ -1,0 +1,345 @@
+"""Physics of a link, a rod or a cable, between a rigid body and a point mass.
+
+The link is a constraint, so the accelerations of body and mass follow from one system of equations. With the unit
+vector q from the attachment p to the mass, the tension T per mass (the *specific tension* t = T / m_tip) obeys
+
+    t (1 + m_tip q.A q) = q.(a_tip - a_p) + |w|^2 / L + impulses
+
+where a_tip and a_p are the accelerations of mass and attachment without the link, w is the velocity of the mass across
+the link, relative to the attachment, and A maps a force at the attachment to its acceleration. Nothing divides by
+m_tip: at zero the body is free, and the mass still swings.
+
+A hinge about the body's y axis keeps the mass in the body's x-z plane. That is a second constraint along the body's y
+axis, whose force acts on the body as if the rod were part of it, and so turns it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from crazysim import rotation
+from crazysim.core.data import SimState, SimStateDeriv
+from crazysim.rotation import add_cross, cross, dot, matvec
+
+SMALLEST_MASS = 1e-12
+"""Summand of denominators that vanish where both mass and damping are zero, kg."""
+LENGTHLESS = 1e-20
+"""Summand of the squared distance, m^2, by which the direction of a link without length is zero."""
+BOUNCE_SPEED = 0.1
+"""Speed below which a cable that becomes taut does not bounce, m/s."""
+CORRECTION, MOST_CORRECTION = 50.0, 0.5
+"""Rate at which a scheme of higher order removes errors in length, 1/s: the same at all rates of steps, which the order
+of the scheme needs. No step removes a larger share than the second."""
+SLACK = 1e9
+"""Acceleration that no tension of a slack cable outweighs, m/s^2."""
+BAND = 1e-4
+"""Relative slack up to which a cable counts as taut: 0.04 mm of 0.4 m."""
+
+
+class Link(NamedTuple):
+    """Parameters of a link."""
+
+    attach: Array | None
+    """Attachment on the body, from its centre of mass, body frame, m; None for the centre of mass. (3,)"""
+    length: Array
+    """Length, m. (1,)"""
+    mass: Array
+    """Mass at the tip, kg. (1,)"""
+    damping: Array | None = None
+    """Viscous torque of the joint over the angular velocity, N m s; None for none. (1,)"""
+    restitution: Array | None = None
+    """Ratio of radial speeds after and before a cable becomes taut, 1; None for no bounce. (1,)"""
+    holds: Array | None = None
+    """True where the link is connected; None for always. ()"""
+    is_cable: bool = False
+    """True for a cable, which can be slack; False for a rod."""
+    is_hinge: bool = False
+    """True if the link turns about the body's y axis only."""
+
+
+class Relative(NamedTuple):
+    """Geometry of a link at an instant, world frame unless noted."""
+
+    rot: Array
+    """Attitude of the body. (3, 3)"""
+    arm: Array | None
+    """Attachment from the centre of mass, m; None for zero. (3,)"""
+    offset: Array
+    """Tip from the attachment, m. (3,)"""
+    distance: Array
+    """Length of the offset, m. (1,)"""
+    direction: Array
+    """Unit vector along the offset; zero where the offset is. (3,)"""
+    vel: Array
+    """Velocity of the tip relative to the attachment, m/s. (3,)"""
+
+
+def relative(s: SimState, pos: Array, vel: Array, attach: Array | None) -> Relative:
+    """Return the geometry of the link from a body to a tip."""
+    rot, arm = rotation.matrix(s.quat), None
+    offset, rel_vel = pos - s.pos, vel - s.vel
+    if attach is not None:
+        arm = matvec(rot, attach)
+        offset, rel_vel = offset - arm, matvec(rot, -cross(s.ang_vel, attach), rel_vel)
+    square = dot(offset, offset)
+    inverse = lax.rsqrt(square + LENGTHLESS)
+    return Relative(rot, arm, offset, square * inverse, offset * inverse, rel_vel)
+
+
+class Linked(NamedTuple):
+    """Result of ``couple``."""
+
+    deriv: SimStateDeriv
+    """Derivative of the body under the reaction of the link."""
+    rate: Array
+    """Rate of the tip's position, m/s. (3,)"""
+    acc: Array
+    """Acceleration of the tip, m/s^2. (3,)"""
+
+
+class Pull(NamedTuple):
+    """A unit force on the tip along a direction, and the same backwards on the body."""
+
+    direction: Array
+    """Direction, world frame. (3,)"""
+    lever: Array | None
+    """Torque on the body, body frame, m; None for none. (3,)"""
+    turn: Array | None
+    """Angular acceleration of the body, body frame, 1/(kg m). (3,)"""
+
+    @staticmethod
+    def create(direction: Array, rot: Array, J_inv: Array, point: Array | None) -> Pull:
+        """Return the pull at a point of the body, from its centre of mass, body frame, m; None for there."""
+        if point is None:
+            return Pull(direction, None, None)
+        lever = cross(point, to_body(rot, direction))
+        return Pull(direction, lever, matvec(J_inv, lever))
+
+    def response(self, other: Pull, mass: Array) -> Array:
+        """Return the acceleration of the body at this pull, along it, under the other. (1,)"""
+        along = dot(self.direction, other.direction) / mass
+        return along if self.lever is None or other.turn is None else along + dot(self.lever, other.turn)
+
+
+def couple(
+    s: SimState, deriv: SimStateDeriv, mass: Array, J_inv: Array, link: Link, pos: Array, vel: Array, free_acc: Array,
+    dt: float | None, freq: int,
+) -> Linked:  # fmt: skip
+    """Return the derivative of a body and a tip that a link joins.
+
+    Schemes of order 1 get the mean over a step. Then the impulse that ends all relative motion along the link is part
+    of the tension: of a rod in every step, of a cable where it would be longer than ``length`` at the end of the step.
+    The change of the constraint's direction counts half: the other half follows as an impulse in the next step, which
+    makes the swing time-reversible (the two kicks of RATTLE, Andersen 1983). The tip moves with its new velocity,
+    relative to the attachment. Errors in length are removed from positions only.
+
+    Args:
+        s: State of the body. Leaves (k,)
+        deriv: Derivative of the free body.
+        mass: Mass of the body, kg. (1,)
+        J_inv: Inverse of its inertia, 1/(kg m^2). (3, 3)
+        link: Parameters.
+        pos: Position of the tip, world frame, m. (3,)
+        vel: Velocity of the tip, world frame, m/s. (3,)
+        free_acc: Acceleration of the tip without the link, world frame, m/s^2. (3,)
+        dt: Duration of the step, s; None for the derivative at an instant.
+        freq: Steps per second, Hz.
+    """
+    r, m = relative(s, pos, vel, link.attach), link.mass
+    out = dot(r.direction, r.vel)
+    attach_acc = acceleration_at(s, deriv, r.rot, link.attach, 1.0 if dt is None else 0.5)
+    rel_acc = free_acc - attach_acc
+
+    first = Pull.create(r.direction, r.rot, J_inv, link.attach)
+    # Of equal directions: their product is 1 but for rounding.
+    share = m / mass if first.lever is None or first.turn is None else m / mass + m * dot(first.lever, first.turn)
+    rhs = dot(r.direction, rel_acc) + (1.0 if dt is None else 0.5) / link.length * (dot(r.vel, r.vel) - out * out)
+    rhs = rhs + _radial(r, out, rhs, link, dt, freq)
+    pulls = [first]
+    if link.is_hinge:
+        second, rhs_2 = _hinge(s, deriv, r, rel_acc, J_inv, link, dt, freq)
+        cross_share = dot(first.direction, second.direction) + m * first.response(second, mass)
+        share_2 = m * second.response(second, mass)
+        inverse = 1 / ((1 + share) * (1 + share_2) - cross_share * cross_share)
+        tension = ((1 + share_2) * rhs - cross_share * rhs_2) * inverse
+        aside = ((1 + share) * rhs_2 - cross_share * rhs) * inverse
+        tensions, pulls = [tension, aside], [first, second]
+    else:
+        tension = rhs * (1 / (1 + share))
+        tensions = [jnp.maximum(tension, 0.0) if link.is_cable else tension]
+    if link.holds is not None:
+        tensions = [jnp.where(link.holds, t, 0.0) for t in tensions]
+    damping = None
+    if link.damping is not None:  # it pulls against the swing across the link
+        rate, swing = _damping(link, dt, freq), _swing(s, r)[1]
+        damping = rate * swing
+        tensions[0] = tensions[0] - rate * out
+    parts = [t * p.direction for t, p in zip(tensions, pulls, strict=True)]
+    pull = sum(parts[1:], parts[0])
+    # Constants are multiplied first: what no step changes is then computed once, and the rest are multiply-adds.
+    share, turned = m / mass, deriv
+    if damping is not None:
+        pull = pull + damping
+        # All that pulls at the tip turns the body as if it were part of it: along the link no force has another lever.
+        torque = to_body(r.rot, cross(pos - s.pos, pull))
+        turned = _turned(deriv, m * J_inv, torque, dt)
+    elif any(p.turn is not None for p in pulls):
+        turns = [m * t * p.turn for t, p in zip(tensions, pulls, strict=True) if p.turn is not None]
+        turned = _turned(deriv, None, sum(turns[1:], turns[0]), dt)
+    tip_acc = free_acc - pull
+    after = turned.replace(acc=deriv.acc + share * pull)
+    after = after if dt is None else after.replace(vel=deriv.vel + dt * share * pull)
+    rate = _tip_rate(s, deriv, r, link, vel, tip_acc, attach_acc, dt, freq)
+    return Linked(after, rate, tip_acc)
+
+
+def _turned(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float | None) -> SimStateDeriv:
+    """Return a derivative with the angular acceleration ``factor @ torque`` added, and its share in the velocity."""
+    if factor is None:
+        turned = deriv.replace(ang_acc=deriv.ang_acc + torque)
+        return turned if dt is None else turned.replace(ang_vel=deriv.ang_vel + dt * torque)
+    turned = deriv.replace(ang_acc=matvec(factor, torque, deriv.ang_acc))
+    return turned if dt is None else turned.replace(ang_vel=matvec(dt * factor, torque, deriv.ang_vel))
+
+
+def to_body(rot: Array, vector: Array) -> Array:
+    """Return a world vector in the frame of a body. (3,)"""
+    return matvec(jnp.swapaxes(rot, -1, -2), vector)
+
+
+def acceleration_at(s: SimState, deriv: SimStateDeriv, rot: Array, point: Array | None, share: float) -> Array:
+    """Return the acceleration of a point of the body, with a share of its centripetal part, m/s^2. (3,)"""
+    if point is None:
+        return deriv.acc
+    centripetal = cross(s.ang_vel, share * cross(s.ang_vel, point))
+    return matvec(rot, add_cross(centripetal, deriv.ang_acc, point), deriv.acc)
+
+
+def _swing(s: SimState, r: Relative) -> tuple[Array, Array]:
+    """Return the body's angular velocity, world frame, and the velocity of the tip relative to the turning body."""
+    ang_vel = matvec(r.rot, s.ang_vel)
+    return ang_vel, add_cross(r.vel, r.offset, ang_vel)
+
+
+def correction(freq: int) -> float:
+    """Return the rate at which a scheme of higher order removes errors in length, 1/s."""
+    return min(CORRECTION, MOST_CORRECTION * freq)
+
+
+def decay(coefficient: Array, mass: Array, dt: float | None, freq: int) -> Array:
+    """Return the deceleration by a linear drag over the speed, 1/s, which cannot reverse a motion in a step. (1,)
+
+    In a step of a scheme of order 1 it is implicit in time. The derivative at an instant is exact up to a rate of one
+    per step, and limited to that.
+
+    Args:
+        coefficient: Drag over the speed, N s/m. (1,)
+        mass: Mass, kg. (1,)
+        dt: Duration of the step, s; None for the derivative at an instant.
+        freq: Steps per second, Hz.
+    """
+    heavy = jnp.maximum(mass, coefficient / freq) if dt is None else mass + coefficient / freq
+    return coefficient / (heavy + SMALLEST_MASS)
+
+
+def _damping(link: Link, dt: float | None, freq: int) -> Array:
+    """Return the deceleration of the tip by the damped joint over its speed of swing, 1/s. (1,)"""
+    rate = decay(link.damping / (link.length * link.length), link.mass, dt, freq)  # type: ignore[operator]
+    return rate if link.holds is None else jnp.where(link.holds, rate, 0.0)
+
+
+def _radial(r: Relative, out: Array, free: Array, link: Link, dt: float | None, freq: int) -> Array:
+    """Return the summand of the tension, before it is shared, that ends relative motion along the link."""
+    if dt is None:
+        if not link.is_cable:
+            return 2 * correction(freq) * out
+        # A faster tip gets the impulse of ``end_relative_motion`` in front of the next step.
+        is_taut = (r.distance > (1 - BAND) * link.length) & (out < BOUNCE_SPEED)
+        return jnp.where(is_taut, 2 * correction(freq) * out, -SLACK)
+    if not link.is_cable:
+        return freq * out
+    # Within the band a cable is taut, and smooth in its parameters like a rod.
+    slack = link.length - r.distance
+    gap = jnp.where(slack > BAND * link.length, freq * slack, 0.0)
+    if link.restitution is None:
+        return freq * (out - gap)
+    # It bounces in the step at whose end it would be taut, with the speed that it had when it became taut.
+    late = jnp.maximum(r.distance - link.length, 0.0)
+    back = link.restitution * rotation.safe_sqrt(out * out - 2 * late * jnp.maximum(free, 0.0))
+    bounces = (link.restitution > 0) & (out > BOUNCE_SPEED) & (out + dt * free > gap)
+    return freq * (out - jnp.where(bounces, -back, gap))
+
+
+def _hinge(
+    s: SimState, deriv: SimStateDeriv, r: Relative, rel_acc: Array, J_inv: Array, link: Link, dt: float | None,
+    freq: int,
+) -> tuple[Pull, Array]:  # fmt: skip
+    """Return the pull that keeps the tip in the body's x-z plane, and the relative acceleration that it prevents."""
+    y = r.rot[..., 1]
+    ang_vel, swing = _swing(s, r)
+    offset = to_body(r.rot, r.offset)
+    pull = Pull.create(y, r.rot, J_inv, offset if link.attach is None else offset + link.attach)
+    turning = matvec(r.rot, cross(deriv.ang_acc, offset))
+    coriolis = cross(ang_vel, cross(ang_vel, r.offset) - 2 * r.vel)
+    aside = dot(y, swing)
+    end = freq * aside if dt is not None else 2 * correction(freq) * aside
+    return pull, dot(y, rel_acc - turning + (1.0 if dt is None else 0.5) * coriolis) + end
+
+
+def _tip_rate(
+    s: SimState, deriv: SimStateDeriv, r: Relative, link: Link, vel: Array, tip_acc: Array, attach_acc: Array,
+    dt: float | None, freq: int,
+) -> Array:  # fmt: skip
+    """Return the rate of the tip's position, which removes errors in length, m/s. (3,)"""
+    holds, stretch = link.holds, r.distance - link.length
+    if link.is_cable:
+        stretch = jnp.where(stretch > -BAND * link.length, stretch, 0.0)
+    share = freq if dt is not None else correction(freq)
+    share = share if holds is None else jnp.where(holds, share, 0.0)
+    rate = vel if dt is None else vel + dt * tip_acc  # as the integrator has it: computed once
+    rate = rate - share * stretch * r.direction
+    if link.is_hinge:
+        rate = rate - share * dot(r.rot[..., 1], r.offset) * r.rot[..., 1]
+    if dt is None:
+        return rate
+    # ``deriv.vel`` moves the body; the tip moves with its new velocity relative to that.
+    carried = attach_acc
+    if deriv.vel is not s.vel:  # it is the new velocity of the body
+        carried = carried - deriv.acc
+        if link.attach is not None:
+            carried = carried - matvec(r.rot, cross(deriv.ang_acc, link.attach))
+    return rate - (dt if holds is None else jnp.where(holds, dt, 0.0)) * carried
+
+
+def end_relative_motion(
+    s: SimState, mass: Array, J_inv: Array, link: Link, pos: Array, vel: Array
+) -> tuple[SimState, Array]:
+    """Return the body and the tip's velocity after the impulse that ends relative motion along the link.
+
+    Of a cable only if it is taut and the tip moves outwards; above ``BOUNCE_SPEED`` it bounces by the restitution.
+    Momentum is kept, and energy is not gained.
+
+    Args:
+        s: State of the body. Leaves (k,)
+        mass: Mass of the body, kg. (1,)
+        J_inv: Inverse of its inertia, 1/(kg m^2). (3, 3)
+        link: Parameters.
+        pos: Position of the tip, world frame, m. (3,)
+        vel: Velocity of the tip, world frame, m/s. (3,)
+    """
+    r = relative(s, pos, vel, link.attach)
+    out = dot(r.direction, r.vel)
+    pull = Pull.create(r.direction, r.rot, J_inv, link.attach)
+    change = out / (1 + link.mass * pull.response(pull, mass))
+    if link.is_cable:
+        back = 1.0 if link.restitution is None else 1 + link.restitution
+        taut = (r.distance > (1 - BAND) * link.length) & (out > 0)
+        change = jnp.where(taut, jnp.where(out > BOUNCE_SPEED, back, 1.0) * change, 0.0)
+    change = change if link.holds is None else jnp.where(link.holds, change, 0.0)
+    s = s.replace(vel=s.vel + link.mass / mass * change * pull.direction)
+    if pull.turn is not None:
+        s = s.replace(ang_vel=s.ang_vel + link.mass * change * pull.turn)
+    return s, vel - change * pull.direction

@@ -1,0 +1,295 @@
+"""Parts common to all loads: forces of air and floor, poses in the scene, and the swing of the rod."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import Objects, SimData, SimState
+from crazysim.core.plugin import Simulation
+from crazysim.core.settings import as_mask, as_rgba
+from crazysim.eager import compiled
+from crazysim.plugins.effects.ground import ground_height
+from crazysim.plugins.effects.moving_air import Exposed
+from crazysim.plugins.effects.wind import wind_at
+from crazysim.plugins.effects.wind_field import WindFieldData
+from crazysim.plugins.payloads.body import Colliding
+from crazysim.plugins.payloads.link import decay, relative
+from crazysim.plugins.payloads.rotor_jet import jet_force
+from crazysim.pytree import leaf, select_worlds
+
+CABLE_SEGMENTS = 8
+"""Straight pieces by which a cable is drawn."""
+LINK_RADIUS = 0.004
+"""Radius of a drawn rod or cable, m."""
+WIRE_RADIUS, HOOK_RADIUS = 0.003, 0.0045
+"""Radii of the wires by which a drawn load hangs, and of a drawn hook, m."""
+HOOK_OUTLINE = ((0, -0.045), (-0.02, -0.025), (-0.014, -0.004), (0, 0.003), (0.014, -0.004), (0.02, -0.02))
+"""Drawn shape of a hook: x, and z towards the load from the hook's position, m."""
+HEAD_RADIUS, HEAD_HEIGHT = 0.0245, 0.021
+"""Radius of the ball around that outline, with which a hook collides, and its height above the hook's position, m."""
+DARK, STEEL, YELLOW = (0.15, 0.15, 0.15, 1.0), (0.35, 0.35, 0.4, 1.0), (0.95, 0.75, 0.1, 1.0)
+"""Colours of rods, wires and hooks."""
+SOLID = 'contype="0" conaffinity="2"'
+"""MJCF attributes of a geom that drones touch."""
+
+
+class LoadData(Exposed):
+    """State and parameters of the load of each drone."""
+
+    vel: Array = leaf("drone", 1)
+    """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
+    attached: Array = leaf("drone", 0)
+    """True where the load hangs from its drone. (n_worlds, n_drones)"""
+    mass: Array = leaf("parameter", 1, (1,))
+    """Mass of the load, kg; zero for none. (1,)"""
+    length: Array = leaf("parameter", 1, (1,))
+    """Length of rod or cable, m. (1,)"""
+    attach: Array | None = leaf("parameter", 1, (3,), sparse=True)
+    """Attachment on the drone, from its centre of mass, body frame, m; None for the centre of mass. (3,)"""
+    damping: Array | None = leaf("parameter", 1, (1,))
+    """Viscous torque of the joint over the angular velocity, N m s; None for none. (1,)"""
+    restitution: Array | None = leaf("parameter", 1, (1,))
+    """Ratio of radial speeds after and before a cable becomes taut, 1; None for no bounce. (1,)"""
+    drag: Array | None = leaf("parameter", 1, (1,))
+    """Linear drag coefficient of the load, N s/m; None for none. (1,)"""
+    friction: Array = leaf("parameter", 1, (1,))
+    """Coulomb's coefficient between load and floor, 1. (1,)"""
+    clearance: Array = leaf("parameter", 1, (1,))
+    """Height of the load's position above the floor where it rests, m. (1,)"""
+
+
+class PointLoad(Colliding):
+    """A load that is one point mass on links that can be cut; mixed into a ``Plugin``."""
+
+    read: Any
+    """``Plugin.read``."""
+    write: Any
+    """``Plugin.write``."""
+
+    def stop_at_floor(self, data: SimData) -> SimData:
+        """Stop the load at the floor; of one drone or of one world."""
+        load = self.read(data)
+        clearance = load.clearance + ground_height(data, load.pos)
+        pos, vel = on_floor(load.pos, load.vel, clearance, load.friction)
+        return self.write(data, load.replace(pos=pos, vel=vel))
+
+    def release(self, data: SimData, mask: Any = None) -> SimData:
+        """Return the data with links of loads cut.
+
+        Args:
+            data: Simulation.
+            mask: True for drones that let go, or for worlds in which all do; None for all. (n_worlds, n_drones) or
+                (n_worlds,)
+
+        Raises:
+            ConfigError: If the mask has another shape or type.
+        """
+        load = self.read(data)
+        shape = load.attached.shape
+        mask = as_mask(mask, shape, shape[:-1], each="drone or world")
+        return self.write(
+            data, load.replace(attached=select_worlds(mask, jnp.zeros_like(load.attached), load.attached))
+        )
+
+
+def integrator_of(sim: Simulation) -> Any:
+    """Return the function of the integrator, such as ``core.integration.rk4``, or None if the stage is not built in."""
+    return getattr(getattr(sim.step_pipeline.get("integration"), "fn", None), "method", None)
+
+
+def air_and_gravity(data: SimData, load: LoadData, name: str, dt: float | None) -> Array:
+    """Return the acceleration of a free load under gravity, drag and jets of rotors, m/s^2; of one drone. (3,)
+
+    Drag cannot reverse a motion (``decay``), and a load without mass moves with the air.
+
+    Args:
+        data: Simulation.
+        load: Record of the load.
+        name: Name of the load's plugin.
+        dt: Duration of the step, s; None for the derivative at an instant.
+    """
+    acc = data.params.gravity_vec
+    jet = jet_force(data, name)
+    if jet is not None:
+        acc = acc + jnp.where(load.mass > 0, jet / jnp.where(load.mass > 0, load.mass, 1.0), 0.0)
+    if load.air_vel is None or load.drag is None:
+        return acc
+    air = wind_at(data, load.pos) + load.air_vel
+    if any(isinstance(record, WindFieldData) for record in data.plugins.values()):
+        air = air + load.wind_vel  # type: ignore[operator]  # there are fields, so it is set
+    return acc + decay(load.drag, load.mass, dt, data.core.freq) * (air - load.vel)
+
+
+def on_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> tuple[Array, Array]:
+    """Return position and velocity of a body that does not fall through the floor.
+
+    Friction brakes it there, along x and y separately.
+
+    Args:
+        pos: Position, world frame, m. (..., 3)
+        vel: Velocity, world frame, m/s. (..., 3)
+        clearance: Height of the body above the floor where it rests, m. (..., 1)
+        friction: Coulomb's coefficient, 1. (..., 1)
+    """
+    height, climb, level = pos[..., 2:], vel[..., 2:], vel[..., :2]
+    lands = height <= clearance
+    brake = jnp.where(lands, friction * jnp.maximum(-climb, 0.0), 0.0)
+    level = level - jnp.maximum(jnp.minimum(level, brake), -brake)
+    vel = jnp.concatenate([level, jnp.where(lands, jnp.maximum(climb, 0.0), climb)], axis=-1)
+    return jnp.concatenate([pos[..., :2], jnp.maximum(height, clearance)], axis=-1), vel
+
+
+@compiled("is_cable")
+def hanging(s: SimState, attach: Array | None, length: Array, clearance: Array, is_cable: bool) -> tuple[Array, Array]:
+    """Return position and velocity of a load that hangs at rest below its drone, or rests on the floor.
+
+    Args:
+        s: State of the drones. Leaves (..., k)
+        attach: Attachment, body frame, m; None for the centre of mass. (..., 3)
+        length: Length of the link, m. (..., 1)
+        clearance: Height of the load above the floor where it rests, m. (..., 1)
+        is_cable: True for a cable, which is slack where the load rests; a rod then lies behind the drone.
+    """
+    rot = rotation.matrix(s.quat)
+    arm = jnp.zeros(3, s.pos.dtype) if attach is None else attach
+    top = s.pos + rotation.matvec(rot, arm)
+    drop = jnp.clip(top[..., 2:] - clearance, -length, length)
+    back = jnp.zeros_like(drop) if is_cable else rotation.safe_sqrt(length * length - drop * drop)
+    heading = rotation.yaw(s.quat)[..., None]
+    offset = jnp.concatenate([-back * jnp.cos(heading), -back * jnp.sin(heading), -drop], axis=-1)
+    vel = s.vel + rotation.matvec(rot, rotation.cross(s.ang_vel, jnp.broadcast_to(arm, s.ang_vel.shape)))
+    return top + offset, vel
+
+
+@compiled("name")
+def direction(data: SimData, name: str = "load") -> tuple[Array, Array]:
+    """Return the unit vector from attachment to load, world frame, and its rate, 1/s; of one drone or of all. (..., 3)
+
+    Args:
+        data: Simulation with a ``SlungLoad`` or a ``Hook``.
+        name: Name of the plugin.
+    """
+    load: Any = data.plugins[name]
+    pos, vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
+    r = relative(data.states, pos, vel, load.attach)
+    across = r.vel - rotation.dot(r.direction, r.vel) * r.direction
+    is_zero = r.distance == 0
+    return r.direction, jnp.where(is_zero, 0.0, across / jnp.where(is_zero, 1.0, r.distance))
+
+
+def load_pos(data: SimData, name: str = "load") -> Array:
+    """Return the position of the load, world frame, m. (..., 3)"""
+    return data.plugins[name].pos
+
+
+def load_vel(data: SimData, name: str = "load") -> Array:
+    """Return the velocity of the load, world frame, m/s. (..., 3)"""
+    return data.plugins[name].vel
+
+
+# Scene ------------------------------------------------------------------------------------------------------
+
+
+def add_to_scene(
+    sim: Simulation,
+    name: str,
+    size: Any,
+    rgba: Any,
+    length: float,
+    n_loads: int,
+    n_pieces: int,
+    ring: float | None = None,
+) -> None:
+    """Add the loads and links of a plugin to the scene, if they are not there yet.
+
+    Args:
+        sim: Simulation.
+        name: Name of the plugin, and of the loads: ``name:0``, ...
+        size: Radius of a ball, or full lengths of a box, m.
+        rgba: Colour of the loads.
+        length: Length of a link, m.
+        n_loads: Number of loads in a world; there is a link for each drone.
+        n_pieces: Straight pieces of each.
+        ring: Height of the loads' rings above their middles, m, for links that end in a hook; None for others.
+    """
+    objects = sim.data.objects
+    if objects is not None and f"{name}:0" in objects.names:
+        return
+    rgba = as_rgba((0.85, 0.55, 0.2, 1.0) if rgba is None else rgba)
+    half = np.full(3, float(size)) if np.ndim(size) == 0 else np.asarray(size, float) / 2
+    kind = "sphere" if np.ndim(size) == 0 else "box"
+    body = f'<geom type="{kind}" size="{_numbers(half)}" {SOLID} rgba="{_numbers(rgba)}"/>'
+    shank = 0.0 if ring is None else HOOK_OUTLINE[0][1]
+    link = _rod((0, 0, -length / n_pieces / 2), (0, 0, length / n_pieces / 2 + shank), LINK_RADIUS, DARK)
+    kinds = [(body, name, n_loads), (link, f"{name}_link", sim.n_drones * n_pieces)]
+    if ring is not None:
+        ends = [(side * half[0], 0, 0 if kind == "sphere" else half[2]) for side in (-1, 1)]
+        body += "".join(_rod(end, (0, 0, ring), WIRE_RADIUS, STEEL) for end in ends)
+        head = f'<geom type="sphere" pos="0 0 {HEAD_HEIGHT}" size="{HEAD_RADIUS}" group="3" {SOLID}/>'
+        head += "".join(
+            _rod((x, 0, -z), (x_2, 0, -z_2), HOOK_RADIUS, YELLOW) for (x, z), (x_2, z_2) in pairwise(HOOK_OUTLINE)
+        )
+        kinds = [(body, name, n_loads), kinds[1], (head, f"{name}_hook", n_loads)]
+    for text, kind, count in kinds:
+        sim.scene.add(f"<mujoco><worldbody>{text}</worldbody></mujoco>", kind, count=count)
+
+
+def _rod(start: Any, end: Any, radius: float, rgba: Any) -> str:
+    """Return MJCF of a rod that touches nothing."""
+    ends = f"{_numbers(start)} {_numbers(end)}"
+    return f'<geom type="capsule" fromto="{ends}" size="{radius}" contype="0" conaffinity="0" rgba="{_numbers(rgba)}"/>'
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{float(value):.9g}" for value in values)
+
+
+def with_poses(objects: Objects, rows: dict[str, tuple[Array, Array]]) -> Objects:
+    """Return the objects of a world with some at other poses.
+
+    Args:
+        objects: Objects of one world.
+        rows: Positions (n, 3) and attitudes, xyzw (n, 4), of all objects of a kind, by the kind's name.
+    """
+    pos, quat = objects.pos, objects.quat
+    for kind, (at, turned) in rows.items():
+        where = np.array([objects.names.index(f"{kind}:{k}") for k in range(at.shape[0])])
+        pos, quat = pos.at[where].set(at.astype(pos.dtype)), quat.at[where].set(turned.astype(quat.dtype))
+    return objects.replace(pos=pos, quat=quat)
+
+
+def pieces(top: Array, offset: Array, length: Array, n: int) -> tuple[Array, Array]:
+    """Return centres and attitudes of the straight pieces of links; a slack cable sags like a parabola.
+
+    Args:
+        top: Upper ends, world frame, m. (k, 3)
+        offset: Lower ends from there, m. (k, 3)
+        length: Lengths, m. (k, 1) or (1,)
+        n: Pieces per link.
+
+    Returns:
+        Positions (k n, 3), attitudes, xyzw (k n, 4).
+    """
+    span = rotation.safe_norm(offset)
+    # Length of a flat parabola of sag d over a span b: b + 8 d^2 / (3 b).
+    sag = (
+        rotation.safe_sqrt(0.375 * jnp.maximum(length - span, 0.0) * jnp.maximum(span, 0.1 * length)) if n > 1 else 0.0
+    )
+    share = jnp.linspace(0.0, 1.0, n + 1)[:, None, None]
+    down = jnp.asarray([0.0, 0.0, -1.0], top.dtype)
+    nodes = top + share * offset + 4 * share * (1 - share) * sag * down
+    centre, along = (nodes[1:] + nodes[:-1]) / 2, nodes[1:] - nodes[:-1]
+    return tuple(jnp.swapaxes(x, 0, 1).reshape(-1, x.shape[-1]) for x in (centre, turned_z(along)))  # type: ignore[return-value]
+
+
+def turned_z(axis: Array) -> Array:
+    """Return the smallest rotation of the z axis to a vector, as a quaternion, xyzw. (..., 4)"""
+    z = rotation.safe_normalize(axis, jnp.asarray([0.0, 0.0, 1.0], axis.dtype))
+    quat = jnp.stack([-z[..., 1], z[..., 0], jnp.zeros_like(z[..., 0]), 1 + z[..., 2]], axis=-1)
+    return rotation.safe_normalize(quat, jnp.asarray([1.0, 0.0, 0.0, 0.0], axis.dtype))

@@ -1,0 +1,226 @@
+"""The jet of a drone's rotors on the surface of loads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter
+from crazysim.core.stage import Stage
+from crazysim.dynamics.rotor import RPM_TO_RAD_S
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.downwash import AIR_DENSITY, collective_thrust, jet, mean_rotor_vel, stream_diameter
+from crazysim.plugins.effects.grid import LARGEST_FUSED, interpolate, is_inside
+from crazysim.plugins.effects.moving_air import require_rotors, zeros
+from crazysim.plugins.payloads.body import Colliding
+from crazysim.plugins.payloads.jet_table import JetTable
+from crazysim.plugins.payloads.panels import panels_of
+from crazysim.pytree import PyTree, leaf, on_device, static
+
+PANELS_PER_LENGTH = 2
+"""Panels along the longest edge of a load by default."""
+
+
+class RotorJetData(PyTree):
+    """Wrench of the jets on the loads, and the table of the jet."""
+
+    force: Array = leaf("drone", 1)
+    """Force on the load, world frame, N. (n_worlds, n_drones, 3)"""
+    torque: Array = leaf("drone", 1)
+    """Torque about the centre of the load's shape, world frame, N m. (n_worlds, n_drones, 3)"""
+    diameter: Array = leaf("parameter", 1, (1,))
+    """Diameter of the fully contracted jet of a drone, m. (1,)"""
+    air_density: Array = leaf("parameter", 1, (1,))
+    """Density of air, kg/m^3. (1,)"""
+    speeds: Array | None = leaf("shared", 1)
+    """Mean rotor speeds of the tables, rad/s; None for the analytic jet. (n_tables,)"""
+    pressure: Array | None = leaf("shared", 4)
+    """Pressures, Pa; None for none. (n_tables, n_x, n_y, n_z)"""
+    velocity: Array | None = leaf("shared", 5)
+    """Velocities of the air, body frame of the drone, m/s; None for none. (n_tables, n_x, n_y, n_z, 3)"""
+    origin: Array | None = leaf("shared", 1)
+    """First node from the drone's centre of mass, body frame, m; None for the analytic jet. (3,)"""
+    spacing: Array | None = leaf("shared", 1)
+    """Distance between nodes, m; None for the analytic jet. (3,)"""
+    load: str = static()
+    """Name of the plugin of the loads."""
+
+
+class RotorJet(Plugin):
+    """Jet of a drone's rotors on the panels of loads, from tables or an analytic jet; needs rotors.
+
+    The force on a panel of area A with the outward normal n is ``-P A n`` for a pressure P of a table, and
+    ``rho v max(-v.n, 0) A`` for air of velocity v relative to the load: the momentum of the air that arrives. The
+    analytic jet is that of ``Downwash``. A table is linear between nodes and between rotor speeds, and zero outside its
+    box; below its smallest speed the jet falls to zero with the speed, above its largest it stays.
+    """
+
+    table: JetTable | None = None
+    """Pressure or velocity around the drone; None for the analytic jet."""
+    load: str = "load"
+    """Name of the plugin of the loads, a ``SlungLoad`` or a ``Hook``."""
+    panel: float | None = None
+    """Largest edge of a panel, m; None for half the longest edge of the load."""
+    all_drones: bool = False
+    """True for the jets of all drones of a world on each load; False for that of the load's own drone."""
+    air_density: Any = parameter(default=AIR_DENSITY)
+    """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
+    propeller_radius: Any = parameter(default=None)
+    """Radius of a propeller, m, for the analytic jet; None for the airframe's. () or (n_worlds, n_drones)"""
+    name: str = "rotor_jet"
+
+    def record(self, sim: Simulation) -> RotorJetData:
+        """Return the table, and no wrench until the first step."""
+        require_rotors(sim, "the jet of rotors")
+        self._loads(sim)
+        if self.panel is not None and not self.panel > 0:
+            raise ConfigError(f"expected panel as a positive length, m, got {self.panel!r}")
+        if self.table is not None and not isinstance(self.table, JetTable):
+            raise ConfigError(
+                f"expected table as a JetTable or None, got {type(self.table).__name__}. Use load_jet_table(folder)."
+            )
+        table = None if self.table is None else self.table.checked()
+        radius = self.propeller_radius
+        if radius is None:
+            radius = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
+        radius = check_parameter(sim, "propeller_radius", radius, positive=True)
+        dtype = radius.dtype
+
+        def shared(name: str) -> Array | None:
+            value = getattr(table, name, None)
+            return None if value is None else on_device(value, dtype)
+
+        return RotorJetData(
+            force=zeros(sim, 3),
+            torque=zeros(sim, 3),
+            diameter=stream_diameter(sim, radius),
+            air_density=check_parameter(sim, "air_density", self.air_density, positive=True),
+            speeds=shared("speeds"),
+            pressure=shared("pressure"),
+            velocity=shared("velocity"),
+            origin=shared("origin"),
+            spacing=shared("spacing"),
+            load=self.load,
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that adds up the forces on the panels."""
+        loads, shape = self._loads(sim), self._loads(sim).shape()
+        edge = 2 * max(shape.size) / PANELS_PER_LENGTH if self.panel is None else self.panel
+        panels = panels_of(shape, edge)
+
+        def press(data: SimData) -> SimData:
+            if self.load not in data.plugins:
+                return self.write(data, still(self.read(data)))
+            record, body, s = self.read(data), loads.body(data), data.states
+            arm = rotation.rotate(body.quat[..., None, :], jnp.asarray(panels.pos, s.pos.dtype))
+            normal = rotation.rotate(body.quat[..., None, :], jnp.asarray(panels.normal, s.pos.dtype))
+            total: Any = 0.0
+            for k in range(s.pos.shape[-2]) if self.all_drones else (None,):
+                total = total + pressed(data, record, k, body.pos[..., None, :] + arm, normal, body.vel)
+            force = total * jnp.asarray(panels.area, s.pos.dtype)
+            torque = jnp.sum(rotation.cross(arm, force), axis=-2)
+            return self.write(data, record.replace(force=jnp.sum(force, axis=-2), torque=torque))
+
+        numbers = 0 if self.table is None else sum(np.size(x) for x in (self.table.pressure, self.table.velocity))
+        scope = "world" if self.all_drones else "drone" if numbers <= LARGEST_FUSED else "batch"
+        return [Placement(Stage(press, scope, batched=not self.all_drones))]  # type: ignore[arg-type]
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the force of the jet on the load, world frame, N."""
+        return {"force": self.read(data).force}
+
+    def _loads(self, sim: Simulation) -> Any:
+        """Return the plugin of the loads."""
+        found = [p for p in sim.scene.plugins() if isinstance(p, Colliding) and p.name == self.load]
+        if not found:
+            names = [p.name for p in sim.scene.plugins() if isinstance(p, Colliding)]
+            raise ConfigError(
+                f"expected the name of a plugin of loads, {' or '.join(map(repr, names)) or 'none of which is there'}, "
+                f"got {self.load!r}. Use sim.add(SlungLoad(...)) first, and load= for another name."
+            )
+        if found[0].coupling != "drone":
+            raise ConfigError(
+                f"expected loads of one drone each, got {self.load!r}, which hangs from all drones of a world. Use "
+                f"SlungLoad or Hook."
+            )
+        return found[0]
+
+
+def still(record: RotorJetData) -> RotorJetData:
+    """Return the record without a wrench, for loads that were removed."""
+    return record.replace(force=jnp.zeros_like(record.force), torque=jnp.zeros_like(record.torque))
+
+
+def jet_force(data: SimData, name: str) -> Array | None:
+    """Return the force of all jets on the load of a plugin, world frame, N; None without jets. (..., 3)"""
+    forces = [x.force for x in data.plugins.values() if isinstance(x, RotorJetData) and x.load == name]
+    return sum(forces[1:], forces[0]) if forces else None
+
+
+def pressed(data: SimData, record: RotorJetData, drone: int | None, pos: Array, normal: Array, vel: Array) -> Array:
+    """Return the force of a drone's jet per area of panels, world frame, Pa. (..., n, 3)
+
+    Args:
+        data: One drone, one world or all worlds.
+        record: Record of the jets.
+        drone: Number of the drone whose jet it is; None for each load's own.
+        pos: Centres of the panels, world frame, m. (..., n, 3)
+        normal: Their outward normals, world frame. (..., n, 3)
+        vel: Velocity of the loads, world frame, m/s. (..., 3)
+    """
+    s = data.states
+    of_one = (s.pos, s.quat, mean_rotor_vel(data), collective_thrust(data), record.diameter, record.air_density)
+    if drone is not None:
+        of_one = tuple(x if x.ndim == 1 else x[drone] for x in of_one)
+    # An axis for the panels.
+    at, quat, rotor_vel, thrust, diameter, density = (x[..., None, :] for x in of_one)
+    offset = pos - at
+
+    def momentum(air: Array) -> Array:
+        relative = air - vel[..., None, :]
+        arrives = -rotation.dot(relative, normal)
+        # Only air of the jet has momentum to give: still air beside it exerts no force on a load that moves.
+        blows = rotation.dot(air, air) > 0
+        return jnp.where(blows & (arrives > 0), density * arrives, 0.0) * relative
+
+    if record.speeds is None:
+        axis = rotation.z_axis(quat)
+        return momentum(-jet(offset, axis, thrust, diameter, density) * axis)
+    speed = rotor_vel * RPM_TO_RAD_S
+    share, place = between(speed, record.speeds)
+    # A record with tables has their place.
+    cell = (rotation.rotate_inverse(quat, offset) - record.origin) / record.spacing  # type: ignore[operator]
+    shape = record.velocity.shape if record.pressure is None else record.pressure.shape
+    share = jnp.where(is_inside(shape[1:4], cell)[..., None], share, 0.0)
+    where = jnp.concatenate([jnp.broadcast_to(place, (*cell.shape[:-1], 1)), cell], axis=-1)
+    total: Any = 0.0
+    if record.pressure is not None:
+        total = total - share * interpolate(record.pressure, where)[..., None] * normal
+    if record.velocity is not None:
+        total = total + momentum(rotation.rotate(quat, share * interpolate(record.velocity, where)))
+    return total
+
+
+def between(speed: Array, speeds: Array) -> tuple[Array, Array]:
+    """Return the factor of a rotor speed below the smallest of a table, and its place between tables.
+
+    Args:
+        speed: Rotor speed, rad/s. (..., 1)
+        speeds: Rotor speeds of the tables, ascending, rad/s. (k,)
+
+    Returns:
+        Factor, 0 to 1 (..., 1), and place in units of tables, 0 to k - 1 (..., 1).
+    """
+    share = rotation.safe_clip(speed / speeds[0], 0.0, 1.0)
+    steps = [
+        rotation.safe_clip((speed - speeds[i]) / (speeds[i + 1] - speeds[i]), 0.0, 1.0)
+        for i in range(speeds.shape[0] - 1)
+    ]
+    return share, sum(steps, jnp.zeros_like(speed))

@@ -1,0 +1,230 @@
+"""One load below several drones of a world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import Objects, SimData, SimState, SimStateDeriv
+from crazysim.core.integration import euler
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.stage import Stage
+from crazysim.eager import compiled
+from crazysim.errors import ConfigError
+from crazysim.geometry.linear import solve
+from crazysim.plugins.payloads.body import LoadBody, rest_height
+from crazysim.plugins.payloads.link import BAND, Pull, acceleration_at, correction, relative
+from crazysim.plugins.payloads.load import (
+    CABLE_SEGMENTS,
+    PointLoad,
+    add_to_scene,
+    integrator_of,
+    pieces,
+    turned_z,
+    with_poses,
+)
+from crazysim.pytree import PyTree, leaf, on_device
+
+SOFT = 1e-6
+"""Summand of the matrix of tensions, 1, without which four rods at one load would have no unique tensions."""
+ROUNDS = 3
+"""Solutions of the tensions, each without the cables that would push in the one before."""
+
+
+class SharedLoadData(PyTree):
+    """State and parameters of the load of each world."""
+
+    pos: Array = leaf("world", 1)
+    """Position, world frame, m. (n_worlds, 1, 3)"""
+    vel: Array = leaf("world", 1)
+    """Velocity, world frame, m/s. (n_worlds, 1, 3)"""
+    attached: Array = leaf("drone", 0)
+    """True for drones that hold the load. (n_worlds, n_drones)"""
+    mass: Array = leaf("shared", 1)
+    """Mass of the load, kg. (1,)"""
+    length: Array = leaf("parameter", 1, (1,))
+    """Length of each rod or cable, m. (1,)"""
+    attach: Array | None = leaf("parameter", 1, (3,))
+    """Attachment on the drones, body frame, m; None for the centre of mass. (3,)"""
+    friction: Array = leaf("shared", 1)
+    """Coulomb's coefficient between load and floor, 1. (1,)"""
+    clearance: Array = leaf("shared", 1)
+    """Height of the load above the floor where it rests, m. (1,)"""
+
+
+@compiled()
+def below(states: SimState, length: Array, clearance: Array) -> tuple[Array, Array]:
+    """Return position and velocity of a load at rest below the drones of each world.
+
+    Args:
+        states: States of the drones. (n_worlds, n_drones, ...)
+        length: Length of each rod or cable, m. (1,) or (n_worlds, n_drones, 1)
+        clearance: Height of the load above the floor where it rests, m. (1,)
+
+    Returns:
+        World frame, m and m/s. (n_worlds, 1, 3) each
+    """
+    mean = states.pos.mean(axis=1, keepdims=True)
+    # As low as the cables of the drones around it allow.
+    level = rotation.safe_norm((states.pos - mean)[..., :2])
+    drop = rotation.safe_sqrt(length * length - level * level)
+    height = jnp.maximum(jnp.max(states.pos[..., 2:] - drop, axis=1, keepdims=True), clearance)
+    return jnp.concatenate([mean[..., :2], height], axis=-1), states.vel.mean(axis=1, keepdims=True)
+
+
+class SharedLoad(PointLoad, Plugin):
+    """One load, a point mass, on rods or cables from all drones of a world.
+
+    The tensions follow from one system of equations of all drones. It needs an integrator that moves positions with new
+    velocities, ``symplectic_euler`` or ``rk4``. It starts at rest below the drones' mean position. Its gravity is
+    the mean of the drones'.
+    """
+
+    coupling: ClassVar[Literal["drone", "world"]] = "world"
+    mass: float = parameter()
+    """Mass of the load, kg."""
+    length: ArrayLike = parameter(default=1.0)
+    """Length of rods or cables, m. () or (n_worlds, n_drones)"""
+    cable: bool = True
+    """True for cables, False for rigid rods."""
+    attach: Any = parameter(default=(0.0, 0.0, 0.0))
+    """Attachment, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    friction: float = parameter(default=0.6)
+    """Coulomb's coefficient between load and floor."""
+    size: ArrayLike = 0.05
+    """Radius of a ball, or full lengths of a box, m: () or (3,)."""
+    rgba: ArrayLike | None = None
+    """Colour; None for the default. (4,)"""
+    in_scene: bool = True
+    """True to put load and links into the scene."""
+    name: str = "load"
+
+    def record(self, sim: Simulation) -> SharedLoadData:
+        """Return a load at rest below the drones."""
+        method = integrator_of(sim)
+        if method is euler:
+            raise ConfigError(
+                "expected an integrator that moves positions with new velocities, which a load between several drones "
+                "needs, got 'euler'. Use Sim(integrator='symplectic_euler') or 'rk4'."
+            )
+        length = check_parameter(sim, "length", self.length, positive=True)
+        attach = check_parameter(sim, "attach", self.attach, (3,))
+        scalars = {}
+        for name, value in (("mass", self.mass), ("friction", self.friction), ("size", rest_height(self.size))):
+            scalars[name] = check_parameter(sim, name, value, low=0.0)
+            if scalars[name].ndim > 1:
+                raise ConfigError(
+                    f"expected {name} as one number, got shape {scalars[name].shape}. The load belongs to all drones."
+                )
+        if self.in_scene:
+            add_to_scene(
+                sim, self.name, self.size, self.rgba, float(np.max(length)), 1,
+                CABLE_SEGMENTS if self.cable else 1,
+            )  # fmt: skip
+        pos, vel = below(sim.data.states, length, scalars["size"])
+        return SharedLoadData(
+            pos=pos,
+            vel=vel,
+            attached=on_device(np.ones(sim.data.states.pos.shape[:2]), bool),
+            mass=scalars["mass"],
+            length=length,
+            attach=attach if np.any(np.asarray(attach)) else None,
+            friction=scalars["friction"],
+            clearance=scalars["size"],
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage of the floor."""
+        return [Placement(Stage(self.stop_at_floor, "world"), "increment_steps", name=f"{self.name}_floor")]
+
+    def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
+        """Return the derivative with the pull of the load on all drones, and the load's rates; of one world."""
+        load, p, s, freq = self.read(data), data.params, data.states, data.core.freq
+        m, n = load.mass, s.pos.shape[0]
+        gravity = p.gravity_vec if p.gravity_vec.ndim == 1 else jnp.mean(p.gravity_vec, axis=0)
+        r = relative(s, load.pos, load.vel, load.attach)
+        q, out = r.direction, rotation.dot(r.direction, r.vel)
+        pull = Pull.create(q, r.rot, p.J_inv, load.attach)
+        share = 1.0 if dt is None else 0.5
+        rel_acc = gravity - acceleration_at(s, deriv, r.rot, load.attach, share)
+        rhs = rotation.dot(q, rel_acc) + share / load.length * (rotation.dot(r.vel, r.vel) - out * out)
+        acts = load.attached
+        if dt is None:
+            rhs = rhs + 2 * correction(freq) * out
+            acts = acts & (r.distance > (1 - BAND) * load.length)[..., 0] if self.cable else acts
+        else:
+            gap = jnp.maximum(load.length - r.distance, 0.0) if self.cable else 0.0
+            rhs = rhs + freq * (out - freq * gap)
+        own = jnp.broadcast_to(m / p.mass, (n, 1))
+        own = own if pull.lever is None or pull.turn is None else own + m * rotation.dot(pull.lever, pull.turn)
+        gram = jnp.sum(q[:, None] * q[None], axis=-1) + jnp.eye(n, dtype=q.dtype) * (own + SOFT)
+        tension = _tensions(gram, rhs[:, 0], acts, self.cable)[:, None]
+
+        force = tension * q
+        acc = m / p.mass * force
+        tip_acc = gravity - jnp.sum(force, axis=0)
+        changes = {"acc": deriv.acc + acc}
+        if dt is not None:
+            changes["vel"] = deriv.vel + dt * acc
+        if pull.turn is not None:
+            ang_acc = m * tension * pull.turn
+            changes["ang_acc"] = deriv.ang_acc + ang_acc
+            if dt is not None:
+                changes["ang_vel"] = deriv.ang_vel + dt * ang_acc
+        stretch = r.distance - load.length
+        stretch = jnp.maximum(stretch, 0.0) if self.cable else stretch
+        error = jnp.sum(jnp.where(load.attached[:, None], stretch * q, 0.0), axis=0) / n
+        rate = load.vel - correction(freq) * error if dt is None else load.vel + dt * tip_acc - freq * error
+        rates = {"pos": rate, "vel": tip_acc}
+        return deriv.replace(**changes, plugins=deriv.plugins | {self.name: rates})
+
+    def place(self, data: SimData) -> Objects:
+        """Return the scene's objects with load and links at their poses; of one world."""
+        if not self.in_scene:
+            return data.objects  # type: ignore[return-value]
+        load = self.read(data)
+        r = relative(data.states, load.pos, load.vel, load.attach)
+        offset = jnp.where(load.attached[:, None], r.offset, -load.length * r.rot[..., 2])
+        top = data.states.pos if r.arm is None else data.states.pos + r.arm
+        links = pieces(top, offset, load.length, CABLE_SEGMENTS if self.cable else 1)
+        up = jnp.asarray([[0.0, 0.0, 1.0]], load.pos.dtype)
+        rows = {self.name: (load.pos[None], turned_z(up)), f"{self.name}_link": links}
+        return with_poses(data.objects, rows)  # type: ignore[arg-type]
+
+    def body(self, data: SimData) -> LoadBody:
+        """Return the load; of one world."""
+        load = self.read(data)
+        upright = jnp.asarray([[0.0, 0.0, 0.0, 1.0]], load.pos.dtype)
+        return LoadBody(load.pos[None], upright, load.vel[None], load.mass[None])
+
+    def with_vel(self, data: SimData, vel: Array) -> SimData:
+        """Return the data with another velocity of the load; of one world. (1, 3)"""
+        return self.write(data, self.read(data).replace(vel=vel[0]))
+
+    def joined(self, data: SimData) -> Array:
+        """Return True for drones that a rod joins to the load; of one world. (1, n_drones)"""
+        return self.read(data).attached[None] & (not self.cable)
+
+
+def _tensions(matrix: Array, rhs: Array, acts: Array, one_sided: bool) -> Array:
+    """Return the tensions per mass of the load, m/s^2; cables that would push are slack. (n,)
+
+    Args:
+        matrix: Accelerations along each link under a unit tension in each, symmetric, positive definite. (n, n)
+        rhs: Relative accelerations that the tensions prevent, m/s^2. (n,)
+        acts: True for links that can pull. (n,)
+        one_sided: True for cables.
+    """
+    eye = jnp.eye(rhs.shape[0], dtype=rhs.dtype)
+    tension = jnp.zeros_like(rhs)
+    for _ in range(ROUNDS if one_sided else 1):
+        both = acts[:, None] & acts[None]
+        tension = solve(jnp.where(both, matrix, eye), jnp.where(acts, rhs, 0.0))
+        acts = acts & (tension > 0) if one_sided else acts
+    return jnp.maximum(tension, 0.0) if one_sided else tension

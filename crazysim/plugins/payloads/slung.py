@@ -1,0 +1,233 @@
+"""A load on a rod or a cable below each drone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import Objects, SimData, SimStateDeriv
+from crazysim.core.integration import rk4
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.settings import as_mask
+from crazysim.core.stage import Stage
+from crazysim.plugins.effects.moving_air import zeros
+from crazysim.plugins.payloads.body import LoadBody, rest_height
+from crazysim.plugins.payloads.link import Link, couple, end_relative_motion, relative
+from crazysim.plugins.payloads.load import (
+    CABLE_SEGMENTS,
+    LoadData,
+    PointLoad,
+    add_to_scene,
+    air_and_gravity,
+    hanging,
+    integrator_of,
+    pieces,
+    turned_z,
+    with_poses,
+)
+from crazysim.pytree import on_device, select_worlds
+
+OUT_OF_SIGHT = 1000.0
+"""Depth at which loads are that do not exist, m."""
+
+
+class SlungLoad(PointLoad, Plugin):
+    """A load on a rod or a cable, a point mass that hangs from each drone.
+
+    Load and drone are integrated together. A cable is slack while the load is nearer than its length, and pulls as soon
+    as it is taut. The load starts at rest below the drone, where the drone is when the plugin is added.
+    """
+
+    mass: Any = parameter()
+    """Mass of the load, kg; at zero the drone flies as without it. () or (n_worlds, n_drones)"""
+    length: Any = parameter(default=0.4)
+    """Length of rod or cable, m. () or (n_worlds, n_drones)"""
+    cable: bool = False
+    """True for a cable, False for a rigid rod."""
+    attach: Any = parameter(default=(0.0, 0.0, 0.0))
+    """Attachment, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    damping: Any = parameter(default=0.0)
+    """Viscous torque of the joint over its angular velocity, N m s. () or (n_worlds, n_drones)"""
+    restitution: Any = parameter(default=0.0)
+    """Ratio of the radial speeds after and before a cable becomes taut, 0 to 1. () or (n_worlds, n_drones)"""
+    drag: Any = parameter(default=0.0)
+    """Linear drag coefficient of the load, N s/m, through which wind and downwash act on it.
+    () or (n_worlds, n_drones)"""
+    friction: Any = parameter(default=0.6)
+    """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
+    size: Any = 0.03
+    """Radius of a ball, or full lengths of a box, m: () or (3,). For contacts, the floor and images."""
+    rgba: Any = None
+    """Colour; None for the default. (4,)"""
+    in_scene: bool = True
+    """True to put loads and links into the scene, where they are drawn and reported as contacts of drones."""
+    name: str = "load"
+
+    def record(self, sim: Simulation) -> LoadData:
+        """Return loads at rest below their drones."""
+        return load_record(self, sim, self.cable, rest_height(self.size))
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage of the floor, and for cables in schemes of higher order that of becoming taut."""
+        found = [Placement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor")]
+        method = integrator_of(sim)
+        if self.cable and method is rk4:
+            found.append(Placement(Stage(self.become_taut, "drone"), "integration", name=f"{self.name}_taut"))
+        return found
+
+    def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
+        """Return the derivative with the pull of the load, and the load's rates; of one drone."""
+        load, p = self.read(data), data.params
+        free = air_and_gravity(data, load, self.name, dt)
+        linked = couple(
+            data.states, deriv, p.mass, p.J_inv, self._link(load), load.pos, load.vel, free, dt, data.core.freq
+        )
+        rates = {"pos": linked.rate, "vel": linked.acc}
+        return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
+
+    def become_taut(self, data: SimData) -> SimData:
+        """Apply the impulse of a cable that is taut while the load moves outwards; of one drone."""
+        load, p = self.read(data), data.params
+        states, vel = end_relative_motion(data.states, p.mass, p.J_inv, self._link(load), load.pos, load.vel)
+        return self.write(data.replace(states=states), load.replace(vel=vel))
+
+    def hang(self, data: SimData, mask: Any = None) -> SimData:
+        """Return the data with every load attached, and at rest below its drone; of all worlds.
+
+        Use it after moving drones.
+
+        Args:
+            data: Simulation.
+            mask: True in the worlds to change; None for all. (n_worlds,)
+
+        Raises:
+            ConfigError: If the mask has another shape or type.
+        """
+        load, mask = self.read(data), as_mask(mask, data.core.steps.shape[:1])
+        pos, vel = hanging(data.states, load.attach, load.length, load.clearance, self.cable)
+        new = load.replace(
+            pos=select_worlds(mask, pos, load.pos),
+            vel=select_worlds(mask, vel, load.vel),
+            attached=select_worlds(mask, jnp.ones_like(load.attached), load.attached),
+        )
+        return self.write(data, new)
+
+    def place(self, data: SimData) -> Objects:
+        """Return the scene's objects with loads and links at their poses; of one world."""
+        if not self.in_scene:
+            return data.objects  # type: ignore[return-value]
+        load = self.read(data)
+        return place_loads(data, self.name, load, load.pos, load.attached, CABLE_SEGMENTS if self.cable else 1)
+
+    def body(self, data: SimData) -> LoadBody:
+        """Return the loads; of one drone or of one world."""
+        load = self.read(data)
+        mass = jnp.broadcast_to(load.mass, (*load.pos.shape[:-1], 1))
+        return LoadBody(load.pos, turned_z(upward(data, load, load.pos)), load.vel, mass)
+
+    def with_vel(self, data: SimData, vel: Array) -> SimData:
+        """Return the data with other velocities of the loads; of one drone or of one world. (..., 3)"""
+        return self.write(data, self.read(data).replace(vel=vel))
+
+    def joined(self, data: SimData) -> Array:
+        """Return True where a rod joins a load to a drone; of one world. (n_drones, n_drones)"""
+        n = data.states.pos.shape[0]
+        return np.eye(n, dtype=bool) & self.read(data).attached & (not self.cable)
+
+    def _link(self, load: LoadData) -> Link:
+        return Link(load.attach, load.length, load.mass, load.damping, load.restitution, load.attached, self.cable)
+
+
+def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, ring: float | None = None) -> LoadData:
+    """Return the record of loads at rest below their drones, from the settings of a plugin, which are checked.
+
+    Args:
+        plugin: The plugin.
+        sim: Simulation.
+        is_cable: True for cables.
+        clearance: Height of a load's position above the floor where it rests, m.
+        ring: Height of the ring above the middle of the load, m, by which a hook holds it; None without a hook.
+    """
+
+    def check(name: str, core: tuple[int, ...] = (1,), **limits: Any) -> Array:
+        return check_parameter(sim, name, getattr(plugin, name), core, **limits)
+
+    def optional(name: str, core: tuple[int, ...] = (1,), **limits: Any) -> Array | None:
+        """Return a setting, or None where it is zero everywhere: what is not there is not computed."""
+        value = check(name, core, **limits)
+        return value if np.any(np.asarray(value)) else None
+
+    length, attach = check("length", positive=True), optional("attach", (3,))
+    rest, drag = check_parameter(sim, "size", clearance, low=0.0), optional("drag", low=0.0)
+    if plugin.in_scene:
+        add_to_scene(
+            sim, plugin.name, plugin.size, plugin.rgba, float(np.max(length)), sim.n_drones,
+            CABLE_SEGMENTS if is_cable else 1, ring,
+        )  # fmt: skip
+    states = sim.data.states
+    pos, vel = hanging(states, attach, length, rest, is_cable)
+    return LoadData(
+        pos=pos,
+        vel=on_device(np.broadcast_to(vel, states.vel.shape)),
+        air_vel=None if drag is None else zeros(sim, 3),
+        wind_vel=None if drag is None else zeros(sim, 3),
+        attached=on_device(np.ones(states.pos.shape[:2]), bool),
+        mass=check("mass", low=0.0),
+        length=length,
+        attach=attach,
+        damping=optional("damping", low=0.0),
+        restitution=optional("restitution", low=0.0, high=1.0) if is_cable else None,
+        drag=drag,
+        friction=check("friction", low=0.0),
+        clearance=rest,
+    )
+
+
+def place_loads(
+    data: SimData,
+    name: str,
+    load: LoadData,
+    tip: Array,
+    holds: Array,
+    n_pieces: int,
+    ring: float = 0.0,
+    bare: bool = False,
+) -> Objects:
+    """Return the scene's objects with loads and links at their poses; of one world.
+
+    Loads without mass, which do not exist, are out of sight.
+
+    Args:
+        data: One world.
+        name: Name of the plugin.
+        load: Its record.
+        tip: Ends of the links, world frame, m. (n_drones, 3)
+        holds: True where something is attached to the end; other links hang along the body's z axis. (n_drones,)
+        n_pieces: Straight pieces of a link.
+        ring: Height of the point by which a load hangs above its middle, m.
+        bare: True to show links without loads.
+    """
+    away = jnp.where(load.mass > 0, 0.0, OUT_OF_SIGHT) * np.array([0.0, 0.0, 1.0], tip.dtype)
+    r = relative(data.states, tip, load.vel, load.attach)
+    offset = jnp.where(holds[..., None], r.offset, -load.length * r.rot[..., 2])
+    up = upward(data, load, tip)
+    top = data.states.pos if r.arm is None else data.states.pos + r.arm
+    links = pieces(top if bare else top - away, offset, load.length, n_pieces)
+    rows = {name: (load.pos - away - ring * up, turned_z(up)), f"{name}_link": links}
+    return with_poses(data.objects, rows)  # type: ignore[arg-type]
+
+
+def upward(data: SimData, load: LoadData, tip: Array) -> Array:
+    """Return the axis of the loads' shapes: along the link where a load hangs, else vertical. (..., 3)
+
+    Args:
+        data: One drone or one world.
+        load: Record of the loads.
+        tip: Ends of the links, world frame, m. (..., 3)
+    """
+    direction = relative(data.states, tip, load.vel, load.attach).direction
+    return jnp.where(load.attached[..., None], -direction, jnp.asarray([0.0, 0.0, 1.0], tip.dtype))

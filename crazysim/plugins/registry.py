@@ -1,0 +1,340 @@
+"""The plugins of a simulation: added, replaced and removed here, and nowhere else."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.integration import Integration
+from crazysim.core.pipeline import Pipeline, insert_fn_before
+from crazysim.core.plugin import Placement, Plugin, Simulation
+from crazysim.core.population import Population
+from crazysim.core.settings import check_flags
+from crazysim.core.stage import Axes, over_drones, over_worlds
+from crazysim.eager import compiled
+from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.pytree import PyTree, n_batch_axes
+
+P = TypeVar("P", bound=Plugin)
+
+_CONFIGURATION = ("parameter", "shared")
+"""Scopes of leaves that hold settings; the others hold states."""
+
+
+class _Installed(NamedTuple):
+    """A plugin with the stages that it put into the step pipeline."""
+
+    plugin: Plugin
+    stages: dict[str, Callable[..., Any]]
+    """The stages by name."""
+    replaced: dict[str, tuple[str, Callable[..., Any]]]
+    """Name and function of the stage that each of some stages replaced."""
+
+
+class PluginRegistry(Mapping[str, Plugin]):
+    """The plugins of one simulation by name, in the order in which they were added."""
+
+    def __init__(self, sim: Simulation):
+        """Start without plugins."""
+        self._sim = sim
+        self._installed: dict[str, _Installed] = {}
+        self._placing: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
+        self._observing: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
+
+    def __getitem__(self, name: str) -> Plugin:
+        """Return a plugin.
+
+        Raises:
+            UnknownNameError: If there is none of that name.
+        """
+        if name not in self._installed:
+            raise UnknownNameError(
+                f"expected the name of an added plugin, got {name!r}. Added are: {', '.join(self) or 'none'}."
+            )
+        return self._installed[name].plugin
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names."""
+        return iter(self._installed)
+
+    def __len__(self) -> int:
+        """Return the number of plugins."""
+        return len(self._installed)
+
+    def __contains__(self, name: object) -> bool:
+        """Return True if there is a plugin of that name."""
+        return name in self._installed
+
+    def add(self, plugin: P, name: str | None = None) -> P:
+        """Add a plugin; see ``Sim.add``."""
+        if not isinstance(plugin, Plugin):
+            raise ConfigError(f"expected a plugin, got {plugin!r}. Use sim.add(Wind(...)), or a Plugin of your own.")
+        check_flags(plugin)
+        plugin = plugin if name is None else dataclasses.replace(plugin, name=name)  # type: ignore[type-var]
+        name, kind = plugin.name, type(plugin).__name__
+        if not isinstance(name, str) or not name:
+            raise ConfigError(f"expected a non-empty string as name of a {kind}, got {name!r}")
+        if name in self:
+            raise ConfigError(
+                f"{name} is already enabled. Use sim.replace({kind}(...)) to change it, or "
+                f"sim.add({kind}(...), name=...) to add another one."
+            )
+        if name in self._sim.data.plugins:
+            raise ConfigError(f"data.plugins already has a record {name!r}. Use sim.add(..., name=...).")
+        self._require_names(plugin, self._sim.names)
+        record, default = plugin.record(self._sim), plugin.default_record(self._sim)
+        pipeline, installed = _with(dict(self._sim.step_pipeline), plugin, plugin.stages(self._sim))
+        pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
+        self._put(name, record, default)
+        self._installed[name] = installed
+        self._build(pipeline)
+        return plugin
+
+    def remove(self, plugin: Plugin | str) -> None:
+        """Remove a plugin; see ``Sim.remove``."""
+        name = plugin.name if isinstance(plugin, Plugin) else plugin
+        self[name]
+        pipeline = _without(dict(self._sim.step_pipeline), self._installed[name])
+        pipeline = _with_influences(pipeline, [p for p in self.values() if p.name != name])
+        self._put(name, None, None)
+        del self._installed[name]
+        self._build(pipeline)
+
+    def replace(self, plugin: P) -> P:
+        """Replace the settings of a plugin; see ``Sim.replace``."""
+        before = self[plugin.name]
+        if type(before) is not type(plugin):
+            raise ConfigError(
+                f"expected a {type(before).__name__} to replace {plugin.name!r}, got a {type(plugin).__name__}. Use "
+                f"sim.remove({plugin.name!r}) first, or another name=."
+            )
+        check_flags(plugin)
+        sim, name = self._sim, plugin.name
+        self._require_names(plugin, [other for other in sim.names if other not in self.members_of(before)])
+        present, record, default = sim.data.plugins.get(name), plugin.record(sim), plugin.default_record(sim)
+        if _same_code(before, plugin) and jax.tree.structure(present) == jax.tree.structure(record):
+            self._put(name, _continued(record, present), default)
+            self._installed[name] = self._installed[name]._replace(plugin=plugin)
+            return plugin
+        present_pipeline = sim.step_pipeline
+        sim.step_pipeline = _without(dict(present_pipeline), self._installed[name])
+        try:  # the stages are made for a pipeline without the plugin
+            pipeline, installed = _with(dict(sim.step_pipeline), plugin, plugin.stages(sim))
+            pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
+        finally:
+            sim.step_pipeline = present_pipeline
+        self._put(name, _continued(record, present), default)
+        self._installed[name] = installed
+        self._build(pipeline)
+        return plugin
+
+    @staticmethod
+    def members_of(plugin: Plugin) -> tuple[str, ...]:
+        """Return the names of the members of a population; none of another plugin."""
+        return plugin.names if isinstance(plugin, Population) else ()
+
+    @property
+    def members(self) -> tuple[str, ...]:
+        """Names of the members of all populations."""
+        return tuple([name for plugin in self.values() for name in self.members_of(plugin)])
+
+    def _require_names(self, plugin: Plugin, taken: Collection[str]) -> None:
+        """Check that the members of a population have names of their own.
+
+        Raises:
+            ConfigError: If another has one of these names.
+        """
+        taken = set(taken)
+        twice = [name for name in self.members_of(plugin) if name in taken]
+        if twice:
+            raise ConfigError(
+                f"expected names that nothing else has, got {twice[0]!r} again. Use "
+                f"{type(plugin).__name__}([...]) with other names."
+            )
+
+    def build_records(self) -> None:
+        """Put a new record of every plugin into the simulation's data."""
+        for name, plugin in self.items():
+            self._set(name, plugin.record(self._sim))
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the observations of all plugins, as ``"plugin.name"``. (n_worlds, n_drones, k) each"""
+        plugins = tuple(self.values())
+        if [*map(id, plugins)] != [*map(id, self._observing[0])]:
+            self._observing = plugins, compiled()(functools.partial(_observations, plugins))
+        return self._observing[1](data)
+
+    def with_placed_objects(self, data: SimData) -> SimData:
+        """Return the data with the plugins' objects of the scene at their poses, unless these are recorded ones."""
+        if data.objects is None or data.objects.recorded:
+            return data
+        for name, plugin in self.items():
+            if plugin.places:
+                if self._placing.get(name, (None, None))[0] is not plugin:
+                    self._placing[name] = plugin, jax.jit(over_worlds(plugin.place))
+                data = data.replace(objects=self._placing[name][1](data))
+        return data
+
+    def draw(self, world: int) -> None:
+        """Draw the overlays of all plugins into the next image of a world."""
+        for plugin in self.values():
+            plugin.draw(self._sim, world)
+
+    def _put(self, name: str, record: PyTree | None, default: PyTree | None) -> None:
+        """Put a record into the data and the default data, or remove it; nothing else of either changes.
+
+        Both records go through ``sim.data``, which places them on the simulation's devices.
+        """
+        self._set(name, default)
+        placed = self._sim.data.plugins.get(name)
+        self._sim.default_data = _with_record(self._sim.default_data, name, placed)
+        self._set(name, record)
+
+    def _set(self, name: str, record: PyTree | None) -> None:
+        if record is not None and not isinstance(record, PyTree):
+            raise ConfigError(
+                f"expected record of plugin {name!r} to return a PyTree or None, got {type(record).__name__}. Use a "
+                f"subclass of PyTree that declares its arrays with leaf(...)."
+            )
+        self._sim.data = _with_record(self._sim.data, name, record)
+
+    def _build(self, pipeline: Pipeline) -> None:
+        self._sim.step_pipeline = pipeline
+        self._sim.build_step_fn()
+
+
+def _with_record(data: SimData, name: str, record: PyTree | None) -> SimData:
+    others = {key: value for key, value in data.plugins.items() if key != name}
+    return data.replace(plugins=others if record is None else others | {name: record})
+
+
+def _with(pipeline: Pipeline, plugin: Plugin, placements: Any) -> tuple[Pipeline, _Installed]:
+    """Return the pipeline with the stages of a plugin, and the plugin with what it changed.
+
+    Raises:
+        ConfigError: If ``placements`` is no list of ``Placement``, or the name of a stage is taken.
+        UnknownNameError: If there is no stage to go in front of.
+    """
+    if not isinstance(placements, (list, tuple)) or not all(isinstance(x, Placement) for x in placements):
+        raise ConfigError(
+            f"expected stages of plugin {plugin.name!r} to return a list of Placement, got {placements!r}. Use "
+            f"[Placement(stage, before='increment_steps')]."
+        )
+    installed = _Installed(plugin, {}, {})
+    for placement in placements:
+        pipeline = _with_stage(pipeline, placement, placement.name or plugin.name, installed)
+    return pipeline, installed
+
+
+def _with_stage(pipeline: Pipeline, placement: Placement, name: str, installed: _Installed) -> Pipeline:
+    replaced = placement.replaces if placement.replaces in pipeline else None
+    if name in pipeline and name != replaced:
+        raise ConfigError(f"the step pipeline already has a stage {name!r}. Use sim.add(..., name=...).")
+    installed.stages[name] = placement.stage
+    if replaced is None:
+        insert_fn_before(pipeline, placement.before, placement.stage, name)
+        return pipeline
+    installed.replaced[name] = (replaced, pipeline[replaced])
+    return {
+        name if key == replaced else key: placement.stage if key == replaced else fn for key, fn in pipeline.items()
+    }
+
+
+def _without(pipeline: Pipeline, installed: _Installed) -> Pipeline:
+    """Return the pipeline without the stages of a plugin, and with those that it had replaced.
+
+    Raises:
+        ConfigError: If one of its stages has been replaced since.
+    """
+    for name, stage in installed.stages.items():
+        if pipeline.get(name, stage) is not stage:
+            raise ConfigError(
+                f"stage {name!r} of plugin {installed.plugin.name!r} has been replaced since it was added. Undo that "
+                f"first, or remove the plugin that did it."
+            )
+    items = [(name, installed.replaced.get(name) if name in installed.stages else (name, fn))
+             for name, fn in pipeline.items()]  # fmt: skip
+    return dict(item for _, item in items if item is not None)
+
+
+def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | None = None) -> Pipeline:
+    """Return the pipeline whose integration applies the influences and derivatives of some plugins.
+
+    Raises:
+        ConfigError: If the one that is being added has any, and the integration is not the built-in one.
+    """
+    dynamic = tuple(sorted((p for p in plugins if p.is_dynamic), key=lambda p: (p.order, p.name)))
+    constraining = [p.name for p in dynamic if p.constrains]
+    if len(constraining) > 1:
+        raise ConfigError(
+            f"expected at most one plugin that joins bodies to the drones, got {' and '.join(constraining)}. Use one "
+            f"plugin for all drones; its parameters can differ between them."
+        )
+    integration = getattr(pipeline.get("integration"), "fn", None)
+    if isinstance(integration, Integration):
+        return pipeline | {"integration": dataclasses.replace(integration, plugins=dynamic).stage()}
+    if added is not None and added.is_dynamic:
+        raise ConfigError(
+            f"{added.name} acts on the time derivative within the stage 'integration', which is "
+            f"{pipeline.get('integration')!r} here. Add it before you replace or remove that stage."
+        )
+    return pipeline
+
+
+def _same_code(before: Plugin, after: Plugin) -> bool:
+    """Return True if two plugins of one class differ in numbers of their records at most."""
+    fields = dataclasses.fields(before)  # type: ignore[arg-type]
+    fixed = [f.name for f in fields if not f.metadata.get("parameter")]
+    return all(_equal(getattr(before, name), getattr(after, name)) for name in fixed)
+
+
+def _equal(a: Any, b: Any) -> bool:
+    if a is b:
+        return True
+    if isinstance(a, (np.ndarray, jax.Array)) or isinstance(b, (np.ndarray, jax.Array)):
+        return type(a) is type(b) and np.array_equal(a, b)
+    try:
+        return bool(a == b)
+    except ValueError:  # sequences of arrays; taken as different, the step is compiled again
+        return False
+
+
+def _continued(record: PyTree | None, before: PyTree | None) -> PyTree | None:
+    """Return a record whose states are those of the record before, as far as these have the same shapes."""
+    if record is None or type(record) is not type(before):
+        return record
+    kept = {}
+    for f in dataclasses.fields(record):  # type: ignore[arg-type]
+        new, old = getattr(record, f.name), getattr(before, f.name)
+        if isinstance(new, PyTree):
+            kept[f.name] = _continued(new, old)
+        elif not f.metadata.get("static") and f.metadata.get("scope") not in _CONFIGURATION:
+            kept[f.name] = old if _signature(old) == _signature(new) else new
+    return record.replace(**kept)
+
+
+def _signature(tree: Any) -> Any:
+    return jax.tree.structure(tree), [(jnp.shape(x), jnp.result_type(x)) for x in jax.tree.leaves(tree)]
+
+
+def _no_observations(_data: SimData) -> dict[str, Array]:
+    return {}
+
+
+def _observations(plugins: Sequence[Plugin], data: SimData) -> dict[str, Array]:
+    def of_one(one: SimData) -> dict[str, Array]:
+        return {f"{p.name}.{key}": x for p in plugins for key, x in p.observations(one).items()}
+
+    leaves, axes = jax.tree.leaves(data), Axes(data)
+    worlds = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]
+    of_drones = over_drones(of_one)
+    of_world = [x[:, 0] if scope == "world" else x for scope, x in zip(axes.scopes, leaves, strict=True)]
+    return jax.vmap(lambda values: of_drones(axes.treedef.unflatten(values)), (worlds,))(of_world)

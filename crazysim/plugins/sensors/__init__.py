@@ -1,0 +1,1 @@
+"""Sensors: range finders and radars."""

@@ -1,0 +1,171 @@
+"""Radars that detect drones within a lobe, in closed form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.stage import Stage
+from crazysim.eager import compiled
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.moving_air import zeros
+from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.rotation import safe_clip, safe_norm
+
+CLEAR, ALARM = (0.25, 0.6, 0.9, 1.0), (0.95, 0.2, 0.15, 1.0)
+"""Colours of a lobe without a drone in it, and with one."""
+N_MERIDIANS, N_POINTS = 12, 40
+"""Curves by which a lobe is drawn, and points of each side of a curve."""
+
+
+class RadarData(PyTree):
+    """Radars of every world, and the time that each drone has been within their lobes."""
+
+    pos: Array = leaf("shared", 2)
+    """Positions of the radars, world frame, m. (n_radars, 3)"""
+    size: Array = leaf("shared", 1)
+    """Half the range of each radar, m. (n_radars,)"""
+    exponent: Array = leaf("shared", 1)
+    """Exponents of the lobes, 1: larger ones are thinner near the radar. (n_radars,)"""
+    height_scale: Array = leaf("shared", 1)
+    """Factors of the thickness of the lobes, 1. (n_radars,)"""
+    tilt: Array = leaf("shared", 1)
+    """Elevations of the lobes, rad. (n_radars,)"""
+    exposure: Array = leaf("drone", 1)
+    """Time that a drone has been within each lobe since the last reset, s. (n_worlds, n_drones, n_radars)"""
+
+    @compiled()
+    def margin_at(self, pos: Array) -> Array:
+        """Return the depth of a place within each lobe, m, negative outside; see ``lobe_margin``. (..., n_radars)"""
+        offset = pos[..., None, :] - self.pos
+        return lobe_margin(offset, self.size, self.exponent, self.height_scale, self.tilt)
+
+
+class Radar(Plugin):
+    """Radars, each of which detects the drones within its lobe; nothing hides a drone.
+
+    The lobe is a teardrop in the vertical plane, turned about the vertical axis of the radar: in all directions the
+    range is twice ``size``. Settings are one for all radars, or one for each.
+    """
+
+    pos: ArrayLike = parameter()
+    """Positions of the radars, world frame, m. (3,) or (n_radars, 3)"""
+    size: ArrayLike = parameter(default=5.0)
+    """Half the range, m. () or (n_radars,)"""
+    exponent: Any = parameter(default=1.3)
+    """Exponent of the lobe, 1: larger ones are thinner near the radar. () or (n_radars,)"""
+    height_scale: Any = parameter(default=1.0)
+    """Factor of the thickness of the lobe, 1. () or (n_radars,)"""
+    tilt: Any = parameter(default=0.0)
+    """Elevation of the lobe, rad, positive upwards. () or (n_radars,)"""
+    visible: bool = False
+    """True to draw the lobes into images, in red where a drone is detected."""
+    name: str = "radar"
+
+    def record(self, sim: Simulation) -> RadarData:
+        """Return the radars, before any detection."""
+        pos = np.asarray(self.pos, np.float64)
+        pos = pos[None] if pos.ndim == 1 else pos
+        if pos.ndim != 2 or pos.shape[1] != 3 or not np.isfinite(pos).all() or not len(pos):
+            raise ConfigError(f"expected pos as finite positions (3,) or (n_radars, 3), m, got {self.pos!r}")
+        dtype = sim.data.states.pos.dtype
+        found = {}
+        for name, low, high in (
+            ("size", 1e-6, np.inf),
+            ("exponent", 0.0, np.inf),
+            ("height_scale", 1e-6, np.inf),
+            ("tilt", -math.pi / 2, math.pi / 2),
+        ):
+            value = np.asarray(getattr(self, name), np.float64)
+            if value.shape not in ((), (len(pos),)):
+                raise ConfigError(f"expected {name} of shape () or ({len(pos)},) for each radar, got {value.shape}")
+            if not np.isfinite(value).all() or np.any(value < low) or np.any(value > high):
+                bounds = "positive" if low > 0 else f"from {low:.4g} to {high:.4g}"
+                raise ConfigError(f"expected {name} to be finite and {bounds}, got {getattr(self, name)!r}")
+            found[name] = on_device(np.broadcast_to(value, len(pos)), dtype)
+        return RadarData(pos=on_device(pos, dtype), **found, exposure=zeros(sim, len(pos)))
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that counts the time within the lobes."""
+        return [Placement(Stage(self.count, "drone"), before="increment_steps")]
+
+    def count(self, data: SimData) -> SimData:
+        """Add a step to the time within each lobe, of one drone."""
+        record = self.read(data)
+        time = jnp.where(record.margin_at(data.states.pos) > 0, 1 / data.core.freq, 0.0)
+        return self.write(data, record.replace(exposure=record.exposure + time))
+
+    def detects(self, data: SimData) -> Array:
+        """Return True where a radar detects a drone, of one drone, one world or all worlds. (..., n_radars)"""
+        return self.read(data).margin_at(data.states.pos) > 0
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the depth within each lobe, m, negative outside, and the time within it, s."""
+        record = self.read(data)
+        return {"margin": record.margin_at(data.states.pos), "exposure": record.exposure}
+
+    def draw(self, sim: Simulation, world: int) -> None:
+        """Draw the lobes."""
+        if not self.visible:
+            return
+        detected = np.any(np.asarray(self.detects(sim.data))[world], axis=0).reshape(-1)
+        record = self.read(sim.data)
+        for k, pos in enumerate(np.asarray(record.pos, np.float64)):
+            shape = (float(x[k]) for x in (record.size, record.exponent, record.height_scale, record.tilt))
+            for curve in lobe_curves(*shape):
+                sim.scene.renderer.overlays.line(pos + curve, ALARM if detected[k] else CLEAR, 2.0, 2.0)
+
+
+@compiled()
+def lobe_margin(offset: Array, size: Array, exponent: Array, height_scale: Array, tilt: Array) -> Array:
+    """Return the depth of a place within a radar's lobe along the normal to its axis, m, negative outside. (...)
+
+    With a half the range, the lobe is the teardrop ``x = a (1 - cos t)``, ``|z| <= h a sin(t) sin(t / 2)^e``, t from 0
+    to pi, tilted in the vertical plane and then turned about the vertical axis (facts of AIMotionLab-Virtual, 2024).
+    Without t, ``|z| <= h a 2^(-e / 2) u^((1 + e) / 2) sqrt(2 - u)`` with ``u = x / a``.
+
+    Args:
+        offset: Position relative to the radar, world frame, m. (..., 3)
+        size: Half the range a, m. (...)
+        exponent: Exponent e, 1. (...)
+        height_scale: Factor h of the thickness, 1. (...)
+        tilt: Elevation of the lobe, rad. (...)
+    """
+    away, up = safe_norm(offset[..., :2])[..., 0], offset[..., 2]
+    c, s = jnp.cos(tilt), jnp.sin(tilt)
+
+    def margin(away: Array) -> Array:
+        along, across = c * away + s * up, c * up - s * away
+        u = along / size
+        inside = safe_clip(u, 1e-6, 2.0)
+        root = rotation.safe_sqrt(2 - inside)
+        limit = height_scale * size * jnp.exp(0.5 * ((1 + exponent) * jnp.log(inside) - exponent * math.log(2))) * root
+        beyond = jnp.maximum(u - 2, 0.0) + jnp.maximum(-u, 0.0)
+        return limit - jnp.abs(across) - size * beyond
+
+    # The lobe of the opposite direction reaches over the axis where it is steep.
+    return jnp.maximum(margin(away), margin(-away))
+
+
+def lobe_curves(size: float, exponent: float, height_scale: float, tilt: float) -> list[np.ndarray]:
+    """Return outlines of a lobe relative to its radar, m: teardrops in vertical planes, and circles. (n, 3) each"""
+    t = np.linspace(0.0, math.pi, N_POINTS)
+    along, across = size * (1 - np.cos(t)), height_scale * size * np.sin(t) * np.sin(t / 2) ** exponent
+    along, across = np.concatenate([along, along[::-1]]), np.concatenate([across, -across[::-1]])
+    away = along * math.cos(tilt) - across * math.sin(tilt)
+    up = along * math.sin(tilt) + across * math.cos(tilt)
+    turns = np.linspace(0.0, 2 * math.pi, N_MERIDIANS, endpoint=False)
+    curves = [np.stack([away * math.cos(a), away * math.sin(a), up], axis=-1) for a in turns]
+    around = np.linspace(0.0, 2 * math.pi, 2 * N_POINTS)
+    for k in (int(np.argmax(away)), int(np.argmax(up)), int(np.argmin(up))):
+        curves.append(np.stack([away[k] * np.cos(around), away[k] * np.sin(around), 0 * around + up[k]], axis=-1))
+    return curves

@@ -1,0 +1,132 @@
+"""Range finder: a few rays from every drone, measured within the compiled step."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.settings import dividing_rate
+from crazysim.core.stage import Stage
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.scene.collision import CollisionModel
+from crazysim.scene.placement import place, placed_by
+from crazysim.scene.rays import cast
+
+MULTI_RANGER = {
+    "front": (1, 0, 0),
+    "back": (-1, 0, 0),
+    "left": (0, 1, 0),
+    "right": (0, -1, 0),
+    "up": (0, 0, 1),
+    "down": (0, 0, -1),
+}
+GREEN = (0.1, 0.8, 0.2, 1.0)
+
+
+class RangeFinderData(PyTree):
+    """Measurements of the range finders, and their rays."""
+
+    distance: Array = leaf("drone", 1)
+    """Distance along each ray, m; ``max_range`` where nothing is nearer. (n_worlds, n_drones, n_rays)"""
+    direction: Array = leaf("shared", 2)
+    """Unit directions of the rays, body frame. (n_rays, 3)"""
+    max_range: Array = leaf("shared", 0)
+    """Largest distance measured, m. ()"""
+
+
+class RangeFinder(Plugin):
+    """Rays from the centre of mass of every drone that measure distances.
+
+    A ray ignores its own drone, and rods and cables of loads, which are thin. Other drones have the shapes that they
+    collide with.
+    """
+
+    MULTI_RANGER: ClassVar[Mapping[str, tuple[int, int, int]]] = MULTI_RANGER
+    """Directions of a multi-ranger deck by name, body frame."""
+
+    directions: ArrayLike = parameter(default=None)
+    """Directions, body frame, of any length; None for ``MULTI_RANGER``. (n_rays, 3)"""
+    max_range: float = parameter(default=4.0)
+    """Largest distance measured, m."""
+    freq: int | None = None
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    drones: bool = False
+    """True to measure distances to other drones too, in a stage of one world."""
+    visible: bool = False
+    """True to draw the rays into images."""
+    name: str = "range_finder"
+
+    def record(self, sim: Simulation) -> RangeFinderData:
+        """Return rays that have measured nothing."""
+        rays = np.asarray(list(MULTI_RANGER.values()) if self.directions is None else self.directions, np.float64)
+        if rays.ndim != 2 or rays.shape[1] != 3 or not np.isfinite(rays).all() or not rays.any(axis=-1).all():
+            raise ConfigError(f"expected directions as vectors (n_rays, 3), none of them zero, got {rays.tolist()}")
+        if not self.max_range > 0:
+            raise ConfigError(f"expected max_range to be positive, in m, got {self.max_range}")
+        self._period(sim)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        far = float(self.max_range)
+        distance = np.full((sim.n_worlds, sim.n_drones, len(rays)), far)
+        return RangeFinderData(on_device(distance), on_device(rays), on_device(far))
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that measures, of one drone, or of one world if drones or loads are to be measured."""
+        visual, solid = sim.scene.visual_model, sim.scene.collision_model
+        placed = placed_by(sim.scene.plugins(), [body.name for body in visual.objects])
+        touched = {body.name for body in solid.objects}
+        objects = tuple(body for body in visual.objects if body.name in touched or body.name not in placed)
+        # The outline of a drone is enough for a few rays.
+        model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
+        placed = {name: plugin for name, plugin in placed.items() if name in touched}
+        scope = "world" if self.drones or placed else "drone"
+        period = self._period(sim)
+        when = None if period == 1 else lambda data: data.core.steps % period == 0
+
+        def measure(data: SimData) -> SimData:
+            """Measure distances, to loads where they are now."""
+            present = {name: plugin for name, plugin in placed.items() if plugin.name in data.plugins}
+            return self.write(data, self._measured(model, place(data, present), scope == "world"))
+
+        return [Placement(Stage(measure, scope, when), before="increment_steps")]
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the distances, m."""
+        return {"distance": self.read(data).distance}
+
+    def draw(self, sim: Simulation, world: int) -> None:
+        """Draw the rays up to what they met."""
+        if not self.visible:
+            return
+        record, states = self.read(sim.data), sim.data.states
+        start = np.asarray(states.pos[world])[:, None]
+        direction = rotation.rotate(states.quat[world][:, None], record.direction)
+        end = start + np.asarray(record.distance[world])[..., None] * np.asarray(direction)
+        for points in np.stack(np.broadcast_arrays(start, end), axis=-2).reshape(-1, 2, 3):
+            sim.scene.renderer.overlays.line(points, GREEN, 2.0, 2.0)
+
+    def _period(self, sim: Simulation) -> int:
+        """Return the number of steps between measurements."""
+        steps = sim.data.core.freq
+        return 1 if self.freq is None else steps // dividing_rate(f"freq of {self.name!r}", self.freq, steps)
+
+    def _measured(self, model: CollisionModel, data: SimData, of_world: bool) -> RangeFinderData:
+        """Return the record with the distances of one drone, or of one world."""
+        record, states = self.read(data), data.states
+        pos, quat = (states.pos, states.quat) if of_world else (states.pos[None], states.quat[None])
+        direction = rotation.rotate(quat[:, None], record.direction)
+        n_rays = direction.shape[1]
+        origin = jnp.broadcast_to(pos[:, None], direction.shape)
+        own = np.repeat(np.arange(direction.shape[0]), n_rays) if self.drones else None
+        hits = cast(model, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, self.drones)
+        distance = jnp.minimum(hits.distance, record.max_range).reshape(direction.shape[:2])
+        return record.replace(distance=distance if of_world else distance[0])

@@ -1,0 +1,181 @@
+"""Cars in the scene: bodies, wheels that roll and steer, and trailers, as objects that follow the dynamics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import Objects
+from crazysim.core.plugin import Simulation
+from crazysim.core.settings import as_rgba
+from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle
+from crazysim.plugins.vehicles.state import ackermann, heading_quat, tilted
+from crazysim.plugins.vehicles.trailer import trailer_axles
+
+BODY, DARK, STEEL = (0.1, 0.35, 0.75, 1.0), (0.08, 0.08, 0.08, 1.0), (0.6, 0.6, 0.65, 1.0)
+RUBBER, WOOD = (0.16, 0.16, 0.16, 1.0), (0.7, 0.6, 0.35, 1.0)
+"""Colours of bodies, rims, spokes, tyres and decks."""
+TOUCHES, GHOST = 'contype="0" conaffinity="2"', 'contype="0" conaffinity="0"'
+"""Attributes of geoms that drones touch, and of others."""
+SPOKES = 5
+"""Spokes of a wheel, which make its rotation visible."""
+
+
+def kinds(cars: Any) -> tuple[str, ...]:
+    """Return the names of the objects of cars, without their numbers."""
+    parts = ("body", "wheel", "drawbar", "trailer", "trailer_wheel") if cars.trailer else ("body", "wheel")
+    return tuple(_kind(cars, part) for part in parts)
+
+
+def _kind(cars: Any, part: str) -> str:
+    """Return the name of the objects of a part; those of bodies begin with the names of cars."""
+    return cars.name if part == "body" else f"{cars.name}_{part}"
+
+
+def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
+    """Add the objects of cars to the scene, if they are not there yet."""
+    objects = sim.data.objects
+    if objects is not None and f"{_kind(cars, 'body')}:0" in objects.names:
+        return
+    number, n = vehicle.number, cars.n_members
+    wheel = _wheel(number("wheels.radius"), number("wheels.width"))
+    parts = {"body": (_body(vehicle, as_rgba(BODY if cars.rgba is None else cars.rgba)), n)}
+    parts["wheel"] = (wheel, n * len(wheel_places(vehicle)))
+    if cars.trailer:
+        length, small = number("trailer.drawbar"), _wheel(number("trailer.wheel_radius"), number("trailer.wheel_width"))
+        parts["drawbar"] = (_drawbar(length, number("trailer.track")), n)
+        parts["trailer"] = (_deck(vehicle), n)
+        parts["trailer_wheel"] = (small, 4 * n)
+    for part, (geoms, count) in parts.items():
+        sim.scene.add(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", _kind(cars, part), count=count)
+
+
+def wheel_places(vehicle: VehicleModel) -> np.ndarray:
+    """Return the places of the wheels in the body frame, front left, front right, rear left, rear right, m. (n, 2)"""
+    front, rear = vehicle.number("axles.front"), -vehicle.number("axles.rear")
+    half = vehicle.number("axles.track") / 2
+    sides = (half, -half) if vehicle.number("wheels.number") == 4 else (0.0,)
+    return np.array([(x, y) for x in (front, rear) for y in sides])
+
+
+def with_poses(objects: Objects, cars: Any, car: Any) -> Objects:
+    """Return the objects of a world with those of its cars at their poses.
+
+    Args:
+        objects: Objects of the world.
+        cars: The population.
+        car: Its record, for one world. Leaves (n_members, ...)
+    """
+    vehicle = load_vehicle(cars.vehicle)
+    rows = {"body": (car.pos, car.quat), "wheel": _wheels(vehicle, car)}
+    if cars.trailer:
+        rows |= _trailers(vehicle, car)
+    pos, turned = objects.pos, objects.quat
+    for part, (at, attitude) in rows.items():
+        where = np.array([objects.names.index(f"{_kind(cars, part)}:{k}") for k in range(at.shape[0])])
+        pos = pos.at[where].set(at.astype(pos.dtype))
+        turned = turned.at[where].set(attitude.astype(turned.dtype))
+    return objects.replace(pos=pos, quat=turned)
+
+
+def _wheels(vehicle: VehicleModel, car: Any) -> tuple[Array, Array]:
+    """Return positions, m, and attitudes of all wheels; a wheel's axis is its y axis. (n_members n_wheels, ...)"""
+    places = wheel_places(vehicle)
+    shape = (car.pos.shape[0], len(places))
+    body = jnp.broadcast_to(car.quat[:, None], (*shape, 4))
+    pos = car.pos[:, None] + rotation.rotate(body, jnp.asarray(np.pad(places, ((0, 0), (0, 1))), car.pos.dtype))
+    front = ackermann(car.steer, vehicle.wheelbase, vehicle.number("axles.track"))[:, : len(places) // 2]
+    steer = jnp.concatenate([front, jnp.zeros_like(front)], axis=-1)[..., None]
+    rolled = _rolled(jnp.broadcast_to((car.distance / vehicle.number("wheels.radius"))[:, None], steer.shape))
+    quat = rotation.multiply(body, rotation.multiply(heading_quat(steer), rolled))
+    return pos.reshape(-1, 3), quat.reshape(-1, 4)
+
+
+def _trailers(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]:
+    """Return positions, m, and attitudes of drawbars, decks and wheels of trailers, on the plane below their cars."""
+    number = vehicle.number
+    radius, half = number("trailer.wheel_radius"), number("trailer.track") / 2
+    bar, deck = (tilted(car.joints[:, k : k + 1], car.normal) for k in range(2))
+    front, rear = (_above_plane(x, car, radius - number("wheels.radius")) for x in trailer_axles(car.state, car.params))
+    turn = _rolled(car.distance / radius)
+    wheels = []
+    for at, attitude in ((front, bar), (rear, deck)):
+        for side in (half, -half):
+            offset = rotation.rotate(attitude, jnp.asarray([0.0, side, 0.0], at.dtype))
+            wheels.append((at + offset, rotation.multiply(attitude, turn)))
+    pos, quat = (jnp.stack(x, axis=1) for x in zip(*wheels, strict=True))
+    wheel = (pos.reshape(-1, 3), quat.reshape(-1, 4))
+    return {"drawbar": (front, bar), "trailer": (front, deck), "trailer_wheel": wheel}
+
+
+def _above_plane(at: Array, car: Any, height: float) -> Array:
+    """Return places, (n, 2), at a height above the plane through the cars' centres of mass, m. (n, 3)"""
+    off, normal = at - car.pos[:, :2], car.normal
+    rise = -(normal[:, :1] * off[:, :1] + normal[:, 1:2] * off[:, 1:]) / normal[:, 2:]
+    return jnp.concatenate([at, car.pos[:, 2:] + rise + height], axis=-1)
+
+
+def _rolled(angle: Array) -> Array:
+    """Return the rotation about y by an angle, (..., 1), as a quaternion, xyzw. (..., 4)"""
+    zero = jnp.zeros_like(angle)
+    return jnp.concatenate([zero, jnp.sin(angle / 2), zero, jnp.cos(angle / 2)], axis=-1)
+
+
+def _geom(kind: str, size: Any, pos: Any, rgba: Any, bits: str, more: str = "") -> str:
+    text = " ".join(f"{float(x):.6g}" for x in size), " ".join(f"{float(x):.6g}" for x in pos)
+    colour = " ".join(f"{float(x):.3g}" for x in rgba)
+    return f'<geom type="{kind}" size="{text[0]}" pos="{text[1]}" rgba="{colour}" {bits} {more}/>'
+
+
+def _body(vehicle: VehicleModel, rgba: Any) -> str:
+    """Return geoms of a car in the frame of its centre of mass: a plate, a hood, a cabin with a flat roof, bumpers."""
+    length, width, height = (vehicle.number(f"shape.{x}") / 2 for x in ("length", "width", "height"))
+    front, floor = vehicle.number("axles.front"), 0.02
+    if vehicle.number("wheels.number") != 4:
+        return _geom("box", (length, width / 2, height * 2), (0, 0, 0), rgba, TOUCHES)
+    inner = min(width, vehicle.number("axles.track") / 2 - vehicle.number("wheels.width") / 2 - 0.005)
+    roof = (height - floor / 2, 0.12 * length, floor + height)
+    return (
+        _geom("box", (length * 0.92, inner, floor), (0, 0, 0), rgba, TOUCHES)
+        + _geom("box", (length * 0.45, inner * 0.8, roof[0]), (-roof[1], 0, 2 * height - roof[0]), rgba, TOUCHES)
+        + _geom("box", (length * 0.2, inner * 0.7, floor / 2), (front - length * 0.12, 0, 1.5 * floor), rgba, GHOST)
+        + _geom("box", (0.008, width * 0.85, floor), (length - 0.008, 0, 0), DARK, TOUCHES)
+        + _geom("box", (0.008, width * 0.85, floor), (0.008 - length, 0, 0), DARK, TOUCHES)
+    )
+
+
+def _wheel(radius: float, width: float) -> str:
+    """Return geoms of a wheel whose axis is y: a tyre, a rim and spokes."""
+    axis, reach = 'zaxis="0 1 0"', 0.29 * radius
+    rim = _geom("cylinder", (0.6 * radius, width / 2 + 0.0008), (0, 0, 0), DARK, GHOST, axis)
+    spokes = ""
+    for angle in np.arange(SPOKES) * 2 * np.pi / SPOKES:
+        at, turn = (reach * np.cos(angle), 0, -reach * np.sin(angle)), (np.cos(angle / 2), np.sin(angle / 2))
+        quat = f'quat="{turn[0]:.6g} 0 {turn[1]:.6g} 0"'
+        spokes += _geom("box", (reach, width / 2 + 0.0016, 0.06 * radius), at, STEEL, GHOST, quat)
+    return _geom("cylinder", (radius, width / 2), (0, 0, 0), RUBBER, TOUCHES, axis) + rim + spokes
+
+
+def _drawbar(length: float, track: float) -> str:
+    """Return geoms of a drawbar and the axle behind it, in the frame of the axle's middle."""
+    bar = _geom("box", (length / 2, 0.004, 0.004), (length / 2, 0, 0), DARK, GHOST)
+    return bar + _geom("box", (0.0075, track / 2, 0.0075), (0, 0, 0), DARK, TOUCHES)
+
+
+def _deck(vehicle: VehicleModel) -> str:
+    """Return geoms of the deck of a trailer with its rear axle, in the frame of the middle of its front axle."""
+    size, centre = vehicle.value("trailer.deck") / 2, vehicle.value("trailer.deck_centre")
+    axles, track = vehicle.number("trailer.axle_distance"), vehicle.number("trailer.track")
+    posts = "".join(
+        _geom("cylinder", (0.008, centre[2] / 2), (x, 0, centre[2] / 2), DARK, GHOST) for x in (0.0, -axles)
+    )
+    return (
+        _geom("box", size, centre, WOOD, TOUCHES)
+        + _geom("box", (axles / 2 + 0.025, track / 2 - 0.025, 0.0025), (-axles / 2, 0, 0.014), STEEL, GHOST)
+        + _geom("box", (0.0075, track / 2, 0.0075), (-axles, 0, 0), DARK, TOUCHES)
+        + posts
+    )

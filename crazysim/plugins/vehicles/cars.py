@@ -1,0 +1,267 @@
+"""Cars: a population of ground vehicles, driven by commands or along paths."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import Objects, SimData
+from crazysim.core.plugin import Placement, Simulation, parameter
+from crazysim.core.population import Population
+from crazysim.core.settings import default_rates
+from crazysim.core.stage import Stage, tick
+from crazysim.dynamics.models import GRAVITY
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.ground import TerrainData, ground_at
+from crazysim.plugins.vehicles import appearance, starts
+from crazysim.plugins.vehicles.car_data import CarData
+from crazysim.plugins.vehicles.following import PathController, PurePursuit, motor_reference, path_state
+from crazysim.plugins.vehicles.kinematic import kinematic
+from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle
+from crazysim.plugins.vehicles.parameters import CarParams
+from crazysim.plugins.vehicles.path import Path
+from crazysim.plugins.vehicles.single_track import single_track
+from crazysim.plugins.vehicles.state import to_body
+from crazysim.pytree import PyTree, on_device
+from crazysim.trajectories import Trajectory
+
+CONTROL_FREQ = 50
+"""Default rate of the controllers, Hz, lowered to the next divisor of the simulation's rate."""
+SPEED_GAIN = 4.0
+"""Acceleration over the error of speed at the command level ``speed``, 1/s."""
+SETTLING = 0.02
+"""Time in which height and tilt of a car follow the ground, s: that of stiff springs."""
+
+
+class Cars(Population):
+    """Cars, driven by commands, or along paths by a controller, on level ground or on terrain.
+
+    Commands are held until they change: at the level ``drive`` the motor reference and the steering angle, at ``speed``
+    the speed and the steering angle. With a path the cars need no commands. On terrain the dynamics are those of level
+    ground with the pull of the slope; height and tilt follow the ground. Wheels do not leave it.
+    """
+
+    members: int | Sequence[str] = 1
+    """Number of cars in each world, or their names."""
+    vehicle: Any = "f1tenth_ros"
+    """Vehicle model, as for ``load_vehicle``."""
+    pos: Any = parameter(default=None)
+    """Positions at the start, x and y, m; None for the start of the path, or a row along y with gaps of 1 m.
+    (2,), (n_members, 2) or (n_worlds, n_members, 2)"""
+    yaw: Any = parameter(default=None)
+    """Headings at the start, rad; None for that of the path, or zero. (), (n_members,) or (n_worlds, n_members)"""
+    level: Literal["drive", "speed"] = "drive"
+    """Command level of cars without a path."""
+    path: Any = None
+    """Path, trajectory, or a sequence of them to follow; None to drive by commands."""
+    controller: PathController | None = None
+    """Controller that follows paths; None for ``PurePursuit()``."""
+    reference: Literal["time", "arc"] = "time"
+    """``time`` to keep to the timing of the path; ``arc`` to drive at the speed of the place where the car is."""
+    index: Any = parameter(default=None)
+    """Number of the path of each car; None for car i path i modulo their number. () or (n_worlds, n_members)"""
+    start: Any = parameter(default=None)
+    """Time at which a car is at the start of its path, s; None for zero, and at equal intervals for the cars of one
+    closed path. () or (n_worlds, n_members)"""
+    trailer: bool = False
+    """True for cars that tow a trailer."""
+    rate: int | None = None
+    """Rate of the controller, Hz, a divisor of the simulation's rate; None for the largest one up to 50 Hz."""
+    rgba: Any = None
+    """Colour; None for the default. (4,)"""
+    in_scene: bool = True
+    """True to put the cars into the scene, where they are drawn and reported as contacts of drones."""
+    name: str = "cars"
+    prefix: ClassVar[str] = "Fleet1Tenth"
+    positions: ClassVar[tuple[str, ...]] = ("pos", "yaw", "distance")
+    command_field: ClassVar[str | None] = "command"
+
+    def with_poses(self, record: CarData, pos: Array, quat: Array) -> CarData:
+        """Return a record with other positions and headings; trailers stand straight behind."""
+        yaw = rotation.yaw(quat)[..., None]
+        joints = None if record.joints is None else jnp.broadcast_to(yaw, record.joints.shape)
+        return record.replace(pos=pos, yaw=yaw, joints=joints)
+
+    @property
+    def control_freq(self) -> int | None:
+        """Rate of the controller, Hz."""
+        return self.rate
+
+    @property
+    def model(self) -> VehicleModel:
+        """The vehicle model."""
+        return load_vehicle(self.vehicle)
+
+    @property
+    def follows(self) -> PathController | None:
+        """The path controller, or None."""
+        if self.path is None:
+            return None
+        return PurePursuit() if self.controller is None else self.controller
+
+    def rate_in(self, freq: int) -> int:
+        """Return the rate of the controller in a simulation of a rate, Hz."""
+        if self.rate is not None:
+            return self.rate
+        return default_rates(freq, {"rate": CONTROL_FREQ}, f" of {self.name!r}")["rate"]
+
+    def record(self, sim: Simulation) -> CarData:
+        """Return the cars at rest at their starts."""
+        self.check(sim)
+        vehicle, freq, counts = self.model, sim.data.core.freq, (sim.n_worlds, self.n_members)
+        self._check_settings(vehicle)
+        paths, follows = self._paths(), self.follows
+        index = start = arc = gains = memory = None
+        params = CarParams.create(vehicle, freq, self.trailer)
+        pos, yaw = starts.in_a_row(self.n_members), np.zeros((self.n_members, 1))
+        if paths is not None and follows is not None:
+            follows.check(vehicle, paths)
+            index = starts.numbers("index", self._indices(paths), counts, paths.n_paths)
+            given = starts.spread(paths, index, self.n_members) if self.start is None else self.start
+            start = starts.numbers("start", given, counts)
+            pos, yaw, arc = starts.on_path(paths, index, start, counts)
+            gains, memory = follows.gains(vehicle, params, self.rate_in(freq)), follows.memory()
+        if self.pos is not None:
+            pos = starts.per_member("pos", self.pos, counts, (2,))
+        if self.yaw is not None:
+            yaw = starts.per_member("yaw", np.asarray(self.yaw, float)[..., None], counts, (1,))
+        pos, yaw = (np.broadcast_to(x, (*counts, x.shape[-1])) for x in (pos, yaw))
+        if arc is not None and self.pos is not None:
+            arc = starts.projected(paths, index, pos, arc)
+        height, normal = ground_at(sim.data, on_device(np.concatenate([pos, pos[..., :1]], axis=-1)))
+        z = np.asarray(height) + vehicle.number("wheels.radius")
+        zero = np.zeros((*counts, 1))
+        two, three = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)
+        if self.in_scene:
+            appearance.add_to_scene(sim, self, vehicle)
+        held = self.level == "drive" and follows is None
+        return self.create(
+            sim,
+            CarData,
+            pos=np.concatenate([pos, z], axis=-1),
+            yaw=yaw,
+            body_vel=two,
+            yaw_rate=zero,
+            normal=np.asarray(normal),
+            steer=zero,
+            distance=zero,
+            joints=np.concatenate([yaw, yaw], axis=-1) if self.trailer else None,
+            command=two,
+            applied=None if held else two,
+            force=three,
+            torque=three,
+            params=params,
+            path=paths,
+            index=index,
+            start=start,
+            arc=arc,
+            memory=_for_members(memory, counts),
+            gains=gains,
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages of controller and integration; commands of the level ``drive`` need no controller."""
+        placed = [x for x in Population.stages(self, sim) if x.name != f"{self.name}_control"]
+        if self.follows is None and self.level == "drive":
+            return placed
+        name, when = f"{self.name}_control", functools.partial(tick, freq=self.rate_in(sim.data.core.freq))
+        return [Placement(Stage(self._controlled, self.name, when, name=name), name=name), *placed]
+
+    def control(self, data: SimData) -> CarData:
+        """Return the record of one car with motor reference and steering angle for the next period."""
+        car = self.read(data)
+        follows = self.follows
+        if follows is None:
+            acc = SPEED_GAIN * (car.command[:1] - car.body_vel[:1])
+            drive = motor_reference(car.command[:1], acc, car.params)
+            return car.replace(applied=jnp.concatenate([drive, car.command[1:]]))
+        time = data.core.steps / data.core.freq - car.start[0] if self.reference == "time" else None
+        at = path_state(car.state, car.path, car.index[0], car.arc, follows.ahead(car.params), time)
+        applied, memory = follows.update(car.state, at, car.memory, car.gains, car.params)
+        return car.replace(applied=applied, arc=at.arc, memory=memory)
+
+    def derivative(self, data: SimData) -> Mapping[str, Array]:
+        """Return the rates of the states of one car."""
+        car = self.read(data)
+        model = kinematic if self.model.dynamics == "kinematic" else single_track
+        command = car.command if car.applied is None else car.applied
+        force, settling = car.force[:2], {}
+        if any(isinstance(record, TerrainData) for record in data.plugins.values()):
+            force = force - GRAVITY[2] * car.params.mass * car.normal[2:] * car.normal[:2]
+            settling = self._settling(data, car)
+        push = jnp.concatenate([to_body(car.yaw, force), car.torque[2:]])
+        rates = model(car.state, command, car.params, push)._asdict() | settling
+        return {name: rate for name, rate in rates.items() if rate is not None}
+
+    def _settling(self, data: SimData, car: CarData) -> dict[str, Array]:
+        """Return the rates of position and normal of one car that follows terrain."""
+        height, normal = ground_at(data, car.pos)
+        vel, rate = car.vel, 1 / max(SETTLING, 2 / data.core.freq)
+        climb = -(normal[:1] * vel[:1] + normal[1:2] * vel[1:2]) / normal[2:]
+        sink = rate * (height + self.model.number("wheels.radius") - car.pos[2:])
+        return {"pos": jnp.concatenate([vel[:2], climb + sink]), "normal": rate * (normal - car.normal)}
+
+    def place(self, data: SimData) -> Objects:
+        """Return the objects of a world with the cars' bodies, wheels and trailers at their poses."""
+        return appearance.with_poses(data.objects, self, self.read(data))  # type: ignore[arg-type]
+
+    @property
+    def placed_kinds(self) -> tuple[str, ...] | None:
+        """Names of the objects that ``place`` moves, without their numbers."""
+        return appearance.kinds(self)
+
+    @property
+    def places(self) -> bool:
+        """True if the cars are in the scene."""
+        return self.in_scene
+
+    def _check_settings(self, vehicle: VehicleModel) -> None:
+        """Check settings that are not numbers.
+
+        Raises:
+            ConfigError: If one is invalid.
+        """
+        for name, allowed in (("level", ("drive", "speed")), ("reference", ("time", "arc"))):
+            if getattr(self, name) not in allowed:
+                raise ConfigError(f"expected {name} of {self.name!r} as one of {allowed}, got {getattr(self, name)!r}")
+        if self.controller is not None and self.path is None:
+            raise ConfigError(f"expected a path for the controller of {self.name!r}, got none. Use Cars(path=...).")
+        if self.controller is not None and not isinstance(self.controller, PathController):
+            raise ConfigError(f"expected a PathController, got {self.controller!r}. Use controller=PurePursuit().")
+        if self.trailer and not vehicle.has_trailer:
+            raise ConfigError(f"expected a vehicle with a table [trailer], got {vehicle.name!r}. Use 'aiml_head'.")
+
+    def _paths(self) -> Path | None:
+        """Return all paths in one record."""
+        if self.path is None:
+            return None
+        given = [self.path] if isinstance(self.path, (Path, Trajectory)) else self.path
+        if not isinstance(given, Sequence) or not all(isinstance(x, (Path, Trajectory)) for x in given):
+            raise ConfigError(
+                f"expected a Path, a Trajectory or a sequence of them, got {self.path!r}. Use "
+                f"Path.of_points([(0, 0), (1, 0), (2, 1)])."
+            )
+        return Path.stack([Path.of_trajectory(x) if isinstance(x, Trajectory) else x for x in given])
+
+    def _indices(self, paths: Path) -> Any:
+        return np.arange(self.n_members) % paths.n_paths if self.index is None else self.index
+
+
+def _for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTree | None:
+    """Return a record of one member repeated for all."""
+    return None if record is None else jax.tree.map(lambda x: np.array(np.broadcast_to(x, (*counts, *x.shape))), record)
+
+
+class Bicycles(Cars):
+    """Bicycles of AIMotionLab-Virtual: the motor reference is the torque of the rear wheel, N m; no steering."""
+
+    vehicle: Any = "bicycle"
+    name: str = "bicycles"
+    prefix: ClassVar[str] = "Bicycle"

@@ -1,0 +1,233 @@
+"""The protocol of controllers that follow paths, and the part that all have in common: errors and speed."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar, NamedTuple, dataclass_transform
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.errors import ConfigError
+from crazysim.plugins.vehicles.model import VehicleModel
+from crazysim.plugins.vehicles.parameters import CarParams
+from crazysim.plugins.vehicles.path import Path
+from crazysim.plugins.vehicles.state import CarState, to_world
+from crazysim.pytree import PyTree
+from crazysim.rotation import safe_arctan2, safe_clip
+
+
+class PathState(NamedTuple):
+    """A vehicle relative to its path at one instant.
+
+    Offset, heading error and curvature are those of the path along the direction in which the vehicle points:
+    of a path that is driven backwards, against its direction.
+    """
+
+    path: Path
+    """The paths."""
+    index: Array
+    """Number of the vehicle's path. ()"""
+    arc: Array
+    """Arc length of the projection of the vehicle, m. (1,)"""
+    offset: Array
+    """Distance of the projected point of the vehicle from the path, m, positive to the left of it. (1,)"""
+    heading_error: Array
+    """Heading relative to that of the path, rad, from -pi to pi, positive to the left. (1,)"""
+    curvature: Array
+    """Signed curvature of the path, 1/m. (1,)"""
+    speed: Array
+    """Reference speed, m/s; negative backwards. (1,)"""
+    lag: Array
+    """Distance by which the vehicle is behind a reference by time, m, positive if it has to go faster in the direction
+    in which it points; zero for a reference by arc length. (1,)"""
+
+    @property
+    def direction(self) -> Array:
+        """1 forwards and -1 backwards. (1,)"""
+        return jnp.where(self.speed < 0, -1.0, 1.0)
+
+
+def path_state(state: CarState, path: Path, index: Array, guess: Array, ahead: Array, time: Array | None) -> PathState:
+    """Return where a vehicle is relative to its path.
+
+    Args:
+        state: State of the vehicle.
+        path: Paths.
+        index: Number of its path. ()
+        guess: Arc length near its projection, m. (1,)
+        ahead: Distance from the centre of mass to the point of the vehicle that is projected, forwards, m. (1,)
+        time: Time since the start for a reference by time, s; None for one by arc length. ()
+    """
+    heading = jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
+    at = state.pos[:2] + ahead * heading
+    arc = path.project(index, at, guess[0])
+    point = path.at(index, arc)
+    backwards = path.speed_at(index, jnp.zeros_like(arc)) < 0
+    sign = jnp.where(backwards, -1.0, 1.0)
+    tangent, off = sign * point.tangent, at - point.pos
+    cross = tangent[0] * heading[1] - tangent[1] * heading[0]
+    dot = tangent[0] * heading[0] + tangent[1] * heading[1]
+    if time is None:
+        speed, lag = path.speed_at(index, (arc - sign * ahead)[0]), jnp.zeros_like(guess)
+    else:
+        reference, speed = path.time_reference(index, time)
+        lag = sign * (reference - arc) + ahead  # of the centre of mass
+    return PathState(
+        path=path,
+        index=index,
+        arc=arc[None],
+        offset=(tangent[0] * off[1] - tangent[1] * off[0])[None],
+        heading_error=safe_arctan2(cross, dot)[None],
+        curvature=sign * point.curvature,
+        speed=speed,
+        lag=lag,
+    )
+
+
+def motor_reference(speed: Array, acc: Array, car: CarParams) -> Array:
+    """Return the motor reference that holds a speed and accelerates from it, on level ground. (..., 1)
+
+    Args:
+        speed: Speed, m/s. (..., 1)
+        acc: Acceleration, m/s^2. (..., 1)
+        car: Parameters of the vehicle.
+    """
+    sign = speed / jnp.sqrt(speed * speed + car.slip_speed * car.slip_speed)
+    damping, friction = car.drive[..., 1:2] + car.rolling[..., :1], car.drive[..., 2:] + car.rolling[..., 1:]
+    force = (car.mass + car.towed_mass) * acc + damping * speed + friction * sign
+    return force / car.drive[..., :1]
+
+
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(dataclasses.field,))
+class PathController:
+    """Base class of controllers that follow paths, with the speed control that they share.
+
+    A subclass lists its settings as annotated fields with defaults and overrides ``steering``; it becomes a frozen
+    dataclass. Its methods are pure and written for one vehicle.
+    """
+
+    backwards: ClassVar[bool] = True
+    """True if it can drive backwards."""
+    position_gain: float = 4.0
+    """Acceleration over the distance from a reference by time, 1/s^2."""
+    speed_gain: float = 4.0
+    """Acceleration over the error of speed, 1/s."""
+    reference_max: float = 0.25
+    """Largest motor reference."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Make every subclass a frozen dataclass."""
+        super().__init_subclass__(**kwargs)
+        dataclasses.dataclass(frozen=True, eq=False)(cls)
+
+    def check(self, vehicle: VehicleModel, path: Path) -> None:
+        """Check that the controller suits vehicle and path.
+
+        Raises:
+            ConfigError: If it does not.
+        """
+        name = type(self).__name__
+        if path.goes_backwards and not self.backwards:
+            raise ConfigError(
+                f"expected a path that {name} can drive forwards, got negative speeds. Use PurePursuit() or PathLQR()."
+            )
+        if not vehicle.number("steering.angle_max") > 0:
+            raise ConfigError(f"expected a vehicle that steers for {name}, got {vehicle.name!r}, which cannot")
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if isinstance(value, (int, float)) and not 0 <= value < float("inf"):
+                raise ConfigError(f"expected {field.name} of {name} to be at least zero and finite, got {value!r}")
+
+    def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> PyTree | None:
+        """Return gains in a record of leaves of scope ``shared`` or ``parameter``, or None.
+
+        Args:
+            vehicle: The vehicle.
+            car: Its parameters.
+            freq: Rate of the controller, Hz.
+        """
+        return None
+
+    def memory(self) -> PyTree | None:
+        """Return the memory of one vehicle at the start, in a record of leaves of scope ``member``, or None."""
+        return None
+
+    def ahead(self, car: CarParams) -> Array:
+        """Return the distance from the centre of mass to the point of the vehicle that follows the path, m. (1,)"""
+        return jnp.zeros_like(car.front)
+
+    def steering(self, state: CarState, at: PathState, memory: Any, gains: Any, car: CarParams) -> tuple[Array, Any]:
+        """Return the steering angle, rad (1,), and the memory.
+
+        Args:
+            state: State of the vehicle.
+            at: The vehicle relative to its path.
+            memory: Memory.
+            gains: Gains.
+            car: Parameters of the vehicle.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not define steering")
+
+    def driving(self, state: CarState, at: PathState, gains: Any, car: CarParams) -> Array:
+        """Return the motor reference that follows the reference speed, and the position of one by time. (1,)"""
+        acc = self.position_gain * at.lag + self.speed_gain * (at.speed - state.body_vel[:1])
+        return motor_reference(at.speed, acc, car)
+
+    def update(self, state: CarState, at: PathState, memory: Any, gains: Any, car: CarParams) -> tuple[Array, Any]:
+        """Return motor reference and steering angle, rad (2,), and the memory."""
+        steer, memory = self.steering(state, at, memory, gains, car)
+        drive = safe_clip(self.driving(state, at, gains, car), -self.reference_max, self.reference_max)
+        return jnp.concatenate([drive, safe_clip(steer, -car.steer_max, car.steer_max)]), memory
+
+
+class PurePursuit(PathController):
+    """Pure pursuit: the rear axle drives on the circle to a point ahead on the path.
+
+    ``tan(d) = L 2 y / (x^2 + y^2)`` with the wheelbase L and the point (x, y) seen from the rear axle, also backwards.
+    Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm", 1992. It cuts corners by about the square of
+    the look-ahead distance times the curvature over 6, and needs no gains.
+    """
+
+    lookahead: float = 0.3
+    """Look-ahead distance at standstill, m."""
+    lookahead_time: float = 0.25
+    """Growth of the look-ahead distance with speed, s."""
+
+    def ahead(self, car: CarParams) -> Array:
+        """Return the distance to the rear axle."""
+        return -car.rear
+
+    def steering(self, state: CarState, at: PathState, memory: Any, gains: Any, car: CarParams) -> tuple[Array, Any]:
+        """Return the steering angle."""
+        distance = self.lookahead + self.lookahead_time * jnp.abs(state.body_vel[0])
+        goal = at.path.at(at.index, at.arc[0] + distance).pos
+        axle = state.pos[:2] - car.rear * jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
+        seen = to_world(-state.yaw, goal - axle)
+        square = seen[:1] * seen[:1] + seen[1:] * seen[1:]
+        # Past the end of an open path the point is that end, as near as one likes.
+        curvature = 2 * seen[1:] / jnp.maximum(square, 0.25 * self.lookahead * self.lookahead + 1e-4)
+        return jnp.arctan((car.front + car.rear) * curvature), memory
+
+
+class Stanley(PathController):
+    """Stanley's law: the front wheels point along the path, and to it in proportion to the front axle's offset.
+
+    ``d = -heading_error - arctan(k offset / (v_0 + v))`` (Hoffmann, Tomlin, Montemerlo and Thrun, "Autonomous
+    Automobile Trajectory Tracking for Off-Road Driving", 2007). Forwards only.
+    """
+
+    backwards: ClassVar[bool] = False
+    gain: float = 2.5
+    """Gain k, 1/s."""
+    soft_speed: float = 0.5
+    """Speed v_0 that is added, so that slow vehicles steer gently, m/s."""
+
+    def ahead(self, car: CarParams) -> Array:
+        """Return the distance to the front axle."""
+        return car.front
+
+    def steering(self, state: CarState, at: PathState, memory: Any, gains: Any, car: CarParams) -> tuple[Array, Any]:
+        """Return the steering angle."""
+        speed = self.soft_speed + jnp.abs(state.body_vel[:1])
+        return -at.heading_error - jnp.arctan(self.gain * at.offset / speed), memory

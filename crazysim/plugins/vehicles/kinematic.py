@@ -1,0 +1,41 @@
+"""Dynamics of a vehicle whose wheels roll without slip: the kinematic bicycle."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from crazysim.plugins.vehicles.parameters import CarParams
+from crazysim.plugins.vehicles.single_track import drive_force, rates_of, steer_rate
+from crazysim.plugins.vehicles.state import CarState
+
+RETURN = 50.0
+"""Rate at which velocities that no rolling wheels allow decrease, 1/s."""
+
+
+def kinematic(state: CarState, command: Array, params: CarParams, push: Array | None = None) -> CarState:
+    """Return the time derivative of the state of a vehicle that rolls without slip.
+
+    The yaw rate is ``w = v_x tan(d) / L`` and the velocity of the centre of mass to the left ``l_r w`` (Rajamani,
+    "Vehicle Dynamics and Control", 2012, section 2.2). Along the vehicle the drive, limited by the grip, and external
+    forces accelerate it; those across it are taken by the wheels.
+
+    Args:
+        state: State.
+        command: Motor reference, 1, and steering angle, rad. (..., 2)
+        params: Parameters.
+        push: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None for
+            none. (..., 3)
+    """
+    p, speed, wheelbase = params, state.body_vel[..., :1], params.front + params.rear
+    drive, grip = drive_force(command[..., :1], speed, p), p.grip[..., :1] + p.grip[..., 1:]
+    force = drive * lax.rsqrt(1 + drive * drive / (grip * grip))
+    if push is not None:
+        force = force + push[..., :1]
+    forward = force / p.mass
+    tan, turn = jnp.tan(state.steer), steer_rate(state, command, p)
+    yaw_rate = speed * tan / wheelbase
+    yaw_acc = (forward * tan + speed * turn * (1 + tan * tan)) / wheelbase
+    side = p.rear * yaw_acc + RETURN * (p.rear * yaw_rate - state.body_vel[..., 1:])
+    acc = jnp.concatenate([forward, side], axis=-1)
+    return rates_of(state, acc, yaw_acc + RETURN * (yaw_rate - state.yaw_rate), turn, p)

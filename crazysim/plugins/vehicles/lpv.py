@@ -1,0 +1,116 @@
+"""The lab's gain-scheduled path controller: polynomials of speed, with the sign of the curvature."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.plugins.vehicles.following import PathController, PathState
+from crazysim.plugins.vehicles.model import VehicleModel
+from crazysim.plugins.vehicles.parameters import CarParams
+from crazysim.plugins.vehicles.state import CarState
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import safe_arctan2, safe_clip
+
+LATERAL = {
+    "aiml_apr24": ((0.00127, -0.00864, 0.0192, 0.0159), (0.172, -1.17, 2.59, 2.14), (0.00423, 0.0948, 0.463, 0.00936)),
+    "aiml_head": ((0.00127, -0.00864, 0.0192, 0.0159), (0.172, -1.17, 2.59, 5.14), (0.00423, 0.0948, 0.463, 0.00936)),
+}
+"""Gains of integral, offset and its rate as polynomials of the speed, highest power first. Sources:
+AIMotionLab-Virtual, commit ea392436, aiml_virtual/controller/car_controller.py, and commit fc1bc3e0,
+aiml_virtual/controller/car_lpv_controller.py."""
+LONGITUDINAL = ((0.0010, -0.0132, 0.4243), (-0.0044, 0.0563, 0.0959))
+"""Gains of distance and speed as polynomials of the model's parameter p, highest power first. Sources: the same."""
+RATE, INTEGRAL_MAX, SMOOTHING = 40, 0.1, 0.5
+"""Rate of the controller for which the integral's gain is, Hz, limit of the integral, m, and weight of the newest
+difference in the rate of the offset. Sources: the same."""
+
+
+class LPVGains(PyTree):
+    """Gains of ``LPV``."""
+
+    feedforward: Array = leaf("parameter", 1, (1,))
+    """Steering angle over signed curvature, rad m. (1,)"""
+    period: Array = leaf("parameter", 1, (1,))
+    """Period of the controller, s. (1,)"""
+
+
+class LPVMemory(PyTree):
+    """Memory of ``LPV``."""
+
+    integral: Array = leaf("member", 1)
+    """Sum of the offsets at the ticks, scaled to ``RATE``, m. (n_worlds, n_members, 1)"""
+    offset: Array = leaf("member", 1)
+    """Offset at the last tick, m. (n_worlds, n_members, 1)"""
+    rate: Array = leaf("member", 1)
+    """Smoothed rate of the offset, m/s. (n_worlds, n_members, 1)"""
+    started: Array = leaf("member", 1)
+    """One after the first tick, zero before. (n_worlds, n_members, 1)"""
+
+
+class LPV(PathController):
+    """Linear parameter-varying control of AIMotionLab's cars: gains that are polynomials of the speed.
+
+    With e the distance of the path to the left of the car, its sum q and its smoothed rate, at forward speed v:
+
+        steer = -heading_error + k1(v) q + k2(v) e + k3(v) e' + f curvature
+
+    Along the path, with ``p = |cos(heading_error + slip) / cos(slip) / (1 - curvature offset)|`` and the lag l behind a
+    reference by time, the motor reference is that of speed ``v_ref / p``, plus ``kl1(p) l + kl2(p) (v_ref / p - v)``.
+
+    Gains and feed-forward f are published (``LATERAL``, ``LONGITUDINAL``). The lab's curvature has no sign, which
+    steers the wrong way in one direction of turning; here it has. Forwards only, for the F1TENTH cars.
+    """
+
+    backwards: ClassVar[bool] = False
+    lateral: Any = LATERAL["aiml_head"]
+    """Gains k1, k2, k3 as polynomials of the speed, highest power first."""
+    longitudinal: Any = LONGITUDINAL
+    """Gains kl1, kl2 as polynomials of p, highest power first."""
+
+    def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> LPVGains:
+        """Return the gains; the feed-forward is ``(m / C_f) (1 - (l_r C_r - l_f C_f) / m)``."""
+        m, front, rear = (float(np.asarray(x)[0]) for x in (car.mass, car.front, car.rear))
+        stiff_front, stiff_rear = (float(x) for x in np.asarray(car.stiffness))
+        feedforward = m / stiff_front * (1 - (rear * stiff_rear - front * stiff_front) / m) if stiff_front else 0.0
+        return LPVGains(as_parameter(feedforward), as_parameter(1 / freq))
+
+    def memory(self) -> LPVMemory:
+        """Return the memory before the first tick."""
+        return LPVMemory(*[as_parameter(0.0) for _ in range(4)])
+
+    def steering(
+        self, state: CarState, at: PathState, memory: LPVMemory, gains: LPVGains, car: CarParams
+    ) -> tuple[Array, LPVMemory]:
+        """Return the steering angle."""
+        right, speed = -at.offset, state.body_vel[:1]
+        integral = safe_clip(memory.integral + RATE * gains.period * right, -INTEGRAL_MAX, INTEGRAL_MAX)
+        newest = (right - memory.offset) / gains.period
+        rate = memory.started * (memory.rate + SMOOTHING * (newest - memory.rate))
+        terms = (integral, right, rate)
+        feedback = sum(polynomial(c, speed) * x for c, x in zip(self.lateral, terms, strict=True))
+        steer = -at.heading_error + feedback + gains.feedforward * at.curvature
+        return steer, LPVMemory(integral, right, rate, jnp.ones_like(memory.started))
+
+    def driving(self, state: CarState, at: PathState, gains: LPVGains, car: CarParams) -> Array:
+        """Return the motor reference."""
+        vx, vy = state.body_vel[:1], state.body_vel[1:]
+        slip = safe_arctan2(vy, jnp.abs(vx))
+        room = jnp.maximum(1 - at.curvature * at.offset, 0.2)
+        p = jnp.maximum(jnp.abs(jnp.cos(at.heading_error + slip)) / (jnp.cos(slip) * room), 0.2)
+        speed = at.speed / p
+        sign = speed / jnp.sqrt(speed * speed + car.slip_speed * car.slip_speed)
+        hold = (car.drive[1:2] * speed + car.drive[2:] * sign) / car.drive[:1]
+        by_lag, by_speed = (polynomial(c, p) for c in self.longitudinal)
+        return hold + by_lag * at.lag + by_speed * (speed - vx)
+
+
+def polynomial(coefficients: Any, x: Array) -> Array:
+    """Return a polynomial, highest power first, at x. (...)"""
+    value = jnp.full_like(x, coefficients[0])
+    for c in coefficients[1:]:
+        value = value * x + c
+    return value

@@ -1,0 +1,215 @@
+"""Vehicle models: loading the constants of a ground vehicle from a TOML file or a dict, with checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError, UnknownNameError, shown
+from crazysim.storage import is_file, read_toml
+from crazysim.tables import (
+    INERTIA,
+    LARGEST,
+    LENGTH,
+    MASS,
+    MAYBE_LENGTH,
+    NOT_NEGATIVE,
+    PLACE,
+    POSITIVE,
+    UNLIMITED,
+    Key,
+    Range,
+    as_numbers,
+    check_numbers,
+    extended,
+)
+
+FOLDER = Path(__file__).parent
+GUIDE = "docs/guides/vehicles.md"
+DYNAMICS = ("single_track", "kinematic")
+"""Names of the dynamics of vehicles."""
+
+_SIZE, _MAYBE_SIZE = Key(((),), LENGTH), Key(((),), MAYBE_LENGTH)
+_POSITIVE, _NOT_NEGATIVE, _UNLIMITED = (Key(((),), found) for found in (POSITIVE, NOT_NEGATIVE, UNLIMITED))
+_DRIVE = Key(((3,),), Range("a positive gain, then damping and friction of at least zero", (1 / LARGEST, 0.0, 0.0)))
+
+KEYS: dict[str, Key] = {
+    "rigid_body.mass": Key(((),), MASS),
+    "rigid_body.yaw_inertia": Key(((),), INERTIA),
+    "axles.front": _SIZE,
+    "axles.rear": _SIZE,
+    "axles.track": _MAYBE_SIZE,
+    "axles.kingpin_track": _MAYBE_SIZE,
+    "wheels.number": Key(((),), Range("from 1 to 100", 1.0, 100.0)),
+    "wheels.mass": Key(((),), Range("from 0 to 1e6 kg", 0.0, MASS.high)),
+    "wheels.radius": _SIZE,
+    "wheels.width": _MAYBE_SIZE,
+    "wheels.armature": _NOT_NEGATIVE,
+    "wheels.friction_loss": _NOT_NEGATIVE,
+    "wheels.damping": _NOT_NEGATIVE,
+    "tyres.front": _POSITIVE,
+    "tyres.rear": _POSITIVE,
+    "tyres.friction": _POSITIVE,
+    "drive.torque": _DRIVE,
+    "drive.torque_max": _UNLIMITED,
+    "drive.force": _DRIVE,
+    "drive.force_max": _UNLIMITED,
+    "drive.front_share": Key(((),), Range("from 0 to 1", 0.0, 1.0)),
+    "steering.angle_max": Key(((),), Range("from 0 to 1.5 rad, below a right angle", 0.0, 1.5)),
+    "steering.rate_max": _UNLIMITED,
+    "steering.bandwidth": _NOT_NEGATIVE,
+    "trailer.hitch": _SIZE,
+    "trailer.drawbar": _SIZE,
+    "trailer.axle_distance": _SIZE,
+    "trailer.track": _SIZE,
+    "trailer.wheel_radius": _SIZE,
+    "trailer.wheel_width": _SIZE,
+    "trailer.mass": Key(((),), MASS),
+    "trailer.deck": Key(((3,),), LENGTH),
+    "trailer.deck_centre": Key(((3,),), PLACE),
+    "shape.length": _SIZE,
+    "shape.width": _SIZE,
+    "shape.height": _SIZE,
+}
+"""Shapes and ranges of all numbers, by table and key."""
+OPTIONAL = ("tyres.front", "tyres.rear", "drive.", "trailer.")
+"""Beginnings of the keys that a vehicle may lack; ``drive`` needs its force or its torque."""
+TOP_LEVEL = ("name", "base", "model", "sources")
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleModel:
+    """Constants of a ground vehicle, as plain numbers in SI units."""
+
+    name: str
+    """Name: the key ``name``, or else the file's stem; ``custom`` for a dict without one."""
+    dynamics: str
+    """Dynamics of the vehicle, one of ``DYNAMICS``."""
+    numbers: Mapping[str, NDArray[np.float64]]
+    """All numbers by table and key, such as ``rigid_body.mass``."""
+
+    def value(self, key: str) -> NDArray[np.float64]:
+        """Return one number or array by its table and key, such as ``rigid_body.mass``.
+
+        Raises:
+            ConfigError: If the vehicle has none.
+        """
+        if key not in self.numbers:
+            raise ConfigError(f"vehicle {self.name!r} has no value {key!r}. Add it; {GUIDE} lists all keys.")
+        return self.numbers[key]
+
+    def number(self, key: str) -> float:
+        """Return one number by its table and key."""
+        return float(self.value(key))
+
+    @property
+    def has_trailer(self) -> bool:
+        """True if the vehicle has the numbers of a trailer."""
+        return "trailer.hitch" in self.numbers
+
+    @property
+    def wheelbase(self) -> float:
+        """Distance of the axles, m."""
+        return self.number("axles.front") + self.number("axles.rear")
+
+    def __repr__(self) -> str:
+        """Return the name alone; the tables are long."""
+        return f"VehicleModel({self.name!r})"
+
+
+def vehicle_names() -> tuple[str, ...]:
+    """Return the names of the built-in vehicle models."""
+    return tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
+
+
+def load_vehicle(source: str | Path | Mapping[str, Any] | VehicleModel) -> VehicleModel:
+    """Return the vehicle model of a name, a TOML file anywhere on disk, or a dict of the same tables.
+
+    A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. With
+    the key ``base``, the name or path of another vehicle, only the numbers that differ from it are given.
+
+    Args:
+        source: Name of a built-in vehicle, path of a ``.toml`` file, dict, or a vehicle model (returned as is).
+
+    Raises:
+        UnknownNameError: If the source is neither the name of a vehicle nor a file.
+        ConfigError: If a table or key does not exist, or the numbers cannot be those of a vehicle.
+    """
+    return _load(source, ())
+
+
+def _load(source: Any, bases: tuple[str, ...]) -> VehicleModel:
+    """Return the vehicle model of a source, which is the base of others."""
+    if isinstance(source, VehicleModel):
+        return source
+    bases = extended(bases, source)
+    name, tables = ("custom", dict(source)) if isinstance(source, Mapping) else _read(source)
+    name = str(tables.get("name", name))
+    base = _load(tables["base"], bases) if "base" in tables else None
+    numbers = dict(base.numbers) if base is not None else {}
+    own = dict(_numbers(name, {key: table for key, table in tables.items() if key not in TOP_LEVEL}))
+    for kind, other in (("torque", "force"), ("force", "torque")):
+        if f"drive.{kind}" in own:
+            numbers = {key: x for key, x in numbers.items() if not key.startswith(f"drive.{other}")}
+    dynamics = tables.get("model", base.dynamics if base is not None else DYNAMICS[0])
+    vehicle = VehicleModel(name, dynamics, numbers | own)
+    _check(vehicle)
+    return vehicle
+
+
+def _read(source: Any) -> tuple[str, Mapping[str, Any]]:
+    """Return the name of a vehicle and its tables."""
+    if not isinstance(source, (str, Path)):
+        raise ConfigError(
+            f"expected a vehicle as a name, the path of a TOML file, a dict or a VehicleModel, got {shown(source)}"
+        )
+    path = FOLDER / f"{source}.toml" if str(source) in vehicle_names() else Path(source)
+    if not is_file(path):
+        raise UnknownNameError(
+            f"expected a vehicle as one of {', '.join(vehicle_names())}, the path of a .toml file, or a dict, got "
+            f"{shown(str(source))}, and no file of that path exists"
+        )
+    return path.stem, read_toml(path, GUIDE)
+
+
+def _numbers(name: str, node: Any, prefix: str = "") -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Yield the key and the value of every number, and check that the key exists."""
+    for key, item in node.items():
+        path = f"{prefix}{key}"
+        is_table = isinstance(item, Mapping) and not prefix
+        if is_table and any(known.startswith(f"{path}.") for known in KEYS):
+            yield from _numbers(name, item, f"{path}.")
+            continue
+        if path not in KEYS:
+            near = get_close_matches(path, KEYS, n=3) or [k for k in KEYS if k.rpartition(".")[2] == key]
+            hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
+            raise ConfigError(f"vehicle {name!r}: expected a key that exists, got {path!r}. {hint}{GUIDE} lists all.")
+        yield path, as_numbers(f"vehicle {name!r}", path, item)
+
+
+def _check(vehicle: VehicleModel) -> None:
+    """Check that the numbers are those of a vehicle that can drive."""
+    name, numbers = vehicle.name, vehicle.numbers
+    if vehicle.dynamics not in DYNAMICS:
+        raise ConfigError(
+            f"vehicle {name!r}: expected model as one of {', '.join(DYNAMICS)}, got {shown(vehicle.dynamics)}"
+        )
+    tyres = ("tyres.front", "tyres.rear") if vehicle.dynamics == "single_track" else ()
+    trailer = tuple(key for key in KEYS if key.startswith("trailer.")) if vehicle.has_trailer else ()
+    needed = [key for key in KEYS if not key.startswith(OPTIONAL)]
+    missing = [key for key in (*needed, *tyres, *trailer) if key not in numbers]
+    if missing:
+        raise ConfigError(
+            f"vehicle {name!r}: expected {', '.join(missing)}, which it lacks. Add them, or start from another vehicle "
+            f"with base = 'aiml_head'. {GUIDE} lists all keys."
+        )
+    if ("drive.torque" in numbers) == ("drive.force" in numbers):
+        raise ConfigError(f"vehicle {name!r}: expected either drive.torque or drive.force, got both or neither")
+    for key, value in numbers.items():
+        check_numbers(f"vehicle {name!r}", key, value, KEYS[key])

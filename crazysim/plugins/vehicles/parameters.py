@@ -1,0 +1,127 @@
+"""Parameters of the dynamics of a ground vehicle, from the constants of its model."""
+
+from __future__ import annotations
+
+import math
+
+from jax import Array
+
+from crazysim.dynamics.models import GRAVITY, RINGING
+from crazysim.errors import ConfigError
+from crazysim.plugins.vehicles.model import VehicleModel
+from crazysim.pytree import PyTree, as_parameter, leaf
+
+SLIP_SPEED = 0.1
+"""Least speed below which the forces of tyres and dry friction decrease to zero at standstill, m/s."""
+
+
+class CarParams(PyTree):
+    """Parameters of a ground vehicle with two axles, each shared or one per vehicle."""
+
+    mass: Array = leaf("parameter", 1, (1,))
+    """Mass of the vehicle with its wheels, kg. (1,)"""
+    yaw_inertia: Array = leaf("parameter", 1, (1,))
+    """Moment of inertia about the vertical axis through the centre of mass, kg m^2. (1,)"""
+    front: Array = leaf("parameter", 1, (1,))
+    """Distance of the front axle from the centre of mass, m. (1,)"""
+    rear: Array = leaf("parameter", 1, (1,))
+    """Distance of the rear axle from the centre of mass, m. (1,)"""
+    stiffness: Array = leaf("parameter", 1, (2,))
+    """Cornering stiffness of front and rear axle at small slip angles, N/rad. (2,)"""
+    grip: Array = leaf("parameter", 1, (2,))
+    """Largest horizontal force of front and rear axle, N. (2,)"""
+    drive: Array = leaf("parameter", 1, (3,))
+    """Force of the drive per motor reference, N, its decrease with speed, N s/m, and its dry friction, N. (3,)"""
+    drive_max: Array = leaf("parameter", 1, (1,))
+    """Largest force of the drive, N. (1,)"""
+    front_share: Array = leaf("parameter", 1, (1,))
+    """Share of the drive's force that acts on the front axle, 1. (1,)"""
+    rolling: Array = leaf("parameter", 1, (2,))
+    """Resistance of the wheels: increase with speed, N s/m, and dry friction, N. (2,)"""
+    towed_mass: Array = leaf("parameter", 1, (1,))
+    """Mass that the drive accelerates besides the vehicle's: a trailer, and J / r^2 of wheels and motors, kg. (1,)"""
+    steer_max: Array = leaf("parameter", 1, (1,))
+    """Largest steering angle, rad. (1,)"""
+    steer_rate_max: Array = leaf("parameter", 1, (1,))
+    """Largest rate of the steering angle, rad/s. (1,)"""
+    steer_bandwidth: Array = leaf("parameter", 1, (1,))
+    """Rate at which the steering angle approaches its command, 1/s. (1,)"""
+    slip_speed: Array = leaf("parameter", 1, (1,))
+    """Speed below which the forces of tyres and dry friction decrease to zero at standstill, m/s. (1,)"""
+    trailer: Array | None = leaf("parameter", 1, (3,))
+    """Distance of the hitch behind the centre of mass, length of the drawbar, distance of the axles of the trailer, m;
+    None without a trailer. (3,)"""
+
+    @staticmethod
+    def create(vehicle: VehicleModel, freq: int, trailer: bool = False) -> CarParams:
+        """Return the shared parameters of a vehicle model.
+
+        The grip of an axle is its static load times the friction coefficient; load transfer is neglected.
+
+        Args:
+            vehicle: The vehicle model.
+            freq: Rate of the physics, Hz: at rates too low for tyres at ``SLIP_SPEED``, ``slip_speed`` is larger.
+            trailer: True if the vehicle tows its trailer.
+
+        Raises:
+            ConfigError: If the vehicle lacks a number, or stops within a step.
+        """
+        number = vehicle.number
+        n, wheel_mass, radius = number("wheels.number"), number("wheels.mass"), number("wheels.radius")
+        front, rear, half_track = number("axles.front"), number("axles.rear"), number("axles.track") / 2
+        mass = number("rigid_body.mass") + n * wheel_mass
+        # Uniform cylinders: m (3 r^2 + w^2) / 12 about a diameter, m r^2 / 2 about the axis.
+        upright = wheel_mass * (3 * radius**2 + number("wheels.width") ** 2) / 12
+        arms = wheel_mass * (half_track**2 + (front**2 + rear**2) / 2)
+        yaw_inertia = number("rigid_body.yaw_inertia") + n * (upright + arms)
+        spin = number("wheels.armature") + wheel_mass * radius**2 / 2
+        axle_loads = [-GRAVITY[2] * mass * x / (front + rear) for x in (rear, front)]
+        kinematic = vehicle.dynamics == "kinematic"
+        stiffness = [0.0, 0.0] if kinematic else [number("tyres.front"), number("tyres.rear")]
+        moments = front**2 * stiffness[0] + rear**2 * stiffness[1]
+        # The fastest rate of lateral motion is at most this over the speed; times the step it stays below 1.
+        rate = max(sum(stiffness) / mass, moments / yaw_inertia)
+        drive, drive_max = drive_constants(vehicle)
+        slip_speed = max(SLIP_SPEED, rate / freq)
+        rolling = [n * number("wheels.damping") / radius**2, n * number("wheels.friction_loss") / radius]
+        towed_mass = n * spin / radius**2 + (number("trailer.mass") if trailer else 0.0)
+        damping = (drive[1] + rolling[0]) / (mass + towed_mass)
+        if damping > RINGING * freq:
+            raise ConfigError(
+                f"expected damping of vehicle {vehicle.name!r} to be slow for steps of 1/{freq} s, got {damping:.4g} "
+                f"1/s. Use freq={math.ceil(damping / RINGING)} or more, or less damping of the drive and the wheels."
+            )
+        return CarParams(
+            mass=as_parameter(mass),
+            yaw_inertia=as_parameter(yaw_inertia),
+            front=as_parameter(front),
+            rear=as_parameter(rear),
+            stiffness=as_parameter(stiffness),
+            grip=as_parameter([number("tyres.friction") * load for load in axle_loads]),
+            drive=as_parameter(drive),
+            drive_max=as_parameter(drive_max),
+            front_share=as_parameter(vehicle.value("drive.front_share")),
+            rolling=as_parameter(rolling),
+            towed_mass=as_parameter(towed_mass),
+            steer_max=as_parameter(vehicle.value("steering.angle_max")),
+            steer_rate_max=as_parameter(vehicle.value("steering.rate_max")),
+            steer_bandwidth=as_parameter(min(number("steering.bandwidth"), freq)),
+            slip_speed=as_parameter(slip_speed),
+            trailer=as_parameter([number(f"trailer.{x}") for x in ("hitch", "drawbar", "axle_distance")])
+            if trailer
+            else None,
+        )
+
+
+def drive_constants(vehicle: VehicleModel) -> tuple[list[float], float]:
+    """Return gain, N, damping, N s/m, and friction, N, of the force of the whole drive, and its limit, N.
+
+    Published forces are those of one axle, of two; published torques are those of one driven wheel.
+    """
+    share = vehicle.number("drive.front_share")
+    if "drive.force" in vehicle.numbers:
+        factor, kind = 2.0, "force"
+    else:
+        driven = vehicle.number("wheels.number") / (2 if share in (0, 1) else 1)
+        factor, kind = driven / vehicle.number("wheels.radius"), "torque"
+    return (factor * vehicle.value(f"drive.{kind}")).tolist(), factor * vehicle.number(f"drive.{kind}_max")

@@ -1,0 +1,369 @@
+"""Paths on the ground: curves by arc length with signed curvature, projection onto them, and their timing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, floating, leaf
+from crazysim.rotation import safe_clip
+from crazysim.trajectories import interpolation
+from crazysim.trajectories.piece_table import PieceTable
+from crazysim.trajectories.splines import spline
+from crazysim.trajectories.trajectory import Trajectory
+
+SPACING = 0.1
+"""Largest length of a piece of a path, m."""
+MAX_PIECES = 100_000
+"""Most pieces of a path."""
+SAMPLES = 8193
+"""Samples of a curve from which its arc length is measured, by the trapezoidal rule."""
+N_TIMES = 257
+"""Samples of the arc length over time."""
+NEWTON_STEPS = 2
+"""Newton steps of a projection, which begins where the tick before ended."""
+REACH = 0.5
+"""Largest displacement in one Newton step, m."""
+STOPPING = 0.5
+"""Length before the end of an open path in which a reference by arc length slows down, m."""
+SLOWEST = 0.1
+"""Least speed of a reference by arc length, as a share of the path's largest: one must leave a start at rest."""
+STRAIGHT_RATE = 0.05
+"""Rate of a curve, of its largest, below which its path is straight."""
+REPEATED = 12
+"""Points of a closed path that are repeated on both sides, so that its spline is smooth where it closes."""
+
+Floats = NDArray[np.float64]
+
+
+class PathPoint(NamedTuple):
+    """A path at one arc length."""
+
+    pos: Array
+    """Position, world frame, m. (2,)"""
+    tangent: Array
+    """Unit tangent in the direction of increasing arc length. (2,)"""
+    curvature: Array
+    """Signed curvature, 1/m, positive where the path turns to the left. (1,)"""
+
+
+class Path(PyTree):
+    """Curves on the ground by arc length with their timing: one, or several in slots.
+
+    Each piece is a polynomial of degree 5 that has the curve's position, tangent and curvature at both ends, so that
+    the curvature is continuous. All pieces of a path have the same length.
+    """
+
+    coefficients: Array = leaf("shared", 4)
+    """Coefficients of x and y, m, in each piece, constant term first, of the share of the piece's length. Padding
+    repeats the last piece. (n_paths, n_pieces, 2, 6)"""
+    length: Array = leaf("shared", 1)
+    """Length of each path, m. (n_paths,)"""
+    spacing: Array = leaf("shared", 1)
+    """Length of the pieces of each path, m. (n_paths,)"""
+    closed: Array = leaf("shared", 1)
+    """True where a path ends at its start. (n_paths,)"""
+    speeds: Array = leaf("shared", 2)
+    """Speed at the start of each piece, m/s; negative to drive backwards. (n_paths, n_pieces)"""
+    progress: Array = leaf("shared", 3)
+    """Arc length, m, and its rate, m/s, at equally spaced times from start to end. (n_paths, n_times, 2)"""
+    duration: Array = leaf("shared", 1)
+    """Time from start to end, s. (n_paths,)"""
+
+    @staticmethod
+    def of_trajectory(trajectory: Trajectory, backwards: bool = False) -> Path:
+        """Return the path and the timing of a trajectory, of which x and y count; closed if the trajectory repeats.
+
+        Args:
+            trajectory: Trajectory of one vehicle.
+            backwards: True to drive along it backwards.
+
+        Raises:
+            ConfigError: If the path has no length, stops on its way, or repeats without ending at its start.
+        """
+        pieces = PieceTable.of([trajectory])
+
+        def curve(t: Floats, order: int) -> Floats:
+            return pieces.at(np.zeros(len(t), int), t, order)[:, :2]
+
+        times = np.linspace(0.0, pieces.duration, SAMPLES)
+        speed = np.hypot(*curve(times, 1).T)
+        table = np.linspace(0.0, pieces.duration, N_TIMES)
+        arc = _arc_length(times, speed)
+        progress = np.stack([np.interp(table, times, arc), np.hypot(*curve(table, 1).T)], axis=1)
+        return _of_curve(curve, times, speed, progress, bool(np.asarray(trajectory.repeats)), backwards)
+
+    @staticmethod
+    def of_points(points: ArrayLike, speed: float = 1.0, closed: bool = False) -> Path:
+        """Return the smoothest path through points, at a constant speed.
+
+        It is the spline of degree 5 over the length of the chords.
+
+        Args:
+            points: Points, x and y, world frame, m; of a closed path without the first one again. (n_points, 2)
+            speed: Speed, m/s; negative to drive backwards.
+            closed: True for a path that ends at its start.
+
+        Raises:
+            ConfigError: If there are fewer than three points, two neighbours are equal, or the speed is zero.
+        """
+        xy = np.asarray(points, float)
+        if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < 3 or not np.all(np.isfinite(xy)):
+            raise ConfigError(
+                f"expected at least three points (n_points, 2), finite, got shape {xy.shape}. Use "
+                f"Path.of_points([(0, 0), (1, 0), (2, 1)])."
+            )
+        if not np.isfinite(speed) or speed == 0:
+            raise ConfigError(
+                f"expected a speed other than zero, m/s, got {speed!r}. Use speed=1.0, or a negative one to reverse."
+            )
+        if closed:
+            xy = xy[np.arange(-REPEATED, len(xy) + REPEATED + 1) % len(xy)]
+        chords = np.hypot(*np.diff(xy, axis=0).T)
+        if not np.all(chords > 0):
+            raise ConfigError(
+                f"expected points that differ from their neighbours, got {xy[np.argmin(chords)].tolist()} twice. Leave "
+                f"one out; a closed path does not repeat its first point."
+            )
+        knots = np.concatenate([[0.0], np.cumsum(chords)])
+        trajectory = spline(knots, np.pad(xy, ((0, 0), (0, 1))), at_rest=False)
+        begin, end = (knots[REPEATED], knots[-1 - REPEATED]) if closed else (0.0, knots[-1])
+        pieces = PieceTable.of([trajectory])
+
+        def curve(t: Floats, order: int) -> Floats:
+            return pieces.at(np.zeros(len(t), int), t, order)[:, :2]
+
+        times = np.linspace(begin, end, SAMPLES)
+        rate = np.hypot(*curve(times, 1).T)
+        length = _arc_length(times, rate)[-1]
+        progress = np.stack([np.linspace(0.0, length, N_TIMES), np.full(N_TIMES, abs(speed))], axis=1)
+        return _of_curve(curve, times, rate, progress, closed, speed < 0, abs(speed))
+
+    @staticmethod
+    def stack(paths: Sequence[Path]) -> Path:
+        """Return the slots of several records as one record.
+
+        Raises:
+            ConfigError: If there is none.
+        """
+        if not paths:
+            raise ConfigError("expected at least one path, got none. Use Path.stack([Path.of_points(points)]).")
+        n = max(path.n_pieces for path in paths)
+        padded = []
+        for path in paths:
+            more = n - path.n_pieces
+            last = np.repeat(path.coefficients[:, -1:], more, axis=1)
+            coefficients = np.concatenate([path.coefficients, last], axis=1)
+            speeds = np.concatenate([path.speeds, np.repeat(path.speeds[:, -1:], more, axis=1)], axis=1)
+            padded.append(path.replace(coefficients=coefficients, speeds=speeds))
+        fields = ("coefficients", "length", "spacing", "closed", "speeds", "progress", "duration")
+        joined: dict[str, Any] = {name: np.concatenate([getattr(path, name) for path in padded]) for name in fields}
+        return Path(**joined)
+
+    @property
+    def n_paths(self) -> int:
+        """Number of paths."""
+        return self.coefficients.shape[0]
+
+    @property
+    def n_pieces(self) -> int:
+        """Largest number of pieces of a path."""
+        return self.coefficients.shape[1]
+
+    @property
+    def goes_backwards(self) -> bool:
+        """True if a path is driven backwards; on the host."""
+        return bool(np.any(np.asarray(self.speeds) < 0))
+
+    def at(self, index: Any, s: Array) -> PathPoint:
+        """Return a path at an arc length; a closed one continues from its start, an open one stays at its ends.
+
+        Args:
+            index: Number of the path. ()
+            s: Arc length, m. ()
+        """
+        piece, u = self._locate(index, s)
+        return _evaluate(_take(self.coefficients, index, piece), u)
+
+    def speed_at(self, index: Any, s: Array) -> Array:
+        """Return the speed at an arc length, m/s; it decreases to zero before the end of an open path. (1,)"""
+        piece, _ = self._locate(index, s)
+        rest = safe_clip((_take(self.length, index) - s) / STOPPING, 0.0, 1.0)
+        share = jnp.where(_take(self.closed, index), 1.0, rest)
+        return (share * _take(self.speeds, index, piece))[None]
+
+    def time_reference(self, index: Any, t: Array) -> tuple[Array, Array]:
+        """Return the arc length, m, and the speed, m/s, at a time; before the start and after the end at rest.
+
+        On a closed path the arc length increases with every round, and the motion continues.
+
+        Args:
+            index: Number of the path. ()
+            t: Time since the start, s. ()
+
+        Returns:
+            (1,) each
+        """
+        duration, closed = _take(self.duration, index), _take(self.closed, index)
+        rounds = jnp.where(closed, lax.floor(t / duration), 0.0)
+        local = safe_clip(t - rounds * duration, 0.0, duration)
+        step = duration / (N_TIMES - 1)
+        node = jnp.minimum(lax.floor(local / step), N_TIMES - 2.0)
+        k, u = node.astype(jnp.int32), local / step - node
+        (s0, v0), (s1, v1) = _take(self.progress, index, k), _take(self.progress, index, k + 1)
+        rise, v0, v1 = s1 - s0, v0 * step, v1 * step
+        c2, c3 = 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise  # cubic of Hermite
+        s = s0 + u * (v0 + u * (c2 + u * c3))
+        moving = (t >= 0) & (closed | (t <= duration))
+        v = jnp.where(moving, (v0 + u * (2 * c2 + 3 * u * c3)) / step, 0.0)
+        sign = jnp.where(_take(self.speeds, index, 0) < 0, -1.0, 1.0)
+        return (s + rounds * _take(self.length, index))[None], (sign * v)[None]
+
+    def project(self, index: Any, pos: Array, guess: Array) -> Array:
+        """Return the arc length of the point of a path next to a position, from a guess nearby; within a step.
+
+        Newton's method, whose steps ``(p - r) . t / (1 - curvature e)`` are limited to ``REACH``. On a closed path the
+        arc length increases with every round.
+
+        Args:
+            index: Number of the path. ()
+            pos: Position, world frame, m. (2,)
+            guess: Arc length nearby, m. ()
+
+        Returns:
+            m. ()
+        """
+        s, length, closed = guess, _take(self.length, index), _take(self.closed, index)
+        for _ in range(NEWTON_STEPS):
+            point = self.at(index, s)
+            off = pos - point.pos
+            along = off[0] * point.tangent[0] + off[1] * point.tangent[1]
+            left = point.tangent[0] * off[1] - point.tangent[1] * off[0]
+            s = s + safe_clip(along / jnp.maximum(1 - point.curvature[0] * left, 0.2), -REACH, REACH)
+            s = jnp.where(closed, s, safe_clip(s, 0.0, length))
+        return s
+
+    def nearest(self, index: int, pos: ArrayLike) -> float:
+        """Return the arc length of the point of a path next to a position, anywhere on it, on the host.
+
+        Args:
+            index: Number of the path.
+            pos: Position, world frame, m. (2,)
+        """
+        count = round(float(self.length[index]) / float(self.spacing[index]))
+        u = np.linspace(0.0, 1.0, 9)[:-1]
+        powers = u[:, None] ** np.arange(6)
+        at = np.einsum("uk,pak->pua", powers, np.asarray(self.coefficients[index][:count], float)).reshape(-1, 2)
+        k = int(np.argmin(np.sum((at - np.asarray(pos, float)[:2]) ** 2, axis=1)))
+        return k / 8 * float(self.spacing[index])
+
+    def at_time(self, index: int, start: float) -> tuple[Floats, float, float]:
+        """Return position, m (2,), heading of the vehicle, rad, and arc length, m, at time zero, on the host.
+
+        Args:
+            index: Number of the path.
+            start: Time at which the vehicle is at the start of the path, s.
+        """
+        point, arc = jax.device_get(_point_at_time(self, np.int32(index), np.asarray(-start, floating())))
+        x, y = np.asarray(point.tangent, float) * (-1 if np.asarray(self.speeds)[index, 0] < 0 else 1)
+        return np.asarray(point.pos, float), float(np.arctan2(y, x)), float(arc[0])
+
+    def _locate(self, index: Any, s: Array) -> tuple[Array, Array]:
+        """Return the piece at an arc length, and the share of its length."""
+        length, spacing = _take(self.length, index), _take(self.spacing, index)
+        wrapped = s - length * lax.floor(s / length)
+        local = jnp.where(_take(self.closed, index), wrapped, safe_clip(s, 0.0, length)) / spacing
+        piece = safe_clip(lax.floor(local), 0.0, lax.floor(length / spacing - 0.5))
+        return piece.astype(jnp.int32), local - piece
+
+
+@jax.jit
+def _point_at_time(path: Path, index: Array, t: Array) -> tuple[PathPoint, Array]:
+    """Return a point at a time since the start, s, and its arc length, m (1,)."""
+    arc, _ = path.time_reference(index, t)
+    return path.at(index, arc[0]), arc
+
+
+def _of_curve(
+    curve: Callable[[Floats, int], Floats],
+    times: Floats,
+    rate: Floats,
+    progress: Floats,
+    closed: bool,
+    backwards: bool,
+    speed: float | None = None,
+) -> Path:
+    """Return a path of one slot.
+
+    Args:
+        curve: Parameters (n,) and the order of a derivative to x and y. (n, 2)
+        times: Parameters, equally spaced. (n,)
+        rate: Length of the derivative there. (n,)
+        progress: Arc length and its rate over time. (n_times, 2)
+        closed: True for a path that ends at its start.
+        backwards: True to drive backwards.
+        speed: Speed, m/s; None for the rate.
+    """
+    arc = _arc_length(times, rate)
+    if not arc[-1] > 1e-3:
+        raise ConfigError(
+            "expected a path of some length on the ground, got one that stays where it is. Leave path out, and command "
+            "the cars, to let them stand."
+        )
+    if not arc[-1] <= MAX_PIECES * SPACING:
+        raise ConfigError(f"expected a path of at most {MAX_PIECES * SPACING:g} m, got {arc[-1]:.4g} m. Split it.")
+    moving = np.flatnonzero(rate > 1e-3 * rate.max())
+    if len(moving) != moving[-1] - moving[0] + 1:
+        stop = times[moving[0] + np.argmax(np.diff(moving) > 1)]
+        raise ConfigError(
+            f"expected a path that stops only at its ends, got one without a tangent at {stop:.3g} s. Split it there."
+        )
+    n = max(4, int(np.ceil(arc[-1] / SPACING)))
+    nodes = np.interp(np.linspace(0.0, arc[-1], n + 1), arc, times)
+    inner = np.clip(nodes, times[moving[0]], times[moving[-1]])  # at rest there is no tangent
+    pos, vel, acc = curve(nodes, 0), curve(inner, 1), curve(inner, 2)
+    if closed and not np.allclose(pos[0], pos[-1], atol=1e-3):
+        raise ConfigError(
+            f"expected a closed path that ends at its start, got a gap of {np.hypot(*(pos[0] - pos[-1])):.3g} m. Let "
+            f"the trajectory end where it starts, or not repeat."
+        )
+    size = np.hypot(*vel.T)[:, None]
+    tangent = vel / size
+    bend = (acc - np.sum(acc * tangent, axis=1, keepdims=True) * tangent) / size**2
+    bend[size[:, 0] < STRAIGHT_RATE * rate.max()] = 0.0  # near rest the curvature of a polynomial grows without bound
+    spacing = arc[-1] / n
+    derivatives = np.stack([pos, tangent, bend], axis=1)
+    coefficients = interpolation.unit_coefficients(derivatives, np.full(n, spacing))
+    speeds = np.full(n, speed) if speed is not None else np.maximum(size[:-1, 0], SLOWEST * rate.max())
+    end = progress[-1, 0] / speed if speed is not None else times[-1]
+    arrays = (coefficients, arc[-1], spacing, speeds * (-1 if backwards else 1), progress, end)
+    coefficients, length, spacing, speeds, progress, duration = (np.asarray(x, floating())[None] for x in arrays)
+    return Path(coefficients, length, spacing, np.array([closed]), speeds, progress, duration)  # type: ignore[arg-type]
+
+
+def _arc_length(times: Floats, rate: Floats) -> Floats:
+    """Return the arc length at each parameter, by the trapezoidal rule. (n,)"""
+    return np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(times))])
+
+
+def _evaluate(coefficients: Array, u: Array) -> PathPoint:
+    """Return position, tangent and curvature of a piece, (2, 6), at a share of its length. ()"""
+    x = [coefficients[:, k] for k in range(6)]
+    pos = x[0] + u * (x[1] + u * (x[2] + u * (x[3] + u * (x[4] + u * x[5]))))
+    rate = x[1] + u * (2 * x[2] + u * (3 * x[3] + u * (4 * x[4] + u * 5 * x[5])))
+    second = 2 * x[2] + u * (6 * x[3] + u * (12 * x[4] + u * 20 * x[5]))
+    inverse = lax.rsqrt(rate[0] * rate[0] + rate[1] * rate[1])
+    bend = (rate[0] * second[1] - rate[1] * second[0]) * inverse * inverse * inverse
+    return PathPoint(pos, rate * inverse, bend[None])
+
+
+def _take(x: Any, *index: Any) -> Array:
+    """Return an entry of an array; an index that is too large or too small means the last or first one."""
+    return jnp.asarray(x).at[index].get(mode="clip", wrap_negative_indices=False)

@@ -1,0 +1,126 @@
+"""A linear quadratic regulator of offset and heading, with gains for each speed from the vehicle's own model."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.typing import ArrayLike
+
+from crazysim.control.lqr import as_weights, solve_on_host
+from crazysim.control.riccati import gain_discrete
+from crazysim.plugins.vehicles.following import PathController, PathState, motor_reference
+from crazysim.plugins.vehicles.kinematic import kinematic
+from crazysim.plugins.vehicles.model import VehicleModel
+from crazysim.plugins.vehicles.parameters import CarParams
+from crazysim.plugins.vehicles.single_track import single_track
+from crazysim.plugins.vehicles.state import CarState
+from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.rotation import safe_clip
+
+SPEED_STEP, N_SPEEDS = 0.25, 24
+"""Distance of the speeds for which there are gains, m/s, and their number: the gains hold up to 6 m/s."""
+
+SQUARINGS = 14
+"""Squarings of the matrix exponential."""
+
+
+class PathLQRGains(PyTree):
+    """Gains of ``PathLQR`` over the speed."""
+
+    table: Array = leaf("shared", 3)
+    """Gains of offset, sideways velocity, heading error and yaw rate, and the steering angle over curvature, for
+    speeds from ``SPEED_STEP`` in steps of that, forwards and backwards. (2, N_SPEEDS, 5)"""
+
+
+class PathLQR(PathController):
+    """Linear quadratic regulator of a vehicle about its path, forwards and backwards.
+
+    ``steer = f curvature - K (offset, sideways velocity, heading error, yaw rate)``. At each speed the model is
+    linearised about straight driving and K minimises the weighted squares; f gives the steering angle and the sideways
+    velocity of steady cornering, at which the offset is zero.
+    """
+
+    Q: Any = (100.0, 0.1, 10.0, 0.1)
+    """Weights of offset, sideways velocity, heading error and yaw rate. (4,) or (4, 4)"""
+    R: float = 20.0
+    """Weight of the steering angle."""
+
+    def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> PathLQRGains:
+        """Return the gains, computed in float64.
+
+        Raises:
+            ConfigError: If no gain stabilises the vehicle, or a weight has another shape.
+        """
+        speeds = SPEED_STEP * np.arange(1, N_SPEEDS + 1) * np.array([[1.0], [-1.0]])
+        Q, R = as_weights("Q", self.Q, 4), as_weights("R", [self.R], 1)
+        table = solve_on_host(ROWS[vehicle.dynamics], car, speeds.ravel(), 1 / freq, Q, R)
+        return PathLQRGains(as_parameter(table.reshape(2, N_SPEEDS, 5)))
+
+    def steering(
+        self, state: CarState, at: PathState, memory: Any, gains: PathLQRGains, car: CarParams
+    ) -> tuple[Array, Any]:
+        """Return the steering angle."""
+        cell = safe_clip(jnp.abs(state.body_vel[0]) / SPEED_STEP - 1, 0.0, N_SPEEDS - 1.001)
+        k = lax.floor(cell)
+        side, node = (at.speed[0] < 0).astype(jnp.int32), k.astype(jnp.int32)
+        table = jnp.asarray(gains.table)
+        low, high = (table.at[side, node + i].get(mode="clip") for i in range(2))
+        row = low + (cell - k) * (high - low)
+        x = jnp.concatenate([at.offset, state.body_vel[1:], at.heading_error, state.yaw_rate])
+        return row[4:] * at.curvature - jnp.sum(row[:4] * x, keepdims=True), memory
+
+
+def lateral_model(model: Any, car: CarParams, speed: Array) -> tuple[Array, Array]:
+    """Return matrices A (4, 4) and B (4, 1) of offset, sideways velocity, heading and yaw rate at a speed, m/s. ()"""
+    reference = motor_reference(speed[None], jnp.zeros(1, speed.dtype), car)
+
+    def rates(x: Array, steer: Array) -> Array:
+        zero = jnp.zeros(1, x.dtype)
+        pos, vel = jnp.stack([x[0] * 0, x[0], x[0] * 0]), jnp.stack([speed, x[1]])
+        state = CarState(pos, x[2:3], vel, x[3:], steer, zero)
+        rate = model(state, jnp.concatenate([reference, steer]), car)
+        return jnp.concatenate([rate.pos[1:2], rate.body_vel[1:], rate.yaw, rate.yaw_rate])
+
+    x, steer = jnp.zeros(4, speed.dtype), jnp.zeros(1, speed.dtype)
+    return jax.jacfwd(rates)(x, steer), jax.jacfwd(rates, argnums=1)(x, steer)
+
+
+def lateral_gains(model: Any, car: CarParams, speed: Array, period: ArrayLike, Q: Array, R: Array) -> Array:
+    """Return the gain of the regulator at a speed and the feed-forward of curvature. (5,)"""
+    A, B = lateral_model(model, car, speed)
+    block = jnp.zeros((5, 5), A.dtype).at[:4, :4].set(A).at[:4, 4:].set(B)
+    held = exponential(block * period)  # the input is held for a period
+    K = gain_discrete(held[:4, :4], held[:4, 4:], Q, R)[0]
+    # Steady cornering of curvature 1: the yaw rate is the speed, and sideways velocity and steering angle balance it.
+    # Of vehicles without slip the two equations are multiples of the tangent of the steering angle, and still regular.
+    rows = jnp.array([1, 3])
+    balance = jnp.stack([A[rows, 1], B[rows, 0]], axis=1)
+    side, steer = jnp.linalg.solve(balance, -A[rows, 3] * speed)
+    steady = jnp.stack([jnp.zeros_like(speed), side, -side / speed, speed])
+    return jnp.concatenate([K, (steer + K @ steady)[None]])
+
+
+def _rows(model: Any, car: CarParams, speeds: Array, period: Array, Q: Array, R: Array) -> Array:
+    """Return ``lateral_gains`` at several speeds. (n, 5)"""
+    return jax.vmap(lambda speed: lateral_gains(model, car, speed, period, Q, R))(speeds)
+
+
+ROWS = {"kinematic": functools.partial(_rows, kinematic), "single_track": functools.partial(_rows, single_track)}
+"""``lateral_gains`` at several speeds, by the vehicle's dynamics: one function for all vehicles, compiled once."""
+
+
+def exponential(matrix: Array) -> Array:
+    """Return the exponential of a small matrix, by a Taylor polynomial of order 6 and squaring. (n, n)
+
+    In float64 its relative error is below 1e-12 for norms up to 100.
+    """
+    eye, small = jnp.eye(len(matrix), dtype=matrix.dtype), matrix / 2**SQUARINGS
+    found = eye
+    for k in range(6, 0, -1):
+        found = eye + small @ found / k
+    return lax.fori_loop(0, SQUARINGS, lambda _, x: x @ x, found)

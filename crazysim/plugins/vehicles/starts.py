@@ -1,0 +1,123 @@
+"""Starts of cars: in a row, at given positions, or along their paths."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.plugins.vehicles.path import Path
+from crazysim.pytree import floating
+
+GAP = 1.0
+"""Distance between neighbours that start in a row, m."""
+
+
+def in_a_row(n: int) -> NDArray[Any]:
+    """Return positions in a row along y around the origin, m. (n, 2)"""
+    return np.stack([np.zeros(n), GAP * (np.arange(n) - (n - 1) / 2)], axis=1)
+
+
+def per_member(name: str, value: Any, counts: tuple[int, int], core: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return positions or headings for all cars, or for each, checked. (..., *core)
+
+    Args:
+        name: Name of the setting, for errors.
+        value: Positions, m, or headings, rad.
+        counts: Numbers of worlds and of cars.
+        core: Shape for one car.
+
+    Raises:
+        ConfigError: If it has another shape or is not finite.
+    """
+    array = np.asarray(value, float)
+    shapes, finite = [core, (counts[1], *core), (*counts, *core)], np.all(np.isfinite(array))
+    if array.shape not in shapes or not finite:
+        raise ConfigError(
+            f"expected {name} as finite numbers of shape {' or '.join(map(str, shapes))} = (n_worlds, n_members, ...), "
+            f"got shape {array.shape}{'' if finite else ' with NaN or infinity'}. Use one value for "
+            f"all cars, or one for each."
+        )
+    return array
+
+
+def numbers(name: str, value: Any, counts: tuple[int, int], n: int | None = None) -> NDArray[Any]:
+    """Return a number for all cars, (1,), or for each, (n_worlds, n_members, 1).
+
+    Args:
+        name: Name of the setting, for errors.
+        value: Number or numbers.
+        counts: Numbers of worlds and of cars.
+        n: Number of paths, for indices of paths; None for real numbers.
+
+    Raises:
+        ConfigError: If it has another shape or an invalid value.
+    """
+    array = np.asarray(value)
+    whole = n is None or (array.dtype.kind in "iu" and np.all((array >= 0) & (array < n)))
+    if array.shape not in ((), counts[1:], counts) or array.dtype.kind not in "iuf" or not whole:
+        what = "a number" if n is None else f"a whole number from 0 to {n - 1}"
+        raise ConfigError(
+            f"expected {name} as {what} for all cars, or for each, {counts[1:]} or {counts} = (n_worlds, n_members), "
+            f"got {value!r}. Use one number, or an array of one of these shapes."
+        )
+    if not np.all(np.isfinite(array)):
+        raise ConfigError(f"expected {name} to be finite, got {value!r}. Use a time in seconds, such as 0.0.")
+    array = array.astype(floating() if n is None else np.int32)
+    return array[None] if array.ndim == 0 else np.array(np.broadcast_to(array, counts))[..., None]
+
+
+def on_path(
+    paths: Path, index: NDArray[Any], start: NDArray[Any], counts: tuple[int, int]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return positions, m, headings, rad, and arc lengths, m, of cars on their paths at time zero.
+
+    Args:
+        paths: Paths.
+        index: Index of each car's path. (1,) or (n_worlds, n_members, 1)
+        start: Time at which each car is at the start of its path, s. (1,) or (n_worlds, n_members, 1)
+        counts: Numbers of worlds and of cars.
+
+    Returns:
+        Arrays (n_worlds, n_members, 2), (n_worlds, n_members, 1) and (n_worlds, n_members, 1).
+    """
+    index, start = (np.broadcast_to(x, (*counts, 1)) for x in (index, start))
+    pos, yaw, arc = np.zeros((*counts, 2)), np.zeros((*counts, 1)), np.zeros((*counts, 1))
+    found: dict[tuple[int, float], tuple[Any, ...]] = {}
+    for at in np.ndindex(counts):
+        key = int(index[at][0]), float(start[at][0])
+        if key not in found:
+            found[key] = paths.at_time(*key)
+        pos[at], yaw[at], arc[at] = found[key]
+    return pos, yaw, arc
+
+
+def projected(paths: Any, index: Any, pos: NDArray[Any], arc: NDArray[Any]) -> NDArray[Any]:
+    """Return the arc lengths of the points of paths that are nearest to cars, m. (n_worlds, n_members, 1)
+
+    Args:
+        paths: Paths.
+        index: Index of each car's path. (1,) or (n_worlds, n_members, 1)
+        pos: Positions of the cars, m. (n_worlds, n_members, 2)
+        arc: References, m: on closed paths the result is in the round nearest to them. (n_worlds, n_members, 1)
+    """
+    index, found = np.broadcast_to(index, arc.shape), np.empty_like(arc)
+    for at in np.ndindex(arc.shape[:2]):
+        k = int(index[at][0])
+        nearest, length = paths.nearest(k, pos[at]), float(paths.length[k])
+        rounds = round((float(arc[at][0]) - nearest) / length) if paths.closed[k] else 0
+        found[at] = nearest + rounds * length
+    return found
+
+
+def spread(paths: Path, index: NDArray[Any], n: int) -> NDArray[Any]:
+    """Return start times of n cars, s: spaced equally over the duration of a closed path, zero on others. (n,)"""
+    own = np.broadcast_to(index.reshape(-1)[:n], (n,))
+    times = np.zeros(n)
+    for path in np.unique(own):
+        cars = np.flatnonzero(own == path)
+        if np.asarray(paths.closed)[path]:
+            times[cars] = -np.arange(len(cars)) / len(cars) * float(paths.duration[path])
+    return times

@@ -1,0 +1,42 @@
+"""Kinematics of a trailer with two joints: a steered front axle on a drawbar, and a deck on its own rear axle."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.errors import ConfigError
+from crazysim.plugins.vehicles.parameters import CarParams
+from crazysim.plugins.vehicles.state import CarState, to_world
+
+
+def trailer_rates(state: CarState, params: CarParams) -> Array:
+    """Return the rates of the headings of drawbar and deck, both of whose axles roll without slip, rad/s. (..., 2)
+
+    The hitch moves with the vehicle. Its velocity across the drawbar turns the drawbar, that along it moves the front
+    axle, and the front axle's velocity across the deck turns the deck.
+
+    Raises:
+        ConfigError: If the parameters have no trailer.
+    """
+    if params.trailer is None or state.joints is None:
+        raise ConfigError(
+            "expected parameters of a trailer, got none. Use CarParams.create(vehicle, freq, trailer=True)."
+        )
+    hitch, drawbar, axles = (params.trailer[..., k : k + 1] for k in range(3))
+    vx, vy = state.body_vel[..., :1], state.body_vel[..., 1:] - hitch * state.yaw_rate
+    to_bar = state.yaw - state.joints[..., :1]
+    cos, sin = jnp.cos(to_bar), jnp.sin(to_bar)
+    along, across = cos * vx - sin * vy, sin * vx + cos * vy
+    to_deck = state.joints[..., :1] - state.joints[..., 1:]
+    return jnp.concatenate([across / drawbar, along * jnp.sin(to_deck) / axles], axis=-1)
+
+
+def trailer_axles(state: CarState, params: CarParams) -> tuple[Array, Array]:
+    """Return the positions of the middles of the trailer's front and rear axle, world frame, m. (..., 2) each"""
+    hitch, drawbar, axles = (params.trailer[..., k : k + 1] for k in range(3))  # type: ignore[index]
+    zero = jnp.zeros_like(state.yaw)
+    at = state.pos[..., :2] + to_world(state.yaw, jnp.concatenate([zero - hitch, zero], axis=-1))
+    front = at + to_world(state.joints[..., :1], jnp.concatenate([zero - drawbar, zero], axis=-1))  # type: ignore[index]
+    rear = front + to_world(state.joints[..., 1:], jnp.concatenate([zero - axles, zero], axis=-1))  # type: ignore[index]
+    return front, rear

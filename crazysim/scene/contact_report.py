@@ -1,0 +1,347 @@
+"""The contact report: contacts and distances of every drone, in pure JAX.
+
+One function serves all worlds, one world, or one drone, so it also works in a stage of the step. It does not use MuJoCo
+and allocates nothing per world.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from itertools import groupby
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.others import reduce_over_others
+from crazysim.core.settings import flag
+from crazysim.errors import ConfigError
+from crazysim.geometry import Shape, distance
+from crazysim.pytree import PyTree, static
+from crazysim.scene.collision import CollisionBody, CollisionGeom, CollisionModel
+from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
+from crazysim.scene.objects import Handle
+from crazysim.scene.placement import Placing, place, placed_by
+
+UNROLLED = 16
+"""Most fixed geoms of one shape that are computed one by one."""
+CHUNK = 64
+"""Drones whose distances to all others of their world are computed at a time."""
+
+
+class ContactReport(PyTree):
+    """Contacts of every drone, and signed distances: negative where two bodies overlap, by the depth of the overlap.
+
+    In a stage of one world the arrays lack the axis ``n_worlds``, in a stage of one drone ``n_drones`` too. Fields that
+    were not requested are None.
+    """
+
+    floor: Array | None
+    """True where a drone touches the floor. (n_worlds, n_drones)"""
+    floor_distance: Array | None
+    """Distance to the floor, m. (n_worlds, n_drones)"""
+    objects: Array | None
+    """True where a drone touches an object. (n_worlds, n_drones, n_objects)"""
+    object_distance: Array | None
+    """Distance to each object, m. (n_worlds, n_drones, n_objects)"""
+    nearest_object: Array | None
+    """Index of the nearest object in ``object_names``. (n_worlds, n_drones)"""
+    drones: Array | None
+    """True where a drone touches another drone. (n_worlds, n_drones)"""
+    drone_distance: Array | None
+    """Distance to the nearest other drone, m; infinite for a single drone. (n_worlds, n_drones)"""
+    nearest_drone: Array | None
+    """Index of that drone; the drone's own for a single drone. None in a stage of one drone. (n_worlds, n_drones)"""
+    object_names: tuple[str, ...] = static()
+    """Names of the objects' bodies."""
+
+    def joined(self, other: ContactReport) -> ContactReport:
+        """Return the fields of both reports; those that both have are taken from this one."""
+        names = (f.name for f in dataclasses.fields(self))  # type: ignore[arg-type]
+        mine = {name: x for name in names if (x := getattr(self, name)) is not None}
+        return other.replace(**mine | {"object_names": self.object_names or other.object_names})
+
+    @property
+    def any(self) -> Array:
+        """True where a drone touches anything that was requested. (n_worlds, n_drones)"""
+        found = [x for x in (self.floor, self.drones) if x is not None]
+        if self.objects is not None:
+            found.append(jnp.any(self.objects, axis=-1))
+        return functools.reduce(jnp.logical_or, found)
+
+
+ObjectSelection = Iterable[Handle | str] | Handle | str | None
+"""ObjectSelection of a report: handles, names of bodies; None for all."""
+ContactFn = Callable[..., ContactReport]
+"""``contacts(data, mocap=None) -> ContactReport``."""
+
+
+def build(
+    model: CollisionModel,
+    objects: ObjectSelection = None,
+    floor: bool = True,
+    drones: bool = True,
+    plugins: Placing = tuple,
+) -> ContactFn:
+    """Return ``contacts(data, mocap=None) -> ContactReport``, pure: for all worlds, one world, or one drone.
+
+    Args:
+        model: Collision model of the scene.
+        objects: Handles or names of the objects to report; None for all, () for none.
+        floor: True to report the floor.
+        drones: True to report other drones. For one drone this needs a stage, and ``nearest_drone`` is None there.
+        plugins: Returns the plugins of the simulation, whose objects are put at their poses first.
+
+    Raises:
+        ConfigError: If nothing is requested, or an object does not exist.
+    """
+    floor, drones = flag("floor", floor), flag("drones", drones)
+    chosen = choose(model, objects, in_data=False)
+    names = tuple(body.name for body in chosen)
+    if not (chosen or floor or drones):
+        raise ConfigError("expected floor, drones or at least one object, got a contact report of nothing")
+    groups = [list(group) for _, group in groupby(chosen, _group_key)]
+
+    def contacts(data: SimData, mocap: MocapPoses = None) -> ContactReport:
+        require_poses(model, names, mocap)
+        data = place(data, placed_by(plugins(), names))
+        data = with_mocap_bodies(model, data, mocap)
+        pos, quat = data.states.pos, data.states.quat
+        all_geoms = [geom for kind in model.drones for geom in kind.geoms]
+        drone_rot = rotation.matrix(quat) if any(geom.shape.kind != "sphere" for geom in all_geoms) else None
+        own = [
+            (geom, pos + rotation.rotate(quat, jnp.asarray(geom.pos, pos.dtype)), present)
+            for kind in model.drones
+            for present in (kind.present(data.core.drone_id),)
+            for geom in kind.geoms
+        ]
+        found: dict[str, Array | None] = dict.fromkeys(
+            ("floor", "floor_distance", "objects", "object_distance", "nearest_object", "drones", "drone_distance",
+             "nearest_drone")
+        )  # fmt: skip
+        if floor:
+            gaps = [_of(has, _gap(mine, at, drone_rot, geom)) for mine, at, has in own for geom in model.floor]
+            gap = _smallest(gaps, pos)
+            found |= {"floor": gap < 0, "floor_distance": gap}
+        if chosen:
+            gap = jnp.concatenate([_to_group(own, drone_rot, group, data) for group in groups], axis=-1)
+            found |= {"objects": gap < 0, "object_distance": gap, "nearest_object": jnp.argmin(gap, axis=-1)}
+        if drones:
+            gap, nearest = (_to_others(own, drone_rot), None) if pos.ndim == 1 else _to_drones(own, drone_rot)
+            found |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": nearest}
+        return ContactReport(**found, object_names=names)
+
+    return contacts
+
+
+def choose(model: CollisionModel, objects: ObjectSelection, in_data: bool = True) -> list[CollisionBody]:
+    """Return the objects of a model that are named.
+
+    Args:
+        model: Collision model of the scene.
+        objects: Handles or names; None for all, () for none.
+        in_data: True to refuse bodies whose poses are not part of the data, for use in a step.
+
+    Raises:
+        ConfigError: If an object does not exist or, with ``in_data``, is moved through ``mjx_data``.
+    """
+    by_name = {body.name: body for body in model.objects}
+    if objects is None:
+        names = list(by_name)
+    else:
+        listed = [objects] if isinstance(objects, (Handle, str)) else list(objects)
+        names = [name for x in listed for name in (x.bodies if isinstance(x, Handle) else (x,))]
+    for name in names:
+        if name not in by_name:
+            raise ConfigError(
+                f"expected an object that drones can touch, {', '.join(by_name) or 'of which there are none'}, got "
+                f"{name!r}"
+            )
+        if in_data and name in model.mocap_bodies:
+            raise ConfigError(
+                f"expected objects whose poses are in the data, got body {name!r}, which is moved through "
+                f"sim.mjx_data. Add it with sim.scene.add, or leave it out with objects=."
+            )
+    return [by_name[name] for name in names]
+
+
+def _group_key(body: CollisionBody) -> tuple[Any, ...]:
+    """Return equal keys for objects whose distances can be computed side by side."""
+    if body.row is not None:
+        return (True, body.geoms)
+    kinds = tuple([(geom.shape, geom.rot is None) for geom in body.geoms])
+    # The geoms of a body that cannot move are in the world frame: bodies of one geom differ in its pose alone.
+    return (False, *kinds) if len(kinds) == 1 else (False, body.name)
+
+
+def size_of(model: CollisionModel, objects: ObjectSelection) -> int:
+    """Return a measure of the length of a kernel for the contacts with some objects: geoms, movable ones times four."""
+    return sum(len(body.geoms) * (1 if body.row is None else 4) for body in choose(model, objects, in_data=False))
+
+
+Own = Sequence[tuple[CollisionGeom, Array, Array | None]]
+"""Geoms of the drone, their positions, world frame, m (..., 3), and True for drones that have them (...) or None."""
+
+
+def _of(present: Array | None, gap: Array) -> Array:
+    """Return distances, infinite for geoms that a drone does not have. (...)"""
+    return gap if present is None else jnp.where(present, gap, jnp.inf)
+
+
+def _to_group(own: Own, drone_rot: Array | None, group: list[CollisionBody], data: SimData) -> Array:
+    """Return the distances to objects with equal geoms, m. (..., n)"""
+    geoms = group[0].geoms
+    if group[0].row is None:
+        if len(group) > UNROLLED:
+            stacked = Stacked.of([body.geoms[0] for body in group])
+            return _smallest([_gaps(mine, at, drone_rot, stacked, has) for mine, at, has in own], own[0][1])
+        return jnp.stack([_to_fixed(own, drone_rot, body.geoms) for body in group], axis=-1)
+    objects = data.objects
+    rows = [body.row for body in group if body.row is not None]
+    run = slice(rows[0], rows[-1] + 1) if rows == list(range(rows[0], rows[-1] + 1)) else np.array(rows)
+    pos, quat = objects.pos[..., run, :], objects.quat[..., run, :]
+    rot = None
+    if drone_rot is not None:
+        rot = _product(jnp.swapaxes(rotation.matrix(quat), -1, -2), drone_rot[..., None, :, :])
+    gaps = []
+    for mine, at, has in own:
+        inside = rotation.rotate_inverse(quat, at[..., None, :] - pos)
+        of_each = None if has is None else has[..., None]
+        gaps += [_of(of_each, _gap(mine, inside, rot, geom)) for geom in geoms]
+    return _smallest(gaps, own[0][1])
+
+
+def _to_fixed(own: Own, drone_rot: Array | None, geoms: Sequence[CollisionGeom]) -> Array:
+    """Return the distance to the nearest of some geoms in the world frame, m. (...)
+
+    Of many of one shape, the distances are computed side by side.
+    """
+    kinds: dict[Any, list[CollisionGeom]] = {}
+    for geom in geoms:
+        kinds.setdefault((geom.shape, geom.rot is None), []).append(geom)
+    gaps = []
+    for alike in kinds.values():
+        for mine, at, has in own:
+            if len(alike) > UNROLLED:
+                gaps.append(jnp.min(_gaps(mine, at, drone_rot, Stacked.of(alike), has), axis=-1))
+            else:
+                gaps += [_of(has, _gap(mine, at, drone_rot, geom)) for geom in alike]
+    return _smallest(gaps, own[0][1])
+
+
+class Stacked(NamedTuple):
+    """Geoms of one shape at different poses."""
+
+    shape: Shape
+    """Shape of all, in its own frame."""
+    pos: NDArray
+    """Origins, m. (n, 3)"""
+    rot: NDArray | None
+    """Rotation matrices; None for the identity. (n, 3, 3)"""
+
+    @staticmethod
+    def of(geoms: Sequence[CollisionGeom]) -> Stacked:
+        """Return geoms of one shape, either all turned or none."""
+        rot = None if geoms[0].rot is None else np.array([geom.rot for geom in geoms])
+        return Stacked(geoms[0].shape, np.array([geom.pos for geom in geoms]), rot)
+
+
+def _gaps(mine: CollisionGeom, at: Array, drone_rot: Array | None, geoms: Stacked, present: Array | None) -> Array:
+    """Return the distances of a drone's geom to stacked geoms, infinite if the drone has no such geom, m. (..., n)"""
+    turned = None if drone_rot is None else drone_rot[..., None, :, :]
+    gap = _gap(mine, at[..., None, :], turned, geoms)
+    return _of(None if present is None else present[..., None], gap)
+
+
+def _gap(mine: CollisionGeom, at: Array, drone_rot: Array | None, geom: CollisionGeom | Stacked) -> Array:
+    """Return the distance of a drone's geom to another geom, m. (...)
+
+    Args:
+        mine: Geom of the drone.
+        at: Its position in the frame in which the other is given, m. (..., 3)
+        drone_rot: Attitude of the drone in that frame; None if all its geoms are spheres. (..., 3, 3)
+        geom: The other geom, or several along the last batch axis.
+    """
+    inside = at - jnp.asarray(geom.pos, at.dtype)
+    rot = drone_rot
+    if geom.rot is not None:
+        columns = jnp.asarray(geom.rot, at.dtype)
+        x, y, z = (inside[..., k, None] * columns[..., k, :] for k in range(3))
+        inside = x + y + z
+        rot = None if drone_rot is None else _product(jnp.swapaxes(columns, -1, -2), drone_rot)
+    if rot is not None and mine.rot is not None:
+        rot = _product(rot, jnp.asarray(mine.rot, at.dtype))
+    return distance(mine.shape, geom.shape, inside, jnp.eye(3) if rot is None else rot)
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Return ``a @ b`` of 3 x 3 matrices, by components: a GPU may round matrix products to 10 bits. (..., 3, 3)"""
+    return jnp.stack([rotation.matvec(a, b[..., k]) for k in range(3)], axis=-1)
+
+
+def _smallest(gaps: list[Array], pos: Array) -> Array:
+    """Return the smallest of some distances, infinite if there are none. (...)"""
+    if not gaps:
+        return jnp.full(pos.shape[:-1], jnp.inf, pos.dtype)
+    return functools.reduce(lambda a, b: jnp.where(b < a, b, a), gaps)
+
+
+def _to_others(own: Own, drone_rot: Array | None) -> Array:
+    """Return the distance of one drone to the nearest other of its world, m. ()"""
+
+    def between(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
+        places, theirs, rot = other
+        inverse = None if rot is None else rot.T
+        turned = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
+        gaps = []
+        for mine, at, has in own:
+            for (geom, *_), there, other_has in zip(own, places, theirs, strict=True):
+                inside = at - there if inverse is None else rotation.matvec(inverse, at - there)
+                both = None if has is None or other_has is None else has & other_has
+                gaps.append(_of(both, distance(mine.shape, geom.shape, inside, turned)))
+        return jnp.where(is_self, jnp.inf, _smallest(gaps, own[0][1]))
+
+    return reduce_over_others(between, ([at for _, at, _ in own], [has for *_, has in own], drone_rot), "min")
+
+
+def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:
+    """Return the distance to the nearest other drone, m, and its index. (..., n_drones)
+
+    In a large swarm the distances of ``CHUNK`` drones to all others are computed at a time, so memory grows linearly
+    with the swarm.
+    """
+    n = own[0][1].shape[-2]
+    indices = jnp.arange(n)
+
+    def of_chunk(chunk: Array) -> tuple[Array, Array]:
+        gaps = []
+        for mine, at, has in own:
+            here = jnp.take(at, chunk, axis=-2)[..., :, None, :]
+            for geom, other, other_has in own:
+                both = None
+                if has is not None and other_has is not None:
+                    both = jnp.take(has, chunk, axis=-1)[..., :, None] & other_has[..., None, :]
+                offset = here - other[..., None, :, :]
+                if drone_rot is None:
+                    gaps.append(_of(both, distance(mine.shape, geom.shape, offset, jnp.eye(3))))
+                    continue
+                inverse = jnp.swapaxes(drone_rot, -1, -2)[..., None, :, :, :]
+                inside = rotation.matvec(inverse, offset)
+                rot = _product(inverse, jnp.take(drone_rot, chunk, axis=-3)[..., :, None, :, :])
+                gaps.append(_of(both, distance(mine.shape, geom.shape, inside, rot)))
+        gap = jnp.where(chunk[:, None] == indices, jnp.inf, _smallest(gaps, own[0][1]))
+        return jnp.min(gap, axis=-1), jnp.argmin(gap, axis=-1)
+
+    if n <= CHUNK:
+        return of_chunk(indices)
+    n_chunks = -(-n // CHUNK)
+    padded = jnp.minimum(jnp.arange(n_chunks * CHUNK), n - 1).reshape(n_chunks, CHUNK)
+    gap, nearest = jax.lax.map(of_chunk, padded)
+    return tuple(jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :n] for x in (gap, nearest))  # type: ignore[return-value]

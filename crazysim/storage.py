@@ -1,0 +1,206 @@
+"""Files that are written as a whole or not at all, and files and archives that are read within bounds."""
+
+from __future__ import annotations
+
+import io
+import os
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError, DamagedFileError
+
+MAX_TOML = 2**20
+"""Largest TOML file, bytes; the built-in ones have up to 12,000."""
+MAX_ARRAYS = 10_000
+"""Most arrays of an ``.npz`` file."""
+MAX_UNPACKED, MAX_RATIO = 2**30, 100
+"""Most bytes that are unpacked from an ``.npz`` file: so many, or so many times its size if that is more."""
+
+
+def is_file(path: str | Path) -> bool:
+    """Return True if a file of that path exists, and False for text that can be no path."""
+    try:
+        return Path(path).is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def read_bytes(path: str | Path, at_most: int) -> bytes:
+    """Return the contents of a file.
+
+    Args:
+        path: The file.
+        at_most: Largest size, bytes.
+
+    Raises:
+        ConfigError: If it does not exist, cannot be read, or is larger.
+    """
+    if not is_file(path):
+        raise ConfigError(f"expected an existing file, got {str(path)[:200]!r}")
+    try:
+        size = Path(path).stat().st_size
+        if size > at_most:
+            raise ConfigError(f"expected a file of at most {at_most} bytes, got {size} in {path}")
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise ConfigError(f"expected a file that can be read, got {str(path)!r}: {error}") from error
+
+
+def read_text(path: str | Path, at_most: int) -> str:
+    """Return the contents of a text file, without a byte order mark.
+
+    Args:
+        path: The file.
+        at_most: Largest size, bytes.
+
+    Raises:
+        ConfigError: If it does not exist, cannot be read, is larger, or is not text in UTF-8.
+    """
+    try:
+        return read_bytes(path, at_most).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"expected text in {path}, got bytes that are not UTF-8: {error}. Save it as UTF-8."
+        ) from error
+
+
+def read_toml(path: str | Path, guide: str) -> dict[str, Any]:
+    """Return the tables of a TOML file.
+
+    Args:
+        path: The file.
+        guide: Page that describes the format, for messages.
+
+    Raises:
+        ConfigError: If it cannot be read, is larger than ``MAX_TOML``, or is not TOML.
+    """
+    text = read_text(path, MAX_TOML)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # also of dates that do not exist
+        raise ConfigError(f"{path} is not valid TOML: {error}; see {guide} for the format") from error
+
+
+@contextmanager
+def reading(path: str | Path, content: str, remedy: str) -> Iterator[None]:
+    """Raise the errors of a block that reads a file as errors of crazysim that name the file.
+
+    Damaged files raise errors of almost any type in the libraries that read them. A ``ConfigError`` is passed on.
+
+    Args:
+        path: The file.
+        content: Description of its contents, such as ``"a recorded flight"``.
+        remedy: Sentence about what to do.
+
+    Raises:
+        DamagedFileError: If the block raises another error than ``ConfigError``.
+        ConfigError: If the file does not exist.
+    """
+    try:
+        yield
+    except ConfigError:
+        raise
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        raise ConfigError(f"expected an existing file with {content}, got {str(path)!r}. {remedy}") from None
+    except Exception as error:
+        reason = f"{type(error).__name__}: {str(error)[:100]}"
+        raise DamagedFileError(
+            f"expected {content}, got {str(path)!r}, which is damaged or a file of another kind ({reason}). {remedy}"
+        ) from error
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[BinaryIO]:
+    """Open a file for writing that takes the place of ``path`` at the end of the block.
+
+    If writing fails, or the block raises an error, ``path`` is as before, and nothing is left beside it.
+
+    Raises:
+        ConfigError: If the folder does not exist, or the file cannot be written, for example on a full disk.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
+    unfinished = path.with_name(path.name + ".part")
+    try:
+        with unfinished.open("wb") as file:
+            yield file
+        os.replace(unfinished, path)
+    except BaseException as error:
+        unfinished.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise ConfigError(
+                f"expected a file that can be written, got {str(path)!r}: {error}. Use another folder, or make room."
+            ) from error
+        raise
+
+
+class ZipReader:
+    """A zip archive whose files are unpacked within bounds."""
+
+    def __init__(self, file: BinaryIO, place: str, max_files: int, max_file: int, max_total: int):
+        """Open an archive.
+
+        Args:
+            file: The archive, which stays open.
+            place: Name of the archive, for messages.
+            max_files: Largest number of files.
+            max_file: Largest file that is unpacked, bytes.
+            max_total: Most bytes that are unpacked in all.
+
+        Raises:
+            ConfigError: If it has more files.
+            Exception: Of any type, if it is damaged; see ``reading``.
+        """
+        self._zip = zipfile.ZipFile(file)
+        self._place, self._max_file, self._max_total, self._unpacked = place, max_file, max_total, 0
+        members = self._zip.infolist()
+        if len(members) > max_files:
+            raise ConfigError(f"expected at most {max_files} files, got {len(members)} in {place}")
+        self._members = {str(PurePosixPath(member.filename)): member for member in members}
+        self.names = self._members.keys()
+        """Names of the files."""
+
+    def read(self, name: str) -> bytes:
+        """Return the contents of a file of the archive.
+
+        Raises:
+            ConfigError: If the file, or all files until now, are too large.
+            Exception: Of any type, if it is damaged; see ``reading``.
+        """
+        member = self._members[name]
+        self._unpacked += member.file_size
+        if member.file_size > self._max_file or self._unpacked > self._max_total:
+            raise ConfigError(
+                f"expected files of at most {self._max_file} bytes, {self._max_total} in all, got more in "
+                f"{self._place}: {name}"
+            )
+        with self._zip.open(member) as file:
+            return file.read(member.file_size)  # with a length no more is unpacked, even if the archive holds more
+
+
+def read_arrays(file: BinaryIO, place: str) -> dict[str, NDArray]:
+    """Return the arrays of an ``.npz`` file, after comparing their checksums.
+
+    Args:
+        file: The file.
+        place: Name of the file, for messages.
+
+    Raises:
+        ConfigError: If it unpacks to much more than its size.
+        Exception: Of any type, if it is damaged; see ``reading``.
+    """
+    most = max(MAX_UNPACKED, MAX_RATIO * file.seek(0, os.SEEK_END))
+    archive = ZipReader(file, place, MAX_ARRAYS, most, most)
+    # A whole member is read before NumPy parses it: the checksum of a member is compared only at its end.
+    return {
+        name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(archive.read(name)), allow_pickle=False)
+        for name in archive.names
+    }

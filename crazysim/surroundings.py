@@ -1,0 +1,32 @@
+"""Variables of the environment that JAX and MuJoCo read when they are imported, so set before.
+
+XLA logs an error of 3,000 characters for each CPU program that it loads from a persistent cache: the options
+``prefer-no-gather`` and ``prefer-no-scatter``, with which it compiled the program, are no features of any CPU. What
+really fails is raised as an exception.
+
+MuJoCo draws through GLFW, which needs a screen. Without a screen, and where EGL is installed, it draws through EGL.
+"""
+
+import ctypes
+import os
+import sys
+
+
+def set_variables() -> None:
+    """Set the variables that the user has not set."""
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":  # JAX sets 1, which a process passes to its children
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+    chosen = any(os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"))
+    if sys.platform == "linux" and not chosen and _has_egl():
+        os.environ["MUJOCO_GL"] = "egl"
+
+
+def _has_egl() -> bool:
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return False
+    return True
+
+
+set_variables()

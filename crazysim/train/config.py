@@ -1,0 +1,193 @@
+"""Configurations of training runs, and recipes that are known to solve the tasks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crazysim.core.data import as_key
+from crazysim.core.settings import positive
+from crazysim.drones.airframe import is_airframe_file
+from crazysim.envs.env import DroneEnv
+from crazysim.envs.references import absolute, is_reference, reference_of, split
+from crazysim.envs.registry import TASKS, entry_of, make
+from crazysim.envs.task import Task
+from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.train import apg, ppo
+
+ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg}
+"""Algorithms by name: modules with ``Config``, ``init`` and ``iterate``."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Algorithm and hyperparameters that are known to solve a task."""
+
+    algorithm: str = "ppo"
+    """Name of the algorithm, a key of ``ALGORITHMS``."""
+    n_worlds: int = 1024
+    """Number of parallel worlds."""
+    config: dict[str, Any] = field(default_factory=dict)
+    """Hyperparameters that differ from the defaults of the algorithm."""
+    practice: dict[str, Any] = field(default_factory=dict)
+    """Options of the training environment that the evaluation environment does not have."""
+    evaluate_every: int = 20
+    """Iterations between evaluations; a checkpoint is written at each."""
+
+
+RECIPES: dict[str, Recipe] = {
+    "hover": Recipe(config={"iterations": 80}),
+    "recover": Recipe(config={"iterations": 150}),
+    "race": Recipe(
+        n_worlds=4096,
+        config={"iterations": 150, "entropy": 0.01, "init_std": 0.7},
+        practice={"practice": True},
+    ),
+    "transport": Recipe(n_worlds=4096, config={"iterations": 400, "discount": 0.99}),
+    "chase": Recipe(config={"iterations": 200, "discount": 0.99}),
+    "deliver": Recipe(n_worlds=4096, config={"iterations": 1000, "discount": 0.99}),
+    "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
+}
+"""Recipes by task; the default of other tasks is ``Recipe()``."""
+
+
+ALTERABLE = (
+    "iterations", "learning_rate", "discount", "gae_lambda", "clip", "entropy", "value_weight", "max_grad_norm",
+)  # fmt: skip
+"""Hyperparameters that may change when a run is resumed: neither shapes nor counters of its state depend on them."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Complete configuration of a run; a checkpoint resumes only with one that differs in ``ALTERABLE`` alone."""
+
+    task: str
+    """Name of a registered task, or the absolute place of its class, ``FILE.py:NAME`` or ``MODULE:NAME``."""
+    algorithm: str
+    """Name of the algorithm, a key of ``ALGORITHMS``."""
+    seed: int
+    """Random seed."""
+    n_worlds: int
+    """Number of parallel worlds."""
+    options: dict[str, Any]
+    """Options of ``crazysim.envs.make``."""
+    config: dict[str, Any]
+    """Hyperparameters of the algorithm; omitted ones have their defaults."""
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ConfigError: If a value is not of its type or range, or the algorithm has no such hyperparameter.
+            UnknownNameError: If there is no such algorithm.
+        """
+        if self.algorithm not in ALGORITHMS:
+            raise UnknownNameError(f"expected an algorithm of {', '.join(ALGORITHMS)}, got {self.algorithm!r}")
+        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)):
+            raise ConfigError(f"expected an integer as seed, got {self.seed!r}. Use for example 0.")
+        known = [f.name for f in dataclasses.fields(ALGORITHMS[self.algorithm].Config)]
+        if wrong := [name for name in self.config if name not in known]:
+            raise ConfigError(
+                f"expected hyperparameters of {self.algorithm}, got {', '.join(wrong)}; use {', '.join(known)}"
+            )
+        config = dataclasses.asdict(self.algorithm_config())
+        values = {
+            "seed": int(self.seed),
+            "n_worlds": positive("n_worlds", self.n_worlds),
+            "config": config | {"hidden": list(config["hidden"])},
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        as_key(self.seed)  # which is an error for more than 64 bits
+
+    @staticmethod
+    def create(
+        task: str | Task,
+        algorithm: str | None = None,
+        seed: int | None = None,
+        n_worlds: int | None = None,
+        options: dict[str, Any] | None = None,
+        config: dict[str, Any] | None = None,
+        resumed: TrainConfig | None = None,
+    ) -> TrainConfig:
+        """Return the configuration of a run; omitted values come from the recipe of the task.
+
+        Args:
+            task: Name of a task, the place of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
+            algorithm: Name of the algorithm, a key of ``ALGORITHMS``.
+            seed: Random seed; None for 0.
+            n_worlds: Number of parallel worlds.
+            options: Options of ``crazysim.envs.make``.
+            config: Hyperparameters of the algorithm.
+            resumed: Configuration of the run to continue, from which omitted values come instead; None for a new run.
+
+        Raises:
+            ConfigError: If a value is not of its type or range, or the algorithm has no such hyperparameter.
+            UnknownNameError: If there is no such task or algorithm.
+        """
+        entry = entry_of(task)
+        known = {} if resumed is None else resumed.options
+        if isinstance(task, Task):
+            fields = [f for f in dataclasses.fields(task) if f.init]
+            own = {f.name: getattr(task, f.name) for f in fields}
+            usual = {f.name: known.get(f.name, f.default) for f in fields}
+            options = {k: x for k, x in own.items() if not _same(x, usual[k])} | dict(options or {})
+            task = next((name for name, one in TASKS.items() if one is entry), None) or reference_of(entry.task)
+        elif is_reference(task):
+            task = absolute(task) if split(task)[1] else reference_of(entry.task)
+        recipe = RECIPES.get(task, Recipe())
+        if resumed is not None:
+            recipe = Recipe(resumed.algorithm, resumed.n_worlds, resumed.config)
+            seed = resumed.seed if seed is None else seed
+        if algorithm not in (None, recipe.algorithm):
+            recipe = Recipe(algorithm)
+        n_worlds = recipe.n_worlds if n_worlds is None else n_worlds
+        options, config = known | dict(options or {}), recipe.config | dict(config or {})
+        if is_airframe_file(options.get("drone")):  # so that the run can be flown from any folder
+            options["drone"] = str(Path(options["drone"]).resolve())
+        return TrainConfig(task, recipe.algorithm, 0 if seed is None else seed, n_worlds, options, config)
+
+    @property
+    def title(self) -> str:
+        """Name of the task in messages and of the default folder: without the place of its class, in lower case."""
+        name = split(self.task)[1] if is_reference(self.task) else self.task
+        return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(".")[2]).lower()
+
+    def make_env(self, n_worlds: int | None = None, **defaults: Any) -> DroneEnv:
+        """Return an environment of the run.
+
+        Args:
+            n_worlds: Number of worlds; None for that of the run.
+            **defaults: Options of ``crazysim.envs.make`` where the run does not set them.
+
+        Raises:
+            ConfigError: If the task is in a file that this user has not named before; see ``load_policy``.
+        """
+        entry_of(self.task, named=False)
+        return make(self.task, self.n_worlds if n_worlds is None else n_worlds, **defaults | self.options)
+
+    def with_device(self, device: str | None) -> TrainConfig:
+        """Return the same configuration on another device, such as ``"cpu"``; None keeps the device."""
+        return self if device is None else dataclasses.replace(self, options=self.options | {"device": device})
+
+    def practice_options(self) -> dict[str, Any]:
+        """Return the options of the training environment that the recipe of the task adds."""
+        return dict(RECIPES.get(self.task, Recipe()).practice)
+
+    def algorithm_config(self) -> Any:
+        """Return the ``Config`` of the algorithm."""
+        return ALGORITHMS[self.algorithm].Config(**self.config)
+
+
+def _same(x: Any, y: Any) -> bool:
+    """Return true if a setting has a value, in the form that JSON gives it: lists and tuples are alike."""
+    try:
+        return json.dumps(x) == json.dumps(y)
+    except (TypeError, ValueError):
+        return x is y

@@ -1,0 +1,59 @@
+"""Checks of the hyperparameters of all algorithms."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from crazysim.core.settings import positive
+from crazysim.errors import ConfigError
+
+FRACTIONS = ("discount", "gae_lambda")
+"""Hyperparameters from 0 to 1."""
+WEIGHTS = ("entropy", "value_weight")
+"""Hyperparameters that are finite, and 0 or larger."""
+LIMITS = ("max_grad_norm",)
+"""Hyperparameters that are larger than 0, and may be infinite. All other numbers are finite and larger than 0."""
+
+
+def check_hyperparameters(config: Any) -> None:
+    """Check the fields of a frozen ``Config``, and convert them to Python's numbers and tuples.
+
+    Raises:
+        ConfigError: With the first field that is not of its type, or outside of its range.
+    """
+    for field in dataclasses.fields(config):
+        value, default = getattr(config, field.name), field.default
+        if isinstance(default, tuple):
+            value = _sizes(field.name, value)
+        elif isinstance(default, int):
+            value = positive(field.name, value)
+        else:
+            value = _number(field.name, value, default)
+        object.__setattr__(config, field.name, value)
+
+
+def _sizes(name: str, value: Any) -> tuple[int, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise ConfigError(
+            f"expected {name} as the sizes of the hidden layers, got {value!r}. Use for example [64, 64]."
+        )
+    return tuple(positive(f"{name}[{i}]", size) for i, size in enumerate(value))
+
+
+def _number(name: str, value: Any, default: Any) -> float:
+    if name in FRACTIONS:
+        low, high, expected = 0.0, 1.0, "a number from 0 to 1"
+    elif name in WEIGHTS:
+        low, high, expected = 0.0, np.finfo(np.float32).max, "a finite number of at least 0"
+    elif name in LIMITS:
+        low, high, expected = math.ulp(0.0), math.inf, "a number larger than 0"
+    else:
+        low, high, expected = np.finfo(np.float32).tiny, np.finfo(np.float32).max, "a finite number larger than 0"
+    is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if not is_number or not low <= value <= high:
+        raise ConfigError(f"expected {name} as {expected}, got {value!r}. Use for example {default}.")
+    return float(value)

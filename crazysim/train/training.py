@@ -1,0 +1,322 @@
+"""Training in a folder, with checkpoint, learning curve and policy."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import crazysim
+from crazysim.core.settings import positive
+from crazysim.engine.backends.native import compiling_threads
+from crazysim.envs.env import DroneEnv
+from crazysim.envs.references import code_digest, is_reference, split
+from crazysim.envs.statistics import RunningStats
+from crazysim.envs.wrappers import AutoReset
+from crazysim.errors import ConfigError, DivergedError
+from crazysim.storage import replacing
+from crazysim.train import apg, checkpoint
+from crazysim.train.config import ALGORITHMS, ALTERABLE, RECIPES, Recipe, TrainConfig
+from crazysim.train.evaluation import evaluate, outcome
+from crazysim.train.export import describe
+from crazysim.train.networks import Policy
+
+CHECKPOINT, POLICY, CURVE = "checkpoint.npz", "policy.npz", "curve.json"
+"""Names of the files of a run."""
+
+
+@dataclass
+class TrainResult:
+    """Outcome of a run."""
+
+    folder: Path
+    """Folder of the files of the run."""
+    metrics: dict[str, float]
+    """Metrics of ``evaluate`` on held-out initial states; ``seconds`` in all and ``compile_seconds`` of them, s;
+    ``env_steps``, environment steps of all drones."""
+    policy: Policy
+    """Trained policy."""
+    env: DroneEnv
+    """Environment of the evaluations, without automatic resets."""
+
+
+def train(
+    config: TrainConfig,
+    folder: str | Path,
+    resume: bool = False,
+    evaluation_worlds: int = 1000,
+    log: Callable[[str], None] = print,
+    progress: bool = True,
+) -> TrainResult:
+    """Train a policy and write checkpoint, learning curve and policy into a folder.
+
+    An interrupt (Ctrl-C) writes a checkpoint first. A resumed run is bit for bit the same as an uninterrupted one on
+    the same machine.
+
+    Args:
+        config: Configuration of the run.
+        folder: Folder of the run.
+        resume: True to continue from the checkpoint in the folder.
+        evaluation_worlds: Number of held-out initial states of each evaluation.
+        log: Function that is called with each line of output.
+        progress: True to show a progress bar, if tqdm is installed.
+
+    Raises:
+        ConfigError: If the folder holds a run and ``resume`` is False, or the run has another configuration or is
+            damaged; if files cannot be written.
+        DivergedError: If weights or losses become non-finite; the last checkpoint stays.
+        KeyboardInterrupt: After the checkpoint of an interrupted run has been written.
+    """
+    folder = Path(folder)
+    path = folder / CHECKPOINT
+    started = time.perf_counter()
+    evaluation_worlds = positive("evaluation_worlds", evaluation_worlds)
+    meta = _meta(config)
+    stored, curve, code = _stored(path, config) if resume else ({}, [], meta["code"])
+    if path.exists() and not resume:
+        raise ConfigError(
+            f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
+            f"with --out"
+        )
+    algorithm, hyperparameters = ALGORITHMS[config.algorithm], config.algorithm_config()
+    # A gradient runs on lanes in any case; a kernel for the forward pass would take longer to compile than it saves.
+    engine = {"engine": "lanes"} if algorithm is apg else {}
+    base = config.make_env(config.n_worlds, **engine | config.practice_options())
+    env = base if algorithm is apg else AutoReset(base)
+    eval_env = config.make_env(evaluation_worlds)
+    key = jax.random.fold_in(jax.random.key(config.seed), 1)
+    init = jax.jit(algorithm.init, static_argnums=(0, 1))
+    shapes = init.eval_shape(env, hyperparameters, key)
+    _make_folder(folder)
+
+    def start() -> tuple[Any, dict[str, float]]:
+        if resume:
+            learner = jax.device_put(checkpoint.restore(path, stored, shapes), base.sim.device)
+        else:
+            learner = init(env, hyperparameters, jax.device_put(key, base.sim.device))
+        return learner, evaluate(eval_env, learner.as_policy())
+
+    def compile_iteration() -> tuple[Any, float]:
+        compiling = time.perf_counter()
+        compiled = algorithm.iterate.lower(_on_device(shapes, base.sim.device), env, hyperparameters).compile()
+        return compiled, time.perf_counter() - compiling
+
+    with compiling_threads(2) as pool:  # each compiles for seconds, mostly on one core
+        starting, compiling = pool.submit(start), pool.submit(compile_iteration)
+        (learner, metrics), (iterate, compile_s) = starting.result(), compiling.result()
+    done, seconds_before = int(learner.iteration), curve[-1]["seconds"] if curve else 0.0
+    steps_per_iteration = config.n_worlds * base.sim.n_drones * hyperparameters.n_steps
+    log(
+        f"{config.title} by {config.algorithm}, seed {config.seed}: {hyperparameters.iterations} iterations of "
+        f"{steps_per_iteration:,} steps in {config.n_worlds:,} worlds, {base.sim.control.value} commands, "
+        f"{base.sim.explain().splitlines()[0]}" + (f"; continues after iteration {done}" if done else "")
+    )
+    if code != meta["code"]:
+        log("the file of the task has changed since the checkpoint was written; it is used as it is now")
+    if done >= hyperparameters.iterations:
+        log(f"nothing is left to train after {done} iterations; continue with more: --iterations {2 * done or 100}")
+
+    def record(learner: Any, metrics: dict[str, float] | None = None) -> dict[str, float]:
+        """Evaluate the policy, and write policy, learning curve and checkpoint."""
+        iteration = int(learner.iteration)
+        require_finite(finite, iteration)
+        metrics = metrics or evaluate(eval_env, learner.as_policy())
+        seconds = seconds_before + time.perf_counter() - started
+        point = {"round": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds, **metrics}
+        point["compile_seconds"] = compile_s
+        curve[:] = [*(earlier for earlier in curve if earlier["round"] < iteration), point]
+        checkpoint.save(path, learner, meta | {"curve": curve})
+        save_policy(folder / POLICY, learner.as_policy(), base, config)
+        with replacing(folder / CURVE) as file:
+            file.write(json.dumps(curve, indent=1).encode())
+        return point
+
+    def require_finite(finite: Any, iteration: int) -> None:
+        if not finite:
+            raise DivergedError(
+                f"expected finite weights and losses, got NaN or infinity in iteration {iteration} of {config.title} "
+                f"by {config.algorithm}; {path} and {POLICY} are those of iteration {curve[-1]['round']}. Use a "
+                f"smaller learning_rate or max_grad_norm, with another --out."
+            )
+
+    finite: Any = True
+    if not resume:
+        record(learner, metrics)
+    every = RECIPES.get(config.task, Recipe()).evaluate_every
+    try:
+        with _bar(hyperparameters.iterations, done, progress) as show:
+            for i in range(done, hyperparameters.iterations):
+                learner, metrics = iterate(learner)
+                require_finite(finite, i)  # of the iteration before, while this one runs
+                finite = metrics["finite"]
+                show(metrics if i % 5 == 0 else None)
+                if (i + 1) % every == 0 and i + 1 < hyperparameters.iterations:
+                    show(record(learner), 0)
+    except KeyboardInterrupt:
+        jax.block_until_ready(learner)
+        record(learner)
+        log(f"interrupted after iteration {int(learner.iteration)}; wrote {path}; continue with --resume")
+        raise
+    point = record(learner)
+    log(
+        f"success {point['success']:.1%} of {evaluation_worlds:,} held-out starts (error below "
+        f"{base.task.tolerance:g} {base.task.unit} for the last {base.task.hold:g} s), "
+        f"{outcome(point, base.task.unit)}; "
+        f"{point['env_steps']:,} steps in {point['seconds']:.1f} s, including {compile_s:.1f} s of compilation"
+    )
+    return TrainResult(folder, point, learner.as_policy(), eval_env)
+
+
+def _on_device(shapes: Any, device: jax.Device) -> Any:
+    """Return the shapes with a device attached."""
+    place = jax.sharding.SingleDeviceSharding(device)
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), shapes)
+
+
+def save_policy(path: Path, policy: Policy, env: DroneEnv, config: TrainConfig) -> None:
+    """Write a policy with the description of its inputs and outputs."""
+    checkpoint.save(path, policy, _meta(config) | describe(env))
+
+
+def load_policy(folder: str | Path, task: str | None = None) -> tuple[Policy, TrainConfig, dict[str, Any]]:
+    """Return the policy of a run, its configuration, and the description of its inputs and outputs.
+
+    Args:
+        folder: Folder of the run.
+        task: Place of the class of the task, ``FILE.py:NAME`` or ``MODULE:NAME``, where it has moved since the
+            training, or this user has not named it on this machine before; its code is executed. None for the place in
+            the run: ``config.make_env`` then executes only a file that this user has named before.
+
+    Raises:
+        ConfigError: If the folder holds no policy that this version can read.
+    """
+    path = Path(folder) / POLICY
+    arrays, meta = checkpoint.read(path)
+    with checkpoint.opened(path):
+        config = TrainConfig(**meta["settings"])
+        if task is not None:
+            config = dataclasses.replace(config, task=TrainConfig.create(task).task)
+        n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])
+    sizes = (n_obs, *config.config["hidden"], n_actions)
+    dtype = jnp.zeros(()).dtype
+    layers = [
+        (jax.ShapeDtypeStruct((a, b), dtype), jax.ShapeDtypeStruct((b,), dtype)) for a, b in itertools.pairwise(sizes)
+    ]
+    stats = jax.eval_shape(lambda: RunningStats.create(n_obs))
+    return checkpoint.restore(path, arrays, Policy(stats, layers)), config, meta
+
+
+def _meta(config: TrainConfig) -> dict[str, Any]:
+    """Return the metadata of the files of a run.
+
+    Raises:
+        ConfigError: If JSON cannot hold the options.
+    """
+    meta = {"crazysim": crazysim.__version__, "settings": dataclasses.asdict(config), "code": code_digest(config.task)}
+    try:
+        return json.loads(json.dumps(meta))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"expected options that a checkpoint can hold, got {config.options!r}: {error}. Use numbers, texts and "
+            f"lists."
+        ) from error
+
+
+def _make_folder(folder: Path) -> None:
+    """Make the folder of a run.
+
+    Raises:
+        ConfigError: If that is impossible.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"expected a folder for the run, got {str(folder)!r}: {error}. Use another --out.") from error
+
+
+def stored_config(folder: str | Path) -> TrainConfig:
+    """Return the configuration in the checkpoint of a folder.
+
+    Raises:
+        ConfigError: If there is no intact checkpoint.
+    """
+    path = Path(folder) / CHECKPOINT
+    meta = checkpoint.read(path)[1]
+    with checkpoint.opened(path):
+        return TrainConfig(**meta["settings"])
+
+
+def _stored(path: Path, config: TrainConfig) -> tuple[dict[str, Any], list[dict[str, Any]], str]:
+    """Return the arrays of a checkpoint, the learning curve until then, and the hash of the code of the task.
+
+    Raises:
+        ConfigError: If there is no intact checkpoint, or it belongs to a run with another configuration.
+    """
+    arrays, meta = checkpoint.read(path)
+    with checkpoint.opened(path):
+        _require_same(path, meta, config)
+        return arrays, list(meta["curve"]), meta["code"]
+
+
+def _require_same(path: Path, meta: dict[str, Any], config: TrainConfig) -> None:
+    """Check that a checkpoint belongs to a run with this configuration, but for what may change.
+
+    Raises:
+        ConfigError: With the first difference.
+    """
+    if meta["crazysim"] != crazysim.__version__:
+        raise ConfigError(
+            f"expected a checkpoint of crazysim {crazysim.__version__}, got {path} of {meta['crazysim']}; start a new "
+            f"run in another folder with --out"
+        )
+    stored, given = (_settings(settings) for settings in (meta["settings"], _meta(config)["settings"]))
+    for name in {**stored, **given}:
+        if stored.get(name, "its default") != given.get(name, "its default"):
+            alterable = [x for x in ALTERABLE if x in config.config]
+            raise ConfigError(
+                f"expected {name} = {stored.get(name, 'its default')!r} as in {path}, got "
+                f"{given.get(name, 'its default')!r}; resume with the same value, or start a new run in another folder "
+                f"with --out. A resumed run may change {', '.join(alterable)} and device."
+            )
+
+
+def _settings(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of a configuration that a resumed run keeps, by name, those of options and config too."""
+    place, name = split(settings["task"]) if is_reference(settings["task"]) else ("", settings["task"])
+    flat = {k: x for k, x in settings.items() if k not in ("options", "config")}
+    kept = {k: x for k, x in settings["config"].items() if k not in ALTERABLE}
+    options = {k: x for k, x in settings["options"].items() if k != "device"}
+    return flat | {"task": f"{Path(place).name}:{name}" if place else name} | options | kept
+
+
+@contextmanager
+def _bar(total: int, done: int, wanted: bool) -> Iterator[Callable[..., None]]:
+    """Yield a function that shows metrics on a progress bar; without ``wanted`` or tqdm it does nothing."""
+    try:
+        if not wanted:
+            raise ImportError
+        from tqdm import tqdm
+    except ImportError:
+        yield lambda *_: None
+        return
+    with tqdm(total=total, initial=done, unit="iteration", ncols=100) as bar:
+        shown: dict[str, str] = {}
+
+        def show(metrics: dict[str, Any] | None, iterations: int = 1) -> None:
+            if metrics is not None:
+                known = {k: metrics[k] for k in ("success", "error", "reward") if k in metrics}
+                shown.update({k: f"{float(np.asarray(v)):.3f}" for k, v in known.items()})
+                bar.set_postfix(shown, refresh=False)
+            bar.update(iterations)
+
+        yield show

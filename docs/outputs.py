@@ -1,0 +1,129 @@
+"""Printed output of the Python blocks of a page: run them, compare, and write the output into the page.
+
+A block ``text`` that follows a block ``python`` shows what that block prints. ``python docs/outputs.py PAGE ...`` runs
+pages and writes the outputs that are missing or have changed; ``tests/docs/test_pages.py`` compares them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+BLOCK = re.compile(
+    r"^```python\n(?P<code>.*?)^```\n(?:\n```text\n(?P<output>.*?)^```\n)?",
+    re.DOTALL | re.MULTILINE,
+)
+NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+TOKEN = re.compile(rf"(?<![\w.]){NUMBER.pattern}(?!\w)|[A-Za-z_]\w*|\S")
+
+
+class Block(NamedTuple):
+    """Python block of a page."""
+
+    code: str
+    """Source, with as many empty lines in front as precede it on the page, so that tracebacks show the page's lines."""
+
+    output: str | None
+    """Output that the page shows below the block; None where it shows none."""
+
+    end: int
+    """Offset in the page of the end of the block, its output included."""
+
+
+def blocks(text: str) -> Iterator[Block]:
+    """Yield the Python blocks of a page in order."""
+    for match in BLOCK.finditer(text):
+        code = "\n" * text[: match.start("code")].count("\n") + match["code"]
+        yield Block(code, match["output"], match.end())
+
+
+def run(block: Block, page: Path, namespace: dict[str, Any]) -> str:
+    """Execute a block in a namespace and return what it prints, without spaces at the ends of lines."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(compile(block.code, str(page), "exec", dont_inherit=True), namespace)
+    return "".join(f"{line.rstrip()}\n" for line in printed.getvalue().strip("\n").splitlines())
+
+
+def same(shown: str, printed: str) -> bool:
+    """Return True where the output that a page shows is that of its block.
+
+    ``...`` stands for any text. Spaces and line breaks do not count. Integers are equal. Other numbers may differ by
+    2%, by 2 in the last digit that the page shows, or by 2e-5: processors and versions of JAX round differently.
+    """
+    parts = [TOKEN.findall(part) for part in shown.split("...")]
+    tokens = TOKEN.findall(printed)
+    if len(parts) == 1:
+        return _equal(parts[0], tokens)
+    first, *middle, last = parts
+    start, end = len(first), len(tokens) - len(last)
+    if start > end or not (_equal(first, tokens[:start]) and _equal(last, tokens[end:])):
+        return False
+    for part in middle:
+        places = range(start, end - len(part) + 1)
+        found = next((i for i in places if _equal(part, tokens[i : i + len(part)])), None)
+        if found is None:
+            return False
+        start = found + len(part)
+    return True
+
+
+def _equal(shown: list[str], printed: list[str]) -> bool:
+    return len(shown) == len(printed) and all(map(_token_equal, shown, printed))
+
+
+def _token_equal(shown: str, printed: str) -> bool:
+    if shown == printed:
+        return True
+    if not (NUMBER.fullmatch(shown) and NUMBER.fullmatch(printed)):
+        return False
+    if shown.lstrip("+-").isdigit() and printed.lstrip("+-").isdigit():
+        return int(shown) == int(printed)
+    mantissa, _, exponent = shown.lower().partition("e")
+    last_digit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+    a, b = float(shown), float(printed)
+    return abs(a - b) <= max(0.02 * max(abs(a), abs(b)), 2.1 * last_digit, 2e-5)
+
+
+def _update(page: Path) -> int:
+    """Run a page, write its outputs, and return the number of blocks whose output has changed."""
+    text = page.read_text()
+    namespace: dict[str, Any] = {"__name__": "page"}
+    pieces, start, changed = [], 0, 0
+    for block in blocks(text):
+        printed = run(block, page, namespace)
+        piece = text[start : block.end]
+        start = block.end
+        if printed and not (block.output is not None and same(block.output, printed)):
+            if block.output is not None:
+                piece = piece[: piece.rindex("\n```text\n")]
+            piece += f"\n```text\n{printed}```\n"
+            changed += 1
+        pieces.append(piece)
+    if changed:
+        page.write_text("".join(pieces) + text[start:])
+    return changed
+
+
+def main() -> int:
+    """Run pages and write their outputs."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("pages", nargs="+", type=Path)
+    for page in [path.resolve() for path in parser.parse_args().pages]:
+        with tempfile.TemporaryDirectory() as folder:
+            os.chdir(folder)
+            changed = _update(page)
+            os.chdir("/")
+        print(f"{page.name}: {changed} outputs written", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

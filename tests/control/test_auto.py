@@ -1,0 +1,346 @@
+"""The default controller: what it achieves with every airframe at every level, and its parts."""
+
+import functools
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import unit_quats, vectors, with_states
+from hypothesis import given
+from scipy.spatial.transform import Rotation
+
+from crazysim import Sim, load_airframe
+from crazysim.control.allocation import yaw_arm
+from crazysim.control.auto import DAMPING, STIFFNESS, Auto, AutoParams, error_of_axes, error_of_quat
+from crazysim.control.bandwidth import rotor_rate
+from crazysim.core import functional as F
+from crazysim.dynamics import first_principles
+from crazysim.dynamics.models import supported_drones
+from crazysim.plugins.follow import Follow
+from crazysim.trajectories import hover, line
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+HIGH = 50.0
+
+
+@functools.cache
+def benchmark():
+    """Return the benchmark of controllers, whose flights and own airframes these tests use."""
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        import controllers
+    finally:
+        sys.path.remove(str(BENCHMARKS))
+    return controllers
+
+
+@functools.cache
+def airframes():
+    return [load_airframe(name) for name in supported_drones("first_principles")] + benchmark().own_airframes()
+
+
+# Flights --------------------------------------------------------------------------------------------------------
+
+
+def test_every_airframe_goes_where_it_is_sent():
+    """The figures of the page on controllers for all built-in airframes and three of plain physics."""
+    found = benchmark().fly("auto", airframes(), 2.0, 100)
+    assert len(found) == 10
+    for name, row in found.items():
+        assert row["hover"] < 2e-3, (name, row)
+        assert row["tracking"] < 0.03, (name, row)
+        assert row["pushed"] < 0.01, (name, row)
+        assert row["heavier"] < 0.01, (name, row)
+        assert row["home"] >= 0.99, (name, row)
+
+
+@pytest.mark.parametrize("dynamics", ["so_rpy", "so_rpy_rotor_drag"])
+def test_the_position_loop_flies_fitted_dynamics(dynamics):
+    """The same figures above the attitude response of the models; hb_x500, the slowest, tracks within 4 cm."""
+    names = [load_airframe(name) for name in supported_drones(dynamics)]
+    for name, row in benchmark().fly("auto", names, 2.0, 1, dynamics).items():
+        assert row["hover"] < 2e-3, (name, row)
+        assert row["tracking"] < (0.04 if name == "hb_x500" else 0.03), (name, row)
+        assert row["pushed"] < 0.01, (name, row)
+        assert row["heavier"] < 0.01, (name, row)
+
+
+def flying(level, worlds, controller="auto", **settings):
+    """Return a simulation of all airframes, high up at rest with rotors at hover, and their weights, N."""
+    sim = Sim(worlds, drone=airframes(), control=level, controller=controller, **settings)
+    s, high = sim.data.states, np.zeros((worlds, len(airframes()), 3), np.float32)
+    high[..., 2] = HIGH
+    rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(sim.data.params), s.rotor_vel.shape)
+    sim.data = sim.data.replace(states=s.replace(pos=jnp.asarray(high), rotor_vel=rotor_vel))
+    return sim, np.array([9.81 * a.value("rigid_body.mass") for a in airframes()])
+
+
+@functools.cache
+def responses(level, steps):
+    """Return the angles or body rates over time after steps of the command, over their sizes.
+
+    (n_times, n_steps, n_airframes)
+    """
+    sim, weights = flying(level, len(steps))
+    command = np.zeros((len(steps), len(weights), 4), np.float32)
+    command[..., 3] = weights
+    for k, (axis, size) in enumerate(steps):
+        command[k, :, axis] = size
+    getattr(sim, f"{level}_control")(command)
+    out = []
+    for _ in range(150):
+        sim.step(10)
+        s = sim.data.states
+        quat = np.asarray(s.quat)
+        angles = Rotation.from_quat(quat.reshape(-1, 4)).as_euler("xyz").reshape(*quat.shape[:2], 3)
+        now = angles if level == "attitude" else np.asarray(s.ang_vel)
+        out.append(np.stack([now[k, :, axis] / size for k, (axis, size) in enumerate(steps)]))
+    return np.array(out)
+
+
+@pytest.mark.parametrize(
+    ("level", "steps"),
+    [
+        ("attitude", ((0, 0.1), (0, 0.5), (1, -0.5), (2, 0.5), (2, 2.5))),
+        ("body_rate", ((0, 0.5), (0, 3.0), (1, -3.0), (2, 0.5), (2, 2.0))),
+    ],
+)
+def test_steps_of_the_command_settle_without_overshoot(level, steps):
+    """At most 10%, within 2% after 2 s; half of the way within 0.3 s, for yaw within 0.6 s."""
+    y = responses(level, steps)
+    assert y.max() < 1.1
+    np.testing.assert_allclose(y[100:], 1.0, atol=0.02)
+    assert np.all(y[15, :3] > 0.5)
+    assert np.all(y[30] > 0.5)
+
+
+def test_body_rates_are_followed_and_nothing_levels_the_drone():
+    """Half a turn of roll in 1 s at pi rad/s: CTBR."""
+    sim, weights = flying("body_rate", 1)
+    sim.body_rate_control(np.stack([np.array([np.pi, 0, 0, w], np.float32) for w in weights])[None])
+    sim.step(500)
+    tilt = np.arccos(np.clip(1 - 2 * np.sum(np.asarray(sim.data.states.quat)[0, :, :2] ** 2, axis=-1), -1, 1))
+    assert np.all(tilt > 2.6)
+
+
+def test_the_third_entry_of_an_attitude_may_be_a_yaw_rate():
+    sim, weights = flying("attitude", 1, Auto(yaw_rate=True))
+    sim.attitude_control(np.stack([np.array([0.2, 0.0, 0.8, w], np.float32) for w in weights])[None])
+    sim.step(1500)
+    quat, ang_vel = np.asarray(sim.data.states.quat)[0], np.asarray(sim.data.states.ang_vel)[0]
+    rotation = Rotation.from_quat(quat)
+    np.testing.assert_allclose(rotation.apply(ang_vel)[:, 2], 0.8, atol=0.01)
+    np.testing.assert_allclose(rotation.as_euler("xyz")[:, 0], 0.2, atol=0.02)
+
+
+@pytest.mark.parametrize("level", ["attitude", "body_rate"])
+def test_zero_thrust_switches_the_motors_off(level):
+    sim, _ = flying(level, 1)
+    getattr(sim, f"{level}_control")(np.full((1, len(airframes()), 4), [0.3, -0.2, 0.1, 0.0], np.float32))
+    sim.step(10)
+    np.testing.assert_array_equal(sim.data.controls.rotor_vel, 0.0)
+
+
+def test_an_unknown_torque_leaves_no_error():
+    """A torque that would turn each drone by 0.2 rad under its gains alone."""
+    sim, weights = flying("attitude", 1)
+    params = sim.data.controls.controller.params
+    torque = 0.2 * np.asarray(params.torque_max)[:1] / 0.5
+    sim.data = sim.data.replace(states=sim.data.states.replace(torque=jnp.asarray(torque * [1.0, -1.0, 0.0])))
+    sim.attitude_control(np.stack([np.array([0, 0, 0, w], np.float32) for w in weights])[None])
+    sim.step(150)
+    middle = np.abs(Rotation.from_quat(np.asarray(sim.data.states.quat)[0]).as_euler("xyz")[:, :2]).max()
+    sim.step(1850)
+    end = np.abs(Rotation.from_quat(np.asarray(sim.data.states.quat)[0]).as_euler("xyz")[:, :2]).max()
+    assert middle > 0.01
+    assert end < 1e-3
+
+
+def test_a_far_setpoint_is_approached_without_losing_height():
+    """30 m aside: the feedback keeps the tilt within what the rotors can carry."""
+    sim, _ = flying("state", 1)
+    command = np.zeros((1, len(airframes()), 16), np.float32)
+    command[..., :3], command[..., 12] = [30.0, 0.0, HIGH], 1.0
+    sim.state_control(command)
+    low = np.inf
+    for _ in range(200):
+        sim.step(50)
+        low = min(low, float(sim.data.states.pos[..., 2].min()))
+    assert low > HIGH - 0.5
+    np.testing.assert_allclose(np.asarray(sim.data.states.pos)[0], command[0, :, :3], atol=0.01)
+
+
+# Parts ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.fast
+@given(body=unit_quats(), desired=unit_quats())
+def test_the_rotation_error_is_a_shortest_tilt_and_a_turn(body, desired):
+    """The error of SciPy's rotations: both forms agree, and their lengths are 2 sin(angle / 2)."""
+    relative = Rotation.from_quat(body).inv() * Rotation.from_quat(desired)
+    axes = relative.as_matrix().astype(np.float32)
+    z = relative.as_matrix()[:, 2]
+    tilt = np.arccos(np.clip(z[2], -1, 1))
+    if tilt > 3.1:
+        return  # the direction of the tilt is undefined nearby
+    axis = np.cross([0, 0, 1], z)
+    axis = axis / max(np.linalg.norm(axis), 1e-12)
+    turn = (Rotation.from_rotvec(tilt * axis).inv() * relative).as_rotvec()[2]
+    expected = 2 * np.array([*(np.sin(tilt / 2) * axis[:2]), np.sin(turn / 2)])
+    from_axes = np.asarray(jitted_axes(axes[:, 0], axes[:, 1], axes[:, 2]))
+    from_quat = np.asarray(jitted_quat(relative.as_quat().astype(np.float32)))
+    for found in (from_axes, from_quat):
+        np.testing.assert_allclose(found[:2], expected[:2], atol=5e-3)
+        np.testing.assert_allclose(np.abs(found[2]), np.abs(expected[2]), atol=5e-3)
+        if abs(turn) < 3.0:
+            np.testing.assert_allclose(found[2], expected[2], atol=5e-3)
+
+
+jitted_axes, jitted_quat = jax.jit(error_of_axes), jax.jit(error_of_quat)
+
+
+@pytest.mark.fast
+def test_upside_down_the_error_is_a_full_turn_about_x():
+    """Where the direction of the shortest turn is undefined, so that such a drone does not stay there."""
+    x, y, z = (np.float32(v) for v in ([1, 0, 0], [0, -1, 0], [0, 0, -1]))
+    np.testing.assert_allclose(jitted_axes(x, y, z), [2, 0, 0])
+    np.testing.assert_allclose(jitted_quat(np.float32([1, 0, 0, 0])), [2, 0, 0])
+    np.testing.assert_allclose(jitted_axes(-x, y, -z)[2], 2.0, atol=1e-3)  # turned by 180 degrees
+
+
+@pytest.mark.fast
+def test_the_gains_are_damped_as_documented():
+    """Poles of s^3 / a + s^2 + kd s + kp over a, and of s^2 / a + s + kd: the numbers of the module's docstring."""
+    poles = np.roots([1, 1, DAMPING, STIFFNESS])
+    real, pair = poles[np.abs(poles.imag) < 1e-9].real, poles[poles.imag > 0]
+    np.testing.assert_allclose(real, -0.31, atol=0.005)
+    np.testing.assert_allclose(-pair.real / np.abs(pair), 0.55, atol=0.005)
+    rate = np.roots([1, 1, DAMPING])[0]
+    damping = -rate.real / abs(rate)
+    np.testing.assert_allclose(damping, 0.645, atol=0.001)
+    np.testing.assert_allclose(np.exp(-np.pi * damping / np.sqrt(1 - damping**2)), 0.07, atol=0.002)
+
+
+@pytest.mark.fast
+def test_gains_by_hand():
+    """cf21B_500: lag 16.094 1/s, made faster to 50 1/s; with 1.5 periods of 500 Hz that is 43.48 1/s."""
+    airframe = load_airframe("cf21B_500")
+    p = AutoParams.create(airframe, 500)
+    rate = 1 / (1 / 50 + 1.5 / 500)
+    np.testing.assert_allclose(p.lead, 50 / rotor_rate(airframe))
+    np.testing.assert_allclose(p.damping, 0.6 * rate * np.array([1, 1, 0.5]))
+    np.testing.assert_allclose(p.stiffness, 0.12 * rate**2 * np.array([1, 1, 0.25]))
+    np.testing.assert_allclose(p.position.damping, 2 * 0.4 * rate / 5)
+    slow = AutoParams.create(load_airframe("cf2x_L250"), 500)
+    np.testing.assert_allclose(slow.lead, 5.0)  # the most
+    assert AutoParams.create(airframe, 50).lead < p.lead  # half of what is missing in a tick of 20 ms
+
+
+@pytest.mark.fast
+def test_the_drag_torque_over_thrust_of_the_curves_is_that_of_the_tables():
+    """Derived from thrust and torque curves around hover, within 15% of the firmware's number where there is one."""
+    for name in ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "crazyflie", "bumblebee", "bumblebee_lab"):
+        airframe = load_airframe(name)
+        assert yaw_arm(airframe) == pytest.approx(float(airframe.value("controller.thrust2torque")), rel=0.15)
+
+
+# Laws -------------------------------------------------------------------------------------------------------------
+
+
+@given(
+    quat=unit_quats(), pos=vectors(3, 100.0), vel=vectors(3, 50.0), ang_vel=vectors(3, 100.0), command=vectors(4, 20.0)
+)
+def test_any_state_and_command_give_finite_rotor_speeds(quat, pos, vel, ang_vel, command):
+    """At every level, with finite memory; from saturation to free fall."""
+    for level, run in steppers().items():
+        data, step = run
+        s = data.states
+        new = {"pos": pos, "quat": quat, "vel": vel, "ang_vel": ang_vel}
+        states = s.replace(**{key: jnp.asarray(x, jnp.float32)[None, None] for key, x in new.items()})
+        given = np.concatenate([command, command, command, [0, 0, 0, 0]]) if level == "state" else command
+        out = step(data.replace(states=states), jnp.asarray(given, jnp.float32)[None, None])
+        for leaf in jax.tree.leaves((out.states, out.controls)):
+            assert np.isfinite(leaf).all(), level
+
+
+@functools.cache
+def steppers():
+    """Return data and a compiled step with a command, for every level that the controller follows."""
+    found = {}
+    for level in ("state", "attitude", "body_rate"):
+        sim = Sim(control=level, controller="auto", engine="plain")
+        command = getattr(F, f"{level}_control")
+        step = sim.build_step_fn()
+        found[level] = (sim.data, jax.jit(lambda data, cmd, f=command, step=step: step(f(data, cmd), 2)))
+    return found
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("level", ["state", "attitude", "body_rate"])
+def test_gradients_equal_central_differences(level, rng):
+    """Of the height, place and attitude after 20 ms by state, command and estimates, in float64, in free flight."""
+    sim = Sim(control=level, controller="auto", engine="plain")
+    command = getattr(F, f"{level}_control")
+    step, s = sim.build_step_fn(), sim.data.states
+    rotor_vel = first_principles.hover_rotor_vel(sim.data.params)
+    wanted = {"state": [*rng.normal(size=9), 0, 0, 0.3, 0.9, 0, 0, 0.2], "attitude": [0.2, -0.1, 0.3, 0.5]}
+    wanted["body_rate"] = wanted["attitude"]
+
+    def end(x):
+        states = s.replace(
+            pos=s.pos + x[0:3] + jnp.array([0, 0, 1.0]),
+            vel=s.vel + x[3:6],
+            ang_vel=s.ang_vel + x[6:9],
+            rotor_vel=jnp.broadcast_to(rotor_vel, s.rotor_vel.shape) * (1 + 0.1 * x[9:13]),
+        )
+        data = command(sim.data.replace(states=states), jnp.asarray(wanted[level])[None, None] * (1 + x[13]))
+        out = step(data, 10).states
+        return jnp.sum(out.pos * jnp.array([1.0, 2.0, 3.0])) + jnp.sum(out.quat) + 1e-2 * jnp.sum(out.ang_vel)
+
+    x, direction = 0.1 * rng.normal(size=14), rng.normal(size=14)
+    slope = jax.jit(lambda x: jax.jvp(end, (x,), (direction,))[1])(x)
+    gradient = jax.jit(jax.grad(end))(x)
+    value, h = jax.jit(end), 1e-6
+    numeric = (value(x + h * direction) - value(x - h * direction)) / (2 * h)
+    assert abs(numeric) > 1e-3
+    np.testing.assert_allclose(slope, numeric, rtol=1e-5)
+    np.testing.assert_allclose(gradient @ direction, numeric, rtol=1e-5)
+
+
+@pytest.mark.parametrize("level", ["state", "attitude", "body_rate"])
+def test_worlds_and_drones_fly_alike_alone_and_together(level):
+    """``f(batch)[i] == f(batch[i])``, fused: every drone of a mixed batch, by rounding of different code, 1e-4."""
+    together, weights = flying(level, 2, strict=True)
+    n = len(weights)
+    command = np.zeros((2, n, 16 if level == "state" else 4), np.float32)
+    if level == "state":
+        command[..., :3], command[..., 12] = [1.0, -0.5, HIGH + 1], 1.0
+        command[1, :, 0] = -1.0
+    else:
+        command[..., 3], command[0, :, 0], command[1, :, 1] = weights, 0.3, -0.4
+    getattr(together, f"{level}_control")(command)
+    together.step(100)
+    for k in (0, n - 1):
+        alone = Sim(drone=airframes()[k], control=level, controller="auto", strict=True)
+        s = alone.data.states
+        rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(alone.data.params), s.rotor_vel.shape)
+        alone.data = alone.data.replace(states=s.replace(pos=s.pos + np.array([0, 0, HIGH]), rotor_vel=rotor_vel))
+        getattr(alone, f"{level}_control")(command[1:, k : k + 1])
+        alone.step(100)
+        for name in ("pos", "quat", "vel", "ang_vel"):
+            mine, ours = getattr(alone.data.states, name)[0, 0], getattr(together.data.states, name)[1, k]
+            np.testing.assert_allclose(ours, mine, atol=1e-4, err_msg=name)
+
+
+@pytest.mark.parametrize("drone", ["cf21B_500", "cf2x_T350", "bumblebee"])
+def test_a_slow_climb_beside_the_start_leaves_the_floor(drone):
+    """The floor of the simulation stops every motion of a drone on it: what is measured there must not tilt it."""
+    sim = Sim(n_worlds=32, drone=drone, control="state")
+    away = np.random.default_rng(0).uniform(-2.0, 2.0, (32, 1, 2))
+    sim.data = with_states(sim.data, pos=np.concatenate([away, np.zeros((32, 1, 1))], axis=-1))
+    sim.add(Follow([line([0, 0, 0], [0, 0, 1.0], 4.0).then(hover([0, 0, 1.0]))]))
+    sim.step(10 * sim.freq)
+    np.testing.assert_allclose(np.asarray(sim.data.states.pos), np.broadcast_to([0, 0, 1.0], (32, 1, 3)), atol=0.01)

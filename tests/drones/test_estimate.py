@@ -1,0 +1,139 @@
+"""Airframes that are estimated from a few numbers."""
+
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.control.bandwidth import rotor_rate
+from crazysim.drones import estimate_airframe, load_airframe
+from crazysim.dynamics import supported_dynamics
+
+pytestmark = pytest.mark.fast
+
+QUAD: dict[str, Any] = {"mass": 1.2, "propeller": 0.127, "arm": 0.12, "thrust_to_weight": 4.0}
+SMALL: dict[str, Any] = {"mass": 0.25, "propeller": 0.0762, "arm": 0.07, "thrust_to_weight": 4.0}
+HEXA: dict[str, Any] = {"mass": 4.0, "propeller": 0.33, "arm": 0.36, "n_rotors": 6, "thrust_to_weight": 2.4}
+TABLE: dict[str, Any] = {"throttle": [30, 60, 100], "thrust_g": [200, 600, 1200], "rpm": [10e3, 17.3e3, 24.5e3]}
+
+
+def load(**numbers):
+    return load_airframe(tomllib.loads(estimate_airframe(**numbers)))
+
+
+@pytest.mark.parametrize("numbers", [QUAD, SMALL, HEXA], ids=["quad", "small", "hexa"])
+def test_an_estimated_airframe_hovers(numbers):
+    """At the levels that need no gains, with the default controller, from the file alone."""
+    airframe = load(**numbers)
+    assert supported_dynamics(airframe) == ("first_principles",)
+    sim = Sim(drone=airframe, control="state", controller="auto")
+    sim.state_control(pos=[0.0, 0, 1.0])
+    sim.step(6 * sim.freq)
+    np.testing.assert_allclose(sim.data.states.pos[0, 0], [0, 0, 1], atol=0.01)
+
+
+def test_every_number_has_a_source_that_is_described():
+    tables = tomllib.loads(estimate_airframe(**QUAD))
+    sources = tables.pop("sources")
+    entries = [entry for name, table in tables.items() if name != "name" for entry in table.values()]
+    assert {entry["source"] for entry in entries} == set(sources)
+    assert all(entry["unit"] for entry in entries)
+    assert not any("{" in text for text in sources.values())
+    estimates = [key for key, text in sources.items() if text.startswith("estimate: ")]
+    assert {"inertia", "thrust_curve", "torque_curve", "lag", "drag", "resistance"} <= set(estimates)
+
+
+def test_a_quadrotor_is_that_of_the_built_in_airframes():
+    """Order and signs of the rotors: clockwise from ahead-right, which turns counter-clockwise."""
+    mine, theirs = load(**QUAD), load_airframe("cf21B_500")
+    np.testing.assert_array_equal(mine.mixing_matrix, theirs.mixing_matrix)
+    assert load(**QUAD | {"layout": "+"}).value("rotors.position")[0].tolist() == [0.12, 0, 0]
+    assert load(**HEXA).n_rotors == 6
+
+
+@pytest.mark.parametrize(
+    ("name", "propeller", "pitch"), [("cf21B_500", 0.055, 0.035), ("bumblebee", 0.127, None), ("hb_x500", 0.254, 0.114)]
+)
+def test_estimates_are_near_what_is_known(name, propeller, pitch):
+    """Inertias within 45%, thrust at a speed and torque over thrust within 35%, of the built-in airframes."""
+    true = load_airframe(name)
+    mass = float(true.value("rigid_body.mass"))
+    most = float(np.sum(np.broadcast_to(true.value("rotors.thrust_max"), true.n_rotors)))
+    mine = load(
+        mass=mass,
+        propeller=propeller,
+        positions=true.value("rotors.position")[:, :2],
+        spins=-true.value("rotors.yaw_torque_sign"),
+        thrust_to_weight=most / mass / 9.81,
+        pitch=pitch,
+    )
+    np.testing.assert_allclose(np.diag(mine.inertia) / np.diag(true.inertia), 1, atol=0.45)
+    np.testing.assert_allclose(mine.value("rotors.thrust_max"), true.value("rotors.thrust_max"), rtol=1e-5)
+    if "rotors.thrust_curve" not in true.values:
+        return
+    speed = true.rotor_vel_limits.max()
+    thrusts, torques = (
+        [float(np.polyval(a.value(f"rotors.{key}_curve")[::-1], speed)) for a in (mine, true)]
+        for key in ("thrust", "torque")
+    )
+    np.testing.assert_allclose(thrusts[0] / thrusts[1], 1, atol=0.35)
+    np.testing.assert_allclose(torques[0] / thrusts[0] / (torques[1] / thrusts[1]), 1, atol=0.35)
+
+
+def test_a_motor_table_gives_thrust_and_curves(tmp_path):
+    path = tmp_path / "motor.csv"
+    path.write_text(
+        "# 2306, 5 inch\n" + "\n".join(",".join(map(str, row)) for row in [TABLE, *zip(*TABLE.values(), strict=True)]),
+        encoding="utf-8",
+    )
+    numbers = {key: value for key, value in QUAD.items() if key != "thrust_to_weight"}
+    from_file, from_dict = load(**numbers, motor_table=path), load(**numbers, motor_table=TABLE)
+    np.testing.assert_allclose(from_file.value("rotors.thrust_max"), 1.2 * 9.81, rtol=1e-5)
+    k = from_file.value("rotors.thrust_curve")[2]
+    np.testing.assert_allclose(k, from_dict.value("rotors.thrust_curve")[2])
+    np.testing.assert_allclose(k * np.square(TABLE["rpm"]), np.array(TABLE["thrust_g"]) * 9.81e-3, rtol=0.03)
+    torque = np.array([2, 4, 8]) * 1e-10 * np.square(TABLE["rpm"]) * [2, 1, 0.5]
+    measured = load(**numbers, motor_table=TABLE | {"torque_nm": torque})
+    np.testing.assert_allclose(measured.value("rotors.torque_curve")[2], 4e-10, rtol=1e-5)
+    power = 4e-10 * np.square(TABLE["rpm"]) * np.array(TABLE["rpm"]) * 2 * np.pi / 60 / 0.75
+    electric = load(**numbers, motor_table=TABLE | {"power_w": power})
+    np.testing.assert_allclose(electric.value("rotors.torque_curve")[2], 4e-10, rtol=1e-5)
+
+
+def test_given_numbers_replace_estimates():
+    mine = load(**QUAD, inertia=[4e-3, 5e-3, 8e-3], time_constant=0.03, cells=6, capacity=1.3, resistance=0.04)
+    np.testing.assert_allclose(mine.value("rigid_body.inertia"), [4e-3, 5e-3, 8e-3])
+    assert rotor_rate(mine) == pytest.approx(1 / 0.03, rel=1e-5)
+    assert [float(mine.value(f"battery.{key}")) for key in ("cells", "capacity", "resistance")] == [6, 1.3, 0.04]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mass": 0.0}, "mass to be positive, got 0"),
+        ({"arm": None}, "either arm, .* or positions"),
+        ({"arm": 0.08}, r"propellers that do not touch, got a diameter of 0.127 m and rotors 0.113 m apart"),
+        ({"n_rotors": 5}, "an even number of rotors from 4"),
+        ({"layout": "h"}, "layout as 'x' or '\\+', got 'h'"),
+        ({"arm": None, "positions": [[0.1, 0.1, 0]]}, "at least 3 rotors"),
+        ({"arm": None, "positions": [[0.2, 0], [-0.2, 0.2], [-0.2, -0.2]]}, "expected spins for 3 rotors"),
+        ({"spins": [1, 1, 1, 1]}, "spins of 1 and -1 for 4 rotors, and not all equal"),
+        ({"thrust_to_weight": None}, "either thrust_to_weight or motor_table"),
+        ({"motor_table": TABLE}, "either thrust_to_weight or motor_table"),
+        ({"thrust_to_weight": None, "motor_table": "nowhere.csv"}, "existing CSV file, got 'nowhere.csv'"),
+        ({"thrust_to_weight": None, "motor_table": {"force": [1]}}, "columns of a motor table among .*got 'force'"),
+        ({"thrust_to_weight": None, "motor_table": {"rpm": [1e4]}}, "a column thrust_n or thrust_g"),
+        ({"thrust_to_weight": None, "motor_table": TABLE | {"rpm": [1, 2]}}, "columns of equal lengths"),
+        ({"thrust_to_weight": None, "motor_table": {"thrust_g": ["much"]}}, "numbers in column 'thrust_g'"),
+    ],
+)
+def test_law_09_wrong_numbers_are_refused(change, message):
+    with pytest.raises(ConfigError, match=message):
+        estimate_airframe(**QUAD | change)
+
+
+def test_law_09_a_drone_that_does_not_lift_itself_is_refused():
+    with pytest.raises(ConfigError, match=r"expected rotors that lift 1\.2 kg"):
+        load(**QUAD | {"thrust_to_weight": 0.9})

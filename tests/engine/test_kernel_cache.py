@@ -1,0 +1,181 @@
+"""Folders of kernels: of this user alone, and without what processes that were killed have left."""
+
+import os
+import stat
+import subprocess
+import sys
+import time
+import warnings
+
+import pytest
+
+from crazysim.engine.backends import kernel_cache
+from crazysim.errors import ConfigError
+from crazysim.trust import distrust
+from crazysim.utils import enable_cache
+
+OTHERS = 12345
+"""User that the tests do not run as."""
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """JAX's compilation cache, and no folder that was refused or swept before."""
+    monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path))
+    kernel_cache._refuse.cache_clear()
+    kernel_cache._swept.cache_clear()
+    return tmp_path
+
+
+def finished_process():
+    """Return the number of a process that has ended."""
+    process = subprocess.Popen(["true"])
+    process.wait()
+    return process.pid
+
+
+def mode(path):
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_the_folder_is_made_for_this_user_alone(cache):
+    mask = os.umask(0)
+    try:
+        assert kernel_cache.folder() == cache / "crazysim"
+    finally:
+        os.umask(mask)
+    assert mode(cache / "crazysim") == 0o700
+    assert mode(kernel_cache.temporary()) == 0o700
+
+
+@pytest.mark.parametrize("bits", [0o777, 0o775, 0o702])
+def test_a_folder_that_others_can_write_is_refused_once(cache, bits):
+    shared = cache / "crazysim"
+    shared.mkdir()
+    shared.chmod(bits)
+    with pytest.warns(UserWarning, match=r"only this user can write, got .*crazysim'.* Remove it"):
+        assert kernel_cache.folder() == kernel_cache.temporary()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert kernel_cache.folder() == kernel_cache.temporary()
+    shared.chmod(0o755)
+    assert kernel_cache.folder() == shared
+
+
+def test_a_folder_that_others_can_replace_is_refused(cache):
+    shared = cache / "crazysim"
+    assert kernel_cache.folder() == shared
+    cache.chmod(0o777)
+    assert str(cache) in distrust(shared)
+    cache.chmod(0o1777)  # as of /tmp: others can add files, but rename and remove only their own
+    assert not distrust(shared)
+
+
+@as_root
+def test_a_folder_of_another_user_is_refused(cache):
+    shared = cache / "crazysim"
+    shared.mkdir(mode=0o700)
+    os.chown(shared, OTHERS, OTHERS)
+    with pytest.warns(UserWarning, match=f"belongs to the user {OTHERS}"):
+        assert kernel_cache.folder() == kernel_cache.temporary()
+
+
+@as_root
+def test_a_file_of_another_user_is_not_loaded(cache):
+    """It may have been put there before the folder was closed."""
+    folder = kernel_cache.folder()
+    made = folder / "made.tmp"
+    made.write_bytes(b"library")
+    library = kernel_cache.store(folder, "key", made)
+    assert list(kernel_cache.find(folder, "key")) == [library]
+    os.chown(library, OTHERS, OTHERS)
+    assert not list(kernel_cache.find(folder, "key"))
+    assert library.exists()
+
+
+def test_a_folder_that_is_asked_for_is_checked_at_once(tmp_path):
+    """With ``enable_cache``, an error rather than a warning."""
+    mask = os.umask(0)
+    try:
+        opened = tmp_path / "open"
+        opened.mkdir()
+    finally:
+        os.umask(mask)
+    with pytest.raises(ConfigError, match=r"only this user can write, got .*open': other users can write to it"):
+        enable_cache(opened)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"expected a folder for compiled programs, got .*file'"):
+        enable_cache(tmp_path / "file")
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """Function that makes a file or folder of a process, and returns its path."""
+
+    def make(name, age=0.0):
+        path = tmp_path / name
+        if name.endswith(".tmp"):
+            path.write_text("")
+        else:
+            path.mkdir()
+            (path / "kernel.so").write_text("")
+        os.utime(path, (time.time() - age,) * 2)
+        return path
+
+    return make
+
+
+def test_remains_of_killed_processes_are_removed(tmp_path, kept):
+    here, other, gone = kernel_cache.owner(), "0" * 8, finished_process()
+    machine = here.split("-")[0]
+    day = 1.01 * kernel_cache.DAY
+    remains = [
+        kept(f"key.{machine}-{gone}-140.tmp"),
+        kept(f"crazysim-{machine}-{gone}-abc"),
+        kept(f"key.{other}-{os.getpid()}-1.tmp", day),
+        kept("key.4711.140.tmp", day),  # as 0.1 named them
+    ]
+    needed = [
+        kept(f"key.{here}-140.tmp", day),
+        kept(f"crazysim-{here}-abc", day),
+        kept(f"key.{other}-{gone}-1.tmp"),  # of another machine, which may still need it
+        kept("key.4711.140.tmp2.tmp"),
+        kept("crazysim-mine", day),
+    ]
+    for pattern in ("*.tmp", "crazysim-*"):
+        kernel_cache.sweep(tmp_path, pattern)
+    assert sorted(tmp_path.iterdir()) == sorted(needed)
+    assert not any(path.exists() for path in remains)
+
+
+def test_the_folders_are_swept_at_the_next_start(cache, kept):
+    (cache / "crazysim").mkdir(mode=0o700)
+    machine = kernel_cache.owner().split("-")[0]
+    remains = kept(f"crazysim/key.{machine}-{finished_process()}-1.tmp")
+    assert kernel_cache.folder() == cache / "crazysim"
+    assert not remains.exists()
+
+
+FORK = """
+import os, sys
+from crazysim.engine.backends import kernel_cache
+mine = kernel_cache.temporary()
+child = os.fork()
+if not child:
+    own = kernel_cache.temporary()
+    sys.exit(0 if own != mine and own.is_dir() else 3)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), mine.is_dir())
+print(mine)
+"""
+
+
+def test_a_child_that_ends_leaves_the_folder_of_its_parent(tmp_path):
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "TMPDIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", FORK], capture_output=True, text=True, env=environment, check=True
+    )
+    status, folder = done.stdout.splitlines()
+    assert status == "0 True"
+    assert folder.startswith(str(tmp_path))
+    assert not list(tmp_path.iterdir()), "each removes its own"

@@ -1,0 +1,75 @@
+"""Law 4 for long flights: the number of steps never wraps without a word."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.core.data import MAX_STEPS
+from crazysim.engine import ENGINES
+from crazysim.engine.backends import fused
+from crazysim.envs import AutoReset, DroneEnv
+from crazysim.envs.tasks.hover import Hover
+
+
+def counted(data, steps):
+    """Return data after numbers of steps. (n_worlds,)"""
+    return data.replace(core=data.core.replace(steps=np.array(steps, np.int32)[:, None]))
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return Sim(2, control="rotor_vel", freq=1000, engine="interpret")
+
+
+def test_a_simulation_refuses_the_step_that_would_pass_the_largest_count(sim):
+    sim.data = counted(sim.data, [0, MAX_STEPS - 3])
+    sim.step(2)
+    sim.step()
+    before = sim.data
+    for n_steps in (1, 2**31, 2**40):
+        with pytest.raises(ConfigError, match=r"at most 2147483647 steps.*24\.9 days at 1000 Hz.*sim\.reset\(\)"):
+            sim.step(n_steps)
+    with pytest.raises(ConfigError, match="at most 2147483647 steps"):
+        sim.rollout(lambda params, data: data.controls.rotor_vel, None, 5)
+    assert sim.data is before
+    assert sim.data.core.steps.tolist() == [[3], [MAX_STEPS]]
+    np.testing.assert_allclose(sim.time[1], 2147483.647)
+    sim.reset([False, True])
+    sim.step(5)
+    assert sim.data.core.steps.tolist() == [[8], [5]]
+    sim.data = counted(sim.data, [MAX_STEPS, 0])
+    with pytest.raises(ConfigError, match="at most 2147483647 steps"):
+        sim.step()
+    sim.reset()
+    sim.step()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_functional_api_flags_worlds_whose_count_has_wrapped(engine):
+    sim = Sim(3, control="rotor_vel", engine=engine)
+    data = counted(sim.data, [MAX_STEPS - 2, MAX_STEPS - 1, 0])
+    after = sim.step_fn(sim.step_fn(data, jnp.int32(2)), jnp.int32(1))
+    np.testing.assert_array_equal(after.core.nonfinite[:, 0], [True, True, False])
+    assert not np.any(sim.step_fn(data, jnp.int32(1)).core.nonfinite)
+
+
+@pytest.mark.parametrize("engine", ["plain", "auto"])
+def test_an_environment_that_never_resets_ends_where_its_count_wraps(engine):
+    sim, task = Sim(3, control="attitude", engine=engine), Hover()
+    task.install(sim)
+    env = AutoReset(DroneEnv(sim, task), "Disabled")
+    state = env.reset(jax.random.key(0))
+    state = state.replace(data=counted(state.data, [MAX_STEPS - 5, MAX_STEPS - 10, 0]))
+    after = jax.jit(env.step)(state, jnp.zeros_like(state.action))
+    is_fused = engine == "auto" and fused.missing("cpu") is None
+    assert env.explain().startswith("a step is one kernel\n") == is_fused
+    np.testing.assert_array_equal(after.info["nonfinite"], [True, False, False])
+    np.testing.assert_array_equal(after.terminated, [True, False, False])
+
+
+def test_a_call_of_more_steps_than_can_be_counted_is_refused(sim):
+    for n_steps in (2**31, np.int64(2**31)):
+        with pytest.raises(ConfigError, match="at most 2147483647 steps in a call, got 2147483648"):
+            sim.step_fn(sim.data, n_steps)

@@ -1,1 +1,0 @@
-"""Programs of JAX in NumPy, for the tests; see ``small_programs``."""

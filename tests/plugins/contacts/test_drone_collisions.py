@@ -1,0 +1,115 @@
+"""Drones that collide: impulses by hand, laws, engines, and wrong input."""
+
+import numpy as np
+import pytest
+from cases import with_params, with_states
+from scipy.spatial.transform import Rotation
+
+from crazysim import ConfigError, DroneCollisions, Sim
+
+
+def build(n_worlds=2, n_drones=2, engine="auto", **kwargs):
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", engine=engine)
+    sim.data = with_params(sim.data, drag_matrix=0 * np.asarray(sim.data.params.drag_matrix))
+    sim.data = with_states(sim.data, pos=np.array([[0.2 * i, 0.0, 20.0] for i in range(n_drones)]))
+    sim.build_default_data()
+    return sim, sim.add(DroneCollisions(**kwargs))
+
+
+@pytest.mark.parametrize("restitution", [0.0, 1.0])
+def test_a_central_impact_shares_momentum(restitution):
+    """Equal masses: (1 + e) / 2 of the speed goes over; the other world does not collide."""
+    sim, _ = build(restitution=restitution)
+    vel = np.zeros((2, 2, 3))
+    vel[0, 0, 0], vel[1, 0, 0] = 2.0, -2.0
+    sim.data = with_states(sim.data, vel=vel)
+    sim.step(80)
+    found = np.asarray(sim.data.states.vel)[..., 0]
+    share = (1 + restitution) / 2
+    np.testing.assert_allclose(found[0], [2 * (1 - share), 2 * share], atol=0.02)
+    np.testing.assert_allclose(found[1], [-2.0, 0.0], atol=1e-6)
+
+
+def test_momentum_is_kept_in_an_oblique_impact_of_three():
+    sim, _ = build(n_worlds=1, n_drones=3, friction=0.8)
+    sim.data = with_states(sim.data, vel=np.array([[2.0, 0.1, 0.05], [0, 0, 0], [-1.0, 0.0, 0.1]]))
+    before = np.asarray(sim.data.states.vel, np.float64)[0].sum(axis=0)
+    sim.step(100)
+    after = np.asarray(sim.data.states.vel, np.float64)[0].sum(axis=0) + [0, 0, 3 * 9.81 * 0.2]
+    np.testing.assert_allclose(after, before, atol=1e-4)
+    assert np.abs(np.asarray(sim.data.states.ang_vel)).max() > 0.1, "it turns them"
+    pos = np.asarray(sim.data.states.pos)[0]
+    assert np.all(np.diff(pos[:, 0]) > 0.05), "none has passed through another"
+
+
+def test_an_overlap_is_removed_without_a_velocity():
+    """Two drones that begin within each other part in tenths of a second and fall side by side then."""
+    sim, _ = build(n_worlds=1)
+    sim.data = with_states(sim.data, pos=np.array([[0, 0, 20.0], [0.0, 0, 20.01]]))
+    sim.step(250)
+    states = sim.data.states
+    height = 2 * sim.airframe.value("shape.collision_box")[5]
+    np.testing.assert_allclose(np.diff(np.asarray(states.pos)[0, :, 2]), height, atol=1e-4)
+    np.testing.assert_allclose(np.diff(np.asarray(states.vel)[0], axis=0), 0, atol=1e-4)
+
+
+@pytest.mark.parametrize("iterations", [10, 100])
+def test_law_08_impacts_of_any_attitude_add_no_energy(iterations, rng):
+    """Restitution 1 and friction, where drones that turn gained up to 38 % (two) and 81 % (three).
+
+    Energies are those in the frame of the mean velocity, which gravity alone changes.
+    """
+    n_worlds, n_drones = 64, 3
+    sim, _ = build(n_worlds, n_drones, restitution=1.0, iterations=iterations)
+    start = np.array([[0.2 * i, 0.0, 20.0] for i in range(n_drones)])
+    vel = 0.3 * rng.normal(size=(n_worlds, n_drones, 3)) - 2 * np.arange(n_drones)[:, None] * [1, 0, 0]
+    sim.data = with_states(
+        sim.data,
+        pos=start + rng.uniform(-0.04, 0.04, vel.shape) * [0, 1, 1],
+        vel=vel,
+        quat=Rotation.random(n_worlds * n_drones, rng=rng).as_quat().reshape(n_worlds, n_drones, 4),
+        ang_vel=5 * rng.normal(size=vel.shape),
+    )
+    mass, inertia = (np.asarray(x, np.float64) for x in (sim.data.params.mass[0], sim.data.params.J))
+
+    def energy():
+        v, w = (np.asarray(x, np.float64) for x in (sim.data.states.vel, sim.data.states.ang_vel))
+        v = v - v.mean(axis=1, keepdims=True)
+        return 0.5 * mass * (v**2).sum(axis=(1, 2)) + 0.5 * np.einsum("wni,ij,wnj->w", w, inertia, w)
+
+    found = [energy()]
+    for _ in range(20):
+        sim.step(10)
+        found.append(energy())
+    changes = np.array(found) / found[0] - 1
+    assert changes.max() < 0.02, "what the integration of fast spins adds"
+    assert changes[-1].min() < -0.3, "they collide, with friction"
+
+
+def test_resets_clear_the_impulses():
+    sim, plugin = build(engine="interpret")
+    sim.data = with_states(
+        sim.data, pos=np.array([[0, 0, 20.0], [0.02, 0, 20.0]]), vel=np.array([[1, 0, 0], [0, 0, 0]])
+    )
+    sim.step(2)
+    assert np.abs(np.asarray(plugin.read(sim.data).impulse)).max() > 0
+    sim.reset()
+    assert not np.asarray(plugin.read(sim.data).press).any()
+    assert np.isfinite(np.asarray(sim.data.states.pos)).all()
+
+
+@pytest.mark.parametrize("kwargs, message", [
+    ({"friction": -1.0}, "friction"),
+    ({"restitution": 2.0}, "restitution"),
+    ({"softness": 0.0}, "softness"),
+    ({"softness": np.nan}, "softness"),
+    ({"iterations": 0}, "iterations is 0"),
+])  # fmt: skip
+def test_law_09_wrong_settings(kwargs, message):
+    with pytest.raises(ConfigError, match=message):
+        build(**kwargs)
+
+
+def test_law_09_one_drone_cannot_collide():
+    with pytest.raises(ConfigError, match="at least two drones"):
+        Sim().add(DroneCollisions())

@@ -1,0 +1,178 @@
+"""Battery: energy is booked, the voltage sags by hand-made numbers, and rotors slow down with it."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import hover_rotor_state, with_states
+
+from crazysim import Battery, ConfigError, Sim, load_airframe
+from crazysim.dynamics import supported_drones
+from crazysim.plugins.effects import battery
+
+RAD_S = 2 * np.pi / 60
+
+
+def build(n_worlds=2, n_drones=2, freq=500, **kwargs):
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", freq=freq)
+    sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=hover_rotor_state(sim.data))
+    sim.build_default_data()
+    sim.add(Battery(**{"capacity": 0.25, "resistance": 0.1} | kwargs))
+    return sim
+
+
+def record(sim):
+    return sim.data.plugins["battery"]
+
+
+def ocv(charge):
+    return -1.031 * np.exp(-35 * charge) + 3.685 + 0.2156 * charge - 0.1178 * charge**2 + 0.3201 * charge**3
+
+
+def rotor_power(rotor_vel):
+    """Return the mechanical power of the rotors of a Crazyflie 2.1 Brushless, W."""
+    r = np.asarray(rotor_vel, np.float64)
+    return np.sum((1.65886356219615e-9 * r + 2.4693477924534137e-12 * r**2) * r * RAD_S, axis=-1, keepdims=True)
+
+
+def test_voltage_and_current_under_load_by_hand():
+    """4 V, 0.5 ohm: 6 W at 3 V and 2 A. 8 W is the most there is, at half the voltage; 100 W get no more."""
+    one = lambda *x: [np.float32([v]) for v in x]  # noqa: E731
+    for power, expected in ((0, (4, 0)), (6, (3, 2)), (8, (2, 4)), (100, (2, 4))):
+        np.testing.assert_allclose(np.ravel(jax.jit(battery.under_load)(*one(power, 4.0, 0.5))), expected, rtol=1e-6)
+    np.testing.assert_allclose(battery.open_circuit_voltage(np.ones(1, np.float32), 2), [2 * 4.1029], rtol=1e-6)
+    np.testing.assert_allclose(battery.open_circuit_voltage(np.zeros(1, np.float32), 1), [2.654], rtol=1e-6)
+
+
+def test_energy_is_booked():
+    """What the cells gave, integral of V_0 I, is what the rotors took over their efficiency and what heated R."""
+    sim = build(efficiency=0.6, base_power=0.5, charge=[[1.0, 0.5], [0.2, 0.05]], n_cells=1)
+    sim.rotor_vel_control(np.linspace(0.7, 1.1, 16).reshape(2, 2, 4) * hover_rotor_state(sim.data))
+    start = np.asarray(record(sim).charge, np.float64)
+    given = taken = heat = charge = 0.0
+    for _ in range(250):
+        asked, before = rotor_power(sim.data.states.rotor_vel) / 0.6 + 0.5, np.asarray(record(sim).charge, np.float64)
+        sim.step()
+        v, i = (np.asarray(x, np.float64) for x in (record(sim).voltage, record(sim).current))
+        given, taken, heat = given + ocv(before) * i, taken + asked, heat + 0.1 * i**2
+        charge = charge + i / 500 / 3600
+        np.testing.assert_allclose(v * i, asked, rtol=1e-5)  # float32
+        np.testing.assert_allclose(v, ocv(before) - 0.1 * i, rtol=1e-6)
+    np.testing.assert_allclose(given, taken + heat, rtol=1e-5)
+    # The charge, to what float32 can hold of it: one rounding of the last value, none of the 250 steps.
+    np.testing.assert_allclose(start - np.asarray(record(sim).charge, np.float64), charge / 0.25, atol=7e-8)
+    assert np.min(charge / 0.25) > 1e-4
+
+
+def test_a_sagging_battery_slows_the_rotors_and_leaves_the_command():
+    """The rotors settle at the airframe's largest speed times V / V_full, here V / 4 V."""
+    sim = build(capacity=10.0, resistance=0.5, full_speed_voltage=4.0)
+    top = np.float32(sim.data.params.rotor_vel_max[0])
+    sim.rotor_vel_control(np.full((2, 2, 4), 1.5 * top))
+    sim.step(600)
+    speed = np.asarray(sim.data.states.rotor_vel, np.float64)
+    v = np.asarray(record(sim).voltage, np.float64)
+    v0 = ocv(np.asarray(record(sim).charge, np.float64))
+    np.testing.assert_allclose(v, 0.5 * (v0 + np.sqrt(v0**2 - 4 * 0.5 * rotor_power(speed))), rtol=1e-4)
+    np.testing.assert_allclose(speed, np.broadcast_to(v / 4.0 * top, speed.shape), rtol=1e-4)  # slow discharge
+    assert v.max() < 3.9
+    np.testing.assert_array_equal(sim.data.controls.rotor_vel, np.full((2, 2, 4), top))
+
+
+@pytest.mark.parametrize("name, expected", [("cf21B_500", 3.1257), ("cf2x_T350", 2.8166), ("bumblebee", 2 * 3.7)])
+def test_full_speed_needs_the_voltage_of_the_airframe(name, expected):
+    """A Crazyflie's is that of the firmware's thrust curve; an airframe without a curve gets 3.7 V per cell."""
+    sim = Sim(drone=name, control="rotor_vel")
+    sim.add(Battery(capacity=0.25, resistance=0.1, n_cells=2 if name == "bumblebee" else 1))
+    np.testing.assert_allclose(record(sim).full_speed_voltage, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", sorted(set(supported_drones("first_principles")) - {"bumblebee_lab"}))
+def test_without_arguments_it_is_that_of_the_airframe(name):
+    """It is full, sags under load, and lasts some minutes of hover. No battery feeds bumblebee_lab."""
+    sim = Sim(drone=name, control="state", controller="auto")
+    sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(sim.data))
+    sim.add(Battery())
+    for key in ("capacity", "resistance"):
+        np.testing.assert_allclose(getattr(record(sim), key), sim.airframe.value(f"battery.{key}"), rtol=1e-6)
+    np.testing.assert_array_equal(record(sim).n_cells, [sim.airframe.value("battery.cells")])
+    sim.state_control(pos=[0.0, 0, 1.0])
+    sim.step(2 * sim.freq)
+    np.testing.assert_allclose(sim.data.states.pos[0, 0], [0, 0, 1], atol=0.02)
+    cells = float(sim.airframe.value("battery.cells"))
+    assert 3.2 * cells < float(record(sim).voltage[0, 0, 0]) < 4.1 * cells
+    minutes = 2 / 60 / (1 - float(record(sim).charge[0, 0, 0]))
+    assert 3 < minutes < 60, "electric losses are not counted"
+
+
+def test_drones_of_a_fleet_have_their_own_batteries():
+    sim = Sim(n_worlds=2, drone=["cf21B_500", "bumblebee"], control="rotor_vel")
+    sim.add(Battery())
+    np.testing.assert_array_equal(record(sim).n_cells, [[[1], [4]]] * 2)
+    np.testing.assert_allclose(record(sim).voltage[1, :, 0], [4.1029, 4 * 4.1029], rtol=1e-5)
+    np.testing.assert_allclose(np.ravel(record(sim).full_speed_voltage[1]), [3.1257, 4 * 3.7], atol=1e-4)
+
+
+def test_law_09_an_airframe_without_a_battery_needs_arguments():
+    tables = {key: load_airframe("cf21B_500").tables[key] for key in ("rigid_body", "rotors", "drag")}
+    sim = Sim(drone=tables, control="rotor_vel")
+    with pytest.raises(ConfigError, match=r"has no value 'battery.capacity'. Add capacity to its table \[battery\]"):
+        sim.add(Battery())
+    sim.add(Battery(0.3, 0.1))
+    np.testing.assert_array_equal(record(sim).n_cells, [1])
+
+
+def test_above_full_speed_voltage_nothing_is_limited():
+    strong, plain = build(resistance=1e-3, full_speed_voltage=3.0), build()
+    assert len(plain.step_pipeline) == len(strong.step_pipeline)
+    plain = Sim(n_worlds=2, n_drones=2, control="rotor_vel")
+    plain.data = strong.data.replace(plugins={})
+    for sim in (strong, plain):
+        sim.rotor_vel_control(np.full((2, 2, 4), 30000.0))
+        sim.step(50)
+    np.testing.assert_allclose(strong.data.states.rotor_vel, plain.data.states.rotor_vel, rtol=1e-6)
+
+
+def test_an_empty_battery_turns_no_rotor_and_a_reset_fills_it():
+    """2 A for 2 s from 0.0002 A h: empty, no current, rotors run down; the other battery flies on."""
+    sim = build(capacity=[[2e-4, 0.25], [0.25, 0.25]])
+    sim.rotor_vel_control(np.broadcast_to(hover_rotor_state(sim.data), (2, 2, 4)))
+    sim.step(1000)
+    assert np.asarray(record(sim).charge)[0, 0, 0] == 0
+    assert np.asarray(record(sim).current)[0, 0, 0] == 0
+    assert np.asarray(sim.data.states.rotor_vel)[0, 0].max() < 300
+    assert np.asarray(record(sim).charge)[0, 1, 0] > 0.9
+    assert np.asarray(sim.data.states.rotor_vel)[0, 1].min() > 14000
+    sim.reset(np.array([True, False]))
+    charge = np.asarray(record(sim).charge)
+    np.testing.assert_array_equal(charge[0], 1.0)
+    assert np.all(charge[1] < 1)
+
+
+def test_law_07_gradients_are_finite_from_full_to_empty_and_at_the_most_power():
+    @jax.jit
+    @functools.partial(jax.grad, argnums=(0, 1))
+    def slopes(charge, power):
+        v, i = battery.under_load(power, battery.open_circuit_voltage(charge, 1), jnp.array([0.5]))
+        return jnp.sum(v + i)
+
+    for charge in (0.0, 0.1, 1.0):
+        charge = np.float32([charge])
+        most = np.asarray(battery.open_circuit_voltage(charge, 1)) ** 2 / 2
+        for power in (0 * most, most, 10 * most):
+            assert np.isfinite(slopes(charge, power)).all()
+
+
+@pytest.mark.parametrize("kwargs, message", [
+    ({"capacity": 0.0}, "capacity.*positive"),
+    ({"resistance": 0.0}, "resistance.*positive"),
+    ({"efficiency": 1.2}, "efficiency"),
+    ({"charge": 1.01}, "charge.*from 0.0 to 1.0"),
+    ({"n_cells": 0}, "n_cells"),
+    ({"n_cells": 1.5}, "n_cells.*whole numbers"),
+])  # fmt: skip
+def test_law_09_a_battery_that_cannot_be_is_told(kwargs, message):
+    with pytest.raises(ConfigError, match=message):
+        build(**kwargs)

@@ -1,0 +1,155 @@
+"""Latency: a command arrives exactly so many steps later, in every command level; nothing of the user's is touched."""
+
+import jax
+import numpy as np
+import pytest
+from cases import FITTED, LEVELS, hover_command, hover_rotor_state, to_all, with_states
+
+from crazysim import ConfigError, Latency, MotorFailure, Sim
+
+DELAY = np.array([[0, 1], [3, 7], [7, 2]])
+STEPS = 24
+
+
+def command_of(sim, step):
+    """Return the command sent before a step: hover, and a little more of everything the later it is."""
+    return to_all(sim.data, hover_command(sim.data) + (1 + step) * 1e-4)
+
+
+def fly(sim, n_steps=STEPS):
+    """Send another command before every step, and return the tracks. (n_steps, n_worlds, n_drones, 13 + n_rotors)"""
+    track = []
+    for step in range(n_steps):
+        getattr(sim, f"{sim.control.value}_control")(command_of(sim, step))
+        sim.step()
+        s = sim.data.states
+        track.append(np.concatenate([s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel], axis=-1))
+    return np.stack(track)
+
+
+def build(control, dynamics="first_principles", engine="auto"):
+    sim = Sim(n_worlds=3, n_drones=2, control=control, dynamics=dynamics, state_freq=500, engine=engine)
+    sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=0.9 * hover_rotor_state(sim.data))
+    sim.build_default_data()
+    return sim
+
+
+@pytest.mark.parametrize(
+    "control, dynamics", [(c, "first_principles") for c in LEVELS] + [("attitude", "so_rpy"), ("state", FITTED[-1])]
+)
+def test_a_command_arrives_exactly_so_many_steps_later(control, dynamics):
+    """Late by k steps a drone flies as one to which the first k commands were never sent, but the initial one."""
+    sim = build(control, dynamics, engine="interpret")
+    initial = initial_command(sim)
+    prompt = {}
+    for k in np.unique(DELAY):
+        sim.data = sim.default_data
+        track = []
+        for step in range(STEPS):
+            command = initial if step < k else command_of(sim, step - k)
+            getattr(sim, f"{control}_control")(command)
+            sim.step()
+            s = sim.data.states
+            track.append(np.concatenate([s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel], axis=-1))
+        prompt[k] = np.stack(track)
+    sim.data = sim.default_data
+    sim.add(Latency(DELAY))
+    late = fly(sim)
+    for (world, drone), k in np.ndenumerate(DELAY):
+        # Two programs of the same arithmetic: float32, relative to rotor speeds of 15,000 rpm and angles near zero.
+        np.testing.assert_allclose(late[:, world, drone], prompt[k][:, world, drone], rtol=2e-6, atol=2e-6)
+        others = [j for j in prompt if j != k]
+        assert all(np.abs(prompt[j] - prompt[k])[-1, world, drone].max() > 1e-5 for j in others)
+    sent = sim.data.controls.rotor_vel if control == "rotor_vel" else getattr(sim.data.controls, control).staged_cmd
+    np.testing.assert_array_equal(sent, command_of(sim, STEPS - 1).astype(np.float32))
+
+
+def initial_command(sim):
+    """Return the command that is staged before any was sent."""
+    controls = sim.default_data.controls
+    return np.asarray(
+        controls.rotor_vel if sim.control == "rotor_vel" else getattr(controls, sim.control.value).staged_cmd
+    )
+
+
+@pytest.fixture(scope="module")
+def late():
+    sim = build("attitude")
+    sim.add(Latency(3, max_delay=5))
+    return sim
+
+
+def test_a_command_that_is_sent_once_stays(late):
+    """The queue is fed with what was sent, not with what came out of it."""
+    sim, before = late, late.data
+    sim.attitude_control(command_of(sim, 5))
+    in_force = []
+    for _ in range(9):
+        sim.step()
+        in_force.append(np.asarray(sim.data.controls.attitude.cmd)[0, 0])
+    sim.data = before
+    np.testing.assert_array_equal(in_force[2], 0.0)
+    for command in in_force[3:]:
+        np.testing.assert_array_equal(command, command_of(sim, 5)[0, 0].astype(np.float32))
+
+
+def test_a_reset_empties_the_queues_of_its_worlds_alone(late):
+    sim, before = late, late.data
+    fly(sim, 8)
+    flown = jax.device_get(sim.data.plugins["latency"])
+    sim.reset(np.array([True, False, False]))
+    after, sim.data = jax.device_get(sim.data.plugins["latency"]), before
+    default = jax.device_get(sim.default_data.plugins["latency"])
+    for name in ("queue", "arrived"):
+        np.testing.assert_array_equal(getattr(after, name)[0], getattr(default, name)[0])
+        np.testing.assert_array_equal(getattr(after, name)[1:], getattr(flown, name)[1:])
+        assert np.any(getattr(flown, name)[0] != getattr(after, name)[0])
+
+
+def test_the_delay_may_change_in_flight_without_another_trace(late):
+    sim, before = late, late.data
+    record = before.plugins["latency"]
+    sim.attitude_control(command_of(sim, 0))
+    sim.step()
+    n_traces = sim.step_fn._cache_size()
+    sim.data = before.replace(plugins={"latency": record.replace(delay=np.asarray(record.delay) + 2)})
+    for _ in range(6):
+        arrived = np.asarray(sim.data.controls.attitude.cmd)
+        sim.attitude_control(command_of(sim, 0))
+        sim.step()
+    assert sim.step_fn._cache_size() == n_traces
+    assert not np.any(arrived)
+    assert np.all(np.asarray(sim.data.controls.attitude.cmd)[..., 3] > 0)
+    sim.data = before
+
+
+@pytest.mark.parametrize("first", ["latency", "motors"])
+def test_a_late_rotor_command_does_not_turn_a_failed_rotor(first):
+    """Whatever was added first: commands are late before they are lost."""
+    sim = build("rotor_vel")
+    for name in (first, *{"latency", "motors"} - {first}):
+        sim.add(Latency(1) if name == "latency" else MotorFailure(effectiveness=[0.0, 1, 1, 1]))
+    for step in range(5):
+        sim.rotor_vel_control(command_of(sim, step))
+        sim.step()
+    speed = np.asarray(sim.data.states.rotor_vel)[0, 0]
+    assert speed[1:].min() - speed[0] > 1000  # rpm; coasting costs 1,500 in these 10 ms, 300 before the command comes
+
+
+@pytest.mark.parametrize("kwargs, message", [
+    ({"delay": -1}, "whole numbers of steps"),
+    ({"delay": np.nan}, "whole numbers of steps from 0 to 100000, got nan"),
+    ({"delay": np.inf}, "got inf"),
+    ({"delay": "late"}, "got 'late'"),
+    ({"delay": 10**9}, "got 1000000000"),
+    ({"delay": 1, "max_delay": 10**9}, "got 1 and 1000000000"),
+    ({"delay": 1.5}, "whole numbers"),
+    ({"delay": 6, "max_delay": 5}, "delay.*from 0 to 5"),
+    ({"delay": [1, 2]}, r"delay as whole.*got shape \(2,\)"),
+    ({"delay": 1, "max_delay": 2.5}, "max_delay as whole.*got 1 and 2.5"),
+])  # fmt: skip
+def test_law_09_a_delay_that_cannot_be_is_told(kwargs, message):
+    sim = Sim(n_worlds=3, n_drones=3)
+    with pytest.raises(ConfigError, match=message):
+        sim.add(Latency(**kwargs))
+    assert not sim.data.plugins

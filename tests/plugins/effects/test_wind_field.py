@@ -1,0 +1,144 @@
+"""Wind fields: the air at drones and loads by hand, displacements, engines, gradients, and wrong input."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import with_states
+
+from crazysim import ConfigError, Sim, SlungLoad, Wind, WindField
+from crazysim.core.stage import as_stages
+from crazysim.engine import Step
+from crazysim.plugins.effects import wind_field
+from crazysim.plugins.effects.grid import Grid
+
+SHEAR = Grid(np.array([[[[0.0, 0, 0], [4.0, 0, 2.0]]]]), (0, 0, 1.0), 2.0)
+"""Wind along x and up that grows linearly from zero at 1 m to (4, 0, 2) m/s at 3 m."""
+
+
+def build(field=SHEAR, n_worlds=2, n_drones=2, engine="interpret", **kwargs):
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, control="rotor_vel", rng_key=3, engine=engine)
+    sim.data = with_states(sim.data, pos=[0, 0, 2.0])
+    sim.build_default_data()
+    sim.add(WindField(field, **kwargs))
+    return sim
+
+
+def test_the_field_pushes_as_a_steady_wind_of_the_same_velocity():
+    """Half way up the shear the air moves with (2, 0, 1) m/s."""
+    field, steady = build(), Sim(n_worlds=2, n_drones=2, control="rotor_vel", engine="interpret")
+    steady.data = with_states(steady.data, pos=[0, 0, 2.0])
+    steady.add(Wind((2.0, 0.0, 1.0)))
+    for sim in (field, steady):
+        sim.step()
+    assert float(np.asarray(steady.data.states.vel)[0, 0, 0]) > 1e-4
+    np.testing.assert_allclose(field.data.states.vel, steady.data.states.vel, rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(field.data.plugins["wind_field"].air_vel)[1, 1], [2, 0, 1])
+
+
+def test_offset_scale_and_outside():
+    sim = build(offset=np.array([[[0, 0, 0], [0, 0, 0.5]], [[0, 0, 5.0], [0, 0, -5.0]]]), scale=2.0)
+    sim.step()
+    expected = [[[4, 0, 2], [2, 0, 1]], [[0, 0, 0], [8, 0, 4]]]  # the last two are outside, where the wind is constant
+    np.testing.assert_allclose(sim.data.plugins["wind_field"].air_vel, expected, rtol=1e-6)
+
+
+def test_law_10_displacements_are_of_world_and_episode():
+    shifts = []
+    for n_worlds in (2, 4):
+        sim = build(n_worlds=n_worlds, spread=(1.0, 2.0, 0.0))
+        sim.step(3)
+        shifts.append(np.asarray(sim.data.plugins["wind_field"].shift))
+    np.testing.assert_array_equal(shifts[0], shifts[1][:2])
+    found = shifts[1]
+    np.testing.assert_array_equal(found[:, 0], found[:, 1])
+    assert len(np.unique(found[:, 0, 0])) == 4
+    assert 0.05 < np.abs(found[..., 1]).max() <= 2
+    assert not found[..., 2].any()
+    sim.reset(np.array([True, False, False, False]))
+    sim.step(2)
+    again = np.asarray(sim.data.plugins["wind_field"].shift)
+    np.testing.assert_array_equal(again[1:], found[1:])
+    assert not np.isclose(again[0], found[0]).all(axis=-1).any()
+
+
+def test_the_air_at_loads_counts_for_loads():
+    """A load 1.6 m below drones at 3 m is at 1.4 m, in (0.8, 0, 0.4) m/s, and drones in (4, 0, 2)."""
+    sim = build()
+    sim.data = with_states(sim.data, pos=[0, 0, 3.0])
+    load = sim.add(SlungLoad(0.01, 1.6, drag=0.05))
+    sim.step()
+    np.testing.assert_allclose(np.asarray(load.read(sim.data).wind_vel)[0, 0], [0.8, 0, 0.4], rtol=1e-5)
+    still = build(Grid(np.zeros((1, 1, 1, 3))))
+    still.data = with_states(still.data, pos=[0, 0, 3.0])
+    still.add(SlungLoad(0.01, 1.6, drag=0.05))
+    still.step()
+    # implicit: dt b / (m + dt b) of the air's velocity
+    push = np.asarray(load.read(sim.data).vel) - np.asarray(still.data.plugins["load"].vel)
+    np.testing.assert_allclose(push[..., 0], 0.8 * 0.05 / 500 / (0.01 + 0.05 / 500), rtol=0.02)  # the cable's pull too
+    sim.remove("wind_field")
+    sim.step()
+    assert np.abs(np.asarray(load.read(sim.data).vel)[..., 0]).max() < push[..., 0].max(), "no wind remains"
+
+
+@pytest.mark.parametrize("largest", [10**6, 1])
+def test_engines_agree_whether_the_table_is_fused_or_not(monkeypatch, largest, rng):
+    monkeypatch.setattr(wind_field, "LARGEST_FUSED", largest)
+    sim = build(
+        Grid(rng.normal(size=(6, 5, 4, 3)), (-1, -1, 0), 1.0), n_worlds=3, engine="auto", spread=(0.5, 0.5, 0.5)
+    )
+    alone = [stage.name for stage in sim.step_fn.plan(sim.data).program.unfused_stages] if largest == 1 else []
+    assert alone == (["wind_field"] if largest == 1 else [])
+    plain = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(20))
+    sim.step(20)
+    np.testing.assert_allclose(sim.data.states.vel, plain.states.vel, rtol=1e-5, atol=1e-6)  # float32
+    assert np.abs(np.asarray(plain.plugins["wind_field"].air_vel)).min() > 0
+
+
+def test_law_08_gradients_of_a_flight_equal_central_differences(x64, rng):
+    sim = build(Grid(rng.normal(size=(6, 6, 6, 3)), (-1, -1, 0), 0.8), n_worlds=1, n_drones=1)
+    stages = as_stages(sim.step_pipeline)
+
+    def step(data, _):
+        for apply in stages:
+            data = apply(data)
+        return data, None
+
+    @jax.jit
+    @jax.value_and_grad
+    def end(pos):
+        data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+        data, _ = jax.lax.scan(step, data, length=20)
+        return jnp.sum(data.states.vel * np.array([1.0, 2.0, 3.0]))
+
+    at, h = np.array([[[0.31, -0.22, 2.13]]]), 1e-5
+    found = np.asarray(end(at)[1])
+    central = [float(end(at + h * e)[0] - end(at - h * e)[0]) / (2 * h) for e in np.eye(3)]
+    assert np.abs(central).max() > 1e-3
+    np.testing.assert_allclose(found[0, 0], central, rtol=1e-5, atol=1e-9)
+
+
+def test_other_velocities_compile_nothing():
+    sim = build(engine="auto")
+    sim.step()
+    sim.replace(WindField(Grid(2 * SHEAR.values, SHEAR.origin, SHEAR.spacing)))
+    sim.step()
+    assert sim.step_fn._cache_size() == 1
+    air_vel = np.asarray(sim.data.plugins["wind_field"].air_vel)
+    np.testing.assert_allclose(air_vel[0, 0], [4, 0, 2], rtol=1e-4)
+
+
+@pytest.mark.parametrize("kwargs, message", [
+    ({"field": np.zeros((2, 2, 2, 3))}, "expected field as a Grid"),
+    ({"field": Grid(np.zeros((2, 2, 2)))}, "expected field as values of shape"),
+    ({"field": SHEAR, "spread": -1.0}, "spread"),
+    ({"field": SHEAR, "scale": np.nan}, "scale"),
+    ({"field": SHEAR, "offset": 1.0}, "offset"),
+])  # fmt: skip
+def test_law_09_wrong_settings(kwargs, message):
+    sim = Sim(control="rotor_vel")
+    with pytest.raises(ConfigError, match=message):
+        sim.add(WindField(**kwargs))
+    assert sim.data.plugins == {}
+    with pytest.raises(ConfigError, match="wind acts through drag"):
+        Sim(dynamics="so_rpy").add(WindField(SHEAR))

@@ -1,0 +1,98 @@
+"""One load under several drones."""
+
+import numpy as np
+import pytest
+from cases import broadcast_like, with_params, with_states
+
+from crazysim import ConfigError, Sim
+from crazysim.plugins.payloads import SharedLoad, SlungLoad
+
+SETTINGS = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "strict": True}
+CORNERS = np.array([[0.3, 0.3, 5.0], [-0.3, 0.3, 5.0], [-0.3, -0.3, 5.0], [0.3, -0.3, 5.0]])
+
+
+def carrying(n_drones, integrator, engine="fused", **settings):
+    sim = Sim(1, n_drones, **SETTINGS | {"engine": engine}, integrator=integrator)
+    sim.data = with_states(sim.data, pos=CORNERS[:n_drones])
+    return sim, sim.add(SharedLoad(**{"in_scene": False, "mass": 0.3} | settings))
+
+
+def test_below_one_drone_it_is_the_slung_load(x64):
+    ends = []
+    for kind in (SharedLoad, SlungLoad):
+        sim = Sim(**SETTINGS, integrator="rk4")
+        sim.data = with_states(sim.data, pos=CORNERS[:1])
+        load = sim.add(kind(mass=0.2, length=0.4, cable=False, attach=(0.02, 0.01, -0.03), in_scene=False))
+        record = load.read(sim.data)
+        at = broadcast_like(np.asarray(sim.data.states.pos) + [0.02, 0.01, -0.43], record.pos)
+        sim.data = load.write(sim.data, record.replace(pos=at, vel=broadcast_like([0.5, 0.2, 0.0], record.vel)))
+        sim.step(200)
+        ends.append(np.concatenate([np.ravel(load.read(sim.data).pos), np.ravel(sim.data.states.ang_vel)]))
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)  # SOFT is a millionth of the tension
+
+
+@pytest.mark.parametrize("cable", [False, True])
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "rk4"])
+def test_four_drones_share_the_weight_and_keep_momentum(integrator, cable, x64):
+    sim, load = carrying(4, integrator, cable=cable)
+    mass = float(sim.data.params.mass[0])
+    share = mass + 0.3 / 4
+    drop = np.sqrt(1 - 0.18)
+    pull = 0.3 / 4 * 9.81 * 0.3 / drop  # horizontal pull on each, towards the middle
+    outward = np.sign(CORNERS[:, :2]) * pull
+    force = np.concatenate([outward, np.full((4, 1), share * 9.81)], axis=-1)
+    sim.data = with_states(sim.data, force=force)
+    sim.step(250)
+    np.testing.assert_allclose(np.asarray(sim.data.states.pos)[0], CORNERS, atol=1e-4)
+    np.testing.assert_allclose(np.asarray(load.read(sim.data).pos)[0, 0], [0, 0, 5 - drop], atol=1e-4)
+    sim.data = with_states(sim.data, vel=np.random.default_rng(0).normal(size=(4, 3)), force=np.zeros((4, 3)))
+
+    def momentum():
+        return mass * np.asarray(sim.data.states.vel)[0].sum(0) + 0.3 * np.asarray(load.read(sim.data).vel)[0, 0]
+
+    before = momentum()
+    sim.step(100)
+    np.testing.assert_allclose(momentum() - before, [0, 0, -9.81 * 0.2 * (4 * mass + 0.3)], atol=1e-10)
+
+
+def test_cables_go_slack_and_drones_let_go(x64):
+    """Two drones hold the load; a third, which comes nearer, pulls nothing, and one that lets go neither."""
+    sim, load = carrying(3, "symplectic_euler", "interpret")
+    lower = np.array(CORNERS[:3])
+    lower[2] = [0.0, 0.0, 4.5]
+    sim.data = load.release(with_states(sim.data, pos=lower), [[True, False, False]])
+    start = np.asarray(sim.data.states.pos)[0]
+    sim.step(10)
+    moved = np.asarray(sim.data.states.pos)[0] - start
+    np.testing.assert_allclose(moved[0, :2], 0, atol=1e-12)
+    np.testing.assert_allclose(moved[2, :2], 0, atol=1e-12)
+
+
+def test_where_gravity_differs_the_load_falls_with_the_mean(x64):
+    """Whatever the order of the drones."""
+    sim, load = carrying(2, "symplectic_euler", "interpret")
+    gravity = np.zeros((1, 2, 3))
+    gravity[0, :, 2] = [-8.0, -10.0]
+    sim.data = with_params(sim.data, gravity_vec=gravity)
+    sim.data = load.release(sim.data)
+    start = np.asarray(load.read(sim.data).vel)
+    sim.step(10)
+    np.testing.assert_allclose(
+        (np.asarray(load.read(sim.data).vel) - start)[0, 0], [0, 0, -9.0 * 10 / 500], rtol=1e-9, atol=1e-12
+    )
+
+
+def test_explicit_euler_is_refused():
+    with pytest.raises(ConfigError, match="symplectic_euler"):
+        carrying(2, "euler")
+
+
+def test_it_is_fused_and_drawn():
+    sim = Sim(2, 3, drone="bumblebee", control="rotor_vel", integrator="symplectic_euler", strict=True)
+    load = sim.add(SharedLoad(mass=0.3))
+    sim.step(5)
+    assert "unfused" not in sim.explain()
+    assert sim.contact_report().object_names == ("load:0",)
+    sim.sync(1)
+    body = sim.mj_model.body("load:0").mocapid.item()
+    np.testing.assert_allclose(sim.mj_data.mocap_pos[body], np.asarray(load.read(sim.data).pos)[1, 0], atol=1e-6)

@@ -1,0 +1,362 @@
+"""Loads on rods and cables: invariants, impacts, the bare drone in the limit, and the laws.
+
+Flights use the fused engine, whose programs compile in a quarter of the time; law 01 compares the engines.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import INTEGRATORS, broadcast_like, by_stages, with_params, with_states
+from scipy.spatial.transform import Rotation
+
+from crazysim import ConfigError, Downwash, Sim, Wind
+from crazysim.plugins.payloads import SlungLoad, direction
+from crazysim.plugins.payloads.link import Link, end_relative_motion
+
+MASS, LOAD = 0.605, 0.2
+OFFSET = (0.02, 0.01, -0.03)
+
+
+def flying(n_worlds=1, n_drones=1, height=500.0, **kwargs):
+    options = {"drone": "bumblebee", "control": "rotor_vel", "engine": "fused", "strict": True} | kwargs
+    sim = Sim(n_worlds, n_drones, **options)
+    sim.data = with_states(sim.data, pos=np.asarray(sim.data.states.pos) + [0, 0, height])
+    return sim
+
+
+def with_load(load, data, **changes):
+    record = load.read(data)
+    return load.write(data, record.replace(**{k: broadcast_like(v, getattr(record, k)) for k, v in changes.items()}))
+
+
+def momentum(load, data):
+    """Return momentum, and angular momentum about the common centre of mass. (n_worlds, 3) each"""
+    s, r = data.states, load.read(data)
+    x, y, v, u, quat, w = (np.asarray(a)[:, 0] for a in (s.pos, r.pos, s.vel, r.vel, s.quat, s.ang_vel))
+    centre, mean = (MASS * x + LOAD * y) / (MASS + LOAD), (MASS * v + LOAD * u) / (MASS + LOAD)
+    spin = Rotation.from_quat(quat).apply(w @ np.asarray(data.params.J))
+    orbit = MASS * np.cross(x - centre, v - mean) + LOAD * np.cross(y - centre, u - mean)
+    return MASS * v + LOAD * u, orbit + spin
+
+
+def inner_energy(load, data):
+    """Return the kinetic energy of drone and load relative to their centre of mass, J. (n_worlds,)"""
+    s, r = data.states, load.read(data)
+    v, u, w = (np.asarray(a)[:, 0] for a in (s.vel, r.vel, s.ang_vel))
+    reduced = MASS * LOAD / (MASS + LOAD)
+    return reduced / 2 * np.sum((v - u) ** 2, axis=-1) + np.sum(w @ np.asarray(data.params.J) * w, axis=-1) / 2
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_law_08_momentum_and_energy_of_drone_and_load_are_kept(integrator, x64):
+    """In free fall the tension is the only force between them: for 10 s at 500 Hz, centred and with an offset."""
+    sim, attach = flying(2, integrator=integrator), np.array([(0, 0, 0), OFFSET])
+    load = sim.add(SlungLoad(mass=LOAD, attach=attach[:, None], in_scene=False))
+    sim.data = with_load(load, sim.data, vel=(1.0, 0.5, 0.0))
+    (p0, l0), e0 = momentum(load, sim.data), inner_energy(load, sim.data)
+    n = 5000
+    sim.step(n)
+    p, spin = momentum(load, sim.data)
+    np.testing.assert_allclose(p, p0 + [0, 0, -9.81 * n / 500 * (MASS + LOAD)], atol=1e-11)
+    assert np.abs(inner_energy(load, sim.data) / e0 - 1).max() < 2e-3
+    assert (np.linalg.norm(spin - l0, axis=-1) < 1e-2 * np.linalg.norm(l0, axis=-1)).all()
+    pos, quat, at = (np.asarray(x)[:, 0] for x in (sim.data.states.pos, sim.data.states.quat, load.read(sim.data).pos))
+    length = np.linalg.norm(at - pos - Rotation.from_quat(quat).apply(attach), axis=-1)
+    assert np.abs(length - 0.4).max() < 1e-4
+
+
+@pytest.mark.parametrize("cable", [False, True])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_law_08_energy_never_grows_below_a_heavy_drone(integrator, cable):
+    """A pendulum below a body of 1e9 kg that hovers: 60 s at 500 Hz in float32, at amplitudes up to 2.5 rad."""
+    sim = flying(8, integrator=integrator, height=2.0)
+    sim.data = with_params(sim.data, mass=np.full(1, 1e9, np.float32))
+    sim.data = with_states(sim.data, force=np.array([0, 0, 9.81e9]))
+    load = sim.add(SlungLoad(mass=LOAD, cable=cable, in_scene=False))
+    angle = np.linspace(0.2, 2.5, 8)
+    pos = np.stack([0.4 * np.sin(angle), 0 * angle, 2 - 0.4 * np.cos(angle)], axis=-1)[:, None]
+    sim.data = with_load(load, sim.data, pos=pos)
+
+    def energy():
+        r, s = load.read(sim.data), sim.data.states
+        at, vel, pos, drone_vel = (np.asarray(x)[:, 0] for x in (r.pos, r.vel, s.pos, s.vel))
+        return 9.81 * (at - pos)[:, 2] + np.sum((vel - drone_vel) ** 2, axis=-1) / 2
+
+    start, seen = energy(), []
+    for _ in range(60):
+        sim.step(497)
+        seen.append(energy())
+    span = 2 * 9.81 * 0.4
+    # Semi-implicit schemes oscillate within a band of dt, which does not widen.
+    assert (np.array(seen) - start).max() < 0.01 * span
+    assert (np.array(seen)[-20:].max(0) - np.array(seen)[:20].max(0)).max() < 0.002 * span
+    if not cable:
+        assert np.abs(np.array(seen) - start).max() < 0.01 * span
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_without_mass_the_drone_flies_as_without_load(integrator):
+    flights = []
+    for mass in (None, 0.0):
+        sim = flying(integrator=integrator, height=5.0)
+        if mass is not None:
+            load = sim.add(SlungLoad(mass=mass, attach=OFFSET, damping=0.001, drag=0.1, in_scene=False))
+        sim.rotor_vel_control(np.array([[[12000.0, 12100, 12050, 11990]]]))
+        sim.step(300)
+        flights.append(sim.data.states)
+    for name in ("pos", "quat", "vel", "ang_vel"):
+        np.testing.assert_allclose(getattr(flights[1], name), getattr(flights[0], name), rtol=1e-5, atol=1e-5)
+    assert np.isfinite(load.read(sim.data).pos).all()
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_cable_that_becomes_taut(integrator, x64):
+    """The impulse of two masses along the line, with and without a bounce: speeds as worked out by hand."""
+    sim, restitution = flying(2, integrator=integrator, engine="interpret"), np.array([0.0, 0.6])
+    load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=restitution[:, None], in_scene=False))
+    start = np.asarray(sim.data.states.pos)
+    sim.data = with_load(load, sim.data, pos=start + [0, 0, -0.35], vel=(0.0, 0.0, -1.0))
+    sim.step(15)  # 3 cm: still slack
+    v, u = np.asarray(sim.data.states.vel)[:, 0, 2], np.asarray(load.read(sim.data).vel)[:, 0, 2]
+    np.testing.assert_allclose(v - u, 1.0, atol=1e-9)
+    sim.step(15)
+    t = 30 / 500
+    mean = -LOAD / (MASS + LOAD) - 9.81 * t
+    v, u = np.asarray(sim.data.states.vel)[:, 0, 2], np.asarray(load.read(sim.data).vel)[:, 0, 2]
+    np.testing.assert_allclose(MASS * v + LOAD * u, (MASS + LOAD) * mean, rtol=1e-9)
+    np.testing.assert_allclose(v - u, -restitution, atol=1e-3)
+
+
+def test_impulse_by_hand():
+    """P = q.(u - v) / (1/m + 1/m_L), which changes v by P q / m and u by -P q / m_L."""
+    sim = flying()
+    s = jax.tree.map(lambda x: np.asarray(x)[0, 0], sim.data.states)
+    s = s.replace(vel=np.float32([0.1, 0.2, 0.3]))
+    q, p = np.array([0.6, 0.0, -0.8]), sim.data.params
+    u = np.array([1.0, -1.0, 0.5])
+
+    @jax.jit
+    def end(s, pos, vel):
+        link = Link(None, jnp.full(1, 0.4), jnp.full(1, LOAD))
+        return end_relative_motion(s, p.mass, p.J_inv, link, pos, vel)
+
+    after, vel = jax.tree.map(np.asarray, end(s, s.pos + 0.4 * q, u))
+    impulse = q @ (u - [0.1, 0.2, 0.3]) / (1 / MASS + 1 / LOAD)
+    np.testing.assert_allclose(after.vel, np.array([0.1, 0.2, 0.3]) + impulse * q / MASS, rtol=1e-4)
+    np.testing.assert_allclose(vel, u - impulse * q / LOAD, rtol=1e-4)
+    np.testing.assert_allclose(q @ (vel - after.vel), 0, atol=1e-4)
+
+
+def test_order_of_convergence(x64):
+    """Runge-Kutta keeps order four with a load, Euler's scheme order one; both tend to the same flight.
+
+    The load has drag, and its joint damping and a place far off the centre: each of them made Runge-Kutta's order 1 to
+    3 when it was implicit in time or corrected lengths by a share per step.
+    """
+
+    def end(integrator, freq):
+        sim = flying(integrator=integrator, freq=freq)
+        far = (0.05, 0.03, -0.1)
+        load = sim.add(SlungLoad(mass=LOAD, attach=far, drag=0.05, damping=0.001, in_scene=False))
+        sim.data = with_states(sim.data, ang_vel=np.array([0.5, -1.0, 2.0]), vel=np.array([0.3, 0, 0]))
+        sim.data = load.hang(sim.data)
+        sim.rotor_vel_control(np.full((1, 1, 4), 13000.0))
+        sim.step(freq // 2)
+        return np.concatenate([np.ravel(load.read(sim.data).pos), np.ravel(sim.data.states.ang_vel)])
+
+    exact = end("rk4", 3200)
+    for integrator, order, freqs in (("rk4", 4, (100, 400)), ("euler", 1, (250, 1000))):
+        errors = [np.abs(end(integrator, freq) - exact).max() for freq in freqs]
+        slope = np.log(errors[0] / errors[1]) / np.log(freqs[1] / freqs[0])
+        assert abs(slope - order) < 0.4, (integrator, errors)
+
+
+@pytest.mark.parametrize("cable", [False, True])
+def test_law_08_gradients_are_central_differences(cable, x64):
+    """Those of a rod in forward mode, those of a cable in reverse mode."""
+    sim = flying(height=2.0, engine="plain")
+    load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, damping=0.001, cable=cable, in_scene=False))
+    sim.rotor_vel_control(np.full((1, 1, 4), 13000.0))
+    step, data = by_stages(sim) if cable else sim.build_step_fn(), sim.data  # each compiles sooner in its mode
+
+    def end(x):
+        record = load.read(data)
+        changed = load.write(data, record.replace(mass=x[:1], length=x[1:2], vel=record.vel + x[2:5]))
+        after = step(changed, 40)
+        return jnp.sum(after.states.pos**2) + jnp.sum(after.states.ang_vel) + jnp.sum(load.read(after).vel[..., 0])
+
+    x = np.array([LOAD, 0.4, 0.3, 0.2, -0.1])
+
+    def forward(x):
+        return jax.vmap(lambda change: jax.jvp(end, (x,), (change,)), out_axes=(None, 0))(np.eye(5))
+
+    both = jax.jit(jax.value_and_grad(end) if cable else forward)
+    gradient = np.asarray(both(x)[1])
+    for k, d in enumerate(1e-5 * np.eye(5)):
+        np.testing.assert_allclose(gradient[k], (both(x + d)[0] - both(x - d)[0]) / 2e-5, rtol=2e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_law_07_no_nan(integrator):
+    """Upside down with the load above, on the floor, load in the attachment, at the fastest spin, for 10 s."""
+    for cable in (False, True):
+        sim = flying(5, integrator=integrator, height=0.5, engine="auto")
+        load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, cable=cable, damping=0.001, drag=0.05, in_scene=False))
+        quat = np.tile([0, 0, 0, 1.0], (5, 1, 1))
+        quat[0], ang_vel, pos = [1, 0, 0, 0], np.zeros((5, 1, 3)), np.array(load.read(sim.data).pos)
+        pos[0] = np.asarray(sim.data.states.pos)[0] + [0, 0, 0.4]
+        pos[1] = np.asarray(sim.data.states.pos)[1]
+        ang_vel[2] = [300.0, -200.0, 500.0]
+        height = np.array(sim.data.states.pos)
+        height[3:, :, 2] = 0.0
+        sim.data = with_states(sim.data, quat=quat, ang_vel=ang_vel, pos=height)
+        sim.data = with_load(load, sim.data, pos=pos)
+        sim.rotor_vel_control(np.full((5, 1, 4), 20000.0) * np.array([1, 1, 1, 0, 1])[:, None, None])
+        for _ in range(10):
+            sim.step(500)
+            for x in jax.tree.leaves((sim.data.states, load.read(sim.data))):
+                assert np.isfinite(x).all()
+
+
+def test_law_07_no_nan_in_gradients():
+    """Of two steps, by all states: with the load in the attachment, on the floor."""
+    sim = flying(2, height=0.0, engine="plain")
+    load = sim.add(SlungLoad(mass=LOAD, cable=True, restitution=0.3, in_scene=False))
+    data = with_load(load, sim.data, pos=np.asarray(sim.data.states.pos))
+
+    def advanced(data):
+        for stage in sim.step_pipeline.values():
+            data = stage(data)
+        return data
+
+    @jax.jit
+    def gradient_and_next(data):
+        """Return gradients of the sum of what moves after a step, and the data then."""
+
+        def total(data):
+            after = advanced(data)
+            numbers = jax.tree.leaves((after.states, load.read(after)))
+            return sum(jnp.sum(x) for x in numbers if jnp.issubdtype(x.dtype, jnp.floating)), after
+
+        return jax.grad(total, allow_int=True, has_aux=True)(data)
+
+    for _ in range(2):
+        gradient, data = gradient_and_next(data)
+        for x in jax.tree.leaves((gradient.states, gradient.plugins["load"])):
+            assert x.dtype == jax.dtypes.float0 or np.isfinite(x).all()
+
+
+def test_law_01_all_engines_and_all_worlds_agree():
+    """Worlds of drones with loads of their own masses fly as alone, on every engine."""
+    masses = np.array([[0.0, 0.1], [0.2, 0.3]])
+    ends = {}
+    for engine in ("plain", "lanes", "fused"):
+        sim = flying(2, 2, height=2.0, engine=engine, strict=True)
+        load = sim.add(SlungLoad(mass=masses, attach=OFFSET, cable=True, in_scene=False))
+        sim.data = load.release(sim.data, np.array([[False, False], [False, True]]))
+        sim.rotor_vel_control(np.full((2, 2, 4), 13000.0))
+        sim.step(50)
+        ends[engine] = np.concatenate([sim.data.states.pos, load.read(sim.data).pos], axis=-1)
+    np.testing.assert_allclose(ends["lanes"], ends["plain"], atol=1e-5)
+    np.testing.assert_allclose(ends["fused"], ends["plain"], atol=1e-5)
+    alone = flying(1, 1, height=2.0)
+    load = alone.add(SlungLoad(mass=0.2, attach=OFFSET, cable=True, in_scene=False))
+    alone.rotor_vel_control(np.full((1, 1, 4), 13000.0))
+    alone.step(50)
+    rise = np.asarray(load.read(alone.data).pos)[0, 0, 2]
+    np.testing.assert_allclose(ends["plain"][1, 0, 5], rise, atol=1e-5)
+    np.testing.assert_allclose(ends["plain"][1, 1, 5], 2 - 0.03 - 0.4 - 9.81 * 0.1**2 / 2, atol=3e-3)  # cut loose
+
+
+def test_rest_on_the_floor_and_release(x64):
+    sim = flying(height=1.0)
+    load = sim.add(SlungLoad(mass=LOAD, cable=True, size=(0.1, 0.1, 0.06), in_scene=False))
+    sim.data = with_load(load, load.release(sim.data), vel=(0.5, 0.0, 0.0))
+    sim.step(500)
+    pos, vel = (np.asarray(x)[0, 0] for x in (load.read(sim.data).pos, load.read(sim.data).vel))
+    np.testing.assert_allclose(pos[2], 0.03, atol=1e-12)
+    np.testing.assert_allclose(vel, 0, atol=1e-12)
+    assert 0.1 < pos[0] < 0.3  # it fell for 0.34 s at 0.5 m/s, and friction stopped it
+
+
+def test_direction_and_its_rate(x64):
+    sim = flying()
+    load = sim.add(SlungLoad(mass=LOAD, attach=OFFSET, in_scene=False))
+    sim.data = with_states(sim.data, ang_vel=np.array([1.0, 2.0, 3.0]))
+    sim.data = with_load(load, sim.data, vel=(0.3, 0.2, 0.1))
+    q, rate = (np.asarray(x) for x in jax.jit(direction)(sim.data))
+    np.testing.assert_allclose(q[0, 0], [0, 0, -1], atol=1e-12)
+    lever = np.cross([1.0, 2.0, 3.0], OFFSET)
+    np.testing.assert_allclose(rate[0, 0], (np.array([0.3, 0.2, 0]) - lever * [1, 1, 0]) / 0.4, atol=1e-12)
+
+
+def test_wind_and_downwash_push_the_load():
+    sim = flying(drone="cf21B_500", height=2.0)
+    load = sim.add(SlungLoad(mass=0.01, drag=0.01, in_scene=False))
+    sim.add(Downwash())
+    sim.add(Wind(velocity=(1.0, 0.0, 0.0)))
+    sim.rotor_vel_control(np.full((1, 1, 4), 15000.0))
+    sim.step(100)
+    record = load.read(sim.data)
+    air, vel, drone = (np.asarray(x)[0, 0] for x in (record.air_vel, record.vel, sim.data.states.vel))
+    assert air[2] < -1.0, "the drone's own jet"
+    assert vel[0] - drone[0] > 0.05
+
+
+def test_loads_are_objects_of_the_scene():
+    sim = flying(2, 2, height=1.0, engine="interpret")
+    load = sim.add(SlungLoad(mass=0.05, cable=True, size=0.05))
+    pos = np.asarray(load.read(sim.data).pos).copy()
+    pos[1, 0] = np.asarray(sim.data.states.pos)[1, 1]  # into the other drone
+    sim.data = with_load(load, sim.data, pos=pos)
+    report = sim.contact_report(floor=False, drones=False)
+    assert report.object_names == ("load:0", "load:1")
+    touched = np.asarray(report.objects)
+    assert touched[1, 1, 0]
+    assert not touched[0].any()
+    assert not touched[1, 0].any()
+    sim.sync(1)
+    body = sim.mj_model.body("load:0").mocapid.item()
+    np.testing.assert_allclose(sim.mj_data.mocap_pos[body], pos[1, 0], atol=1e-6)
+    sim.step()
+    sim.sync(1)
+    np.testing.assert_allclose(sim.mj_data.mocap_pos[body], np.asarray(load.read(sim.data).pos)[1, 0], atol=1e-6)
+
+
+def test_law_09_wrong_settings_are_errors():
+    sim = flying()
+    for settings, message in (
+        ({"mass": -1.0}, "mass"), ({"mass": 0.1, "length": 0.0}, "length"), ({"mass": 0.1, "size": (1, 2)}, "size"),
+        ({"mass": 0.1, "cable": True, "restitution": 2.0}, "restitution"), ({"mass": [1.0, 2.0]}, "mass"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=message):
+            sim.add(SlungLoad(**settings, in_scene=False))
+    sim.add(SlungLoad(mass=0.1, in_scene=False))
+    with pytest.raises(ConfigError, match="at most one plugin"):
+        sim.add(SlungLoad(mass=0.1, name="second", in_scene=False))
+
+
+def test_other_numbers_compile_nothing():
+    sim = flying(engine="interpret")
+    load = sim.add(SlungLoad(mass=0.1, in_scene=False))
+    sim.step()
+    before = sim.step_fn
+    sim.replace(SlungLoad(mass=0.3, length=0.5, in_scene=False))
+    assert sim.step_fn is before
+    assert float(load.read(sim.data).mass[0]) == pytest.approx(0.3)
+
+
+def test_zeros_of_an_attachment_are_left_out_of_the_step_until_they_change():
+    sim = flying()
+    load = SlungLoad(mass=LOAD, attach=(0.0, 0.0, -0.03), in_scene=False)
+    sim.add(load)
+
+    def n_operations():
+        return sum(s.n_operations for s in sim.step_fn.plan(sim.data).program.fused_segments)
+
+    few, other = n_operations(), with_load(load, sim.data, attach=(0.0, 0.0, -0.02))
+    sim.data = other
+    assert n_operations() == few
+    sim.data = with_load(load, sim.data, attach=OFFSET)
+    assert n_operations() > few + 40

@@ -1,0 +1,88 @@
+"""Radars: the lobe against its parametric outline, detection in flight, gradients, overlays, wrong input."""
+
+import jax
+import numpy as np
+import pytest
+from cases import with_states
+
+from crazysim import ConfigError, Radar, Sim
+from crazysim.plugins.sensors.radar import lobe_curves, lobe_margin
+
+LOBES = [(5.0, 1.3, 1.0, 0.0), (3.0, 2.5, 0.6, 0.3), (4.0, 0.0, 1.0, 0.0), (4.0, 2.0, 0.7, -0.2)]
+
+
+@pytest.mark.parametrize("lobe", LOBES)
+def test_the_outline_is_where_the_margin_changes_sign(lobe, x64):
+    """The parametric curve of the drawing bounds the closed form of the test."""
+    size, _, _height, tilt = lobe
+    outline = lobe_curves(*lobe)[0]
+    middle = np.array([size * np.cos(tilt), 0.0, size * np.sin(tilt)])  # on the axis of the lobe
+    for share, inside in ((0.98, True), (1.02, False)):
+        points = (middle + share * (outline - middle))[2:-2]
+        np.testing.assert_array_equal(np.asarray(lobe_margin(points, *lobe)) > 0, inside)
+    np.testing.assert_allclose(lobe_margin(outline[2:-2], *lobe), 0, atol=1e-6 * size)
+
+
+def test_the_lobe_by_hand_and_its_symmetry(rng):
+    """At half the range, u = 1: |z| <= h a 2^(-e / 2)."""
+    margin = lobe_margin(np.float32([[3.0, 4.0, 1.0], [-4.0, 3.0, -1.0]]), 5.0, 1.3, 0.8, 0.0)
+    np.testing.assert_allclose(margin, 0.8 * 5 * 2**-0.65 - 1, rtol=1e-6)
+    up = lobe_margin(np.float32([[5.0, 0.0, 1.5], [5.0, 0.0, -1.5]]), 5.0, 1.3, 0.5, 0.3)
+    np.testing.assert_array_equal(np.asarray(up) > 0, [True, False])  # positive tilt raises the lobe
+    assert float(lobe_margin(np.float32([10.1, 0, 0]), 5.0, 1.3, 1.0, 0.0)) < 0
+
+
+def test_law_07_margin_and_gradient_are_finite_everywhere():
+    points = np.float32([[0, 0, 0], [10, 0, 0], [0, 0, 3.0], [1e6, 0, 1e6], [1e-9, 0, 0], [5, 0, 0]])
+    margin = jax.value_and_grad(lambda p, e: lobe_margin(p, 5.0, e, 1.0, 0.2))
+    each = jax.jit(jax.vmap(margin, in_axes=(0, None)))
+    for e in (0.0, 1.3):
+        value, slope = each(points, e)
+        assert np.isfinite(value).all()
+        assert np.isfinite(slope).all()
+
+
+def test_detection_counts_time_and_is_reset():
+    sim = Sim(n_worlds=3, n_drones=2, control="rotor_vel")
+    sim.data = with_states(
+        sim.data, pos=np.array([[[5, 0, 4.0], [6, 0, 9.3]], [[9, 0, 4.0], [11, 0, 4]], [[0, 2, 4], [0, 2, 9]]])
+    )
+    sim.build_default_data()
+    radar = sim.add(Radar([[0, 0, 4.0], [5.0, 0.0, 9.0]], size=[5.0, 2.0], exponent=1.3))
+    expected = [[[1, 0], [0, 1]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]]
+    np.testing.assert_array_equal(radar.detects(sim.data), expected)
+    sim.step(5)
+    np.testing.assert_allclose(radar.read(sim.data).exposure, np.array(expected) * 5 / sim.freq, rtol=1e-5)
+    assert sim.plugins.observations(sim.data)["radar.margin"].shape == (3, 2, 2)
+    sim.reset(np.array([True, False, False]))
+    assert not np.asarray(radar.read(sim.data).exposure)[0].any()
+    assert "radar" in str(sim.explain()).split("fused, for one drone:")[1].splitlines()[0]
+
+
+def test_the_lobe_is_drawn_in_red_where_it_detects():
+    sim = Sim(n_worlds=2, control="rotor_vel")
+    sim.data = with_states(sim.data, pos=np.array([[[5, 0, 4.0]], [[50, 0, 4.0]]]))
+    radar = sim.add(Radar((0, 0, 4.0), visible=True))
+    for world, red in ((0, True), (1, False)):
+        overlays = sim.scene.renderer.overlays
+        radar.draw(sim, world)
+        assert len(overlays) > 500
+        color = overlays._geoms[0][4]
+        assert (color[0] > color[2]) == red
+        overlays.clear()
+    sim.add(Radar((0, 0, 4.0)), name="hidden").draw(sim, 0)
+    assert len(sim.scene.renderer.overlays) == 0
+
+
+@pytest.mark.parametrize("kwargs, message", [
+    ({"pos": (0, 0)}, "expected pos"),
+    ({"pos": np.zeros((0, 3))}, "expected pos"),
+    ({"pos": (0, 0, np.nan)}, "expected pos"),
+    ({"pos": (0, 0, 0), "size": -1.0}, "size to be finite and positive"),
+    ({"pos": (0, 0, 0), "size": (1.0, 2.0)}, "size of shape"),
+    ({"pos": (0, 0, 0), "exponent": -1.0}, "exponent"),
+    ({"pos": (0, 0, 0), "tilt": 30.0}, "tilt to be finite and from -1.571 to 1.571"),
+])  # fmt: skip
+def test_law_09_wrong_settings(kwargs, message):
+    with pytest.raises(ConfigError, match=message):
+        Sim().add(Radar(**kwargs))

@@ -1,0 +1,278 @@
+"""Cars in a simulation: engines, counts, commands, paths, gradients, the scene, terrain, and wrong input."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import by_stages, with_states
+
+from crazysim import ConfigError, Sim, Terrain
+from crazysim.plugins.vehicles import LPV, Bicycles, Cars, Path, PathLQR, PurePursuit, Stanley, ackermann
+from crazysim.trajectories import circle, figure_eight
+
+EIGHT = figure_eight(5, 1.5, period=14.0, height=0.0)
+CONTROLLERS = {"pursuit": PurePursuit(), "stanley": Stanley(), "lpv": LPV(), "lqr": PathLQR()}
+
+
+def build(n_worlds=2, n_drones=1, engine="interpret", alone=True, **settings):
+    """Return a simulation with cars, whose drones stand still if cars move alone."""
+    sim = Sim(n_worlds, n_drones, control="rotor_vel", engine=engine)
+    cars = sim.add(Cars(**settings))
+    if alone:
+        stages = sim.step_pipeline.items()
+        sim.step_pipeline = {name: fn for name, fn in stages if name.startswith("cars") or name == "increment_steps"}
+    return sim, cars
+
+
+def states_of(sim):
+    record = sim.data.plugins["cars"]
+    return {name: np.asarray(getattr(record, name)) for name in ("pos", "yaw", "body_vel", "yaw_rate", "steer")}
+
+
+@pytest.mark.parametrize(("n_worlds", "n_drones", "n_cars"), [(1, 1, 1), (2, 2, 2), (3, 1, 3), (2, 3, 4)])
+def test_engines_agree_for_any_counts(n_worlds, n_drones, n_cars):
+    sims, found, most = {}, {}, n_cars == 4
+    for engine in ("plain", "interpret", *(("lanes", "fused") if most else ())):
+        sim, cars = build(n_worlds, n_drones, engine, not most, members=n_cars, level="speed", in_scene=False)
+        command = np.random.default_rng(0).uniform([0.5, -0.3], [1.5, 0.3], (n_worlds, n_cars, 2))
+        sim.data = cars.commanded(sim.data, command)
+        sim.step(60)
+        assert sim.step_fn.engines == [engine]
+        sims[engine], found[engine] = sim, states_of(sim)
+    for engine, values in found.items():
+        for name, value in values.items():
+            np.testing.assert_allclose(value, found["plain"][name], rtol=1e-4, atol=1e-4, err_msg=f"{engine} {name}")
+    sims["plain"].step(240)
+    np.testing.assert_allclose(states_of(sims["plain"])["body_vel"][..., 0], command[..., 0], atol=0.1)
+
+
+@jax.jit
+def deviations(record, time):
+    """Return the distances of the cars of a world from their path, and their lags behind it, m. (n_cars,) each"""
+
+    def of_one(pos, arc, start):
+        arc = record.path.project(0, pos[:2], arc[0])
+        reference = record.path.time_reference(0, time - start[0])[0]
+        return jnp.linalg.norm(pos[:2] - record.path.at(0, arc).pos), reference[0] - arc
+
+    return jax.vmap(of_one)(record.pos[0], record.arc[0], record.start[0])
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_cars_follow_a_path(name):
+    """Three cars on a figure eight at up to 1.5 m/s, in their places on it, that start beside it and turned."""
+    sim, _ = build(1, engine="fused", members=3, path=EIGHT, controller=CONTROLLERS[name], in_scene=False)
+    record = sim.data.plugins["cars"]
+    pos, yaw = np.asarray(record.pos) + np.float32([0.0, 0.1, 0.0]), np.asarray(record.yaw) + np.float32(0.3)
+    sim.data = sim.plugins["cars"].write(sim.data, record.replace(pos=jnp.asarray(pos), yaw=jnp.asarray(yaw)))
+    sim.step(3000)
+    distances, lags = [], []
+    for k in range(20):
+        sim.step(150)
+        found = deviations(sim.data.plugins["cars"], np.float32((3000 + 150 * (k + 1)) / 500))
+        distances.append(found[0])
+        lags.append(found[1])
+    assert np.shape(lags) == (20, 3)
+    assert np.max(distances) < {"pursuit": 0.06, "stanley": 0.1, "lpv": 0.05, "lqr": 0.03}[name]
+    assert np.abs(lags).max() < 0.15
+
+
+@pytest.mark.parametrize("controller", [PurePursuit(), PathLQR()], ids=["pursuit", "lqr"])
+def test_cars_follow_a_path_backwards(controller):
+    path = Path.of_trajectory(circle(2.0, speed=0.6), backwards=True)
+    sim, _ = build(1, engine="fused", path=path, controller=controller, in_scene=False)
+    sim.step(5000)
+    record = sim.data.plugins["cars"]
+    assert np.asarray(record.body_vel)[0, 0, 0] == pytest.approx(-0.6, abs=0.05)
+    assert np.linalg.norm(np.asarray(record.pos)[0, 0, :2]) == pytest.approx(2.0, abs=0.08)
+
+
+def test_references_by_arc_length_stop_at_the_end():
+    path = Path.of_points([(0, 0), (1, 0.3), (2, 0), (3, 0.5)], speed=1.0)
+    sim, _ = build(1, engine="fused", path=path, reference="arc", in_scene=False)
+    sim.step(4000)
+    record = sim.data.plugins["cars"]
+    np.testing.assert_allclose(np.asarray(record.pos)[0, 0, :2], [3, 0.5], atol=0.1)
+    assert abs(np.asarray(record.body_vel)[0, 0, 0]) < 0.02
+
+
+def test_a_car_drives_as_it_does_alone():
+    sim, _ = build(2, 1, members=3, path=[EIGHT, circle(2.0, speed=1.0)], in_scene=False)
+    sim.step(60)
+    alone, _ = build(1, 1, path=circle(2.0, speed=1.0), in_scene=False)
+    alone.step(60)
+    for name, value in states_of(alone).items():
+        np.testing.assert_allclose(states_of(sim)[name][1, 1], value[0, 0], rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_reach_commands_and_parameters():
+    sim, cars = build(1, in_scene=False)
+    step = by_stages(sim)
+
+    def end(command, mass):
+        data = cars.commanded(sim.data, command)
+        record = cars.read(data)
+        data = cars.write(data, record.replace(params=record.params.replace(mass=mass)))
+        return jnp.sum(cars.read(step(data, 100)).pos[..., :2])
+
+    command, mass = np.float32([[[0.2, 0.1]]]), cars.read(sim.data).params.mass
+    both = jax.jit(jax.value_and_grad(end, argnums=(0, 1)))
+    by_command, by_mass = (np.asarray(x) for x in both(command, mass)[1])
+    assert np.all(by_command > 0)
+    assert by_mass[0] < 0
+    step = np.float32([[[0.02, 0.0]]])
+    central = float(both(command + step, mass)[0] - both(command - step, mass)[0]) / 0.04
+    assert by_command[0, 0, 0] == pytest.approx(central, rel=0.02)
+
+
+def test_rest_has_finite_gradients():
+    """Of a step at rest, and of one after the car has driven off, by all that moves."""
+    sim, cars = build(1, path=EIGHT, controller=PathLQR(), in_scene=False)
+    stages = list(sim.step_pipeline.values())
+
+    def end(record, data):
+        data = cars.write(data, record)
+        for stage in stages:
+            data = stage(data)
+        return sum(jnp.sum(x) for x in jax.tree.leaves(cars.read(data)) if jnp.issubdtype(x.dtype, jnp.floating))
+
+    slopes = jax.jit(jax.grad(end, allow_int=True))
+    for n_steps in (0, 60):
+        sim.step(n_steps) if n_steps else None
+        found = jax.tree.leaves(slopes(cars.read(sim.data), sim.data))
+        assert all(x.dtype == jax.dtypes.float0 or np.all(np.isfinite(x)) for x in found)
+
+
+def test_resets_restore_the_start():
+    sim, _ = build(3, members=2, path=EIGHT, in_scene=False)
+    start = states_of(sim)
+    sim.step(50)
+    sim.reset(np.array([True, False, True]))
+    for name, value in states_of(sim).items():
+        np.testing.assert_array_equal(value[[0, 2]], start[name][[0, 2]])
+    assert np.ptp(states_of(sim)["pos"][1] - start["pos"][1]) > 0
+
+
+def test_external_forces_move_a_car():
+    sim, cars = build(1, in_scene=False)
+    record = cars.read(sim.data)
+    force = np.zeros(record.force.shape, np.float32)
+    force[..., 0] = 2.923
+    sim.data = cars.write(sim.data, record.replace(force=jnp.asarray(force)))
+    sim.step(10)
+    assert np.asarray(cars.read(sim.data).body_vel)[0, 0, 0] == pytest.approx(0.02 * 2.923 / 2.923, rel=0.15)
+
+
+def test_bicycles_are_driven_by_a_torque():
+    """The acceleration is the torque over the radius, over mass and rotating inertia."""
+    sim = Sim(control="rotor_vel")
+    bikes = sim.add(Bicycles(2, in_scene=False))
+    assert bikes.names == ("Bicycle_0", "Bicycle_1")
+    sim.data = bikes.commanded(sim.data, np.full((1, 2, 2), [0.01, 0.3]))
+    sim.step(500)
+    record = bikes.read(sim.data)
+    inertia = 1 + 2 * 0.1507964 + 2 * (0.01 / 0.04**2 + 0.1507964 / 2)
+    speed = np.asarray(record.body_vel)[0, 0, 0]
+    # The friction of both wheels is 0.001 N m / 0.04 m, of which a part acts below the slip speed.
+    assert (0.01 / 0.04 - 2 * 0.001 / 0.04) / inertia < speed < 0.01 / 0.04 / inertia
+    np.testing.assert_array_equal(record.steer, 0.0)
+
+
+def test_wheels_roll_and_steer_in_the_scene():
+    sim, cars = build(1, members=2, trailer=True, vehicle="aiml_head", pos=[(1, 0), (-1, 0)], yaw=[0.0, np.pi / 2])
+    sim.data = cars.commanded(sim.data, np.tile([0.05, 0.3], (1, 2, 1)))
+    sim.step(100)
+    sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), 0)
+    model, data, record = sim.mj_model, sim.mj_data, jax.tree.map(np.asarray, cars.read(sim.data))
+    left, right = np.asarray(jax.jit(ackermann)(record.steer[0, 0], 0.32226, 0.24477))
+    for k, angle in ((0, left), (1, right), (2, 0.0), (3, 0.0)):
+        axis = data.body(f"cars_wheel:{k}").xmat.reshape(3, 3)[:, 1]
+        np.testing.assert_allclose(np.arctan2(-axis[0], axis[1]), angle + record.yaw[0, 0, 0], atol=1e-5)
+    wheel = data.body("cars_wheel:7").xmat.reshape(3, 3)
+    rolled = np.arctan2(-wheel[2, 0], wheel[2, 2])
+    np.testing.assert_allclose(rolled, record.distance[0, 1, 0] / 0.052388, atol=1e-5)
+    np.testing.assert_allclose(data.body("cars:1").xpos, record.pos[0, 1], atol=1e-6)
+    deck = data.body("cars_trailer:0").xmat.reshape(3, 3)
+    np.testing.assert_allclose(np.arctan2(deck[1, 0], deck[0, 0]), record.joints[0, 0, 1], atol=1e-6)
+    assert model.nbody > 2 * (1 + 4 + 1 + 1 + 4)
+
+
+def test_contacts_of_drones_name_the_car():
+    sim, _ = build(2, pos=(0, 0))
+    pos = np.array(sim.data.states.pos)
+    pos[1, 0] = [0.0, 0.0, 0.1]
+    sim.data = with_states(sim.data, pos=pos)
+    report = sim.contact_report()
+    assert "cars:0" in report.object_names
+    touched = np.asarray(report.objects)[..., report.object_names.index("cars:0")]
+    assert touched[1].all()
+    pos[1, 0, 2] = 1.0
+    sim.data = with_states(sim.data, pos=pos)
+    assert not np.asarray(sim.contact_report().objects)[1].any()
+
+
+def test_cars_roll_down_a_slope():
+    """Without drive a car on a plane of 0.1 rad accelerates by g sin(a) and loses what its damping takes."""
+    x = np.linspace(-20, 20, 41)
+    heights = np.tile(5 - np.tan(0.1) * x, (41, 1))
+    sim = Sim(control="rotor_vel", engine="fused")
+    sim.add(Terrain(heights, size=(40.0, 40.0)))
+    cars = sim.add(Cars(pos=(0, 0), in_scene=False))
+    np.testing.assert_allclose(np.asarray(cars.read(sim.data).pos)[0, 0, 2], 5 + 0.052388, atol=1e-4)
+    sim.step(250)
+    record = jax.tree.map(np.asarray, cars.read(sim.data))
+    np.testing.assert_allclose(record.normal[0, 0], [np.sin(0.1), 0, np.cos(0.1)], atol=1e-5)
+    np.testing.assert_allclose(record.pos[0, 0, 2] - 0.052388, 5 - np.tan(0.1) * record.pos[0, 0, 0], atol=2e-3)
+    speed = 0.0
+    for _ in range(250):
+        force = 4.0304 * speed + 0.8656 * speed / np.hypot(speed, 0.1)
+        speed += (9.81 * np.sin(0.1) * np.cos(0.1) - force / 2.923) / 500
+    assert record.body_vel[0, 0, 0] == pytest.approx(speed, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"vehicle": "tank"}, "expected a vehicle as one of"),
+        ({"level": "torque"}, "expected level of 'cars' as one of"),
+        ({"reference": "place"}, "expected reference of 'cars' as one of"),
+        ({"controller": PurePursuit()}, "expected a path for the controller"),
+        ({"controller": "lqr", "path": EIGHT}, "expected a PathController"),
+        ({"path": "eight"}, "expected a Path, a Trajectory"),
+        ({"path": EIGHT, "index": 1}, "a whole number from 0 to 0"),
+        ({"path": EIGHT, "start": [0.0, 1.0]}, "expected start as a number"),
+        ({"path": EIGHT, "controller": Stanley(gain=-1.0)}, "expected gain of Stanley to be at least zero"),
+        ({"path": EIGHT, "vehicle": "bicycle"}, "expected a vehicle that steers"),
+        ({"vehicle": "bicycle", "trailer": True}, "expected a vehicle with a table [trailer]"),
+        ({"path": Path.of_points([(0, 0), (1, 0), (2, 0)], -1.0), "controller": LPV()}, "can drive forwards"),
+        ({"members": 2, "pos": [(0, 0, 0)]}, "expected pos as finite numbers of shape"),
+        ({"yaw": np.nan}, "expected yaw as finite numbers"),
+        ({"rate": 40}, "to divide freq = 500 Hz"),
+        ({"members": ["a", "a"]}, "got 'a' twice"),
+    ],
+)
+def test_wrong_settings_are_errors(settings, message):
+    sim = Sim()
+    before = sim.data
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        sim.add(Cars(**settings))
+    assert sim.data is before
+    assert "cars" not in sim.plugins
+
+
+def test_a_car_has_a_view_by_its_name():
+    sim, cars = build(2, members=3, in_scene=False)
+    assert sim["Fleet1Tenth_1"].pos.shape == (2, 3)
+    np.testing.assert_array_equal(sim["Fleet1Tenth_2"].pos, np.asarray(cars.read(sim.data).pos)[:, 2])
+    sim["Fleet1Tenth_1"].command([0.1, 0.2])
+    np.testing.assert_allclose(np.asarray(cars.read(sim.data).command)[:, 1], [[0.1, 0.2]] * 2)
+    np.testing.assert_array_equal(np.asarray(cars.read(sim.data).command)[:, 0], 0.0)
+
+
+def test_wrong_commands_are_errors():
+    sim, cars = build(2, members=3, in_scene=False)
+    for command, message in ((np.zeros((2, 3, 4)), "(2, 3, 2)"), (np.full((2, 3, 2), np.nan), "finite")):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            cars.commanded(sim.data, command)

@@ -1,0 +1,123 @@
+"""Vehicle models: built-in files, users' files, and wrong input."""
+
+import re
+import tomllib
+
+import numpy as np
+import pytest
+
+from crazysim import ConfigError
+from crazysim.errors import UnknownNameError
+from crazysim.plugins.vehicles import CarParams, load_vehicle, vehicle_names
+from crazysim.plugins.vehicles.model import FOLDER, KEYS
+
+
+@pytest.mark.parametrize("name", vehicle_names())
+def test_every_number_has_a_unit_and_a_source(name):
+    tables = tomllib.loads((FOLDER / f"{name}.toml").read_text())
+    entries = {f"{t}.{k}": x for t, table in tables.items() if t not in ("sources", "base", "model", "name")
+               for k, x in table.items()}  # fmt: skip
+    assert entries
+    assert set(entries) <= set(KEYS)
+    for entry in entries.values():
+        assert set(entry) == {"value", "unit", "source"}
+        assert entry["source"] in tables["sources"]
+    assert {entry["source"] for entry in entries.values()} <= set(tables["sources"])
+
+
+def test_published_sets():
+    assert {"aiml_apr24", "aiml_head", "f1tenth_ros", "bicycle"} <= set(vehicle_names())
+    ros, head, apr = (load_vehicle(name) for name in ("f1tenth_ros", "aiml_head", "aiml_apr24"))
+    assert [ros.number(f"rigid_body.{k}") for k in ("mass", "yaw_inertia")] == [2.923, 0.0796]
+    assert ros.value("drive.force").tolist() == [41.796, 2.0152, 0.4328]
+    assert head.value("drive.torque").tolist() == [52.4282, 5.2465, 1.119465]
+    assert apr.value("drive.torque").tolist() == [65.0, 3.3, 1.05]
+    assert "drive.torque" not in ros.numbers  # the base's drive is replaced as a whole
+    for vehicle in (ros, head, apr):
+        assert [vehicle.number(f"tyres.{k}") for k in ("front", "rear")] == [41.7372, 29.4662]
+
+
+def test_parameters_by_hand():
+    ros = CarParams.create(load_vehicle("f1tenth_ros"), 500)
+    np.testing.assert_allclose(ros.drive, [83.592, 4.0304, 0.8656], rtol=1e-6)  # two axles
+    np.testing.assert_allclose(ros.grip, 1.0489 * 9.81 * 2.923 * np.array([0.168, 0.163]) / 0.331, rtol=1e-6)
+    assert float(ros.towed_mass[0]) == 0
+    head = CarParams.create(load_vehicle("aiml_head"), 500, trailer=True)
+    np.testing.assert_allclose(head.mass, 3.4)
+    # Four wheels of 0.05 + 0.1 r^2 / 2 kg m^2 over r^2, and the trailer of 3.74 kg.
+    np.testing.assert_allclose(head.towed_mass, 4 * (0.05 / 0.052388**2 + 0.05) + 3.74, rtol=1e-6)
+    np.testing.assert_allclose(head.yaw_inertia, 0.08 + 0.0167, atol=5e-5)
+    np.testing.assert_allclose(head.drive_max, 4 * 2.0 / 0.052388, rtol=1e-6)
+
+
+def test_slow_physics_gets_a_larger_slip_speed():
+    fast, slow = (float(CarParams.create(load_vehicle("f1tenth_ros"), freq).slip_speed[0]) for freq in (500, 50))
+    assert fast == pytest.approx(0.1)
+    assert slow == pytest.approx(71.2034 / 2.923 / 50, rel=0.02)
+
+
+def test_a_file_and_a_dict_of_a_user(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('base = "f1tenth_ros"\n[rigid_body]\nmass = 4.0\n[tyres]\nfriction = { value = 0.5 }\n')
+    mine, same = load_vehicle(path), load_vehicle({"base": "f1tenth_ros", "rigid_body": {"mass": 4.0}})
+    assert mine.name == "mine"
+    assert mine.number("tyres.friction") == 0.5
+    assert mine.number("rigid_body.mass") == same.number("rigid_body.mass") == 4.0
+    assert same.name == "custom"
+    assert load_vehicle(mine) is mine
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("f1tenth", "aiml_apr24, aiml_head"),
+        (3, "expected a vehicle as a name"),
+        ({"base": "aiml_head", "rigid_body": {"mas": 1.0}}, "Did you mean 'rigid_body.mass'"),
+        ({"base": "aiml_head", "wheel": {"radius": 1.0}}, "expected a key that exists"),
+        ({"base": "aiml_head", "rigid_body": {"mass": -1.0}}, "rigid_body.mass to be from 1e-6 to 1e6 kg, got -1"),
+        (
+            {"base": "aiml_head", "rigid_body": {"mass": 1e-300}},
+            "rigid_body.mass to be from 1e-6 to 1e6 kg, got 1e-300",
+        ),
+        ({"base": "aiml_head", "rigid_body": {"mass": "3"}}, "rigid_body.mass as a number or array, got '3'"),
+        ({"base": "aiml_head", "rigid_body": {"mass": "heavy"}}, "as a number or array"),
+        ({"base": "aiml_head", "rigid_body": {"mass": [1.0, 2.0]}}, "of shape"),
+        ({"base": "aiml_head", "rigid_body": {"mass": float("nan")}}, "from 1e-6 to 1e6 kg, got nan"),
+        ({"base": "aiml_head", "wheels": {"radius": 0.0}}, "wheels.radius to be from 1e-6 to 1e3 m, got 0.0"),
+        ({"base": "aiml_head", "wheels": {"mass": -0.1}}, "wheels.mass to be from 0 to 1e6 kg"),
+        ({"base": "aiml_head", "wheels": {"number": 0}}, "wheels.number to be from 1 to 100"),
+        ({"base": "aiml_head", "drive": {"torque": [0, 5, 1]}}, "drive.torque to be a positive gain, then damping"),
+        ({"base": "aiml_head", "drive": {"torque": [50, -5, 1]}}, "drive.torque to be a positive gain, then damping"),
+        ({"base": "aiml_head", "drive": {"front_share": 1.5}}, "drive.front_share to be from 0 to 1"),
+        ({"base": "aiml_head", "steering": {"angle_max": 2.0}}, "steering.angle_max to be from 0 to 1.5 rad"),
+        ({"base": "aiml_head", "steering": {"bandwidth": float("inf")}}, "steering.bandwidth to be at least zero"),
+        ({"base": "aiml_head", "model": [[]] * 99}, "single_track, kinematic, got a list"),
+        ({"base": "aiml_head", "model": "tank"}, "single_track, kinematic"),
+        ({"rigid_body": {"mass": 1.0}}, "which it lacks"),
+        ({"base": "aiml_head", "drive": {"force": [1, 1, 1], "torque": [1, 1, 1], "force_max": 1}}, "either"),
+    ],
+)
+def test_wrong_models_are_errors(source, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        load_vehicle(source)
+
+
+def test_unknown_names_and_broken_files_are_errors(tmp_path):
+    with pytest.raises(UnknownNameError):
+        load_vehicle("nothing.toml")
+    path = tmp_path / "broken.toml"
+    path.write_text("[rigid_body\n")
+    with pytest.raises(ConfigError, match="not valid TOML"):
+        load_vehicle(path)
+    for content, message in ((b"\xff\xfe[", "not UTF-8"), (b"a = " + b"[" * 5000, "not valid TOML")):
+        path.write_bytes(content)
+        with pytest.raises(ConfigError, match=message):
+            load_vehicle(path)
+    path.write_text(f'base = "{path}"\n')
+    with pytest.raises(ConfigError, match="expected a base that leads to a file without one"):
+        load_vehicle(path)
+    heavy = load_vehicle({"base": "aiml_head", "drive": {"torque": [52.0, 1e3, 1.0]}})
+    with pytest.raises(ConfigError, match=r"expected damping of vehicle 'custom' to be slow .* Use freq=666 or more"):
+        CarParams.create(heavy, 500)
+    with pytest.raises(ConfigError, match=re.escape("has no value 'trailer.hitch'")):
+        load_vehicle("bicycle").number("trailer.hitch")

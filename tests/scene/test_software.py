@@ -1,0 +1,78 @@
+"""Images of machines without a GPU: recognised, drawn with less work, and of the same scene."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim
+from crazysim.scene import software
+
+
+@pytest.fixture
+def renderer(monkeypatch):
+    """Return a function that gives OpenGL's renderer another name; each name is looked at again."""
+    from OpenGL import GL
+
+    def rename(name):
+        monkeypatch.setattr(GL, "glGetString", lambda _: name)
+        software.is_software.cache_clear()
+
+    monkeypatch.delenv(software.VARIABLE, raising=False)
+    yield rename
+    software.is_software.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        (b"llvmpipe (LLVM 15.0.6, 256 bits)", True),
+        (b"softpipe", True),
+        (b"NVIDIA H200/PCIe/SSE2", False),
+        (b"Mesa Intel(R) UHD Graphics 630 (CFL GT2)", False),
+        (None, False),
+    ],
+)
+def test_the_name_of_the_renderer_tells_a_cpu_from_a_gpu(opengl, renderer, name, expected):
+    renderer(name)
+    assert software.is_fast() == expected
+    assert software.film_size(960, 544) == ((640, 362) if expected else (960, 544))
+
+
+def test_the_variable_decides_first(opengl, renderer, monkeypatch):
+    renderer(b"llvmpipe")
+    monkeypatch.setenv(software.VARIABLE, "full")
+    assert not software.is_fast()
+    renderer(b"NVIDIA H200/PCIe/SSE2")
+    monkeypatch.setenv(software.VARIABLE, "fast")
+    assert software.is_fast()
+
+
+def test_a_wrong_variable_is_an_error(monkeypatch):
+    monkeypatch.setenv(software.VARIABLE, "quick")
+    with pytest.raises(ConfigError, match=r"expected full or fast in CRAZYSIM_RENDERING, got 'quick'"):
+        Sim().render("rgb_array", width=32, height=24)
+
+
+def test_the_settings_hold_while_a_context_is_made(monkeypatch):
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><visual><quality offsamples='8' shadowsize='512'/></visual></mujoco>"
+    )
+    monkeypatch.setenv(software.VARIABLE, "fast")
+    with software.quality(model):
+        assert (model.vis.quality.offsamples, model.vis.quality.shadowsize) == (0, 0)
+    assert (model.vis.quality.offsamples, model.vis.quality.shadowsize) == (8, 512)
+
+
+def test_a_fast_image_shows_the_same_scene_with_jagged_edges(opengl, monkeypatch):
+    images = {}
+    for chosen in ("full", "fast"):
+        monkeypatch.setenv(software.VARIABLE, chosen)
+        sim = Sim()
+        sim.scene.add("pole", count=1, pos=[[0.0, 0.5, 0.0]], height=1.0, radius=0.05)
+        config = {"lookat": [0, 0, 0.3], "distance": 1.5, "azimuth": 90, "elevation": -20}
+        images[chosen] = sim.render("rgb_array", cam_config=config, width=240, height=180).astype(int)
+        sim.close()
+    off = np.abs(images["full"] - images["fast"]).max(-1)
+    assert np.mean(off > 24) < 0.05, "edges and shadows differ, and nothing else"
+    n_colors = {chosen: len(np.unique(image.reshape(-1, 3), axis=0)) for chosen, image in images.items()}
+    assert n_colors["fast"] < n_colors["full"], "samples of a pixel mix the colours at edges"

@@ -1,0 +1,106 @@
+"""The commands that make and check airframes, as a user runs them."""
+
+import tomllib
+
+import numpy as np
+import pytest
+
+from crazysim import load_airframe
+from crazysim.__main__ import main
+from crazysim.airframe_check import describe_airframe
+
+NUMBERS = ("--mass", "1.2", "--propeller", "0.127", "--thrust-to-weight", "4")
+
+
+def rows(text):
+    """Return the printed lines by name."""
+    return {line[:22].strip(): line[22:] for line in text.splitlines()}
+
+
+def test_new_writes_a_file_that_check_reads_and_draws(tmp_path, capsys, opengl):
+    path, picture = tmp_path / "mine.toml", tmp_path / "mine.png"
+    assert main(["airframe", "new", str(path), *NUMBERS, "--arm", "0.12", "--cells", "6"]) == 0
+    out = capsys.readouterr().out
+    assert f"wrote {path}; estimated: inertia" in out
+    assert f"crazysim airframe check {path}" in out
+    assert load_airframe(path).name == "mine"
+    assert load_airframe(path).value("battery.cells") == 6
+    assert main(["airframe", "check", str(path), "--picture", str(picture)]) == 0
+    found = rows(capsys.readouterr().out)
+    assert found["thrust over weight"] == "4.00"
+    assert found["hover"] == "25% of the largest thrust"
+    assert found["tilt at full thrust"] == "holds height up to 76 degrees"  # arccos(1 / 4) = 75.5 degrees
+    assert "50% of" in found["rotor speed"]  # thrust is quadratic in the speed
+    assert found["rotor time constant"] == "0.05 s in hover"
+    assert found["auto"] == "state, attitude, body_rate"
+    loops = ("position", "velocity", "attitude", "rate")
+    gains = "; ".join(f"[pid.{loop}] kp, ki, kd" for loop in loops)
+    assert found["pid"] == f"not: lacks {gains}; [pid] tilt_max, thrust_base, thrust_min; [controller] pwm_max"
+    assert found["mellinger"].startswith("not: lacks [mellinger] mass, mass_thrust, kp, kd, ki, integral_max, kR, ")
+    assert found["mellinger"].endswith("; [controller] pwm_max")
+    assert "state not: lacks [controller.state] kp, kd, ki, int_err_max; [controller] mass, " in found["crazyflow"]
+    assert "attitude, body_rate not: lacks [controller.attitude] kR, kw, ki_m" in found["crazyflow"]
+    assert found["crazyflow"].endswith("; force_torque")
+    assert "warning" not in found
+    from matplotlib.image import imread
+
+    image = np.asarray(imread(picture))[..., :3]
+    assert image.shape == (640, 960, 3)
+    dark = np.asarray(image).mean(axis=-1) < 0.35
+    assert 0.05 < dark[150:500, 200:760].mean() < 0.6, "the propellers are in the middle"
+
+
+def test_new_takes_rotors_one_by_one(tmp_path):
+    path = tmp_path / "tri.toml"
+    places = "0.2,0.2 -0.3,0,0.01 0.2,-0.2,0"
+    arguments = [str(path), *NUMBERS, "--spins", "ccw", "cw", "CCW", "--name", "tri copter", "--positions", places]
+    assert main(["airframe", "new", *arguments]) == 0
+    airframe = load_airframe(path)
+    assert airframe.name == "tri copter"
+    np.testing.assert_allclose(airframe.value("rotors.position"), [[0.2, 0.2, 0], [-0.3, 0, 0.01], [0.2, -0.2, 0]])
+    np.testing.assert_array_equal(airframe.value("rotors.yaw_torque_sign"), [-1, 1, -1])
+    warnings = [line for line in describe_airframe(airframe).splitlines() if line.startswith("warning")]
+    assert len(warnings) == 2
+    assert "beside the centre of mass" in warnings[0]
+    assert "turn one way" in warnings[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["mine.txt", *NUMBERS], "expected a .toml file in an existing folder"),
+        (["mine.toml", *NUMBERS], "expected either arm"),
+        (["mine.toml", *NUMBERS, "--arm", "0.12", "--spins", "left"], "--spins of ccw and cw, got 'left'"),
+        (["mine.toml", *NUMBERS, "--positions", "a,b"], "--positions such as"),
+        (["there.toml", *NUMBERS, "--arm", "0.12"], "expected a new file"),
+        (["mine.toml", *NUMBERS[:-1], "0.5", "--arm", "0.12"], "expected rotors that lift"),
+    ],
+)
+def test_wrong_arguments_are_one_line_and_write_nothing(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.toml").write_text("")
+    assert main(["airframe", "new", *arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert "\n" not in error
+    assert not (tmp_path / "mine.toml").exists()
+
+
+def test_a_drone_is_checked_by_hand():
+    """Largest torques at hover: the rotors may change by what is left to their limits, with lever arms."""
+    airframe = load_airframe("cf21B_500")
+    hover = 0.0434 * 9.81 / 4
+    spare = min(hover - airframe.value("rotors.thrust_min"), 0.2 - hover)
+    text = rows(describe_airframe(airframe))
+    assert f"up to {4 * spare * 0.035355 / 25e-6:.3g} rad/s^2" in text["roll"]
+    assert text["pid"] == "state, attitude, body_rate"
+    fitted = rows(describe_airframe(load_airframe("hb_x500")))
+    assert fitted["dynamics"].startswith("so_rpy")
+    assert fitted["auto"].startswith("state")
+
+
+def test_what_estimates_assume_is_in_the_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    assert main(["airframe", "new", str(path), *NUMBERS, "--arm", "0.12"]) == 0
+    sources = tomllib.loads(path.read_text(encoding="utf-8"))["sources"]
+    assert "figure of merit of 0.44" in sources["torque_curve"]

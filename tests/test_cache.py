@@ -1,0 +1,122 @@
+"""The cache of compiled programs: where it is, what it keeps, and what a user reads of it."""
+
+import os
+import subprocess
+import sys
+import time
+
+import jax
+import pytest
+
+from crazysim import cache
+from crazysim.cache import default_cache, enable_cache, enable_for_command, trim
+
+PROGRAM = """
+import sys
+from crazysim.__main__ import COMMANDS, main
+import jax, jax.numpy as jnp
+COMMANDS["info"] = COMMANDS["train"] = lambda options: print(jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((3, 3)))[0, 0])
+sys.exit(main([sys.argv[1], *["hover"] * (sys.argv[1] == "train")]))
+"""
+"""A command that compiles something."""
+
+
+@pytest.fixture
+def settings(monkeypatch):
+    """Restore JAX's settings after the test, in which there is no cache and no variable."""
+    names = ("min_entry_size_bytes", "min_compile_time_secs", "enable_xla_caches")
+    names = ("jax_compilation_cache_dir", *(f"jax_persistent_cache_{name}" for name in names))
+    before = {name: getattr(jax.config, name) for name in names}
+    jax.config.update("jax_compilation_cache_dir", None)
+    for name in (cache.VARIABLE, "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def test_the_folder_is_that_of_the_variable_or_in_the_folder_of_caches(settings, monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert default_cache() == tmp_path / ".cache" / "crazysim" / "jax"
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # ignored, as the specification of XDG says
+    assert default_cache() == tmp_path / ".cache" / "crazysim" / "jax"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert default_cache() == tmp_path / "xdg" / "crazysim" / "jax"
+    monkeypatch.setenv(cache.VARIABLE, "~/mine")
+    assert enable_cache() == tmp_path / "mine"
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "mine")
+
+
+def test_off_keeps_nothing_unless_a_folder_is_named(settings, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv(cache.VARIABLE, "off")
+    enable_for_command()
+    assert enable_cache() is None
+    assert jax.config.jax_compilation_cache_dir is None
+    assert enable_cache(tmp_path) == tmp_path
+    assert capsys.readouterr().err == ""
+
+
+def test_a_command_tells_once_and_leaves_the_cache_that_jax_has(settings, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "kept"))
+    enable_for_command()
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert str(tmp_path / "kept") in told
+    assert "1 GB" in told
+    jax.config.update("jax_compilation_cache_dir", None)
+    enable_for_command()
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "kept")
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "other"))
+    enable_for_command()
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "kept")
+    assert capsys.readouterr().err == ""
+
+
+def test_a_command_runs_where_the_folder_cannot_be_used(settings, monkeypatch, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file"))
+    enable_for_command()
+    assert jax.config.jax_compilation_cache_dir is None
+    assert capsys.readouterr().err.startswith("compiled programs are not kept: expected a folder")
+
+
+def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path):
+    (tmp_path / "crazysim").mkdir()
+    names = ("jit_a-cache", "jit_b-cache", "crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache")
+    for age, name in enumerate(reversed(names)):
+        (tmp_path / name).write_bytes(bytes(10))
+        os.utime(tmp_path / name, (time.time() - 1000 * age,) * 2)
+
+    def left():
+        return {name for name in names if (tmp_path / name).exists()}
+
+    trim(tmp_path, 50)
+    assert left() == set(names)
+    trim(tmp_path, 49)  # down to 0.8 of it: 39 bytes, three programs
+    assert left() == {"crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache"}
+
+
+def test_a_second_command_reads_the_cache_in_silence(tmp_path):
+    """XLA writes errors about features of the CPU for each program that it reads, if it is not told otherwise."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "TF_CPP", "CRAZYSIM"))}
+    environment["XDG_CACHE_HOME"] = str(tmp_path)
+    environment["TF_CPP_MIN_LOG_LEVEL"] = "1"  # as JAX sets it, for the children of a process that has imported it
+
+    def run(name):
+        command = [sys.executable, "-c", PROGRAM, name]
+        return subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+
+    folder = tmp_path / "crazysim" / "jax"
+    run("info")
+    assert not folder.exists(), "a report of bugs changes nothing"
+    first = run("train")
+    assert first.stderr.startswith(f"compiled programs are kept in {folder}")
+    programs = set(folder.iterdir())
+    assert programs
+    assert folder.stat().st_mode & 0o077 == 0
+    second = run("train")
+    assert second.stderr == ""
+    assert second.stdout == first.stdout
+    assert {path for path in folder.iterdir() if path.name.endswith("-cache")} == {
+        path for path in programs if path.name.endswith("-cache")
+    }

@@ -1,0 +1,72 @@
+"""What ``crazysim info`` prints, where everything is there and where little is."""
+
+import importlib.metadata
+import os
+import shutil
+import subprocess
+import sys
+
+import jax
+import pytest
+
+import crazysim
+from crazysim.__main__ import main
+from crazysim.info import OPTIONAL, PACKAGES, VARIABLES
+
+
+def lines(text):
+    """Return the printed lines by name."""
+    return {name: value.strip() for name, _, value in (line.partition(":") for line in text.splitlines())}
+
+
+def test_it_prints_versions_devices_compiler_and_caches(capsys):
+    assert main(["info"]) == 0
+    found = lines(capsys.readouterr().out)
+    assert found["crazysim"].startswith(crazysim.__version__)
+    assert found["Python"].startswith(".".join(map(str, sys.version_info[:3])))
+    assert "CPU cores" in found["system"]
+    for name in PACKAGES:
+        assert found[name] == importlib.metadata.version(name)
+    assert found["devices"].count("cpu") >= len(jax.devices("cpu"))
+    if shutil.which("g++"):
+        assert "g++" in found["C++ compiler"]
+        assert "-O2" in found["C++ compiler"]
+    assert jax.config.jax_compilation_cache_dir in found["caches"].replace("~", os.path.expanduser("~"))
+    assert " MB in " in found["caches"]
+    assert found["rendering"].startswith(os.environ["MUJOCO_GL"])
+
+
+def test_missing_parts_are_lines_with_the_reason(tmp_path):
+    """No compiler, no OpenGL, no cache, whatever the machine has; its other variables may be how Python finds JAX."""
+    given = {name: value for name, value in os.environ.items() if name not in (*VARIABLES, "DISPLAY")}
+    environment = given | {
+        "PATH": str(tmp_path), "HOME": str(tmp_path), "MUJOCO_GL": "disable", "JAX_PLATFORMS": "cpu"
+    }  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "crazysim", "info"], capture_output=True, text=True, env=environment, check=True
+    )
+    found = lines(done.stdout)
+    assert found["C++ compiler"].startswith("none")
+    assert found["caches"] == "~/.cache/crazysim/jax: not there"
+    assert found["rendering"].startswith("disable, fails: ")
+    assert "JAX_PLATFORMS=cpu" in found["variables"]
+
+
+@pytest.mark.parametrize("missing", [OPTIONAL, (*OPTIONAL, "mujoco-mjx")])
+def test_missing_packages_are_named(monkeypatch, capsys, missing):
+    def version(name, real=importlib.metadata.version):
+        if name in missing:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return real(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    assert main(["info"]) == 0
+    found = lines(capsys.readouterr().out)
+    assert found["extras"] == "none"
+    assert (found["mujoco-mjx"] == "not installed") == ("mujoco-mjx" in missing)
+
+
+def test_broken_settings_are_lines_with_the_reason(monkeypatch, capsys):
+    monkeypatch.setenv("CXXFLAGS", "'-O2")
+    assert main(["info"]) == 0
+    assert "words in CXXFLAGS" in lines(capsys.readouterr().out)["C++ compiler"]

@@ -1,0 +1,109 @@
+"""Files are written whole or not at all, and damaged ones are refused with their name."""
+
+import io
+import resource
+import tracemalloc
+import zipfile
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from crazysim.errors import ConfigError, DamagedFileError
+from crazysim.storage import read_arrays, reading, replacing
+
+
+@contextmanager
+def full_disk():
+    """Let every file end at 100 bytes, as the system does for a quota."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def write_to_a_full_disk(path):
+    with full_disk(), replacing(path) as file:
+        file.write(bytes(1000))
+
+
+def write_and_stop(path):
+    with replacing(path) as file:
+        file.write(b"sec")
+        raise KeyboardInterrupt
+
+
+def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "a.bin"
+    with replacing(path) as file:
+        file.write(b"first")
+    with pytest.raises(ConfigError, match=r"expected a file that can be written, got .*a\.bin.*too large"):
+        write_to_a_full_disk(path)
+    with pytest.raises(KeyboardInterrupt):
+        write_and_stop(path)
+    assert path.read_bytes() == b"first"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
+    with pytest.raises(ConfigError, match="expected an existing folder"), replacing(tmp_path / "b" / "a"):
+        pass
+    with pytest.raises(ConfigError, match="expected a file that can be written"), replacing(tmp_path):
+        pass
+
+
+def packed(save=np.savez, **arrays):
+    file = io.BytesIO()
+    save(file, **arrays)
+    return file.getvalue()
+
+
+def read(content):
+    with reading("a.npz", "some arrays", "Use another copy."):
+        return read_arrays(io.BytesIO(content), "a.npz")
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_damaged_arrays_are_refused_wherever_the_damage_is(save):
+    arrays = {"x": np.arange(8.0), "n": np.array(3), "text": np.array("meta")}
+    content = packed(save, **arrays)
+    assert read(content).keys() == arrays.keys()
+    for length in range(0, len(content), 7):
+        with pytest.raises(DamagedFileError, match=r"expected some arrays, got 'a\.npz', which .* Use another copy\."):
+            read(content[:length])
+    refused = 0
+    for k in range(len(content)):
+        try:
+            found = read(content[:k] + bytes([content[k] ^ 0x10]) + content[k + 1 :])
+        except ConfigError as error:
+            refused += "a.npz" in str(error)
+        else:  # of a date, for example, or of the size of the table of contents, which then lacks names
+            assert all(np.array_equal(x, arrays[name]) for name, x in found.items())
+    assert refused > 0.6 * len(content)
+
+
+def test_objects_are_not_unpickled():
+    with pytest.raises(DamagedFileError, match="Object arrays cannot be loaded"):
+        read(packed(x=np.array([{}])))
+
+
+def test_small_files_do_not_take_all_memory():
+    """An archive of 256 kB that states 2 GiB is refused before any of it is unpacked."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("x0.npy", "w") as member:
+        for _ in range(2**8):
+            member.write(bytes(2**20))
+    one = file.getvalue()
+    stated = one.replace((2**28).to_bytes(4, "little"), (2**31 - 1).to_bytes(4, "little"))
+    tracemalloc.start()
+    with pytest.raises(ConfigError, match=r"expected files of at most 1073741824 bytes.*a\.npz: x0"):
+        read(stated)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**20
+
+
+def test_a_missing_file_is_named(tmp_path):
+    path, message = tmp_path / "none", r"expected an existing file with some arrays, got .*none'\. Use another"
+    with pytest.raises(ConfigError, match=message) as error, reading(path, "some arrays", "Use another copy."):
+        path.read_bytes()
+    assert not isinstance(error.value, DamagedFileError)

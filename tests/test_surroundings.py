@@ -1,0 +1,60 @@
+"""Variables of the environment that are set before JAX and MuJoCo are imported."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from crazysim import surroundings
+
+VARIABLES = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
+PROGRAM = """
+import os
+from crazysim import Sim
+print(os.environ["MUJOCO_GL"], Sim().render("rgb_array", width=64, height=48).shape)
+"""
+
+
+@pytest.fixture
+def bare(monkeypatch):
+    """An environment without a screen or a choice."""
+    for name in VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    return monkeypatch
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL is how Linux draws without a screen")
+def test_images_need_no_setting_without_a_screen():
+    environment = {key: value for key, value in os.environ.items() if key not in VARIABLES}
+    result = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True)
+    assert result.stdout.split() == ["egl", "(48,", "64,", "3)"], result.stderr
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("variable", VARIABLES)
+def test_a_screen_or_a_choice_is_kept(bare, variable):
+    bare.setenv(variable, "osmesa")
+    before = dict(os.environ)
+    surroundings.set_variables()
+    assert dict(os.environ) == before
+
+
+@pytest.mark.fast
+def test_without_egl_nothing_is_chosen(bare):
+    def missing(name):
+        raise OSError(name)
+
+    bare.setattr(surroundings.ctypes, "CDLL", missing)
+    surroundings.set_variables()
+    assert "MUJOCO_GL" not in os.environ
+
+
+@pytest.mark.fast
+def test_the_log_of_xla_is_quiet_unless_chosen(monkeypatch):
+    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
+    surroundings.set_variables()
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
+    surroundings.set_variables()
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "0"

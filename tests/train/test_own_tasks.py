@@ -1,0 +1,259 @@
+"""Tasks of users: from a file to a trained policy, by place, by name and as objects; the package stays as it is."""
+
+import importlib.metadata
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, envs, train
+from crazysim.__main__ import main
+from crazysim.envs import TASKS, Task, references, registry
+from crazysim.envs.tasks.hover import Hover
+from crazysim.errors import UnknownNameError
+from crazysim.train.config import TrainConfig
+from crazysim.train.training import load_policy
+
+SOURCE = """
+from __future__ import annotations
+
+from dataclasses import dataclass
+from helpers import HEIGHT
+import crazysim.envs as envs
+from crazysim.envs.tasks.hover import Hover
+
+
+@dataclass(frozen=True, kw_only=True)
+class High(Hover):
+    'Hover high.'
+
+    name = "high"
+    extra: float = HEIGHT
+    sides: tuple[float, ...] = (1.0, 2.0)
+"""
+SMALL = {"iterations": 2, "n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (8,)}
+QUIET = {"evaluation_worlds": 8, "progress": False, "film": False, "n_worlds": 4, "config": SMALL}
+
+
+@pytest.fixture(autouse=True)
+def own_list(tmp_path_factory, monkeypatch):
+    """Give each test a list of named tasks of its own, and take away what it registers."""
+    path = tmp_path_factory.mktemp("user") / "crazysim" / "tasks"
+    monkeypatch.setattr(references, "_list_path", lambda: path)
+    monkeypatch.setattr(references, "_CLASSES", {})
+    monkeypatch.setattr(references, "_LOADED", set())
+    tasks, ids = dict(TASKS), dict(gymnasium.registry)
+    yield path
+    TASKS.clear()
+    TASKS.update(tasks)
+    gymnasium.registry.clear()
+    gymnasium.registry.update(ids)
+
+
+@pytest.fixture
+def file(tmp_path):
+    (tmp_path / "helpers.py").write_text("HEIGHT = 0.5")
+    (tmp_path / "my_tasks.py").write_text(SOURCE)
+    return tmp_path / "my_tasks.py"
+
+
+def another_process(monkeypatch):
+    """Forget what this process has named, as another one would."""
+    monkeypatch.setattr(references, "_CLASSES", {})
+    monkeypatch.setattr(references, "_LOADED", set())
+
+
+def test_a_file_is_trained_evaluated_resumed_and_exported(file, tmp_path, monkeypatch, capsys):
+    """By the commands alone, from the folder of the run."""
+    monkeypatch.chdir(tmp_path)
+    few = [f"{k}={list(v) if isinstance(v, tuple) else v}" for k, v in SMALL.items()]
+    assert (
+        main(["train", "my_tasks.py:High", "--worlds", "4", "--set", "seconds=0.4", "--no-film", "--config", *few]) == 0
+    )
+    assert "high by ppo, seed 0: 2 iterations" in capsys.readouterr().out
+    another_process(monkeypatch)
+    folder = str(tmp_path / "out" / "high")
+    assert main(["evaluate", folder, "--worlds", "4"]) == 0
+    assert "high, 4 starts: success" in capsys.readouterr().out
+    assert main(["export", folder, "--c", "policy.h"]) == 0
+    file.write_text(SOURCE + "\n# a comment\n")
+    assert main(["train", "my_tasks.py", "--resume", "--iterations", "3", "--no-film"]) == 0
+    out = capsys.readouterr().out
+    assert "3 iterations of 32 steps in 4 worlds" in out
+    assert "the file of the task has changed" in out
+    assert main(["train", "my_tasks.py:High", "--resume", "--set", "extra=0.7"]) == 2
+    assert "expected extra = 'its default' as in" in capsys.readouterr().err
+
+
+def test_code_named_by_a_run_alone_is_not_executed(file, tmp_path, monkeypatch, own_list):
+    """A run of somebody else may name any file; naming it oneself is what executes it, and its network needs none."""
+    train.run(f"{file}:High", tmp_path / "run", log=list, options={"seconds": 0.4}, **QUIET)
+    own_list.unlink()
+    another_process(monkeypatch)
+    (tmp_path / "my_tasks.py").write_text("raise SystemExit('executed')")
+    policy, config, _ = load_policy(tmp_path / "run")
+    assert policy({"x": np.zeros(policy.stats.mean.shape)}).shape == (4,)
+    for _ in range(2):
+        with pytest.raises(
+            ConfigError, match=r"expected a task that you have named .*my_tasks\.py:High.*--task FILE\.py:High"
+        ):
+            config.make_env(1)
+    (tmp_path / "moved.py").write_text(SOURCE)
+    moved = load_policy(tmp_path / "run", task=f"{tmp_path / 'moved.py'}:High")[1]
+    assert moved.make_env(1).task.extra == 0.5
+    assert f"{tmp_path / 'moved.py'}:High" in own_list.read_text()
+    another_process(monkeypatch)
+    assert moved.make_env(1).task.extra == 0.5  # named before
+    (tmp_path / "moved.py").chmod(0o666)
+    another_process(monkeypatch)
+    with pytest.raises(ConfigError, match=r"only you can write.*other users can write to it"):
+        moved.make_env(1)
+
+
+def test_a_list_that_others_can_write_is_not_used(file, own_list, monkeypatch):
+    envs.make(f"{file}:High")
+    assert own_list.stat().st_mode & 0o077 == 0
+    another_process(monkeypatch)
+    own_list.chmod(0o666)
+    with pytest.raises(ConfigError, match="expected a task that you have named"):
+        TrainConfig(f"{file}:High", "ppo", 0, 4, {}, {}).make_env(1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Low(Hover):
+    """Hover low."""
+
+    name = "low"
+    depth: float = 0.1
+
+
+def test_an_object_is_trained_with_its_settings(tmp_path, monkeypatch):
+    """What differs from the defaults is in the checkpoint; resuming with another value is refused."""
+    result = train.run(Low(depth=0.3, seconds=0.4), tmp_path / "run", log=list, **QUIET)
+    assert result.env.task == Low(depth=0.3, seconds=0.4)
+    config = load_policy(tmp_path / "run")[1]
+    assert config.options == {"depth": 0.3, "seconds": 0.4}
+    assert config.title == "low"
+    another_process(monkeypatch)
+    assert config.make_env(2).task.depth == 0.3  # from this file, which another process finds by its path
+    with pytest.raises(ConfigError, match=r"expected depth = 0\.3 as in .*, got 0\.1"):
+        train.run(Low(seconds=0.4), tmp_path / "run", resume=True)
+    state = result.env.reset(jax.random.key(0))
+    one = {name: np.asarray(x)[0, 0] for name, x in state.obs.items()}
+    np.testing.assert_allclose(result.policy(one), result.policy(state.obs)[0, 0], rtol=1e-5, atol=1e-6)
+
+    class Local(Low):
+        """Low, in a function."""
+
+    train.run(Local(seconds=0.4), tmp_path / "local", log=list, **QUIET)
+    another_process(monkeypatch)
+    with pytest.raises(ConfigError, match="expected a task that you have named"):
+        load_policy(tmp_path / "local")[1].make_env(1)
+
+
+def test_a_registered_task_is_made_trained_and_vectorised_by_name(tmp_path):
+    assert envs.register("low_hover", Low, control="body_rate") == "crazysim/LowHover-v0"
+    assert envs.make("low_hover", depth=0.2).task.depth == 0.2
+    assert envs.make("low_hover").sim.control.value == "body_rate"
+    assert envs.make(Low(depth=0.5)).sim.control.value == "body_rate"
+    vector = gymnasium.make_vec("crazysim/LowHover-v0", num_envs=3, depth=0.4)
+    assert vector.unwrapped.env.task.depth == 0.4
+    result = train.run("low_hover", tmp_path / "run", log=list, options={"seconds": 0.4}, **QUIET)
+    assert load_policy(result.folder)[1].task == "low_hover"
+
+    class Lower(Low):
+        """Low again, as from a cell that is executed again."""
+
+    envs.register("low_hover", Lower)
+    assert type(envs.make("low_hover").task) is Lower
+
+
+def test_a_file_that_registers_is_named_by_that_name(file):
+    file.write_text(SOURCE + "\nenvs.register('higher', High, n_drones=2)")
+    assert envs.make(f"{file}:higher").sim.n_drones == 2
+    assert envs.make("higher", n_drones=1).sim.n_drones == 1
+
+
+def test_a_file_that_was_edited_is_loaded_again(file):
+    assert envs.make(f"{file}:High").task.extra == 0.5
+    assert type(envs.make(f"{file}:High").task) is type(envs.make(f"{file}:High").task)
+    file.write_text(SOURCE.replace("= HEIGHT", "= 0.75"))
+    assert envs.make(str(file)).task.extra == 0.75
+
+
+def test_a_script_trains_its_own_class(file, tmp_path):
+    """A class of the module that runs is found by its file; the command evaluates it in another process."""
+    run = f"train.run(High(seconds=0.4), 'run', log=print, **{QUIET!r})"
+    file.write_text(SOURCE + f"\nif __name__ == '__main__':\n    from crazysim import train\n    {run}\n")
+    environment = os.environ | {"HOME": str(tmp_path)}
+    subprocess.run([sys.executable, "my_tasks.py"], cwd=tmp_path, check=True, env=environment)
+    evaluate = [sys.executable, "-m", "crazysim", "evaluate", "run", "--worlds", "4"]
+    done = subprocess.run(evaluate, cwd=tmp_path, check=True, env=environment, capture_output=True, text=True)
+    assert "high, 4 starts: success" in done.stdout
+
+
+def test_a_film_shows_several_marks_of_a_drone(tmp_path, opengl):
+    """A ring of marks around the middle of the picture, which one mark per drone would not fill."""
+    from crazysim.train.show import film
+
+    class Ringed(Low):
+        """Low, in a ring."""
+
+        def target(self, data):
+            angle = jnp.linspace(0, 2 * jnp.pi, 24)
+            ring = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.full(24, 1.2)], axis=-1)
+            return jnp.broadcast_to(ring, (data.core.n_drones, 24, 3))
+
+    drawn = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("crazysim.train.show.draw_points", lambda sim, points, *_: drawn.append(np.shape(points)))
+        film(envs.make(Ringed(seconds=0.04)), lambda obs: jnp.zeros((1, 1, 4)), tmp_path / "ring.gif", worlds=1)
+    assert set(drawn) == {(24, 3)}
+
+
+def test_an_installed_package_lists_its_tasks(monkeypatch):
+    class Point(importlib.metadata.EntryPoint):
+        def load(self):
+            return Low
+
+    points = importlib.metadata.EntryPoints([Point("of_a_package", "package.tasks:Low", registry.PLUGINS)])
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points.select(group=group))
+    with pytest.raises(
+        UnknownNameError, match=r"task 'of' does not exist; there are hover.*of_a_package.*FILE\.py:CLASS"
+    ):
+        envs.make("of")
+    assert type(envs.make("of_a_package").task) is Low
+    assert TASKS["of_a_package"].id in gymnasium.registry
+
+
+def test_law_09_wrong_places_and_names_are_errors(file, tmp_path):
+    class Bare(Task):
+        radius: float = 1.0
+
+    for given, message in (
+        (f"{tmp_path / 'no.py'}:High", "expected a file with a task, got .*no.py': No such file"),
+        (f"{file}:Hihg", "expected the name of a task in .*, got 'Hihg'; it defines High"),
+        (f"{file}:Hover2", "it defines High"),
+        ("no_such_module:High", "expected a module with a task, got 'no_such_module'"),
+        (Hover, r"expected the name of a task or a task, got <class.*Task\(\)"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            envs.make(given)
+    for name in ("hover", "Two Hoops", "a:b", 3):
+        with pytest.raises(ConfigError, match="expected a name of lower case letters"):
+            envs.register(name, Low)
+    with pytest.raises(ConfigError, match="expected a subclass of Task, got <class 'int'>"):
+        envs.register("low", int)
+    with pytest.raises(ConfigError, match="expected radius as a setting of a dataclass, got the class Bare without"):
+        envs.register("low", Bare)
+    (tmp_path / "broken.py").write_text("import nothing_of_this_name")
+    with pytest.raises(ModuleNotFoundError, match="nothing_of_this_name"):
+        envs.make(f"{tmp_path / 'broken.py'}:Any")
+    with pytest.raises(ConfigError, match="expected options that a checkpoint can hold"):
+        train.run("hover", tmp_path / "x", options={"pos": jnp.zeros(3)})

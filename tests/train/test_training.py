@@ -1,0 +1,489 @@
+"""Training runs: they learn, resume bit for bit, and refuse checkpoints of other configurations."""
+
+import dataclasses
+import functools
+import io
+import json
+import re
+import resource
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import crazysim
+from crazysim import ConfigError
+from crazysim.__main__ import main
+from crazysim.envs import AutoReset, DroneEnv, make
+from crazysim.envs.state import bare
+from crazysim.envs.tasks.hover import Hover
+from crazysim.errors import DamagedFileError, DivergedError, UnknownNameError
+from crazysim.pytree import PyTree
+from crazysim.train import apg, checkpoint, ppo
+from crazysim.train import config as configs
+from crazysim.train import training as runs
+from crazysim.train.config import TrainConfig
+from crazysim.train.evaluation import evaluate, outcome
+from crazysim.train.runs import run
+from crazysim.train.show import plot_episode, read_curve
+from crazysim.train.training import CHECKPOINT, POLICY, load_policy, train
+
+SMALL = {"n_steps": 8, "minibatches": 2, "epochs": 1, "hidden": (16, 16)}
+
+
+def small_config(iterations=4, **changes):
+    config = {**SMALL, "iterations": iterations}
+    given = {"task": "hover", "n_worlds": 8, "options": {"seconds": 0.4}, "config": config} | changes
+    return TrainConfig.create(**given)
+
+
+def quiet(*_):
+    pass
+
+
+def trained(folder, config, **options):
+    return train(config, folder, evaluation_worlds=8, log=quiet, progress=False, **options)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_environments():
+    """Let runs with equal options share environments, and with them all that was compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(configs, "make", functools.cache(make))
+        patch.setattr(runs, "AutoReset", functools.cache(AutoReset))
+        yield
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Return an uninterrupted run of four iterations."""
+    folder = tmp_path_factory.mktemp("run") / "whole"
+    return trained(folder, small_config())
+
+
+def frames(path):
+    """Return the frames of a film. (n, height, width, 3)"""
+    import imageio_ffmpeg
+
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-vf", "scale=480:360", "-"]
+    ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
+    done = subprocess.run([ffmpeg, "-loglevel", "error", "-i", str(path), *raw], capture_output=True, check=True)
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, 360, 480, 3).astype(int)
+
+
+def arrays(folder):
+    with np.load(folder / CHECKPOINT) as file:
+        return {name: file[name] for name in file.files if name != checkpoint.META}
+
+
+def test_an_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
+    """Interrupted after two of four iterations and resumed, a run ends with the arrays of an uninterrupted one."""
+    shown, real = [0], runs._bar
+
+    def interrupting(*args):
+        class Bar:
+            def __enter__(self):
+                return self.show
+
+            def __exit__(self, *_):
+                return False
+
+            def show(self, *_):
+                shown[0] += 1
+                if shown[0] == 2:
+                    raise KeyboardInterrupt
+
+        return Bar()
+
+    lines = []
+    monkeypatch.setattr(runs, "_bar", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        train(small_config(), tmp_path, evaluation_worlds=8, log=lines.append, progress=False)
+    assert "interrupted after iteration 2" in lines[-1]
+    assert str(tmp_path / CHECKPOINT) in lines[-1]
+    assert "--resume" in lines[-1]
+    monkeypatch.setattr(runs, "_bar", real)
+    trained(tmp_path, small_config(), resume=True)
+    mine, others = arrays(tmp_path), arrays(whole.folder)
+    assert mine.keys() == others.keys()
+    for name, x in mine.items():
+        np.testing.assert_array_equal(x, others[name], err_msg=name)
+    assert [p["round"] for p in json.loads((tmp_path / "curve.json").read_text())][-1] == 4
+
+
+def test_iterations_change_the_policy_and_seeds_differ(whole, tmp_path):
+    other = trained(tmp_path, small_config(seed=1))
+    first, second = (jax.tree.leaves(r.policy.layers) for r in (whole, other))
+    assert all(np.any(a != b) for a, b in zip(first[::2], second[::2], strict=True))
+
+
+def test_resuming_with_another_configuration_is_an_error(whole, tmp_path):
+    with pytest.raises(ConfigError, match=r"expected a folder without a run.*--resume.*--out"):
+        trained(whole.folder, small_config())
+    with pytest.raises(ConfigError, match=r"expected seed = 0 .*, got 5; resume"):
+        trained(whole.folder, small_config(seed=5), resume=True)
+    other = small_config(config=SMALL | {"iterations": 9, "hidden": (8,)})
+    with pytest.raises(
+        ConfigError, match=r"expected hidden = \[16, 16\] as in .*, got \[8\].*may change iterations, le"
+    ):
+        trained(whole.folder, other, resume=True)
+    with pytest.raises(ConfigError, match=r"expected seconds = 0\.4 as in .*, got 'its default'"):
+        trained(whole.folder, small_config(options={}), resume=True)
+    with pytest.raises(ConfigError, match=r"expected an existing file with a checkpoint .*crazysim train"):
+        trained(tmp_path / "nothing", small_config(), resume=True)
+    with pytest.raises(UnknownNameError, match="expected an algorithm of ppo, apg, got 'sac'"):
+        small_config(algorithm="sac")
+    with pytest.raises(UnknownNameError, match="task 'juggle' does not exist; there are hover"):
+        small_config(task="juggle")
+    with pytest.raises(ConfigError, match="expected hyperparameters of ppo, got learning_speed; use iterations"):
+        small_config(config={"learning_speed": 1})
+
+
+def test_a_finished_run_resumes_with_more_iterations(whole, tmp_path):
+    """What is given changes; everything else, the number of worlds too, is that of the run."""
+    shutil.copy(whole.folder / CHECKPOINT, tmp_path)
+    lines = []
+    quiet = {"film": False, "evaluation_worlds": 8, "progress": False, "log": lines.append}
+    result = run("hover", tmp_path, resume=True, config={"iterations": 6, "learning_rate": 1e-4}, **quiet)
+    assert [point["round"] for point in read_curve(tmp_path)] == [0, 4, 6]
+    config = load_policy(tmp_path)[1]
+    assert config == small_config(config=SMALL | {"iterations": 6, "learning_rate": 1e-4})
+    assert "continues after iteration 4" in lines[0]
+    assert any(
+        np.any(a != b) for a, b in zip(jax.tree.leaves(result.policy), jax.tree.leaves(whole.policy), strict=True)
+    )
+    run("hover", tmp_path, resume=True, **quiet)
+    assert "nothing is left to train after 6 iterations; continue with more: --iterations 12" in lines
+
+
+def test_evaluations_hold_the_terms_of_the_reward(whole, tmp_path):
+    """They add up to the return, and the plot of an episode returns them over time."""
+    point = read_curve(whole.folder)[-1]
+    terms = [x for name, x in point.items() if name.startswith("reward ")]
+    assert len(terms) == 4
+    np.testing.assert_allclose(sum(terms), point["reward"], rtol=1e-5)
+    over_time = plot_episode(whole.env, whole.policy, tmp_path / "episode.png")
+    assert (tmp_path / "episode.png").stat().st_size > 5000
+    assert {name: x.shape for name, x in over_time.items()} == dict.fromkeys(
+        ("proximity", "spin", "action_rate", "crash"), (20,)
+    )
+    np.testing.assert_allclose(over_time["proximity"].sum(), point["reward proximity"], rtol=1e-5)
+    # A policy that falls is paid until it crashes, and never after that.
+    fallen = plot_episode(make("hover", 8, seconds=2.0), Always(-jnp.ones(4)), tmp_path / "fallen.png")
+    assert fallen["proximity"][0] > 0
+    assert fallen["proximity"][-1] == 0
+    np.testing.assert_allclose(fallen["crash"].sum(), -10.0, rtol=1e-6)
+
+
+def test_a_checkpoint_of_another_version_is_refused(whole, tmp_path):
+    _, meta = checkpoint.read(whole.folder / CHECKPOINT)
+    learner = {"x": np.zeros(2, np.float32)}
+    checkpoint.save(tmp_path / CHECKPOINT, learner, meta | {"crazysim": "0.0.1"})
+    with pytest.raises(ConfigError, match=r"expected a checkpoint of crazysim .*, got .* of 0\.0\.1"):
+        trained(tmp_path, small_config(), resume=True)
+    stored, _ = checkpoint.read(tmp_path / CHECKPOINT)
+    with pytest.raises(ConfigError, match="expected the arrays of this task and version"):
+        checkpoint.restore(tmp_path / CHECKPOINT, stored, {"y": np.zeros(2, np.float32)})
+    with pytest.raises(ConfigError, match=r"expected \['x'\] in .* as float32 \(3,\), got float32 \(2,\)"):
+        checkpoint.restore(tmp_path / CHECKPOINT, stored, {"x": np.zeros(3, np.float32)})
+
+
+def cut(content):
+    return content[: len(content) // 2]
+
+
+def flipped(content):
+    at = content.index(b"NUMPY") + 300
+    return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
+
+
+def other_meta(content):
+    with np.load(io.BytesIO(content)) as file:
+        arrays = dict(file)
+    changed = io.BytesIO()
+    np.savez(changed, **arrays | {checkpoint.META: np.array(json.dumps({"crazysim": crazysim.__version__}))})
+    return changed.getvalue()
+
+
+@pytest.mark.parametrize("damage", [cut, flipped, other_meta, lambda _: b"", lambda _: b"nothing", np.random.bytes],
+                         ids=["cut", "flipped", "other", "empty", "text", "random"])  # fmt: skip
+def test_a_damaged_run_is_refused_with_the_name_of_the_file(whole, tmp_path, damage):
+    """At once: nothing is compiled for it, and the file stays as it is."""
+    for name in (CHECKPOINT, POLICY):
+        content = (whole.folder / name).read_bytes()
+        (tmp_path / name).write_bytes(damage(content) if damage is not np.random.bytes else damage(1000))
+    with pytest.raises(
+        DamagedFileError, match=r"expected a checkpoint .*checkpoint\.npz', which is damaged.*train again"
+    ):
+        trained(tmp_path, small_config(), resume=True)
+    with pytest.raises(DamagedFileError, match=r"expected a checkpoint .*policy\.npz', which is damaged.*train again"):
+        load_policy(tmp_path)
+
+
+def test_a_run_without_its_learning_curve_resumes(whole, tmp_path):
+    shutil.copy(whole.folder / CHECKPOINT, tmp_path)
+    with pytest.raises(ConfigError, match=r"expected an existing file with a learning curve, got .*curve\.json"):
+        read_curve(tmp_path)
+    (tmp_path / "curve.json").write_text('[{"round": 0, "env')
+    with pytest.raises(DamagedFileError, match=r"expected a learning curve, got .*curve\.json.*--resume"):
+        read_curve(tmp_path)
+    trained(tmp_path, small_config(), resume=True)
+    assert [point["round"] for point in read_curve(tmp_path)] == [0, 4]
+    assert not list(tmp_path.glob("*.part"))
+
+
+INVALID = {
+    "init_std": (
+        {"init_std": -0.5},
+        "expected init_std as a finite number larger than 0, got -0.5. Use for example 0.5",
+    ),
+    "std of zero": ({"init_std": 0}, "expected init_std as a finite number larger than 0, got 0"),
+    "std that float32 rounds to zero": ({"init_std": 1e-60}, "expected init_std as"),
+    "nan": ({"learning_rate": float("nan")}, "expected learning_rate as a finite number larger than 0, got nan"),
+    "infinite": ({"learning_rate": float("inf")}, "expected learning_rate as a finite"),
+    "text": ({"learning_rate": "fast"}, "expected learning_rate as .*, got 'fast'"),
+    "n_steps": ({"n_steps": 0}, "n_steps is 0; it must be a positive whole number"),
+    "minibatches": ({"minibatches": 0}, "minibatches is 0; it must be"),
+    "epochs": ({"epochs": 1.5}, "epochs is 1.5; it must be"),
+    "iterations": ({"iterations": -1}, "iterations is -1; it must be"),
+    "hidden": ({"hidden": [0]}, r"hidden\[0\] is 0; it must be"),
+    "hidden number": ({"hidden": 64}, r"expected hidden as the sizes .*, got 64. Use for example \[64, 64\]"),
+    "discount": ({"discount": 1.01}, "expected discount as a number from 0 to 1, got 1.01"),
+    "value_weight": ({"value_weight": -1}, "expected value_weight as a finite number of at least 0, got -1"),
+    "max_grad_norm": ({"max_grad_norm": 0}, "expected max_grad_norm as a number larger than 0, got 0"),
+}
+
+
+@pytest.mark.parametrize(("config", "message"), INVALID.values(), ids=INVALID)
+def test_invalid_hyperparameters_are_refused(config, message):
+    with pytest.raises(ConfigError, match=message):
+        small_config(config=config)
+    with pytest.raises(ConfigError, match=message):
+        ppo.Config(**config)
+
+
+def test_invalid_settings_of_a_run_are_refused(tmp_path):
+    for name, value, message in (
+        ("n_worlds", 0, "n_worlds is 0; it must be a positive whole number"),
+        ("seed", 1.5, r"expected an integer as seed, got 1\.5"),
+        ("seed", 2**70, "more than 64 bits"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            small_config(**{name: value})
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"expected a folder for the run, got .*file'.* Use another --out"):
+        trained(tmp_path / "file", small_config())
+    with pytest.raises(
+        ConfigError, match=r"expected minibatches that divide the 128 samples .*, got 7. Use for example 8"
+    ):
+        trained(tmp_path / "run", small_config(config={"n_steps": 16, "minibatches": 7}))
+    with pytest.raises(ConfigError, match="expected options that a checkpoint can hold"):
+        trained(tmp_path / "run", small_config(options={"seconds": 0.4, "pos": np.zeros(3)}))
+    with pytest.raises(ConfigError, match="evaluation_worlds is 0"):
+        train(small_config(), tmp_path / "run", evaluation_worlds=0)
+    with pytest.raises(ConfigError, match="n_worlds is 0"):
+        small_config().make_env(0)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_training_that_diverges_stops_and_keeps_its_last_checkpoint(tmp_path):
+    config = small_config(config=SMALL | {"iterations": 4, "learning_rate": 1e38})
+    with pytest.raises(
+        DivergedError, match=r"NaN or infinity in iteration \d of hover by ppo; .*iteration 0\. Use a sm"
+    ):
+        trained(tmp_path, config)
+    assert [point["round"] for point in read_curve(tmp_path)] == [0]
+    policy, _, _ = load_policy(tmp_path)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(policy))
+    assert all(np.isfinite(x).all() for name, x in arrays(tmp_path).items() if ".policy" in name)
+
+
+def test_a_full_disk_leaves_the_last_checkpoint_and_nothing_else(tmp_path):
+    path = tmp_path / CHECKPOINT
+    checkpoint.save(path, {"x": np.zeros(2)}, {"round": 1})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+    try:
+        with pytest.raises(ConfigError, match=r"expected a file that can be written, got .*checkpoint\.npz"):
+            checkpoint.save(path, {"x": np.zeros(2000)}, {"round": 2})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [p.name for p in tmp_path.iterdir()] == [CHECKPOINT]
+    assert checkpoint.read(path)[1] == {"round": 1}
+
+
+def test_a_policy_comes_back_as_it_was(whole):
+    policy, config, meta = load_policy(whole.folder)
+    assert config == small_config()
+    assert sum(meta["observations"].values()) == policy.layers[0][0].shape[0]
+    for a, b in zip(jax.tree.leaves(policy), jax.tree.leaves(whole.policy), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+class Always(PyTree):
+    """Policy with the same action for all observations."""
+
+    action: jax.Array
+    """Action. (k,)"""
+
+    def __call__(self, obs):
+        """Return the action of every drone."""
+        return jnp.broadcast_to(self.action, (*obs["pos"].shape[:-1], *self.action.shape))
+
+
+def test_evaluation_uses_tolerance_and_hold_of_the_task():
+    """A policy of zeros hovers at its start, so it fails unless the goal is there."""
+    idle, falling = Always(jnp.zeros(4)), Always(-jnp.ones(4))
+    found = evaluate(make("hover", 16, seconds=2.0, reach=1.0), idle)
+    assert found["success"] == 0
+    assert 0.3 < found["error"] < 3
+    assert found["crashed"] < 1
+    easy = make("hover", 16, seconds=2.0, reach=1e-3, tolerance=1e3)
+    assert evaluate(easy, idle)["success"] == 1
+    # A crash is no success, however small the error was.
+    crashed = evaluate(easy, falling)
+    assert crashed["crashed"] == 1
+    assert crashed["success"] == 0
+    assert re.fullmatch(r"crashed 100\.0%, on average after 0\.\d+ s, so there is no mean error", outcome(crashed, "m"))
+    assert re.match(r"mean error 0\.\d+ m/s, ", outcome(evaluate(easy, idle), "m/s"))
+    lost = evaluate(easy, Always(jnp.full(4, jnp.nan)))
+    assert lost["nonfinite"] == 1
+    assert "of all worlds 100.0% became non-finite" in outcome(lost, "m")
+
+
+def test_advantages_are_sums_of_discounted_errors(rng):
+    """Generalised advantage: sum of (gamma lambda)^k delta_(t+k) up to the end of the episode, in NumPy."""
+    config = ppo.Config(discount=0.9, gae_lambda=0.7)
+    reward, value = rng.normal(size=(2, 6, 3, 1)).astype(np.float32)
+    last = rng.normal(size=(3, 1)).astype(np.float32)
+    over = np.zeros((6, 3, 1), bool)
+    over[2, 0], over[5, 1] = True, True
+    sample = ppo.Sample(*(jnp.zeros(0),) * 3, value, reward, over)
+    advantages, returns = jax.jit(ppo._advantages, static_argnums=2)(sample, last, config)
+    after = np.concatenate([value[1:], last[None]])
+    delta = reward + 0.9 * after * ~over - value
+    expected = np.zeros_like(delta)
+    for t, world in np.ndindex(6, 3):
+        for k in range(t, 6):
+            expected[t, world] += (0.9 * 0.7) ** (k - t) * delta[k, world]
+            if over[k, world]:
+                break
+    np.testing.assert_allclose(advantages, expected, atol=1e-5)
+    np.testing.assert_allclose(returns, expected + value, atol=1e-5)
+
+
+def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
+    """The reward of a truncated step contains the discounted value of the final observation; no other step does."""
+    env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))  # three steps an episode
+    config = ppo.Config(n_steps=4, discount=0.5, hidden=(8,))
+    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
+    _, samples, _, _ = jax.jit(ppo._collect, static_argnums=(1, 2))(learner, env, config, jax.random.key(1))
+    state, step = learner.env, jax.jit(env.step)
+    n_truncated = 0
+    for k in range(4):
+        state = step(state, samples.action[k])
+        value = ppo._value(learner.value, learner.stats, state.info["final_obs"])
+        truncated = np.asarray(state.truncated & ~state.terminated)[:, None]
+        n_truncated += truncated.sum()
+        np.testing.assert_allclose(samples.reward[k], state.reward + 0.5 * truncated * value, atol=1e-5)
+        assert np.abs(value).min() > 1e-3
+        state = bare(state)
+    assert n_truncated == 4
+
+
+def test_ppo_finds_the_action_that_pays():
+    """With a reward that is largest at 0.5, thirty iterations move the action from 0 to 0.5."""
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Pays(Hover):
+        """Hovering with a reward for the action alone."""
+
+        def rewards(self, data, action, last_action):
+            return {"action": -jnp.sum((action - 0.5) ** 2, axis=-1)}
+
+    base = make("hover", 128, freq=500, seconds=0.1)
+    env = AutoReset(DroneEnv(base.sim, Pays(seconds=0.1), freq=500))
+    config = ppo.Config(iterations=30, n_steps=16, minibatches=4, hidden=(16,), init_std=0.3, discount=0.5)
+    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
+    assert np.abs(learner.as_policy()(learner.env.obs)).max() < 0.1
+    for _ in range(config.iterations):
+        learner, metrics = ppo.iterate(learner, env, config)
+    action = np.asarray(learner.as_policy()(learner.env.obs))
+    assert metrics["finite"]
+    _, metrics = ppo.iterate(learner.replace(log_std=learner.log_std + jnp.nan), env, config)
+    assert not metrics["finite"]
+    assert np.abs(action.mean(axis=(0, 1)) - 0.5).max() < 0.1
+    assert float(jnp.exp(learner.log_std).max()) < 0.3
+
+
+def test_analytic_gradients_follow_the_eight():
+    """Thirty updates with 32 worlds more than halve the distance from the trajectory."""
+    config = apg.Config(iterations=30)
+    env = make("track", 32, engine="plain", dynamics="so_rpy")
+    learner = jax.jit(apg.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
+    errors = []
+    for _ in range(config.iterations):
+        learner, metrics = apg.iterate(learner, env, config)
+        errors.append(float(metrics["error"]))
+        assert np.isfinite(float(metrics["gradient"]))
+        assert metrics["finite"]
+    assert np.mean(errors[-5:]) < 0.5 * np.mean(errors[:5])
+    broken = jax.tree.map(lambda x: x + jnp.inf, learner.policy)
+    assert not apg.iterate(learner.replace(policy=broken), env, config)[1]["finite"]
+
+
+def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):
+    folder = str(tmp_path / "hover")
+    few = [f"{k}={json.dumps(v)}" for k, v in SMALL.items()]
+    done = main(["train", "hover", "--worlds", "8", "--iterations", "2", "--set", "seconds=0.4", "--out", folder,
+                 "--no-film", "--config", *few])  # fmt: skip
+    out = capsys.readouterr().out
+    assert done == 0
+    assert re.search(r"success \d+\.\d% of 1,000 held-out starts", out)
+    assert (tmp_path / "hover" / "curve.png").stat().st_size > 5000
+    assert (tmp_path / "hover" / "episode.png").stat().st_size > 5000
+    assert main(["evaluate", folder, "--worlds", "8"]) == 0
+    assert re.search(
+        r"hover, 8 starts: success .*, mean return \S+ \(action_rate .*, proximity \d", capsys.readouterr().out
+    )
+    assert main(["evaluate", folder, "--worlds", "8", "--plot", str(tmp_path / "terms.png")]) == 0
+    assert (tmp_path / "terms.png").stat().st_size > 5000
+    capsys.readouterr()
+    assert main(["evaluate", folder, "--worlds", "8", "--device", "tpu"]) == 2
+    assert "device 'tpu' does not exist" in capsys.readouterr().err
+    assert main(["export", folder, "--c", str(tmp_path / "p.h")]) == 0
+    assert "void policy(" in (tmp_path / "p.h").read_text()
+    assert main(["export", folder]) == 2
+    assert "--onnx FILE, --c FILE" in capsys.readouterr().err
+    assert main(["train", "list"]) == 0
+    assert "Reach a random point and hover there" in capsys.readouterr().out
+    assert main(["train", "hover", "--set", "secnds=1", "--out", str(tmp_path / "x")]) == 2
+    assert "did you mean seconds?" in capsys.readouterr().err
+
+
+def test_a_film_shows_the_drone_and_its_goal(whole, tmp_path):
+    """The green target is in the image, and the image changes from the first frame to the last."""
+    from crazysim.train.show import TARGET_COLOR, film
+
+    env = small_config().make_env(2)
+    path = tmp_path / "film.gif"
+    assert film(env, whole.policy, path, worlds=1) == 11
+    env.sim.close()  # a renderer that is collected on a thread of a later training cannot be freed there
+    images = frames(path)
+    green = (images[0][..., 1] - images[0][..., 0] > 40) & (images[0][..., 1] - images[0][..., 2] > 20)
+    assert TARGET_COLOR[1] > TARGET_COLOR[0]
+    assert green.sum() > 20
+    assert np.abs(images[-1] - images[0]).max() > 60
+
+
+def test_a_run_finds_its_airframe_from_any_folder(tmp_path, monkeypatch):
+    (tmp_path / "mine.toml").write_text('base = "cf2x_L250"\n', encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    config = TrainConfig.create("hover", options={"drone": "mine.toml"})
+    assert config.options == {"drone": str(tmp_path / "mine.toml")}
+    assert TrainConfig.create("hover", options={"drone": "cf2x_L250"}).options == {"drone": "cf2x_L250"}
+    monkeypatch.chdir("/")
+    assert config.make_env(1).sim.drone == "mine"
