@@ -32,12 +32,15 @@ if TYPE_CHECKING:
     from crazysim.plugins.contacts.terrain import Terrain
     from crazysim.plugins.follow import Follow
     from crazysim.plugins.payloads import Hook, RotorJet, SharedLoad, SlungLoad
+    from crazysim.plugins.sensors.imu import IMU
     from crazysim.plugins.sensors.radar import Radar
     from crazysim.plugins.sensors.range_finder import RangeFinder
+    from crazysim.plugins.sensors.sensor import Sensor
     from crazysim.plugins.vehicles import Bicycles, Cars
     from crazysim.sim.mppi import MPPI
 
 __all__ = [
+    "IMU",
     "MPPI",
     "Airframe",
     "Battery",
@@ -67,6 +70,7 @@ __all__ = [
     "Radar",
     "RangeFinder",
     "RotorJet",
+    "Sensor",
     "SharedLoad",
     "Sim",
     "SimData",
@@ -96,8 +100,10 @@ __getattr__ = lazy(
         "Follow": "crazysim.plugins.follow",
         "FreeBodies": "crazysim.plugins.bodies",
         "Hook": "crazysim.plugins.payloads",
+        "IMU": "crazysim.plugins.sensors.imu",
         "MPPI": "crazysim.sim.mppi",
         "RotorJet": "crazysim.plugins.payloads",
+        "Sensor": "crazysim.plugins.sensors.sensor",
         "SharedLoad": "crazysim.plugins.payloads",
         "SlungLoad": "crazysim.plugins.payloads",
         "Radar": "crazysim.plugins.sensors.radar",

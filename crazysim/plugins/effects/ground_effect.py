@@ -36,13 +36,7 @@ class GroundEffect(Plugin):
         """Return the parameters."""
         require_rotors(sim, "ground effect")
         radius = checked_propeller_radius(sim, self.propeller_radius)
-        n_rotors = sim.data.states.rotor_vel.shape[-1]
-
-        def rotor_positions(airframe: Airframe) -> np.ndarray:
-            own = airframe.value("rotors.position")
-            return np.pad(own, [(0, n_rotors - len(own)), (0, 0)])  # missing rotors have no thrust
-
-        return GroundEffectData(radius, on_device(of_airframes(sim, rotor_positions), radius.dtype))
+        return GroundEffectData(radius, rotor_positions(sim))
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the thrust curves at the height of each rotor."""
@@ -51,6 +45,17 @@ class GroundEffect(Plugin):
         upright = rotation.z_axis(s.quat)[..., 2:]
         gain = thrust_gain(height, upright, record.propeller_radius)
         return data.replace(params=p.replace(rpm2thrust=gain[..., None] * p.rpm2thrust))
+
+
+def rotor_positions(sim: Simulation) -> Array:
+    """Return the positions of the rotors, body frame, m; zero for rotors that a drone lacks. (..., n_rotors, 3)"""
+    n_rotors = sim.data.states.rotor_vel.shape[-1]
+
+    def of_one(airframe: Airframe) -> np.ndarray:
+        own = airframe.value("rotors.position")
+        return np.pad(own, [(0, n_rotors - len(own)), (0, 0)])  # missing rotors have no thrust
+
+    return on_device(of_airframes(sim, of_one), sim.data.states.pos.dtype)
 
 
 def thrust_gain(height: Array, upright: Array, radius: Array) -> Array:

@@ -1,0 +1,267 @@
+"""Inertial measurement unit: gyroscope and accelerometer with the errors of their data sheets."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Simulation, check_parameter, parameter
+from crazysim.core.stage import Stage
+from crazysim.dynamics.rotor import RPM_TO_RAD_S
+from crazysim.plugins.effects.ground_effect import rotor_positions
+from crazysim.plugins.effects.moving_air import require_rotors, zeros
+from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
+from crazysim.plugins.sensors.triad import Triad, TriadData
+from crazysim.pytree import PyTree, leaf
+
+DEGREE = math.pi / 180
+G = 9.80665
+"""Standard acceleration of gravity, m/s^2 (CGPM 1901), the unit of data sheets."""
+
+BMI088: dict[str, Any] = {
+    "gyro": Triad(
+        noise=0.014 * DEGREE,
+        bias_spread=1.0 * DEGREE,
+        bandwidth=116.0,
+        limit=2000 * DEGREE,
+        resolution=2000 / 32768 * DEGREE,
+    ),
+    "accel": Triad(
+        noise=np.array([160e-6, 160e-6, 190e-6]) * G,
+        bias_spread=20e-3 * G,
+        bandwidth=145.0,
+        limit=24 * G,
+        resolution=24 / 32768 * G,
+    ),
+}
+"""Bosch BMI088, of the Crazyflie 2.1. Noise densities and offsets: data sheet BST-BMI088, revision 1.9, tables 4 and 5
+(an offset's typical value taken as standard deviation). Ranges of 2000 degrees/s and 24 g in 16 bits, and the filters:
+as the firmware sets them (sensors_bmi088_bmp3xx.c of crazyflie-firmware, BW_116 and OSR4 at 1600 Hz). The data sheet
+states no instability or random walk of the bias: they are zero."""
+
+MPU9250: dict[str, Any] = {
+    "gyro": Triad(
+        noise=0.01 * DEGREE,
+        bias_spread=5.0 * DEGREE,
+        scale_spread=0.03,
+        misalignment_spread=0.02,
+        bandwidth=92.0,
+        limit=2000 * DEGREE,
+        resolution=DEGREE / 16.4,
+    ),
+    "accel": Triad(
+        noise=300e-6 * G,
+        bias_spread=np.array([60e-3, 60e-3, 80e-3]) * G,
+        scale_spread=0.03,
+        misalignment_spread=0.02,
+        bandwidth=94.0,
+        limit=16 * G,
+        resolution=G / 2048,
+    ),
+}
+"""InvenSense MPU-9250, of the Crazyflie 2.0: product specification PS-MPU-9250A-01, revision 1.0, tables 1 and 2, at
+2000 degrees/s, 16 g and DLPFCFG = 2. Tolerances are taken as standard deviations, and the cross-axis sensitivity as
+that of a rotation. It states no instability or random walk of the bias: they are zero."""
+
+MPU6050: dict[str, Any] = {
+    "gyro": dataclasses.replace(MPU9250["gyro"], noise=0.005 * DEGREE, bias_spread=20 * DEGREE, bandwidth=100.0),
+    "accel": dataclasses.replace(
+        MPU9250["accel"], noise=400e-6 * G, bias_spread=np.array([50e-3, 50e-3, 80e-3]) * G, bandwidth=100.0
+    ),
+}
+"""InvenSense MPU-6050: product specification PS-MPU-6000A-00, revision 3.4, sections 6.1 and 6.2, otherwise as
+``MPU9250``. The corner of the accelerometer is taken to be that of the gyroscope."""
+
+
+class IMUData(PyTree):
+    """State and parameters of the inertial measurement unit of every drone."""
+
+    samples: Samples
+    """Measurements."""
+    gyro: TriadData
+    """Errors of the gyroscope, rad/s."""
+    accel: TriadData
+    """Errors of the accelerometer, m/s^2."""
+    vel: Array = leaf("drone", 1)
+    """Velocity before the step, world frame, m/s. (n_worlds, n_drones, 3)"""
+    ang_vel: Array = leaf("drone", 1)
+    """Angular velocity before the step, body frame, rad/s. (n_worlds, n_drones, 3)"""
+    pos: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Position of the accelerometer relative to the centre of mass, body frame, m. (3,)"""
+    quat: Array = leaf("parameter", 1, (4,), sparse=True)
+    """Attitude of the sensor, sensor to body, unit, xyzw. (4,)"""
+    imbalance: Array | None = leaf("parameter", 1)
+    """Imbalance of each rotor, kg m; None without vibration. (n_rotors,)"""
+    rotor_pos: Array | None = leaf("parameter", 2)
+    """Positions of the rotors, body frame, m; None without vibration. (n_rotors, 3)"""
+    phase: Array | None = leaf("drone", 1)
+    """Angle of each rotor, rad; None without vibration. (n_worlds, n_drones, n_rotors)"""
+
+
+class IMU(Sensor):
+    """Gyroscope, rad/s, and accelerometer, m/s^2, in the sensor's frame.
+
+    The accelerometer measures the acceleration of its place, with gravity subtracted: 9.81 m/s^2 upwards at rest. The
+    acceleration is the change of the velocity in the step, whatever caused it, contacts and loads included. An
+    unbalanced rotor shakes the drone with the centrifugal force ``imbalance w^2``.
+    """
+
+    gyro: Triad = parameter(default=Triad())
+    """Errors of the gyroscope, rad/s."""
+    accel: Triad = parameter(default=Triad())
+    """Errors of the accelerometer, m/s^2."""
+    pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
+    """Position relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    rpy: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
+    """Roll, pitch and yaw of the sensor in the body frame, rad. (3,) or (n_worlds, n_drones, 3)"""
+    imbalance: ArrayLike | None = parameter(default=None)
+    """Mass of a rotor times the distance of its centre from its axis, kg m; None for no vibration.
+    (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
+    _: dataclasses.KW_ONLY
+    name: str = "imu"
+
+    @classmethod
+    def bmi088(cls, **settings: Any) -> IMU:
+        """Return the unit of the Crazyflie 2.1; see ``BMI088``. Other settings are passed on."""
+        return cls(**(BMI088 | settings))
+
+    @classmethod
+    def mpu9250(cls, **settings: Any) -> IMU:
+        """Return the unit of the Crazyflie 2.0; see ``MPU9250``. Other settings are passed on."""
+        return cls(**(MPU9250 | settings))
+
+    @classmethod
+    def mpu6050(cls, **settings: Any) -> IMU:
+        """Return a common unit of small drones; see ``MPU6050``. Other settings are passed on."""
+        return cls(**(MPU6050 | settings))
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
+        return {"gyro": 3, "accel": 3}
+
+    def record(self, sim: Simulation) -> IMUData:
+        """Return the unit before its first measurement."""
+        n_rotors = sim.data.states.rotor_vel.shape[-1]
+        shakes = self.imbalance is not None
+        if shakes:
+            require_rotors(sim, "vibration")
+        return IMUData(
+            samples=self.samples(sim),
+            gyro=self.gyro.record(sim, "gyro"),
+            accel=self.accel.record(sim, "accel"),
+            vel=zeros(sim, 3),
+            ang_vel=zeros(sim, 3),
+            pos=check_parameter(sim, "pos", self.pos, (3,)),
+            quat=mounting(sim, self.rpy),
+            imbalance=check_parameter(sim, "imbalance", self.imbalance, (n_rotors,), 0.0) if shakes else None,
+            rotor_pos=rotor_positions(sim) if shakes else None,
+            phase=zeros(sim, n_rotors) if shakes else None,
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that notes the velocity before the step, and those of every sensor."""
+        stages = super().stages(sim)
+        when = next(p.stage for p in stages if p.name is None).when  # type: ignore[attr-defined]
+        before = Placement(Stage(self._note, "drone", when), name=f"{self.name}_before")
+        return [before, *stages]
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the measurement of a perfect unit of a drone that does not accelerate. (6,)"""
+        record, s = self.read(data), data.states
+        zero = jnp.zeros_like(s.vel)
+        force = specific_force(s.quat, zero, s.ang_vel, zero, data.params.gravity_vec, record.pos)
+        return _to_sensor(record.quat, s.ang_vel, force)
+
+    def begin(self, data: SimData, record: IMUData, key: Array) -> IMUData:
+        """Draw the errors of one unit, and the angles of its rotors."""
+        truth, keys = self.ideal(data), jax.random.split(key, 3)
+        gyro, accel = record.gyro.begin(truth[:3], keys[0]), record.accel.begin(truth[3:], keys[1])
+        record = record.replace(gyro=gyro, accel=accel)
+        if record.phase is None:
+            return record
+        phase = jax.random.uniform(keys[2], record.phase.shape, truth.dtype, 0.0, 2 * math.pi)
+        return record.replace(phase=phase)
+
+    def measure(self, data: SimData, record: IMUData, key: Array) -> tuple[Array, IMUData]:
+        """Return the angular velocity, rad/s, and the specific force, m/s^2, and the record after it."""
+        s, freq, dt, keys = data.states, data.core.freq, self.interval(data), jax.random.split(key)
+        ang_vel = s.ang_vel
+        acc, ang_acc = freq * (s.vel - record.vel), freq * (s.ang_vel - record.ang_vel)
+        if record.phase is not None:
+            speed = RPM_TO_RAD_S * s.rotor_vel
+            phase = record.phase + dt * speed
+            phase = phase - 2 * math.pi * jnp.floor(phase / (2 * math.pi))
+            p = data.params
+            push, twist, swing = shaking(record.imbalance, speed, phase, record.rotor_pos)  # type: ignore[arg-type]
+            acc = acc + rotation.rotate(s.quat, push) / p.mass
+            ang_acc = ang_acc + rotation.matvec(p.J_inv, twist)
+            ang_vel = ang_vel + rotation.matvec(p.J_inv, swing)
+            record = record.replace(phase=phase)
+        force = specific_force(s.quat, acc, s.ang_vel, ang_acc, data.params.gravity_vec, record.pos)
+        truth = _to_sensor(record.quat, ang_vel, force)
+        rates, gyro = record.gyro.measure(truth[:3], keys[0], dt)
+        forces, accel = record.accel.measure(truth[3:], keys[1], dt)
+        return jnp.concatenate([rates, forces]), record.replace(gyro=gyro, accel=accel)
+
+    def measured_states(self, data: SimData) -> dict[str, Array]:
+        """Return the angular velocity, body frame, rad/s."""
+        return {"ang_vel": rotation.rotate(self.read(data).quat, self.part(data, "gyro"))}
+
+    def _note(self, data: SimData) -> SimData:
+        """Note the velocities of one drone before the step."""
+        s = data.states
+        return self.write(data, self.read(data).replace(vel=s.vel, ang_vel=s.ang_vel))
+
+
+def specific_force(quat: Array, acc: Array, ang_vel: Array, ang_acc: Array, gravity: Array, pos: Array) -> Array:
+    """Return the specific force at a place of a rigid body, body frame, m/s^2. (..., 3)
+
+    ``R^T (a - g) + w' x r + w x (w x r)``: the acceleration of the place without gravity.
+
+    Args:
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        acc: Acceleration of the centre of mass, world frame, m/s^2. (..., 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        ang_acc: Angular acceleration, body frame, rad/s^2. (..., 3)
+        gravity: Acceleration of gravity, world frame, m/s^2. (..., 3)
+        pos: The place relative to the centre of mass, body frame, m. (..., 3)
+    """
+    force = rotation.rotate_inverse(quat, acc - gravity)
+    force = rotation.add_cross(force, ang_acc, pos)
+    return rotation.add_cross(force, ang_vel, rotation.cross(ang_vel, pos))
+
+
+def shaking(imbalance: Array, speed: Array, phase: Array, rotor_pos: Array) -> tuple[Array, Array, Array]:
+    """Return force, N, torque, N m, and angular momentum, N m s, of unbalanced rotors, body frame. (3,) each
+
+    The centrifugal force ``m e w^2`` turns with the rotor in its plane; the angular momentum is the integral of its
+    torque over time. All rotors turn the same way here, which only sets the order of the phases.
+
+    Args:
+        imbalance: Imbalance m e, kg m. (n_rotors,)
+        speed: Angular velocity of the rotors, rad/s. (n_rotors,)
+        phase: Angle of the rotors, rad. (n_rotors,)
+        rotor_pos: Positions of the rotors, body frame, m. (n_rotors, 3)
+    """
+    momentum, zero = imbalance * speed, jnp.zeros_like(speed)
+    c, s = jnp.cos(phase), jnp.sin(phase)
+    force = (momentum * speed)[:, None] * jnp.stack([c, s, zero], axis=-1)
+    impulse = momentum[:, None] * jnp.stack([s, -c, zero], axis=-1)
+    torque, swing = rotation.cross(rotor_pos, force), rotation.cross(rotor_pos, impulse)
+    return jnp.sum(force, axis=0), jnp.sum(torque, axis=0), jnp.sum(swing, axis=0)
+
+
+def _to_sensor(quat: Array, *vectors: Array) -> Array:
+    """Return vectors of the body frame in the sensor's frame, joined. (3 n,)"""
+    return jnp.concatenate([rotation.rotate_inverse(quat, v) for v in vectors])

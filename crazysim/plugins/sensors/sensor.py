@@ -1,0 +1,259 @@
+"""Base class of sensors: a rate, a delay with jitter, and lost measurements; errors are those of each sensor."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.random import drone_key
+from crazysim.core.settings import dividing_rate
+from crazysim.core.stage import Stage, tick
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.moving_air import zeros
+from crazysim.pytree import PyTree, leaf, on_device
+
+MAX_ROWS = 64
+"""Most measurements of one sensor in transit."""
+NEVER = 2**31 - 1
+"""Step of arrival of a measurement that is lost."""
+LONGEST = 100.0
+"""Longest delay, s."""
+
+
+class Samples(PyTree):
+    """Latest measurement that has arrived, and those in transit."""
+
+    value: Array = leaf("drone", 1)
+    """Latest measurement that has arrived. (n_worlds, n_drones, k)"""
+    taken: Array = leaf("drone", 1)
+    """Step in which it was taken, negative before the first one. (n_worlds, n_drones, 1)"""
+    delay: Array | None = leaf("parameter", 1, (1,))
+    """Time from measurement to arrival, s; None without delay. (1,)"""
+    jitter: Array | None = leaf("parameter", 1, (1,))
+    """Largest random addition to the delay, s; None without delay. (1,)"""
+    dropout: Array | None = leaf("parameter", 1, (1,))
+    """Probability that a measurement is lost, 0 to 1; None if none is. (1,)"""
+    queue: Array | None = leaf("drone", 2)
+    """Measurements in transit, newest first; None without delay. (n_worlds, n_drones, n_rows, k)"""
+    due: Array | None = leaf("drone", 1)
+    """Steps in which they arrive; None without delay. (n_worlds, n_drones, n_rows)"""
+
+
+class Sensor(Plugin):
+    """Base class of sensors that measure at a rate, and whose measurements may arrive late or never.
+
+    A subclass defines ``channels``, ``record``, ``ideal`` and ``measure``, and ``begin`` if a sensor has errors of its
+    own, drawn once an episode. Its record has a field ``samples``. Measurements are taken after the state of the step
+    is known; the latest one is held. A measurement that is overtaken by a newer one is discarded.
+    """
+
+    _: dataclasses.KW_ONLY
+    freq: int | None = None
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    delay: ArrayLike = parameter(default=0.0)
+    """Time from measurement to arrival, s, rounded to steps. () or (n_worlds, n_drones)"""
+    jitter: ArrayLike = parameter(default=0.0)
+    """Largest random addition to the delay, s, uniform from zero. () or (n_worlds, n_drones)"""
+    dropout: ArrayLike = parameter(default=0.0)
+    """Probability that a measurement is lost, 0 to 1. () or (n_worlds, n_drones)"""
+    max_delay: float | None = None
+    """Largest delay with jitter that the record can take later on, s; None for that of ``delay`` and ``jitter``."""
+    name: str = "sensor"
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement, in their order."""
+        raise NotImplementedError
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the measurement of a perfect sensor, of one drone. (k,)"""
+        raise NotImplementedError
+
+    def measure(self, data: SimData, record: Any, key: Array) -> tuple[Array, Any]:
+        """Return a measurement of one drone, (k,), and the record of the plugin after it."""
+        raise NotImplementedError
+
+    def begin(self, data: SimData, record: Any, key: Array) -> Any:
+        """Return the record with the errors of one sensor, which stay the same in an episode, drawn at random."""
+        return record
+
+    def measured_states(self, data: SimData) -> dict[str, Array]:
+        """Return the fields of ``data.states`` that the sensor measures, of one drone."""
+        return {}
+
+    def samples(self, sim: Simulation) -> Samples:
+        """Return the field ``samples`` of the record, before the first measurement; check the common settings."""
+        period = _period(self, sim)
+        k, shape, longest = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._longest
+        is_number = isinstance(longest, (int, float)) and math.isfinite(longest)
+        rows = (
+            math.floor(longest * sim.data.core.freq / period + 0.5) + 2 if is_number and 0 < longest <= LONGEST else 0
+        )
+        if not is_number or not 0 <= longest <= LONGEST or rows > MAX_ROWS:
+            raise ConfigError(
+                f"expected a delay of {self.name!r} of zero to {MAX_ROWS - 2} measurements, with its jitter, got "
+                f"{longest} s. Use a shorter delay or a lower freq=."
+            )
+        lossy = bool(np.any(np.asarray(self.dropout)))
+        transit = {}
+        if rows:
+            transit = {
+                "delay": check_parameter(sim, "delay", self.delay, (1,), 0.0, longest),
+                "jitter": check_parameter(sim, "jitter", self.jitter, (1,), 0.0, longest),
+                "queue": on_device(np.zeros((*shape, rows, k)), sim.data.states.pos.dtype),
+                "due": on_device(np.full((*shape, rows), NEVER), np.int32),
+            }
+        return Samples(
+            value=zeros(sim, k),
+            taken=on_device(np.full((*shape, 1), -1), np.int32),
+            delay=transit.get("delay"),
+            jitter=transit.get("jitter"),
+            dropout=check_parameter(sim, "dropout", self.dropout, (1,), 0.0, 1.0) if lossy else None,
+            queue=transit.get("queue"),
+            due=transit.get("due"),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages that draw a sensor's errors, measure, and deliver late measurements."""
+        end, placements = "increment_steps", []
+        if type(self).begin is not Sensor.begin:
+            begins = Stage(self._begin, "drone", lambda data: data.core.steps == 0)
+            placements.append(Placement(begins, before=end, name=f"{self.name}_begin"))
+        when = None if _period(self, sim) == 1 else lambda data: tick(data, self.freq or data.core.freq)
+        placements.append(Placement(Stage(self._take, "drone", when), before=end))
+        if self._longest:
+            placements.append(Placement(Stage(self._deliver, "drone"), before=end, name=f"{self.name}_arrival"))
+        return placements
+
+    def latest(self, data: SimData) -> Array:
+        """Return the latest measurement of one drone; that of a perfect sensor before the first one arrives. (k,)"""
+        samples = self.read(data).samples
+        return jnp.where(samples.taken >= 0, samples.value, self.ideal(data))
+
+    def part(self, data: SimData, channel: str) -> Array:
+        """Return one of the ``channels`` of the latest measurement of one drone. (k,)"""
+        return self.split(self.latest(data))[channel]
+
+    def age(self, data: SimData) -> Array:
+        """Return the time since the latest measurement was taken, s; zero before the first one arrives. (..., 1)"""
+        taken = self.read(data).samples.taken
+        steps = data.core.steps[..., None] if taken.ndim > data.core.steps.ndim else data.core.steps
+        return jnp.where(taken >= 0, (steps - 1 - taken) / data.core.freq, 0.0)
+
+    def split(self, value: Array) -> dict[str, Array]:
+        """Return the parts of a measurement by the names of ``channels``. (..., n) each"""
+        parts, start = {}, 0
+        for name, length in self.channels.items():
+            parts[name] = value[..., start : start + length]
+            start += length
+        return parts
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the parts of the latest measurement."""
+        return self.split(self.latest(data))
+
+    def interval(self, data: SimData) -> float:
+        """Return the time between measurements, s."""
+        return 1 / (self.freq or data.core.freq)
+
+    @property
+    def _longest(self) -> float:
+        """Longest delay that a record has room for, s."""
+        if self.max_delay is not None:
+            return self.max_delay
+        delay, jitter = np.asarray(self.delay), np.asarray(self.jitter)
+        return float(np.max(delay) + np.max(jitter)) if delay.size and jitter.size else 0.0
+
+    def _begin(self, data: SimData) -> SimData:
+        """Draw the errors of one sensor."""
+        return self.write(data, self.begin(data, self.read(data), drone_key(data, f"{self.name}_begin")))
+
+    def _take(self, data: SimData) -> SimData:
+        """Take a measurement of one drone, and send it on its way."""
+        key, step = drone_key(data, self.name), data.core.steps
+        value, record = self.measure(data, self.read(data), key)
+        samples, lost, late = record.samples, False, 0.0
+        if samples.dropout is not None or samples.queue is not None:
+            chance = jax.random.uniform(drone_key(data, f"{self.name}_arrival"), (2,), value.dtype)
+            lost = False if samples.dropout is None else chance[:1] < samples.dropout
+            late = chance[1:]
+        if samples.queue is None:
+            taken = jnp.broadcast_to(step, (1,))
+            if samples.dropout is not None:
+                value, taken = jnp.where(lost, samples.value, value), jnp.where(lost, samples.taken, taken)
+            samples = samples.replace(value=value, taken=taken)
+        else:
+            due = step + jnp.round(data.core.freq * (samples.delay + late * samples.jitter)).astype(jnp.int32)
+            due = due if samples.dropout is None else jnp.where(lost, NEVER, due)
+            queue = jnp.concatenate([value[None], samples.queue[:-1]])
+            samples = samples.replace(queue=queue, due=jnp.concatenate([due, samples.due[:-1]]))
+        return self.write(data, record.replace(samples=samples))
+
+    def _deliver(self, data: SimData) -> SimData:
+        """Replace the latest measurement of one drone by the newest one that has arrived."""
+        record, step = self.read(data), data.core.steps
+        samples, period = record.samples, data.core.freq // (self.freq or data.core.freq)
+        value, taken = samples.value, samples.taken
+        for row in reversed(range(samples.due.shape[0])):  # newest last
+            arrived = samples.due[row] <= step
+            value = jnp.where(arrived, samples.queue[row], value)
+            taken = jnp.where(arrived, step - step % period - row * period, taken)
+        return self.write(data, record.replace(samples=samples.replace(value=value, taken=taken)))
+
+
+def _period(sensor: Sensor, sim: Simulation) -> int:
+    """Return the number of steps between measurements."""
+    steps = sim.data.core.freq
+    return 1 if sensor.freq is None else steps // dividing_rate(f"freq of {sensor.name!r}", sensor.freq, steps)
+
+
+def per_axis(sim: Simulation, name: str, value: ArrayLike, low: float = -np.inf, n: int = 3) -> Array:
+    """Return a setting as ``check_parameter`` does; one number counts for all axes. (n,) or (n_worlds, n_drones, n)"""
+    value = np.full(n, value) if np.ndim(value) == 0 else value
+    return check_parameter(sim, name, value, (n,), low)
+
+
+def mounting(sim: Simulation, rpy: ArrayLike) -> Array:
+    """Return the attitude of a sensor, sensor to body, as a parameter of quaternions, xyzw.
+
+    Args:
+        sim: The simulation.
+        rpy: Roll, pitch and yaw of the sensor's frame in the body frame, rad. (3,) or (n_worlds, n_drones, 3)
+    """
+    return jax.jit(rotation.from_rpy)(check_parameter(sim, "rpy", rpy, (3,)))
+
+
+@jax.custom_jvp
+def quantise(x: Array, resolution: Array) -> Array:
+    """Return the nearest multiple of a resolution; its gradient is that of ``x`` itself. (...)"""
+    return resolution * jnp.round(x / resolution)
+
+
+@quantise.defjvp
+def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    return quantise(*primals), tangents[0]
+
+
+def correlated(state: Array, deviation: Array, time: Array, dt: float, noise: Array) -> Array:
+    """Return a first-order Gauss-Markov process one interval later; the variance is exact for any interval.
+
+    Args:
+        state: The process. (..., k)
+        deviation: Its standard deviation. (..., k)
+        time: Its correlation time, s. (..., k)
+        dt: The interval, s.
+        noise: Standard normal numbers. (..., k)
+    """
+    keep = jnp.exp(-dt / time)
+    return keep * state + deviation * rotation.safe_sqrt(1 - keep * keep) * noise

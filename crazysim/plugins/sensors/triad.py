@@ -1,0 +1,166 @@
+"""Errors of a three-axis sensor: bias that wanders, noise, scale, misalignment, low-pass, saturation, resolution."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.plugin import Simulation, check_parameter
+from crazysim.plugins.effects.moving_air import per_drone, zeros
+from crazysim.plugins.sensors.sensor import correlated, per_axis, quantise
+from crazysim.pytree import PyTree, leaf
+
+
+class TriadData(PyTree):
+    """Errors of the three axes of every sensor, in the unit u of the measurement."""
+
+    bias: Array = leaf("drone", 1)
+    """Bias now, without the wandering part, u. (n_worlds, n_drones, 3)"""
+    scale: Array = leaf("drone", 1)
+    """Relative error of the scale in this episode, 1. (n_worlds, n_drones, 3)"""
+    misalignment: Array = leaf("drone", 1)
+    """Rotation of the axes in this episode, rad. (n_worlds, n_drones, 3)"""
+    wander: Array = leaf("drone", 1)
+    """Wandering part of the bias, u. (n_worlds, n_drones, 3)"""
+    filtered: Array | None = leaf("drone", 1)
+    """Output of the low-pass filter, u; None without one. (n_worlds, n_drones, 3)"""
+    noise: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Density of the white noise, one-sided, u/sqrt(Hz). (3,)"""
+    random_walk: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Standard deviation by which the bias has changed after 1 s, u/sqrt(s). (3,)"""
+    instability: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Standard deviation of the wandering part of the bias, u. (3,)"""
+    correlation_time: Array = leaf("parameter", 1, (1,))
+    """Correlation time of the wandering part, s. (1,)"""
+    mean: Array = leaf("parameter", 1, (9,), sparse=True)
+    """Means of bias, scale error and misalignment at the beginning of an episode. (9,)"""
+    spread: Array = leaf("parameter", 1, (9,), sparse=True)
+    """Standard deviations of bias, scale error and misalignment at the beginning of an episode. (9,)"""
+    bandwidth: Array | None = leaf("parameter", 1, (1,))
+    """Corner frequency of the low-pass filter, Hz; None without one. (1,)"""
+    limit: Array | None = leaf("parameter", 1, (3,))
+    """Largest measurement of either sign, u; None for any. (3,)"""
+    resolution: Array | None = leaf("parameter", 1, (3,))
+    """Smallest difference of two measurements, u; None for none. (3,)"""
+
+    def begin(self, truth: Array, key: Array) -> TriadData:
+        """Return the errors drawn for an episode of one sensor whose first measurement is of ``truth``, (3,)."""
+        noise = jax.random.normal(key, (12,), truth.dtype)
+        drawn = self.mean + self.spread * noise[:9]
+        triad = self.replace(
+            bias=drawn[:3], scale=drawn[3:6], misalignment=drawn[6:], wander=self.instability * noise[9:]
+        )
+        return triad if self.filtered is None else triad.replace(filtered=triad.without_noise(truth))
+
+    def without_noise(self, truth: Array) -> Array:
+        """Return the measurement of one sensor before noise, low-pass, saturation and rounding, u. (3,)"""
+        turned = truth - rotation.cross(self.misalignment, truth)
+        return turned + self.scale * turned + self.bias + self.wander
+
+    def measure(self, truth: Array, key: Array, dt: float) -> tuple[Array, TriadData]:
+        """Return the measurement of one sensor, u, (3,), an interval after the last one, and the errors after it.
+
+        Args:
+            truth: True quantity in the sensor's frame, u. (3,)
+            key: Random key. ()
+            dt: Time between measurements, s.
+        """
+        noise = jax.random.normal(key, (9,), truth.dtype)
+        bias = self.bias + self.random_walk * math.sqrt(dt) * noise[3:6]
+        wander = correlated(self.wander, self.instability, self.correlation_time, dt, noise[6:])
+        triad = self.replace(bias=bias, wander=wander)
+        # a one-sided density up to half the rate
+        value = triad.without_noise(truth) + self.noise * math.sqrt(0.5 / dt) * noise[:3]
+        if self.filtered is not None and self.bandwidth is not None:
+            value = self.filtered + (1 - jnp.exp(-2 * math.pi * dt * self.bandwidth)) * (value - self.filtered)
+            triad = triad.replace(filtered=value)
+        if self.limit is not None:
+            value = rotation.safe_clip(value, -self.limit, self.limit)
+        if self.resolution is not None:
+            value = quantise(value, self.resolution)
+        return value, triad
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Triad:
+    """Errors of a three-axis sensor, in the unit u of the measurement.
+
+    Each is one number for all axes, (3,), or (n_worlds, n_drones, 3). The Allan deviation of the measurement at rest is
+    ``noise / sqrt(2 t)`` from white noise, ``random_walk sqrt(t / 3)`` from the random walk, and at most
+    0.62 ``instability``, at ``t = 1.89 correlation_time``, from the wandering bias.
+    """
+
+    noise: ArrayLike = 0.0
+    """Density of white noise as data sheets state it, one-sided, u/sqrt(Hz): the root mean square behind an ideal
+    low-pass filter is ``noise sqrt(bandwidth)``."""
+    bias: ArrayLike = 0.0
+    """Mean of the bias at the beginning of an episode, u."""
+    bias_spread: ArrayLike = 0.0
+    """Standard deviation of the bias at the beginning of an episode, u."""
+    random_walk: ArrayLike = 0.0
+    """Standard deviation by which the bias changes in 1 s, u/sqrt(s)."""
+    instability: ArrayLike = 0.0
+    """Standard deviation of a bias that wanders, a first-order Gauss-Markov process, u."""
+    correlation_time: ArrayLike = 100.0
+    """Correlation time of the bias that wanders, s. () or (n_worlds, n_drones)"""
+    scale: ArrayLike = 0.0
+    """Mean relative error of the scale, 1."""
+    scale_spread: ArrayLike = 0.0
+    """Standard deviation of the relative error of the scale between episodes, 1."""
+    misalignment: ArrayLike = 0.0
+    """Small rotation of the axes against the mounting, rad."""
+    misalignment_spread: ArrayLike = 0.0
+    """Standard deviation of that rotation between episodes, rad."""
+    bandwidth: ArrayLike | None = None
+    """Corner frequency of a first-order low-pass filter, Hz; None for none. () or (n_worlds, n_drones)"""
+    limit: ArrayLike | None = None
+    """Largest measurement of either sign, u; None for any."""
+    resolution: ArrayLike | None = None
+    """Smallest difference of two measurements, u; None for none. Gradients pass as if there were none."""
+
+    def record(self, sim: Simulation, name: str) -> TriadData:
+        """Return the record before the first measurement; ``name`` is that of the sensor in messages."""
+
+        def vector(field: str, low: float = -np.inf) -> Array:
+            return per_axis(sim, f"{field} of {name}", getattr(self, field), low)
+
+        def joined(*fields: str, low: float = -np.inf) -> Array:
+            parts = [np.asarray(vector(field, low)) for field in fields]
+            batch = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
+            parts = [np.broadcast_to(x, (*batch, 3)) for x in parts]
+            return check_parameter(sim, name, np.concatenate(parts, axis=-1), (9,))
+
+        def optional(field: str, n: int) -> Array | None:
+            value = getattr(self, field)
+            if value is None:
+                return None
+            value = np.full(n, value) if np.ndim(value) == 0 else value
+            return check_parameter(sim, f"{field} of {name}", value, (n,), positive=True)
+
+        mean = joined("bias", "scale", "misalignment")
+        each = per_drone(sim, mean)
+        return TriadData(
+            bias=each[..., :3],
+            scale=each[..., 3:6],
+            misalignment=each[..., 6:],
+            wander=zeros(sim, 3),
+            filtered=None if self.bandwidth is None else zeros(sim, 3),
+            noise=vector("noise", 0.0),
+            random_walk=vector("random_walk", 0.0),
+            instability=vector("instability", 0.0),
+            correlation_time=check_parameter(
+                sim, f"correlation_time of {name}", self.correlation_time, (1,), positive=True
+            ),
+            mean=mean,
+            spread=joined("bias_spread", "scale_spread", "misalignment_spread", low=0.0),
+            bandwidth=optional("bandwidth", 1),
+            limit=optional("limit", 3),
+            resolution=optional("resolution", 3),
+        )
