@@ -9,7 +9,7 @@ from cases import hover_rotor_state, with_states
 from crazysim import IMU, Sim
 from crazysim.engine import Step
 from crazysim.engine.backends import native
-from crazysim.plugins.sensors.triad import Triad
+from crazysim.plugins.sensors import Triad
 
 ERRORS = Triad(noise=1e-3, bias=0.1, bias_spread=0.1, random_walk=0.01, instability=0.1, scale=0.1, scale_spread=0.03,
                misalignment=0.02, misalignment_spread=0.02, bandwidth=80.0)  # fmt: skip

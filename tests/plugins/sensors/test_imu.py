@@ -8,8 +8,8 @@ import pytest
 from cases import hover_rotor_state, with_states
 
 from crazysim import IMU, ConfigError, Sim, rotation
+from crazysim.plugins.sensors import Triad
 from crazysim.plugins.sensors.imu import G, specific_force
-from crazysim.plugins.sensors.triad import Triad
 
 DEGREE = np.pi / 180
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, PyTree, Sim
-from crazysim.plugins.sensors.sensor import Samples, Sensor
+from crazysim.plugins.sensors import Samples, Sensor
 
 
 class ClockData(PyTree):
