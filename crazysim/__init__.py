@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.follow import Follow
     from crazysim.plugins.payloads import Hook, RotorJet, SharedLoad, SlungLoad
     from crazysim.plugins.sensors.imu import IMU
+    from crazysim.plugins.sensors.motion_capture import MotionCapture
     from crazysim.plugins.sensors.radar import Radar
     from crazysim.plugins.sensors.range_finder import RangeFinder
     from crazysim.plugins.sensors.sensor import Sensor
@@ -62,6 +63,7 @@ __all__ = [
     "Integrator",
     "Latency",
     "Members",
+    "MotionCapture",
     "MotorFailure",
     "Placement",
     "Plugin",
@@ -101,6 +103,7 @@ __getattr__ = lazy(
         "FreeBodies": "crazysim.plugins.bodies",
         "Hook": "crazysim.plugins.payloads",
         "IMU": "crazysim.plugins.sensors.imu",
+        "MotionCapture": "crazysim.plugins.sensors.motion_capture",
         "MPPI": "crazysim.sim.mppi",
         "RotorJet": "crazysim.plugins.payloads",
         "Sensor": "crazysim.plugins.sensors.sensor",

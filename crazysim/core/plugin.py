@@ -269,6 +269,10 @@ class Plugin:
         """Return named measurements of one drone. (k,) each"""
         return {}
 
+    def measured_states(self, data: SimData) -> dict[str, Array]:
+        """Return fields of ``data.states`` as the plugin measures them, by name, of one drone."""
+        return {}
+
     def draw(self, sim: Simulation, world: int) -> None:
         """Draw overlays into the next image of a world, on ``sim.scene``."""
 
@@ -289,6 +293,19 @@ class Plugin:
     def write(self, data: SimData, record: PyTree) -> SimData:
         """Return the data with another record of this plugin."""
         return data.replace(plugins=data.plugins | {self.name: record})
+
+
+def with_measured_states(plugins: Sequence[Plugin], data: SimData) -> SimData:
+    """Return the data of one drone with the states that plugins measure in place of the true ones.
+
+    Args:
+        plugins: The plugins; of several that measure one state, the last one counts.
+        data: The data of one drone.
+    """
+    measured = {}
+    for plugin in plugins:
+        measured |= plugin.measured_states(data)
+    return data.replace(states=data.states.replace(**measured))
 
 
 class FunctionPlugin(Plugin):

@@ -13,9 +13,10 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
+from crazysim.core.plugin import Plugin
 from crazysim.core.settings import as_mask, positive
 from crazysim.core.sharding import beside, commit, put, shard
-from crazysim.core.stage import Stage
+from crazysim.core.stage import Stage, over_worlds
 from crazysim.core.stages import reset
 from crazysim.eager import is_traced
 from crazysim.engine.backends import fused
@@ -81,7 +82,9 @@ class Env(ABC):
         """The phases of its step."""
         base, last_step = self.base, self.max_steps * self.n_substeps
         reset_data, batched = base.reset_data, base.batched_reset
-        return Phases(self.task, self.actions, self.wrappers, base.sim.n_drones, last_step, reset_data, batched)
+        return Phases(
+            self.task, self.actions, self.wrappers, base.sim.n_drones, last_step, reset_data, batched, base.measured
+        )
 
     def reset(self, key: Array) -> EnvState:
         """Return all worlds at the start of an episode; the same key gives the same episodes.
@@ -165,7 +168,7 @@ class Env(ABC):
 class DroneEnv(Env):
     """Many worlds of one task. Episodes that are over continue; ``AutoReset`` begins new ones."""
 
-    def __init__(self, sim: Sim, task: Task, freq: int = 50, actions: Actions | None = None):
+    def __init__(self, sim: Sim, task: Task, freq: int = 50, actions: Actions | None = None, measured: bool = False):
         """Take a simulation in which the task is installed.
 
         Args:
@@ -173,10 +176,13 @@ class DroneEnv(Env):
             task: The task.
             freq: Environment steps per second, Hz; divides the simulation's.
             actions: Meaning of an action; None for ``actions_of``.
+            measured: True for observations of the states as the sensors of the simulation measure them. Rewards and
+                ends of episodes are of the true states.
 
         Raises:
             ConfigError: If the task is not installed, lacks a method, or observes or rewards in a wrong shape; if a
-                rate does not divide, or the controller runs less often than actions come.
+                rate does not divide, or the controller runs less often than actions come; if no plugin measures states
+                although ``measured`` is true.
         """
         freq = positive("freq", freq)
         require_installed(sim, task)
@@ -193,6 +199,17 @@ class DroneEnv(Env):
         self._sim, self._task, self.freq = sim, task, freq
         self._actions = actions_of(sim.airframes, sim.data.params, sim.control) if actions is None else actions
         check_task(task, sim.default_data, self._actions.size)
+        self.measured: Callable[[SimData], SimData] | None = None
+        """``measured(data)``: the data with measured states, of one world, or of all worlds for a task that is batched;
+        None if the task observes the true ones."""
+        if measured:
+            if not any(type(plugin).measured_states is not Plugin.measured_states for plugin in sim.plugins.values()):
+                raise ConfigError(
+                    "expected a sensor of states where measured=True, got a simulation without one. Use "
+                    "sim.add(MotionCapture()) before the environment is made, or make(..., sensors=[MotionCapture()])."
+                )
+            of_world = sim.plugins.measured_states
+            self.measured = over_worlds(of_world) if task.batched else of_world
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
         self._step = sim.build_step_fn()

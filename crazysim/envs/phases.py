@@ -56,6 +56,9 @@ class Phases:
     """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``batched_reset``."""
     batched_reset: bool
     """True if ``reset_data`` takes all worlds at once."""
+    measured: Callable[[SimData], SimData] | None = None
+    """``measured(data)``: the data that the task observes, of one world, or of all if it is batched; None for the true
+    ones."""
 
     def act(self, state: EnvState, action: Array, apply: Apply = one_world) -> tuple[EnvState, Array]:
         """Return the state with the action's command staged, and the action as the wrappers pass it on.
@@ -82,7 +85,7 @@ class Phases:
 
         def evaluate(data: SimData, action: Array, last_action: Array) -> Any:
             reward = jnp.asarray(total(task.rewards(data, action, last_action)), action.dtype)
-            return task.observe(data), reward, task.terminated(data), _step_info(task, data)
+            return self._observed(data), reward, task.terminated(data), _step_info(task, data)
 
         def conclude(state: EnvState, action: Array, results: Any) -> EnvState:
             obs, reward, terminated, info = results
@@ -130,11 +133,15 @@ class Phases:
                 info=state.info | {"nonfinite": state.data.core.nonfinite} | info,
             )
 
-        seen = apply(lambda data: (task.observe(data), _step_info(task, data)), task.batched)(data)
+        seen = apply(lambda data: (self._observed(data), _step_info(task, data)), task.batched)(data)
         state = apply(start, False)(state.replace(data=data), *seen)
         for wrapper in self.wrappers:
             state = apply(wrapper.after_reset, wrapper.batched)(state)
         return state
+
+    def _observed(self, data: SimData) -> Any:
+        """Return the observations of the task, of measured states if it is to get these."""
+        return self.task.observe(data if self.measured is None else self.measured(data))
 
 
 def _step_info(task: Task, data: SimData) -> dict[str, Array]:

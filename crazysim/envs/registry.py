@@ -7,12 +7,14 @@ import difflib
 import importlib.metadata
 import inspect
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 
 from crazysim.control import Control
+from crazysim.core.plugin import Plugin
 from crazysim.core.settings import member, positive
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv
@@ -78,7 +80,12 @@ SIM_OPTIONS = tuple(inspect.signature(Sim).parameters)
 
 
 def make(
-    task: str | Task, n_worlds: int = 1, freq: int = 50, actions: Actions | None = None, **options: Any
+    task: str | Task,
+    n_worlds: int = 1,
+    freq: int = 50,
+    actions: Actions | None = None,
+    sensors: Sequence[Plugin] = (),
+    **options: Any,
 ) -> DroneEnv:
     """Return an environment of many worlds of a task, with a simulation of its own.
 
@@ -87,6 +94,8 @@ def make(
         n_worlds: Number of worlds.
         freq: Environment steps per second, Hz.
         actions: Meaning of an action; None for the usual one of the command level.
+        sensors: Sensors, such as ``MotionCapture``; the task observes the states as they measure them. Empty for the
+            true states.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
 
@@ -110,7 +119,9 @@ def make(
     task = entry.task(**own) if isinstance(task, str) else dataclasses.replace(task, **own)
     sim = Sim(n_worlds=n_worlds, **settings)
     task.install(sim)
-    return DroneEnv(sim, task, freq, actions)
+    for sensor in sensors:
+        sim.add(sensor)
+    return DroneEnv(sim, task, freq, actions, bool(sensors))
 
 
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:

@@ -15,12 +15,13 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, insert_fn_before
-from crazysim.core.plugin import Placement, Plugin, Simulation
+from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
 from crazysim.core.population import Population
 from crazysim.core.settings import check_flags
 from crazysim.core.stage import Axes, over_drones, over_worlds
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.pytree import PyTree, n_batch_axes
 
 P = TypeVar("P", bound=Plugin)
@@ -165,12 +166,22 @@ class PluginRegistry(Mapping[str, Plugin]):
         for name, plugin in self.items():
             self._set(name, plugin.record(self._sim))
 
-    def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the observations of all plugins, as ``"plugin.name"``. (n_worlds, n_drones, k) each"""
+    def observations(self, data: SimData, measured: bool = False) -> dict[str, Array]:
+        """Return the observations of all plugins, as ``"plugin.name"``. (n_worlds, n_drones, k) each
+
+        Args:
+            data: The data of all worlds.
+            measured: True for observations that are calculated from the states as sensors measure them.
+        """
         plugins = tuple(self.values())
         if [*map(id, plugins)] != [*map(id, self._observing[0])]:
-            self._observing = plugins, compiled()(functools.partial(_observations, plugins))
-        return self._observing[1](data)
+            self._observing = plugins, compiled("measured")(functools.partial(_observations, plugins))
+        return self._observing[1](data, measured=measured)
+
+    def measured_states(self, data: SimData) -> SimData:
+        """Return the data of one world with the states that sensors measure in place of the true ones."""
+        plugins = tuple(self.values())
+        return data.replace(states=over_drones(lambda one: with_measured_states(plugins, one).states)(data))
 
     def with_placed_objects(self, data: SimData) -> SimData:
         """Return the data with the plugins' objects of the scene at their poses, unless these are recorded ones."""
@@ -325,13 +336,15 @@ def _signature(tree: Any) -> Any:
     return jax.tree.structure(tree), [(jnp.shape(x), jnp.result_type(x)) for x in jax.tree.leaves(tree)]
 
 
-def _no_observations(_data: SimData) -> dict[str, Array]:
+def _no_observations(_data: SimData, **_: Any) -> dict[str, Array]:
     return {}
 
 
-def _observations(plugins: Sequence[Plugin], data: SimData) -> dict[str, Array]:
+def _observations(plugins: Sequence[Plugin], data: SimData, measured: bool) -> dict[str, Array]:
     def of_one(one: SimData) -> dict[str, Array]:
-        return {f"{p.name}.{key}": x for p in plugins for key, x in p.observations(one).items()}
+        seen = with_measured_states(plugins, one) if measured else one
+        each = [(p, one if isinstance(p, Sensor) else seen) for p in plugins]
+        return {f"{p.name}.{key}": x for p, known in each for key, x in p.observations(known).items()}
 
     leaves, axes = jax.tree.leaves(data), Axes(data)
     worlds = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]

@@ -5,22 +5,50 @@ from typing import TYPE_CHECKING
 from crazysim.lazy import lazy
 
 if TYPE_CHECKING:
+    from crazysim.plugins.sensors.barometer import Barometer
+    from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
     from crazysim.plugins.sensors.imu import IMU
+    from crazysim.plugins.sensors.magnetometer import Magnetometer
+    from crazysim.plugins.sensors.motion_capture import MotionCapture
+    from crazysim.plugins.sensors.onboard import BatteryVoltage, MultiRanger, RotorSpeeds
     from crazysim.plugins.sensors.radar import Radar
     from crazysim.plugins.sensors.range_finder import RangeFinder
     from crazysim.plugins.sensors.sensor import Samples, Sensor
     from crazysim.plugins.sensors.triad import Triad
 
-__all__ = ["IMU", "Radar", "RangeFinder", "Samples", "Sensor", "Triad"]
+__all__ = [
+    "IMU",
+    "Barometer",
+    "BatteryVoltage",
+    "Magnetometer",
+    "MotionCapture",
+    "MultiRanger",
+    "OpticalFlow",
+    "Radar",
+    "RangeFinder",
+    "RotorSpeeds",
+    "Samples",
+    "Sensor",
+    "TimeOfFlight",
+    "Triad",
+]
 
 __getattr__ = lazy(
     __name__,
     {
         "IMU": f"{__name__}.imu",
+        "Barometer": f"{__name__}.barometer",
+        "BatteryVoltage": f"{__name__}.onboard",
+        "Magnetometer": f"{__name__}.magnetometer",
+        "MotionCapture": f"{__name__}.motion_capture",
+        "MultiRanger": f"{__name__}.onboard",
+        "OpticalFlow": f"{__name__}.flow_deck",
         "Radar": f"{__name__}.radar",
         "RangeFinder": f"{__name__}.range_finder",
+        "RotorSpeeds": f"{__name__}.onboard",
         "Samples": f"{__name__}.sensor",
         "Sensor": f"{__name__}.sensor",
+        "TimeOfFlight": f"{__name__}.flow_deck",
         "Triad": f"{__name__}.triad",
     },
 )

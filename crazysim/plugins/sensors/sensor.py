@@ -88,10 +88,6 @@ class Sensor(Plugin):
         """Return the record with the errors of one sensor, which stay the same in an episode, drawn at random."""
         return record
 
-    def measured_states(self, data: SimData) -> dict[str, Array]:
-        """Return the fields of ``data.states`` that the sensor measures, of one drone."""
-        return {}
-
     def samples(self, sim: Simulation) -> Samples:
         """Return the field ``samples`` of the record, before the first measurement; check the common settings."""
         period = _period(self, sim)

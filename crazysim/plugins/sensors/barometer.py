@@ -1,0 +1,124 @@
+"""Barometer: pressure of the standard atmosphere with noise and drift, and the height that follows from it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation, check_parameter, parameter
+from crazysim.plugins.effects.moving_air import zeros
+from crazysim.plugins.sensors.sensor import Samples, Sensor, correlated, quantise
+from crazysim.pytree import PyTree, leaf
+
+SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE, LAPSE = 101325.0, 288.15, 0.0065
+"""Pressure, Pa, and temperature, K, at sea level, and decrease of temperature with height, K/m (ISO 2533:1975)."""
+EXPONENT = 9.80665 * 0.0289644 / (8.31432 * LAPSE)
+"""Exponent of the pressure, 5.256: g M / (R L) with the constants of the US Standard Atmosphere 1976."""
+
+
+class BarometerData(PyTree):
+    """State and parameters of the barometer of every drone."""
+
+    samples: Samples
+    """Measurements."""
+    drift: Array = leaf("drone", 1)
+    """Error that wanders, Pa. (n_worlds, n_drones, 1)"""
+    offset: Array = leaf("drone", 1)
+    """Error in this episode, Pa. (n_worlds, n_drones, 1)"""
+    noise: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Standard deviation of a measurement, Pa. (1,)"""
+    drift_deviation: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Standard deviation of the error that wanders, Pa. (1,)"""
+    drift_time: Array = leaf("parameter", 1, (1,))
+    """Its correlation time, s. (1,)"""
+    offset_spread: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Standard deviation of the offset between episodes, Pa. (1,)"""
+    altitude: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Altitude of the origin above sea level, m. (1,)"""
+    resolution: Array | None = leaf("parameter", 1, (1,))
+    """Smallest difference of two measurements, Pa; None for none. (1,)"""
+
+
+class Barometer(Sensor):
+    """Pressure, Pa, and the height above the world's origin that it corresponds to in the standard atmosphere, m."""
+
+    noise: ArrayLike = parameter(default=0.0)
+    """Standard deviation of a measurement, Pa; 12 Pa are a metre. () or (n_worlds, n_drones)"""
+    drift: ArrayLike = parameter(default=0.0)
+    """Standard deviation of an error that wanders, such as weather and temperature, Pa. () or (n_worlds, n_drones)"""
+    drift_time: ArrayLike = parameter(default=60.0)
+    """Correlation time of that error, s. () or (n_worlds, n_drones)"""
+    offset_spread: ArrayLike = parameter(default=0.0)
+    """Standard deviation of an error that is constant in an episode, Pa. () or (n_worlds, n_drones)"""
+    altitude: ArrayLike = parameter(default=0.0)
+    """Altitude of the origin above sea level, m. () or (n_worlds, n_drones)"""
+    resolution: ArrayLike | None = parameter(default=None)
+    """Smallest difference of two measurements, Pa; None for none. () or (n_worlds, n_drones)"""
+    _: dataclasses.KW_ONLY
+    freq: int | None = 50
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    name: str = "barometer"
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
+        return {"pressure": 1, "height": 1}
+
+    def record(self, sim: Simulation) -> BarometerData:
+        """Return the barometer before its first measurement."""
+        resolution = self.resolution
+        if resolution is not None:
+            resolution = check_parameter(sim, "resolution", resolution, positive=True)
+        return BarometerData(
+            samples=self.samples(sim),
+            drift=zeros(sim, 1),
+            offset=zeros(sim, 1),
+            noise=check_parameter(sim, "noise", self.noise, low=0.0),
+            drift_deviation=check_parameter(sim, "drift", self.drift, low=0.0),
+            drift_time=check_parameter(sim, "drift_time", self.drift_time, positive=True),
+            offset_spread=check_parameter(sim, "offset_spread", self.offset_spread, low=0.0),
+            altitude=check_parameter(sim, "altitude", self.altitude, low=-500.0, high=9000.0),
+            resolution=resolution,
+        )
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the pressure, Pa, and the height, m. (2,)"""
+        height = data.states.pos[2:]
+        return jnp.concatenate([pressure_at(height + self.read(data).altitude), height])
+
+    def begin(self, data: SimData, record: BarometerData, key: Array) -> BarometerData:
+        """Draw the offset of one barometer, and where its drift begins."""
+        noise = jax.random.normal(key, (2,), record.offset.dtype)
+        return record.replace(offset=record.offset_spread * noise[:1], drift=record.drift_deviation * noise[1:])
+
+    def measure(self, data: SimData, record: BarometerData, key: Array) -> tuple[Array, Any]:
+        """Return the pressure and the height of one barometer, and the record after it."""
+        noise = jax.random.normal(key, (2,), record.offset.dtype)
+        drift = correlated(record.drift, record.drift_deviation, record.drift_time, self.interval(data), noise[:1])
+        pressure = self.ideal(data)[:1] + record.offset + drift + record.noise * noise[1:]
+        if record.resolution is not None:
+            pressure = quantise(pressure, record.resolution)
+        height = altitude_of(pressure) - record.altitude
+        return jnp.concatenate([pressure, height]), record.replace(drift=drift)
+
+
+def pressure_at(altitude: Array) -> Array:
+    """Return the pressure of the standard atmosphere below 11 km, ``p_0 (1 - L h / T_0)^(g M / (R L))``, Pa. (...)
+
+    Args:
+        altitude: Geopotential altitude above sea level, m. (...)
+    """
+    return SEA_LEVEL_PRESSURE * jnp.exp(EXPONENT * jnp.log1p(-LAPSE / SEA_LEVEL_TEMPERATURE * altitude))
+
+
+def altitude_of(pressure: Array) -> Array:
+    """Return the altitude at which the standard atmosphere has a pressure, m; the inverse of ``pressure_at``. (...)"""
+    log = jnp.log1p((pressure - SEA_LEVEL_PRESSURE) / SEA_LEVEL_PRESSURE)
+    return -SEA_LEVEL_TEMPERATURE / LAPSE * jnp.expm1(log / EXPONENT)

@@ -1,0 +1,193 @@
+"""Flow deck: optical flow of the ground, and the distance to it by time of flight."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation, check_parameter, parameter
+from crazysim.plugins.effects.ground import ground_below
+from crazysim.plugins.sensors.sensor import Samples, Sensor, per_axis, quantise
+from crazysim.pytree import PyTree, leaf
+
+PIXELS_PER_RADIAN = 35.0 / 0.71674
+"""Pixels by which the image moves per radian (mm_flow.c of crazyflie-firmware: 35 pixels, aperture 0.71674)."""
+LOWEST_COSINE = 0.1
+"""Least cosine of the tilt at which the ground is seen, 84 degrees. An assumption."""
+LOWEST = 0.02
+"""Least distance of the ground, m, that the flow is divided by. An assumption."""
+FAR_NOISE = math.log(0.2 / 0.0025) / (4.0 - 2.5), 2.5, 0.0025
+"""Growth b, 1/m, distance c, m, and scale a, m, of the noise of the time of flight, ``a (1 + exp(b (d - c)))``, as the
+filter of the Crazyflie assumes it (zranger2.c of crazyflie-firmware)."""
+
+
+class OpticalFlowData(PyTree):
+    """Measurements and parameters of the optical flow."""
+
+    samples: Samples
+    """Measurements."""
+    noise: Array = leaf("parameter", 1, (2,), sparse=True)
+    """Standard deviation of a measurement, pixels. (2,)"""
+    scale: Array = leaf("parameter", 1, (1,))
+    """Pixels by which the image moves per radian. (1,)"""
+    pos: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Position of the camera relative to the centre of mass, body frame, m. (3,)"""
+    resolution: Array | None = leaf("parameter", 1, (1,))
+    """Smallest difference of two measurements, pixels; None for none. (1,)"""
+
+
+class OpticalFlow(Sensor):
+    """Motion of the image of a camera that looks down, pixels since the measurement before, along x and y of the body.
+
+    With the distance d to the ground along the optical axis, and the velocity v of the camera in its own frame, the
+    image of the ground moves by ``v_x / d - w_y`` and ``v_y / d + w_x`` radians per second (mm_flow.c of
+    crazyflie-firmware). The ground is taken to be level; a drone on its side or upside down measures no motion.
+    """
+
+    noise: ArrayLike = parameter(default=0.0)
+    """Standard deviation of a measurement, pixels. (), (2,) or (n_worlds, n_drones, 2)"""
+    scale: ArrayLike = parameter(default=PIXELS_PER_RADIAN)
+    """Pixels by which the image moves per radian. () or (n_worlds, n_drones)"""
+    pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
+    """Position of the camera relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    resolution: ArrayLike | None = parameter(default=None)
+    """Smallest difference of two measurements, pixels; None for none. () or (n_worlds, n_drones)"""
+    _: dataclasses.KW_ONLY
+    freq: int | None = 100
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    name: str = "optical_flow"
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
+        return {"flow": 2}
+
+    def record(self, sim: Simulation) -> OpticalFlowData:
+        """Return the camera before its first measurement."""
+        resolution = self.resolution
+        if resolution is not None:
+            resolution = check_parameter(sim, "resolution", resolution, positive=True)
+        return OpticalFlowData(
+            samples=self.samples(sim),
+            noise=per_axis(sim, "noise", self.noise, 0.0, 2),
+            scale=check_parameter(sim, "scale", self.scale, positive=True),
+            pos=check_parameter(sim, "pos", self.pos, (3,)),
+            resolution=resolution,
+        )
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the motion of the image, pixels per interval. (2,)"""
+        record, s = self.read(data), data.states
+        distance, sees = ground_distance(data, record.pos)
+        vel = rotation.rotate_inverse(s.quat, s.vel, rotation.cross(s.ang_vel, record.pos))
+        turn = jnp.stack([-s.ang_vel[1], s.ang_vel[0]])
+        rate = vel[:2] / jnp.where(distance > LOWEST, distance, LOWEST) + turn
+        return jnp.where(sees, record.scale * self.interval(data) * rate, 0.0)
+
+    def measure(self, data: SimData, record: OpticalFlowData, key: Array) -> tuple[Array, Any]:
+        """Return the motion of the image of one camera, pixels, and the record."""
+        truth = self.ideal(data)
+        value = truth + record.noise * jax.random.normal(key, (2,), truth.dtype)
+        return value if record.resolution is None else quantise(value, record.resolution), record
+
+
+class TimeOfFlightData(PyTree):
+    """Measurements and parameters of the time of flight."""
+
+    samples: Samples
+    """Measurements."""
+    noise: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Standard deviation at any distance, m. (1,)"""
+    far_noise: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Scale of the standard deviation that grows with the distance, m. (1,)"""
+    max_range: Array = leaf("parameter", 1, (1,))
+    """Largest distance measured, m. (1,)"""
+    pos: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Position of the sensor relative to the centre of mass, body frame, m. (3,)"""
+    resolution: Array | None = leaf("parameter", 1, (1,))
+    """Smallest difference of two measurements, m; None for none. (1,)"""
+
+
+class TimeOfFlight(Sensor):
+    """Distance to the ground along the negative z axis of the body, m; ``max_range`` where nothing is nearer.
+
+    The ground is the floor or terrain below the drone, taken to be level: the distance is the height over the cosine of
+    the tilt. Obstacles are for ``RangeFinder``. At distance d the standard deviation is
+    ``noise + far_noise (1 + exp(2.92 (d - 2.5)))``, by default what the filter of the Crazyflie assumes.
+    """
+
+    noise: ArrayLike = parameter(default=0.0)
+    """Standard deviation at any distance, m. () or (n_worlds, n_drones)"""
+    far_noise: ArrayLike = parameter(default=FAR_NOISE[2])
+    """Scale of the standard deviation that grows with the distance, m. () or (n_worlds, n_drones)"""
+    max_range: ArrayLike = parameter(default=4.0)
+    """Largest distance measured, m. () or (n_worlds, n_drones)"""
+    pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
+    """Position of the sensor relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    resolution: ArrayLike | None = parameter(default=0.001)
+    """Smallest difference of two measurements, m; None for none. () or (n_worlds, n_drones)"""
+    _: dataclasses.KW_ONLY
+    freq: int | None = 10
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    name: str = "time_of_flight"
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
+        return {"distance": 1}
+
+    def record(self, sim: Simulation) -> TimeOfFlightData:
+        """Return the sensor before its first measurement."""
+        resolution = self.resolution
+        if resolution is not None:
+            resolution = check_parameter(sim, "resolution", resolution, positive=True)
+        return TimeOfFlightData(
+            samples=self.samples(sim),
+            noise=check_parameter(sim, "noise", self.noise, low=0.0),
+            far_noise=check_parameter(sim, "far_noise", self.far_noise, low=0.0),
+            max_range=check_parameter(sim, "max_range", self.max_range, positive=True),
+            pos=check_parameter(sim, "pos", self.pos, (3,)),
+            resolution=resolution,
+        )
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the distance to the ground, m. (1,)"""
+        record = self.read(data)
+        distance, sees = ground_distance(data, record.pos)
+        distance = jnp.where(distance > 0, distance, 0.0)
+        return jnp.where(sees & (distance < record.max_range), distance, record.max_range)
+
+    def measure(self, data: SimData, record: TimeOfFlightData, key: Array) -> tuple[Array, Any]:
+        """Return the distance of one sensor, m, and the record."""
+        truth = self.ideal(data)
+        growth, at, _ = FAR_NOISE
+        deviation = record.noise + record.far_noise * (1 + jnp.exp(growth * (truth - at)))
+        near = truth < record.max_range
+        value = truth + deviation * jax.random.normal(key, (1,), truth.dtype)
+        value = jnp.where(near, rotation.safe_clip(value, 0.0, record.max_range), record.max_range)
+        return value if record.resolution is None else quantise(value, record.resolution), record
+
+
+def ground_distance(data: SimData, pos: Array) -> tuple[Array, Array]:
+    """Return the distance of level ground along the negative z axis of the body, m, and True where it is seen.
+
+    Both are (1,).
+
+    Args:
+        data: The data of one drone.
+        pos: Place from which it is measured, relative to the centre of mass, body frame, m. (3,)
+    """
+    s = data.states
+    cosine = rotation.z_axis(s.quat)[2:]
+    sees = cosine > LOWEST_COSINE
+    height = s.pos[2:] + rotation.rotate(s.quat, pos)[2:] - ground_below(data)
+    return height / jnp.where(sees, cosine, 1.0), sees

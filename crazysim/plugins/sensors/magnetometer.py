@@ -1,0 +1,74 @@
+"""Magnetometer: the magnetic field of the earth in the sensor's frame, with the errors of three axes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation, check_parameter, parameter
+from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
+from crazysim.plugins.sensors.triad import Triad, TriadData
+from crazysim.pytree import PyTree, leaf
+
+
+class MagnetometerData(PyTree):
+    """State and parameters of the magnetometer of every drone."""
+
+    samples: Samples
+    """Measurements."""
+    errors: TriadData
+    """Errors, T."""
+    field: Array = leaf("parameter", 1, (3,))
+    """Magnetic field, world frame, T. (3,)"""
+    quat: Array = leaf("parameter", 1, (4,), sparse=True)
+    """Attitude of the sensor, sensor to body, unit, xyzw. (4,)"""
+
+
+class Magnetometer(Sensor):
+    """Magnetic field in the sensor's frame, T. The bias of its errors is what is known as hard iron."""
+
+    field: ArrayLike = parameter()
+    """Magnetic field, world frame, T: (0, 2e-5, -4.5e-5) with x east, y north and z up has the size of that in central
+    Europe (an estimate; take yours from the World Magnetic Model). (3,) or (n_worlds, n_drones, 3)"""
+    errors: Triad = parameter(default=Triad())
+    """Errors of the three axes, T."""
+    rpy: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
+    """Roll, pitch and yaw of the sensor in the body frame, rad. (3,) or (n_worlds, n_drones, 3)"""
+    _: dataclasses.KW_ONLY
+    freq: int | None = 20
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    name: str = "magnetometer"
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
+        return {"field": 3}
+
+    def record(self, sim: Simulation) -> MagnetometerData:
+        """Return the magnetometer before its first measurement."""
+        return MagnetometerData(
+            samples=self.samples(sim),
+            errors=self.errors.record(sim, "errors"),
+            field=check_parameter(sim, "field", self.field, (3,)),
+            quat=mounting(sim, self.rpy),
+        )
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the field in the sensor's frame, T. (3,)"""
+        record = self.read(data)
+        return rotation.rotate_inverse(rotation.multiply(data.states.quat, record.quat), record.field)
+
+    def begin(self, data: SimData, record: MagnetometerData, key: Array) -> MagnetometerData:
+        """Draw the errors of one magnetometer."""
+        return record.replace(errors=record.errors.begin(self.ideal(data), key))
+
+    def measure(self, data: SimData, record: MagnetometerData, key: Array) -> tuple[Array, Any]:
+        """Return the field that one magnetometer measures, T, and the record after it."""
+        value, errors = record.errors.measure(self.ideal(data), key, self.interval(data))
+        return value, record.replace(errors=errors)

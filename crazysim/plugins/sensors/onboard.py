@@ -1,0 +1,169 @@
+"""Measurements on board of quantities that other parts simulate: rotor speeds, battery voltage, ranges."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation, check_parameter, parameter
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.battery import BatteryData
+from crazysim.plugins.effects.moving_air import require_rotors
+from crazysim.plugins.sensors.range_finder import RangeFinderData
+from crazysim.plugins.sensors.sensor import Samples, Sensor, quantise
+from crazysim.pytree import PyTree, leaf
+
+ERPM = 100.0
+"""Step of the electrical speed in telemetry, rpm: the flights of IDSIA's Crazyflies (2025) have it."""
+
+
+class NoisyData(PyTree):
+    """Measurements with white noise and a resolution."""
+
+    samples: Samples
+    """Measurements."""
+    noise: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Standard deviation of a measurement, in its unit. (1,)"""
+    resolution: Array | None = leaf("parameter", 1, (1,))
+    """Smallest difference of two measurements, in its unit; None for none. (1,)"""
+
+
+class Noisy(Sensor):
+    """Base class of sensors whose measurement is the true one with white noise, rounded."""
+
+    noise: ArrayLike = parameter(default=0.0)
+    """Standard deviation of a measurement, in its unit. () or (n_worlds, n_drones)"""
+    resolution: ArrayLike | None = parameter(default=None)
+    """Smallest difference of two measurements, in its unit; None for none. () or (n_worlds, n_drones)"""
+    _: dataclasses.KW_ONLY
+    name: str = "noisy"
+
+    def record(self, sim: Simulation) -> NoisyData:
+        """Return the sensor before its first measurement."""
+        resolution = self.resolution
+        if resolution is not None:
+            resolution = check_parameter(sim, "resolution", resolution, positive=True)
+        noise = check_parameter(sim, "noise", self.noise, low=0.0)
+        return NoisyData(self.samples(sim), noise, resolution)
+
+    def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, Any]:
+        """Return the measurement of one drone, and the record."""
+        truth = self.ideal(data)
+        value = truth + record.noise * jax.random.normal(key, truth.shape, truth.dtype)
+        return value if record.resolution is None else quantise(value, record.resolution), record
+
+
+class RotorSpeeds(Noisy):
+    """Rotor speeds as telemetry of the motors reports them, rpm; needs rotors.
+
+    Telemetry counts electrical revolutions in steps of 100 rpm: with six pole pairs, ``resolution=100 / 6``.
+    """
+
+    n_rotors: int = 4
+    """Number of rotors."""
+    _: dataclasses.KW_ONLY
+    name: str = "rotor_speeds"
+
+    @classmethod
+    def telemetry(cls, pole_pairs: int, **settings: Any) -> RotorSpeeds:
+        """Return a sensor with the resolution of telemetry for motors with a number of pole pairs."""
+        return cls(resolution=ERPM / pole_pairs, **settings)
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
+        return {"speed": self.n_rotors}
+
+    def record(self, sim: Simulation) -> NoisyData:
+        """Return the sensor before its first measurement."""
+        require_rotors(sim, "measuring rotor speeds")
+        own = sim.data.states.rotor_vel.shape[-1]
+        if self.n_rotors != own:
+            raise ConfigError(f"expected n_rotors = {own}, that of the drones, got {self.n_rotors}")
+        return super().record(sim)
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the rotor speeds, rpm. (n_rotors,)"""
+        return data.states.rotor_vel
+
+    def measured_states(self, data: SimData) -> dict[str, Array]:
+        """Return the rotor speeds, rpm."""
+        return {"rotor_vel": self.latest(data)}
+
+
+class BatteryVoltage(Noisy):
+    """Voltage of the battery, V; needs the plugin ``Battery``, added before."""
+
+    battery: str = "battery"
+    """Name of the plugin of the battery."""
+    _: dataclasses.KW_ONLY
+    freq: int | None = 100
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    name: str = "battery_voltage"
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
+        return {"voltage": 1}
+
+    def record(self, sim: Simulation) -> NoisyData:
+        """Return the sensor before its first measurement."""
+        if not isinstance(sim.data.plugins.get(self.battery), BatteryData):
+            raise ConfigError(f"expected a Battery named {self.battery!r}, got none. Use sim.add(Battery()) first.")
+        return super().record(sim)
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the voltage under load, V. (1,)"""
+        return data.plugins[self.battery].voltage
+
+
+class MultiRanger(Noisy):
+    """Distances of a ``RangeFinder``, added before, at a rate, late and with noise, m.
+
+    A distance beyond the range is that of the range finder's ``max_range``, without noise.
+    """
+
+    n_rays: int = 6
+    """Number of rays of the range finder."""
+    range_finder: str = "range_finder"
+    """Name of the plugin of the range finder."""
+    _: dataclasses.KW_ONLY
+    freq: int | None = 10
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    name: str = "multi_ranger"
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
+        return {"distance": self.n_rays}
+
+    def record(self, sim: Simulation) -> NoisyData:
+        """Return the sensor before its first measurement."""
+        found = sim.data.plugins.get(self.range_finder)
+        if not isinstance(found, RangeFinderData):
+            raise ConfigError(
+                f"expected a RangeFinder named {self.range_finder!r}, got none. Use sim.add(RangeFinder()) first."
+            )
+        if found.direction.shape[0] != self.n_rays:
+            raise ConfigError(
+                f"expected n_rays = {found.direction.shape[0]}, those of the range finder, got {self.n_rays}"
+            )
+        return super().record(sim)
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the distances, m. (n_rays,)"""
+        return data.plugins[self.range_finder].distance
+
+    def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, Any]:
+        """Return the distances of one drone, m, and the record."""
+        value, record = super().measure(data, record, key)
+        far = data.plugins[self.range_finder].max_range
+        return jnp.where(self.ideal(data) < far, rotation.safe_clip(value, 0.0, far), far), record

@@ -1,0 +1,223 @@
+"""Sensors by hand, and the statistics of their errors over many drones."""
+
+import jax
+import numpy as np
+import pytest
+from cases import hover_rotor_state, with_states
+
+from crazysim import Battery, ConfigError, Plugin, RangeFinder, Sim, rotation
+from crazysim.envs import DroneEnv, make
+from crazysim.plugins import sensors
+from crazysim.plugins.sensors.barometer import altitude_of, pressure_at
+
+N = 2000
+
+
+def build(*plugins, n_worlds=1, n_drones=1, **states):
+    sim = Sim(n_worlds, n_drones, control="rotor_vel", engine="interpret", rng_key=4)
+    sim.data = with_states(sim.data, **({"pos": [0, 0, 1.0]} | states))
+    sim.build_default_data()
+    for plugin in plugins:
+        sim.add(plugin)
+    return sim
+
+
+def read(sim, name):
+    return np.asarray(sim.plugins.observations(sim.data)[name], np.float64)
+
+
+def errors(n):
+    """Return the tolerance of a standard deviation from n numbers: four of its standard errors."""
+    return 4 / np.sqrt(2 * n)
+
+
+def test_motion_capture_has_its_noise_and_offsets():
+    quat = np.float32([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])  # yaw 90 degrees
+    plugin = sensors.MotionCapture(2e-3, 0.01, pos=(0.1, 0, 0), rpy=(0, 0, 0.2))
+    sim = build(plugin, n_worlds=N, quat=quat, vel=[1.0, 0, 0])
+    sim.step()
+    s = sim.data.states
+    at = np.asarray(s.pos)[:, 0] + [0.0, 0.1, 0.0]
+    pos, attitude = read(sim, "motion_capture.pos")[:, 0], read(sim, "motion_capture.quat")[:, 0]
+    np.testing.assert_allclose((pos - at).std(axis=0), 2e-3, rtol=errors(N))
+    np.testing.assert_allclose((pos - at).mean(axis=0), 0, atol=4 * 2e-3 / np.sqrt(N))
+    np.testing.assert_allclose(np.linalg.norm(attitude, axis=-1), 1, atol=1e-6)
+    true = jax.jit(lambda q: rotation.multiply(q, rotation.from_rpy(np.float32([0, 0, 0.2]))))(s.quat[:, 0])
+    turn = 2 * np.asarray(jax.jit(lambda a, b: rotation.multiply(rotation.conjugate(a), b))(true, attitude))[:, :3]
+    np.testing.assert_allclose(turn.std(axis=0), 0.01, rtol=errors(N))
+
+
+def test_motion_capture_differentiates_positions():
+    """A constant velocity is met at once. The low-pass leaves 2 a^2 / (2 - a) of the variance of the positions over the
+    interval squared, where differences of white noise in the position have 2."""
+    sim = build(sensors.MotionCapture(), vel=[3.0, 0, 0])
+    sim.step(21)
+    vel = read(sim, "motion_capture.vel")[0, 0]
+    np.testing.assert_allclose(vel[0], 3.0, atol=0.1)  # drag
+    sim = build(sensors.MotionCapture(1e-3, bandwidth=10.0), n_worlds=N, vel=[3.0, 0, 0])
+    sim.step(101)
+    noise = read(sim, "motion_capture.vel")[:, 0, 1:2].std()
+    a = 1 - np.exp(-2 * np.pi * 10 / 100)
+    np.testing.assert_allclose(noise, 1e-3 * 100 * np.sqrt(2 * a**2 / (2 - a)), rtol=errors(N))
+
+
+def test_optical_flow_by_hand():
+    """1 m/s ahead 0.5 m above ground is 2 rad/s; so is a pitch rate of -2 rad/s; 35 / 0.71674 pixels a radian."""
+    pixels = 35 / 0.71674 / 500
+    flow = sensors.OpticalFlow(freq=None)
+    for states, expected in (
+        ({"pos": [0, 0, 0.5], "vel": [1.0, 0, 0]}, [2, 0]),
+        ({"pos": [0, 0, 2.0], "vel": [1.0, 0.4, 0]}, [0.5, 0.2]),
+        ({"ang_vel": [3.0, -2.0, 0]}, [2, 3]),
+        ({"quat": [0, np.sin(0.25), 0, np.cos(0.25)], "vel": [1.0, 0, 0]}, [np.cos(0.5) ** 2, 0]),
+        ({"quat": [1.0, 0, 0, 0], "vel": [1.0, 0, 0]}, [0, 0]),
+    ):
+        sim = build(flow, **states)
+        sim.step()
+        np.testing.assert_allclose(read(sim, "optical_flow.flow")[0, 0], pixels * np.array(expected), rtol=0.05,
+                                   atol=1e-4)  # the motion of one step # fmt: skip
+    sim = build(sensors.OpticalFlow(0.3, resolution=0.1), n_worlds=N)
+    sim.step()
+    found = read(sim, "optical_flow.flow")
+    np.testing.assert_allclose(found.std(), np.sqrt(0.3**2 + 0.1**2 / 12), rtol=errors(2 * N))
+    np.testing.assert_allclose(found / 0.1, np.round(found / 0.1), atol=1e-4)
+
+
+def test_time_of_flight_by_hand():
+    """Height over the cosine of the tilt up to the range; noise grows as the firmware's filter assumes."""
+    angle = np.array([0, 0.5, 0.5, 3.0])[:, None, None]
+    quat = np.concatenate([np.sin(angle / 2), 0 * angle, 0 * angle, np.cos(angle / 2)], axis=-1)
+    pos = np.array([1.0, 1.0, 3.9, 1.0])[:, None, None] * [0, 0, 1]
+    sim = build(sensors.TimeOfFlight(far_noise=0.0, freq=None), n_worlds=4, pos=pos, quat=quat)
+    sim.step()
+    found = read(sim, "time_of_flight.distance")[:, 0, 0]
+    np.testing.assert_allclose(found, [1, 1 / np.cos(0.5), 4, 4], atol=1e-3)  # of one step, rounded
+    for height in (0.5, 2.5, 3.5):
+        deviation = 0.01 + 0.0025 * (1 + 80 ** ((height - 2.5) / 1.5))
+        sim = build(sensors.TimeOfFlight(0.01, resolution=None), n_worlds=N, pos=[0, 0, height])
+        sim.step()
+        distance = read(sim, "time_of_flight.distance")
+        np.testing.assert_allclose(distance.std(), deviation, rtol=errors(N) + 0.01)
+        np.testing.assert_allclose(distance.mean(), height, atol=4 * deviation / np.sqrt(N) + 1e-3)
+
+
+def test_the_standard_atmosphere():
+    """ISO 2533:1975: 89874.6 Pa at 1000 m and 54019.9 Pa at 5000 m of geopotential altitude."""
+    with jax.enable_x64(True):
+        pressure = pressure_at(np.array([0.0, 1000.0, 5000.0]))
+        np.testing.assert_allclose(pressure, [101325, 89874.6, 54019.9], atol=0.1)
+        np.testing.assert_allclose(altitude_of(pressure), [0, 1000, 5000], atol=1e-9)
+
+
+def test_barometer_has_its_errors():
+    plugin = sensors.Barometer(noise=2.0, altitude=400.0, freq=100)
+    sim = build(plugin, n_worlds=N, pos=[0, 0, 10.0])
+    sim.step()
+    pressure, height = read(sim, "barometer.pressure"), read(sim, "barometer.height")
+    np.testing.assert_allclose(pressure.std(), 2.0, rtol=errors(N))
+    np.testing.assert_allclose(pressure.mean(), pressure_at(410.0), atol=4 * 2.0 / np.sqrt(N) + 0.02)
+    slope = 96500 * 9.80665 * 0.0289644 / 8.31432 / (288.15 - 2.665)  # p g M / (R T) at 410 m, Pa/m
+    np.testing.assert_allclose((height - 10).std(), 2.0 / slope, rtol=errors(N) + 0.01)
+
+    drifting = sensors.Barometer(drift=5.0, drift_time=0.1, offset_spread=20.0, freq=100)
+    sim = build(drifting, n_worlds=N)
+    found = []
+    for n_steps in (1, 50):
+        sim.step(n_steps)
+        found.append(read(sim, "barometer.pressure")[:, 0, 0])
+    np.testing.assert_allclose(found[0].std(), np.hypot(5, 20), rtol=errors(N))
+    np.testing.assert_allclose((found[1] - found[0]).std(), 5 * np.sqrt(2 - 2 * np.exp(-1)), rtol=errors(N) + 0.01)
+
+
+def test_magnetometer_by_hand():
+    """Yaw 90 degrees: north is on the right of a drone that looks west, at -y; here the drone's x axis looks north."""
+    quat = np.float32([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    sim = build(sensors.Magnetometer((0, 2e-5, -4e-5), sensors.Triad(bias=(0, 1e-6, 0))), quat=quat)
+    sim.step()
+    np.testing.assert_allclose(read(sim, "magnetometer.field")[0, 0], [2e-5, 1e-6, -4e-5], atol=1e-10)
+
+
+def test_telemetry_and_battery():
+    sim = build(Battery(0.25, 0.1), sensors.RotorSpeeds.telemetry(6), sensors.BatteryVoltage(0.02, 0.01), n_worlds=N)
+    speed = np.broadcast_to(hover_rotor_state(sim.data), (N, 1, 4))
+    sim.data = with_states(sim.data, rotor_vel=speed)
+    sim.rotor_vel_control(speed)
+    sim.step()
+    speeds = read(sim, "rotor_speeds.speed")
+    np.testing.assert_allclose(speeds * 6 / 100, np.round(speeds * 6 / 100), atol=1e-3)
+    assert np.abs(speeds - np.asarray(sim.data.states.rotor_vel)).max() <= 100 / 12 + 1e-2
+    voltage = read(sim, "battery_voltage.voltage")
+    np.testing.assert_allclose(voltage.mean(), sim.data.plugins["battery"].voltage[0, 0, 0], atol=4 * 0.02 / np.sqrt(N))
+    np.testing.assert_allclose(voltage.std(), np.sqrt(0.02**2 + 0.01**2 / 12), rtol=errors(N))
+
+
+def test_multi_ranger_measures_what_the_range_finder_does():
+    sim = build(RangeFinder(max_range=2.0), sensors.MultiRanger(0.05, freq=None), n_worlds=N)
+    sim.step()
+    distance = read(sim, "multi_ranger.distance")[:, 0]
+    np.testing.assert_array_equal(distance[:, :5], 2.0)
+    np.testing.assert_allclose(distance[:, 5].mean(), 1.0, atol=4 * 0.05 / np.sqrt(N) + 1e-3)
+    np.testing.assert_allclose(distance[:, 5].std(), 0.05, rtol=errors(N))
+
+
+@pytest.mark.parametrize("plugin, message", [
+    (sensors.BatteryVoltage(), "expected a Battery"),
+    (sensors.MultiRanger(), "expected a RangeFinder"),
+    (sensors.RotorSpeeds(n_rotors=6), "expected n_rotors = 4"),
+    (sensors.MotionCapture(-1.0), "expected noise"),
+    (sensors.MotionCapture(freq=333), "expected freq of 'motion_capture'"),
+    (sensors.OpticalFlow(resolution=0.0), "expected resolution"),
+    (sensors.TimeOfFlight(max_range=0.0), "expected max_range"),
+    (sensors.Barometer(altitude=2e4), "expected altitude"),
+    (sensors.Magnetometer(1e-5), "expected field"),
+])  # fmt: skip
+def test_law_09_wrong_settings(plugin, message):
+    with pytest.raises(ConfigError, match=message):
+        build(plugin)
+
+
+def test_a_multi_ranger_has_the_rays_of_its_range_finder():
+    with pytest.raises(ConfigError, match="expected n_rays = 1"):
+        build(RangeFinder(directions=[(0, 0, 1)]), sensors.MultiRanger())
+
+
+def test_observations_of_measured_states():
+    """Slung loads, say, are observed relative to the measured position; measurements themselves stay as they are."""
+    sim = build(sensors.MotionCapture(pos=(0, 0, 0.5)), RangeFinder(directions=[(0, 0, -1)]))
+    sim.add(Relative())
+    sim.step()
+    true, seen = (sim.plugins.observations(sim.data, measured=m) for m in (False, True))
+    np.testing.assert_allclose(
+        np.asarray(seen["relative.height"]) - np.asarray(true["relative.height"]), 0.5, atol=1e-6
+    )
+    np.testing.assert_array_equal(seen["motion_capture.pos"], true["motion_capture.pos"])
+
+
+class Relative(Plugin):
+    """Observe the height of the drone."""
+
+    name: str = "relative"
+
+    def observations(self, data):
+        return {"height": data.states.pos[2:]}
+
+
+def test_a_task_observes_measurements_by_one_argument():
+    """Positions are off by the tracked body's offset, rates by the bias of the gyroscope; the reward is not."""
+    on = [sensors.MotionCapture(pos=(0, 0, 0.3)), sensors.IMU(gyro=sensors.Triad(bias=0.2))]
+    envs = [make("hover", n_worlds=3, sensors=s) for s in ((), on)]
+    states = [env.reset(jax.random.key(1)) for env in envs]
+    action = np.zeros(envs[0].sim.data.states.pos.shape[:2] + (4,), np.float32)
+    for _ in range(2):
+        truth, measured = (np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.obs)]) for s in states)
+        assert truth.shape == measured.shape
+        assert 0.05 < np.abs(truth - measured).max() < 1.0
+        np.testing.assert_array_equal(states[0].reward, states[1].reward)
+        states = [env.step(state, action) for env, state in zip(envs, states, strict=True)]
+    assert "imu" in str(envs[1].explain())
+
+
+def test_law_09_measured_needs_a_sensor():
+    env = make("hover")
+    with pytest.raises(ConfigError, match="expected a sensor of states"):
+        DroneEnv(env.sim, env.task, measured=True)
