@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
-from typing import Any, Literal, Self, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -76,6 +77,59 @@ class PyTree:
     def replace(self, **changes: Any) -> Self:
         """Return a copy with the given fields replaced."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
+
+    if not TYPE_CHECKING:  # a type checker would take any name for a field
+
+        def __getattr__(self, name: str) -> Any:
+            """Return a field of a record from ``lazy`` when it is first read."""
+            own = self.__dict__
+            template = own.get(_TEMPLATE)
+            if template is None or name not in template.__dict__:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+            return own.setdefault(name, _lazy_child(template.__dict__[name], own[_READ]))
+
+        def __getstate__(self) -> dict[str, Any]:
+            """Return all fields, for copies and pickles."""
+            return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+
+_TEMPLATE, _READ = "_template", "_read"
+"""Attributes of a record from ``lazy``."""
+
+
+def lazy(template: T, read: Callable[[Any], Any]) -> T:
+    """Return the record whose leaves are ``read(x)`` for the leaves of a template, each made when it is first read.
+
+    It is a record like any other: JAX, ``replace`` and ``copy`` read all fields.
+
+    Args:
+        template: A record of the same structure.
+        read: Returns a leaf. Two threads that read a field at once may both call it.
+    """
+    record, values = object.__new__(type(template)), template.__dict__
+    own = record.__dict__
+    own[_TEMPLATE], own[_READ] = template, read
+    for name, is_static in _present_fields(type(template)):
+        own[name] = values[name] if is_static else _lazy_child(values[name], read)
+    return record
+
+
+def _lazy_child(x: Any, read: Callable[[Any], Any]) -> Any:
+    if isinstance(x, PyTree):
+        return lazy(x, read)
+    if isinstance(x, dict):
+        return {k: _lazy_child(v, read) for k, v in x.items()}
+    return read(x) if jax.tree_util.all_leaves([x]) else jax.tree.map(read, x)
+
+
+@functools.cache
+def _present_fields(cls: Any) -> list[tuple[str, bool]]:
+    """Return the fields that a lazy record has from the start, and which of them are static.
+
+    A field with a default is an attribute of the class, so it never seems to be missing.
+    """
+    fields = [(field.name, bool(field.metadata.get("static"))) for field in dataclasses.fields(cls)]
+    return [(name, is_static) for name, is_static in fields if is_static or hasattr(cls, name)]
 
 
 class Members(PyTree):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim import jaxcompat
 from crazysim.control import COMMAND_FIELDS, Control, Setpoint
@@ -53,14 +53,16 @@ def state_control(
     Raises:
         ValueError: Wrong shape, type or command level, a NaN or infinite command, or both forms at once.
     """
-    return stage_command(
-        data, *check_setpoint(data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward)
+    command, feedforward = check_setpoint(
+        data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward
     )
+    feedforward = None if feedforward is None else placed(data, feedforward)
+    return stage_command(data, placed(data, command), feedforward)
 
 
 def check_setpoint(
     data: SimData, controls: ArrayLike | None, check_finite: bool, *, feedforward: ArrayLike | None, **parts: Any
-) -> tuple[Array, Array | None]:
+) -> tuple[Array | NDArray, Array | NDArray | None]:
     """Return a full-state setpoint and its feedforward as arrays of the state's dtype, for ``stage_command``.
 
     Arguments and errors as in ``state_control``; of the data, shapes and types are enough.
@@ -129,7 +131,7 @@ def attitude_control(data: SimData, controls: ArrayLike, check_finite: bool = Fa
 
     Arguments and errors as in ``state_control``.
     """
-    return stage_command(data, check_command(data, Control.attitude, controls, check_finite))
+    return stage_command(data, placed(data, check_command(data, Control.attitude, controls, check_finite)))
 
 
 def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
@@ -137,7 +139,7 @@ def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = F
 
     Arguments and errors as in ``state_control``.
     """
-    return stage_command(data, check_command(data, Control.body_rate, controls, check_finite))
+    return stage_command(data, placed(data, check_command(data, Control.body_rate, controls, check_finite)))
 
 
 def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
@@ -145,7 +147,7 @@ def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool 
 
     Arguments and errors as in ``state_control``.
     """
-    return stage_command(data, check_command(data, Control.force_torque, controls, check_finite))
+    return stage_command(data, placed(data, check_command(data, Control.force_torque, controls, check_finite)))
 
 
 def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
@@ -153,7 +155,7 @@ def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = F
 
     Arguments and errors as in ``state_control``.
     """
-    return stage_command(data, check_command(data, Control.rotor_vel, controls, check_finite))
+    return stage_command(data, placed(data, check_command(data, Control.rotor_vel, controls, check_finite)))
 
 
 def stage_command(data: SimData, command: Array, feedforward: Array | None = None) -> SimData:
@@ -188,9 +190,17 @@ def staged_fields(data: SimData, command: Array, feedforward: Array | None = Non
     }
 
 
+def feedforward_of(command: Any) -> Any:
+    """Return the feedforward of a setpoint that is given without one: its yaw rate and zeros. (..., 8)"""
+    if isinstance(command, np.ndarray):
+        feedforward = np.zeros((*command.shape[:-1], 8), command.dtype)
+        feedforward[..., 6] = command[..., 15]
+        return feedforward
+    return _feedforward_of(command)
+
+
 @jax.jit
-def feedforward_of(command: Array) -> Array:
-    """Return the feedforward of a setpoint that is given without one. (..., 8)"""
+def _feedforward_of(command: Array) -> Array:
     return Setpoint.of_command(command).feedforward()
 
 
@@ -206,8 +216,10 @@ def controllable(data: SimData) -> Array:
     return jnp.ones_like(data.core.steps, bool) if mask is None else mask
 
 
-def check_command(data: SimData, control: Control, command: ArrayLike, check_finite: bool = False) -> Array:
+def check_command(data: SimData, control: Control, command: ArrayLike, check_finite: bool = False) -> Array | NDArray:
     """Return a command as an array of the state's dtype; of the data, shapes and types are enough.
+
+    One of the host is a copy of its caller's; it is still on the host, and ``placed`` moves it.
 
     Raises:
         ValueError: Wrong shape, type or command level, or a NaN or infinite command.
@@ -224,7 +236,7 @@ def check_command(data: SimData, control: Control, command: ArrayLike, check_fin
 
 def _as_command(
     data: SimData, name: str, shape: tuple[int, ...], fields: str, command: ArrayLike, check_finite: bool
-) -> Array:
+) -> Array | NDArray:
     """Return a command of some shape as an array of the state's dtype, as ``check_command``."""
     on_host = not isinstance(command, jax.Array)
     try:
@@ -254,10 +266,14 @@ def _as_command(
             f"{name} command is NaN or infinite in world(s) {worlds.tolist()}, as {dtype}, which would last "
             f"until their next reset; check the computation that returns it"
         )
-    inside_jit = is_tracer or isinstance(data.states.pos, jax.core.Tracer)
-    if inside_jit:
-        return jnp.asarray(array)
+    return array
+
+
+def placed(data: SimData, command: Array | NDArray) -> Array:
+    """Return a command that was checked as an array beside the data, of which shapes and devices are enough."""
+    if isinstance(command, jax.core.Tracer) or isinstance(data.states.pos, jax.core.Tracer):
+        return jnp.asarray(command)
     sharding = data.states.pos.sharding
-    if isinstance(array, np.ndarray):
-        return jaxcompat.put_own(array, sharding)
-    return array if array.committed and array.sharding == sharding else jax.device_put(array, sharding)
+    if isinstance(command, np.ndarray):
+        return jaxcompat.put_own(command, sharding)
+    return command if command.committed and command.sharding == sharding else jax.device_put(command, sharding)

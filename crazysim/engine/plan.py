@@ -28,6 +28,7 @@ from crazysim.core.stage import Stage, with_leaves
 from crazysim.core.stages import watched
 from crazysim.engine.backends import Build, Run, fused, interpret, kernel, lanes, plain
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
+from crazysim.engine.host_call import HostCall, is_possible
 from crazysim.engine.ir.program import Program, Zeros
 from crazysim.engine.lowering.groups import Group, independent
 from crazysim.engine.lowering.relative import on_data
@@ -70,6 +71,8 @@ class Plan(NamedTuple):
     """The same for a number of steps that is a Python number, which can be differentiated in reverse."""
     direct: Callable[..., Any] | None = None
     """The step in NumPy, for arguments that are not traced; None for other engines."""
+    host_call: HostCall | None = None
+    """The step without XLA, for a simulation that holds its data between calls; None where it is not possible."""
 
     @property
     def synced(self) -> int:
@@ -167,6 +170,12 @@ class Planner(NamedTuple):
         read = tuple(i for program in programs for i in (*program.read, *_needed(program)))
         run, written = _together(groups, programs, runs)
         plan = self._wrap(engine, why, data, programs, read, written, run, len(programs[0].leaves))
+        kernels = [run.kernels for run in runs if isinstance(run, fused.FusedRun) and run.kernels is not None]
+        on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
+        if on_host and is_possible(kernels):
+            owned = [group.owned for group in groups]
+            call = HostCall(kernels, owned, jax.tree.leaves(data), int(plan.numbers.core.nonfinite))
+            plan = plan._replace(host_call=call)
         return plan, problems
 
     def _built(self, engine: str, programs: Sequence[Program]) -> list[Run]:

@@ -13,16 +13,17 @@ from jax.sharding import Mesh
 from crazysim import jaxcompat
 from crazysim.control import Control
 from crazysim.core.data import MAX_STEPS, SimData
-from crazysim.core.functional import staged_fields
+from crazysim.core.functional import placed, staged_fields
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS, Location, locate
 from crazysim.core.stage import Axes, as_stages, with_leaves
 from crazysim.engine.backends import fused
 from crazysim.engine.flat import PackCache, ZerosCache
+from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.ir.program import Zeros
 from crazysim.engine.plan import ENGINES, Plan, Planner
 from crazysim.errors import ConfigError
-from crazysim.pytree import check_axes
+from crazysim.pytree import check_axes, lazy
 
 
 class FlatData:
@@ -30,7 +31,7 @@ class FlatData:
 
     __slots__ = ("_record", "leaves", "packed", "plan", "treedef")
 
-    def __init__(self, leaves: list[Any], treedef: Any, plan: Plan, packed: Array | None):
+    def __init__(self, leaves: list[Any] | HostLeaves, treedef: Any, plan: Plan, packed: Array | None):
         """Hold the leaves, and the array of those that are packed."""
         self.leaves, self.treedef, self.plan, self.packed = leaves, treedef, plan, packed
         self._record: SimData | None = None
@@ -40,19 +41,28 @@ class FlatData:
         return data is self._record
 
     def data(self) -> SimData:
-        """Return the data as a record, which is put together once."""
+        """Return the data as a record, which is made once, and whose fields are made when they are read."""
         record = self._record
         if record is None:
-            record = self._record = self.treedef.unflatten(self.leaves)
+            record = self._record = lazy(self.plan.numbers, self.leaves.__getitem__)
         return record
 
-    def staged(self, command: Array, feedforward: Array | None = None) -> FlatData:
-        """Return the data with a command that was checked, as ``crazysim.core.functional.stage_command`` does."""
+    def staged(self, like: SimData, command: Any, feedforward: Any = None) -> FlatData:
+        """Return the data with a command that was checked, as ``crazysim.core.functional.stage_command`` does.
+
+        Args:
+            like: The data, or its shapes and devices.
+            command: Command, which nothing writes into any more. (n_worlds, n_drones, k)
+            feedforward: Feedforward of a setpoint; None for that of ``stage_command``.
+        """
         controls = self.plan.numbers.controls
         level: Any = controls if controls.mode == Control.rotor_vel else getattr(controls, controls.mode.value)
-        leaves = list(self.leaves)
-        for field, x in staged_fields(self.plan.numbers, command, feedforward).items():
-            leaves[getattr(level, field)] = x
+        fields = staged_fields(self.plan.numbers, command, feedforward)
+        numbers = [getattr(level, field) for field in fields]
+        if isinstance(self.leaves, HostLeaves):
+            leaves: Any = self.leaves.replaced(numbers, fields.values())
+        else:
+            leaves = with_leaves(self.leaves, numbers, [placed(like, x) for x in fields.values()])
         return FlatData(leaves, self.treedef, self.plan, self.packed)
 
     def inputs(self) -> list[Any]:
@@ -125,7 +135,8 @@ class Step:
         """
         if isinstance(n_steps, (int, np.integer)) and n_steps > MAX_STEPS:
             raise ConfigError(f"expected at most {MAX_STEPS} steps in a call, got {n_steps}. Use several calls.")
-        return self.advance(self.flatten(data, zeros, n_steps), n_steps).data()
+        after = self.advance(self.flatten(data, zeros, n_steps), n_steps)
+        return after.treedef.unflatten(after.leaves)
 
     def flatten(self, data: SimData, zeros: Zeros | None = None, n_steps: int | Array | None = None) -> FlatData:
         """Return the data flattened for ``advance``.
@@ -146,9 +157,19 @@ class Step:
         if plan.direct is not None and not any(isinstance(x, jax.core.Tracer) for x in (*inputs, n_steps)):
             step = plan.direct
         out = step(inputs, n_steps)
-        leaves = with_leaves(flat.leaves, plan.written, out)
+        leaves = with_leaves(flat.leaves, plan.written, out)  # type: ignore[arg-type]  # a list, but for a host call
         leaves[plan.synced] = self._false(leaves[plan.synced])
         return FlatData(leaves, flat.treedef, plan, flat.packed)
+
+    def advance_on_host(self, flat: FlatData, n_steps: int) -> FlatData:
+        """Return the same without XLA, for data whose plan has a ``host_call``; it waits until the steps are taken."""
+        plan, leaves = flat.plan, flat.leaves
+        call: Any = plan.host_call
+        if not isinstance(leaves, HostLeaves):
+            leaves = call.hold(leaves, flat.packed, leaves[plan.synced].sharding)
+        after = call(leaves, n_steps)
+        after.items[plan.synced] = self._false(after.items[plan.synced])
+        return FlatData(after, flat.treedef, plan, flat.packed)
 
     def plan(self, data: SimData, zeros: Zeros | None = None) -> Plan:
         """Return how this data is stepped."""
@@ -173,7 +194,8 @@ class Step:
     def _cache_size(self) -> int:
         """Return the number of compiled programs, as for a jitted function; the tests of law 6 count them."""
         count = jaxcompat.n_compilations
-        return sum(count(plan.dynamic) + count(plan.static) for plan in self._plans.values())
+        called = [plan.host_call is not None and plan.host_call.used for plan in self._plans.values()]
+        return sum(called) + sum(count(plan.dynamic) + count(plan.static) for plan in self._plans.values())
 
     def _packed(self, plan: Plan, leaves: list[Any]) -> Array | None:
         return self._pack([leaves[i] for i in plan.packed]) if plan.packed else None

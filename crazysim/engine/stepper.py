@@ -11,7 +11,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from crazysim.core.data import MAX_STEPS, SimData
-from crazysim.core.functional import stage_command
+from crazysim.core.functional import placed, stage_command
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import put, shard
 from crazysim.engine.plan import Plan
@@ -68,17 +68,21 @@ class Stepper:
             self._like = flat.plan, jax.tree.map(_without_values, data)
         return self._like[1]
 
-    def stage(self, command: Array, feedforward: Array | None = None) -> None:
+    def stage(self, command: Any, feedforward: Any = None) -> None:
         """Stage a command that was checked with ``like``; flattened data stays flattened.
 
         Args:
-            command: Command in the units of the command level. (n_worlds, n_drones, k)
+            command: Command in the units of the command level, which nothing writes into any more.
+                (n_worlds, n_drones, k)
             feedforward: Feedforward of a setpoint; None for that of ``crazysim.core.functional.stage_command``.
         """
-        if isinstance(self._data, FlatData):
-            self._data = self._data.staged(command, feedforward)
-        else:
-            self._data = stage_command(self.data, command, feedforward)
+        traced = isinstance(command, jax.core.Tracer) or isinstance(feedforward, jax.core.Tracer)
+        if isinstance(self._data, FlatData) and not traced:
+            self._data = self._data.staged(self.like, command, feedforward)
+            return
+        data = self.data
+        feedforward = None if feedforward is None else placed(data, feedforward)
+        self._data = stage_command(data, placed(data, command), feedforward)
 
     def assign(self, data: SimData) -> None:
         """Take data from outside: put it on the device, and clear ``core.mjx_synced``."""
@@ -111,8 +115,11 @@ class Stepper:
         """Advance the data; any number of steps uses the same compilation."""
         self.count(n_steps)
         flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
-        self._data = after = self.step.advance(flat, self._as_array(n_steps))
-        self._unsynced = after.leaves[flat.plan.synced]
+        if flat.plan.host_call is None:
+            after = self.step.advance(flat, self._as_array(n_steps))
+        else:
+            after = self.step.advance_on_host(flat, n_steps)
+        self._data, self._unsynced = after, after.leaves[flat.plan.synced]
 
     def count(self, n_steps: int, times: int = 1) -> None:
         """Count steps that are about to be taken.

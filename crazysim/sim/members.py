@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -125,7 +126,8 @@ class Member:
     def _fields(self) -> list[str]:
         record = self._record()
         shared = ("population", "n_members", "member_id")
-        return [name for name, x in vars(record).items() if name not in shared and getattr(x, "ndim", 0) >= 2]
+        names = [field.name for field in dataclasses.fields(record) if field.name not in shared]  # type: ignore[arg-type]
+        return [name for name in names if getattr(getattr(record, name), "ndim", 0) >= 2]
 
     def __repr__(self) -> str:
         """Return name, population and index."""

@@ -64,7 +64,7 @@ class Kernels:
     def _compiled(self, location: Location) -> Launch:
         if location.platform == "gpu":
             return cuda.compiled(kernel.write(self.program, "cuda"), location.devices)
-        return native.compiled(kernel.write(self.program, "host"))
+        return native.HostLaunch(kernel.write(self.program, "host"))
 
     def results(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
         """Return shapes and types of what the kernel writes: leaves, and flags of drones if it checks."""
@@ -99,7 +99,19 @@ def missing(platform: str) -> str | None:
     return None if native.compiler() else "no C++ compiler was found (g++, clang++, or the variable CXX)"
 
 
-def build(program: Program, location: Location) -> Run:
+class FusedRun:
+    """A ``Run``, and the kernel that it calls."""
+
+    def __init__(self, run: Run, kernels: Kernels | None):
+        """Take the function, and its kernel; None if there are several."""
+        self._run, self.kernels = run, kernels
+
+    def __call__(self, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+        """Return the written leaves some steps later, and the worlds that are flagged."""
+        return self._run(leaves, n_steps)
+
+
+def build(program: Program, location: Location) -> FusedRun:
     """Compile a program to kernels, and return the function that runs them.
 
     Raises:
@@ -110,8 +122,9 @@ def build(program: Program, location: Location) -> Run:
     def compiled(part: Program) -> Kernels:
         return Kernels(part, location)
 
-    run = _one_kernel(compiled(program)) if program.fused else _split(program, compiled)
-    return differentiable(_over_batches(program, run), lanes.build(program, location))
+    kernels = compiled(program) if program.fused else None
+    run = _split(program, compiled) if kernels is None else _one_kernel(kernels)
+    return FusedRun(differentiable(_over_batches(program, run), lanes.build(program, location)), kernels)
 
 
 def differentiable(run: CountedRun, on_lanes: Run) -> Run:

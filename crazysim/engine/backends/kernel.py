@@ -332,8 +332,7 @@ def _host(pointers: Sequence[str], body: str, in_memory: bool) -> str:
     arguments = ", ".join(pointers)
     kinds = [p.split("*")[0].removeprefix("const ") for p in pointers]
     n_in = sum(p.startswith("const") for p in pointers)
-    buffers = [f"({kind}*)in[{k + 2}]->data" if k < n_in else f"({kind}*)out[{k - n_in}]->data"
-               for k, kind in enumerate(kinds)]  # fmt: skip
+    buffers = [f"({kind}*)in[{k}]" if k < n_in else f"({kind}*)out[{k - n_in}]" for k, kind in enumerate(kinds)]
     call = f"n_lanes, n_steps, {', '.join(buffers)}"
     sizes = "int64_t n_lanes, int n_steps"
     if in_memory:
@@ -351,9 +350,7 @@ def _host(pointers: Sequence[str], body: str, in_memory: bool) -> str:
 {block}{body}
 }}
 
-static void advance(XLA_FFI_Buffer** in, XLA_FFI_Buffer** out) {{
-  const int64_t n_lanes = *(int*)in[0]->data;
-  const int n_steps = *(int*)in[1]->data;
+static __attribute__((noinline)) void advance(int64_t n_lanes, int n_steps, void** in, void** out) {{
   const auto run = [=](int64_t begin, int64_t end) {{
 {each}
   }};

@@ -65,19 +65,32 @@ Launch = Callable[[int, Array, Sequence[Array], Sequence[Any]], list[Array]]
 """Number of lanes, number of steps (1,), inputs, and shapes and types of outputs, to outputs."""
 
 
-def compiled(kernel: Kernel) -> Launch:
-    """Compile a kernel, and return the function that calls it.
+class HostLaunch:
+    """A compiled kernel: called, it is an operation of a traced function."""
 
-    Raises:
-        KernelError: If the compiler refuses it or takes too long, with its message.
-    """
-    name = target(kernel)
+    def __init__(self, kernel: Kernel):
+        """Compile a kernel.
 
-    def launch(n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
-        run = jax.ffi.ffi_call(name, list(outputs), input_output_aliases=kernel.aliases())
+        Raises:
+            KernelError: If the compiler refuses it or takes too long, with its message.
+        """
+        self._name, self._aliases = target(kernel), kernel.aliases()
+
+    def __call__(self, n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
+        """Return what the kernel writes."""
+        run = jax.ffi.ffi_call(self._name, list(outputs), input_output_aliases=self._aliases)
         return list(run(np.asarray([n_lanes], np.int32), count, *inputs))
 
-    return launch
+    def on_memory(self) -> Callable[[int, int, Any, int], None]:
+        """Return the kernel as a function on memory, without XLA, which waits until it is done.
+
+        It takes the number of lanes, that of steps, the addresses of inputs and outputs (a ``ctypes`` array), and the
+        number of inputs.
+        """
+        call = _LOADED[self._name].crazysim_call
+        call.restype = None
+        call.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_int]
+        return call
 
 
 @functools.cache
@@ -211,7 +224,7 @@ def _loaded(path: Path) -> ctypes.CDLL | None:
         library = ctypes.CDLL(str(path))
     except OSError:
         return None
-    return library if hasattr(library, "crazysim_advance") else None
+    return library if hasattr(library, "crazysim_call") else None
 
 
 def _compile(words: Sequence[str], key: str, source: str, place: Path) -> Path:

@@ -40,6 +40,8 @@ def explain(step: Step, data: SimData, measure: bool = False) -> str:
     if plan.engine == "fused":
         where = plan.location.platform, plan.location.devices
         lines += dict.fromkeys(line for program in plan.programs for line in fused.describe(program, *where))
+        how = "sim.step calls it without XLA" if plan.host_call is not None else "sim.step is one compiled call"
+        lines[-1] += f"; {how}, and reads make only the fields that are read"
     return "\n".join(lines)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -31,7 +32,8 @@ class Randomize(Wrapper):
             ConfigError: If the dynamics have no such parameter.
         """
         super().__init__(env)
-        known = vars(env.sim.data.params)
+        params_now = env.sim.data.params
+        known = {field.name: getattr(params_now, field.name) for field in dataclasses.fields(params_now)}
         if missing := [name for name in params if known.get(name) is None]:
             raise ConfigError(
                 f"expected parameters of {env.sim.dynamics.value}, {', '.join(known)}, got {', '.join(missing)}"

@@ -1,0 +1,226 @@
+"""Steps on the host without XLA: compiled kernels are called on the memory of arrays.
+
+A call of a compiled function of JAX takes some 30 us, most of it for its operands and results. A loop that commands,
+steps and reads needs few of them as arrays of JAX, so those are made when they are read.
+
+Nothing that a kernel reads or has written changes afterwards. It reads arrays of JAX through views of NumPy, and as
+long as there is a view JAX copies a buffer that it would otherwise reuse for a donated array; commands, which are
+copies; and results of the call before. It writes into new memory, which nothing writes into again.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import math
+import struct
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim import jaxcompat
+from crazysim.engine.backends.fused import Kernels
+
+ALIGNMENT = 64
+"""Alignment of memory that JAX takes over without a copy, bytes."""
+SMALL = 1 << 16
+"""Bytes up to which all results of a call share one piece of memory."""
+
+
+class HostLeaves:
+    """Leaves of a simulation at one moment: arrays of JAX, commands of the host, or results of a kernel.
+
+    An index gives a leaf as an array of JAX, which is made once.
+    """
+
+    __slots__ = ("_made", "_sharding", "_views", "addresses", "items")
+
+    def __init__(self, items: list[Any], addresses: list[int], views: Any, sharding: Any):
+        """Hold leaves.
+
+        Args:
+            items: Arrays of JAX or NumPy, and for each leaf that the last call wrote its ``Results``.
+            addresses: Address of each leaf that kernels read.
+            views: Whatever keeps the memory of arrays of JAX.
+            sharding: Device that arrays of JAX are made on.
+        """
+        self.items, self.addresses, self._views, self._sharding = items, addresses, views, sharding
+        self._made: dict[int, Array] = {}
+
+    def __getitem__(self, i: int) -> Array:
+        """Return a leaf as an array of JAX."""
+        x = self.items[i]
+        if isinstance(x, jax.Array):
+            return x
+        if i not in self._made:
+            self._made.setdefault(i, jaxcompat.put_own(self.array(i), self._sharding))  # another thread may read it too
+        return self._made[i]
+
+    def array(self, i: int) -> NDArray:
+        """Return a leaf as an array of NumPy, which must not be written into."""
+        x = self.items[i]
+        return x.array(i) if isinstance(x, Results) else np.asarray(x)
+
+    def replaced(self, numbers: Iterable[int], arrays: Iterable[Any]) -> HostLeaves:
+        """Return leaves of which some are replaced by arrays that nothing writes into any more."""
+        arrays = [np.ascontiguousarray(x) for x in arrays]
+        return self.changed(numbers, arrays, [x.ctypes.data for x in arrays])
+
+    def changed(self, numbers: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
+        """Return leaves of which some are replaced."""
+        new = HostLeaves(list(self.items), list(self.addresses), self._views, self._sharding)
+        for i, x, address in zip(numbers, items, addresses, strict=True):
+            new.items[i], new.addresses[i] = x, address
+        return new
+
+
+class _Place(NamedTuple):
+    """Place of an array in the memory of a call."""
+
+    piece: int
+    offset: int
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+class _Layout:
+    """Pieces of memory that a call writes, and the places of its results in them."""
+
+    def __init__(self, results: Sequence[tuple[Any, tuple[int, ...], np.dtype]]):
+        self.places: list[_Place] = []
+        self.sizes: list[int] = []
+        rounded = [-(-math.prod(shape) * dtype.itemsize // ALIGNMENT) * ALIGNMENT for _, shape, dtype in results]
+        self.shared = sum(rounded) <= SMALL
+        for (_, shape, dtype), size in zip(results, rounded, strict=True):
+            if self.shared and self.sizes:
+                self.places.append(_Place(0, self.sizes[0], shape, dtype))
+                self.sizes[0] += size
+            else:
+                self.places.append(_Place(len(self.sizes), 0, shape, dtype))
+                self.sizes.append(size)
+        self.by_key = dict(zip((key for key, _, _ in results), self.places, strict=True))
+
+
+class Results:
+    """Arrays that one call wrote."""
+
+    __slots__ = ("_layout", "_memory", "_starts", "addresses")
+
+    def __init__(self, layout: _Layout):
+        """Allocate their memory."""
+        self._layout = layout
+        self._memory = [np.empty(size + ALIGNMENT, np.uint8) for size in layout.sizes]
+        begins = [ctypes.addressof(ctypes.c_char.from_buffer(x)) for x in self._memory]  # type: ignore[arg-type]
+        self._starts = [-begin % ALIGNMENT for begin in begins]
+        first = [begin + start for begin, start in zip(begins, self._starts, strict=True)]
+        self.addresses = [first[place.piece] + place.offset for place in layout.places]
+
+    def array(self, key: Any) -> NDArray:
+        """Return one of them. Where several share memory it is a copy, so that who keeps it keeps it alone."""
+        piece, offset, shape, dtype = self._layout.by_key[key]
+        x = np.ndarray(shape, dtype, self._memory[piece], self._starts[piece] + offset)
+        return x.copy() if self._layout.shared else x
+
+
+class _Launch(NamedTuple):
+    """Call of one kernel."""
+
+    kernel: Any
+    """The kernel, from ``HostLaunch.on_memory``."""
+    n_lanes: int
+    """Number of drones or members in all worlds."""
+    inputs: tuple[int, ...]
+    """Leaves that it reads."""
+    outputs: slice
+    """Results that it writes, among those of all kernels."""
+    packed: struct.Struct
+    """Form of the addresses of both."""
+
+
+class HostCall:
+    """Steps of a plan, by one kernel of the host for each of its programs."""
+
+    def __init__(self, kernels: Sequence[Kernels], owned: Sequence[Any], leaves: Sequence[Any], nonfinite: int):
+        """Take the kernels.
+
+        Args:
+            kernels: Kernels of the programs, all of which can be called so (``is_possible``).
+            owned: Leaves whose new values are taken from each program; None for all.
+            leaves: Leaves of the data, for their shapes and types.
+            nonfinite: Leaf with the worlds that are flagged.
+        """
+        self.used = False
+        """True once it has been called."""
+        self._n_leaves, self._nonfinite = len(leaves), nonfinite
+        self._held: dict[int, tuple[Any, NDArray]] = {}
+        self._launches: list[_Launch] = []
+        results: list[tuple[Any, tuple[int, ...], np.dtype]] = []
+        n_worlds = leaves[nonfinite].shape[0]
+        for k, (kernel, own) in enumerate(zip(kernels, owned, strict=True)):
+            first, n_drones = len(results), kernel.program.n_drones
+            for i in kernel.outputs:
+                key = i if own is None or i in own else (k, i)
+                results.append((key, leaves[i].shape, np.dtype(leaves[i].dtype)))
+            results.append((("flags", k), (n_worlds, n_drones), np.dtype(bool)))
+            outputs = slice(first, len(results))
+            form = struct.Struct(f"{len(kernel.inputs) + len(results) - first}P")
+            self._launches.append(
+                _Launch(kernel.on("cpu").on_memory(), n_worlds * n_drones, kernel.inputs, outputs, form)
+            )
+        self._flags = [key for key, _, _ in results if isinstance(key, tuple) and key[0] == "flags"]
+        if self._flags == [("flags", 0)] and results[-1][1][1] == 1:  # they are the leaf
+            results[-1] = (nonfinite, *results[-1][1:])
+            self._flags = []
+        self._layout = _Layout(results)
+        written = [(i, k) for k, (i, _, _) in enumerate(results) if isinstance(i, int)]
+        self._written, self._positions = [i for i, _ in written], [k for _, k in written]
+        self._read = sorted({i for launch in self._launches for i in launch.inputs})
+
+    def hold(self, leaves: Sequence[Any], packed: Any, sharding: Any) -> HostLeaves:
+        """Return leaves that can be stepped.
+
+        Args:
+            leaves: Leaves of the data on the device.
+            packed: The packed leaf; None if there is none.
+            sharding: The device.
+        """
+        items = [*leaves, packed]
+        views = {i: self._view(i, items[i]) for i in self._read}
+        addresses = [0] * len(items)
+        for i, view in views.items():
+            addresses[i] = view.ctypes.data
+        return HostLeaves(items, addresses, views, sharding)
+
+    def _view(self, i: int, x: Any) -> NDArray:
+        """Return a view of an array of JAX once it is computed; that of the same array again costs nothing."""
+        held = self._held.get(i)
+        if held is None or held[0] is not x:
+            numbers = jax.random.key_data(x) if jaxcompat.is_key(x) else x
+            held = self._held[i] = x, np.ascontiguousarray(numbers)
+        return held[1]
+
+    def __call__(self, leaves: HostLeaves, n_steps: int) -> HostLeaves:
+        """Return the leaves some steps later."""
+        self.used = True
+        results, addresses = Results(self._layout), leaves.addresses
+        for kernel, n_lanes, inputs, outputs, packed in self._launches:
+            pointers = packed.pack(*[addresses[i] for i in inputs], *results.addresses[outputs])
+            kernel(n_lanes, n_steps, pointers, len(inputs))
+        new = [results.addresses[k] for k in self._positions]
+        after = leaves.changed(self._written, [results] * len(new), new)
+        if not self._flags:
+            return after
+        flagged = functools.reduce(np.logical_or, (results.array(k).any(axis=1, keepdims=True) for k in self._flags))
+        return after.replaced([self._nonfinite], [flagged])
+
+
+def is_possible(kernels: Sequence[Kernels]) -> bool:
+    """Return whether kernels can be called without XLA: each checks its results, and none writes random keys."""
+    return all(
+        kernel.program.check is not None and not any(jaxcompat.is_key(kernel.program.leaves[i]) for i in kernel.outputs)
+        for kernel in kernels
+    )

@@ -1,0 +1,162 @@
+"""Steps on the host without XLA: the numbers of the compiled step, from memory that nothing writes into again."""
+
+import copy
+import pickle
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import as_numbers, trees_equal
+
+from crazysim import Cars, Sim
+from crazysim.core.sharding import world_mesh
+from crazysim.engine.backends import native
+
+pytestmark = pytest.mark.skipif(native.compiler() is None, reason="needs a C++ compiler")
+
+COMMAND = np.full((3, 2, 4), 0.1)
+
+
+@pytest.fixture
+def sim():
+    sim = Sim(3, 2, control="attitude")
+    sim.attitude_control(COMMAND)
+    sim.step(2)
+    assert sim.step_fn.plan(sim.data).host_call.used
+    return sim
+
+
+def on_xla(sim, n):
+    """Return the data some steps later, by the compiled function."""
+    return sim.step_fn(sim.data, jnp.int32(n))
+
+
+@pytest.mark.parametrize("n_worlds", [3, 700], ids=["one piece of memory", "one for each array"])
+@pytest.mark.parametrize("n_drones", [1, 2])
+def test_it_gives_the_numbers_of_the_compiled_step(n_worlds, n_drones):
+    sim = Sim(n_worlds, n_drones, control="state")
+    for _ in range(3):
+        expected = on_xla(sim, 7)
+        sim.step(7)
+        assert trees_equal(sim.data, expected)
+
+
+def test_populations_that_do_not_depend_on_each_other_are_stepped_alike():
+    sim = Sim(3, 2)
+    sim.add(Cars(2))
+    sim.step(5)
+    plan = sim.step_fn.plan(sim.data)
+    assert len(plan.programs) == 2
+    assert plan.host_call.used
+    expected = on_xla(sim, 5)
+    sim.step(5)
+    assert trees_equal(sim.data, expected)
+
+
+def test_subnormal_numbers_are_zero_as_in_the_compiled_step(sim):
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(ang_vel=jnp.full_like(states.ang_vel, 1e-40)))
+    expected = on_xla(sim, 1)
+    sim.step()
+    assert trees_equal(sim.data, expected)
+    assert np.float32(1e-38) / np.float32(100) > 0  # and the caller's arithmetic is as it was
+
+
+def test_a_non_finite_drone_flags_its_world_alone(sim):
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(vel=states.vel.at[1, 1].set(jnp.nan)))
+    sim.step()
+    sim.step()
+    np.testing.assert_array_equal(sim.data.core.nonfinite[:, 0], [False, True, False])
+
+
+def test_what_is_read_late_is_what_it_was(sim):
+    """A record makes its fields when they are read; steps and commands since do not show in it."""
+    expected = [np.array(as_numbers(x)) for x in jax.tree.leaves(on_xla(sim, 3))]
+    sim.step(3)
+    unread, half = sim.data, sim.data.states
+    pos = half.pos
+    for k in range(4):
+        sim.attitude_control(COMMAND * (k + 2))
+        sim.step(3)
+        assert not np.array_equal(sim.data.states.pos, pos)
+    for x, y in zip(jax.tree.leaves(unread), expected, strict=True):
+        np.testing.assert_array_equal(as_numbers(x), y)
+    assert unread.states is half
+    assert half.pos is pos
+
+
+def test_leaves_are_made_once(sim):
+    assert sim.data is sim.data
+    assert sim.data.states.pos is sim.data.states.pos
+
+
+def test_a_record_that_was_not_read_can_be_copied(sim):
+    for copied in (copy.copy(sim.data), copy.deepcopy(sim.data.states), pickle.loads(pickle.dumps(sim.data.states))):
+        states = getattr(copied, "states", copied)
+        sim.step()
+        np.testing.assert_array_equal(states.quat.shape, (3, 2, 4))
+        assert not np.array_equal(states.pos, sim.data.states.pos)
+    with pytest.raises(AttributeError, match="no attribute 'position'"):
+        sim.data.states.position  # noqa: B018
+
+
+@pytest.mark.parametrize("field", ["states", "params", "controls"])
+def test_arrays_that_their_reader_donates_stay_those_of_the_simulation(sim, field):
+    twin = Sim(3, 2, control="attitude")
+    twin.attitude_control(COMMAND)
+    twin.step(2)
+    sim.step()
+    twin.step()
+    jax.jit(lambda x: jax.tree.map(lambda y: y * 0 + 7, x), donate_argnums=0)(getattr(sim.data, field))
+    sim.step(3)
+    twin.step(3)
+    assert trees_equal(sim.data.states, twin.data.states)
+
+
+def test_a_command_of_the_device_may_be_donated_later(sim):
+    command = jax.device_put(COMMAND.astype(np.float32), sim.device)
+    sim.attitude_control(command)
+    jax.jit(lambda x: x * 0 + 7, donate_argnums=0)(command)
+    expected = on_xla(sim, 3)
+    sim.step(3)
+    assert trees_equal(sim.data, expected)
+    np.testing.assert_array_equal(sim.data.controls.attitude.staged_cmd, COMMAND.astype(np.float32))
+
+
+def test_threads_read_whole_moments_while_another_steps(sim):
+    """Drones that climb alike have positions and step counts of one moment in every record."""
+    seen, done = [], threading.Event()
+
+    def read():
+        while not done.is_set():
+            data = sim.data
+            seen.append((int(data.core.steps[0, 0]), float(data.states.pos[0, 0, 2])))
+
+    threads = [threading.Thread(target=read) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    heights = {int(sim.data.core.steps[0, 0]): float(sim.data.states.pos[0, 0, 2])}
+    for _ in range(200):
+        sim.step()
+        heights[int(sim.data.core.steps[0, 0])] = float(sim.data.states.pos[0, 0, 2])
+    done.set()
+    for thread in threads:
+        thread.join()
+    assert len(seen) > 10
+    assert all(heights[steps] == height for steps, height in seen)
+
+
+def test_other_devices_and_engines_keep_the_compiled_step():
+    for sim in (Sim(2, engine="lanes"), Sim(2, mesh=world_mesh(jax.devices("cpu")[:2]))):
+        assert sim.step_fn.plan(sim.data).host_call is None
+        assert "without XLA" not in sim.explain()
+    device = jax.devices("cpu")[1]
+    sim = Sim(2, device=device)
+    sim.step()
+    assert sim.step_fn.plan(sim.data).host_call.used
+    assert "sim.step calls it without XLA" in sim.explain()
+    assert sim.data.states.pos.devices() == {device}
+    assert sim.data.states.pos.committed
