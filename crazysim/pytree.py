@@ -100,7 +100,8 @@ _TEMPLATE, _READ = "_template", "_read"
 def lazy(template: T, read: Callable[[Any], Any]) -> T:
     """Return the record whose leaves are ``read(x)`` for the leaves of a template, each made when it is first read.
 
-    It is a record like any other: JAX, ``replace`` and ``copy`` read all fields.
+    It is a record like any other: JAX, ``replace`` and ``copy`` read all fields. Only ``vars`` has no more than those
+    that were read before; ``dataclasses.fields`` has all.
 
     Args:
         template: A record of the same structure.
