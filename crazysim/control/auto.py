@@ -28,7 +28,7 @@ from crazysim.control.bandwidth import YAW, rotor_rate
 from crazysim.control.fitted import FittedAuto
 from crazysim.control.flatness import HORIZONTAL, NO_THRUST
 from crazysim.control.levels import Control
-from crazysim.control.position import PositionMemory, PositionParams, specific_force
+from crazysim.control.position import PositionMemory, PositionParams, specific_force, upright
 from crazysim.control.priority import prioritized_thrusts
 from crazysim.control.protocol import Controller
 from crazysim.control.rigid_body import RigidBodyParams, rigid_body
@@ -245,11 +245,11 @@ class Auto(Controller):
         drag = matvec(p.drag_matrix, matvec(to_body, s.vel)) / p.mass
         known = matvec(matrix, drag + rotation.along_z(thrust[..., 0] / p.mass[..., 0]))
         specific, memory = specific_force(s.pos, s.vel, known, setpoint, memory, self.freq, p.position)
-        specific = matvec(to_body, specific) - drag
+        up = matrix[..., 2, :]  # the world's z axis in the body frame
+        specific = upright(matvec(to_body, specific) - drag, up, setpoint, p.position)
 
         squared = dot(specific, specific)
         falls = squared < NO_THRUST**2
-        up = matrix[..., 2, :]  # the world's z axis in the body frame
         inverse = jnp.where(falls, 0.0, 1 / safe_sqrt(jnp.where(falls, 1.0, squared)))
         z = jnp.where(falls, up, specific * inverse)
         jerk = matvec(to_body, setpoint.jerk)

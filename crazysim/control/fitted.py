@@ -10,7 +10,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.levels import Control
-from crazysim.control.position import PositionMemory, PositionParams, specific_force
+from crazysim.control.position import PositionMemory, PositionParams, specific_force, upright
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
@@ -92,11 +92,12 @@ class FittedAuto(Controller):
             drag = matvec(model.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), s.vel))
         known = matvec(matrix, force + drag) / model.mass
         specific, memory = specific_force(s.pos, s.vel, known, command, memory, self.freq, p.position)  # type: ignore
-        specific = specific - matvec(matrix, drag) / model.mass
+        up = jnp.asarray([0.0, 0.0, 1.0], specific.dtype)
+        specific = upright(specific - matvec(matrix, drag) / model.mass, up, command, p.position)  # type: ignore
 
         ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
         later = specific + p.ahead[..., :1] * command.jerk + p.ahead[..., 1:] * command.snap
-        z = rotation.safe_normalize(later, jnp.asarray([0.0, 0.0, 1.0], specific.dtype))
+        z = rotation.safe_normalize(later, up)
         y = rotation.safe_normalize(cross(z, ahead), left)
         angles = p.angles * rotation.from_axes(cross(y, z), y, z)
         thrust = (model.mass * dot(specific, matrix[..., 2]) - model.acc_coef) / model.cmd_f_coef

@@ -22,6 +22,8 @@ TILT = 1.0
 """Largest horizontal acceleration by feedback over that of gravity, 1: a tilt of 45 degrees."""
 FALL = 0.5
 """Largest downward acceleration by feedback over that of gravity, 1: rotors keep half of their thrust to turn with."""
+UPRIGHT = 0.1
+"""Upward force of the rotors over the weight that keeps a falling drone upright, 1; idle rotors give twice that."""
 LEAST = 0.1
 """Least acceleration that the feedback may use over that of gravity, 1, for drones that can hardly lift themselves."""
 DISTURBANCE = 0.5
@@ -132,6 +134,24 @@ def specific_force(
     acc = _with_height(_within(acc[..., :2], p.acc_max[..., :1]), height)
     specific = setpoint.acc + acc - p.gravity_vec - disturbance
     return specific, PositionMemory(vel + (known + p.gravity_vec) / freq, disturbance)
+
+
+def upright(specific: Array, up: Array, setpoint: Setpoint, params: PositionParams) -> Array:
+    """Return the specific force of the rotors, raised so that it does not turn the drone on its back.
+
+    Where feedback, drag and estimates cancel the weight, as in a fall, the sum points anywhere. A small upward
+    force is kept, which most rotors give in any case. A setpoint that accelerates downward by more than gravity does
+    turn the drone over: what it needs beyond gravity lowers the limit twice.
+
+    Args:
+        specific: Specific force of the rotors, m/s^2. (..., 3)
+        up: The world's z axis in the frame of that force. (..., 3)
+        setpoint: Setpoint with the leading axes of the force.
+        params: Gains and limits, shared or with the leading axes of the force.
+    """
+    wanted = setpoint.acc[..., 2:] - params.gravity_vec[..., 2:]
+    lacking = -UPRIGHT * GRAVITY[2] + 2 * jnp.where(wanted < 0, wanted, 0.0) - dot(up, specific)
+    return specific + up * jnp.where(lacking > 0, lacking, 0.0)
 
 
 def _within(x: Array, limit: Array) -> Array:

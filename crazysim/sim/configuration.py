@@ -7,12 +7,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import Mesh
 
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import find_controller
 from crazysim.core.airframes import AirframeSource, is_list, load_airframes
-from crazysim.core.controls import require_controller, require_pair
+from crazysim.core.controls import ControllerData, require_controller, require_pair
+from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.settings import (
     check_flags,
@@ -61,10 +63,14 @@ class Configuration:
     strict: bool
     """True to raise an error where a slower engine would be taken with a warning."""
 
-    def check(self, data: Any) -> None:
-        """Check that data are those of a simulation with these settings; it takes a microsecond.
+    def check(self, data: Any, like: SimData) -> None:
+        """Check that data are those of a simulation with these settings; it takes some microseconds.
 
         The axes of each leaf are checked by the step.
+
+        Args:
+            data: Data to check.
+            like: Data of the simulation.
 
         Raises:
             ConfigError: If they are not.
@@ -83,6 +89,12 @@ class Configuration:
             raise ConfigError(
                 f"expected data of {_described(*needed)}, got data of {_described(*given)}. Use data of this "
                 f"simulation, or of one with the same settings."
+            )
+        present, needed = controls.controller, like.controls.controller
+        if present is not needed and _layout(present) != _layout(needed):
+            raise ConfigError(
+                f"expected data of controller {getattr(self.controller, 'name', None)!r} with {_records(needed)}, got "
+                f"{_records(present)}. Use data of this simulation, or of one with the same settings."
             )
 
     @staticmethod
@@ -144,6 +156,27 @@ class Configuration:
             engine,
             flag("strict", strict),
         )
+
+
+def _layout(controller: ControllerData | None) -> tuple[object, list[tuple[int, ...]]]:
+    """Return what the data of two simulations with the same controller have in common."""
+    memory = None if controller is None else controller.memory
+    return jax.tree.structure(controller), [np.shape(x) for x in jax.tree.leaves(memory)]
+
+
+def _records(controller: ControllerData | None) -> str:
+    """Return the records of a controller for a message."""
+    if controller is None:
+        return "no records"
+    shapes = [np.shape(x) for x in jax.tree.leaves(controller.memory)]
+    memory, params = _kind(controller.memory), _kind(controller.params)
+    return f"memory {memory} of shapes {shapes}, parameters {params} and freq={controller.freq}"
+
+
+def _kind(record: object) -> str:
+    """Return the name of a record's type, with those of several controllers in it."""
+    name, members = type(record).__name__, getattr(record, "controllers", ())
+    return f"{name}({', '.join(map(_kind, members))})" if members else name
 
 
 def _described(n_worlds: int, n_drones: int, freq: int, control: Control, cascade: bool, fitted: bool) -> str:

@@ -169,7 +169,7 @@ class Sim:
         self._queries = self._new_queries()
         self._seed = as_key(rng_key)
         self.build_data()
-        self.build_default_data()
+        self._default_data = self._stepper.data
 
         stages = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
         self._steps = BuiltPipeline("step_pipeline", stages, self._stepper.build)
@@ -249,7 +249,7 @@ class Sim:
     @data.setter
     @locked
     def data(self, data: SimData) -> None:
-        self.configuration.check(data)
+        self.configuration.check(data, self._default_data)
         self._stepper.assign(data)
         self._scene.invalidate()
 
@@ -261,7 +261,7 @@ class Sim:
 
     @default_data.setter
     def default_data(self, data: SimData) -> None:
-        self.configuration.check(data)
+        self.configuration.check(data, self._default_data)
         self._default_data = data
 
     def _adopt_scene(self) -> None:
@@ -297,7 +297,8 @@ class Sim:
             self._seed,
             self.configuration.controller,
         )
-        self.data = data.replace(objects=self._scene.objects(None))
+        self._stepper.assign(data.replace(objects=self._scene.objects(None)))
+        self._scene.invalidate()
         self.plugins.build_records()
         return self.data
 

@@ -12,7 +12,7 @@ from cases import unit_quats, vectors, with_states
 from hypothesis import given
 from scipy.spatial.transform import Rotation
 
-from crazysim import Sim, load_airframe
+from crazysim import Sim, load_airframe, rotation
 from crazysim.control.allocation import yaw_arm
 from crazysim.control.auto import DAMPING, STIFFNESS, Auto, AutoParams, error_of_axes, error_of_quat
 from crazysim.control.bandwidth import rotor_rate
@@ -157,6 +157,30 @@ def test_an_unknown_torque_leaves_no_error():
     end = np.abs(Rotation.from_quat(np.asarray(sim.data.states.quat)[0]).as_euler("xyz")[:, :2]).max()
     assert middle > 0.01
     assert end < 1e-3
+
+
+@pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy", "so_rpy_rotor_drag"])
+@pytest.mark.parametrize("acc", [-9.81, -9.5, -9.0])
+def test_a_fall_does_not_turn_a_drone_on_its_back(dynamics, acc):
+    """Drag and estimates then ask for more downward acceleration than gravity gives, or for any direction."""
+    sim = Sim(dynamics=dynamics, control="state", controller="auto", engine="lanes")
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(100.0)))
+    for _ in range(50):
+        sim.state_control(pos=sim.data.states.pos, vel=sim.data.states.vel, acc=(0, 0, acc))
+        sim.step(10)
+        assert np.all(rotation.matrix(sim.data.states.quat)[..., 2, 2] > 0.95)
+    assert np.all(sim.data.states.vel[..., 2] < -4)
+
+
+def test_a_setpoint_that_falls_faster_than_gravity_turns_a_drone_over():
+    sim = Sim(control="state", controller="auto", engine="lanes")
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(100.0)))
+    for _ in range(50):
+        sim.state_control(pos=sim.data.states.pos, vel=sim.data.states.vel, acc=(0, 0, -16.0))
+        sim.step(10)
+    assert np.all(rotation.matrix(sim.data.states.quat)[..., 2, 2] < -0.9)
 
 
 def test_a_far_setpoint_is_approached_without_losing_height():

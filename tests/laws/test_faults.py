@@ -122,53 +122,85 @@ def test_fault_05_rates_that_do_not_divide_are_refused(level, freq, given):
         Sim(control=level, freq=freq, **{f"{level}_freq": given})
 
 
-def fall(data, n_steps):
-    """Return height, speed and rotor state of a level drone with its motors off, by explicit Euler in float64."""
+def fall(data, n_steps, commanded=lambda r: 0.0):
+    """Return height, speed and rotor state of a falling level drone, by explicit Euler in float64.
+
+    ``commanded(r)`` is the command to the rotors, rpm, or of fitted dynamics the thrust, N; 0 for motors that are off.
+    """
     dt, z, v = 1 / data.core.freq, 100.0, 0.0
     p = jax.tree.map(lambda x: np.asarray(x, np.float64), data.params)
     r = hover_rotor_state(data)
     for _ in range(n_steps):
         if hasattr(p, "rpm2thrust"):
             (k0, k1, k2), (_, _, a, b) = p.rpm2thrust[0], p.rotor_dyn_coef[0]
-            thrust, r_dot = np.sum(k0 + k1 * r + k2 * r**2), a * (0 - r) + b * (0 - r**2)
+            cmd = commanded(r)
+            thrust, r_dot = np.sum(k0 + k1 * r + k2 * r**2), a * (cmd - r) + b * (cmd**2 - r**2)
         elif p.thrust_dyn_coef is None:
-            thrust, r_dot = p.acc_coef[0], 0 * r
+            thrust, r_dot = p.acc_coef[0] + p.cmd_f_coef[0] * commanded(r), 0 * r
         else:
-            thrust, r_dot = p.acc_coef[0] + p.cmd_f_coef[0] * r[0], -p.thrust_dyn_coef[0] * r
+            thrust, r_dot = p.acc_coef[0] + p.cmd_f_coef[0] * r[0], p.thrust_dyn_coef[0] * (commanded(r) - r)
         drag = 0.0 if p.drag_matrix is None else p.drag_matrix[2, 2]
         acc = (thrust + drag * v) / p.mass[0] - 9.81
         z, v, r = z + dt * v, v + dt * acc, r + dt * r_dot
     return z, v, r
 
 
-@pytest.mark.parametrize("dynamics, control", PAIRS)
-def test_fault_06_zero_thrust_stops_the_motors_at_every_level(dynamics, control):
-    """The peer keeps the rotors at their least speed, a fifth of the weight: 3.6 m/s after half a second, not 4.3.
+def without_force(step, data):
+    """Return the data after 250 steps with setpoints at the present position and velocity that need no force."""
+    for _ in range(50):
+        cmd = np.broadcast_to(zero_thrust_command(data), (3, 2, 16)).copy()
+        cmd[..., 0:3], cmd[..., 3:6] = data.states.pos, data.states.vel
+        data = run(step, send(data, cmd), 5)
+    return data
 
-    From hover the rotors run down as their lag has it, and the drone falls in its drag alone. At the level state the
-    default controller keeps the rotors running, to turn with; Crazyflow's stops them.
-    """
-    data, step, _ = program(dynamics, control, **({"controller": "crazyflow"} if control == "state" else {}))
-    data = with_states(data, pos=[0, 0, 100.0], rotor_vel=hover_rotor_state(data))
-    zero = zero_thrust_command(data)
-    if control == "state":
-        # A setpoint equal to the current position and velocity at every tick makes the controller command zero force.
-        for _ in range(50):
-            cmd = np.broadcast_to(zero, (3, 2, 16)).copy()
-            cmd[..., 0:3], cmd[..., 3:6] = data.states.pos, data.states.vel
-            data = run(step, send(data, cmd), 5)
-    else:
-        data = run(step, send(data, to_all(data, zero)), 250)
-    commanded = data.controls.attitude.cmd[..., 3] if dynamics in FITTED else data.controls.rotor_vel
-    np.testing.assert_array_equal(commanded, 0.0)
-    z, v, r = fall(data, 250)
-    states = data.states
+
+def assert_falls(states, z, v, r):
     # 250 float32 additions near 100 m (half an ulp is 4e-6 m), and near 4 m/s
     np.testing.assert_allclose(states.pos[..., 2], z, atol=1e-3, rtol=0)
     np.testing.assert_allclose(states.vel[..., 2], v, atol=1e-4, rtol=0)
     np.testing.assert_allclose(states.rotor_vel, np.broadcast_to(r, states.rotor_vel.shape), rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(states.vel[..., :2], 0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("dynamics, control", PAIRS)
+def test_fault_06_zero_thrust_stops_the_motors_at_every_level(dynamics, control):
+    """The peer keeps the rotors at their least speed, a fifth of the weight: 3.6 m/s after half a second, not 4.3.
+
+    From hover the rotors run down as their lag has it, and the drone falls in its drag alone. At the level state this
+    is Crazyflow's cascade, which has no command for motors that are on but give no thrust.
+    """
+    data, step, _ = program(dynamics, control, **({"controller": "crazyflow"} if control == "state" else {}))
+    data = with_states(data, pos=[0, 0, 100.0], rotor_vel=hover_rotor_state(data))
+    if control == "state":
+        data = without_force(step, data)
+    else:
+        data = run(step, send(data, to_all(data, zero_thrust_command(data))), 250)
+    commanded = data.controls.attitude.cmd[..., 3] if dynamics in FITTED else data.controls.rotor_vel
+    np.testing.assert_array_equal(commanded, 0.0)
+    z, v, r = fall(data, 250)
+    assert_falls(data.states, z, v, r)
     assert v < -3.5, "gravity alone gives 4.905 m/s; the rotors' last turns and drag take some"
+
+
+@pytest.mark.parametrize("dynamics", ["first_principles", *FITTED])
+def test_fault_06_the_default_controller_keeps_the_rotors_at_their_least_speed(dynamics):
+    """Rotors that stand still cannot turn a drone, and start late; and what drag asks for does not tilt it."""
+    data, step, _ = program(dynamics, "state")
+    data = with_states(data, pos=[0, 0, 100.0], rotor_vel=hover_rotor_state(data))
+    fell = without_force(step, data)
+    if dynamics in FITTED:
+        least = float(data.params.thrust_min[0])
+        commanded, z_v_r = fell.controls.attitude.cmd[..., 3], fall(data, 250, lambda r: least)
+    else:
+        p = jax.tree.map(lambda x: np.asarray(x, np.float64), data.controls.controller.params)
+        (k0, k1, k2), lead = p.allocation.rpm2thrust[0], p.lead[0]
+        idle = (np.sqrt(k1**2 - 4 * k2 * (k0 - p.allocation.thrust_min[0])) - k1) / (2 * k2)
+        least, commanded = idle, fell.controls.rotor_vel
+        lowest = float(np.min(data.params.rotor_vel_min))  # of the dynamics, for rotors that are on
+        z_v_r = fall(data, 250, lambda r: np.maximum(r + lead * (idle - r), lowest))
+    np.testing.assert_allclose(commanded, least, rtol=1e-3)  # the last per mille of the lag
+    assert_falls(fell.states, *z_v_r)
+    assert z_v_r[1] < -2.5, "four fifths of gravity give 3.9 m/s; the rotors' last turns and drag take some"
 
 
 def test_fault_06_a_drone_dropped_with_its_motors_off_falls_freely():

@@ -356,6 +356,19 @@ def test_data_with_axes_of_its_own_is_refused_at_the_next_step(sim, edit, fragme
         (lambda sim: Sim(n_worlds=3, freq=250).data, ("at 500 Hz", "at 250 Hz")),
         (lambda sim: Sim(n_worlds=3, dynamics="so_rpy").data, ("first-principles", "fitted")),
         (lambda sim: Sim(n_worlds=3, controller="crazyflow").data, ("Crazyflow's cascade", "another controller")),
+        (lambda sim: Sim(n_worlds=3, controller="pid").data, ("controller 'auto' with memory AutoMemory", "PIDMemory")),
+        (lambda sim: Sim(n_worlds=3, attitude_freq=250).data, ("freq=500, got", "AutoParams and freq=250")),
+        (lambda sim: Sim(n_worlds=3, controller=["auto"], switch=0).data, ("got memory SwitchMemory(AutoMemory)",)),
+        (
+            lambda sim: sim.data.replace(
+                controls=sim.data.controls.replace(
+                    controller=sim.data.controls.controller.replace(
+                        memory=jax.tree.map(lambda x: x[..., :2], sim.data.controls.controller.memory)
+                    )
+                )
+            ),
+            ("of shapes [(3, 1, 3), ", "got memory AutoMemory of shapes [(3, 1, 2), "),
+        ),
     ],
 )
 @pytest.mark.parametrize("name", ["data", "default_data"])
