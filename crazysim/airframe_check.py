@@ -81,6 +81,9 @@ def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
     most, least = (float(airframe.value(f"rotors.thrust_{end}")) for end in ("max", "min"))
     hover = mass * GRAVITY / airframe.n_rotors
     yield "mass", f"{mass:.4g} kg, {airframe.n_rotors} rotors of {least:.3g} to {most:.3g} N"
+    positions = airframe.value("rotors.position")
+    wheelbase = np.max(np.linalg.norm(positions[:, None] - positions, axis=-1))
+    yield "wheelbase", f"{1000 * wheelbase:.0f} mm, the largest distance of two rotors"
     yield "thrust over weight", f"{ratio:.2f}"
     yield "hover", f"{1 / ratio:.0%} of the largest thrust"
     yield "tilt at full thrust", f"holds height up to {np.degrees(np.arccos(1 / ratio)):.0f} degrees"

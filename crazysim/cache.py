@@ -97,6 +97,27 @@ def enable_for_command() -> None:
         )
 
 
+_announced: set[str] = set()
+
+
+def announce(work: str, seconds: str) -> None:
+    """Print a line on stderr before work that takes long, once in a process for each kind of work.
+
+    Args:
+        work: Name of the work, such as ``"compiling the gradient"``.
+        seconds: Duration on two cores, such as ``"10 to 40 s"``.
+    """
+    if work in _announced:
+        return
+    _announced.add(work)
+    later = (
+        "less once it is in the cache"
+        if jaxcompat.cache_folder() is not None
+        else ("less in later runs with crazysim.enable_cache()")
+    )
+    print(f"{work}: {seconds} on two cores, {later}", file=sys.stderr, flush=True)
+
+
 def trim(folder: Path, limit: int = LIMIT) -> None:
     """Remove the least recently used programs of a folder if they take more than a number of bytes.
 

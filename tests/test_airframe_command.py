@@ -27,6 +27,7 @@ def test_new_writes_a_file_that_check_reads_and_draws(tmp_path, capsys, opengl):
     assert load_airframe(path).value("battery.cells") == 6
     assert main(["airframe", "check", str(path), "--picture", str(picture)]) == 0
     found = rows(capsys.readouterr().out)
+    assert found["wheelbase"] == "240 mm, the largest distance of two rotors"  # twice the arm
     assert found["thrust over weight"] == "4.00"
     assert found["hover"] == "25% of the largest thrust"
     assert found["tilt at full thrust"] == "holds height up to 76 degrees"  # arccos(1 / 4) = 75.5 degrees

@@ -9,7 +9,7 @@ import jax
 import pytest
 
 from crazysim import cache
-from crazysim.cache import default_cache, enable_cache, enable_for_command, trim
+from crazysim.cache import announce, default_cache, enable_cache, enable_for_command, trim
 
 PROGRAM = """
 import sys
@@ -120,3 +120,11 @@ def test_a_second_command_reads_the_cache_in_silence(tmp_path):
     assert {path for path in folder.iterdir() if path.name.endswith("-cache")} == {
         path for path in programs if path.name.endswith("-cache")
     }
+
+
+def test_long_work_is_announced_once_for_each_kind(settings, capsys):
+    for work in ("compiling this", "compiling this", "compiling that"):
+        announce(work, "5 s")
+    told = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[0] for line in told] == ["compiling this", "compiling that"]
+    assert all("5 s" in line and "enable_cache" in line for line in told)

@@ -165,9 +165,11 @@ def film(
     targets = jax.jit(env.target)
     step = jax.jit(lambda state: env.step(state, policy(state.obs)))
     state = jax.jit(env.reset)(jax.random.key(seed))
-    width, height = film_size(960, 720)
+    shown = min(worlds, sim.n_worlds)
+    rows, columns = View(worlds=range(shown)).grid
+    width, height = film_size(960, 2 * round(360 * rows / columns))  # 4:3 for each world
     view = View(
-        worlds=range(min(worlds, sim.n_worlds)),
+        worlds=range(shown),
         width=width,
         height=height,
         trail=1.5,

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import crazysim
+from crazysim.cache import announce
 from crazysim.core.settings import positive
 from crazysim.engine.backends.native import compiling_threads
 from crazysim.envs.env import DroneEnv
@@ -111,6 +112,7 @@ def train(
         compiled = algorithm.iterate.lower(_on_device(shapes, base.sim.device), env, hyperparameters).compile()
         return compiled, time.perf_counter() - compiling
 
+    announce("compiling the training", "5 to 20 s")
     with compiling_threads(2) as pool:  # each compiles for seconds, mostly on one core
         starting, compiling = pool.submit(start), pool.submit(compile_iteration)
         (learner, metrics), (iterate, compile_s) = starting.result(), compiling.result()

@@ -217,6 +217,26 @@ def test_a_film_shows_several_marks_of_a_drone(tmp_path, opengl):
     assert set(drawn) == {(24, 3)}
 
 
+def test_the_worlds_of_a_film_are_wider_than_high(tmp_path, monkeypatch, opengl):
+    from crazysim.train.show import film
+
+    sizes = []
+
+    class StoppedError(Exception):
+        """Raised instead of filming."""
+
+    def open_film(path, view, **_):
+        sizes.append(view.tile_size)
+        raise StoppedError
+
+    monkeypatch.setattr("crazysim.train.show.Film", open_film)
+    env = envs.make(Low(seconds=0.04), n_worlds=6)
+    for worlds in (1, 2, 3, 4, 5, 6):
+        with pytest.raises(StoppedError):
+            film(env, lambda obs: jnp.zeros((6, 1, 4)), tmp_path / "low.gif", worlds=worlds)
+    assert all(1.3 < width / height < 1.4 for width, height in sizes)
+
+
 def test_an_installed_package_lists_its_tasks(monkeypatch):
     class Point(importlib.metadata.EntryPoint):
         def load(self):

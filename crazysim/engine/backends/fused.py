@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
+from crazysim.cache import announce
 from crazysim.core.sharding import Location
 from crazysim.core.stage import with_leaves
 from crazysim.engine.backends import Run, cuda, kernel, lanes, native
@@ -136,6 +137,7 @@ def differentiable(run: CountedRun, on_lanes: Run) -> Run:
             return run(leaves, count)
 
         def derivative(primals: Any, tangents: Any) -> Any:
+            announce("compiling a gradient through the steps", "10 to 40 s")
             (values, _), (slopes, _) = primals, tangents
             changing = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
 
