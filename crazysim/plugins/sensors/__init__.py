@@ -6,7 +6,9 @@ from crazysim.lazy import lazy
 
 if TYPE_CHECKING:
     from crazysim.plugins.sensors.barometer import Barometer
+    from crazysim.plugins.sensors.beacons import UWB, Lighthouse
     from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
+    from crazysim.plugins.sensors.gps import GPS
     from crazysim.plugins.sensors.imu import IMU
     from crazysim.plugins.sensors.magnetometer import Magnetometer
     from crazysim.plugins.sensors.motion_capture import MotionCapture
@@ -17,9 +19,12 @@ if TYPE_CHECKING:
     from crazysim.plugins.sensors.triad import Triad
 
 __all__ = [
+    "GPS",
     "IMU",
+    "UWB",
     "Barometer",
     "BatteryVoltage",
+    "Lighthouse",
     "Magnetometer",
     "MotionCapture",
     "MultiRanger",
@@ -36,9 +41,11 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
+        "GPS": f"{__name__}.gps",
         "IMU": f"{__name__}.imu",
         "Barometer": f"{__name__}.barometer",
         "BatteryVoltage": f"{__name__}.onboard",
+        "Lighthouse": f"{__name__}.beacons",
         "Magnetometer": f"{__name__}.magnetometer",
         "MotionCapture": f"{__name__}.motion_capture",
         "MultiRanger": f"{__name__}.onboard",
@@ -50,5 +57,6 @@ __getattr__ = lazy(
         "Sensor": f"{__name__}.sensor",
         "TimeOfFlight": f"{__name__}.flow_deck",
         "Triad": f"{__name__}.triad",
+        "UWB": f"{__name__}.beacons",
     },
 )

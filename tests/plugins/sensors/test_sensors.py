@@ -9,6 +9,7 @@ from crazysim import Battery, ConfigError, Plugin, RangeFinder, Sim, rotation
 from crazysim.envs import DroneEnv, make
 from crazysim.plugins import sensors
 from crazysim.plugins.sensors.barometer import altitude_of, pressure_at
+from crazysim.plugins.sensors.beacons import SWEEP_TILTS, sweep_angle
 
 N = 2000
 
@@ -160,7 +161,70 @@ def test_multi_ranger_measures_what_the_range_finder_does():
     np.testing.assert_allclose(distance[:, 5].std(), 0.05, rtol=errors(N))
 
 
+def test_ranges_by_hand_and_their_detours():
+    anchors = [(3.0, 0, 1.0), (0, 4.0, 1.0), (0, 0, 6.0)]
+    sim = build(
+        sensors.UWB(anchors, bias=0.1, freq=None), sensors.UWB(anchors, bias=0.1, tdoa=True, freq=None, name="t")
+    )
+    sim.step()
+    np.testing.assert_allclose(read(sim, "uwb.distance")[0, 0], [3.1, 4.1, 5.1], atol=1e-4)  # one step of a fall
+    np.testing.assert_allclose(read(sim, "t.difference")[0, 0], [1, 2], atol=1e-4)
+    sim = build(sensors.UWB(anchors, 0.05), sensors.UWB(anchors, 0.05, tdoa=True, name="t"), n_worlds=N)
+    sim.step()
+    np.testing.assert_allclose(read(sim, "uwb.distance")[:, 0].std(axis=0), 0.05, rtol=errors(N))
+    np.testing.assert_allclose(read(sim, "t.difference")[:, 0].std(axis=0), 0.05 * np.sqrt(2), rtol=errors(N))
+    sim = build(sensors.UWB(anchors, outliers=0.2, detour=0.5), n_worlds=N)
+    sim.step()
+    excess = (read(sim, "uwb.distance")[:, 0] - [3, 4, 5]).ravel()
+    far = excess > 1e-3
+    assert abs(far.mean() - 0.2 * np.exp(-1e-3 / 0.5)) < 4 * np.sqrt(0.16 / (3 * N))
+    np.testing.assert_allclose(excess[far].mean(), 0.501, atol=4 * 0.5 / np.sqrt(far.sum()))
+
+
+def test_sweep_angles_by_hand(x64):
+    """The plane of tilt t through the station, turned by the angle, contains the place."""
+    rng = np.random.default_rng(3)
+    for pos in rng.normal(size=(20, 3)) + [4, 0, 0]:
+        for tilt in SWEEP_TILTS:
+            angle = float(sweep_angle(pos, tilt))
+            # the plane through the axis of rotation's tilted line: normal (-sin a, cos a, -tan t) for the sign above
+            normal = [-np.sin(angle), np.cos(angle), np.tan(tilt)]
+            np.testing.assert_allclose(np.dot(normal, pos), 0, atol=1e-12)
+
+
+def test_a_lighthouse_has_its_view_and_noise():
+    """One station looks along x at the drone from 3 m; one looks away; one is below the deck."""
+    stations, rpy = [(-3.0, 0, 1.5), (3.0, 0, 1.5), (-3.0, 0, 0.5)], [(0, 0, 0), (0, 0, 0), (0, 0, 0)]
+    sim = build(sensors.Lighthouse(stations, rpy, 1e-3, diodes=[(0, 0.3, 0)]), n_worlds=N)
+    sim.step()
+    np.testing.assert_array_equal(read(sim, "lighthouse.visible")[:, 0], np.broadcast_to([1, 0, 0], (N, 3)))
+    angle = read(sim, "lighthouse.angle")[:, 0]
+    lift = np.arcsin(0.5 * np.tan(np.pi / 6) / np.hypot(3, 0.3))
+    expected = np.arctan2(0.3, 3.0) + lift * np.array([1, -1])
+    np.testing.assert_allclose(angle[:, :2].mean(axis=0), expected, atol=4e-3 / np.sqrt(N) + 1e-4)
+    np.testing.assert_allclose(angle[:, :2].std(axis=0), 1e-3, rtol=errors(N))
+    np.testing.assert_array_equal(angle[:, 2:], 0)
+
+
+def test_satellite_navigation_wanders():
+    sim = build(sensors.GPS((1.0, 1.0, 2.0), 3.0, 0.2, 0.1, freq=100), n_worlds=N)
+    found = []
+    for n_steps in (1, 100):
+        sim.step(n_steps)
+        found.append(read(sim, "gps.pos")[:, 0] - np.asarray(sim.data.states.pos)[:, 0])
+    np.testing.assert_allclose(found[0].std(axis=0), np.hypot([1, 1, 2], 3), rtol=errors(N))
+    change = np.sqrt(2 * np.array([1, 1, 4]) + 9 * (2 - 2 * np.exp(-1)))
+    np.testing.assert_allclose((found[1] - found[0]).std(axis=0), change, rtol=errors(N))
+    vel = read(sim, "gps.vel")[:, 0] - np.asarray(sim.data.states.vel)[:, 0]
+    np.testing.assert_allclose(vel.std(axis=0), 0.1, rtol=errors(N))
+
+
 @pytest.mark.parametrize("plugin, message", [
+    (sensors.UWB([(0, 0, 0)], tdoa=True), "expected anchors as at least 2"),
+    (sensors.UWB([(0, 0)]), "expected anchors"),
+    (sensors.UWB([(0, 0, 0)], outliers=2.0), "expected outliers"),
+    (sensors.Lighthouse([(0, 0, 2.0)], [(0, 0, 0)] * 2), "expected rpy of shape"),
+    (sensors.GPS(drift_time=0.0), "expected drift_time"),
     (sensors.BatteryVoltage(), "expected a Battery"),
     (sensors.MultiRanger(), "expected a RangeFinder"),
     (sensors.RotorSpeeds(n_rotors=6), "expected n_rotors = 4"),

@@ -1,0 +1,214 @@
+"""Sensors that measure to known places: ranges of ultra-wideband anchors, and sweep angles of lighthouses."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation, check_parameter, parameter
+from crazysim.errors import ConfigError
+from crazysim.plugins.sensors.sensor import Samples, Sensor
+from crazysim.pytree import PyTree, leaf, on_device
+
+SWEEP_TILTS = -math.pi / 6, math.pi / 6
+"""Tilts of the two light planes of a lighthouse of the second generation, rad: 30 degrees either way (Taffanel et al.
+2021, arXiv:2104.11523)."""
+STEEPEST = 1 - 1e-4
+"""Largest sine of the part of a sweep angle that the height makes."""
+
+
+class UWBData(PyTree):
+    """Measurements and parameters of ultra-wideband ranging."""
+
+    samples: Samples
+    """Measurements."""
+    anchors: Array = leaf("shared", 2)
+    """Positions of the anchors, world frame, m. (n_anchors, 3)"""
+    pos: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Position of the antenna relative to the centre of mass, body frame, m. (3,)"""
+    bias: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Error of every distance, m. (1,)"""
+    noise: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Standard deviation of a distance, m. (1,)"""
+    outliers: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Probability that a distance is measured along a detour, 0 to 1. (1,)"""
+    detour: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Mean length of a detour, m. (1,)"""
+
+
+class UWB(Sensor):
+    """Distances to anchors by two-way ranging, m, or their differences to that of the first anchor (TDoA), m.
+
+    A distance has a bias, white noise, and, at random, a detour of exponentially distributed length, as of reflected
+    signals. All anchors are measured at the same time.
+    """
+
+    anchors: ArrayLike = parameter()
+    """Positions of the anchors, world frame, m. (n_anchors, 3)"""
+    noise: ArrayLike = parameter(default=0.0)
+    """Standard deviation of a distance, m; of a difference it is sqrt(2) times that. () or (n_worlds, n_drones)"""
+    bias: ArrayLike = parameter(default=0.0)
+    """Error of every distance, m; differences have none. () or (n_worlds, n_drones)"""
+    outliers: ArrayLike = parameter(default=0.0)
+    """Probability that a distance is measured along a detour, 0 to 1. () or (n_worlds, n_drones)"""
+    detour: ArrayLike = parameter(default=1.0)
+    """Mean length of a detour, m. () or (n_worlds, n_drones)"""
+    pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
+    """Position of the antenna relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    _: dataclasses.KW_ONLY
+    tdoa: bool = False
+    """True for differences of distances."""
+    freq: int | None = 50
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    name: str = "uwb"
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
+        n = len(np.asarray(self.anchors))
+        return {"difference": n - 1} if self.tdoa else {"distance": n}
+
+    def record(self, sim: Simulation) -> UWBData:
+        """Return the system before its first measurement."""
+        return UWBData(
+            anchors=on_device(_places("anchors", self.anchors, 2 if self.tdoa else 1), sim.data.states.pos.dtype),
+            samples=self.samples(sim),
+            pos=check_parameter(sim, "pos", self.pos, (3,)),
+            bias=check_parameter(sim, "bias", self.bias),
+            noise=check_parameter(sim, "noise", self.noise, low=0.0),
+            outliers=check_parameter(sim, "outliers", self.outliers, low=0.0, high=1.0),
+            detour=check_parameter(sim, "detour", self.detour, low=0.0),
+        )
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the distances, or their differences, m. (n,)"""
+        return self._output(self._distances(data))
+
+    def measure(self, data: SimData, record: UWBData, key: Array) -> tuple[Array, Any]:
+        """Return the distances of one drone, or their differences, m, and the record."""
+        distance = self._distances(data)
+        keys, shape, dtype = jax.random.split(key, 3), distance.shape, distance.dtype
+        detour = -record.detour * jnp.log(1 - jax.random.uniform(keys[0], shape, dtype))
+        detour = jnp.where(jax.random.uniform(keys[1], shape, dtype) < record.outliers, detour, 0.0)
+        distance = distance + record.bias + detour + record.noise * jax.random.normal(keys[2], shape, dtype)
+        return self._output(distance), record
+
+    def _distances(self, data: SimData) -> Array:
+        """Return the distances of one antenna from the anchors, m. (n_anchors,)"""
+        record, s = self.read(data), data.states
+        return rotation.safe_norm(rotation.rotate(s.quat, record.pos, s.pos) - record.anchors)[:, 0]
+
+    def _output(self, distance: Array) -> Array:
+        return distance[1:] - distance[0] if self.tdoa else distance
+
+
+class LighthouseData(PyTree):
+    """Measurements and parameters of lighthouses."""
+
+    samples: Samples
+    """Measurements."""
+    stations: Array = leaf("shared", 2)
+    """Positions of the base stations, world frame, m. (n_stations, 3)"""
+    quat: Array = leaf("shared", 2)
+    """Attitudes of the base stations, station to world, unit, xyzw. (n_stations, 4)"""
+    diodes: Array = leaf("shared", 2)
+    """Positions of the photodiodes relative to the centre of mass, body frame, m. (n_diodes, 3)"""
+    noise: Array = leaf("parameter", 1, (1,), sparse=True)
+    """Standard deviation of an angle, rad. (1,)"""
+
+
+class Lighthouse(Sensor):
+    """Angles at which the two light planes of base stations pass photodiodes, rad, and where these are in view.
+
+    In a station's frame, x forwards and z upwards, a plane with tilt t passes the place (x, y, z) at
+    ``atan2(y, x) + asin(z tan(t) / sqrt(x^2 + y^2))`` (Taffanel et al. 2021, arXiv:2104.11523). A diode is in view in
+    front of a station that is above the plane of the body's x and y axes; other angles are zero. Nothing hides a diode.
+    """
+
+    stations: ArrayLike = parameter()
+    """Positions of the base stations, world frame, m. (n_stations, 3)"""
+    rpy: ArrayLike = parameter()
+    """Roll, pitch and yaw of the base stations, world frame, rad. (n_stations, 3)"""
+    noise: ArrayLike = parameter(default=0.0)
+    """Standard deviation of an angle, rad. () or (n_worlds, n_drones)"""
+    diodes: ArrayLike = parameter(default=((0.0, 0.0, 0.0),))
+    """Positions of the photodiodes relative to the centre of mass, body frame, m. (n_diodes, 3)"""
+    _: dataclasses.KW_ONLY
+    freq: int | None = 50
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    name: str = "lighthouse"
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement: by station, then diode, then plane."""
+        n = len(np.asarray(self.stations)) * len(np.asarray(self.diodes))
+        return {"angle": 2 * n, "visible": n}
+
+    def record(self, sim: Simulation) -> LighthouseData:
+        """Return the system before its first measurement."""
+        stations, rpy = _places("stations", self.stations, 1), _places("rpy", self.rpy, 1)
+        if stations.shape != rpy.shape:
+            raise ConfigError(f"expected rpy of shape {stations.shape}, one for each station, got {rpy.shape}")
+        dtype = sim.data.states.pos.dtype
+        return LighthouseData(
+            stations=on_device(stations, dtype),
+            quat=jax.jit(rotation.from_rpy)(on_device(rpy, dtype)),
+            diodes=on_device(_places("diodes", self.diodes, 1), dtype),
+            samples=self.samples(sim),
+            noise=check_parameter(sim, "noise", self.noise, low=0.0),
+        )
+
+    def ideal(self, data: SimData) -> Array:
+        """Return the angles, rad, and 1 where they are in view, else 0. (3 n_stations n_diodes,)"""
+        record, s = self.read(data), data.states
+        places = rotation.rotate(s.quat, record.diodes, s.pos)
+        offset = places - record.stations[:, None]
+        local = rotation.rotate_inverse(record.quat[:, None], offset)
+        angle = jnp.stack([sweep_angle(local, tilt) for tilt in SWEEP_TILTS], axis=-1)
+        above = -rotation.dot(offset, rotation.z_axis(s.quat))[..., 0] > 0
+        visible = (local[..., 0] > 0) & above
+        angle = jnp.where(visible[..., None], angle, 0.0)
+        return jnp.concatenate([angle.reshape(-1), visible.astype(angle.dtype).reshape(-1)])
+
+    def measure(self, data: SimData, record: LighthouseData, key: Array) -> tuple[Array, Any]:
+        """Return the angles of one drone, rad, with where they are in view, and the record."""
+        truth = self.ideal(data)
+        n = truth.shape[0] // 3
+        visible = jnp.repeat(truth[2 * n :], 2)
+        angle = truth[: 2 * n] + visible * record.noise * jax.random.normal(key, (2 * n,), truth.dtype)
+        return jnp.concatenate([angle, truth[2 * n :]]), record
+
+
+def sweep_angle(pos: Array, tilt: float) -> Array:
+    """Return the angle at which a tilted light plane passes a place, rad. (...)
+
+    Args:
+        pos: The place in the frame of the base station, x forwards, z upwards, m. (..., 3)
+        tilt: Tilt of the plane, rad.
+    """
+    across = rotation.safe_norm(pos[..., :2])[..., 0]
+    sine = pos[..., 2] * math.tan(tilt) / jnp.where(across > 1e-6, across, 1e-6)
+    sine = rotation.safe_clip(sine, -STEEPEST, STEEPEST)
+    return rotation.safe_arctan2(pos[..., 1], pos[..., 0]) + jnp.arcsin(sine)
+
+
+def _places(name: str, value: ArrayLike, least: int) -> np.ndarray:
+    """Return vectors as an array. (n, 3)
+
+    Raises:
+        ConfigError: If they are none, or fewer than ``least``.
+    """
+    places = np.asarray(value, np.float64)
+    if places.ndim != 2 or places.shape[1] != 3 or len(places) < least or not np.isfinite(places).all():
+        raise ConfigError(f"expected {name} as at least {least} finite vectors (n, 3), got shape {places.shape}")
+    return places

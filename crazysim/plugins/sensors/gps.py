@@ -1,0 +1,97 @@
+"""Satellite navigation: position with errors that wander, and velocity."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation, check_parameter, parameter
+from crazysim.plugins.effects.moving_air import zeros
+from crazysim.plugins.sensors.sensor import Samples, Sensor, correlated, per_axis
+from crazysim.pytree import PyTree, leaf
+
+
+class GPSData(PyTree):
+    """State and parameters of the receiver of every drone."""
+
+    samples: Samples
+    """Measurements."""
+    drift: Array = leaf("drone", 1)
+    """Error of the position that wanders, world frame, m. (n_worlds, n_drones, 3)"""
+    noise: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Standard deviation of a position, m. (3,)"""
+    drift_deviation: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Standard deviation of the error that wanders, m. (3,)"""
+    drift_time: Array = leaf("parameter", 1, (1,))
+    """Its correlation time, s. (1,)"""
+    vel_noise: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Standard deviation of a velocity, m/s. (3,)"""
+    pos: Array = leaf("parameter", 1, (3,), sparse=True)
+    """Position of the antenna relative to the centre of mass, body frame, m. (3,)"""
+
+
+class GPS(Sensor):
+    """Position, m, and velocity, m/s, of the antenna, world frame."""
+
+    noise: ArrayLike = parameter(default=0.0)
+    """Standard deviation of a position, world frame, m. (), (3,) or (n_worlds, n_drones, 3)"""
+    drift: ArrayLike = parameter(default=0.0)
+    """Standard deviation of an error of the position that wanders, world frame, m. (), (3,) or
+    (n_worlds, n_drones, 3)"""
+    drift_time: ArrayLike = parameter(default=60.0)
+    """Correlation time of that error, s. () or (n_worlds, n_drones)"""
+    vel_noise: ArrayLike = parameter(default=0.0)
+    """Standard deviation of a velocity, world frame, m/s. (), (3,) or (n_worlds, n_drones, 3)"""
+    pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
+    """Position of the antenna relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    _: dataclasses.KW_ONLY
+    freq: int | None = 10
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    name: str = "gps"
+
+    @property
+    def channels(self) -> Mapping[str, int]:
+        """Names and lengths of the parts of a measurement."""
+        return {"pos": 3, "vel": 3}
+
+    def record(self, sim: Simulation) -> GPSData:
+        """Return the receiver before its first measurement."""
+        return GPSData(
+            samples=self.samples(sim),
+            drift=zeros(sim, 3),
+            noise=per_axis(sim, "noise", self.noise, 0.0),
+            drift_deviation=per_axis(sim, "drift", self.drift, 0.0),
+            drift_time=check_parameter(sim, "drift_time", self.drift_time, positive=True),
+            vel_noise=per_axis(sim, "vel_noise", self.vel_noise, 0.0),
+            pos=check_parameter(sim, "pos", self.pos, (3,)),
+        )
+
+    def ideal(self, data: SimData) -> Array:
+        """Return position and velocity of the antenna. (6,)"""
+        pos, s = self.read(data).pos, data.states
+        vel = rotation.rotate(s.quat, rotation.cross(s.ang_vel, pos), s.vel)
+        return jnp.concatenate([rotation.rotate(s.quat, pos, s.pos), vel])
+
+    def begin(self, data: SimData, record: GPSData, key: Array) -> GPSData:
+        """Draw where the drift of one receiver begins."""
+        return record.replace(drift=record.drift_deviation * jax.random.normal(key, (3,), record.drift.dtype))
+
+    def measure(self, data: SimData, record: GPSData, key: Array) -> tuple[Array, Any]:
+        """Return position and velocity from one receiver, and the record after it."""
+        noise = jax.random.normal(key, (9,), record.drift.dtype)
+        dt = self.interval(data)
+        drift = correlated(record.drift, record.drift_deviation, record.drift_time, dt, noise[:3])
+        error = jnp.concatenate([drift + record.noise * noise[3:6], record.vel_noise * noise[6:]])
+        return self.ideal(data) + error, record.replace(drift=drift)
+
+    def measured_states(self, data: SimData) -> dict[str, Array]:
+        """Return position and velocity, as if the antenna were at the centre of mass."""
+        return self.split(self.latest(data))
