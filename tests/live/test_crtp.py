@@ -109,7 +109,7 @@ def test_parameters(running, uri):
         param.set_value("ring.solidRed", 51)
         with pytest.raises(AttributeError, match="read-only"):
             param.set_value("deck.bcFlow2", 0)
-        end = time.monotonic() + 5
+        end = time.monotonic() + 60
         while not called and time.monotonic() < end:
             time.sleep(0.01)
     assert called == [("ring.solidRed", "51")]
@@ -125,7 +125,7 @@ def test_a_parameter_that_is_not_simulated_keeps_its_value_and_says_so(running, 
         scf.cf.console.receivedChar.add_callback(lines.append)
         scf.cf.param.add_update_callback("pid_attitude", "pitch_kd", lambda name, value: read_back.append(value))
         scf.cf.param.set_value("pid_attitude.pitch_kd", 0.1234)
-        end = time.monotonic() + 5
+        end = time.monotonic() + 60
         while not (read_back and "\n" in "".join(lines)) and time.monotonic() < end:
             time.sleep(0.01)
         with pytest.raises(KeyError, match=r"no\.thing"):
@@ -171,7 +171,7 @@ def test_decks_and_memories(running, uri):
         for led in leds.leds:
             led.set(255, 0, 255)
         leds.write_data(None)
-        end = time.monotonic() + 5
+        end = time.monotonic() + 60
         while running.colors[0, 0] < 1 and time.monotonic() < end:
             time.sleep(0.01)
     np.testing.assert_allclose(running.colors[0], [1, 0, 1])
@@ -287,7 +287,7 @@ def test_a_server_answers_scans_and_says_when_it_is_open_to_a_network(swarm, cap
     with CrtpServer(swarm, port=0) as server:
         assert not caplog.records
         peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        peer.settimeout(5)
+        peer.settimeout(60)
         peer.sendto(b"\xff", ("127.0.0.1", int(server.uris[0].rpartition(":")[2])))
         assert peer.recv(100) == b"\xff"
         with pytest.raises(ConfigError, match="expected a free address"):
@@ -384,12 +384,12 @@ def test_a_failing_log_variable_is_nan_and_reported(swarm):
 def test_a_server_continues_after_a_packet_that_fails(swarm, caplog):
     with CrtpServer(swarm, port=0) as server:
         peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        peer.settimeout(5)
+        peer.settimeout(60)
         address = ("127.0.0.1", int(server.uris[0].rpartition(":")[2]))
         handle = server.devices[0].handle
         server.devices[0].handle = lambda packet: 1 / 0
         peer.sendto(b"\xfd\x00", address)
-        end = time.monotonic() + 5
+        end = time.monotonic() + 60
         while "was not answered" not in caplog.text and time.monotonic() < end:
             time.sleep(0.01)
         server.devices[0].handle = handle
