@@ -80,6 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _add_live(commands)
     _add_training(commands)
     _add_airframe(commands)
+    _add_identify(commands)
     commands.add_parser("info", help="print versions, devices, compiler and caches, for reports of bugs")
     options = parser.parse_args(arguments)
     if options.command is None:
@@ -282,6 +283,59 @@ def _add_airframe(commands: Any) -> None:
     )
     check.add_argument("file", help="path of a .toml file, or the name of a built-in airframe")
     check.add_argument("--picture", type=Path, metavar="FILE", help="picture of the body to write, .png")
+
+
+def _add_identify(commands: Any) -> None:
+    """Add the command that fits airframes to flights."""
+    command = commands.add_parser(
+        "identify", help="fit an airframe to logs of real flights", formatter_class=DefaultsFormatter
+    )
+    command.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="logs to fit, .csv or .npz")
+    command.add_argument("--airframe", default="cf21B_500", help="airframe to start from: a name or a TOML file")
+    command.add_argument("--out", type=Path, required=True, metavar="FILE", help=".toml file to write")
+    command.add_argument("--test", type=Path, nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
+    command.add_argument("--mass", type=float, metavar="KG", help="mass; by default that of the airframe")
+    command.add_argument(
+        "--columns", nargs="+", default=[], metavar="FIELD=NAMES", help="columns, such as time=s pos=px,py,pz"
+    )
+
+
+def _identify(options: argparse.Namespace) -> None:
+    from datetime import UTC, datetime
+
+    from crazysim.identify import Columns, errors_table, identify, prediction_errors, read_log
+
+    if options.out.suffix != ".toml" or not options.out.parent.is_dir() or options.out.exists():
+        raise ValueError(f"expected a new .toml file in an existing folder, got {str(options.out)!r}")
+    columns = None
+    if options.columns:
+        fields = dict(text.partition("=")[::2] for text in options.columns)
+        unknown = sorted(set(fields) - set(Columns.__dataclass_fields__))
+        if unknown:
+            raise ValueError(f"expected fields of {', '.join(Columns.__dataclass_fields__)}, got {unknown[0]!r}")
+        convert = {"time": str, "rpm_per_unit": float}
+        columns = Columns(**{k: convert.get(k, lambda x: tuple(x.split(",")))(x) for k, x in fields.items()})
+
+    def read(paths: Sequence[Path]) -> list[Any]:
+        logs = [read_log(path, columns) for path in paths]
+        for log in logs:
+            for repair in log.repairs:
+                print(f"{log.name}: {repair}")
+        return logs
+
+    logs, held_out = read(options.logs), read(options.test)
+    result = identify(logs, options.airframe, mass=options.mass)
+    for name, x in result.values.items():
+        print(f"{name:20}{x:12.4g} +- {result.deviations[name]:.2g}")
+    if result.doubtful:
+        print(f"doubtful, more than three times from the airframe: {', '.join(result.doubtful)}")
+    for title, flights in (("fitted logs", logs), ("held-out logs", held_out)):
+        if flights:
+            print(f"{title}\n{errors_table(prediction_errors(flights, result.model))}")
+    names = ", ".join(log.name for log in logs)
+    text = result.toml(f"crazysim identify, {datetime.now(UTC):%Y-%m-%d}, from {names}")
+    options.out.write_text(text, encoding="utf-8")
+    print(f"wrote {options.out}")
 
 
 def _airframe(options: argparse.Namespace) -> None:
@@ -500,6 +554,7 @@ COMMANDS = {
     "export": _export,
     "render": _render,
     "airframe": _airframe,
+    "identify": _identify,
     "info": _info,
 }
 """Functions that run the commands."""

@@ -1,0 +1,229 @@
+"""Logs of flights: reading, checks, and repairs that are reported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+
+REPAIRABLE = 0.05
+"""Largest share of samples that may be repaired; a log with more is an error."""
+UNIT = 1e-3
+"""Deviation of a quaternion's norm from 1 that counts as rounding."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Names of a log's columns."""
+
+    pos: tuple[str, ...] = ("x", "y", "z")
+    """Position, world frame, m."""
+    quat: tuple[str, ...] = ("qx", "qy", "qz", "qw")
+    """Attitude, body to world, xyzw."""
+    vel: tuple[str, ...] = ("vx", "vy", "vz")
+    """Velocity, world frame, m/s."""
+    ang_vel: tuple[str, ...] = ("wx", "wy", "wz")
+    """Angular velocity, body frame, rad/s."""
+    rotor_vel: tuple[str, ...] = ("rpm1", "rpm2", "rpm3", "rpm4")
+    """Rotor speeds in the order of the airframe's rotors."""
+    time: str = "t"
+    """Time, s."""
+    rpm_per_unit: float = 1.0
+    """Factor from the logged rotor speeds to rpm."""
+
+
+KNOWN = {
+    "crazysim": Columns(),
+    "idsia": Columns(
+        pos=("x_mocap", "y_mocap", "z_mocap"),
+        rotor_vel=("m1_erpm", "m2_erpm", "m3_erpm", "m4_erpm"),
+        rpm_per_unit=1 / 6,
+    ),
+}
+"""Columns of known logs: the default names, and IDSIA's benchmark (arXiv 2512.14450; motors of six pole pairs)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """One flight, with samples at equal intervals."""
+
+    name: str
+    """Name for messages."""
+    t: NDArray
+    """Time, s. (n,)"""
+    pos: NDArray
+    """Position, world frame, m. (n, 3)"""
+    quat: NDArray
+    """Attitude, body to world, unit, xyzw. (n, 4)"""
+    vel: NDArray
+    """Velocity, world frame, m/s. (n, 3)"""
+    ang_vel: NDArray
+    """Angular velocity, body frame, rad/s. (n, 3)"""
+    rotor_vel: NDArray
+    """Rotor speeds, rpm. (n, n_rotors)"""
+    gaps: NDArray = field(default_factory=lambda: np.zeros(0, int))
+    """Indices of samples that follow a gap. (n_gaps,)"""
+    repairs: tuple[str, ...] = ()
+    """Descriptions of the repairs."""
+
+    @property
+    def dt(self) -> float:
+        """Interval between samples, s."""
+        return float(np.median(np.diff(self.t)))
+
+
+def read_log(path: str | Path | Mapping[str, NDArray], columns: Columns | str | None = None) -> Log:
+    """Return the log of a ``.csv`` or ``.npz`` file, or of a dict of columns, checked and repaired.
+
+    Args:
+        path: File, or columns by name.
+        columns: Names of the columns, or a key of ``KNOWN``; by default the first of ``KNOWN`` that the log has.
+
+    Raises:
+        ConfigError: If columns are missing, or the samples cannot be repaired.
+    """
+    name, table = _table(path)
+    if columns is None:
+        columns = next((c for c in reversed(KNOWN.values()) if not _missing(table, c)), KNOWN["crazysim"])
+    elif isinstance(columns, str):
+        if columns not in KNOWN:
+            raise ConfigError(f"expected columns as one of {', '.join(KNOWN)} or a Columns, got {columns!r}")
+        columns = KNOWN[columns]
+    missing = _missing(table, columns)
+    if missing:
+        raise ConfigError(
+            f"{name}: expected columns {', '.join(missing)}, got {', '.join(sorted(table))}. Name them in a Columns."
+        )
+    repairs: list[str] = []
+
+    def stacked(names: tuple[str, ...]) -> NDArray:
+        return np.stack([np.asarray(table[n], np.float64) for n in names], axis=-1)
+
+    t = np.asarray(table[columns.time], np.float64)
+    data = {key: stacked(getattr(columns, key)) for key in ("pos", "quat", "vel", "ang_vel", "rotor_vel")}
+    data["rotor_vel"] = data["rotor_vel"] * columns.rpm_per_unit
+    t, data = _increasing(name, t, data, repairs)
+    data = {key: _finite(name, key, x, repairs) for key, x in data.items()}
+    data["rotor_vel"] = _without_spikes(name, data["rotor_vel"], repairs)
+    data["quat"] = _unit(name, data["quat"], repairs)
+    _check_rates(name, t, data["quat"], data["ang_vel"])
+    gaps = 1 + np.flatnonzero(np.diff(t) > 1.5 * np.median(np.diff(t)))
+    if len(gaps):
+        repairs.append(f"{len(gaps)} gaps, the longest {np.max(np.diff(t)):.3g} s; no prediction crosses them")
+    return Log(name, t, **data, gaps=gaps, repairs=tuple(repairs))
+
+
+def _table(path: str | Path | Mapping[str, NDArray]) -> tuple[str, Mapping[str, NDArray]]:
+    if isinstance(path, Mapping):
+        return "log", path
+    path = Path(path)
+    if not path.is_file() or path.suffix not in (".npz", ".csv"):
+        raise ConfigError(f"expected an existing .csv or .npz file, got {str(path)!r}")
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as file:
+            return path.stem, {key: file[key] for key in file.files}
+    with path.open(encoding="utf-8") as file:
+        header = [x.strip() for x in file.readline().split(",")]
+        rows = np.genfromtxt(file, delimiter=",", dtype=np.float64, ndmin=2)
+    if rows.shape[1:] != (len(header),):
+        raise ConfigError(
+            f"{path.name}: expected {len(header)} numbers in each row, as in the header, got {rows.shape}"
+        )
+    return path.stem, dict(zip(header, rows.T, strict=True))
+
+
+def _missing(table: Mapping[str, NDArray], columns: Columns) -> list[str]:
+    names = (columns.time, *columns.pos, *columns.quat, *columns.vel, *columns.ang_vel, *columns.rotor_vel)
+    return [x for x in names if x not in table]
+
+
+def _increasing(
+    name: str, t: NDArray, data: dict[str, NDArray], repairs: list[str]
+) -> tuple[NDArray, dict[str, NDArray]]:
+    """Return the samples whose time is later than that of all before them."""
+    latest = np.maximum.accumulate(np.concatenate([[-np.inf], np.where(np.isfinite(t), t, -np.inf)]))[:-1]
+    keep = np.isfinite(t) & (t > latest)
+    lost = int(np.sum(~keep))
+    if len(t) < 20 or lost > REPAIRABLE * len(t):
+        raise ConfigError(
+            f"{name}: expected at least 20 samples whose time increases, got {len(t)} of which {lost} do not. "
+            "Cut the log into flights."
+        )
+    if lost:
+        repairs.append(f"dropped {lost} samples whose time does not increase")
+    return t[keep], {key: x[keep] for key, x in data.items()}
+
+
+def _interpolated(x: NDArray, good: NDArray) -> NDArray:
+    index = np.arange(len(x))
+    return np.stack([np.interp(index, index[g], c[g]) for c, g in zip(x.T, good.T, strict=True)], axis=-1)
+
+
+def _finite(name: str, key: str, x: NDArray, repairs: list[str]) -> NDArray:
+    good = np.isfinite(x)
+    bad = int(np.max(np.sum(~good, axis=0)))
+    if bad > REPAIRABLE * len(x):
+        raise ConfigError(f"{name}: expected finite {key}, got {bad} samples of {len(x)} that are not")
+    if bad:
+        repairs.append(f"interpolated {bad} samples of {key} that were not finite")
+    return _interpolated(x, good) if bad else x
+
+
+def _without_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:
+    good = (x >= 0) & (x <= 3 * np.median(x, axis=0))
+    bad = int(np.sum(~good))
+    if bad > REPAIRABLE * x.size:
+        raise ConfigError(f"{name}: expected rotor speeds from 0 to three times their median, got {bad} others")
+    if bad:
+        repairs.append(f"interpolated {bad} rotor speeds that were negative or more than three times the median")
+    return _interpolated(x, good) if bad else x
+
+
+def _unit(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
+    """Return unit quaternions; a constant that was added to each component is found by fitting a unit sphere."""
+    norm = np.linalg.norm(quat, axis=-1)
+    if np.all(np.abs(norm - 1) < UNIT):
+        return quat / norm[:, None]
+    if not np.all(np.abs(norm - 1) < 0.2):
+        raise ConfigError(f"{name}: expected unit quaternions, got norms from {norm.min():.3g} to {norm.max():.3g}")
+    solution, *_ = np.linalg.lstsq(np.c_[2 * quat, np.ones(len(quat))], norm**2, rcond=None)
+    moved = quat - solution[:4]
+    moved_norm = np.linalg.norm(moved, axis=-1)
+    if np.all(np.abs(moved_norm - 1) < UNIT):
+        offset = ", ".join(f"{x:.4f}" for x in solution[:4])
+        repairs.append(f"subtracted ({offset}) from the quaternions, which makes them unit")
+        return moved / moved_norm[:, None]
+    repairs.append(f"normalised quaternions of norms from {norm.min():.4f} to {norm.max():.4f}")
+    return quat / norm[:, None]
+
+
+def body_rates(t: NDArray, quat: NDArray) -> NDArray:
+    """Return angular velocities that follow from an attitude over the time, body frame, rad/s. (n - 1, 3)"""
+    (a, aw), (b, bw) = [(q[:, :3], q[:, 3:]) for q in (quat[:-1], quat[1:])]
+    vector, scalar = aw * b - bw * a - np.cross(a, b), aw * bw + np.sum(a * b, axis=-1, keepdims=True)
+    return 2 * vector * np.sign(scalar) / np.diff(t)[:, None]
+
+
+def _check_rates(name: str, t: NDArray, quat: NDArray, ang_vel: NDArray) -> None:
+    """Check that attitude and angular velocity agree in unit, frame, order and sign."""
+    size = 9
+    kernel = np.ones(size) / size
+
+    def smooth(x: NDArray) -> NDArray:
+        return np.stack([np.convolve(c, kernel, "valid") for c in x.T], axis=-1)
+
+    turned, measured = smooth(body_rates(t, quat)), smooth((ang_vel[1:] + ang_vel[:-1]) / 2)
+    if np.sqrt(np.mean(turned**2)) < 0.02:
+        return
+    slope = float(np.sum(turned * measured) / np.sum(turned**2))
+    if not 0.5 < slope < 2:
+        hint = " They seem to be in degrees per second." if 30 < slope < 100 else ""
+        raise ConfigError(
+            f"{name}: expected angular velocities that turn the attitude, got {slope:.3g} times as much.{hint} "
+            "Check unit and frame, and that quaternions are xyzw, body to world."
+        )

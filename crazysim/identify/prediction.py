@@ -1,0 +1,177 @@
+"""Open-loop prediction of logged flights from measured rotor speeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.dynamics import first_principles
+from crazysim.dynamics.rotor import reaction_torque
+from crazysim.identify.logs import Log
+from crazysim.pytree import PyTree
+
+HORIZONS = (0.1, 0.25, 0.5)
+"""Horizons of the tables of errors, s."""
+
+
+class Extras(PyTree):
+    """Torques that flights show and an airframe file cannot hold."""
+
+    torque: Array
+    """Constant torque, body frame, N m. (3,)"""
+    torque_per_vel: Array
+    """Torque per velocity of the body, both in the body frame, N s. (3, 3)"""
+    delay: Array
+    """Delay of the state behind the rotor speeds, s. ()"""
+
+    @staticmethod
+    def none() -> Extras:
+        """Return extras that add nothing."""
+        return Extras(torque=jnp.zeros(3), torque_per_vel=jnp.zeros((3, 3)), delay=jnp.zeros(()))
+
+
+class Model(PyTree):
+    """Everything that predicts a flight from its rotor speeds."""
+
+    params: first_principles.Params
+    """Parameters of the first-principles model."""
+    extras: Extras
+    """Torques and delay beside them."""
+
+
+class Windows(PyTree):
+    """Pieces of logs of equal length, from which predictions start."""
+
+    pos: Array
+    """Position, m. (n_windows, n, 3)"""
+    quat: Array
+    """Attitude, xyzw. (n_windows, n, 4)"""
+    vel: Array
+    """Velocity, m/s. (n_windows, n, 3)"""
+    ang_vel: Array
+    """Angular velocity, rad/s. (n_windows, n, 3)"""
+    rotor_vel: Array
+    """Rotor speeds, with ``PADDING`` samples before and after, rpm. (n_windows, n + 2 PADDING, n_rotors)"""
+
+
+PADDING = 6
+"""Samples of rotor speeds before and after a window; a delay is limited to so many less two."""
+
+
+def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
+    """Return the windows of logs of equal sample times that do not cross a gap.
+
+    Args:
+        logs: Logs.
+        duration: Duration of a window, s.
+        stride: Time between the starts of two windows, s.
+    """
+    pieces: dict[str, list[NDArray]] = {key: [] for key in ("pos", "quat", "vel", "ang_vel", "rotor_vel")}
+    for log in logs:
+        n, step = round(duration / log.dt) + 1, max(1, round(stride / log.dt))
+        for start in range(PADDING, len(log.t) - n - PADDING, step):
+            if np.any((log.gaps > start - PADDING) & (log.gaps < start + n + PADDING)):
+                continue
+            for key, values in pieces.items():
+                extra = PADDING if key == "rotor_vel" else 0
+                values.append(getattr(log, key)[start - extra : start + n + extra])
+    return Windows(**{key: jnp.asarray(np.stack(x), jnp.float32) for key, x in pieces.items()})
+
+
+def predict(model: Model, window: Windows, dt: float) -> tuple[Array, Array, Array, Array]:
+    """Return the predicted states of one window, which begin at its first sample: pos, quat, vel, ang_vel.
+
+    Rotor speeds are interpolated linearly, delayed by ``extras.delay``. Each sample is one Runge-Kutta step of order 4.
+    """
+    n = window.pos.shape[0]
+    p, extras = model.params, model.extras
+    limit = (PADDING - 2) * dt
+    at = jnp.arange(2 * n - 1) / 2 + PADDING - jnp.clip(extras.delay, -limit, limit) / dt
+    index = jnp.arange(n + 2 * PADDING, dtype=at.dtype)
+    speeds = jax.vmap(lambda x: jnp.interp(at, index, x), 1, 1)(window.rotor_vel)
+    accelerations = jnp.asarray(jnp.gradient(speeds, axis=0)) / (dt / 2)
+    sign = p.mixing_matrix[..., 2, :]
+
+    def derivative(state: tuple, speed: Array, rotor_acc: Array) -> tuple:
+        pos, quat, vel, ang_vel = state
+        torque = extras.torque + extras.torque_per_vel @ rotation.rotate_inverse(quat, vel)
+        torque = torque + reaction_torque(rotor_acc, sign, p.prop_inertia)
+        torque = rotation.rotate(quat, torque)
+        _, acc, ang_acc, _ = first_principles.dynamics(
+            pos, quat, vel, ang_vel, speed, speed, None, torque, params=model.params
+        )
+        return vel, ang_vel, acc, ang_acc
+
+    def moved(state: tuple, rates: tuple, duration: float) -> tuple:
+        pos, quat, vel, ang_vel = state
+        return (
+            pos + duration * rates[0],
+            rotation.turn(quat, rates[1], duration, normalize=True),
+            vel + duration * rates[2],
+            ang_vel + duration * rates[3],
+        )
+
+    def step(state: tuple, k: Array) -> tuple[tuple, tuple]:
+        u, a = [jax.lax.dynamic_slice_in_dim(x, 2 * k, 3) for x in (speeds, accelerations)]
+        k1 = derivative(state, u[0], a[0])
+        k2 = derivative(moved(state, k1, dt / 2), u[1], a[1])
+        k3 = derivative(moved(state, k2, dt / 2), u[1], a[1])
+        k4 = derivative(moved(state, k3, dt), u[2], a[2])
+        mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
+        new = moved(state, mean, dt)
+        return new, new
+
+    start = (window.pos[0], window.quat[0], window.vel[0], window.ang_vel[0])
+    _, path = jax.lax.scan(step, start, jnp.arange(n - 1))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, path)
+
+
+def attitude_error(quat: Array, reference: Array) -> Array:
+    """Return the rotation from a reference attitude to another, body frame, small angles in rad. (..., 3)"""
+    error = rotation.multiply(reference * jnp.array([-1.0, -1.0, -1.0, 1.0]), quat)
+    return 2 * jnp.where(error[..., 3:] < 0, -error[..., :3], error[..., :3])
+
+
+def prediction_errors(logs: Sequence[Log], model: Model, horizons: Sequence[float] = HORIZONS) -> dict[str, NDArray]:
+    """Return errors of open-loop predictions that start every 0.05 s.
+
+    Args:
+        logs: Logs of the same sample time.
+        model: Model.
+        horizons: Horizons, s.
+
+    Returns:
+        RMSE of the position, m, and of the attitude, degrees, at each horizon, by name: ``position``, ``attitude``,
+        ``position at constant velocity``, ``attitude unchanged``. (len(horizons),) each
+    """
+    batch, dt = windows(logs, max(horizons), 0.05), logs[0].dt
+    pos, quat, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt)))(batch)
+    at = np.asarray([round(h / dt) for h in horizons])
+    times = jnp.asarray(at * dt, jnp.float32)[:, None]
+    truth, turned = batch.pos[:, at], batch.quat[:, at]
+
+    def rmse(x: Array, scale: float = 1.0) -> NDArray:
+        return scale * np.sqrt(np.mean(np.sum(np.asarray(x, np.float64) ** 2, axis=-1), axis=0))
+
+    degrees = 180 / np.pi
+    return {
+        "position": rmse(pos[:, at] - truth),
+        "position at constant velocity": rmse(batch.pos[:, :1] + times * batch.vel[:, :1] - truth),
+        "attitude": rmse(attitude_error(quat[:, at], turned), degrees),
+        "attitude unchanged": rmse(attitude_error(jnp.broadcast_to(batch.quat[:, :1], turned.shape), turned), degrees),
+    }
+
+
+def errors_table(errors: dict[str, NDArray], horizons: Sequence[float] = HORIZONS) -> str:
+    """Return errors as a table of text."""
+    head = f"{'RMSE after':34}" + "".join(f"{f'{h:g} s':>10}" for h in horizons)
+    unit = {"p": "m", "a": "degrees"}
+    return "\n".join(
+        [head, *(f"{f'{k}, {unit[k[0]]}':34}" + "".join(f"{x:10.4g}" for x in v) for k, v in errors.items())]
+    )

@@ -1,0 +1,157 @@
+"""Identification finds the airframe that made a log, and refuses or repairs bad logs."""
+
+import jax
+import numpy as np
+import pytest
+
+from crazysim.__main__ import main
+from crazysim.drones import load_airframe
+from crazysim.errors import ConfigError
+from crazysim.identify import errors_table, identify, prediction_errors, read_log
+from crazysim.sim import Sim
+
+FACTORS = {"inertia x": 1.3, "inertia y": 1.2, "thrust factor": 1.05}
+DRAG = (-0.03, -0.025, -0.02)
+N_FLIGHTS = 6
+
+
+@pytest.fixture(scope="module")
+def flights():
+    """Columns of simulated flights of a drone that differs from cf21B_500, sampled at 250 Hz."""
+    base = load_airframe("cf21B_500")
+    inertia = np.diag(base.inertia) * [FACTORS["inertia x"], FACTORS["inertia y"], 1]
+    curve = base.value("rotors.thrust_curve") * FACTORS["thrust factor"]
+    drone = {
+        "base": "cf21B_500",
+        "rigid_body": {"inertia": inertia.tolist()},
+        "rotors": {"thrust_curve": curve.tolist()},
+        "drag": {"coefficients": list(DRAG)},
+    }
+    sim = Sim(n_worlds=N_FLIGHTS, drone=drone, control="attitude", integrator="rk4")
+    high = sim.data.states.pos + np.array([0, 0, 20.0], np.float32)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=high))
+    rng, rows = np.random.default_rng(0), []
+    weight = float(base.value("rigid_body.mass")) * 9.81
+    for k in range(600):
+        if k % 25 == 0:
+            cmd = np.zeros((N_FLIGHTS, 1, 4), np.float32)
+            cmd[:, 0, :3] = rng.uniform(-0.5, 0.5, (N_FLIGHTS, 3))
+            cmd[:, 0, 3] = weight * rng.uniform(0.9, 1.2, N_FLIGHTS)
+        sim.attitude_control(cmd)
+        sim.step(2)
+        s = sim.data.states
+        rows.append(np.concatenate([np.asarray(x)[:, 0] for x in (s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel)], -1))
+    names = [
+        "x",
+        "y",
+        "z",
+        "qx",
+        "qy",
+        "qz",
+        "qw",
+        "vx",
+        "vy",
+        "vz",
+        "wx",
+        "wy",
+        "wz",
+        *(f"rpm{k}" for k in range(1, 5)),
+    ]
+    table = np.stack(rows[100:], axis=1).astype(np.float64)
+    return [{"t": 0.004 * np.arange(len(x)), **dict(zip(names, x.T, strict=True))} for x in table]
+
+
+@pytest.fixture(scope="module")
+def result(flights):
+    return identify([read_log(x) for x in flights[:-1]])
+
+
+def test_identification_finds_the_airframe_of_the_logs(result):
+    # Interpolated rotor speeds between samples bias the moments by up to 3%.
+    for name, true in {**FACTORS, **dict(zip(["drag x", "drag y", "drag z"], DRAG, strict=True))}.items():
+        assert result.deviations[name] < 0.1 * abs(true), name
+        assert abs(result.values[name] - true) < max(3 * result.deviations[name], 0.03 * abs(true)), name
+    assert abs(result.values["delay"]) < 2e-3
+    assert not result.doubtful, result.values
+
+
+def test_identified_model_predicts_held_out_flights(flights, result):
+    errors = prediction_errors([read_log(flights[-1])], result.model)
+    assert np.all(errors["position"] < 0.1 * errors["position at constant velocity"])
+    assert np.all(errors["attitude"] < 0.1 * errors["attitude unchanged"])
+    assert "attitude, degrees" in errors_table(errors)
+
+
+def test_command_writes_an_airframe(flights, tmp_path, capsys):
+    table = {k: x for k, x in flights[0].items() if k != "t"} | {"seconds": flights[0]["t"]}
+    path, out = tmp_path / "flight.csv", tmp_path / "mine.toml"
+    np.savetxt(path, np.stack(list(table.values()), -1), delimiter=",", header=",".join(table), comments="")
+    status = main(["identify", str(path), "--test", str(path), "--columns", "time=seconds", "--out", str(out)])
+    assert status == 0, capsys.readouterr().err
+    assert "held-out logs" in capsys.readouterr().out
+    assert load_airframe(out).value("rigid_body.mass") == load_airframe("cf21B_500").value("rigid_body.mass")
+
+
+def test_missing_columns_are_named(flights):
+    with pytest.raises(ConfigError, match="qw"):
+        read_log({k: x for k, x in flights[0].items() if k != "qw"})
+
+
+def test_time_that_goes_back_is_dropped(flights):
+    log = {k: np.insert(x, 100, x[50]) for k, x in flights[0].items()}
+    read = read_log(log)
+    assert np.all(np.diff(read.t) > 0)
+    assert "dropped 1 samples" in read.repairs[0]
+    backwards = flights[0] | {"t": -flights[0]["t"]}
+    with pytest.raises(ConfigError, match="time increases"):
+        read_log(backwards)
+
+
+def test_gaps_are_reported(flights):
+    read = read_log({k: np.delete(x, np.arange(200, 230)) for k, x in flights[0].items()})
+    assert read.gaps.tolist() == [200]
+    assert "1 gaps" in read.repairs[0]
+
+
+def test_nan_is_interpolated_or_refused(flights):
+    x = flights[0]["x"].copy()
+    x[10] = np.nan
+    read = read_log(flights[0] | {"x": x})
+    np.testing.assert_allclose(read.pos[10, 0], (x[9] + x[11]) / 2)
+    assert "not finite" in read.repairs[0]
+    with pytest.raises(ConfigError, match="finite pos"):
+        read_log(flights[0] | {"x": np.full_like(x, np.nan)})
+
+
+def test_offset_of_quaternions_is_found(flights):
+    moved = flights[0] | {"qw": flights[0]["qw"] + 0.04, "qx": flights[0]["qx"] - 0.01}
+    read = read_log(moved)
+    np.testing.assert_allclose(read.quat[:, 0], flights[0]["qx"], atol=1e-3)
+    assert "subtracted" in read.repairs[0]
+
+
+def test_spikes_of_rotor_speeds_are_interpolated(flights):
+    x = flights[0]["rpm3"].copy()
+    x[40] = 1e6
+    read = read_log(flights[0] | {"rpm3": x})
+    assert read.rotor_vel[40, 2] < 4e4
+    assert "interpolated 1 rotor speeds" in read.repairs[0]
+
+
+def test_wrong_units_are_refused(flights):
+    degrees = flights[0] | {k: np.degrees(flights[0][k]) for k in ("wx", "wy", "wz")}
+    with pytest.raises(ConfigError, match="degrees per second"):
+        read_log(degrees)
+    radians = flights[0] | {f"rpm{k}": flights[0][f"rpm{k}"] * 2 * np.pi / 60 for k in range(1, 5)}
+    with pytest.raises(ConfigError, match="rpm_per_unit"):
+        identify([read_log(radians)])
+
+
+def test_other_order_of_rotors_is_refused(flights):
+    other = flights[0] | {"rpm1": flights[0]["rpm2"], "rpm2": flights[0]["rpm1"]}
+    with pytest.raises(ConfigError, match=r"order \[2, 1, 3, 4\]"):
+        identify([read_log(other)])
+
+
+def test_results_are_plain_numbers(result):
+    assert all(isinstance(x, float) for x in jax.tree.leaves(result.values))
