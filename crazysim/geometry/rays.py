@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jax import Array
 
 from crazysim.geometry.fieldrays import PARALLEL, field_ray
-from crazysim.geometry.points import components
+from crazysim.geometry.points import Components, components
 from crazysim.geometry.shapes import Shape
 from crazysim.rotation import safe_clip, safe_normalize, safe_sqrt
 
 Interval = tuple[Array, Array, Array]
 """Distances along a line at which it enters and leaves a convex shape, and True where it meets the shape at all."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sized:
+    """Primitives of one kind whose sizes are arrays, as those of many objects are in a loop over them."""
+
+    kind: str
+    """Kind of the shapes; one of those that ``Shape`` describes by its size alone."""
+    size: Sequence[Array]
+    """Size in the convention of the kind, m. (...) each"""
 
 
 def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Array]:
@@ -33,6 +46,21 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
     origin, direction = jnp.broadcast_arrays(origin, direction)
     if shape.kind == "hfield":
         return field_ray(shape, origin, direction)
+    t = hit_distance(shape, components(origin), components(direction))
+    return t, hit_normal(shape, origin, direction, t)
+
+
+def hit_distance(shape: Shape | Sized, origin: Components, direction: Components) -> Array:
+    """Return the distance along rays to the surface of a shape, m, infinite where they miss. (...)
+
+    The conventions are those of ``ray_distance``. Rays in components make a loop over many objects element-wise
+    arithmetic, which compilers fuse and vectorise.
+
+    Args:
+        shape: Shape, or shapes of one kind; not a height field.
+        origin: Origin of each ray, in the frame of the shape, m. 3 of (...)
+        direction: Unit direction of each ray, in the frame of the shape. 3 of (...)
+    """
     if shape.kind == "plane":
         t, hit = _plane(origin, direction)
     else:
@@ -40,13 +68,26 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
         hit = meets & (far >= 0)
         t = jnp.where(near >= 0, near, far)
     # A miss must not contribute NaN, in gradients either.
-    t = jnp.where(hit, t, 0.0)
+    return jnp.where(hit, jnp.where(hit, t, 0.0), jnp.inf)
+
+
+def hit_normal(shape: Shape | Sized, origin: Array, direction: Array, distance: Array) -> Array:
+    """Return the outward unit normal where rays hit a shape, in its frame, zero where they miss. (..., 3)
+
+    Args:
+        shape: Shape, or shapes of one kind; not a height field.
+        origin: Origin of each ray, in the frame of the shape, m. (..., 3)
+        direction: Unit direction of each ray, in the frame of the shape. (..., 3)
+        distance: Distance along each ray, m, infinite where it misses. (...)
+    """
+    hit = jnp.isfinite(distance)
+    t = jnp.where(hit, distance, 0.0)
     normal = SURFACE_NORMAL[shape.kind](shape, origin + t[..., None] * direction)
-    return jnp.where(hit, t, jnp.inf), jnp.where(hit[..., None], normal, 0.0)
+    return jnp.where(hit[..., None], normal, 0.0)
 
 
-def _plane(origin: Array, direction: Array) -> tuple[Array, Array]:
-    height, down = origin[..., 2], -direction[..., 2]
+def _plane(origin: Components, direction: Components) -> tuple[Array, Array]:
+    height, down = origin[2], -direction[2]
     hit = (down > PARALLEL) & (height >= 0)
     return height / jnp.where(hit, down, 1.0), hit
 
@@ -72,63 +113,64 @@ def union(p: Interval, q: Interval) -> Interval:
     return near, far, p[2] | q[2]
 
 
-def _ball_line(origin: list[Array], direction: list[Array], radius: float) -> Interval:
+def _ball_line(origin: Sequence[Array], direction: Sequence[Array], radius: Array | float) -> Interval:
     """Return the interval of a line in a ball, or in a cylinder if two components are given.
 
     It uses the point of the line nearest to the centre, because the usual discriminant cancels far from the ball.
     """
     square = sum(d * d for d in direction)
     parallel = square < PARALLEL
-    square = jnp.where(parallel, 1.0, square)
-    middle = -sum(o * d for o, d in zip(origin, direction, strict=True)) / square
+    inverse = 1 / jnp.where(parallel, 1.0, square)
+    middle = -sum(o * d for o, d in zip(origin, direction, strict=True)) * inverse
     closest = [o + middle * d for o, d in zip(origin, direction, strict=True)]
     rest = radius * radius - sum(c * c for c in closest)
-    half = safe_sqrt(rest / square)
+    half = safe_sqrt(rest * inverse)
     outside = sum(o * o for o in origin) > radius * radius
     half = jnp.where(parallel, 1 / PARALLEL, half)
     return middle - half, middle + half, jnp.where(parallel, ~outside, rest >= 0)
 
 
-def _sphere_line(shape: Shape, origin: Array, direction: Array) -> Interval:
-    return _ball_line(list(components(origin)), list(components(direction)), shape.size[0])
+def _sphere_line(shape: Shape | Sized, origin: Components, direction: Components) -> Interval:
+    return _ball_line(origin, direction, shape.size[0])
 
 
-def _capsule_line(shape: Shape, origin: Array, direction: Array) -> Interval:
+def _capsule_line(shape: Shape | Sized, origin: Components, direction: Components) -> Interval:
     radius, half = shape.size
-    (x, y, z), d = components(origin), list(components(direction))
+    (x, y, z), d = origin, direction
     out = intersection(_ball_line([x, y], d[:2], radius), slab_line(z, d[2], half))
     for end in (-half, half):
         out = union(out, _ball_line([x, y, z - end], d, radius))
     return out
 
 
-def _box_line(shape: Shape, origin: Array, direction: Array) -> Interval:
-    x, y, z = (
-        slab_line(o, d, h) for o, d, h in zip(components(origin), components(direction), shape.size, strict=True)
-    )
+def _box_line(shape: Shape | Sized, origin: Components, direction: Components) -> Interval:
+    x, y, z = (slab_line(o, d, h) for o, d, h in zip(origin, direction, shape.size, strict=True))
     return intersection(intersection(x, y), z)
 
 
-def _cylinder_line(shape: Shape, origin: Array, direction: Array) -> Interval:
+def _cylinder_line(shape: Shape | Sized, origin: Components, direction: Components) -> Interval:
     radius, half = shape.size
-    (x, y, z), (u, v, w) = components(origin), components(direction)
+    (x, y, z), (u, v, w) = origin, direction
     return intersection(_ball_line([x, y], [u, v], radius), slab_line(z, w, half))
 
 
-def _ellipsoid_line(shape: Shape, origin: Array, direction: Array) -> Interval:
-    start, way = ([x / a for x, a in zip(components(v), shape.size, strict=True)] for v in (origin, direction))
+def _ellipsoid_line(shape: Shape | Sized, origin: Components, direction: Components) -> Interval:
+    start, way = ([x / a for x, a in zip(v, shape.size, strict=True)] for v in (origin, direction))
     return _ball_line(start, way, 1.0)
 
 
-def _planes(shape: Shape, v: Array) -> Array:
+def _planes(shape: Shape, v: Components) -> Array:
     """Return the products of vectors with all normals of a mesh. (..., n_planes)"""
-    x, y, z = (jnp.asarray(column, v.dtype) for column in shape.array("normals").T)
-    return x * v[..., :1] + y * v[..., 1:2] + z * v[..., 2:]
+    x, y, z = (
+        jnp.asarray(column, v[0].dtype) * part[..., None]
+        for column, part in zip(shape.array("normals").T, v, strict=True)
+    )
+    return x + y + z
 
 
-def _mesh_line(shape: Shape, origin: Array, direction: Array) -> Interval:
+def _mesh_line(shape: Shape, origin: Components, direction: Components) -> Interval:
     """Return the interval of a line below all planes of a mesh (Kay and Kajiya 1986)."""
-    below = jnp.asarray(shape.offsets, origin.dtype) - _planes(shape, origin)
+    below = jnp.asarray(shape.offsets, origin[0].dtype) - _planes(shape, origin)
     rises = _planes(shape, direction)
     parallel = jnp.abs(rises) < PARALLEL
     t = below / jnp.where(parallel, 1.0, rises)
@@ -156,21 +198,21 @@ def _up(like: Array) -> Array:
     return jnp.stack([zero, zero, zero + 1], axis=-1)
 
 
-def _plane_normal(_: Shape, point: Array) -> Array:
+def _plane_normal(_: Shape | Sized, point: Array) -> Array:
     return _up(point)
 
 
-def _sphere_normal(_: Shape, point: Array) -> Array:
+def _sphere_normal(_: Shape | Sized, point: Array) -> Array:
     return safe_normalize(point, _up(point))
 
 
-def _capsule_normal(shape: Shape, point: Array) -> Array:
+def _capsule_normal(shape: Shape | Sized, point: Array) -> Array:
     x, y, z = components(point)
     half = shape.size[1]
     return safe_normalize(jnp.stack([x, y, z - safe_clip(z, -half, half)], axis=-1), _up(point))
 
 
-def _box_normal(shape: Shape, point: Array) -> Array:
+def _box_normal(shape: Shape | Sized, point: Array) -> Array:
     """Return the normal of the side that a point is nearest to. (..., 3)"""
     x, y, z = (jnp.abs(p) - h for p, h in zip(components(point), shape.size, strict=True))
     of_x = (x >= y) & (x >= z)
@@ -179,7 +221,7 @@ def _box_normal(shape: Shape, point: Array) -> Array:
     return jnp.where(sides, jnp.where(point < 0, -1.0, 1.0), 0.0)
 
 
-def _cylinder_normal(shape: Shape, point: Array) -> Array:
+def _cylinder_normal(shape: Shape | Sized, point: Array) -> Array:
     radius, half = shape.size
     x, y, z = components(point)
     zero = jnp.zeros_like(z)
@@ -191,13 +233,13 @@ def _cylinder_normal(shape: Shape, point: Array) -> Array:
     return jnp.where(of_side[..., None], side, cap)
 
 
-def _ellipsoid_normal(shape: Shape, point: Array) -> Array:
+def _ellipsoid_normal(shape: Shape | Sized, point: Array) -> Array:
     gradient = [x / (a * a) for x, a in zip(components(point), shape.size, strict=True)]
     return safe_normalize(jnp.stack(gradient, axis=-1), _up(point))
 
 
 def _mesh_normal(shape: Shape, point: Array) -> Array:
-    above = _planes(shape, point) - jnp.asarray(shape.offsets, point.dtype)
+    above = _planes(shape, components(point)) - jnp.asarray(shape.offsets, point.dtype)
     return jnp.take(jnp.asarray(shape.array("normals"), point.dtype), jnp.argmax(above, axis=-1), axis=0)
 
 
