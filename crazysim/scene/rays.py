@@ -179,7 +179,7 @@ class _Alike:
     carrier: Literal["world", "object", "drone"]
     """Kind of the bodies that carry them."""
     is_turned: bool
-    """False if no geom has a rotation."""
+    """True if a geom may have a rotation."""
     geoms: list[CollisionGeom]
     """Geoms, in the frames of their bodies."""
     rows: list[int]
@@ -193,8 +193,7 @@ class _Alike:
         rot = np.array([np.eye(3) if geom.rot is None else geom.rot for geom in self.geoms])
         size = jnp.asarray([geom.shape.size for geom in self.geoms], dtype)[None]
         at, axes = jnp.asarray(pos, dtype)[None], [jnp.asarray(rot[:, :, k], dtype)[None] for k in range(3)]
-        if self.carrier == "object":
-            assert data.objects is not None
+        if self.carrier == "object" and data.objects is not None:
             poses = data.objects.pos[:, 0], data.objects.quat[:, 0]
         else:
             poses = data.states.pos, data.states.quat

@@ -1,5 +1,6 @@
 """Depth cameras and range finders against formulas, C MuJoCo's rays and its depth images."""
 
+import dataclasses
 import functools
 
 import jax
@@ -257,3 +258,117 @@ def test_rays_are_those_of_c_mujoco(room, rng):
             met += 1
             assert distance[k] == pytest.approx(far, rel=1e-4, abs=1e-4)
     assert 100 < met < n
+
+
+ALL_KINDS = """<mujoco><asset>
+<mesh name="wedge" vertex="0 0 0 .4 0 0 0 .5 0 0 0 .6"/>
+<hfield name="hill" nrow="3" ncol="4" size=".5 .4 .3 .1" elevation="0 .2 .1 0 .5 1 .6 .3 0 .4 .2 .1"/></asset>
+<worldbody><geom type="sphere" size=".15" pos="0 0 .6"/><geom type="box" size=".1 .2 .3" euler="20 0 40" pos=".6 0 0"/>
+<geom type="capsule" size=".1 .3" pos="-.5 .1 .2"/><geom type="cylinder" size=".12 .2" euler="0 30 0" pos="0 .6 .1"/>
+<geom type="ellipsoid" size=".1 .2 .3" pos="0 -.6 .1"/><geom type="mesh" mesh="wedge" pos="-.2 -.2 -.5"/>
+<geom type="hfield" hfield="hill" pos=".2 .2 -.6"/></worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    """Two worlds of two drones among geoms of all kinds, some fixed and some that move."""
+    sim = Sim(n_worlds=2, n_drones=2)
+    sim.scene.add("box", "fixed", pos=[2, 0, 1], quat=[0.1, 0.2, 0.3, 0.9], size=(0.5, 1.0, 1.5), mocap=False)
+    quat = np.random.default_rng(1).normal(size=(2, 1, 4))
+    sim.scene.add(ALL_KINDS, "moving", pos=[0, 2, 1], quat=quat)
+    placed(sim, [[[0, 0, 1], [0.5, -0.3, 1]]] * 2)
+    return sim
+
+
+def one_by_one(sim, own):
+    """Return functions from data and rays to hits: all worlds at once, and each as a stage of one world does it."""
+    from crazysim.core.stage import Axes
+    from crazysim.scene.rays import cast
+
+    model = sim.scene.collision_model
+    # Every other geom: compiling the gradients of each world takes long.
+    some = tuple(dataclasses.replace(body, geoms=body.geoms[::-1][::2]) for body in model.objects)
+    model = dataclasses.replace(model, objects=some)
+
+    def together(data, origin, direction):
+        return cast(model, data, origin, direction, own)
+
+    def each(data, origin, direction):
+        axes = Axes(data)
+        over = {"drone": 0, "world": 0}
+        one = [x[:, 0] if scope == "world" else x for x, scope in zip(jax.tree.leaves(data), axes.scopes, strict=True)]
+
+        def of_world(leaves, start, along):
+            return cast(model, axes.treedef.unflatten(leaves), start, along, own)
+
+        mapped = jax.vmap(of_world, ([over.get(scope) for scope in axes.scopes], 0, 0))
+        return mapped(one, origin, direction)
+
+    return together, each
+
+
+def some_rays(rng, n):
+    """Return rays from among the geoms, some along axes, some with a negative zero. (2, n, 3) each"""
+    origin, direction = rng.uniform([-3, -3, 0.2], [3, 3, 3.5], (2, n, 3)), rng.normal(size=(2, n, 3))
+    direction[:, : n // 8] = rng.choice([-1.0, -0.0, 0.0, 1.0], (2, n // 8, 3))
+    direction[~direction.any(axis=-1)] = [-0.0, 0, 1]
+    at = slice(n // 4, n)
+    direction[:, at] = [0, 2, 1] + rng.uniform(-0.7, 0.7, (2, n - n // 4, 3)) - origin[:, at]
+    return origin, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def test_rays_of_all_worlds_are_those_of_each_world(x64, crowd, rng):
+    """The loop over geoms of one kind, and the stage's loop over bodies: hits and gradients are the same."""
+    n = 300
+    data = jax.tree.map(lambda x: x.astype(np.float64) if x.dtype == np.float32 else x, crowd.data)
+    quat = data.objects.quat / jnp.linalg.norm(data.objects.quat, axis=-1, keepdims=True)
+    data = data.replace(objects=data.objects.replace(quat=quat))
+    origin, direction = some_rays(rng, n)
+    own = np.repeat([-1, 0, 1], n // 3)
+    origin[:, own == 1] = data.states.pos[:, 1:2]
+    to_drones = np.asarray(data.states.pos)[:, np.arange(40, 100) % 2] - origin[:, 40:100]
+    direction[:, 40:100] = to_drones / np.linalg.norm(to_drones, axis=-1, keepdims=True)
+    weight, slant = rng.uniform(size=(2, n)), rng.normal(size=(2, n, 3))
+
+    def answer(cast_all):
+        def weighed(pos, quat, moved, start, along):
+            states = data.states.replace(pos=pos, quat=quat)
+            hits = cast_all(data.replace(states=states, objects=data.objects.replace(pos=moved)), start, along)
+            lengths = jnp.sum(jnp.where(jnp.isfinite(hits.distance), weight * hits.distance, 0.0))
+            return lengths + jnp.sum(slant * hits.normal), hits
+
+        args = data.states.pos, data.states.quat, data.objects.pos, origin, direction
+        return jax.jit(jax.value_and_grad(weighed, (0, 1, 2, 3, 4), has_aux=True))(*args)
+
+    ((_, together), slopes), ((_, each), expected) = map(answer, one_by_one(crowd, own))
+    seen = {together.names[k].partition(":")[0] for k in np.unique(together.number) if k >= 0}
+    assert seen == {"floor", "fixed", "moving", "drone"}
+    np.testing.assert_array_equal(together.number, each.number)
+    np.testing.assert_allclose(together.distance, each.distance, rtol=1e-9)
+    np.testing.assert_allclose(together.normal, each.normal, atol=1e-9)
+    for slope, known in zip(slopes, expected, strict=True):
+        assert np.abs(known).max() > 0.1
+        np.testing.assert_allclose(slope, known, rtol=1e-6, atol=1e-8 * np.abs(known).max())
+
+
+def test_rays_meet_geoms_of_every_kind_where_c_mujoco_has_them(crowd, rng):
+    n = 300
+    from crazysim.scene.rays import cast
+
+    origin, direction = some_rays(rng, n)
+    rays = [np.float32(x) for x in (origin, direction)]
+    rays[1][0, :3] = np.nan * np.eye(3)
+    hits = jax.jit(lambda data, *rays: cast(crowd.scene.visual_model, data, *rays, drones=False))(crowd.data, *rays)
+    assert not np.isfinite(hits.distance[0, :3]).any()
+    crowd.scene.sync_one(crowd.data, 1)
+    geom, group, met = np.zeros(1, np.int32), np.array([1, 1, 0, 0, 0, 0], np.uint8), set()
+    for k in range(n):
+        far = mujoco.mj_ray(crowd.mj_model, crowd.mj_data, origin[1, k], direction[1, k], group, 1, -1, geom, None)
+        if far < 0:
+            assert not np.isfinite(hits.distance[1, k])
+        else:
+            met.add(int(crowd.mj_model.geom_type[geom[0]]))
+            body = crowd.mj_model.body_rootid[crowd.mj_model.geom_bodyid[geom[0]]]
+            assert hits.names[hits.number[1, k]] == (crowd.mj_model.body(body).name if body else "floor")
+            assert hits.distance[1, k] == pytest.approx(far, rel=1e-4, abs=1e-4)
+    assert len(met) == 8

@@ -1,0 +1,60 @@
+"""Rays per second of depth images, beside the time to the first image.
+
+One JSON line for each number of poles, fixed and movable. For the figures of another version, run this file with its
+folder in PYTHONPATH, in turns with this one.
+
+    python benchmarks/depth.py [--device gpu] [--worlds 64] [--size 64 64] [--poles 0 30 1000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from functools import partial
+
+import jax
+import numpy as np
+from measure import digits, medians, report, seconds
+
+from crazysim import Sim, __version__
+
+HALF = 10.0
+"""Half the side of the square in which the poles stand, m."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--size", type=int, nargs=2, default=(64, 64), help="width and height, pixels")
+    parser.add_argument("--poles", type=int, nargs="+", default=(0, 30, 1000))
+    parser.add_argument("--repeats", type=int, default=9)
+    args = parser.parse_args()
+    for n_poles, movable in [(n, movable) for n in args.poles for movable in ((False, True) if n else (False,))]:
+        sim = scene(args.worlds, n_poles, movable, args.device)
+        look = partial(sim.depth, "fpv_cam", args.size[0], args.size[1])
+        begin = time.perf_counter()
+        jax.block_until_ready(look())
+        first = time.perf_counter() - begin
+        taken = medians({"depth": partial(seconds, look)}, args.repeats)["depth"]
+        n_rays = args.worlds * args.size[0] * args.size[1]
+        report(
+            args.device, benchmark="depth", n_poles=n_poles, movable=movable, n_worlds=args.worlds, width=args.size[0],
+            height=args.size[1], first_s=digits(first), rays_per_s=digits(n_rays / taken), crazysim=__version__,
+        )  # fmt: skip
+
+
+def scene(n_worlds: int, n_poles: int, movable: bool, device: str) -> Sim:
+    """Return a drone at a height of 1 m amid poles."""
+    sim = Sim(n_worlds, control="attitude", device=device)
+    if n_poles:
+        pos = np.zeros((n_poles, 3))
+        pos[:, :2] = np.random.default_rng(0).uniform(-HALF, HALF, (n_poles, 2))
+        sim.scene.add("pole", count=n_poles, pos=pos, mocap=movable)
+    pos = np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), sim.data.states.pos.shape)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    return sim
+
+
+if __name__ == "__main__":
+    main()
