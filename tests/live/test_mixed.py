@@ -43,7 +43,9 @@ def test_the_loop_drives_twins_and_swarms_and_waits_for_no_source():
         live.at(0.2, lambda _: swarm["cf1"].take_off(0.5, 1.0))
         began = time.perf_counter()
         report = live.run(seconds=2.0)
-        assert time.perf_counter() - began < 15
+        assert (
+            time.perf_counter() - began < 60
+        )  # a busy machine takes its time, a wait for the silent source would not end
     assert swarm.state("cf1").pos[2] == pytest.approx(0.5, abs=0.15)
     assert swarm.state("cf2").pos[2] < 0.01
     assert np.asarray(twins[0].handles["cf1"].pose(sim.data)[0])[0, 0, 0] > 1.1
