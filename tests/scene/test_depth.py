@@ -356,8 +356,8 @@ def test_rays_meet_geoms_of_every_kind_where_c_mujoco_has_them(crowd, rng):
     from crazysim.scene.rays import cast
 
     origin, direction = some_rays(rng, n)
-    rays = [np.float32(x) for x in (origin, direction)]
-    rays[1][0, :3] = np.nan * np.eye(3)
+    direction[0, :3] = np.nan * np.eye(3)
+    rays = [x.astype(np.float32) for x in (origin, direction)]
     hits = jax.jit(lambda data, *rays: cast(crowd.scene.visual_model, data, *rays, drones=False))(crowd.data, *rays)
     assert not np.isfinite(hits.distance[0, :3]).any()
     crowd.scene.sync_one(crowd.data, 1)
