@@ -1,0 +1,288 @@
+"""Reverse mode on blocks: from the cotangents of a block's outputs to those of its inputs.
+
+An operation has the derivative that JAX gives it: its rule is traced once for each operation and types, and lowered
+like any other function. What the derivative needs of the block's own results is computed in the same block again, and
+what both compute is computed once.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax import lax
+
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
+from crazysim.engine.lowering.jaxprs import lower_function
+
+MAX_UNROLLED = 4096
+"""Most operations of a loop that is unrolled for its derivative."""
+
+Cotangents = dict[Value, Element]
+"""Cotangents by the values of the block that is differentiated."""
+
+
+def transposed(block: Block, wanted: Sequence[Value]) -> Block:
+    """Return the block that computes cotangents of a block's inputs.
+
+    Args:
+        block: The block.
+        wanted: Inputs whose cotangents are computed, floats.
+
+    Returns:
+        The block from the inputs of ``block``, and behind them a cotangent for each output that is a float, to the
+        cotangents of ``wanted``.
+
+    Raises:
+        UnsupportedError: If an operation between them has no derivative in a kernel.
+    """
+    places = [block.inputs.index(x) for x in wanted]
+    block = _unrolled(block)
+    wanted = [block.inputs[k] for k in places]
+    on_path = active(block, wanted)
+    builder = Builder()
+    values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
+    inline(builder, block, values)
+    cotangents: Cotangents = {}
+    for x in block.outputs:
+        if x.dtype.kind == "f":
+            ct = builder.input(x.dtype)
+            if isinstance(x, Value) and x in on_path:
+                _accumulate(builder, cotangents, x, ct)
+    _pull(builder, block, values, on_path, cotangents)
+    return prune(builder.finish([cotangents.get(x, constant(0, x.dtype)) for x in wanted]))
+
+
+def active(block: Block, wanted: Collection[Value]) -> set[Value]:
+    """Return the values of a block, those of inner blocks included, that some of its inputs change differentiably."""
+    found = set(wanted)
+    _spread(block, found)
+    return found
+
+
+def _spread(block: Block, found: set[Value]) -> None:
+    for op in block.operations:
+        if op.name == "over_others":
+            (body,) = op.blocks
+            found.update(x for x, arg in zip(body.inputs, op.args, strict=False) if arg in found)
+        if op.name in ("loop", "while"):  # what changes in one turn may change all that the next one computes
+            changed = any(x in found for x in (*op.args, *op.blocks[-1].uses()))
+            if changed:
+                found.update(x for x in op.blocks[-1].inputs if x.dtype.kind == "f")
+        if op.name == "custom_jvp":
+            if any(isinstance(x, Value) and x in found for x in op.args):
+                found.update(x for x in op.results if x.dtype.kind == "f")
+            continue
+        for inner in op.blocks:
+            _spread(inner, found)
+        sources = (*op.args, *(x for inner in op.blocks for x in inner.outputs))
+        if any(isinstance(x, Value) and x in found for x in sources):
+            found.update(x for x in op.results if x.dtype.kind == "f")
+
+
+def _pull(builder: Builder, block: Block, values: dict[Value, Element], on_path: set[Value], cts: Cotangents) -> None:
+    """Go through a block backwards, from the cotangents of its results to those of what it uses.
+
+    Args:
+        builder: Takes the operations.
+        block: The block.
+        values: Elements that its values are there.
+        on_path: Values whose cotangents are computed.
+        cts: Cotangents found so far, which are replaced.
+    """
+
+    def mapped(x: Element) -> Element:
+        return values.get(x, x) if isinstance(x, Value) else x
+
+    for op in reversed(block.operations):
+        found = [cts.pop(x, None) for x in op.results]
+        if all(ct is None for ct in found) or not any(x in on_path for x in op.results):
+            continue
+        builder.stage = op.stage
+        rule = STRUCTURE.get(op.name)
+        if rule is not None:
+            rule(builder, op, values, on_path, found, cts)
+            continue
+        if ops.TABLE[op.name].structured:
+            raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
+        slope = _slope(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
+        given = [*map(mapped, op.args), found[0]]
+        parts = inline(builder, slope, dict(zip(slope.inputs, given, strict=True)))
+        floats = [x for x in op.args if x.dtype.kind == "f"]
+        for x, part in zip(floats, parts, strict=True):
+            if isinstance(x, Value) and x in on_path:
+                _accumulate(builder, cts, x, part)
+
+
+def _accumulate(builder: Builder, cts: Cotangents, x: Value, part: Element) -> None:
+    cts[x] = builder.add("add", (cts[x], part), x.dtype) if x in cts else part
+
+
+@functools.lru_cache(maxsize=1024)
+def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
+    """Return the block from operands and the cotangent of an operation to the cotangents of its operands, floats."""
+    floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
+
+    def pull(*args: Any) -> list[Any]:
+        *operands, ct = args
+
+        def of(some: list[Any]) -> Any:
+            every = list(operands)
+            for k, x in zip(floats, some, strict=True):
+                every[k] = x
+            return _applied(name, every, dtype, params)
+
+        return jax.vjp(of, [operands[k] for k in floats])[1](ct)[0]
+
+    return lower_function(pull, *[jax.ShapeDtypeStruct((), x) for x in (*dtypes, dtype)])
+
+
+def _applied(name: str, args: Sequence[Any], dtype: np.dtype, params: tuple) -> Any:
+    if name in ("convert_element_type", "bitcast_convert_type"):
+        return getattr(lax, name)(args[0], dtype)
+    fn = ops.TABLE[name].xla or name
+    return (getattr(lax, fn) if isinstance(fn, str) else fn)(*args, **dict(params))
+
+
+Found = Sequence[Element | None]
+"""Cotangents of the results of an operation; None for those that nothing uses."""
+
+
+def _when(builder: Builder, op: Operation, values: dict, on_path: set[Value], found: Found, cts: Cotangents) -> None:
+    """Where the mask is true the cotangents go through the block, elsewhere to the old numbers."""
+    mask, *old = op.args
+    mask = values.get(mask, mask)
+    (block,) = op.blocks
+    inner, inside, own = Builder(builder), dict(values), Cotangents()
+    inline(inner, block, inside)
+    for x, before, ct in zip(block.outputs, old, found, strict=True):
+        if ct is None:
+            continue
+        if isinstance(before, Value) and before in on_path:
+            rest = builder.add("select_n", (mask, ct, constant(0, ct.dtype)), ct.dtype)
+            _accumulate(builder, cts, before, rest)
+        if isinstance(x, Value) and x in on_path:
+            _accumulate(inner, own, x, ct)
+    _pull(inner, block, inside, on_path, own)
+    before = [cts.get(x, constant(0, x.dtype)) for x in own]
+    sums = [inner.add("add", (a, own[x]), x.dtype) for a, x in zip(before, own, strict=True)]
+    if own:
+        results = builder.add_many("when", (mask, *before), [x.dtype for x in own], (), (inner.finish(sums),))
+        cts.update(zip(own, results, strict=True))
+
+
+def _custom_jvp(
+    builder: Builder, op: Operation, values: dict, on_path: set[Value], found: Found, cts: Cotangents
+) -> None:
+    """Transpose the derivative that the function has of its own."""
+    slope = _transposed_slope(op.param("slope")())
+    args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
+    seeds = [constant(0, x.dtype) if ct is None else ct for x, ct in zip(op.results, found, strict=True)
+             if x.dtype.kind == "f"]  # fmt: skip
+    given = [*args, *(constant(0, x.dtype) for x in args), *seeds]
+    parts = inline(builder, slope, dict(zip(slope.inputs, given, strict=True)))
+    for x, part in zip([x for x in op.args if x.dtype.kind == "f"], parts, strict=True):
+        if isinstance(x, Value) and x in on_path:
+            _accumulate(builder, cts, x, part)
+
+
+@functools.lru_cache(maxsize=256)
+def _transposed_slope(slope: Block) -> Block:
+    tangents = slope.inputs[len(slope.inputs) // 2 :]
+    return transposed(slope, [x for x in tangents if x.dtype.kind == "f"])
+
+
+def _over_others(
+    builder: Builder, op: Operation, values: dict, on_path: set[Value], found: Found, cts: Cotangents
+) -> None:
+    """Cotangents go to the drone that reads, and, from all drones that read them, to the numbers it published."""
+    used = [ct for ct in found if ct is not None]
+    names = [name for name, ct in zip(op.param("reduce"), found, strict=True) if ct is not None]
+    if any(name != "add" for name in names):
+        raise UnsupportedError("the smallest or largest over other drones has no derivative in a kernel", op.name)
+    (body,) = op.blocks
+    own = [x for x in body.uses() if x in values and not x.size and isinstance(values[x], Value)]
+    published = [values.get(x, x) for x in op.args]
+
+    def backwards(inputs: Sequence[Value], mine: dict, wanted: Sequence[Value], shared: Sequence[Element]) -> None:
+        """Add a loop over the other drones for the cotangents of some values."""
+        inner, inside, local = Builder(builder), dict(values), Cotangents()
+        fresh = [inner.input(x.dtype) for x in (*inputs, body.inputs[-1])]
+        inside.update(mine)
+        inside.update(zip((*inputs, body.inputs[-1]), fresh, strict=True))
+        inline(inner, body, inside)
+        for x, ct in zip(body.outputs, found, strict=True):
+            if ct is not None and isinstance(x, Value) and x in on_path:
+                _accumulate(inner, local, x, inside.get(ct, ct) if isinstance(ct, Value) else ct)
+        _pull(inner, body, inside, on_path, local)
+        wanted = [x for x in wanted if x in local]
+        if not wanted:
+            return
+        block = prune(inner.finish([local[x] for x in wanted]))
+        read = block.uses()
+        kept = [(y, s) for y, s in zip(fresh, shared, strict=False) if y in read]
+        block = Block((*(y for y, _ in kept), fresh[-1]), block.operations, block.outputs)
+        params = (("reduce", ("add",) * len(wanted)), ("n_members", op.param("n_members")))
+        sums = builder.add_many("over_others", [s for _, s in kept], [x.dtype for x in wanted], params, (block,))
+        for x, part in zip(wanted, sums, strict=True):
+            target = dict(zip(body.inputs, op.args, strict=False)).get(x, x)
+            if isinstance(target, Value) and target in on_path:
+                _accumulate(builder, cts, target, part)
+
+    others = body.inputs[:-1]
+    backwards(others, {}, [x for x in own if x in on_path], published)
+    seeds = [ct for ct in used if isinstance(ct, Value)]
+    backwards(
+        (*own, *seeds),
+        dict(zip(others, published, strict=True)),
+        [x for x in others if x in on_path],
+        [*(values[x] for x in own), *seeds],
+    )
+
+
+Rule = Callable[[Builder, Operation, dict, set[Value], Found, Cotangents], None]
+STRUCTURE: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "over_others": _over_others}
+
+
+def _unrolled(block: Block) -> Block:
+    """Return a block whose loops of a fixed length are written out; the carries of their turns are needed backwards."""
+    if not any(op.name == "loop" for inner in block.blocks() for op in inner.operations):
+        return block
+    builder = Builder()
+    values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
+    outputs = _unroll(builder, block, values)
+    return Block(tuple(values[x] for x in block.inputs), tuple(builder.operations), tuple(outputs))
+
+
+def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
+    def mapped(x: Element) -> Element:
+        return values.get(x, x) if isinstance(x, Value) else x
+
+    for op in block.operations:
+        builder.stage = op.stage
+        if op.name == "loop":
+            (body,) = op.blocks
+            length, carry = op.param("length"), [mapped(x) for x in op.args]
+            if length * sum(1 for _ in body.walk()) > MAX_UNROLLED:
+                raise UnsupportedError(f"a loop of {length} iterations is too long to be reversed", op.name, op.stage)
+            for _ in range(length):
+                inside = values | dict(zip(body.inputs, carry, strict=True))
+                carry = _unroll(builder, body, inside)
+            values.update(zip(op.results, carry, strict=True))
+        elif op.name in ("when", "over_others"):
+            blocks = []
+            for inner in op.blocks:
+                fresh = Builder(builder)
+                inside = values | {x: fresh.input(x.dtype) for x in inner.inputs}
+                blocks.append(fresh.finish(_unroll(fresh, inner, inside)))
+            args = [mapped(x) for x in op.args]
+            results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, tuple(blocks))
+            values.update(zip(op.results, results, strict=True))
+        else:
+            inline(builder, Block((), (op,), ()), values)
+    return [mapped(x) for x in block.outputs]
