@@ -20,7 +20,7 @@ from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
 from jax.extend.random import threefry2x32_p, threefry_prng_impl
-from jax.interpreters import batching, mlir
+from jax.interpreters import ad, batching, mlir
 from jaxlib.xla_client import batched_device_put
 
 from crazysim.errors import UnsupportedError
@@ -48,6 +48,7 @@ __all__ = [
     "is_key",
     "is_symbolic_zero",
     "jaxpr_as_fun",
+    "linear_primitive",
     "n_compilations",
     "primitive_by_platform",
     "put_own",
@@ -270,6 +271,60 @@ def batched_rule(fn: Callable[..., Any], rule: Callable[..., Any]) -> Callable[.
 def is_symbolic_zero(tangent: Any) -> bool:
     """Return whether the tangent that a rule of ``defjvp(symbolic_zeros=True)`` was given is zero by construction."""
     return tangent is None or isinstance(tangent, SymbolicZero)
+
+
+def linear_primitive(
+    name: str,
+    results: Callable[..., Sequence[Any]],
+    forward: Callable[..., Sequence[Any]],
+    backward: Callable[..., Sequence[Any]],
+) -> Primitive:
+    """Return a primitive for a function that is linear in some operands, with a transpose of its own.
+
+    Its first ``n_fixed`` operands, a parameter, are those that it is not linear in. Any other transformation is that
+    of ``forward``.
+
+    Args:
+        name: Its name.
+        results: From operands and parameters, which are hashable, to the shapes and types of its results.
+        forward: The function, from operands and parameters to results.
+        backward: From the first operands, cotangents of all results and parameters to the cotangents of the others.
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+
+    def impl(*args: Any, **params: Any) -> Any:
+        return jax.jit(functools.partial(forward, **params))(*args)
+
+    def jvp(primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> Any:
+        changing = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
+
+        def of(*some: Any) -> Any:
+            args = list(primals)
+            for i, x in zip(changing, some, strict=True):
+                args[i] = x
+            return list(forward(*args, **params))
+
+        return jax.jvp(of, tuple([primals[i] for i in changing]), tuple([tangents[i] for i in changing]))
+
+    def transposed(cotangents: Sequence[Any], *args: Any, n_fixed: int, **params: Any) -> list[Any]:
+        fixed, linear = args[:n_fixed], args[n_fixed:]
+        seeds = [ad.instantiate_zeros(x) for x in cotangents]
+        found = backward(fixed, seeds, n_fixed=n_fixed, **params)
+        own = [x if ad.is_undefined_primal(arg) else None for x, arg in zip(found, linear, strict=True)]
+        return [*(None for _ in fixed), *own]
+
+    def batched(args: Sequence[Any], dims: Sequence[Any], **params: Any) -> Any:
+        out = list(jax.vmap(functools.partial(forward, **params), tuple(dims))(*args))
+        return out, [0] * len(out)
+
+    primitive.def_impl(impl)
+    primitive.def_abstract_eval(lambda *args, **params: list(map(jax.typeof, results(*args, **params))))
+    mlir.register_lowering(primitive, mlir.lower_fun(forward, multiple_results=True))
+    ad.primitive_jvps[primitive] = jvp
+    ad.primitive_transposes[primitive] = transposed
+    batching.primitive_batchers[primitive] = batched
+    return primitive
 
 
 # Compilation ----------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ A call of a kernel is a primitive of its own, which becomes the kernel of the pl
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -18,7 +19,8 @@ from crazysim import jaxcompat
 from crazysim.cache import announce
 from crazysim.core.sharding import Location
 from crazysim.core.stage import with_leaves
-from crazysim.engine.backends import Run, cuda, kernel, lanes, native
+from crazysim.engine.backends import Run, cuda, gradient, kernel, lanes, native
+from crazysim.engine.backends.gradient import Gradients
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.program import Program
@@ -125,11 +127,20 @@ def build(program: Program, location: Location) -> FusedRun:
 
     kernels = compiled(program) if program.fused else None
     run = _split(program, compiled) if kernels is None else _one_kernel(kernels)
-    return FusedRun(differentiable(_over_batches(program, run), lanes.build(program, location)), kernels)
+    on_lanes = lanes.build(program, location)
+    gradients = GRADIENTS[program] = Gradients(program, location, on_lanes, launch_p.bind)
+    return FusedRun(differentiable(_over_batches(program, run), on_lanes, gradients), kernels)
 
 
-def differentiable(run: CountedRun, on_lanes: Run) -> Run:
-    """Return a function that runs a program, with the derivative of the same program on lanes."""
+GRADIENTS: weakref.WeakKeyDictionary[Program, Gradients] = weakref.WeakKeyDictionary()
+"""Derivatives of the programs that were built."""
+
+
+def differentiable(run: CountedRun, on_lanes: Run, gradients: Gradients) -> Run:
+    """Return a function that runs a program, with its derivatives.
+
+    For a number of steps that is an array they are those of the same program on lanes.
+    """
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         @jax.custom_jvp
@@ -137,9 +148,17 @@ def differentiable(run: CountedRun, on_lanes: Run) -> Run:
             return run(leaves, count)
 
         def derivative(primals: Any, tangents: Any) -> Any:
-            announce("compiling a gradient through the steps", "10 to 40 s")
-            (values, _), (slopes, _) = primals, tangents
+            (values, count), (slopes, _) = primals, tangents
             changing = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
+            if isinstance(n_steps, int) and changing:
+                written, flagged = forward(values, count)
+                some = gradient.tangents(gradients, values, [slopes[i] for i in changing], changing, n_steps)
+                found = dict(zip(gradients.floats, some, strict=True))
+                numbers = gradients.program.written
+                rest = [found[i] if i in found else gradient.float0(x) for i, x in zip(numbers, written, strict=True)]
+                return (written, flagged), (rest, gradient.float0(flagged))
+
+            announce("compiling a gradient through the steps on lanes", "10 to 40 s")
 
             def of(some: list[Any]) -> Any:
                 return on_lanes(with_leaves(values, changing, some), n_steps)
@@ -154,6 +173,12 @@ def differentiable(run: CountedRun, on_lanes: Run) -> Run:
 
 def describe(program: Program, platform: str, devices: Sequence[jax.Device] | None = None) -> list[str]:
     """Return the compiler of the kernels of a program, or on a GPU the registers that each takes, in lines."""
+    gradients = GRADIENTS.get(program)
+    used = [] if gradients is None else list(gradients.used)
+    return [*_described(program, platform, devices), *used]
+
+
+def _described(program: Program, platform: str, devices: Sequence[jax.Device] | None) -> list[str]:
     if platform != "gpu":
         return [f"kernel: compiled by {native.compiler()}"]
     device = cuda.weakest(devices)

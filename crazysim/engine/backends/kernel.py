@@ -75,7 +75,7 @@ def write(program: Program, target: str) -> Kernel:
         UnsupportedError: If there is no source for an operation or a type; the error names the stage.
     """
     require_source(program)
-    body = _Body(program, target)
+    body = Body(program, target)
     hoisted = body.write_loads()
     body.write_loop(hoisted)
     body.write_stores()
@@ -84,35 +84,28 @@ def write(program: Program, target: str) -> Kernel:
     pointers = [f"const {_type(program, i)}* __restrict__ p{rank[i]}" for i in inputs]
     pointers += [f"{_type(program, i)}* __restrict__ q{rank[i]}" for i in outputs]
     pointers += ["b1* __restrict__ flagged"] if program.check is not None else []
-    threads, lanes = lanes_of_block(program.group)
-    code = "\n".join(body.writer.lines)
-    in_memory = body.exchange.depth > 0
-    frame = _cuda(pointers, code, threads, lanes) if target == "cuda" else _host(pointers, code, in_memory)
-    widest = 8 if any(_type(program, i) == "f64" for i in (*inputs, *outputs)) else 4
-    defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n#define BLOCK_THREADS {threads}\n"
-    defines += f"#define OPERATIONS {sum(_n_operations(s.block) for s in body.each)}\n"
-    declared = "".join(f"{line}\n" for line in (*body.writer.tables, *body.exchange.declarations))
-    text = defines + preamble(target) + declared + frame + epilogue(target)
     in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
-    return Kernel(text, inputs, outputs, in_place, threads, lanes)
+    return body.kernel(pointers, inputs, outputs, in_place, [s.block for s in body.each])
 
 
-class _Body:
+class Body:
     """The code of a kernel between its braces: loads and the stages before the steps, the loop, checks and stores."""
 
     def __init__(self, program: Program, target: str):
-        self.program = program
+        self.program, self.target = program, target
         self.exchange = exchange_for(target, program.group)
         self.writer = Writer(self.exchange)
         self.each = [s for s in program.fused_segments if s.phase == "each"]
         self.stored = _stored(program)
         self._depth = 1 + self.exchange.depth
-        self._names: dict[Slot, str] = {}
+        self.names: dict[Slot, str] = {}
         """Expression of each number."""
+        self.starts: dict[Slot, str] = {}
+        """Expression of each number that stages write, before the first of them."""
 
     def write_loads(self) -> list[list[str]]:
         """Write loads and the stages before the steps; return the hoisted values of each segment of the loop."""
-        program, exchange, writer, names = self.program, self.exchange, self.writer, self._names
+        program, exchange, writer, names = self.program, self.exchange, self.writer, self.names
         written, slots = self._slots()
         loaded, deferred, rank = _loaded(program), _deferred(program), program.ranks
         names.update({(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots})
@@ -131,7 +124,8 @@ class _Body:
                 continue
             if slot in written:
                 start = access if slot in loaded else f"{kind}(0)"
-                names[slot] = exchange.variable(writer, names[slot], kind, f"{kind}_lanes({start})", self._depth)
+                self.starts[slot] = f"{kind}_lanes({start})"
+                names[slot] = exchange.variable(writer, names[slot], kind, self.starts[slot], self._depth)
             elif slot not in self.stored and slot in deferred:
                 names[slot] = access
             else:
@@ -146,7 +140,7 @@ class _Body:
         self.writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
         self.exchange.begin(self.writer, 2)
         for segment, constants in zip(self.each, hoisted, strict=True):
-            _write_segment(self.writer, self.program, segment, self._names, constants, 1 + self._depth)
+            write_segment(self.writer, self.program, segment, self.names, constants, 1 + self._depth)
         self.exchange.end(self.writer, 2)
         self.writer.line("}", 1)
 
@@ -155,13 +149,48 @@ class _Body:
         program, writer, check = self.program, self.writer, self.program.check
         self.exchange.begin(writer, 1)
         if check is not None:
-            (flagged,) = writer.block(check.block, [self._names[slot] for slot in check.reads], self._depth)
+            (flagged,) = writer.block(check.block, [self.names[slot] for slot in check.reads], self._depth)
             writer.line(f"STORE(1, 1, flagged, 0, b1_lanes({flagged}))", self._depth)
         self._write_phase("last")
         for slot in self.stored:
-            value = f"{_type(program, slot[0])}_lanes({self._names[slot]})"
+            value = f"{_type(program, slot[0])}_lanes({self.names[slot]})"
             writer.line(_store(program, slot, value), self._depth)
         self.exchange.end(writer, 1)
+
+    def kernel(
+        self,
+        pointers: Sequence[str],
+        inputs: tuple[int, ...],
+        outputs: tuple[int, ...],
+        in_place: tuple[int, ...],
+        blocks: Sequence[Block],
+        kept: int | None = None,
+    ) -> Kernel:
+        """Return the kernel of the lines that were written.
+
+        Args:
+            pointers: Declarations of inputs and outputs.
+            inputs: Leaves that it reads.
+            outputs: Leaves that it writes.
+            in_place: Leaves that it updates in place.
+            blocks: Blocks of a step, whose operations are counted.
+            kept: Numbers of a drone that it keeps for each step of an interval; None for a kernel that goes ahead.
+        """
+        program, target = self.program, self.target
+        threads, lanes = lanes_of_block(program.group)
+        code = "\n".join(self.writer.lines)
+        if target == "cuda":
+            frame = _cuda(pointers, code, threads, lanes)
+        else:
+            frame = _host(pointers, code, self.exchange.depth > 0, kept is not None)
+        widest = 8 if any("f64*" in pointer for pointer in pointers) else 4
+        defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n#define BLOCK_THREADS {threads}\n"
+        defines += f"#define OPERATIONS {sum(map(_n_operations, blocks))}\n"
+        declared = "".join(f"{line}\n" for line in (*self.writer.tables, *self.exchange.declarations))
+        if kept is not None:
+            declared = f"#define N_KEPT {kept}\n{preamble(target + '_kept')}{declared}"
+        text = defines + preamble(target) + declared + frame + epilogue(target)
+        return Kernel(text, inputs, outputs, in_place, threads, lanes)
 
     def _slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:
         """Return the numbers that the stages write, and all that the kernel uses."""
@@ -174,13 +203,13 @@ class _Body:
     def _hoisted(self, segment: Segment) -> list[str]:
         """Write what a segment computes once, and return the names of the results."""
         writer, keep = self.writer, self.exchange.keep
-        outs = writer.block(segment.hoisted, [self._names[slot] for slot in segment.hoisted_reads], self._depth)
+        outs = writer.block(segment.hoisted, [self.names[slot] for slot in segment.hoisted_reads], self._depth)
         kinds = [type_name(x.dtype) for x in segment.hoisted.outputs]
         return [keep(writer, writer.new("h"), kind, x, self._depth) for kind, x in zip(kinds, outs, strict=True)]
 
     def _write_phase(self, phase: Phase) -> None:
         for segment in self.program.of(phase):
-            _write_segment(self.writer, self.program, segment, self._names, [], self._depth)
+            write_segment(self.writer, self.program, segment, self.names, [], self._depth)
 
 
 def _n_operations(block: Block) -> int:
@@ -243,9 +272,19 @@ def _loaded(program: Program) -> set[Slot]:
     return loaded
 
 
-def _write_segment(
+def write_segment(
     writer: Writer, program: Program, segment: Segment, names: dict[Slot, str], constants: Sequence[str], depth: int
 ) -> None:
+    """Write a segment, which assigns to the variables of the numbers it writes.
+
+    Args:
+        writer: Takes the lines.
+        program: The program.
+        segment: The segment.
+        names: Expression of each number.
+        constants: Expressions of the hoisted numbers.
+        depth: Depth of the lines.
+    """
     inputs = [names[slot] for slot in program.per_drone(segment, segment.reads)]
     if segment.scope == "world":  # a drone's numbers come from its lane
         for k, (leaf, number) in enumerate(segment.reads):
@@ -328,13 +367,22 @@ extern "C" __global__ void __launch_bounds__({threads}, {UNBOUNDED}) advance({ar
 """
 
 
-def _host(pointers: Sequence[str], body: str, in_memory: bool) -> str:
+def _host(pointers: Sequence[str], body: str, in_memory: bool, keeps: bool) -> str:
     arguments = ", ".join(pointers)
     kinds = [p.split("*")[0].removeprefix("const ") for p in pointers]
     n_in = sum(p.startswith("const") for p in pointers)
     buffers = [f"({kind}*)in[{k}]" if k < n_in else f"({kind}*)out[{k - n_in}]" for k, kind in enumerate(kinds)]
     call = f"n_lanes, n_steps, {', '.join(buffers)}"
     sizes = "int64_t n_lanes, int n_steps"
+    memory = ("", "")
+    if keeps:
+        sizes, call = f"{sizes}, int interval, char* kept", call.replace("n_steps", "n_steps, interval, kept")
+        memory = (
+            """    const int interval = ((int*)in[1]->data)[1];
+    char* const kept = static_cast<char*>(aligned_alloc(64, KEPT_BYTES));
+""",
+            "\n    free(kept);",
+        )
     if in_memory:
         block = f"static void advance_world(World& w, int64_t begin, {sizes}, {arguments}) {{\n"
         each = f"""    World* const w = static_cast<World*>(aligned_alloc(64, (sizeof(World) + 63) / 64 * 64));
@@ -346,6 +394,7 @@ def _host(pointers: Sequence[str], body: str, in_memory: bool) -> str:
   const i32v own = numbers() % GROUP;
 """
         each = f"    for (int64_t first = begin; first < end; first += LANES) advance_block(first, {call});"
+        each = each.join(memory)
     return f"""
 {block}{body}
 }}

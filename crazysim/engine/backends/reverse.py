@@ -1,0 +1,352 @@
+"""Reverse mode of many steps in one kernel: cotangents of the leaves before them from those of the leaves after them.
+
+The kernel takes the steps once more, keeps the numbers that each begins with, and goes back from the last to the first.
+From more steps than ``interval`` on it keeps the beginnings of intervals, and takes the steps of each once more on the
+way back. A cotangent is a variable beside the number that it belongs to, for every drone: the caller adds up those of
+leaves that drones share.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from crazysim.engine.backends import kernel
+from crazysim.engine.backends.exchange import MAX_IN_VECTOR
+from crazysim.engine.backends.kernel import Body, Kernel
+from crazysim.engine.backends.source import type_name
+from crazysim.engine.errors import LimitError, UnsupportedError
+from crazysim.engine.ir.blocks import Block, Builder, Value, constant, inline
+from crazysim.engine.ir.program import TABLE, Leaf, Program, Segment, Slot
+from crazysim.engine.lowering.transpose import active, transposed
+
+KEPT = 256 * 1024
+"""Memory of the beginnings of steps that a core of the host goes back through, bytes: as much as is near to it."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reverse:
+    """Transposed derivatives of the segments of a program."""
+
+    program: Program
+    """The program without check; behind its leaves those of cotangents, of which every drone has its own."""
+    n_leaves: int
+    """Number of its leaves without cotangents."""
+    perturbed: tuple[int, ...]
+    """Leaves whose cotangents are computed."""
+    back: dict[Segment, Segment]
+    """Segments that go back, by those that go ahead."""
+    back_hoisted: dict[Segment, Segment]
+    """The same for what is computed once before the steps."""
+    carried: tuple[Slot, ...]
+    """Numbers that a step begins with, and that steps change."""
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Leaves with given cotangents: the floats that the program writes."""
+        return tuple(i for i in self.program.written if self.program.leaves[i].number.kind == "f")
+
+    def slots(self) -> list[Slot]:
+        """Return the places of all cotangents."""
+        own = [(i, k) for i in {*self.seeds, *self.perturbed} for k in range(self.program.leaves[i].size)]
+        places = {(self.n_leaves + i, k) for i, k in own}
+        for s in (*self.back.values(), *self.back_hoisted.values()):
+            slots = self.program.per_drone(s, [*s.reads, *s.writes])
+            places.update(slot for slot in slots if slot[0] >= self.n_leaves)
+        return sorted(places)
+
+
+def reverse(program: Program, perturbed: Collection[int]) -> Reverse:
+    """Return the transposed derivatives of a program that one kernel can run.
+
+    Args:
+        program: The program.
+        perturbed: Leaves whose cotangents are computed; those that are no floats have none.
+
+    Raises:
+        UnsupportedError: If a part of it has no derivative in a kernel.
+    """
+    program = dataclasses.replace(program, check=None)
+    if not program.fused:
+        raise LimitError(f"{program.unfused_stages[0].name!r} is not fused")
+    if program.rows:
+        raise LimitError("rows of packed leaves have no gradient in a kernel")
+    n = len(program.leaves)
+    perturbed = tuple(sorted(i for i in perturbed if program.leaves[i].number.kind == "f" and i in program.ranks))
+    if tables := program.tables.intersection(perturbed):
+        names = ", ".join(program.leaves[i].name for i in sorted(tables))
+        raise UnsupportedError(f"{names} is read as a table, which has no derivative in a kernel")
+    cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number) for x in program.leaves]
+    each = [s for s in program.fused_segments if s.phase == "each"]
+    hoisted = [
+        Leaf("cotangents of hoisted numbers", "drone", (1, 1, len(s.hoisted.outputs)), _float_of(s.hoisted))
+        for s in each
+    ]
+    extended = dataclasses.replace(program, leaves=(*program.leaves, *cotangents, *hoisted))
+    found, constants = _changed(program, perturbed)
+    back = {}
+    for s in program.fused_segments:
+        where = 2 * n + each.index(s) if s in each else -1
+        back[s] = _back(extended, n, s, found, constants.get(s, ()), where)
+    back_hoisted = {
+        s: _back_hoisted(n, s, found, constants[s], 2 * n + k) for k, s in enumerate(each) if constants[s]
+    }
+    read = {slot for s in each for slot in program.per_drone(s, [*s.reads, *s.writes])}
+    changing = program.changing()
+    if len(each) == 1 and each[0].scope == "drone":
+        read = set(each[0].reads)
+    return Reverse(extended, n, perturbed, back, back_hoisted, tuple(sorted(read & changing)))
+
+
+def _float_of(block: Block) -> np.dtype:
+    """Return the type of the floats of a block; a program has one."""
+    return next((x.dtype for x in block.outputs if x.dtype.kind == "f"), np.dtype(np.float32))
+
+
+def _changed(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict[Segment, tuple[int, ...]]]:
+    """Return the numbers that depend differentiably on the perturbed leaves, and the hoisted ones that do."""
+    found = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
+    constants: dict[Segment, tuple[int, ...]] = {}
+
+    def of(block: Block, slots: Sequence[Slot], more: Sequence[int] = ()) -> list[int]:
+        wanted = [x for x, slot in zip(block.inputs, slots, strict=False) if slot in found and x.dtype.kind == "f"]
+        wanted += [block.inputs[len(slots) + k] for k in more]
+        on_path = active(block, wanted)
+        return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in on_path]
+
+    def run(s: Segment) -> None:
+        places = program.per_drone(s, s.writes)
+        reads = program.per_drone(s, s.reads)
+        found.update(places[k] for k in of(s.block, reads, constants.get(s, ())))
+
+    for s in program.of("first"):
+        run(s)
+    for s in program.of("each"):
+        constants[s] = tuple(of(s.hoisted, s.hoisted_reads))
+    while True:  # a number that one step changes may change more in the next
+        before = len(found)
+        for s in program.of("each"):
+            run(s)
+        if len(found) == before:
+            break
+    for s in program.of("last"):
+        run(s)
+    return found, constants
+
+
+def _back(program: Program, n: int, s: Segment, found: set[Slot], constants: Sequence[int], where: int) -> Segment:
+    """Return the segment that replaces the cotangents after a segment by those before it.
+
+    In a segment of worlds, each drone has a copy of what belongs to the world, and a cotangent for it; the sum of all
+    is that of the first drone afterwards.
+    """
+    n_drones, of_world = program.n_drones, s.scope == "world"
+    reads = program.per_drone(s, s.reads)
+    wanted = [k for k, (x, slot) in enumerate(zip(s.block.inputs, reads, strict=False))
+              if slot in found and x.dtype.kind == "f" and not x.size]  # fmt: skip
+    wanted_constants = [len(reads) + k for k in constants]
+    outs = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
+    pull = transposed(s.block, [s.block.inputs[k] for k in (*wanted, *wanted_constants)])
+    n_inputs = len(s.block.inputs)
+
+    def copies(slot: Slot) -> list[Slot]:
+        """Return where the cotangents of a number are: one, or in a segment of worlds one for each drone."""
+        i, k = slot
+        if not of_world or program.leaves[i].scope == "drone":
+            return [(n + i, k)]
+        return [(n + i, d * program.leaves[i].size + k) for d in range(n_drones)]
+
+    builder = Builder(stage=f"gradient of {', '.join(s.stages)}")
+    before: dict[Slot, Value] = {}
+    now: dict[Slot, object] = {}
+
+    def read(slot: Slot, dtype: np.dtype) -> Value:
+        if slot not in before:
+            before[slot] = builder.input(dtype)
+        return before[slot]
+
+    def total(slot: Slot, dtype: np.dtype) -> object:
+        sums = [read(c, dtype) for c in copies(slot)]
+        out: object = sums[0]
+        for x in sums[1:]:
+            out = builder.add("add", (out, x), dtype)
+        return out
+
+    primal = [builder.input(x.dtype, x.size) for x in s.block.inputs]
+    seeds = [total(s.writes[k], s.block.outputs[k].dtype) for k in outs]
+    parts = inline(builder, pull, dict(zip(pull.inputs, [*primal, *seeds], strict=True)))
+    for k in outs:  # what is written is another number from here on
+        zero = constant(0, s.block.outputs[k].dtype)
+        now.update(dict.fromkeys(copies(s.writes[k]), zero))
+    for k, part in zip(wanted, parts, strict=False):
+        place, dtype = copies(s.reads[k])[0], s.block.inputs[k].dtype
+        old = now[place] if place in now else read(place, dtype)
+        now[place] = builder.add("add", (old, part), dtype)
+    for k, part in zip(constants, parts[len(wanted) :], strict=True):
+        place, dtype = (where, k), s.block.inputs[len(reads) + k].dtype
+        now[place] = builder.add("add", (read(place, dtype), part), dtype)
+    own, fixed = primal[: len(reads)], primal[len(reads) : n_inputs]
+    block = Block((*own, *before.values(), *fixed), tuple(builder.operations), tuple(now.values()))
+    return Segment(s.scope, s.stages, s.phase, block, (*s.reads, *before), tuple(now))
+
+
+def _back_hoisted(n: int, s: Segment, found: set[Slot], constants: Sequence[int], where: int) -> Segment:
+    """Return the segment that takes the cotangents of hoisted numbers to what they were computed from."""
+    reads = s.hoisted_reads
+    wanted = [k for k, (x, slot) in enumerate(zip(s.hoisted.inputs, reads, strict=True))
+              if slot in found and x.dtype.kind == "f"]  # fmt: skip
+    pull = transposed(s.hoisted, [s.hoisted.inputs[k] for k in wanted])
+    builder = Builder(stage=f"gradient of {', '.join(s.stages)}")
+    primal = [builder.input(x.dtype, x.size) for x in s.hoisted.inputs]
+    seeds, places = [], []
+    for k, x in enumerate(s.hoisted.outputs):
+        if x.dtype.kind == "f" and k in constants:
+            seeds.append(builder.input(x.dtype))
+            places.append((where, k))
+        elif x.dtype.kind == "f":
+            seeds.append(constant(0, x.dtype))
+    old = [builder.input(s.hoisted.inputs[k].dtype) for k in wanted]
+    cts = [x for x in seeds if isinstance(x, Value)]
+    parts = inline(builder, pull, dict(zip(pull.inputs, [*primal, *seeds], strict=True)))
+    sums = [builder.add("add", (a, b), a.dtype) for a, b in zip(old, parts, strict=True)]
+    targets = tuple((n + reads[k][0], reads[k][1]) for k in wanted)
+    block = Block((*primal, *cts, *old), tuple(builder.operations), tuple(sums))
+    return Segment("drone", s.stages, "each", block, (*reads, *places, *targets), targets)
+
+
+def interval(reverse: Reverse, n_steps: int) -> int:
+    """Return the number of steps whose beginnings are kept at once: all, as long as they fit near to a core."""
+    if n_steps * len(reverse.carried) * 64 <= KEPT:
+        return max(n_steps, 1)
+    return math.isqrt(n_steps - 1) + 1
+
+
+def needed(reverse: Reverse) -> tuple[int, ...]:
+    """Return the leaves that the kernel reads; behind them come the cotangents of ``seeds``."""
+    return kernel.needed(reverse.program)
+
+
+def write(reverse: Reverse) -> Kernel:
+    """Return the source of the kernel that goes back, on the host.
+
+    It takes two numbers, those of steps and of the steps of an interval; then the leaves that the program needs and the
+    cotangents of the leaves it writes. It returns a cotangent of each perturbed leaf for every drone.
+
+    Raises:
+        UnsupportedError: If there is no source for an operation or a type.
+    """
+    program, n = reverse.program, reverse.n_leaves
+    if program.group > MAX_IN_VECTOR:
+        raise LimitError(f"gradients of worlds of more than {MAX_IN_VECTOR} drones that act on each other have no kernel")
+    checked = dataclasses.replace(program, segments=(*program.segments, *reverse.back.values()))
+    kernel.require_source(checked)
+    body = Body(program, "host")
+    writer, rank = body.writer, program.ranks
+    constants = body.write_loads()
+    names = body.names
+
+    def kind(slot: Slot) -> str:
+        if slot[0] >= 2 * n:
+            s = [s for s in program.fused_segments if s.phase == "each"][slot[0] - 2 * n]
+            return type_name(s.hoisted.outputs[slot[1]].dtype)
+        return type_name(program.leaves[slot[0]].number)
+
+    for i, k in reverse.slots():
+        primal = i - n
+        name = f"g{i - 2 * n}_{k}" if i >= 2 * n else f"c{rank[primal]}_{k}"
+        seed = f"{kind((i, k))}(0)"
+        if i < 2 * n and primal in reverse.seeds:
+            seed = f"LOAD({program.leaves[primal].size}, 1, s{rank[primal]}, {k})"
+        writer.line(f"auto {name} = {kind((i, k))}_lanes({seed});", 1)
+        names[i, k] = name
+
+    carried = reverse.carried
+    types = [type_name(program.leaves[i].number) for i, _ in carried]
+
+    def keep(state: str, depth: int) -> None:
+        for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
+            writer.line(f"KEEP({t}, {state}, {k}, {names[slot]})", depth)
+
+    last, each, first = program.of("last"), program.of("each"), program.of("first")
+    writer.line("const int n_intervals = n_steps > 0 ? (n_steps + interval - 1) / interval : 1;", 1)
+    writer.line("for (int turn = 0; turn < 2 * n_intervals - 1; ++turn) {", 1)
+    writer.line("const bool back = turn >= n_intervals - 1;", 2)
+    writer.line("const int part = back ? 2 * (n_intervals - 1) - turn : turn;", 2)
+    writer.line("const int n_here = n_steps - part * interval < interval ? n_steps - part * interval : interval;", 2)
+    writer.line("if (turn >= n_intervals) {", 2)
+    for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
+        writer.line(f"{names[slot]} = KEPT({t}, interval + part, {k});", 3)
+    writer.line("} else {", 2)
+    keep("interval + part", 3)
+    writer.line("}", 2)
+    writer.line("for (int step = 0; step < n_here; ++step) {", 2)
+    keep("step", 3)
+    if not last:  # nothing needs what comes after the last step
+        writer.line("if (back && step == n_here - 1) break;", 3)
+    for segment, fixed in zip(each, constants, strict=True):
+        kernel.write_segment(writer, program, segment, names, fixed, 3)
+    writer.line("}", 2)
+    writer.line("if (!back) continue;", 2)
+    if last:
+        writer.line("if (part == n_intervals - 1) {", 2)
+        _write_back(body, reverse, last, [()] * len(last), dict(names), 3)
+        writer.line("}", 2)
+    writer.line("for (int step = n_here - 1; step >= 0; --step) {", 2)
+    here = dict(names)
+    for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
+        here[slot] = writer.new("b")
+        writer.line(f"const auto {here[slot]} = KEPT({t}, step, {k});", 3)
+    _write_back(body, reverse, each, constants, here, 3)
+    writer.line("}", 2)
+    writer.line("}", 1)
+    for s in each:
+        if s in reverse.back_hoisted:
+            kernel.write_segment(writer, program, reverse.back_hoisted[s], names, (), 1)
+    if first:
+        _write_back(body, reverse, first, [()] * len(first), names | body.starts, 1)
+    pointers = [f"const {type_name(program.leaves[i].number)}* __restrict__ "
+                f"p{rank[i]}"
+                for i in kernel.needed(program)]  # fmt: skip
+    pointers += [f"const {type_name(program.leaves[i].number)}* __restrict__ s{rank[i]}" for i in reverse.seeds]
+    for i in reverse.perturbed:
+        pointers.append(f"{type_name(program.leaves[i].number)}* __restrict__ d{rank[i]}")
+        size = program.leaves[i].size
+        for k in range(size):
+            writer.line(f"STORE({size}, 1, d{rank[i]}, {k}, {names[n + i, k]})", 1)
+    blocks = [*(s.block for s in each for _ in range(2)), *(reverse.back[s].block for s in each)]
+    return body.kernel(pointers, needed(reverse), (), (), blocks, len(carried))
+
+
+def _write_back(
+    body: Body,
+    reverse: Reverse,
+    segments: Sequence[Segment],
+    constants: Sequence[Sequence[str]],
+    names: dict[Slot, str],
+    depth: int,
+) -> None:
+    """Write what goes back through the segments of a phase, after what they compute ahead once more.
+
+    Args:
+        body: Takes the lines.
+        reverse: The transposed derivatives.
+        segments: The segments.
+        constants: Expressions of their hoisted numbers.
+        names: Expressions of the numbers before the first segment, which are replaced.
+        depth: Depth of the lines.
+    """
+    program, writer = reverse.program, body.writer
+    before = []
+    for s, fixed in zip(segments, constants, strict=True):
+        before.append(dict(names))
+        if s is not segments[-1]:
+            for slot in dict.fromkeys(program.per_drone(s, s.writes)):
+                fresh, kind = writer.new("a"), type_name(program.leaves[slot[0]].number)
+                writer.line(f"auto {fresh} = {kind}_lanes({names[slot]});", depth)
+                names[slot] = fresh
+            kernel.write_segment(writer, program, s, names, fixed, depth)
+    for s, fixed, here in reversed(list(zip(segments, constants, before, strict=True))):
+        kernel.write_segment(writer, program, reverse.back[s], here, fixed, depth)
