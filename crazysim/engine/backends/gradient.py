@@ -91,7 +91,12 @@ class Gradients:
         return self._found[perturbed]
 
     def _run(
-        self, kernels: ReverseKernels, values: Sequence[Any], seeds: Sequence[Any], changing: Sequence[int], n_steps: int
+        self,
+        kernels: ReverseKernels,
+        values: Sequence[Any],
+        seeds: Sequence[Any],
+        changing: Sequence[int],
+        n_steps: int,
     ) -> list[Array]:
         program = self.program
         n_drones = program.n_drones
@@ -189,6 +194,7 @@ def tangents(gradients: Gradients, values: Sequence[Any], slopes: Sequence[Any],
 
 
 def _results(*args: Any, gradients: Gradients, present: Sequence[int], **params: Any) -> list[Any]:
+    del params
     program = gradients.program
     n_worlds = next(
         x.shape[0] for i, x in zip(present, args, strict=False)
@@ -208,6 +214,7 @@ def _forward(*args: Any, n_fixed: int, gradients: Gradients, n_steps: int, prese
 def _backward(
     fixed: Any, seeds: Any, n_fixed: int, gradients: Gradients, n_steps: int, present: Any, changing: Any, n_leaves: int
 ) -> list[Array]:
+    del n_fixed
     return gradients.pull(_values(fixed, present, n_leaves), seeds, changing, n_steps)
 
 

@@ -20,7 +20,7 @@ from crazysim.engine.backends.kernel import Body, Kernel
 from crazysim.engine.backends.source import type_name
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Block, Builder, Value, constant, inline
-from crazysim.engine.ir.program import TABLE, Leaf, Program, Segment, Slot
+from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
 from crazysim.engine.lowering.transpose import active, transposed
 
 KEPT = 256 * 1024
@@ -91,9 +91,7 @@ def reverse(program: Program, perturbed: Collection[int]) -> Reverse:
     for s in program.fused_segments:
         where = 2 * n + each.index(s) if s in each else -1
         back[s] = _back(extended, n, s, found, constants.get(s, ()), where)
-    back_hoisted = {
-        s: _back_hoisted(n, s, found, constants[s], 2 * n + k) for k, s in enumerate(each) if constants[s]
-    }
+    back_hoisted = {s: _back_hoisted(n, s, found, constants[s], 2 * n + k) for k, s in enumerate(each) if constants[s]}
     read = {slot for s in each for slot in program.per_drone(s, [*s.reads, *s.writes])}
     changing = program.changing()
     if len(each) == 1 and each[0].scope == "drone":
@@ -240,7 +238,9 @@ def write(reverse: Reverse) -> Kernel:
     """
     program, n = reverse.program, reverse.n_leaves
     if program.group > MAX_IN_VECTOR:
-        raise LimitError(f"gradients of worlds of more than {MAX_IN_VECTOR} drones that act on each other have no kernel")
+        raise LimitError(
+            f"gradients of worlds of more than {MAX_IN_VECTOR} drones that act on each other have no kernel"
+        )
     checked = dataclasses.replace(program, segments=(*program.segments, *reverse.back.values()))
     kernel.require_source(checked)
     body = Body(program, "host")

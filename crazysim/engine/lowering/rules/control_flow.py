@@ -32,6 +32,16 @@ def _custom_jvp(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elem
     return _with_derivative(ctx, eqn, args, closed(eqn.params["call_jaxpr"]))
 
 
+@rule("stop_gradient")
+def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Pass numbers on, with a derivative of zero."""
+    aval = eqn.invars[0].aval
+    if not jax.numpy.issubdtype(aval.dtype, np.inexact) or all(map(is_constant, args[0].reshape(-1))):
+        return args
+    called = jax.make_jaxpr(lambda x: x)(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
+    return _with_derivative(ctx, eqn, args, called)
+
+
 @rule("call_hi_primitive")
 def _high_level(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     """Expand a primitive that is defined by others, which JAX has from 0.12 on.

@@ -126,7 +126,7 @@ def _device_put(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elem
     return args
 
 
-@rule("copy", "copy_p", "stop_gradient", "pvary", "reshard", "random_clone", "name")
+@rule("copy", "copy_p", "pvary", "reshard", "random_clone", "name")
 def _identity(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     return args
 

@@ -1,0 +1,138 @@
+"""Gradients of steps in a kernel: equal to those of the stages as they are written, in whatever way they are used."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import Sim, reduce_over_others, stage
+from crazysim.core import functional as F
+from crazysim.core.pipeline import insert_fn_before
+from crazysim.engine import Step, explain
+from crazysim.engine.backends import native, reverse, xla
+from crazysim.engine.lowering.jaxprs import lower_function
+from crazysim.engine.lowering.transpose import transposed
+from crazysim.errors import EngineWarning
+
+needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler")
+COMMAND = np.array([0.05, -0.08, 0.1, 1.02 * 0.0434 * 9.81])
+
+
+def functions(n_worlds=3, n_drones=1, stages=(), n_steps=7, **options):
+    """Return losses of each world's commands and speeds, with kernels and as the stages are written, and both steps."""
+    found = []
+    for engine in ("fused", "plain"):
+        sim = Sim(n_worlds, n_drones, engine=engine, **options)
+        for one in stages:
+            insert_fn_before(sim.step_pipeline, "integration", one)
+        apart = jnp.arange(n_worlds * n_drones * 3.0).reshape(n_worlds, n_drones, 3)
+        start = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + jnp.sin(apart)))
+        step = Step(sim.step_pipeline, engine)
+
+        def losses(x, step=step, start=start):
+            cmd, vel = x
+            data = start.replace(states=start.states.replace(vel=vel))
+            s = step(F.attitude_control(data, cmd), n_steps).states
+            return jnp.sum(s.pos * jnp.array([1.0, -2.0, 3.0]) + 0.5 * s.vel**2 + s.quat[..., :3], (1, 2))
+
+        found.append((losses, step, sim.data))
+    rng = np.random.default_rng(0)
+    at = np.tile(COMMAND, (n_worlds, n_drones, 1)), rng.normal(size=(n_worlds, n_drones, 3))
+    return found, jax.tree.map(jnp.asarray, at)
+
+
+def assert_same(found, expected):
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * max(np.max(np.abs(b)), 1e-3))
+
+
+def gradient(losses):
+    return jax.jit(jax.grad(lambda x: jnp.sum(losses(x))))
+
+
+OPERATIONS = {
+    "products": lambda x, y: x * y / (1.0 + y * y) - x,
+    "functions": lambda x, y: jnp.sin(x) * jnp.exp(-y) + jnp.sqrt(x * x + 1.0) + jnp.arctan2(x, y),
+    "selections": lambda x, y: jnp.where(x > y, x * y, jnp.maximum(x, 2.0 * y)) + jnp.clip(x, -0.5, 0.5) + jnp.abs(y),
+    "loop": lambda x, y: jax.lax.fori_loop(0, 5, lambda _, z: jnp.cos(z) * y, x),
+    "own derivative": lambda x, y: jax.nn.relu(x) * jax.nn.softplus(y) + jax.nn.silu(x * y),
+    "unused": lambda x, y: jnp.floor(x) + jax.lax.stop_gradient(y) * x,
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_a_transposed_block_is_what_jax_makes_of_the_function(name, x64):
+    fn = OPERATIONS[name]
+    block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
+    x, y, ct = np.random.default_rng(1).normal(size=(3, 16))
+    _, pull = jax.vjp(jax.vmap(fn), jnp.asarray(x), jnp.asarray(y))
+    found = xla.run(transposed(block, block.inputs), [jnp.asarray(v) for v in (x, y, ct)], (16,))
+    for a, b in zip(found, pull(jnp.asarray(ct)), strict=True):
+        np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
+
+
+@needs_compiler
+def test_a_kernel_goes_back(x64, monkeypatch):
+    """Twice with the same bits; in intervals too; for many batches of worlds; and it is differentiable once more."""
+    ((fast, step, data), (plain, *_)), at = functions(n_steps=3, n_drones=2)
+    of_kernel = gradient(fast)
+    found = of_kernel(at)
+    assert "gradient: one kernel" in explain(step, data)
+    assert_same(found, gradient(plain)(at))
+    for a, b in zip(found, of_kernel(at), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+    monkeypatch.setattr(reverse, "KEPT", 0)
+    ((in_intervals, step, data), (plain, *_)), at = functions(n_steps=10)
+    assert_same(gradient(in_intervals)(at), gradient(plain)(at))
+    assert "gradient: one kernel" in explain(step, data)
+
+    many = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), at)
+    assert_same(jax.vmap(gradient(in_intervals))(many), jax.vmap(gradient(plain))(many))
+
+
+@stage("drone")
+def repulsion(data):
+    """Push a drone away from the others of its world."""
+    pos = data.states.pos
+
+    def push(other, is_self):
+        offset = pos - other
+        return jnp.where(is_self, 0.0, 1e-3 * offset / (jnp.dot(offset, offset) + 0.01))
+
+    force = reduce_over_others(push, values=pos, reduce="sum")
+    return data.replace(states=data.states.replace(force=force))
+
+
+@stage("drone")
+def gap(data):
+    """Push a drone up by its distance to the nearest other one."""
+    pos = data.states.pos
+    near = reduce_over_others(
+        lambda other, is_self: jnp.where(is_self, jnp.inf, jnp.sum((pos - other) ** 2)), pos, "min"
+    )
+    return data.replace(states=data.states.replace(force=jnp.zeros(3).at[2].set(1e-3 * near)))
+
+
+@stage("world")
+def centre(data):
+    """Pull the drones of a world to their centre."""
+    pos = data.states.pos
+    return data.replace(states=data.states.replace(force=1e-2 * (jnp.mean(pos, axis=0) - pos)))
+
+
+@needs_compiler
+@pytest.mark.parametrize("one", [repulsion, centre], ids=lambda one: one.__name__)
+def test_drones_that_act_on_each_other_are_differentiated_in_the_kernel(one, x64):
+    ((fast, step, data), (plain, *_)), at = functions(n_drones=3, stages=[one], n_steps=4)
+    assert_same(gradient(fast)(at), gradient(plain)(at))
+    assert "gradient: one kernel" in explain(step, data)
+
+
+@needs_compiler
+def test_what_has_no_kernel_is_differentiated_on_lanes(x64):
+    ((fast, step, data), (plain, *_)), at = functions(n_drones=3, stages=[gap], n_steps=2)
+    with pytest.warns(EngineWarning, match="the gradient of the step runs on 'lanes'"):
+        found = gradient(fast)(at)
+    assert_same(found, gradient(plain)(at))
+    assert "the smallest or largest over other drones has no derivative in a kernel" in explain(step, data)
