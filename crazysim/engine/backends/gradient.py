@@ -35,7 +35,7 @@ class Gradients:
         """
         self.program, self.location, self.on_lanes, self.launch = program, location, on_lanes, launch
         self.used: dict[str, None] = {}
-        """What computed gradients so far, as lines for ``explain``."""
+        """Lines for ``explain`` with the way in which gradients were computed so far."""
         self.floats = tuple(i for i in program.written if program.leaves[i].number.kind == "f")
         """Leaves that are written and have derivatives."""
         self._found: dict[tuple[int, ...], ReverseKernels | None] = {}
