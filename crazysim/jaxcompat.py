@@ -277,7 +277,8 @@ def linear_primitive(
     name: str,
     results: Callable[..., Sequence[Any]],
     forward: Callable[..., Sequence[Any]],
-    backward: Callable[..., Sequence[Any]],
+    backward: Callable[..., Sequence[Any]] | None = None,
+    derivative: Callable[..., Sequence[Any]] | None = None,
 ) -> Primitive:
     """Return a primitive for a function that is linear in some operands, with a transpose of its own.
 
@@ -288,7 +289,9 @@ def linear_primitive(
         name: Its name.
         results: From operands and parameters, which are hashable, to the shapes and types of its results.
         forward: The function, from operands and parameters to results.
-        backward: From the first operands, cotangents of all results and parameters to the cotangents of the others.
+        backward: From the first operands, cotangents of all results and parameters to the cotangents of the others;
+            None for a function that is not linear.
+        derivative: The same function, written so that JAX can differentiate it; None for ``forward``.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -303,13 +306,15 @@ def linear_primitive(
             args = list(primals)
             for i, x in zip(changing, some, strict=True):
                 args[i] = x
-            return list(forward(*args, **params))
+            return list((derivative or forward)(*args, **params))
 
         return jax.jvp(of, tuple([primals[i] for i in changing]), tuple([tangents[i] for i in changing]))
 
     def transposed(cotangents: Sequence[Any], *args: Any, n_fixed: int, **params: Any) -> list[Any]:
         fixed, linear = args[:n_fixed], args[n_fixed:]
         seeds = [ad.instantiate_zeros(x) for x in cotangents]
+        if backward is None:
+            raise NotImplementedError(f"{name} is not linear, so it has no transpose")
         found = backward(fixed, seeds, n_fixed=n_fixed, **params)
         own = [x if ad.is_undefined_primal(arg) else None for x, arg in zip(found, linear, strict=True)]
         return [*(None for _ in fixed), *own]
@@ -322,7 +327,8 @@ def linear_primitive(
     primitive.def_abstract_eval(lambda *args, **params: list(map(jax.typeof, results(*args, **params))))
     mlir.register_lowering(primitive, mlir.lower_fun(forward, multiple_results=True))
     ad.primitive_jvps[primitive] = jvp
-    ad.primitive_transposes[primitive] = transposed
+    if backward is not None:
+        ad.primitive_transposes[primitive] = transposed
     batching.primitive_batchers[primitive] = batched
     return primitive
 

@@ -148,10 +148,10 @@ def differentiable(run: CountedRun, on_lanes: Run, gradients: Gradients) -> Run:
             return run(leaves, count)
 
         def derivative(primals: Any, tangents: Any) -> Any:
-            (values, count), (slopes, _) = primals, tangents
+            (values, _), (slopes, _) = primals, tangents
             changing = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
             if isinstance(n_steps, int) and changing:
-                written, flagged = forward(values, count)
+                written, flagged = gradient.advance(gradients, run, values, n_steps)
                 some = gradient.tangents(gradients, values, [slopes[i] for i in changing], changing, n_steps)
                 found = dict(zip(gradients.floats, some, strict=True))
                 numbers = gradients.program.written

@@ -222,6 +222,43 @@ tangent_p = jaxcompat.linear_primitive("crazysim_tangents", _results, _forward, 
 """Tangents of a program: operands are its leaves, then the tangents of those that change."""
 
 
+def advance(gradients: Gradients, run: Any, values: Sequence[Any], n: int) -> tuple[list[Array], Array]:
+    """Return what a kernel writes, in a form that can be differentiated inside a derivative of it.
+
+    Args:
+        gradients: Derivatives of the program.
+        run: Runs the kernel.
+        values: Its leaves; None for one that is written before it is read.
+        n: Number of steps.
+    """
+    present = tuple([i for i, x in enumerate(values) if x is not None])
+    *written, flagged = advance_p.bind(
+        *(values[i] for i in present), gradients=gradients, run=run, n_steps=n, present=present, n_leaves=len(values)
+    )
+    return written, flagged
+
+
+def _advanced(*args: Any, gradients: Gradients, run: Any, n_steps: int, present: Any, n_leaves: int) -> list[Any]:
+    del gradients
+    written, flagged = run(_values(args, present, n_leaves), jnp.asarray(n_steps, jnp.int32))
+    return [*written, flagged]
+
+
+def _on_lanes(*args: Any, gradients: Gradients, run: Any, n_steps: int, present: Any, n_leaves: int) -> list[Any]:
+    del run
+    written, flagged = gradients.on_lanes(_values(args, present, n_leaves), n_steps)
+    return [*written, flagged]
+
+
+def _shapes(*args: Any, **params: Any) -> list[Any]:
+    avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args]
+    return jax.eval_shape(lambda *some: _advanced(*some, **params), *avals)
+
+
+advance_p = jaxcompat.linear_primitive("crazysim_advance", _shapes, _advanced, derivative=_on_lanes)
+"""Steps of a kernel, whose derivative is that of the program on lanes."""
+
+
 def float0(x: Any) -> np.ndarray:
     """Return the tangent of an array that has none."""
     return np.zeros(x.shape, jax.dtypes.float0)

@@ -154,7 +154,7 @@ Found = Sequence[Element | None]
 
 
 def _when(builder: Builder, op: Operation, values: dict, on_path: set[Value], found: Found, cts: Cotangents) -> None:
-    """Where the mask is true the cotangents go through the block, elsewhere to the old numbers."""
+    """Take cotangents through the block where the mask is true, and to the old numbers elsewhere."""
     mask, *old = op.args
     mask = values.get(mask, mask)
     (block,) = op.blocks
@@ -250,7 +250,7 @@ STRUCTURE: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "over_ot
 
 
 def _unrolled(block: Block) -> Block:
-    """Return a block whose loops of a fixed length are written out; the carries of their turns are needed backwards."""
+    """Return a block whose loops of a fixed length are unrolled; the carries of their turns are needed backwards."""
     if not any(op.name == "loop" for inner in block.blocks() for op in inner.operations):
         return block
     builder = Builder()
