@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
+from crazysim.cache import announce
 from crazysim.core.sharding import Location
 from crazysim.core.stage import with_leaves
 from crazysim.engine.backends import Run, lanes, native, reverse
@@ -80,10 +81,13 @@ class Gradients:
     def _kernels(self, perturbed: tuple[int, ...]) -> ReverseKernels | None:
         """Return the kernels for cotangents of some leaves; None where lanes compute them."""
         if perturbed not in self._found:
+            if self.location.platform == "cpu":
+                announce("compiling a gradient through the steps", "5 to 20 s")
             try:
                 self._found[perturbed] = ReverseKernels(self.program, perturbed, self.location)
                 self.used["gradient: one kernel"] = None
             except UnsupportedError as error:
+                announce("compiling a gradient through the steps on lanes", "10 to 40 s")
                 self._found[perturbed] = None
                 self.used[f"gradient: on lanes ({error})"] = None
                 if not isinstance(error, LimitError):
@@ -149,8 +153,8 @@ class ReverseKernels:
         Raises:
             UnsupportedError: If a part of the program has no derivative in a kernel, or it cannot be compiled.
         """
-        if location.platform != "cpu":
-            raise LimitError("gradients have kernels on the CPU alone")
+        if location.platform != "cpu" or jax.default_backend() != "cpu":  # JAX may compile it for its own choice
+            raise LimitError("gradients have kernels only where JAX has CPUs alone")
         self.program = program
         self.reverse = reverse.reverse(program, perturbed)
         self.inputs, self.perturbed = reverse.needed(self.reverse), self.reverse.perturbed
