@@ -158,7 +158,7 @@ class ReverseKernels:
         self.program = program
         self.reverse = reverse.reverse(program, perturbed)
         self.inputs, self.perturbed = reverse.needed(self.reverse), self.reverse.perturbed
-        self._launch = native.compiled(reverse.write(self.reverse))
+        self._launch = native.HostLaunch(reverse.write(self.reverse))
 
     def on(self, platform: str) -> Launch:
         """Return the function that calls the kernel.

@@ -377,8 +377,8 @@ def _host(pointers: Sequence[str], body: str, in_memory: bool, keeps: bool) -> s
     memory = ("", "")
     if keeps:
         sizes, call = f"{sizes}, int interval, char* kept", call.replace("n_steps", "n_steps, interval, kept")
-        memory = (
-            """    const int interval = ((int*)in[1]->data)[1];
+        memory = (  # the number of steps, which XLA passes before the inputs, is followed by the interval
+            """    const int interval = ((int*)in[-1])[1];
     char* const kept = static_cast<char*>(aligned_alloc(64, KEPT_BYTES));
 """,
             "\n    free(kept);",
