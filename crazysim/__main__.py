@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -90,11 +91,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cache.enable_for_command()
     try:
         COMMANDS[options.command](options)
+        sys.stdout.flush()
     except (ValueError, ImportError, DivergedError, RenderError) as error:
         print(f"crazysim: {_named_extra(error, options.command)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
+    except BrokenPipeError:  # who reads the output, such as head, has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
+        return 141
     return 0
 
 

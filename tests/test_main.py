@@ -26,6 +26,14 @@ def test_as_a_module_in_a_process_of_its_own():
     assert "demo" in out.stdout
 
 
+def test_a_reader_may_have_read_enough():
+    command = [sys.executable, "-m", "crazysim", "airframe", "check", "crazyflie"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_help_of_a_command_states_defaults_once(command, capsys):
     with pytest.raises(SystemExit):
