@@ -51,7 +51,7 @@ class Identification:
     airframe: Airframe
     """Airframe with the identified numbers."""
     model: Model
-    """Model with the identified numbers and what an airframe cannot hold."""
+    """Model with the identified numbers, and the torques and delay that have no key in an airframe."""
     values: dict[str, float]
     """Identified parameters by name, see ``NAMES``."""
     deviations: dict[str, float]
@@ -108,14 +108,19 @@ def identify(
         iterations: Largest number of steps of Gauss-Newton.
 
     Raises:
-        ConfigError: If sample times or rotors do not fit.
+        ConfigError: If the mass is not positive, or if sample times, lengths or rotors of the logs do not fit.
     """
     base = load_airframe(airframe)
+    if mass is not None and not 0 < mass < np.inf:
+        raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}")
     _check(logs, base)
+    batch = windows(logs, DURATION, DURATION)
+    if base.n_rotors <= 4:
+        _check_order(logs, base)
     weight = float(base.value("rigid_body.mass")) if mass is None else float(mass)
     params = first_principles.Params.create(base).replace(mass=jnp.asarray([weight], jnp.float32))
     start = _least_squares(logs, params)
-    batch, dt = windows(logs, DURATION, DURATION), logs[0].dt
+    dt = logs[0].dt
 
     def residuals(x: Array) -> Array:
         return jax.vmap(lambda w: _residuals(_model(x, params), w, dt))(batch)
@@ -261,7 +266,7 @@ def _least_squares(logs: Sequence[Log], params: first_principles.Params) -> NDAr
 
 
 def _check(logs: Sequence[Log], airframe: Airframe) -> None:
-    """Check that logs and airframe fit: sample times, number, unit and order of rotors."""
+    """Check that logs and airframe fit: sample times, number and unit of rotors."""
     if not logs:
         raise ConfigError("expected at least one log, got none")
     params = first_principles.Params.create(airframe)
@@ -280,12 +285,11 @@ def _check(logs: Sequence[Log], airframe: Airframe) -> None:
                 f"{np.median(log.rotor_vel):.0f}. Give rpm_per_unit: {60 / (2 * np.pi):.4g} for rad/s, 1 over the pole "
                 "pairs for electrical rpm."
             )
-    if airframe.n_rotors <= 4:
-        _check_order(logs, airframe, params)
 
 
-def _check_order(logs: Sequence[Log], airframe: Airframe, params: first_principles.Params) -> None:
+def _check_order(logs: Sequence[Log], airframe: Airframe) -> None:
     """Check that no other order of the rotors explains the angular accelerations much better."""
+    params = first_principles.Params.create(airframe)
     pieces = [_regressors(log, params) for log in logs]
     _, ang_acc, vel, thrust = [np.concatenate(x) for x in zip(*pieces, strict=True)]
     mixing = airframe.mixing_matrix

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from crazysim import rotation
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import reaction_torque
+from crazysim.errors import ConfigError
 from crazysim.identify.logs import Log
 from crazysim.pytree import PyTree
 
@@ -21,7 +22,7 @@ HORIZONS = (0.1, 0.25, 0.5)
 
 
 class Extras(PyTree):
-    """Torques that flights show and an airframe file cannot hold."""
+    """Torques and a delay that are fitted but have no key in an airframe file."""
 
     torque: Array
     """Constant torque, body frame, N m. (3,)"""
@@ -49,19 +50,19 @@ class Windows(PyTree):
     """Pieces of logs of equal length, from which predictions start."""
 
     pos: Array
-    """Position, m. (n_windows, n, 3)"""
+    """Position, world frame, m. (n_windows, n, 3)"""
     quat: Array
-    """Attitude, xyzw. (n_windows, n, 4)"""
+    """Attitude, body to world, unit, xyzw. (n_windows, n, 4)"""
     vel: Array
-    """Velocity, m/s. (n_windows, n, 3)"""
+    """Velocity, world frame, m/s. (n_windows, n, 3)"""
     ang_vel: Array
-    """Angular velocity, rad/s. (n_windows, n, 3)"""
+    """Angular velocity, body frame, rad/s. (n_windows, n, 3)"""
     rotor_vel: Array
     """Rotor speeds, with ``PADDING`` samples before and after, rpm. (n_windows, n + 2 PADDING, n_rotors)"""
 
 
 PADDING = 6
-"""Samples of rotor speeds before and after a window; a delay is limited to so many less two."""
+"""Samples of rotor speeds before and after a window. Delays are limited to ``PADDING - 2`` samples of either sign."""
 
 
 def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
@@ -71,6 +72,9 @@ def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
         logs: Logs.
         duration: Duration of a window, s.
         stride: Time between the starts of two windows, s.
+
+    Raises:
+        ConfigError: If no log is long enough for a window.
     """
     pieces: dict[str, list[NDArray]] = {key: [] for key in ("pos", "quat", "vel", "ang_vel", "rotor_vel")}
     for log in logs:
@@ -81,6 +85,11 @@ def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
             for key, values in pieces.items():
                 extra = PADDING if key == "rotor_vel" else 0
                 values.append(getattr(log, key)[start - extra : start + n + extra])
+    if not pieces["pos"]:
+        raise ConfigError(
+            f"expected a log without gaps for longer than {duration:g} s and {2 * PADDING + 1} samples, got none. "
+            "Use longer logs."
+        )
     return Windows(**{key: jnp.asarray(np.stack(x), jnp.float32) for key, x in pieces.items()})
 
 
@@ -133,7 +142,10 @@ def predict(model: Model, window: Windows, dt: float) -> tuple[Array, Array, Arr
 
 
 def attitude_error(quat: Array, reference: Array) -> Array:
-    """Return the rotation from a reference attitude to another, body frame, small angles in rad. (..., 3)"""
+    """Return the rotation from a reference attitude to another, body frame. (..., 3)
+
+    Its length is ``2 sin(angle / 2)``: for small angles the angle in rad, and at most 2.
+    """
     error = rotation.multiply(reference * jnp.array([-1.0, -1.0, -1.0, 1.0]), quat)
     return 2 * jnp.where(error[..., 3:] < 0, -error[..., :3], error[..., :3])
 
@@ -147,7 +159,8 @@ def prediction_errors(logs: Sequence[Log], model: Model, horizons: Sequence[floa
         horizons: Horizons, s.
 
     Returns:
-        RMSE of the position, m, and of the attitude, degrees, at each horizon, by name: ``position``, ``attitude``,
+        RMSE of the position, m, and of the attitude, ``2 sin(angle / 2)`` in degrees, at each horizon, by
+        name: ``position``, ``attitude``,
         ``position at constant velocity``, ``attitude unchanged``. (len(horizons),) each
     """
     batch, dt = windows(logs, max(horizons), 0.05), logs[0].dt

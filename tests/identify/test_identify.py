@@ -155,3 +155,14 @@ def test_other_order_of_rotors_is_refused(flights):
 
 def test_results_are_plain_numbers(result):
     assert all(isinstance(x, float) for x in jax.tree.leaves(result.values))
+
+
+def test_mass_that_is_not_positive_is_refused(flights):
+    with pytest.raises(ConfigError, match="expected mass to be positive"):
+        identify([read_log(flights[0])], mass=-0.03)
+
+
+def test_logs_shorter_than_a_window_are_refused(flights):
+    short = {key: x[:60] for key, x in flights[0].items()}
+    with pytest.raises(ConfigError, match="Use longer logs"):
+        identify([read_log(short)])

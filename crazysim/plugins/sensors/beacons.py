@@ -24,7 +24,7 @@ SWEEP_TILTS = -math.pi / 6, math.pi / 6
 """Tilts of the two light planes of a lighthouse of the second generation, rad: 30 degrees either way (Taffanel et al.
 2021, arXiv:2104.11523)."""
 STEEPEST = 1 - 1e-4
-"""Largest sine of the part of a sweep angle that the height makes."""
+"""Limit of the argument of the arcsine in a sweep angle, which keeps gradients finite."""
 
 
 class UWBData(PyTree):
@@ -206,9 +206,9 @@ def _places(name: str, value: ArrayLike, least: int) -> np.ndarray:
     """Return vectors as an array. (n, 3)
 
     Raises:
-        ConfigError: If they are none, or fewer than ``least``.
+        ConfigError: If the shape is not (n, 3), a number is not finite, or n is less than ``least``.
     """
     places = np.asarray(value, np.float64)
     if places.ndim != 2 or places.shape[1] != 3 or len(places) < least or not np.isfinite(places).all():
-        raise ConfigError(f"expected {name} as at least {least} finite vectors (n, 3), got shape {places.shape}")
+        raise ConfigError(f"expected {name} as at least {least} finite vectors (n, 3), got {places.tolist()}")
     return places

@@ -75,6 +75,8 @@ class RotorSpeeds(Noisy):
     @classmethod
     def telemetry(cls, pole_pairs: int, **settings: Any) -> RotorSpeeds:
         """Return a sensor with the resolution of telemetry for motors with a number of pole pairs."""
+        if not pole_pairs > 0:
+            raise ConfigError(f"expected pole_pairs to be positive, got {pole_pairs}")
         return cls(resolution=ERPM / pole_pairs, **settings)
 
     @property

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
-from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
+from crazysim.plugins.sensors.sensor import steps_between
 from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.placement import place, placed_by
@@ -73,7 +73,7 @@ class RangeFinder(Plugin):
             raise ConfigError(f"expected directions as vectors (n_rays, 3), none of them zero, got {rays.tolist()}")
         if not self.max_range > 0:
             raise ConfigError(f"expected max_range to be positive, in m, got {self.max_range}")
-        self._period(sim)
+        steps_between(self, sim)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         far = float(self.max_range)
         distance = np.full((sim.n_worlds, sim.n_drones, len(rays)), far)
@@ -89,7 +89,7 @@ class RangeFinder(Plugin):
         model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
         placed = {name: plugin for name, plugin in placed.items() if name in touched}
         scope = "world" if self.drones or placed else "drone"
-        period = self._period(sim)
+        period = steps_between(self, sim)
         when = None if period == 1 else lambda data: data.core.steps % period == 0
 
         def measure(data: SimData) -> SimData:
@@ -113,11 +113,6 @@ class RangeFinder(Plugin):
         end = start + np.asarray(record.distance[world])[..., None] * np.asarray(direction)
         for points in np.stack(np.broadcast_arrays(start, end), axis=-2).reshape(-1, 2, 3):
             sim.scene.renderer.overlays.line(points, GREEN, 2.0, 2.0)
-
-    def _period(self, sim: Simulation) -> int:
-        """Return the number of steps between measurements."""
-        steps = sim.data.core.freq
-        return 1 if self.freq is None else steps // dividing_rate(f"freq of {self.name!r}", self.freq, steps)
 
     def _measured(self, model: CollisionModel, data: SimData, of_world: bool) -> RangeFinderData:
         """Return the record with the distances of one drone, or of one world."""

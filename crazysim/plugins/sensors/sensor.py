@@ -90,7 +90,7 @@ class Sensor(Plugin):
 
     def samples(self, sim: Simulation) -> Samples:
         """Return the field ``samples`` of the record, before the first measurement; check the common settings."""
-        period = _period(self, sim)
+        period = steps_between(self, sim)
         k, shape, longest = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._longest
         is_number = isinstance(longest, (int, float)) and math.isfinite(longest)
         rows = (
@@ -126,7 +126,7 @@ class Sensor(Plugin):
         if type(self).begin is not Sensor.begin:
             begins = Stage(self._begin, "drone", lambda data: data.core.steps == 0)
             placements.append(Placement(begins, before=end, name=f"{self.name}_begin"))
-        when = None if _period(self, sim) == 1 else lambda data: tick(data, self.freq or data.core.freq)
+        when = None if steps_between(self, sim) == 1 else lambda data: tick(data, self.freq or data.core.freq)
         placements.append(Placement(Stage(self._take, "drone", when), before=end))
         if self._longest:
             placements.append(Placement(Stage(self._deliver, "drone"), before=end, name=f"{self.name}_arrival"))
@@ -208,8 +208,8 @@ class Sensor(Plugin):
         return self.write(data, record.replace(samples=samples.replace(value=value, taken=taken)))
 
 
-def _period(sensor: Sensor, sim: Simulation) -> int:
-    """Return the number of steps between measurements."""
+def steps_between(sensor: Any, sim: Simulation) -> int:
+    """Return the number of steps between measurements of a plugin with ``freq`` and ``name``."""
     steps = sim.data.core.freq
     return 1 if sensor.freq is None else steps // dividing_rate(f"freq of {sensor.name!r}", sensor.freq, steps)
 

@@ -285,3 +285,8 @@ def test_law_09_measured_needs_a_sensor():
     env = make("hover")
     with pytest.raises(ConfigError, match="expected a sensor of states"):
         DroneEnv(env.sim, env.task, measured=True)
+
+
+def test_telemetry_needs_pole_pairs():
+    with pytest.raises(ConfigError, match="expected pole_pairs to be positive"):
+        sensors.RotorSpeeds.telemetry(0)
