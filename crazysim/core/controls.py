@@ -138,6 +138,27 @@ class ControllerData(PyTree):
         return ControllerData(jax.tree.map(of_all, memory, one), params, controller.freq)
 
 
+def controller_layout(controller: ControllerData | None) -> tuple[object, list[tuple[int, ...]]]:
+    """Return what the data of two simulations with the same controller have in common."""
+    memory = None if controller is None else controller.memory
+    return jax.tree.structure(controller), [np.shape(x) for x in jax.tree.leaves(memory)]
+
+
+def described_controller(controller: ControllerData | None) -> str:
+    """Return the records of a controller for a message."""
+    if controller is None:
+        return "no records"
+    shapes = [np.shape(x) for x in jax.tree.leaves(controller.memory)]
+    memory, params = _kind(controller.memory), _kind(controller.params)
+    return f"memory {memory} of shapes {shapes}, parameters {params} and freq={controller.freq}"
+
+
+def _kind(record: object) -> str:
+    """Return the name of a record's type, with those of several controllers in it."""
+    name, members = type(record).__name__, getattr(record, "controllers", ())
+    return f"{name}({', '.join(map(_kind, members))})" if members else name
+
+
 class SimControls(PyTree):
     """Controllers of a simulation; those not in use are None."""
 

@@ -7,13 +7,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import numpy as np
 from jax.sharding import Mesh
 
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import find_controller
 from crazysim.core.airframes import AirframeSource, is_list, load_airframes
-from crazysim.core.controls import ControllerData, require_controller, require_pair
+from crazysim.core.controls import controller_layout, described_controller, require_controller, require_pair
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.settings import (
@@ -91,10 +90,10 @@ class Configuration:
                 f"simulation, or of one with the same settings."
             )
         present, needed = controls.controller, like.controls.controller
-        if present is not needed and _layout(present) != _layout(needed):
+        if present is not needed and controller_layout(present) != controller_layout(needed):
             raise ConfigError(
-                f"expected data of controller {getattr(self.controller, 'name', None)!r} with {_records(needed)}, got "
-                f"{_records(present)}. Use data of this simulation, or of one with the same settings."
+                f"expected data of controller {getattr(self.controller, 'name', None)!r} with {described_controller(needed)}, got "
+                f"{described_controller(present)}. Use data of this simulation, or of one with the same settings."
             )
 
     @staticmethod
@@ -156,27 +155,6 @@ class Configuration:
             engine,
             flag("strict", strict),
         )
-
-
-def _layout(controller: ControllerData | None) -> tuple[object, list[tuple[int, ...]]]:
-    """Return what the data of two simulations with the same controller have in common."""
-    memory = None if controller is None else controller.memory
-    return jax.tree.structure(controller), [np.shape(x) for x in jax.tree.leaves(memory)]
-
-
-def _records(controller: ControllerData | None) -> str:
-    """Return the records of a controller for a message."""
-    if controller is None:
-        return "no records"
-    shapes = [np.shape(x) for x in jax.tree.leaves(controller.memory)]
-    memory, params = _kind(controller.memory), _kind(controller.params)
-    return f"memory {memory} of shapes {shapes}, parameters {params} and freq={controller.freq}"
-
-
-def _kind(record: object) -> str:
-    """Return the name of a record's type, with those of several controllers in it."""
-    name, members = type(record).__name__, getattr(record, "controllers", ())
-    return f"{name}({', '.join(map(_kind, members))})" if members else name
 
 
 def _described(n_worlds: int, n_drones: int, freq: int, control: Control, cascade: bool, fitted: bool) -> str:
