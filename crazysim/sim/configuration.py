@@ -91,8 +91,9 @@ class Configuration:
             )
         present, needed = controls.controller, like.controls.controller
         if present is not needed and controller_layout(present) != controller_layout(needed):
+            name = getattr(self.controller, "name", None)
             raise ConfigError(
-                f"expected data of controller {getattr(self.controller, 'name', None)!r} with {described_controller(needed)}, got "
+                f"expected data of controller {name!r} with {described_controller(needed)}, got "
                 f"{described_controller(present)}. Use data of this simulation, or of one with the same settings."
             )
 
