@@ -136,3 +136,10 @@ def test_what_has_no_kernel_is_differentiated_on_lanes(x64):
         found = gradient(fast)(at)
     assert_same(found, gradient(plain)(at))
     assert "the smallest or largest over other drones has no derivative in a kernel" in explain(step, data)
+
+
+@needs_compiler
+def test_forward_mode_takes_a_number_of_steps_that_is_an_array(x64):
+    ((fast, *_), (plain, *_)), at = functions(n_steps=jnp.int32(3))
+    for along in (at, jax.tree.map(jnp.ones_like, at)):
+        assert_same(jax.jvp(fast, (at,), (along,)), jax.jvp(plain, (at,), (along,)))

@@ -148,7 +148,7 @@ def differentiable(run: CountedRun, on_lanes: Run, gradients: Gradients) -> Run:
             return run(leaves, count)
 
         def derivative(primals: Any, tangents: Any) -> Any:
-            (values, _), (slopes, _) = primals, tangents
+            (values, count), (slopes, _) = primals, tangents
             changing = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
             if isinstance(n_steps, int) and changing:
                 written, flagged = gradient.advance(gradients, run, values, n_steps)
@@ -159,9 +159,10 @@ def differentiable(run: CountedRun, on_lanes: Run, gradients: Gradients) -> Run:
                 return (written, flagged), (rest, gradient.float0(flagged))
 
             announce("compiling a gradient through the steps on lanes", "10 to 40 s")
+            known = n_steps if isinstance(n_steps, int) else count  # a traced one may not be closed over
 
             def of(some: list[Any]) -> Any:
-                return on_lanes(with_leaves(values, changing, some), n_steps)
+                return on_lanes(with_leaves(values, changing, some), known)
 
             return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
 
