@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, check_parameter, parameter
 from crazysim.plugins.effects.moving_air import zeros
-from crazysim.plugins.sensors.sensor import Samples, Sensor, correlated, quantise
+from crazysim.plugins.sensors.sensor import Samples, Sensor, check_resolution, correlated, quantise
 from crazysim.pytree import PyTree, leaf
 
 SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE, LAPSE = 101325.0, 288.15, 0.0065
@@ -73,9 +73,7 @@ class Barometer(Sensor):
 
     def record(self, sim: Simulation) -> BarometerData:
         """Return the barometer before its first measurement."""
-        resolution = self.resolution
-        if resolution is not None:
-            resolution = check_parameter(sim, "resolution", resolution, positive=True)
+        resolution = check_resolution(sim, self.resolution)
         return BarometerData(
             samples=self.samples(sim),
             drift=zeros(sim, 1),
@@ -103,8 +101,7 @@ class Barometer(Sensor):
         noise = jax.random.normal(key, (2,), record.offset.dtype)
         drift = correlated(record.drift, record.drift_deviation, record.drift_time, self.interval(data), noise[:1])
         pressure = self.ideal(data)[:1] + record.offset + drift + record.noise * noise[1:]
-        if record.resolution is not None:
-            pressure = quantise(pressure, record.resolution)
+        pressure = quantise(pressure, record.resolution)
         height = altitude_of(pressure) - record.altitude
         return jnp.concatenate([pressure, height]), record.replace(drift=drift)
 

@@ -16,7 +16,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, check_parameter, parameter
 from crazysim.plugins.effects.ground import ground_below
-from crazysim.plugins.sensors.sensor import Samples, Sensor, per_axis, quantise
+from crazysim.plugins.sensors.sensor import Samples, Sensor, check_resolution, per_axis, quantise
 from crazysim.pytree import PyTree, leaf
 
 PIXELS_PER_RADIAN = 35.0 / 0.71674
@@ -73,9 +73,7 @@ class OpticalFlow(Sensor):
 
     def record(self, sim: Simulation) -> OpticalFlowData:
         """Return the camera before its first measurement."""
-        resolution = self.resolution
-        if resolution is not None:
-            resolution = check_parameter(sim, "resolution", resolution, positive=True)
+        resolution = check_resolution(sim, self.resolution)
         return OpticalFlowData(
             samples=self.samples(sim),
             noise=per_axis(sim, "noise", self.noise, 0.0, 2),
@@ -97,7 +95,7 @@ class OpticalFlow(Sensor):
         """Return the motion of the image of one camera, pixels, and the record."""
         truth = self.ideal(data)
         value = truth + record.noise * jax.random.normal(key, (2,), truth.dtype)
-        return value if record.resolution is None else quantise(value, record.resolution), record
+        return quantise(value, record.resolution), record
 
 
 class TimeOfFlightData(PyTree):
@@ -147,9 +145,7 @@ class TimeOfFlight(Sensor):
 
     def record(self, sim: Simulation) -> TimeOfFlightData:
         """Return the sensor before its first measurement."""
-        resolution = self.resolution
-        if resolution is not None:
-            resolution = check_parameter(sim, "resolution", resolution, positive=True)
+        resolution = check_resolution(sim, self.resolution)
         return TimeOfFlightData(
             samples=self.samples(sim),
             noise=check_parameter(sim, "noise", self.noise, low=0.0),
@@ -174,7 +170,7 @@ class TimeOfFlight(Sensor):
         near = truth < record.max_range
         value = truth + deviation * jax.random.normal(key, (1,), truth.dtype)
         value = jnp.where(near, rotation.safe_clip(value, 0.0, record.max_range), record.max_range)
-        return value if record.resolution is None else quantise(value, record.resolution), record
+        return quantise(value, record.resolution), record
 
 
 def ground_distance(data: SimData, pos: Array) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from crazysim.errors import ConfigError
 from crazysim.plugins.effects.battery import BatteryData
 from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.plugins.sensors.range_finder import RangeFinderData
-from crazysim.plugins.sensors.sensor import Samples, Sensor, quantise
+from crazysim.plugins.sensors.sensor import Samples, Sensor, check_resolution, quantise
 from crazysim.pytree import PyTree, leaf
 
 ERPM = 100.0
@@ -48,9 +48,7 @@ class Noisy(Sensor):
 
     def record(self, sim: Simulation) -> NoisyData:
         """Return the sensor before its first measurement."""
-        resolution = self.resolution
-        if resolution is not None:
-            resolution = check_parameter(sim, "resolution", resolution, positive=True)
+        resolution = check_resolution(sim, self.resolution)
         noise = check_parameter(sim, "noise", self.noise, low=0.0)
         return NoisyData(self.samples(sim), noise, resolution)
 
@@ -58,7 +56,7 @@ class Noisy(Sensor):
         """Return the measurement of one drone, and the record."""
         truth = self.ideal(data)
         value = truth + record.noise * jax.random.normal(key, truth.shape, truth.dtype)
-        return value if record.resolution is None else quantise(value, record.resolution), record
+        return quantise(value, record.resolution), record
 
 
 class RotorSpeeds(Noisy):

@@ -230,15 +230,24 @@ def mounting(sim: Simulation, rpy: ArrayLike) -> Array:
     return jax.jit(rotation.from_rpy)(check_parameter(sim, "rpy", rpy, (3,)))
 
 
+def check_resolution(sim: Simulation, resolution: ArrayLike | None) -> Array | None:
+    """Return the resolution of each drone's sensor; None without one."""
+    return None if resolution is None else check_parameter(sim, "resolution", resolution, positive=True)
+
+
+def quantise(x: Array, resolution: Array | None) -> Array:
+    """Return the nearest multiple of a resolution, ``x`` for None; its gradient is that of ``x`` itself. (...)"""
+    return x if resolution is None else _nearest_multiple(x, resolution)
+
+
 @jax.custom_jvp
-def quantise(x: Array, resolution: Array) -> Array:
-    """Return the nearest multiple of a resolution; its gradient is that of ``x`` itself. (...)"""
+def _nearest_multiple(x: Array, resolution: Array) -> Array:
     return resolution * jnp.round(x / resolution)
 
 
-@quantise.defjvp
+@_nearest_multiple.defjvp
 def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    return quantise(*primals), tangents[0]
+    return _nearest_multiple(*primals), tangents[0]
 
 
 def correlated(state: Array, deviation: Array, time: Array, dt: float, noise: Array) -> Array:

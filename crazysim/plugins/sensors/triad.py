@@ -83,8 +83,7 @@ class TriadData(PyTree):
             triad = triad.replace(filtered=value)
         if self.limit is not None:
             value = rotation.safe_clip(value, -self.limit, self.limit)
-        if self.resolution is not None:
-            value = quantise(value, self.resolution)
+        value = quantise(value, self.resolution)
         return value, triad
 
 
