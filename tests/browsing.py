@@ -10,6 +10,7 @@ import urllib.request
 import numpy as np
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
+from waiting import wait_for
 
 NEAR = 12
 """Pixels between where something is seen and where it is."""
@@ -93,13 +94,6 @@ class Browser:
         self._socket.close()
         self._process.terminate()
         self._process.wait(20)
-
-
-def wait_for(condition, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come to be"
-        time.sleep(0.05)
 
 
 def start_browser(folder):

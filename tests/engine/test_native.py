@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from browsing import wait_for
 from cases import shared_sim
+from waiting import wait_for
 
 from crazysim.engine import Step
 from crazysim.engine.backends import kernel, kernel_cache, native
@@ -299,11 +299,11 @@ def test_compilers_end_with_their_process(tmp_path, end, where):
         try:
             wait_for(lambda: len(compilers(tmp_path)) >= 3)  # the script, the driver and the compiler
             process.send_signal(end)
-            process.wait(60)
+            process.wait(300)
         finally:
             process.kill()
     wait_for(lambda: not compilers(tmp_path))
-    assert compile_in_another_process(tmp_path, "quick").wait(60) == 0
+    assert compile_in_another_process(tmp_path, "quick").wait(300) == 0
     assert [path.suffix for path in (tmp_path / "cache").iterdir()] == [".so"]
     assert [path.name for path in tmp_path.iterdir()] == ["cache"]
 

@@ -9,7 +9,8 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from browsing import NEAR, wait_for
+from browsing import NEAR
+from waiting import wait_for
 
 from crazysim import SlungLoad, Wind
 from crazysim.errors import ConfigError, RenderError
@@ -154,7 +155,7 @@ def test_a_page_is_watched_and_used(chromium, live, caplog):
         live.post(lambda live: live.advance(5))
         wait_for(lambda: live.step == press_again + 5)
         chromium.call("Page.navigate", url=page.url)
-        wait_for(lambda: page.n_clients == 1 and len(chromium.mask(MAGENTA)[0]) > 40, 120)
+        wait_for(lambda: page.n_clients == 1 and len(chromium.mask(MAGENTA)[0]) > 40)
     assert not page.is_open
 
 
@@ -211,15 +212,20 @@ def test_a_port_in_use_is_named(viser, live, caplog):
     assert "every machine of that network" in caplog.text
 
 
-def test_closing_waits_for_no_unused_connection(viser, live):
-    """Browsers open connections in advance."""
+def test_closing_waits_for_no_unused_connection(viser, live, monkeypatch):
+    """Browsers open connections in advance, for which viser waits."""
     page = live.show(Browser(port=0))
-    with socket.create_connection(("127.0.0.1", urlsplit(page.url).port)):
-        time.sleep(0.1)
-        begin = time.monotonic()
-        live.close()
-        assert time.monotonic() - begin < 4
+    unused, ended = threading.Event(), []
+
+    def stop(real=page._server.stop):
+        ended.append(unused.wait(300))
+        real()
+
+    monkeypatch.setattr(page._server, "stop", stop)
+    live.close()
+    assert not ended
     assert not page.is_open
+    unused.set()
 
 
 @pytest.fixture

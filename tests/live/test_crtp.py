@@ -3,12 +3,12 @@
 import errno
 import socket
 import struct
-import time
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from waiting import wait_for
 
 from crazysim import Sim
 from crazysim.errors import ConfigError
@@ -109,9 +109,7 @@ def test_parameters(running, uri):
         param.set_value("ring.solidRed", 51)
         with pytest.raises(AttributeError, match="read-only"):
             param.set_value("deck.bcFlow2", 0)
-        end = time.monotonic() + 60
-        while not called and time.monotonic() < end:
-            time.sleep(0.01)
+        wait_for(lambda: called)
     assert called == [("ring.solidRed", "51")]
     np.testing.assert_allclose(running.colors[0], [0.2, 1.0, 0.0])
 
@@ -125,9 +123,7 @@ def test_a_parameter_that_is_not_simulated_keeps_its_value_and_says_so(running, 
         scf.cf.console.receivedChar.add_callback(lines.append)
         scf.cf.param.add_update_callback("pid_attitude", "pitch_kd", lambda name, value: read_back.append(value))
         scf.cf.param.set_value("pid_attitude.pitch_kd", 0.1234)
-        end = time.monotonic() + 60
-        while not (read_back and "\n" in "".join(lines)) and time.monotonic() < end:
-            time.sleep(0.01)
+        wait_for(lambda: read_back and "\n" in "".join(lines))
         with pytest.raises(KeyError, match=r"no\.thing"):
             scf.cf.param.set_value("no.thing", 1)
     assert [float(value) for value in read_back] == [0.0]
@@ -171,9 +167,7 @@ def test_decks_and_memories(running, uri):
         for led in leds.leds:
             led.set(255, 0, 255)
         leds.write_data(None)
-        end = time.monotonic() + 60
-        while running.colors[0, 0] < 1 and time.monotonic() < end:
-            time.sleep(0.01)
+        wait_for(lambda: running.colors[0, 0] == 1)
     np.testing.assert_allclose(running.colors[0], [1, 0, 1])
 
 
@@ -389,9 +383,7 @@ def test_a_server_continues_after_a_packet_that_fails(swarm, caplog):
         handle = server.devices[0].handle
         server.devices[0].handle = lambda packet: 1 / 0
         peer.sendto(b"\xfd\x00", address)
-        end = time.monotonic() + 60
-        while "was not answered" not in caplog.text and time.monotonic() < end:
-            time.sleep(0.01)
+        wait_for(lambda: "was not answered" in caplog.text)
         server.devices[0].handle = handle
         peer.sendto(b"\xfd\x00", address)
         assert peer.recv(100).startswith(b"\xfdBitcraze")

@@ -50,7 +50,7 @@ WATCHED = textwrap.dedent("""
             window._process.wait()
         if line.strip() == "close":
             other._process.kill()
-            thread.join(20)
+            thread.join(300)
             assert not thread.is_alive() and not other.is_open, "the run ends with its last window"
         time.sleep(0.1)
         print(line.strip(), live.step, window.is_open, flush=True)
@@ -90,7 +90,7 @@ def test_a_window_shows_worlds_and_its_end_is_no_end(screen, opengl):
         assert do("kill") == ["kill", "0", "False"]
         assert do("close")[0] == "close"
         program.stdin.close()
-        assert program.wait(30) == 0
+        assert program.wait(300) == 0
 
 
 def test_without_a_screen_a_window_is_refused(monkeypatch):

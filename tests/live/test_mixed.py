@@ -1,7 +1,5 @@
 """Twins, swarms and messages in the live loop, beside a source that never answers."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -41,11 +39,7 @@ def test_the_loop_drives_twins_and_swarms_and_waits_for_no_source():
         for part in [*twins, swarm]:
             live.add(part, on_error="report")
         live.at(0.2, lambda _: swarm["cf1"].take_off(0.5, 1.0))
-        began = time.perf_counter()
-        report = live.run(seconds=2.0)
-        assert (
-            time.perf_counter() - began < 60
-        )  # a busy machine takes its time, a wait for the silent source would not end
+        report = live.run(seconds=2.0)  # a wait for the silent source would not end
     assert swarm.state("cf1").pos[2] == pytest.approx(0.5, abs=0.15)
     assert swarm.state("cf2").pos[2] < 0.01
     assert np.asarray(twins[0].handles["cf1"].pose(sim.data)[0])[0, 0, 0] > 1.1

@@ -4,11 +4,11 @@ import signal
 import subprocess
 import sys
 import textwrap
-import time
 
 import numpy as np
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
+from waiting import wait_for
 
 from crazysim.errors import ConfigError
 from crazysim.media import Film, Flight, Recorder, View
@@ -119,10 +119,7 @@ def test_a_film_survives_the_end_of_its_process(tmp_path):
     path = tmp_path / "film.mp4"
     ended = subprocess.run([sys.executable, "-c", KILLED, path, "200", "python"], check=False)
     assert ended.returncode == -signal.SIGKILL
-    deadline = time.monotonic() + 20
-    while (n := n_frames(path) if path.exists() and path.stat().st_size else 0) < 200 and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert n == 200
+    wait_for(lambda: path.exists() and path.stat().st_size and n_frames(path) == 200)
     subprocess.run([sys.executable, "-c", KILLED, path, "400", "ffmpeg"], check=True)
     assert n_frames(path) > 200
 

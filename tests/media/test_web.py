@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from browsing import NEAR, wait_for
+from browsing import NEAR
+from waiting import wait_for
 
 from crazysim.__main__ import main
 from crazysim.errors import RenderError

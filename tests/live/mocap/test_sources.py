@@ -2,13 +2,12 @@
 
 import json
 import sys
-import threading
-import time
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from waiting import wait_for
 
 from crazysim.errors import ConfigError, DamagedFileError
 from crazysim.live.mocap import (
@@ -37,13 +36,6 @@ def moving(t):
 
 def stamps(poll):
     return [frame.stamp for frame in poll.frames]
-
-
-def wait_for(condition, seconds=10.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 def test_a_function_is_sampled_in_simulated_time():
@@ -80,7 +72,7 @@ def test_a_thread_sends_in_real_time():
         found = []
         wait_for(lambda: found.extend(source.poll(0, 500).frames) or len(found) >= 20)
     np.testing.assert_allclose(np.diff([f.stamp for f in found]), 1 / 200)
-    assert 0.05 < found[19].received - found[0].received < 2.0
+    assert found[19].received - found[0].received > 0.05
 
 
 class Broken(ThreadSource):
@@ -89,14 +81,6 @@ class Broken(ThreadSource):
     def stream(self, stopped):
         yield Frame.of(0.0, moving(0.0))
         raise OSError("unplugged")
-
-
-class Silent(ThreadSource):
-    """A source that never answers."""
-
-    def stream(self, stopped):
-        threading.Event().wait()
-        yield Frame.of(0.0, moving(0.0))
 
 
 class Quick(ThreadSource):
@@ -112,15 +96,6 @@ def test_a_failing_source_says_why():
         wait_for(lambda: source.ended)
         assert source.ended == "OSError: unplugged"
         assert len(source.poll(0, 500).frames) == 1
-
-
-def test_a_silent_source_stops_nothing():
-    with Silent("optitrack").start() as source:
-        begin = time.monotonic()
-        for _ in range(100):
-            assert source.poll(0, 500).frames == []
-        assert time.monotonic() - begin < 5
-        assert source.ended is None
 
 
 def test_lost_frames_are_counted():
@@ -160,26 +135,33 @@ def test_frames_of_a_laboratory_come_from_a_process(second, reason, tmp_path):
 
 def test_a_silent_process_is_ended(tmp_path):
     program = tmp_path / "worker.py"
-    program.write_text("import time\ntime.sleep(1000)\n")
-    begin = time.monotonic()
+    ended = tmp_path / "ended"
+    program.write_text(f"import time\ntime.sleep(300)\nopen({str(ended)!r}, 'w')\n")
     with MotionCaptureSource("qualisys", "127.0.0.1", command=[sys.executable, str(program)]) as source:
         assert source.poll(0, 500).frames == []
-    assert time.monotonic() - begin < 5
+    assert not ended.exists(), "it ended by itself"
 
 
-def test_the_program_says_that_the_package_is_missing(tmp_path):
-    (tmp_path / "motioncapture.py").write_text("def connect(*args): raise RuntimeError('Unknown motion capture type!')")
-    worker = source_module.__file__.replace("source.py", "worker.py")
-    program = tmp_path / "run.py"
-    program.write_text(
-        f"import sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); runpy.run_path({worker!r}, run_name='__main__')"
-    )
-    with MotionCaptureSource("optitrack", "127.0.0.1", command=[sys.executable, str(program)]) as source:
+@pytest.fixture
+def worker(tmp_path):
+    """A function that starts the program of a laboratory with another module ``motioncapture``."""
+
+    def started(motioncapture):
+        (tmp_path / "motioncapture.py").write_text(motioncapture)
+        path = source_module.__file__.replace("source.py", "worker.py")
+        run = f"import sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); runpy.run_path({path!r}, run_name='__main__')"
+        return MotionCaptureSource("optitrack", "10.0.0.1", command=[sys.executable, "-c", run])
+
+    return started
+
+
+def test_the_program_says_that_the_package_is_missing(worker):
+    with worker("def connect(*args): raise RuntimeError('Unknown motion capture type!')") as source:
         wait_for(lambda: source.ended)
     assert "Unknown motion capture type" in source.ended
 
 
-def test_the_program_prints_frames(tmp_path):
+def test_the_program_prints_frames(worker):
     fake = """
 class Rotation: x, y, z, w = 0.1, 0.2, 0.3, 0.9
 class Body: position, rotation = [1.0, 2.0, 3.0], Rotation
@@ -192,13 +174,7 @@ def connect(system, settings):
     assert (system, settings) == ("optitrack", {"hostname": "10.0.0.1"})
     return Capture()
 """
-    (tmp_path / "motioncapture.py").write_text(fake)
-    worker = source_module.__file__.replace("source.py", "worker.py")
-    program = tmp_path / "run.py"
-    program.write_text(
-        f"import sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); runpy.run_path({worker!r}, run_name='__main__')"
-    )
-    with MotionCaptureSource("optitrack", "10.0.0.1", command=[sys.executable, str(program)]) as source:
+    with worker(fake) as source:
         wait_for(lambda: source.ended)
         frames = source.poll(0, 500).frames
     assert len(frames) == 2

@@ -1,0 +1,11 @@
+"""Waiting for events of other threads and processes."""
+
+import time
+
+
+def wait_for(condition, seconds=300.0):
+    """Wait until a condition holds; the limit is for what never happens, and no test of speed."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come to be"
+        time.sleep(0.01)
