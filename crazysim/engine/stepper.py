@@ -43,6 +43,7 @@ class Stepper:
         self._counts: dict[int, Array] = {}
         self._unsynced: object = None
         self._most_steps: int | None = None
+        self._counted: tuple[object, int] = (None, 0)
 
     @property
     def data(self) -> SimData:
@@ -133,7 +134,10 @@ class Stepper:
         """
         n_steps *= times
         if self._most_steps is None or self._most_steps + n_steps > MAX_STEPS:
-            self._most_steps = int(np.max(self.data.core.steps))  # waits for the device, so not in every call
+            steps = self.data.core.steps
+            if self._counted[0] is not steps:  # the same start may be assigned again and again
+                self._counted = steps, int(np.asarray(steps).max())  # waits for the device, so not in every call
+            self._most_steps = self._counted[1]
         if self._most_steps + n_steps > MAX_STEPS:
             freq = self.data.core.freq
             raise ConfigError(
