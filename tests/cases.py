@@ -1,6 +1,11 @@
 """Helpers shared by tests: pairs of dynamics and command level, hover commands, random vectors, scenes."""
 
+import ast
+import dataclasses
 import functools
+import inspect
+import itertools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +20,7 @@ from crazysim.core.data import create_params
 from crazysim.core.stage import as_stages
 from crazysim.core.stages import nonfinite
 from crazysim.dynamics import first_principles
+from crazysim.pytree import PyTree
 
 FITTED = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
 LEVELS = ("state", "attitude", "body_rate", "force_torque", "rotor_vel")
@@ -201,3 +207,35 @@ def by_stages(sim):
 def shared_sim(**settings):
     """Return a simulation that several tests step: compiled once, and to be left as it was found."""
     return Sim(**settings)
+
+
+def n_documented(record, **sizes):
+    """Return the number of arrays of a record and its parts, all of whose docstrings end with their shapes.
+
+    The sizes are those of the words of these shapes.
+    """
+    shapes, n_arrays = _documented_shapes(type(record)), 0
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        for part in value if isinstance(value, tuple) else (value,):
+            if isinstance(part, PyTree):
+                n_arrays += n_documented(part, **sizes)
+            elif isinstance(part, (jax.Array, np.ndarray)):
+                words, place = shapes[field.name], f"{type(record).__name__}.{field.name}"
+                assert words is not None, f"{place} has no shape in its docstring"
+                assert tuple(sizes.get(w) or int(w) for w in re.findall(r"\w+", words)) == part.shape, place
+                n_arrays += 1
+    return n_arrays
+
+
+def _documented_shapes(record):
+    """Return the shape that the docstring of every field of a record ends with, None where it has none."""
+    (base,) = record.__bases__
+    shapes = {} if base is PyTree else _documented_shapes(base)
+    body = ast.parse(inspect.getsource(record)).body[0].body
+    for field, text in itertools.pairwise(body):
+        if isinstance(field, ast.AnnAssign):
+            assert isinstance(text, ast.Expr), f"{record.__name__}.{field.target.id} has no docstring"
+            shape = re.search(r"\(([\w, ]*)\)$", text.value.value)
+            shapes[field.target.id] = None if shape is None else shape[1]
+    return shapes

@@ -86,16 +86,6 @@ def test_engines_agree_for_any_counts(n_worlds, n_drones, n_members):
         np.testing.assert_array_equal(found["plain"][f"ticks of {kind}"], 2)  # 100 Hz: steps 0 and 5
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_kernel_computes_what_the_interpreter_does(kind):
-    interpreted, fused = (build(kind, 3, 2, 4, engine=engine) for engine in ("interpret", "fused"))
-    for sim in (interpreted, fused):
-        sim.step(11)
-    assert fused.step_fn.plan(fused.data).engine == "fused"
-    for name, value in numbers(interpreted.data).items():
-        np.testing.assert_allclose(numbers(fused.data)[name], value, rtol=2e-5, atol=2e-6, err_msg=name)
-
-
 @pytest.mark.parametrize("engine", ["plain", "interpret"])
 def test_a_member_moves_as_it_does_alone(engine):
     """Law 1."""

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import hover_command, hover_rotor_state, to_all, with_states
 
 from crazysim import PyTree, Sim, leaf
 from crazysim.core.pipeline import insert_fn_before
@@ -63,18 +62,8 @@ def counting():
     return sim
 
 
-def test_a_full_reset_restores_every_plugin(counting):
-    counting.step(5)
-    assert all(np.all(np.asarray(x) >= 5) for x in jax.tree.leaves(counting.data.plugins))
-    counting.reset()
-    assert jax.tree.leaves(counting.data.plugins)
-    for x in jax.tree.leaves(counting.data.plugins):
-        np.testing.assert_array_equal(x, 0)
-
-
-def test_a_masked_reset_restores_the_declared_leaves_of_its_worlds(counting):
+def test_a_masked_reset_restores_the_declared_leaves_of_its_worlds_and_a_full_one_all(counting):
     """Crazyflow's metadata declare an axis over worlds as ``leaf`` does; undeclared and shared arrays stay."""
-    counting.reset()
     counting.step(5)
     counting.reset(MASK)
     plugins = jax.device_get(counting.data.plugins)
@@ -86,6 +75,9 @@ def test_a_masked_reset_restores_the_declared_leaves_of_its_worlds(counting):
         np.testing.assert_array_equal(record.note, 5)
     np.testing.assert_array_equal(plugins["own"].count[:, 0], expected)
     np.testing.assert_array_equal(plugins["bare"], 5)
+    counting.reset()
+    for x in jax.tree.leaves(counting.data.plugins):
+        np.testing.assert_array_equal(x, 0)
 
 
 def test_a_declared_axis_that_is_not_over_worlds_is_refused(counting):
@@ -101,35 +93,6 @@ def test_metadata_on_a_field_that_holds_a_record_are_refused(counting):
     nested = dataclasses.replace(Counter.create(), count=Counter.create())
     with pytest.raises(ConfigError, match=r"\['foreign'\].count, whose metadata have 'core_ndim', got a Counter"):
         scopes(counting.data.replace(plugins={"foreign": nested}))
-
-
-def test_an_action_queue_flies_the_same_way_after_a_full_reset():
-    """A queue in a bare array delays commands: flights from two resets are equal to the last bit."""
-    sim = Sim(control="rotor_vel")
-    hover = to_all(sim.data, hover_command(sim.data))
-    sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(sim.data))
-    queue = jnp.broadcast_to(hover, (10, *hover.shape))
-    sim.data = sim.data.replace(plugins={"queue": queue})
-    sim.build_default_data()
-
-    def delayed(data):
-        queue = jnp.concatenate([data.plugins["queue"][1:], data.controls.rotor_vel[None]])
-        late = data.controls.replace(rotor_vel=data.plugins["queue"][0])
-        return data.replace(controls=late, plugins={"queue": queue})
-
-    insert_fn_before(sim.step_pipeline, "clip_rotor_vel_cmd", delayed)
-    sim.build_step_fn()
-
-    def fly():
-        sim.reset()
-        for _ in range(60):
-            sim.rotor_vel_control(1.2 * np.asarray(hover))
-            sim.step()
-        return np.asarray(sim.data.states.pos)
-
-    first = fly()
-    assert first[0, 0, 2] > 1.005
-    np.testing.assert_array_equal(fly(), first)
 
 
 def test_a_full_reset_restores_shared_parameters_and_a_masked_one_leaves_them():

@@ -52,17 +52,6 @@ def step():
     return program, [*leaves, packed]
 
 
-@pytest.mark.parametrize("n_steps", [3, np.int32(3)])
-def test_steps_of_the_interpreter_are_steps_of_lanes(step, n_steps):
-    """Under jit, however the number of steps is given; equal but for contraction of products and sums by XLA."""
-    program, leaves = step
-    found, flagged = jax.jit(lambda x: interpret.steps(program, x, n_steps))(leaves)
-    expected, _ = jax.jit(lambda x: lanes.steps(program, x, n_steps))(leaves)
-    assert not flagged.any()
-    for i, x, y in zip(program.written, found, expected, strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6, err_msg=program.leaves[i].name)
-
-
 def test_vmap_is_a_loop(step):
     program, leaves = step
     i = next(i for i, leaf in enumerate(program.leaves) if leaf.name == "states.vel")

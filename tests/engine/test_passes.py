@@ -16,7 +16,6 @@ from crazysim.engine.ir.verify import VerificationError, verify
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import apply
 from crazysim.engine.passes import schedule
-from crazysim.engine.passes.layout import as_rows, pack_shared
 from crazysim.jaxcompat import is_key
 
 pytestmark = pytest.mark.fast
@@ -108,35 +107,6 @@ def test_barriers_separate_runs_of_operations_and_change_no_number(pipeline):
         np.testing.assert_array_equal(found[slot], x, err_msg=str(slot))
 
 
-def test_packing_moves_shared_numbers_into_one_leaf(pipeline):
-    program, numbers = pipeline
-    fused = schedule.fuse(program)
-    packed = verify(pack_shared(fused))
-    new = len(program.leaves)
-    assert packed.leaves[new].shape == (sum(program.leaves[i].size for i in packed.packed),)
-    assert not {leaf for leaf, _ in packed.segments[0].reads} & {*packed.packed}
-    row = [numbers[i, k] for i in packed.packed for k in range(program.leaves[i].size)]
-    more = numbers | {(new, k): x for k, x in enumerate(row)}
-    expected, found = run(fused, numbers, 2), run(packed, more, 2)
-    assert all((found[slot] == x).all() for slot, x in expected.items())
-
-
-def test_rows_hold_the_numbers_of_the_leaves_that_are_written(pipeline):
-    program, numbers = pipeline
-    fused = schedule.fuse(program)
-    stored = verify(as_rows(fused, lambda written: written))
-    rows = [leaf for leaf in stored.leaves if leaf.rows_of]
-    assert sorted(i for leaf in rows for i in leaf.rows_of) == fused.written
-    assert stored.written == [i for i, leaf in enumerate(stored.leaves) if leaf.rows_of]
-    place = {}
-    for i, leaf in enumerate(stored.leaves):
-        members = [(m, k) for m in leaf.rows_of for k in range(stored.leaves[m].size)]
-        place |= {slot: (i, row) for row, slot in enumerate(members)}
-    more = numbers | {place[slot]: x for slot, x in numbers.items() if slot in place}
-    expected, found = run(fused, numbers, 2), run(stored, more, 2)
-    assert all((found[place.get(slot, slot)] == x).all() for slot, x in expected.items())
-
-
 # Programs of two numbers --------------------------------------------------------------------------------------------
 
 X, Y, Z, SHARED = (0, 0), (1, 0), (2, 0), (3, 0)
@@ -154,15 +124,6 @@ def segment(name, reads, writes, fn, scope="drone", phase="each"):
 
 def op(name):
     return lambda b, *args: [b.add(name, args, np.float32)]
-
-
-def test_what_one_stage_writes_the_next_reads_as_a_value():
-    program = Program(LEAVES, 1, (segment("a", [X], [Y], op("exp")), segment("b", [Y], [Z], op("neg"))))
-    (fused,) = verify(schedule.fuse(program)).segments
-    assert fused.reads == (X,)
-    assert set(fused.writes) == {Y, Z}
-    assert [x.name for x in fused.block.operations] == ["exp", "barrier", "neg", "barrier"]
-    assert [x.stage for x in fused.block.operations][::2] == ["a", "b"]
 
 
 def guarded(name, reads, write, fn):
@@ -192,13 +153,6 @@ def test_stages_of_the_same_ticks_are_joined(last):
     assert (found[last] == np.where(x > 0, np.sin(np.float32(1.5)) + np.float32(3), numbers[last])).all()
 
 
-def test_constants_pass_from_stage_to_stage_of_the_same_ticks():
-    zero = guarded("zero", [], Y, lambda b: np.float32(0))
-    cosine = guarded("cosine", [Y], Z, lambda b, y: b.add("cos", (y,), F32))
-    joined = schedule.join_ticks(schedule.fuse(Program(LEAVES, 1, (zero, cosine))))
-    assert "cos" not in {op.name for op in joined.segments[0].block.walk()}
-
-
 def test_stages_of_other_ticks_are_not_joined():
     first = guarded("first", [], Y, lambda b: np.float32(1))
     between = segment("between", [Y], [X], op("neg"))
@@ -211,21 +165,6 @@ def test_phases_and_scopes_are_not_joined():
     stages = [segment("a", [X], [Y], op("exp"), phase="first"), segment("b", [Y], [Z], op("neg")),
               segment("c", [Z], [X], op("exp"), scope="world"), segment("d", [X], [Y], op("exp"))]  # fmt: skip
     assert len(schedule.fuse(Program(LEAVES, 1, tuple(stages))).segments) == 4
-
-
-def test_only_what_never_changes_is_hoisted():
-    def body(b, x, shared):
-        product = b.add("mul", (b.add("exp", (shared,), np.float32), b.add("exp", (x,), np.float32)), np.float32)
-        return [b.add("div", (product, b.add("add", (shared, np.float32(1)), np.float32)), np.float32)]
-
-    program = Program(LEAVES, 1, (segment("a", [X, SHARED], [X], body),))
-    (after,) = verify(schedule.hoist(program)).segments
-    assert [x.name for x in after.hoisted.operations] == ["exp", "add", "div"]
-    assert [x.name for x in after.block.operations] == ["exp", "mul", "mul"]
-    numbers = {X: np.full(N_WORLDS, 0.5, np.float32), SHARED: np.float32(2.0)}
-    np.testing.assert_allclose(
-        run(program, numbers, 1)[X], run(verify(schedule.hoist(program)), numbers, 1)[X], rtol=3e-7
-    )
 
 
 def test_the_inverse_of_a_number_is_computed_once():
@@ -243,11 +182,6 @@ def test_the_inverse_of_a_number_is_computed_once():
     numbers = {X: np.full(N_WORLDS, 3.0, np.float32), SHARED: np.float32(2.0)}
     found = run(schedule.hoist(program), numbers, 1)
     assert [found[slot][0] for slot in (X, Y, Z)] == [0.75, np.inf, -np.inf]
-
-
-def test_what_is_cheap_is_computed_again_instead_of_kept():
-    program = Program(LEAVES, 1, (segment("a", [X, SHARED], [X], lambda b, x, s: op("mul")(b, x, *op("neg")(b, s))),))
-    assert schedule.hoist(program).segments == program.segments
 
 
 # Verification -------------------------------------------------------------------------------------------------------

@@ -5,13 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import shared_sim, trees_equal
-from jax.sharding import NamedSharding, PartitionSpec
 
 from crazysim import Sim
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
-from crazysim.engine import Stepper, flat, step
-from crazysim.engine.flat import PackCache, ZerosCache
+from crazysim.engine import Stepper, step
 
 
 @pytest.fixture
@@ -143,49 +141,3 @@ def test_commands_to_data_that_was_spread_since_are_spread():
         sim.attitude_control(command)
         assert sim.data.controls.attitude.staged_cmd.sharding == sim.data.states.pos.sharding
         np.testing.assert_array_equal(sim.data.controls.attitude.staged_cmd, np.float32(0.3))
-
-
-def test_packed_parameters_are_made_again_only_for_other_arrays():
-    pack, a, b = PackCache(), jnp.ones(2), jnp.zeros((2, 2))
-    first = pack([a, b])
-    np.testing.assert_array_equal(first, [1, 1, 0, 0, 0, 0])
-    assert pack([a, b]) is first
-    np.testing.assert_array_equal(pack([a, b - 1]), [1, 1, -1, -1, -1, -1])
-    traced = jax.jit(lambda x: pack([x, b]))(a)
-    np.testing.assert_array_equal(traced, first)
-
-
-def test_the_first_packed_parameters_of_a_processor_need_no_program():
-    """They are an array where the parameters are, inside a trace too."""
-    far = jax.devices("cpu")[1]
-    a, b = np.float32([[1, 2]]), np.float32([3])
-    before = flat._compiled._cache_size()
-    for device in (None, far):
-        arrays = [jax.device_put(x, device) for x in (a, b)]
-        first = PackCache()(arrays)
-        np.testing.assert_array_equal(first, [1, 2, 3])
-        assert (first.sharding, first.committed) == (arrays[0].sharding, device is not None)
-        pack = PackCache()
-        inside = jax.jit(lambda x, pack=pack, arrays=arrays: x * pack(arrays))(2.0)
-        np.testing.assert_array_equal(inside, [2, 4, 6])
-        np.testing.assert_array_equal(pack(arrays), first)
-    assert flat._compiled._cache_size() == before
-    mesh = world_mesh(jax.devices("cpu")[:2])
-    copied = [jax.device_put(x, NamedSharding(mesh, PartitionSpec())) for x in (a, b)]
-    assert PackCache()(copied).sharding.device_set == set(mesh.devices.flat)
-    assert flat._compiled._cache_size() == before + 1
-
-
-def test_zeros_are_looked_for_in_shared_floats_alone(sim):
-    zeros, data = ZerosCache(), sim.data
-    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(data)]
-    found = {names[i]: some for i, some in zeros(data, jax.tree.leaves(data))}
-    assert found[".params.J"] == {1, 2, 3, 5, 6, 7}
-    assert not any("states" in name or "core" in name for name in found)
-    J = data.params.J.at[0, 1].set(1e-6)
-    changed = data.replace(params=data.params.replace(J=J))
-    found = {names[i]: some for i, some in zeros(changed, jax.tree.leaves(changed))}
-    assert found[".params.J"] == {2, 3, 5, 6, 7}
-    seen = []
-    jax.jit(lambda d: seen.append(zeros(d, jax.tree.leaves(d))) or d.states.pos)(changed)
-    assert seen == [()]

@@ -5,17 +5,11 @@ import mujoco
 import numpy as np
 import pytest
 from cases import with_states
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim
-from crazysim.dynamics.drag import drag_force
-from crazysim.dynamics.rigid_body import angular_acceleration
 
 INTEGRATORS = ("euler", "symplectic_euler", "rk4")
-number = st.floats(-10, 10, width=32)
-vectors = st.tuples(number, number, number).map(np.array)
 
 
 def thrown(integrator, freq=500, ang_vel=(0.0, 0.0, 0.0), inertia=None, gravity=True, n_worlds=1):
@@ -127,22 +121,6 @@ def test_convergence_order_of_position_and_attitude(integrator, x64):
     for name, column in zip(("position", "attitude"), errors.T, strict=True):
         slope = np.polyfit(np.log(1 / np.array(freqs)), np.log(column), 1)[0]
         assert abs(slope - order) < 0.35, (name, slope, column)
-
-
-@given(ang_vel=vectors)
-def test_euler_term_does_no_work(ang_vel):
-    """Without a torque, energy w J w / 2 has derivative w . J w' = 0."""
-    inertia = np.diag([2e-5, 3e-5, 5e-5]).astype(np.float32)
-    zero = np.zeros(3, np.float32)
-    acc = jax.jit(angular_acceleration)(zero, np.float32(ang_vel), inertia, np.linalg.inv(inertia), zero)
-    np.testing.assert_allclose(ang_vel @ inertia @ np.asarray(acc), 0.0, atol=1e-7)  # rounding of terms of 1e-2
-
-
-@given(vel=vectors, quat=st.tuples(number, number, number, number).filter(lambda q: np.linalg.norm(q) > 0.1))
-def test_drag_only_dissipates(vel, quat):
-    quat, drag = np.float32(np.array(quat) / np.linalg.norm(quat)), np.diag(np.float32([-0.02, -0.03, -0.05]))
-    force = jax.jit(drag_force)(quat, np.float32(vel), drag)
-    assert float(np.asarray(force) @ vel) <= 1e-6
 
 
 def test_a_free_body_under_a_wrench_agrees_with_mujoco(x64):

@@ -166,13 +166,6 @@ def test_a_body_without_geoms_touches_nothing(crowd):
     assert not np.asarray(crowd[0].contacts("_dummy")).any()
 
 
-def test_an_unknown_body_is_refused_with_the_names_of_the_bodies(crowd):
-    with pytest.raises(
-        ValueError, match=r"expected a body of the scene, world, drone:0, drone:1, ball, pole, got 'gate'"
-    ):
-        crowd[0].contacts("gate")
-
-
 def test_a_closed_over_scene_gives_the_same_contacts(crowd):
     """The contact check for tight loops: the scene is a constant of the compiled function, the poles an argument."""
     sim = crowd[0]
