@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import numpy as np
 import pytest
 from cases import shared_sim
 
@@ -12,6 +13,8 @@ from crazysim.engine.backends import cuda, kernel, native
 from crazysim.engine.backends.exchange import exchange_for
 from crazysim.engine.backends.source import Writer
 from crazysim.engine.errors import KernelError, UnsupportedError
+from crazysim.engine.ir.blocks import Builder
+from crazysim.engine.ir.program import Leaf, Program, Segment
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,6 +114,23 @@ def lowered(sim, planned_for, platform):
     """Return the text of a step that is planned for one platform and compiled for another."""
     step = Step(sim.step_pipeline, "fused", planned_for)
     return jax.jit(lambda data: step(data, 3)).trace(sim.data).lower(lowering_platforms=(platform,)).as_text()
+
+
+@pytest.mark.parametrize(("name", "remains"), [("add", "rem.s32"), ("sub", "setp.lt.s32"), ("mul", "rem.s32")])
+def test_integers_wrap(name, remains):
+    """Signed overflow is undefined in CUDA, where (a + a) % a would be 0, a - 1 < a true and (a * 3) % a 0."""
+    builder = Builder(stage="one")
+    a = builder.input(np.int32)
+    b = {"add": a, "sub": np.int32(1), "mul": np.int32(3)}[name]
+    result = builder.add(name, (a, b), np.int32)
+    test = builder.add("lt", (result, a), bool) if name == "sub" else builder.add("rem", (result, a), np.int32)
+    leaves = (Leaf("a", "drone", (2, 1), np.dtype(np.int32)), Leaf("b", "drone", (2, 1), test.dtype))
+    segment = Segment("drone", ("one",), "each", builder.finish([test]), ((0, 0),), ((1, 0),))
+    made = kernel.write(Program(leaves, 1, (segment,)), "cuda")
+    assert f"{name}_(" in made.text.split("n_steps;")[-1]
+    if cuda.nvrtc() is None:
+        pytest.skip("no NVRTC here; CI has it")
+    assert remains in cuda.ptx(made, cuda.DEFAULT_ARCHITECTURE)
 
 
 def test_a_step_has_a_kernel_on_platforms_that_it_was_not_planned_for():

@@ -31,10 +31,10 @@ from crazysim.engine.ir import dump
 from crazysim.errors import ConfigError
 from crazysim.version import __version__
 
-FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-shared",
-         "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
+FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv",
+         "-shared", "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
 """Options of the compiler, before those of the variable CXXFLAGS. Products and sums may be contracted; no option
-assumes that there is no NaN."""
+assumes that there is no NaN. Integers wrap, as in XLA; NVRTC has no such option, so sources add them without a sign."""
 
 TIMEOUT = 300.0
 """Time that the compiler may take, s, unless the variable CRAZYSIM_COMPILE_TIMEOUT says otherwise."""

@@ -187,8 +187,7 @@ class Writer:
         self.line(f"const auto {inputs[-1]} = eq_(own, i32({turn}));", depth + 1)
         outs = self.block(body, inputs, depth + 1)
         for k, (combine, out) in enumerate(zip(op.param("reduce"), outs, strict=True)):
-            text = f"{name}_{k} + {out}" if combine == "add" else f"{combine}_({name}_{k}, {out})"
-            self.line(f"{name}_{k} = {text};", depth + 1)
+            self.line(f"{name}_{k} = {combine}_({name}_{k}, {out});", depth + 1)
         self.line("}", depth)
 
     def _while(self, op: Operation, args: list[str], depth: int) -> None:

@@ -116,11 +116,12 @@ def _rows() -> list[Row]:
         return binary(name, numpy, kinds, 0, results="b", exact=True, casadi=casadi, casadi_kinds="fiub")
 
     arithmetic = [
-        binary("add", np.add, any_number, exact=True, source="{0} + {1}",
+        binary("add", np.add, any_number, exact=True, source={"fu": "{0} + {1}", "i": "add_({all})"},
                casadi=lambda _, a, b: a + b, casadi_kinds="fiu"),
-        binary("sub", np.subtract, any_number, exact=True, source="{0} - {1}",
+        binary("sub", np.subtract, any_number, exact=True, source={"fu": "{0} - {1}", "i": "sub_({all})"},
                casadi=lambda _, a, b: a - b, casadi_kinds="fiu"),
-        binary("mul", np.multiply, any_number, exact=True, source="{0} * {1}", casadi=lambda _, a, b: a * b),
+        binary("mul", np.multiply, any_number, exact=True, source={"fu": "{0} * {1}", "i": "mul_({all})"},
+               casadi=lambda _, a, b: a * b),
         binary("div", forms.divide, any_number, 4, exact=True, source={"f": "{0} / {1}", "iu": "div_({all})"},
                casadi=lambda _, a, b: a / b, casadi_kinds="fiu"),
         binary("rem", forms.remainder, any_number, 8, exact=True, casadi="fmod", casadi_kinds="fiu"),

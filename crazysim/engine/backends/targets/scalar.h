@@ -111,8 +111,11 @@ FN f64 digamma_(f64 x) {
 }
 FN f32 digamma_(f32 x) { return f32(digamma_(f64(x))); }
 
+#define ARITHMETIC(T, S) /* S is T without a sign: sums of integers with one must not overflow in C */ \
+  FN T add_(T a, T b) { return T(S(a) + S(b)); } FN T sub_(T a, T b) { return T(S(a) - S(b)); } \
+  FN T mul_(T a, T b) { return T(S(a) * S(b)); }
+ARITHMETIC(f32, f32) ARITHMETIC(f64, f64) ARITHMETIC(i32, u32) ARITHMETIC(u32, u32)
 #define COMMON(T) \
-  FN T add_(T a, T b) { return a + b; } FN T sub_(T a, T b) { return a - b; } FN T mul_(T a, T b) { return a * b; } \
   FN b1 lt_(T a, T b) { return a < b; } FN b1 le_(T a, T b) { return a <= b; } FN b1 gt_(T a, T b) { return a > b; } \
   FN b1 ge_(T a, T b) { return a >= b; } FN b1 eq_(T a, T b) { return a == b; } FN b1 ne_(T a, T b) { return a != b; } \
   FN T select_n_(b1 which, T no, T yes) { return which ? yes : no; }
@@ -147,7 +150,7 @@ FN f32 nextafter_(f32 a, f32 b) { return nextafterf(a, b); }
 FN f64 nextafter_(f64 a, f64 b) { return nextafter(a, b); }
 template <class T> FN T integer_pow_positive(T x, int y) { T p = 1; for (; y; y >>= 1, x = x * x) if (y & 1) p = p * x; return p; }
 FN f32 integer_pow(f32 x, int y) { return y < 0 ? 1.0f / integer_pow_positive(x, -y) : integer_pow_positive(x, y); }
-FN i32 integer_pow(i32 x, int y) { return integer_pow_positive(x, y); }
+FN i32 integer_pow(i32 x, int y) { return i32(integer_pow_positive(u32(x), y)); }
 FN u32 integer_pow(u32 x, int y) { return integer_pow_positive(x, y); }
 FN f64 integer_pow(f64 x, int y) { return y < 0 ? 1.0 / integer_pow_positive(x, -y) : integer_pow_positive(x, y); }
 
