@@ -10,6 +10,7 @@ import urllib.request
 import numpy as np
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
+from pictures import of_colour
 from waiting import wait_for
 
 NEAR = 12
@@ -78,8 +79,7 @@ class Browser:
 
     def mask(self, rgb):
         """Return rows and columns of what has a hue."""
-        picture, on = self.picture(), np.asarray(rgb) > 0
-        return np.nonzero(picture[..., on].min(-1) > picture[..., ~on].max(-1) + 60)
+        return np.nonzero(of_colour(self.picture(), rgb))
 
     def find(self, rgb, near):
         """Return column and row of the middle of what has a hue, once that is near a place or half a minute is over."""

@@ -10,6 +10,7 @@ import re
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -20,6 +21,7 @@ from crazysim.core.data import create_params
 from crazysim.core.stage import as_stages
 from crazysim.core.stages import nonfinite
 from crazysim.dynamics import first_principles
+from crazysim.engine.backends import native
 from crazysim.pytree import PyTree
 
 FITTED = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag")
@@ -29,6 +31,9 @@ PAIRS = tuple(("first_principles", control) for control in LEVELS) + tuple(
 )
 """Every dynamics and command level that go together: 11."""
 INTEGRATORS = ("euler", "symplectic_euler", "rk4")
+FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
+"""Engines that compile, those that run here."""
+needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
 
 BOX = """
 <mujoco>

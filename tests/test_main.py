@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from imageio_ffmpeg import get_ffmpeg_exe
+from pictures import frames_of
 
 from crazysim import Sim
 from crazysim.__main__ import COMMANDS, EXTRAS, main
@@ -71,10 +71,8 @@ def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
     assert flown.pos.shape == (25, 1, 4, 3)
     assert np.ptp(flown.pos[:, 0, :, :2], axis=0).max(-1).min() > 0.4, "every drone is on its way"
     film = tmp_path / "flight.mp4"
-    decode = [get_ffmpeg_exe(), "-loglevel", "error", "-i", film, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-    pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)
     width, height = film_size(960, 544)
-    frames = pixels.reshape(-1, height, width, 3)
+    frames = frames_of(film, height, width)
     assert len(frames) == 25  # 1 s
     assert np.mean(np.abs(frames[-1].astype(float) - frames[0])) > 1, "nothing moves in the film"
 

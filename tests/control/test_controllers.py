@@ -164,12 +164,6 @@ def test_latency_delays_setpoint_and_feedforward():
     np.testing.assert_array_equal(sim.data.controls.state.cmd, cmd)
 
 
-@pytest.mark.parametrize("freq, outer, inner", [(500, 100, 500), (240, 80, 240), (1000, 100, 500)])
-def test_default_rates_are_lowered_to_divisors(freq, outer, inner):
-    sim = Sim(control="state", controller="pid", freq=freq)
-    assert (sim.control_freq, sim.data.controls.controller.freq) == (outer, inner)
-
-
 def test_rates_of_the_simulation_replace_those_of_the_controller():
     sim = Sim(control="state", controller="pid", state_freq=50, attitude_freq=250)
     assert (sim.control_freq, sim.data.controls.controller.freq) == (50, 250)

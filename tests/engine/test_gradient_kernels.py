@@ -4,17 +4,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import needs_compiler
 
 from crazysim import Sim, reduce_over_others, stage
 from crazysim.core import functional as F
 from crazysim.core.pipeline import insert_fn_before
 from crazysim.engine import Step, explain
-from crazysim.engine.backends import native, reverse, xla
+from crazysim.engine.backends import reverse, xla
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.transpose import transposed
 from crazysim.errors import EngineWarning
 
-needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler")
 COMMAND = np.array([0.05, -0.08, 0.1, 1.02 * 0.0434 * 9.81])
 
 

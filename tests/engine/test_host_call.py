@@ -8,13 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import as_numbers, trees_equal
+from cases import as_numbers, needs_compiler, trees_equal
 
 from crazysim import Cars, Sim
 from crazysim.core.sharding import world_mesh
-from crazysim.engine.backends import native
 
-pytestmark = pytest.mark.skipif(native.compiler() is None, reason="needs a C++ compiler")
+pytestmark = needs_compiler
 
 COMMAND = np.full((3, 2, 4), 0.1)
 

@@ -4,16 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import FAST
 from fuzz import Case, Fuzzer
 from programs import Program
 
 from crazysim import PyTree, Sim, leaf
 from crazysim.core.stage import stage
 from crazysim.engine import Step
-from crazysim.engine.backends import native
 from crazysim.errors import EngineWarning
 
-ENGINES = ("plain", "lanes", "auto", *(("fused",) if native.compiler() else ()))
+ENGINES = ("plain", "auto", *FAST)
 
 
 @pytest.fixture(scope="module")

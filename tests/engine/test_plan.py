@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import shared_sim
+from cases import FAST, needs_compiler, shared_sim
 from waiting import wait_for
 
 from crazysim import ConfigError, Sim
@@ -22,8 +22,6 @@ from crazysim.errors import EngineWarning
 from crazysim.pytree import PyTree, leaf
 
 pytestmark = pytest.mark.fast
-
-needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
 
 
 @stage("drone")
@@ -126,7 +124,7 @@ def test_a_bug_in_tracing_is_found_at_planning(sim, monkeypatch):
 
 def test_planning_traces_what_the_first_call_runs(sim):
     """Law 6: the trace of planning is that of the call."""
-    for engine in ("plain", "lanes", *(["fused"] if native.compiler() else [])):
+    for engine in ("plain", *FAST):
         for n_steps in (jnp.int32(2), 2):
             step = Step(sim.step_pipeline, engine)
             step(sim.data, n_steps)

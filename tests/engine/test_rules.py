@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from blocks import program_of
+from cases import FAST
 from rule_cases import CASES, N_LANES, RANDOM, ULP, agree, function, given, of_all, of_one
 
 from crazysim import Sim
@@ -38,7 +39,7 @@ def test_a_case_gives_what_jax_gives(name):
     agree(np.stack(found, axis=-1), jax.jit(of_all(name)).lower(g).compile()(g), name)
 
 
-@pytest.mark.parametrize("engine", ["lanes", *(["fused"] if native.compiler() else [])])
+@pytest.mark.parametrize("engine", FAST)
 def test_loops_branches_and_random_numbers_run_in_every_engine(engine):
     """One program of the cases whose operations run blocks or have several results: the rest is in test_targets."""
     names = ["cond", "loops", "loop_until", "nested_calls", "own_gradient", *RANDOM]

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, shared_sim, with_params, with_states
+from cases import FAST, by_stages, shared_sim, with_params, with_states
 
 from crazysim import ConfigError, Sim
 from crazysim.control import Control, command_size
@@ -21,7 +21,6 @@ from crazysim.engine.backends import cuda, kernel, lanes, native
 from crazysim.engine.lowering.stages import MAX_UNROLLED_DRONES
 from crazysim.pytree import PyTree, leaf
 
-FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
 SLOW = {"state": {"state_freq": 100}, "attitude": {"attitude_freq": 250}}
 PAIRS = [("first_principles", c.value) for c in Control] + [
     (d.value, c) for d in Dynamics if d != Dynamics.first_principles for c in ("attitude", "state")

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import FAST
 
 from crazysim import PyTree, Sim, leaf, stage
 from crazysim.core.stage import as_stages
 from crazysim.engine import Step
-from crazysim.engine.backends import cuda, interpret, kernel, native
+from crazysim.engine.backends import cuda, interpret, kernel
 from crazysim.engine.ir.blocks import Builder, Numbers, Operation, Value
 from crazysim.engine.ir.listing import list_program
 from crazysim.engine.ir.verify import VerificationError, verify, verify_block
@@ -19,7 +20,7 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
 from crazysim.errors import EngineWarning
 
-ENGINES = ("lanes", "interpret", *(("fused",) if native.compiler() else ()))
+ENGINES = ("interpret", *FAST)
 RNG = np.random.default_rng(0)
 CONSTANTS = RNG.normal(size=(11, 2, 3)).astype(np.float32)
 CONSTANTS[:, 1, 2] = 0.25
@@ -197,7 +198,7 @@ def test_the_source_for_gpus_is_well_formed():
     assert cuda._compile(text, cuda.DEFAULT_ARCHITECTURE, "PTX")
 
 
-@pytest.mark.parametrize("engine", ENGINES[:1] + ENGINES[2:])
+@pytest.mark.parametrize("engine", FAST)
 def test_gradients_by_states_and_entries_are_those_of_plain(engine):
     @stage("drone")
     def read(data):

@@ -4,16 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import shared_sim
+from cases import FAST, shared_sim
 from oracle import SHAPES
 
 from crazysim import rotation
 from crazysim.core.stage import stage
 from crazysim.engine import Step
-from crazysim.engine.backends import native
 from crazysim.geometry import Shape, distance, hull
 
-FAST = ("lanes", "fused") if native.compiler() else ("lanes",)
 SPHERE = Shape("sphere", (0.1,))
 BODIES = SHAPES | {"mesh": hull([[0.4, 0, 0], [-0.3, 0.3, 0], [-0.2, -0.4, 0.1], [0, 0.1, 0.5], [0.1, 0, -0.3]])}
 

@@ -2,12 +2,11 @@
 
 import builtins
 import re
-import subprocess
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from imageio_ffmpeg import get_ffmpeg_exe
+from pictures import frames_of
 
 from crazysim.errors import ConfigError, RenderError
 from crazysim.media import Film, Recorder, View
@@ -35,13 +34,6 @@ def view(**options):
     return View(**{"camera": "down", "width": WIDTH, "height": HEIGHT} | options)
 
 
-def read(path):
-    """Return the frames of a film. (n, HEIGHT, WIDTH, 3)"""
-    decode = [get_ffmpeg_exe(), "-loglevel", "error", "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-    pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)
-    return pixels.reshape(-1, HEIGHT, WIDTH, 3)
-
-
 def column(frame):
     """Return the mean column of what is darker than the floor."""
     return np.nonzero(frame.astype(int).max(-1) < 130)[1].mean()
@@ -55,7 +47,7 @@ def test_a_film_shows_the_drone_go_from_left_to_right(sim, tmp_path, suffix):
         for k in range(11):
             fly(sim, 50 * k)
             assert film.add(sim) == 1
-    frames = read(path)
+    frames = frames_of(path, HEIGHT, WIDTH)
     assert len(frames) == film.n_frames == 11
     columns = [column(frame) for frame in frames]
     focal = 0.5 * HEIGHT / np.tan(np.deg2rad(45 / 2))
@@ -71,7 +63,7 @@ def test_frames_go_with_simulated_time(sim, tmp_path, fps, speed, n_frames):
         for k in range(21):
             fly(sim, 25 * k)
             drawn.append(film.add(sim))
-    assert sum(drawn) == film.n_frames == len(read(tmp_path / "flight.mp4")) == n_frames
+    assert sum(drawn) == film.n_frames == len(frames_of(tmp_path / "flight.mp4", HEIGHT, WIDTH)) == n_frames
     assert max(drawn) - min(drawn[1:]) <= 1
 
 
@@ -95,7 +87,7 @@ def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path):
         assert film.play(sim, recorder.flight()) == 11
     np.testing.assert_allclose(sim.data.states.pos[:, 0, 0], 9.5)
     np.testing.assert_array_equal(sim.data.core.steps, 5000)
-    frames = read(tmp_path / "flight.mp4")
+    frames = frames_of(tmp_path / "flight.mp4", HEIGHT, WIDTH)
     for k in range(2):
         columns = [column(frame[shown.tile(k)]) for frame in frames]
         focal = 0.25 * HEIGHT / np.tan(np.deg2rad(45 / 2))
@@ -106,7 +98,7 @@ def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path):
 def test_given_images_are_frames(sim, tmp_path):
     with Film(tmp_path / "flight.mp4", view(), fps=10) as film:
         film.write(np.full((HEIGHT, WIDTH, 3), 200, np.uint8), 3)
-    frames = read(tmp_path / "flight.mp4")
+    frames = frames_of(tmp_path / "flight.mp4", HEIGHT, WIDTH)
     assert len(frames) == 3
     np.testing.assert_allclose(frames.astype(int), 200, atol=3)
 
@@ -115,7 +107,7 @@ def test_a_name_that_looks_like_an_option_is_a_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with Film("-y.mp4", view(), fps=10) as film:
         film.write(np.full((HEIGHT, WIDTH, 3), 200, np.uint8), 2)
-    assert len(read(tmp_path / "-y.mp4")) == 2
+    assert len(frames_of(tmp_path / "-y.mp4", HEIGHT, WIDTH)) == 2
 
 
 # Wrong input ----------------------------------------------------------------------------------------------------

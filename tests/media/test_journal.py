@@ -7,7 +7,7 @@ import textwrap
 
 import numpy as np
 import pytest
-from imageio_ffmpeg import get_ffmpeg_exe
+from pictures import frames_of
 from waiting import wait_for
 
 from crazysim.errors import ConfigError
@@ -109,22 +109,17 @@ KILLED = textwrap.dedent("""
 """)
 
 
-def n_frames(path):
-    decode = [get_ffmpeg_exe(), "-loglevel", "fatal", "-i", path, "-f", "rawvideo", "-pix_fmt", "gray", "-"]
-    return len(subprocess.run(decode, capture_output=True, check=True).stdout) // (64 * 48)
-
-
 def test_a_film_survives_the_end_of_its_process(tmp_path):
     """A killed simulation loses no frame; a killed encoder what it had not yet encoded, some seconds."""
     path = tmp_path / "film.mp4"
     ended = subprocess.run([sys.executable, "-c", KILLED, path, "200", "python"], check=False)
     assert ended.returncode == -signal.SIGKILL
-    wait_for(lambda: path.exists() and path.stat().st_size and n_frames(path) == 200)
+    wait_for(lambda: path.exists() and path.stat().st_size and len(frames_of(path, 48, 64)) == 200)
     subprocess.run([sys.executable, "-c", KILLED, path, "400", "ffmpeg"], check=True)
-    assert n_frames(path) > 200
+    assert len(frames_of(path, 48, 64)) > 200
 
 
 def test_film_closes_in_order(tmp_path):
     with Film(tmp_path / "film.mp4", View(width=64, height=48), fps=10) as film:
         film.write(np.zeros((48, 64, 3), np.uint8), 30)
-    assert n_frames(tmp_path / "film.mp4") == 30
+    assert len(frames_of(tmp_path / "film.mp4", 48, 64)) == 30

@@ -5,15 +5,14 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import ABOVE, FOVY
+from cases import ABOVE
+from pictures import HEIGHT, WIDTH, of_colour, pixel
 
 from crazysim.errors import ConfigError
 from crazysim.media import View, render_worlds
 from crazysim.sim import Sim
 from crazysim.sim.visualize import draw_points
 
-HEIGHT, WIDTH = 120, 160
-FOCAL = 0.5 * HEIGHT / np.tan(np.deg2rad(FOVY / 2))
 PLACES = np.array([[0.4, 0.2, 0.5], [-0.4, 0.2, 0.5], [-0.4, -0.2, 0.5], [0.4, -0.2, 0.5]])
 """Where the drone of each world is, m. (4, 3)"""
 RED, GREEN, BLUE = ([1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1])
@@ -34,22 +33,11 @@ def place(sim, pos, time):
     sim.data = sim.data.replace(states=states, core=core)
 
 
-def pixel(point):
-    """Return row and column at which the camera that looks straight down sees a point."""
-    x, y, z = point
-    return 0.5 * HEIGHT - FOCAL * y / (ABOVE - z), 0.5 * WIDTH + FOCAL * x / (ABOVE - z)
-
-
 def dark(tile):
     """Return the mean row and column of what is darker than the floor."""
     rows, columns = np.nonzero(tile.astype(int).max(-1) < 100)
     assert len(rows) > 5
     return rows.mean() + 0.5, columns.mean() + 0.5
-
-
-def of_colour(picture, rgba):
-    picture, on = picture.astype(int), np.asarray(rgba[:3]) > 0.5
-    return picture[..., on].min(-1) > picture[..., ~on].max(-1) + 60
 
 
 def view(**options):
@@ -280,12 +268,6 @@ def test_invalid_views_are_refused(sim, wrong, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         view(**wrong).render(sim)
     assert len(sim.overlays) == 0
-
-
-def test_setpoints_need_state_commands(opengl):
-    sim = Sim(control="attitude")
-    with pytest.raises(ConfigError, match="control='attitude'"):
-        View(width=32, height=24, setpoints=True).render(sim)
 
 
 # Many worlds at once ----------------------------------------------------------------------------------------------

@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import by_stages, with_states
+from cases import FAST, by_stages, with_states
 
 from crazysim import ConfigError, Sim
 from crazysim.engine import Step
-from crazysim.engine.backends import native
 from crazysim.plugins.follow import Follow
 from crazysim.trajectories import Trajectory, figure_eight, helix, hover, line
 
@@ -102,7 +101,7 @@ def test_drones_follow(flown):
     assert sim.plugins.observations(sim.data)["follow.vel_error"].shape == (1, 1, 3)
 
 
-@pytest.mark.parametrize("engine", ["lanes", *(["fused"] if native.compiler() else [])])
+@pytest.mark.parametrize("engine", FAST)
 def test_every_engine_flies_what_plain_flies(engine):
     sim = build()
     sim.add(Follow([EIGHT, UP], start=START, rate=RATE, n_slots=6, max_pieces=20))

@@ -1,13 +1,13 @@
 """The scene is a spec that users edit: what is in it, what may be added, and what is refused."""
 
 import struct
-import zlib
 
 import jax
 import mujoco
 import numpy as np
 import pytest
 from cases import BOX
+from pictures import png_of
 
 from crazysim.drones import airframe_names, load_airframe
 from crazysim.scene import build
@@ -27,19 +27,6 @@ def write_stl(path, size):
     faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
     triangles = b"".join(struct.pack("<12fH", *np.zeros(3), *corners[list(face)].ravel(), 0) for face in faces)
     path.write_bytes(bytes(80) + struct.pack("<I", len(faces)) + triangles)
-
-
-def write_png(path, rgb):
-    """Write a PNG of 8 by 8 pixels of one colour."""
-
-    def chunk(kind, body):
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    rows = (b"\0" + bytes(rgb) * 8) * 8
-    header = struct.pack(">IIBBBBB", 8, 8, 8, 2, 0, 0, 0)
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
-    )
 
 
 SCENE = """
@@ -65,7 +52,7 @@ def scene_file(tmp_path):
     for folder in ("meshes", "textures"):
         (tmp_path / folder).mkdir()
     write_stl(tmp_path / "meshes" / "rock.stl", 0.3)
-    write_png(tmp_path / "textures" / "paint.png", (255, 0, 0))
+    (tmp_path / "textures" / "paint.png").write_bytes(png_of(np.full((8, 8, 3), [255, 0, 0])))
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
     return path

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from pictures import png_of
 
 from crazysim import ConfigError, Sim
 from crazysim.core.stage import stage
@@ -192,7 +193,7 @@ def test_law_09_invalid_poses_are_refused(course):
 
 def test_a_scene_loads_whole_with_mesh_texture_and_height_field(tmp_path):
     """A user's own MJCF, its files beside it, with objects added on top."""
-    (tmp_path / "hill.png").write_bytes(_png(np.arange(16, dtype=np.uint8).reshape(4, 4) * 16))
+    (tmp_path / "hill.png").write_bytes(png_of(np.arange(16).reshape(4, 4) * 16))
     scene = tmp_path / "scene.xml"
     scene.write_text("""
     <mujoco><asset>
@@ -209,17 +210,3 @@ def test_a_scene_loads_whole_with_mesh_texture_and_height_field(tmp_path):
     report = sim.contact_report(drones=False)
     assert np.isfinite(report.object_distance).all()
     assert np.isfinite(report.floor_distance).all()
-
-
-def _png(pixels):
-    """Return an image as the bytes of a PNG file."""
-    import struct
-    import zlib
-
-    def chunk(kind, body):
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    height, width = pixels.shape
-    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
-    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from cases import ABOVE, FOVY
+from pictures import of_colour
 
 from crazysim.scene.overlays import Overlays
 from crazysim.sim import Sim
@@ -35,12 +36,6 @@ def sim(opengl, plain_scene):
 def shoot(sim, **options):
     picture = sim.render(**{"mode": "rgb_array", "camera": "down", "width": WIDTH, "height": HEIGHT} | options)
     return picture.astype(int)
-
-
-def of_colour(picture, rgba):
-    """Return which pixels have a colour's hue: its channels far above the others."""
-    on = np.asarray(rgba[:3]) > 0.5
-    return picture[..., on].min(-1) > picture[..., ~on].max(-1) + 60
 
 
 def seen_at(mask):

@@ -12,12 +12,12 @@ import mujoco
 import numpy as np
 import pytest
 from cases import ABOVE, BOX, FOVY
+from pictures import HEIGHT, WIDTH, pixel
 from screens import screen_pixels, virtual_screen
 
 from crazysim.errors import RenderError
 from crazysim.sim import Sim
 
-HEIGHT, WIDTH = 120, 160
 PLACES = np.array([[[0.4, 0.2, 0.5]], [[-0.5, -0.3, 1.0]]])
 """Where the drone of each world is, m. (2, 1, 3)"""
 SHOT = {"mode": "rgb_array", "camera": "down", "width": WIDTH, "height": HEIGHT}
@@ -43,13 +43,6 @@ def empty(sim):
     picture = sim.render(**SHOT)
     place(sim, PLACES)
     return picture
-
-
-def pixel(point, height=HEIGHT, width=WIDTH):
-    """Return row and column at which the camera that looks straight down sees a point."""
-    focal = 0.5 * height / np.tan(np.deg2rad(FOVY / 2))
-    x, y, z = point
-    return 0.5 * height - focal * y / (ABOVE - z), 0.5 * width + focal * x / (ABOVE - z)
 
 
 def difference(picture, empty):

@@ -1,17 +1,12 @@
 """Drones and members of populations by name, and MJCF with vehicles by name."""
 
-import sys
-from pathlib import Path
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from springs import Springs
 
 from crazysim import ConfigError, Sim
 from crazysim.errors import UnknownNameError
-
-sys.path.append(str(Path(__file__).parents[1] / "core"))
-from springs import Springs
 
 MJCF = """
 <mujoco>

@@ -7,12 +7,12 @@ import json
 import re
 import resource
 import shutil
-import subprocess
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pictures import frames_of
 
 import crazysim
 from crazysim import ConfigError
@@ -62,16 +62,6 @@ def whole(tmp_path_factory):
     """Return an uninterrupted run of four iterations."""
     folder = tmp_path_factory.mktemp("run") / "whole"
     return trained(folder, small_config())
-
-
-def frames(path):
-    """Return the frames of a film. (n, height, width, 3)"""
-    import imageio_ffmpeg
-
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-vf", "scale=480:360", "-"]
-    ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
-    done = subprocess.run([ffmpeg, "-loglevel", "error", "-i", str(path), *raw], capture_output=True, check=True)
-    return np.frombuffer(done.stdout, np.uint8).reshape(-1, 360, 480, 3).astype(int)
 
 
 def arrays(folder):
@@ -472,7 +462,7 @@ def test_a_film_shows_the_drone_and_its_goal(whole, tmp_path):
     path = tmp_path / "film.gif"
     assert film(env, whole.policy, path, worlds=1) == 11
     env.sim.close()  # a renderer that is collected on a thread of a later training cannot be freed there
-    images = frames(path)
+    images = frames_of(path, 360, 480, "-vf", "scale=480:360").astype(int)
     green = (images[0][..., 1] - images[0][..., 0] > 40) & (images[0][..., 1] - images[0][..., 2] > 20)
     assert TARGET_COLOR[1] > TARGET_COLOR[0]
     assert green.sum() > 20

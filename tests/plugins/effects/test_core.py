@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import hover_command, hover_rotor_state, n_documented, to_all, trees_equal, with_states
+from cases import FAST, hover_command, hover_rotor_state, n_documented, to_all, trees_equal, with_states
 
 from crazysim import (
     Battery,
@@ -22,7 +22,6 @@ from crazysim import (
 from crazysim.core.pipeline import replace_fn
 from crazysim.core.stage import over_drones
 from crazysim.engine import Step
-from crazysim.engine.backends import native
 from crazysim.plugins import effects
 from crazysim.plugins.effects.grid import Grid
 from crazysim.pytree import scopes
@@ -209,7 +208,7 @@ def test_effects_mean_the_same_on_every_engine(every, flown):
     expected = Step(every.step_pipeline, "plain")(flown, jnp.int32(20))
     still = Step(hovering().step_pipeline, "interpret")(flown, jnp.int32(20))
     assert np.abs(np.asarray(expected.states.vel) - np.asarray(still.states.vel)).max() > 1e-3
-    for engine in ("lanes", "fused") if native.compiler() else ("lanes",):
+    for engine in FAST:
         found = Step(every.step_pipeline, engine)(flown, jnp.int32(20))
         for name in ("pos", "quat", "vel"):
             a, b = getattr(found.states, name), getattr(expected.states, name)

@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import hover_rotor_state, with_states
+from cases import FAST, hover_rotor_state, with_states
 
 from crazysim import Battery, RangeFinder, Sim
 from crazysim.engine import Step
-from crazysim.engine.backends import native
 from crazysim.plugins import sensors
 from crazysim.plugins.sensors import IMU, Triad
 
@@ -90,7 +89,7 @@ def test_sensors_mean_the_same_on_every_engine(sim):
     """20 steps; random numbers are the same bits everywhere, what is made of them differs by rounding."""
     expected = measurements(sim, Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(20)))
     ideal = measurements(sim, sim.data)
-    for engine in ("lanes", "fused") if native.compiler() else ("lanes",):
+    for engine in FAST:
         found = measurements(sim, Step(sim.step_pipeline, engine)(sim.data, jnp.int32(20)))
         assert found.keys() == expected.keys()
         for name, x in expected.items():

@@ -1,0 +1,44 @@
+"""Pictures and films: hues, places seen by the camera of the plain scene, frames of files, and PNG files."""
+
+import struct
+import subprocess
+import zlib
+
+import numpy as np
+from cases import ABOVE, FOVY
+from imageio_ffmpeg import get_ffmpeg_exe
+
+HEIGHT, WIDTH = 120, 160
+"""Size of most pictures, pixels."""
+
+
+def of_colour(picture, rgba):
+    """Return which pixels have a colour's hue: its channels far above the others. (height, width)"""
+    picture, on = picture.astype(int), np.asarray(rgba[:3]) > 0.5
+    return picture[..., on].min(-1) > picture[..., ~on].max(-1) + 60
+
+
+def pixel(point, height=HEIGHT, width=WIDTH):
+    """Return row and column at which the camera of the plain scene that looks straight down sees a point."""
+    focal = 0.5 * height / np.tan(np.deg2rad(FOVY / 2))
+    x, y, z = point
+    return 0.5 * height - focal * y / (ABOVE - z), 0.5 * width + focal * x / (ABOVE - z)
+
+
+def frames_of(path, height, width, *filters):
+    """Return the frames of a film of a size that it has, or gets by filters of ffmpeg. (n, height, width, 3)"""
+    decode = [get_ffmpeg_exe(), "-loglevel", "fatal", "-i", path, *filters, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    pixels = np.frombuffer(subprocess.run(decode, capture_output=True, check=True).stdout, np.uint8)
+    return pixels[: len(pixels) // (height * width * 3) * height * width * 3].reshape(-1, height, width, 3)
+
+
+def png_of(pixels):
+    """Return an image as the bytes of a PNG file: grey, (height, width), or coloured, (height, width, 3)."""
+
+    def chunk(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    height, width = pixels.shape[:2]
+    rows = b"".join(b"\0" + row.tobytes() for row in pixels.astype(np.uint8))
+    head = struct.pack(">IIBBBBB", width, height, 8, 2 * (pixels.ndim - 2), 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
