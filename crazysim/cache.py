@@ -6,6 +6,8 @@ import contextlib
 import os
 import stat
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -97,6 +99,9 @@ def enable_for_command() -> None:
         )
 
 
+PATIENCE = 1.0
+"""Time after which work that is not over is announced, s."""
+
 _announced: set[str] = set()
 
 
@@ -116,6 +121,23 @@ def announce(work: str, seconds: str) -> None:
         else ("less in later runs with crazysim.enable_cache()")
     )
     print(f"{work}: {seconds} on two cores, {later}", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def announced(work: str, seconds: str) -> Iterator[None]:
+    """Announce work that has not ended after ``PATIENCE``, as it does where its programs are in the cache.
+
+    Args:
+        work: Name of the work, such as ``"compiling the gradient"``.
+        seconds: Duration on two cores, such as ``"10 to 40 s"``.
+    """
+    timer = threading.Timer(PATIENCE, announce, (work, seconds))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def trim(folder: Path, limit: int = LIMIT) -> None:

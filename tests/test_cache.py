@@ -3,13 +3,14 @@
 import os
 import subprocess
 import sys
+import threading
 import time
 
 import jax
 import pytest
 
 from crazysim import cache
-from crazysim.cache import announce, default_cache, enable_cache, enable_for_command, trim
+from crazysim.cache import announce, announced, default_cache, enable_cache, enable_for_command, trim
 
 PROGRAM = """
 import sys
@@ -128,3 +129,16 @@ def test_long_work_is_announced_once_for_each_kind(settings, capsys):
     told = capsys.readouterr().err.splitlines()
     assert [line.split(":")[0] for line in told] == ["compiling this", "compiling that"]
     assert all("5 s" in line and "enable_cache" in line for line in told)
+
+
+def test_work_that_lasts_is_announced_and_work_that_ends_at_once_is_not(settings, capsys, monkeypatch):
+    monkeypatch.setattr(cache, "PATIENCE", 3600.0)
+    with announced("compiling what is cached", "5 s"):
+        pass
+    assert capsys.readouterr().err == ""
+    shown = threading.Event()
+    monkeypatch.setattr(cache, "PATIENCE", 0.0)
+    monkeypatch.setattr(cache, "announce", lambda *args: (announce(*args), shown.set()))
+    with announced("compiling what lasts", "5 s"):
+        assert shown.wait(60), "the notice comes while the work is done"
+    assert capsys.readouterr().err.startswith("compiling what lasts: 5 s on two cores")

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
+from crazysim.cache import announced
 from crazysim.core.settings import as_mask, member
 from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.registry import make
@@ -106,7 +107,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             state = self._again(before, mask)
         else:
             number = seed if seed is not None else int(self.np_random.integers(2**31))
-            state = self._begin(jax.random.key(int(number)))
+            with announced("compiling the environment", "2 to 4 s"):
+                state = self._begin(jax.random.key(int(number)))
         self._stepper.state, self._outputs = state, self._output(state)
         return self._handed((self._outputs[0], self._outputs[2]))
 

@@ -1,4 +1,8 @@
-"""MJX, imported when it is first used: that takes over a second, and only contacts need it."""
+"""MJX, imported when it is first used, which takes more than half a second: only contacts need it.
+
+It is imported without NVIDIA Warp, which nothing here uses MJX on, and which would take two more seconds where it is
+installed. A program that runs MJX on Warp imports ``mujoco.mjx`` or ``warp`` itself, before the first contacts.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +10,9 @@ import contextlib
 import importlib
 import io
 import sys
+from collections.abc import Iterator
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
-
-from crazysim.cache import announce
 
 if TYPE_CHECKING:
     from mujoco.mjx import Data, Model, camlight, collision, com_pos, kinematics, put_data, put_model
@@ -19,11 +22,22 @@ __all__ = ["Data", "Model", "camlight", "collision", "com_pos", "kinematics", "p
 
 def load() -> ModuleType:
     """Return the module ``mujoco.mjx``."""
-    if "mujoco.mjx" not in sys.modules:
-        announce("importing MJX and compiling contacts", "4 to 7 s")
-    # MJX prints two lines when NVIDIA Warp, which nothing here needs, is not installed.
-    with contextlib.redirect_stdout(io.StringIO()):
+    # MJX prints two lines when Warp cannot be imported.
+    with _without_warp(), contextlib.redirect_stdout(io.StringIO()):
         return importlib.import_module("mujoco.mjx")
+
+
+@contextlib.contextmanager
+def _without_warp() -> Iterator[None]:
+    """Let imports of Warp fail, unless it has been imported."""
+    if "warp" in sys.modules or "mujoco.mjx" in sys.modules:
+        yield
+        return
+    sys.modules["warp"] = None  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        del sys.modules["warp"]
 
 
 def __getattr__(name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.cache import announced
 from crazysim.core.data import Objects, SimData
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
@@ -222,7 +224,9 @@ class Scene(PureQueries):
         """
         self.compile_if_edited()
         if not self._synced:
-            data = self._mjx.sync(data)
+            first = not self._mjx.is_allocated
+            with announced("importing MJX and compiling contacts", "2 to 4 s") if first else nullcontext():
+                data = self._mjx.sync(data)
             self._synced = True
         return data
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.data import SimData
 from crazysim.eager import compiled, to_host
 from crazysim.scene import mjx
+from crazysim.scene.kinematics import ONLY_DUMMY, kinematics
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
 """Modes of cameras that follow a centre of mass; a sync computes it for them only."""
@@ -37,8 +38,13 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
             mocap_quat=mjx_data.mocap_quat.at[:, ids].set(jnp.roll(quat, 1, axis=-1)),
         )
 
+    has_joints = mjx_model.njnt > ONLY_DUMMY
+    if not has_joints:
+        mjx_data = kinematics(mjx_model, mjx_data)
+
     def of_world(world: mjx.Data) -> mjx.Data:
-        world = mjx.kinematics(_carry_children(mjx_model, world), world)
+        if has_joints:
+            world = mjx.kinematics(_carry_children(mjx_model, world), world)
         if np.isin(mjx_model.cam_mode, COM_CAMERAS).any():
             world = mjx.com_pos(mjx_model, world)
         world = mjx.camlight(mjx_model, world)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import crazysim
-from crazysim.cache import announce
+from crazysim.cache import announced
 from crazysim.core.settings import positive
 from crazysim.engine.backends.native import compiling_threads
 from crazysim.envs.env import DroneEnv
@@ -112,8 +112,8 @@ def train(
         compiled = algorithm.iterate.lower(_on_device(shapes, base.sim.device), env, hyperparameters).compile()
         return compiled, time.perf_counter() - compiling
 
-    announce("compiling the training", "5 to 20 s")
-    with compiling_threads(2) as pool:  # each compiles for seconds, mostly on one core
+    # Each compiles for seconds, mostly on one core.
+    with announced("compiling the training", "5 to 20 s"), compiling_threads(2) as pool:
         starting, compiling = pool.submit(start), pool.submit(compile_iteration)
         (learner, metrics), (iterate, compile_s) = starting.result(), compiling.result()
     done, seconds_before = int(learner.iteration), curve[-1]["seconds"] if curve else 0.0

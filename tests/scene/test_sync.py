@@ -20,18 +20,40 @@ TOWER = """
         <camera name="lookout" pos="0 0 0.1" euler="90 0 0"/>
         <camera name="com" mode="trackcom" pos="-1 0 0.3"/>
         <light name="beacon" pos="0 0 0.2" dir="1 0 0"/>
+        <body name="hand" pos="0.2 0.1 0" euler="0 0 40">
+          <geom type="box" size="0.02 0.03 0.04" pos="0 0 0.1" euler="10 20 0"/>
+          <site name="palm" pos="0.01 0.02 0.03" euler="0 50 0"/>
+        </body>
       </body>
     </body>
   </worldbody>
 </mujoco>
 """
-DERIVED = ("xpos", "xquat", "xmat", "geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat")
+SHELF = """
+<mujoco>
+  <worldbody>
+    <body name="shelf" pos="1 2 0" euler="0 0 20">
+      <geom type="box" size="0.5 0.2 0.02"/>
+      <body name="cup" pos="0 0 0.1" euler="15 0 0">
+        {joint}
+        <geom type="sphere" size="0.03" pos="0.1 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+DERIVED = (
+    *("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos"),
+    "cam_xmat",
+)
 
 
-@pytest.fixture(scope="module")
-def sim():
-    """Three worlds of two drones at random poses, and a tower with children that is moved through mjx_data."""
+@pytest.fixture(scope="module", params=["", '<joint type="hinge"/>'], ids=["fixed", "joint"])
+def sim(request):
+    """Three worlds of two drones at random poses, a tower with children that is moved through mjx_data, and a shelf."""
     sim = Sim(n_worlds=3, n_drones=2)
+    shelf = mujoco.MjSpec.from_string(SHELF.format(joint=request.param))
+    sim.spec.worldbody.add_frame().attach_body(shelf.body("shelf"), "", "")
     tower = sim.spec.worldbody.add_frame().attach_body(mujoco.MjSpec.from_string(TOWER).body("tower"), "", "")
     tower.mocap = True
     sim.build_mjx()

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
-from crazysim.cache import announce
+from crazysim.cache import announce, announced
 from crazysim.core.sharding import Location
 from crazysim.core.stage import with_leaves
 from crazysim.engine.backends import Run, lanes, native, reverse
@@ -81,10 +81,9 @@ class Gradients:
     def _kernels(self, perturbed: tuple[int, ...]) -> ReverseKernels | None:
         """Return the kernels for cotangents of some leaves; None where lanes compute them."""
         if perturbed not in self._found:
-            if self.location.platform == "cpu":
-                announce("compiling a gradient through the steps", "5 to 20 s")
             try:
-                self._found[perturbed] = ReverseKernels(self.program, perturbed, self.location)
+                with announced("compiling a gradient through the steps", "5 to 20 s"):
+                    self._found[perturbed] = ReverseKernels(self.program, perturbed, self.location)
                 self.used["gradient: one kernel"] = None
             except UnsupportedError as error:
                 announce("compiling a gradient through the steps on lanes", "10 to 40 s")

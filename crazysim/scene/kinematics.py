@@ -1,0 +1,62 @@
+"""Poses of all bodies, geoms and sites of a scene whose bodies are fixed to the world or to mocap bodies."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.scene import mjx
+
+ONLY_DUMMY = 1
+"""Number of joints of a scene without joints of its own: the one that MJX requires, of a body without geoms."""
+
+
+def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Return the scene with the poses of bodies, their centres of mass, geoms and sites.
+
+    The same as ``mjx.kinematics`` for a scene without joints of its own, which takes a fourth of the time to trace and
+    compile; and children of mocap bodies are at this world's poses, not at the model's as in MJX 3.17.
+
+    Args:
+        model: Compiled scene.
+        data: State of the scene in every world. (n_worlds, ...)
+    """
+    n = data.mocap_pos.shape[:1]
+    pos = jnp.broadcast_to(model.body_pos, n + model.body_pos.shape)
+    quat = jnp.broadcast_to(_xyzw(model.body_quat), n + model.body_quat.shape)
+    mocap = np.flatnonzero(model.body_mocapid >= 0)
+    if len(mocap):
+        ids = model.body_mocapid[mocap]
+        turned = _xyzw(data.mocap_quat[:, ids])
+        pos = pos.at[:, mocap].set(data.mocap_pos[:, ids])
+        quat = quat.at[:, mocap].set(turned / jnp.linalg.norm(turned, axis=-1, keepdims=True))
+    for bodies in _generations(np.asarray(model.body_parentid)):
+        parents = model.body_parentid[bodies]
+        pos = pos.at[:, bodies].set(rotation.rotate(quat[:, parents], pos[:, bodies], pos[:, parents]))
+        quat = quat.at[:, bodies].set(rotation.multiply(quat[:, parents], quat[:, bodies]))
+
+    rot = rotation.matrix(quat)
+    of = np.concatenate([np.arange(model.nbody), model.geom_bodyid, model.site_bodyid])
+    offsets = jnp.concatenate([model.body_ipos, model.geom_pos, model.site_pos])
+    turns = _xyzw(jnp.concatenate([model.body_iquat, model.geom_quat, model.site_quat]))
+    ends = np.cumsum([model.nbody, model.ngeom])
+    places = jnp.split(rotation.matvec(rot[:, of], offsets, pos[:, of]), ends, axis=1)
+    frames = jnp.split(rotation.matrix(rotation.multiply(quat[:, of], turns)), ends, axis=1)
+    data = data.replace(xpos=pos, xquat=jnp.roll(quat, 1, axis=-1), xmat=rot, xipos=places[0], ximat=frames[0])
+    return data.replace(geom_xpos=places[1], geom_xmat=frames[1], site_xpos=places[2], site_xmat=frames[2])
+
+
+def _xyzw(quat: Array) -> Array:
+    """Return quaternions of MuJoCo, wxyz, as ours. (..., 4)"""
+    return jnp.roll(quat, -1, axis=-1)
+
+
+def _generations(parents: NDArray) -> list[NDArray]:
+    """Return the bodies whose parents are not the world: children of its children, then their children, and so on."""
+    depth = np.zeros(len(parents), int)
+    for body in range(1, len(parents)):  # a parent comes before its children
+        depth[body] = depth[parents[body]] + 1
+    return [np.flatnonzero(depth == k) for k in range(2, depth.max() + 1)]
