@@ -59,8 +59,8 @@ def test_the_settings_hold_while_a_context_is_made(monkeypatch):
     )
     monkeypatch.setenv(software.VARIABLE, "fast")
     with software.quality(model):
-        assert (model.vis.quality.offsamples, model.vis.quality.shadowsize) == (0, 0)
-    assert (model.vis.quality.offsamples, model.vis.quality.shadowsize) == (8, 512)
+        assert (model.vis.quality.offsamples, model.vis.quality.numslices) == (0, 16)
+    assert (model.vis.quality.offsamples, model.vis.quality.numslices) == (8, 28)
 
 
 def test_a_fast_image_shows_the_same_scene_with_jagged_edges(opengl, monkeypatch):
