@@ -60,28 +60,9 @@ def of_rpy(roll, pitch, yaw):
     )
 
 
-def reference(make, mode, states, commands):
-    """Return the PWM of the motors by a reference controller. (n_ticks, n, 4)"""
-    flown = []
-    for j in range(states.shape[1]):
-        law = make()
-        flown.append(
-            [law.tick(s[:3], s[3:6], s[6:10], s[10:13], c) for s, c in zip(states[:, j], commands[:, j], strict=True)]
-        )
-    return np.swapaxes(np.array(flown), 0, 1)
-
-
-MOST_TICKS, MOST_DRONES = 400, 10
-"""Size of the program of a law; shorter and smaller flights are padded."""
-
-
 def law(controller, mode, states, commands, drone="cf2x_L250"):
     """Return the PWM of the motors by a controller of crazysim, in the precision of JAX. (n_ticks, n, 4)"""
-    n_ticks, n = states.shape[:2]
-    padding = ((0, MOST_TICKS - n_ticks), (0, MOST_DRONES - n), (0, 0))
-    numbers = numbers_of(controller, drone)
-    out = _compiled(controller, mode)(numbers, *(np.pad(x, padding, mode="edge") for x in (states, commands)))
-    return np.asarray(out)[:n_ticks, :n]
+    return np.asarray(_compiled(controller, mode)(numbers_of(controller, drone), states, commands))
 
 
 @functools.cache

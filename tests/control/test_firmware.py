@@ -1,4 +1,4 @@
-"""The firmware's PID and Mellinger controllers, against a second implementation and against what they are for."""
+"""The firmware's PID and Mellinger controllers, against the compiled firmware and against what they are for."""
 
 import dataclasses
 from pathlib import Path
@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import vectors
-from firmware_reference import ReferenceMellinger, ReferencePid
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,48 +23,29 @@ jitted = jax.jit(distribute, static_argnames="whole_numbers")
 # Torques in PWM amplify rounding: yaw has a derivative gain of 0.35 * 500 * 120 PWM per degree.
 FLOAT32_PWM = 3.0
 FILTERED = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
-CASES = [
-    (PID(hold_yaw=True), "state", "cf2x_L250", lambda: ReferencePid("state")),
-    (PID(hold_yaw=True), "state", "cf21B_500", lambda: ReferencePid("state", "cf21bl")),
-    (PID(hold_yaw=True), "state", FILTERED, lambda: ReferencePid("state", "cf2", 0.3, 2.0)),
-    (PID(hold_yaw=True), "attitude", "cf2x_L250", lambda: ReferencePid("attitude")),
-    (PID(hold_yaw=True), "body_rate", "cf2x_L250", lambda: ReferencePid("body_rate")),
-    (Mellinger(), "state", "cf2x_L250", lambda: ReferenceMellinger("state")),
-    (Mellinger(), "attitude", "cf2x_L250", lambda: ReferenceMellinger("attitude")),
-    (Mellinger(), "state", "cf21B_500", lambda: ReferenceMellinger("state", 0.0393)),
-]
-NAMES = ["pid-state", "pid-brushless", "pid-filters", "pid-attitude", "pid-rate", "mellinger", "m-attitude", "m-heavy"]
+CASES = {
+    "pid-state": (PID(hold_yaw=True), "state", "cf2x_L250"),
+    "pid-brushless": (PID(hold_yaw=True), "state", "cf21B_500"),
+    "pid-filters": (PID(hold_yaw=True), "state", FILTERED),
+    "pid-attitude": (PID(hold_yaw=True), "attitude", "cf2x_L250"),
+    "pid-rate": (PID(hold_yaw=True), "body_rate", "cf2x_L250"),
+    "mellinger": (Mellinger(), "state", "cf2x_L250"),
+    "m-attitude": (Mellinger(), "attitude", "cf2x_L250"),
+    "m-heavy": (Mellinger(), "state", "cf21B_500"),
+}
 
 
-@pytest.mark.parametrize("controller, mode, drone, make", CASES, ids=NAMES)
-def test_the_motors_are_those_of_the_reference(controller, mode, drone, make):
-    """Several hundred ticks, through saturation, yaw wraps, full integrals, upside down, and motors off."""
-    states, commands = flown.flights(mode, 10, 400, seed=7)
-    states, commands = states.astype(np.float32), commands.astype(np.float32)
-    expected = flown.reference(make, mode, states.astype(float), commands.astype(float))
-    assert 0.05 < np.mean(expected == 0) < 0.5
-    assert 0.05 < np.mean(expected == 65535) < 0.5
-    np.testing.assert_allclose(flown.law(controller, mode, states, commands, drone), expected, atol=FLOAT32_PWM)
-
-
-@pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("controller, mode, drone, make", [CASES[2], CASES[4], CASES[5]], ids=["pid", "rate", "m"])
-def test_in_float64_they_agree_to_rounding(controller, mode, drone, make):
-    states, commands = flown.flights(mode, 6, 200, seed=8)
-    expected = flown.reference(make, mode, states, commands)
-    np.testing.assert_allclose(flown.law(controller, mode, states, commands, drone), expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("controller, mode, drone, make", CASES, ids=NAMES)
-def test_the_motors_are_those_of_the_firmware(controller, mode, drone, make, request):
+@pytest.mark.parametrize("name", CASES)
+def test_the_motors_are_those_of_the_firmware(name):
     """Those of the compiled C sources (docs/guides/controllers.md), whose integers differ by up to 5 PWM from reals.
 
     Roll, pitch, yaw and motor lose less than one each. Where all motors are lowered by the excess of the highest, the
     difference of two motors counts: twice two of the torques, and less than one.
     """
+    controller, mode, drone = CASES[name]
     states, commands = (x.astype(np.float32) for x in flown.flights(mode, 8, 240, seed=11))
     with np.load(Path(__file__).with_name("firmware_motors.npz")) as file:
-        expected = file[request.node.callspec.id].astype(float)
+        expected = file[name].astype(float)
     assert 0.05 < np.mean(expected == 0) < 0.5
     assert 0.05 < np.mean(expected == 65535) < 0.5
     smooth = np.abs(flown.law(controller, mode, states, commands, drone) - expected)

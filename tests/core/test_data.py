@@ -8,9 +8,8 @@ from cases import PAIRS, shared_sim
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazysim import Sim, load_airframe
-from crazysim.core.data import SimState, as_key, command_shape, create_params, grid_2d, n_rotor_states
-from crazysim.dynamics import Dynamics, first_principles, fitted
+from crazysim import Sim
+from crazysim.core.data import SimState, as_key, command_shape, grid_2d
 
 pytestmark = pytest.mark.fast
 
@@ -40,24 +39,6 @@ def test_drones_begin_at_rest_level_and_alike_in_every_world():
     for name in ("vel", "ang_vel", "force", "torque", "rotor_vel"):
         assert not np.any(getattr(states, name)), name
     assert states.rotor_vel.shape == (3, 5, 6)
-
-
-USED = {
-    ("first_principles", "state"): {"state", "rotor_vel"},
-    ("first_principles", "attitude"): {"attitude", "rotor_vel"},
-    ("first_principles", "body_rate"): {"body_rate", "rotor_vel"},
-    ("first_principles", "force_torque"): {"force_torque", "rotor_vel"},
-    ("first_principles", "rotor_vel"): {"rotor_vel"},
-}
-
-
-@pytest.mark.parametrize("dynamics, control", PAIRS)
-def test_controllers_that_are_not_in_use_are_none(dynamics, control):
-    controls = shared_sim(n_worlds=2, n_drones=2, dynamics=dynamics, control=control).data.controls
-    fields = ("state", "attitude", "body_rate", "force_torque", "rotor_vel")
-    expected = USED.get((dynamics, control), {"state", "attitude"} if control == "state" else {"attitude"})
-    assert {name for name in fields if getattr(controls, name) is not None} == expected
-    assert controls.mode == control
 
 
 @pytest.mark.parametrize("control", ["state", "attitude", "body_rate"])
@@ -91,19 +72,6 @@ def test_default_rates_are_100_hz_for_state_and_500_below_or_the_next_divisor():
         assert (cascade.control_freq, cascade.data.controls.attitude.freq) == rates
         assert (auto.control_freq, auto.data.controls.controller.freq) == rates
     assert Sim(control="rotor_vel", freq=240).control_freq == 240
-
-
-@pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag"])
-def test_parameters_are_those_of_the_model_and_shared(dynamics):
-    airframe = load_airframe("cf21B_500")
-    dynamics = Dynamics(dynamics)
-    params = create_params(dynamics, airframe)
-    assert isinstance(params, first_principles.Params if dynamics == "first_principles" else fitted.Params)
-    assert n_rotor_states(dynamics, airframe) == 4
-    assert all(leaf.ndim <= 2 for leaf in jax.tree.leaves(params))
-    if isinstance(params, fitted.Params):
-        assert (params.thrust_dyn_coef is None) == (dynamics == "so_rpy")
-        assert (params.drag_matrix is None) == (dynamics != "so_rpy_rotor_drag")
 
 
 def test_a_seed_becomes_a_key_and_a_key_stays():

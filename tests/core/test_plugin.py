@@ -187,18 +187,6 @@ def test_remove_restores_what_was_there_before():
     assert trees_equal(fly_on(sim), expected)
 
 
-def test_integration_has_one_place_for_all_plugins():
-    sim = hovering()
-    plain = sim.step_pipeline["integration"].fn
-    for plugin in EVERYTHING:
-        sim.add(plugin)
-    integration = sim.step_pipeline["integration"].fn
-    assert integration.deriv_fn is plain.deriv_fn
-    assert integration.method is plain.method
-    names = [p.name for p in integration.plugins]
-    assert names == ["latency", "battery", "downwash", "ground_effect", "motors", "wake", "wind"]
-
-
 def test_replace_changes_numbers_without_compiling_and_keeps_states():
     sim = hovering()
     sim.add(Wind((2.0, 0, 0), 7.7))

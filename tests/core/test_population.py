@@ -1,7 +1,6 @@
 """Populations: records with members, stages of one member, and programs of their own."""
 
 import functools
-import re
 import warnings
 
 import jax
@@ -17,7 +16,6 @@ from crazysim.core.population import Population
 from crazysim.core.random import member_key, world_key
 from crazysim.core.sharding import world_mesh
 from crazysim.engine import Step
-from crazysim.engine.backends import kernel
 from crazysim.errors import EngineWarning, UnknownNameError
 from crazysim.pytree import PyTree, check_axes, leaf, scopes
 
@@ -221,26 +219,6 @@ def test_random_numbers_are_those_of_world_and_member():
     assert world_key(one, "kick") != member_key(one, "springs", "kick")
 
 
-def test_an_independent_population_costs_the_drones_nothing():
-    """The drones' kernel and the leaves that they read are those without a population."""
-    alone, beside = Sim(2, 2, engine="lanes"), Sim(2, 2, engine="lanes")
-    beside.add(Springs(3))
-    programs = beside.step_fn.plan(beside.data).programs
-    assert [p.population for p in programs] == ["drone", "springs"]
-    plan = alone.step_fn.plan(alone.data)
-    for target in ("cuda", "host"):
-        assert _source(programs[0], target) == _source(plan.program, target)
-        assert _source(programs[1], target) != _source(plan.program, target)
-    assert len(plan.programs) == 1
-    assert programs[1].group == 1
-    assert "fused, for one member of 'springs': springs_control, springs_integration" in beside.explain()
-
-
-def _source(program, target):
-    """Return the source of a kernel, with another name for the packed leaf, whose number is that of leaves."""
-    return re.sub(rf"\b([px]){len(program.leaves) - 1}(?=\b|_)", r"\1packed", kernel.write(program, target).text)
-
-
 def test_what_depends_on_each_other_runs_together():
     for kind, n in ((Springs, 2), (Crowd, 2), (Tied, 1), (Tying, 1)):
         sim = build(kind, engine="lanes")
@@ -252,6 +230,7 @@ def test_two_populations_are_two_programs():
     sim.add(Springs(3))
     sim.add(Springs(["Mass_7", "Mass_8"], name="others", stiffness=0.0))
     assert [p.population for p in sim.step_fn.plan(sim.data).programs] == ["drone", "springs", "others"]
+    assert "fused, for one member of 'springs': springs_control, springs_integration" in sim.explain()
     sim.step(50)
     springs, others = jax.device_get((sim.data.plugins["springs"], sim.data.plugins["others"]))
     assert springs.pos.shape == (2, 3, 3)

@@ -78,14 +78,6 @@ def test_a_drawn_mass_sinks_or_climbs_by_newtons_law():
     assert not np.any(again[1] == mass[1])
 
 
-def test_under_attitude_commands_the_heavier_drone_hangs_lower():
-    sim, _ = build(drawn_mass, control="attitude")
-    sim.step(N)
-    mass, height = np.asarray(sim.data.params.mass).ravel(), np.asarray(sim.data.states.pos[..., 2]).ravel()
-    np.testing.assert_array_equal(np.argsort(mass), np.argsort(-height))
-    assert np.ptp(height) > 0.05
-
-
 def test_angular_acceleration_is_inverse_to_a_drawn_inertia():
     """A small external torque turns a drone at rest by J w' = tau: twice the inertia, half the rate."""
     sim, nominal = build(drawn_inertia)

@@ -337,9 +337,3 @@ def test_stages_of_the_package_are_traced_once_in_a_process(sim, monkeypatch, tm
     assert traced.count("integration") <= 1
     dumps = [{path.name.split("-")[-1] for path in (tmp_path / n).glob("*.jaxpr")} for n in ("3", "4")]
     assert dumps[0] == dumps[1] == {f"{name}.jaxpr" for name in stages}
-    monkeypatch.setattr(tracing, "MAX_FIXED", 1)
-    monkeypatch.setattr(tracing, "_FIXED", {})
-    data = shared_sim(n_worlds=3, n_drones=1, control="attitude").data
-    text = str(Step(shared_sim(n_worlds=3, n_drones=1, control="attitude").step_pipeline, "lanes").plan(data).program)
-    assert len(tracing._FIXED) == 1
-    assert "integration" in text

@@ -179,13 +179,6 @@ def test_a_table_is_read_where_it_is_and_never_selected_from():
     assert not program.packed
 
 
-def test_constants_that_are_the_same_everywhere_are_no_lookups():
-    program = optimise(lower_stages(as_stages(pipeline(["constants"])), data()))
-    (segment,) = program.fused_segments
-    names = [op.name for op in segment.block.walk()]
-    assert (names.count("table"), names.count("lookup")) == (1, 3)
-
-
 def test_the_source_for_gpus_is_well_formed():
     """All cases in one kernel, compiled by NVRTC where there is one."""
     program = optimise(lower_stages(as_stages(pipeline(IN_KERNELS)), data()))

@@ -23,7 +23,6 @@ from crazysim.envs import (
     Wrapper,
     make,
 )
-from crazysim.envs.actions import hover_rotors
 from crazysim.envs.state import flatten
 from crazysim.envs.tasks.hover import Hover
 
@@ -348,18 +347,6 @@ def test_randomised_parameters_are_one_per_drone(env, heavy):
     assert len(np.unique(mass)) == 4
     assert heavy.data.params.J.shape == (3, 3), "what is not named stays shared"
     assert trees_equal(heavy.data.states, env.reset(jax.random.key(0)).data.states)
-
-
-def test_a_heavy_drone_sinks_under_the_action_that_hovers(env, randomized, heavy):
-    """Its acceleration is that of the weight which the thrust of the nominal drone leaves."""
-    step = jax.jit(randomized.step)
-    level = heavy.data.states.quat.at[:].set(jnp.array([0.0, 0, 0, 1]))
-    still = jnp.zeros_like(heavy.data.states.vel)
-    hover = jnp.broadcast_to(hover_rotors(env.sim.data.params), heavy.data.states.rotor_vel.shape)
-    states = heavy.data.states.replace(quat=level, vel=still, ang_vel=still, rotor_vel=hover)
-    state = step(heavy.replace(data=heavy.data.replace(states=states)), jnp.zeros_like(heavy.action))
-    mass = np.asarray(heavy.data.params.mass)[:, 0, 0]
-    np.testing.assert_allclose(state.data.states.vel[:, 0, 2], -9.81 * (1 - 0.0434 / mass) * 0.02, rtol=0.02)
 
 
 def test_only_worlds_that_begin_anew_are_randomised_anew(randomized, heavy):
