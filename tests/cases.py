@@ -208,6 +208,15 @@ def by_stages(sim):
     return step
 
 
+def hovering(n_worlds=3, n_drones=2, **kwargs):
+    """Return a simulation of drones that hover side by side, each in a place of its own."""
+    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, rng_key=4, **kwargs)
+    grid = 0.1 * np.arange(n_worlds * n_drones * 3).reshape(n_worlds, n_drones, 3) + [0, 0, 1.0]
+    sim.data = with_states(sim.data, pos=grid, rotor_vel=hover_rotor_state(sim.data))
+    sim.build_default_data()
+    return sim
+
+
 @functools.cache
 def shared_sim(**settings):
     """Return a simulation that several tests step: compiled once, and to be left as it was found."""

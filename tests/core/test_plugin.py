@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST, hover_command, hover_rotor_state, to_all, trees_equal, with_states
+from cases import FAST, hover_command, hovering, to_all, trees_equal, with_states
 from jax import Array
 from scipy.linalg import expm
 
@@ -108,14 +108,6 @@ def test_law_08_states_of_a_plugin_keep_the_order_of_the_integrator(integrator, 
             assert np.all(errors > 1e-14), "rounding hides the order"
             slope = np.polyfit(np.log(1 / STEPS), np.log(errors), 1)[0]
             assert abs(slope - Integrator(integrator).order) < 0.3, (axis, errors)
-
-
-def hovering(n_worlds=3, n_drones=2, **kwargs):
-    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, rng_key=4, **kwargs)
-    grid = 0.1 * np.arange(n_worlds * n_drones * 3).reshape(n_worlds, n_drones, 3) + [0, 0, 1.0]
-    sim.data = with_states(sim.data, pos=grid, rotor_vel=hover_rotor_state(sim.data))
-    sim.build_default_data()
-    return sim
 
 
 def fly_on(sim, n_steps=20):

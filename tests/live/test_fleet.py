@@ -19,16 +19,8 @@ from crazysim.live import (
     TakeOff,
     Upload,
 )
-from crazysim.trajectories import Trajectory, hover
+from crazysim.trajectories import Trajectory, hover, line
 from crazysim.trajectories.files import Lights, Show
-
-
-def line(begin, end, seconds=2.0):
-    c = np.zeros((1, 4, 8))
-    c[0, :3, 0] = begin
-    c[0, :3, 4:] = np.subtract(end, begin)[:, None] * np.array([35.0, -84.0, 70.0, -20.0])
-    return Trajectory.of_pieces([seconds], c / seconds ** np.arange(8))
-
 
 RED, BLUE, OFF = (1, 0, 0), (0, 0, 1), (0, 0, 0)
 SETTLED = 0.12
@@ -67,12 +59,12 @@ def test_flight_by_commands(sim):
     np.testing.assert_allclose(pos(sim)[:, 2], 0.8, atol=SETTLED)
 
     begin = pos(sim)[2]
-    fleet.apply([Upload(7, line((5, 5, 5), (5, 6, 5))), Start(7, relative=True)])
+    fleet.apply([Upload(7, line((5, 5, 5), (5, 6, 5), 2.0)), Start(7, relative=True)])
     sim.step(1500)
     np.testing.assert_allclose(pos(sim)[2] - begin, [0, 1, 0], atol=SETTLED)
     np.testing.assert_allclose(pos(sim)[:2], [[0, 0, 0.8], [1, 0, 0.8]], atol=SETTLED)
 
-    fleet.apply([Upload(7, line((2, 1, 0.8), (2, 0, 0.8))), Start(7)])
+    fleet.apply([Upload(7, line((2, 1, 0.8), (2, 0, 0.8), 2.0)), Start(7)])
     sim.step(500)
     staged = np.asarray(sim.data.controls.state.staged_cmd[0, 2, :3])
     fleet.apply([Hover(7)])
@@ -90,7 +82,7 @@ def test_flight_by_commands(sim):
 
 
 def test_show_by_commands(sim):
-    lines = [line((k, 0, 0.5), (k, 1, 1.0)) for k in range(2)]
+    lines = [line((k, 0, 0.5), (k, 1, 1.0), 2.0) for k in range(2)]
     show = Show(("a", "b"), Trajectory.stack(lines), Lights.stack([Lights.of_pieces([0, 1], [RED, BLUE])] * 2))
     fleet = Fleet(sim, max_pieces=8)
     assert fleet.apply([StartShow()]) == 0  # nothing to start
@@ -100,22 +92,14 @@ def test_show_by_commands(sim):
     np.testing.assert_array_equal(fleet.colors(), np.zeros((3, 3)))  # the show has not started
     assert fleet.apply([StartShow()]) == 1
     np.testing.assert_array_equal(fleet.colors(), [RED, RED, OFF])
+    np.testing.assert_allclose(fleet.setpoint(0)[:3], [0, 0, 0.5])
     sim.step(600)
     np.testing.assert_array_equal(fleet.colors(), [BLUE, BLUE, OFF])  # 1.2 s later
-    fleet.reset()
-    np.testing.assert_array_equal(fleet.colors(), np.zeros((3, 3)))
-
-
-def test_show_flies_by_commands(sim):
-    lines = [line((k, 0, 0.5), (k, 1, 1.0)) for k in range(2)]
-    fleet = Fleet(sim, max_pieces=8)
-    fleet.apply([LoadShow(Show(("a", "b"), Trajectory.stack(lines), Lights.stack([Lights.constant()] * 2)))])
-    sim.step(250)
-    fleet.apply([StartShow()])
-    np.testing.assert_allclose(fleet.setpoint(0)[:3], [0, 0, 0.5])
-    sim.step(1500)
+    sim.step(900)
     np.testing.assert_allclose(pos(sim)[:2], [[0, 1, 1], [1, 1, 1]], atol=SETTLED)
     assert pos(sim)[2, 2] < SETTLED
+    fleet.reset()
+    np.testing.assert_array_equal(fleet.colors(), np.zeros((3, 3)))
 
 
 def test_commands_that_cannot_be_carried_out_change_nothing(sim, caplog):
@@ -131,7 +115,7 @@ def test_commands_that_cannot_be_carried_out_change_nothing(sim, caplog):
     assert fleet.apply(wrong) == 0
     assert caplog.text.count("refused: expected") == len(wrong)
     assert sim.data is before
-    assert fleet.apply([Upload(1, line((9, 9, 9), (9, 9, 8)))]) == 1
+    assert fleet.apply([Upload(1, line((9, 9, 9), (9, 9, 8), 2.0))]) == 1
     np.testing.assert_allclose(pos(sim), np.asarray(before.states.pos[0]))  # not moved
 
 

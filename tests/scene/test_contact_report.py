@@ -1,7 +1,5 @@
 """The contact report against C MuJoCo's distances, and inside the step."""
 
-import time
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -381,7 +379,7 @@ BALL = "<geom type='sphere' size='.1' pos='{} {} {}' conaffinity='2'/>"
 
 
 @pytest.mark.parametrize("box", [False, True])
-def test_thousands_of_objects_are_reported_in_seconds(box, rng):
+def test_thousands_of_objects_are_reported_by_a_small_program(box, rng):
     """Balls that move and that do not, boxes in any attitude, and a body of forty balls.
 
     The distances of few objects are computed one by one, and compared with those of C MuJoCo above.
@@ -395,10 +393,10 @@ def test_thousands_of_objects_are_reported_in_seconds(box, rng):
     sim.scene.add("box", "turned", count=30, pos=places[0, :30], quat=rng.normal(size=(30, 4)), mocap=False)
     balls = "".join(BALL.format(*place) for place in places_of_one)
     sim.scene.add(f"<mujoco><worldbody>{balls}</worldbody></mujoco>", "many", mocap=False)
-    start = time.monotonic()
+    program = str(jax.make_jaxpr(sim.scene.contact_fn())(sim.data))
+    assert program.count("\n") < 20_000, "it grows with the number of objects, and takes minutes to compile"
     report = sim.contact_report()
     found = np.asarray(report.object_distance)[0, 0]
-    assert time.monotonic() - start < 30
     assert found.shape == (2 * n + 31,)
     assert report.nearest_object[0, 0] == np.argmin(found)
     chosen = [f"{name}:{k}" for name in ("moves", "stays", "turned") for k in (0, 7, 29)]

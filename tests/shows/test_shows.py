@@ -26,17 +26,8 @@ from crazysim.shows import (
     summary,
     tracking_rms,
 )
-from crazysim.trajectories import Trajectory
+from crazysim.trajectories import Trajectory, line
 from crazysim.trajectories.files import Lights, Show, save_show
-
-
-def line(start, end, seconds=2.0):
-    """A straight move at rest at both ends."""
-    c = np.zeros((1, 4, 8))
-    c[0, :3, 0] = start
-    c[0, :3, 4:] = np.subtract(end, start)[:, None] * np.array([35.0, -84.0, 70.0, -20.0])
-    return Trajectory.of_pieces([seconds], c / seconds ** np.arange(8))
-
 
 LIGHTS = [
     Lights.of_pieces([0.0, 1.0], [(1, 0, 0), (0, 0, 1)]),
@@ -46,7 +37,11 @@ LIGHTS = [
 SHOW = Show(
     names=("a", "b", "c"),
     trajectories=Trajectory.stack(
-        [line((0, 0, 1), (1, 0, 1)), line((1, 0.02, 1), (0, 0.02, 1)), line((0.5, 2, 0.5), (0.5, 2, 1.5))]
+        [
+            line((0, 0, 1), (1, 0, 1), 2.0),
+            line((1, 0.02, 1), (0, 0.02, 1), 2.0),
+            line((0.5, 2, 0.5), (0.5, 2, 1.5), 2.0),
+        ]
     ),
     lights=Lights.stack(LIGHTS),
     settings={"validation": {"minDistance": 0.3}},

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST, hover_command, hover_rotor_state, n_documented, to_all, trees_equal, with_states
+from cases import FAST, hover_command, hovering, n_documented, to_all, trees_equal, with_states
 
 from crazysim import (
     Battery,
@@ -49,14 +49,6 @@ def switch_on(sim, settings=ON):
         if "fail_step" in kwargs:
             kwargs = kwargs | {"fail_step": [-1] * (n - 1) + [30]}
         sim.add(effect(**kwargs))
-
-
-def hovering(n_worlds=3, n_drones=2, **kwargs):
-    sim = Sim(n_worlds=n_worlds, n_drones=n_drones, rng_key=4, **kwargs)
-    grid = 0.1 * np.arange(n_worlds * n_drones * 3).reshape(n_worlds, n_drones, 3) + [0, 0, 1.0]
-    sim.data = with_states(sim.data, pos=grid, rotor_vel=hover_rotor_state(sim.data))
-    sim.build_default_data()
-    return sim
 
 
 @pytest.fixture(scope="module")
