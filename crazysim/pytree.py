@@ -100,8 +100,8 @@ _TEMPLATE, _READ = "_template", "_read"
 def lazy(template: T, read: Callable[[Any], Any]) -> T:
     """Return the record whose leaves are ``read(x)`` for the leaves of a template, each made when it is first read.
 
-    It is a record like any other: JAX, ``replace`` and ``copy`` read all fields. Only ``vars`` has no more than those
-    that were read before; ``dataclasses.fields`` has all.
+    It behaves like any other record: JAX, ``replace`` and ``copy`` read all fields. To list its fields, use
+    ``dataclasses.fields``: ``vars`` returns only fields that have been read.
 
     Args:
         template: A record of the same structure.
@@ -120,7 +120,9 @@ def _lazy_child(x: Any, read: Callable[[Any], Any]) -> Any:
         return lazy(x, read)
     if isinstance(x, dict):
         return {k: _lazy_child(v, read) for k, v in x.items()}
-    return read(x) if jax.tree_util.all_leaves([x]) else jax.tree.map(read, x)
+    if x is None or isinstance(x, int):  # the most common cases; JAX takes some time to say so
+        return x if x is None else read(x)
+    return jax.tree.map(read, x)
 
 
 @functools.cache

@@ -260,7 +260,7 @@ def _as_command(
         raise ValueError(f"expected real numbers as {name} command, got type {array.dtype}; use float32")
     is_tracer = isinstance(array, jax.core.Tracer)
     check_finite = flag("check_finite", check_finite)
-    if (on_host or (check_finite and not is_tracer)) and not np.all(np.isfinite(array)):
+    if (on_host or (check_finite and not is_tracer)) and not np.isfinite(array).all():
         worlds = np.unique(np.nonzero(~np.isfinite(np.asarray(array)))[0])[:8]
         raise ValueError(
             f"{name} command is NaN or infinite in world(s) {worlds.tolist()}, as {dtype}, which would last "

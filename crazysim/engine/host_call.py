@@ -68,7 +68,7 @@ class HostLeaves:
     def replaced(self, numbers: Iterable[int], arrays: Iterable[Any]) -> HostLeaves:
         """Return leaves of which some are replaced by arrays that nothing writes into any more."""
         arrays = [np.ascontiguousarray(x) for x in arrays]
-        return self.changed(numbers, arrays, [x.ctypes.data for x in arrays])
+        return self.changed(numbers, arrays, [_address(x) for x in arrays])
 
     def changed(self, numbers: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
         """Return leaves of which some are replaced."""
@@ -76,6 +76,11 @@ class HostLeaves:
         for i, x, address in zip(numbers, items, addresses, strict=True):
             new.items[i], new.addresses[i] = x, address
         return new
+
+
+def _address(x: NDArray) -> int:
+    """Return where the numbers of an array begin; ``ctypes.data`` in a third of the time where they can be changed."""
+    return ctypes.addressof(ctypes.c_char.from_buffer(x)) if x.flags.writeable else x.ctypes.data  # type: ignore[arg-type]
 
 
 class _Place(NamedTuple):
@@ -103,6 +108,7 @@ class _Layout:
                 self.places.append(_Place(len(self.sizes), 0, shape, dtype))
                 self.sizes.append(size)
         self.by_key = dict(zip((key for key, _, _ in results), self.places, strict=True))
+        self.begins = [(place.piece, place.offset) for place in self.places]
 
 
 class Results:
@@ -114,10 +120,10 @@ class Results:
         """Allocate their memory."""
         self._layout = layout
         self._memory = [np.empty(size + ALIGNMENT, np.uint8) for size in layout.sizes]
-        begins = [ctypes.addressof(ctypes.c_char.from_buffer(x)) for x in self._memory]  # type: ignore[arg-type]
+        begins = [_address(x) for x in self._memory]
         self._starts = [-begin % ALIGNMENT for begin in begins]
         first = [begin + start for begin, start in zip(begins, self._starts, strict=True)]
-        self.addresses = [first[place.piece] + place.offset for place in layout.places]
+        self.addresses = [first[piece] + offset for piece, offset in layout.begins]
 
     def array(self, key: Any) -> NDArray:
         """Return one of them. Where several share memory it is a copy, so that who keeps it keeps it alone."""
@@ -209,7 +215,8 @@ class HostCall:
         results, addresses = Results(self._layout), leaves.addresses
         for kernel, n_lanes, inputs, outputs, packed in self._launches:
             pointers = packed.pack(*[addresses[i] for i in inputs], *results.addresses[outputs])
-            kernel(n_lanes, n_steps, pointers, len(inputs))
+            if not kernel(n_lanes, n_steps, pointers, len(inputs)):
+                raise MemoryError("there is no memory for a step")
         new = [results.addresses[k] for k in self._positions]
         after = leaves.changed(self._written, [results] * len(new), new)
         if not self._flags:
@@ -219,8 +226,13 @@ class HostCall:
 
 
 def is_possible(kernels: Sequence[Kernels]) -> bool:
-    """Return whether kernels can be called without XLA: each checks its results, and none writes random keys."""
+    """Return whether kernels can be called without XLA.
+
+    Each checks its results and writes them into memory of their own; none writes random keys.
+    """
     return all(
-        kernel.program.check is not None and not any(jaxcompat.is_key(kernel.program.leaves[i]) for i in kernel.outputs)
+        kernel.program.check is not None
+        and not kernel.program.rows
+        and not any(jaxcompat.is_key(kernel.program.leaves[i]) for i in kernel.outputs)
         for kernel in kernels
     )

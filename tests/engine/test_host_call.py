@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from cases import as_numbers, needs_compiler, trees_equal
 
-from crazysim import Cars, Sim
+from crazysim import Cars, Downwash, Sim
 from crazysim.core.sharding import world_mesh
 
 pytestmark = needs_compiler
@@ -40,6 +40,52 @@ def test_it_gives_the_numbers_of_the_compiled_step(n_worlds, n_drones):
         expected = on_xla(sim, 7)
         sim.step(7)
         assert trees_equal(sim.data, expected)
+
+
+@pytest.mark.parametrize(("n_drones", "control"), [(1, "state"), (3, "attitude"), (9, "rotor_vel")])
+def test_numbers_depend_neither_on_blocks_nor_on_threads(n_drones, control):
+    """Thirteen worlds end within a block of lanes; 1,400 are shared between the cores, of which there may be one."""
+    n_worlds, after = 1400, []
+    rng = np.random.default_rng(n_drones)
+    shapes = {"pos": 3, "vel": 3, "ang_vel": 3, "rotor_vel": 4}
+    start = {name: rng.normal(1, 0.3, (n_worlds, n_drones, k)).astype(np.float32) for name, k in shapes.items()}
+    start["rotor_vel"] *= 15_000
+    for n, engine in ((n_worlds, "fused"), (13, "fused"), (13, "plain")):
+        sim = Sim(n, n_drones, control=control, engine=engine)
+        if n_drones > 1:
+            sim.add(Downwash())
+        states = {name: jnp.asarray(x[:n]) for name, x in start.items()}
+        sim.data = sim.data.replace(states=sim.data.states.replace(**states))
+        sim.step(3)
+        after.append(sim.data.states)
+    many, few, plain = after
+    assert trees_equal(jax.tree.map(lambda x: x[:13], many), few)
+    for x, y in zip(jax.tree.leaves(few), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5)  # rounding: products and sums are contracted
+
+
+def test_two_threads_of_python_may_step_at_once():
+    """One of them takes the threads of the kernel, the other does without."""
+    sims = [Sim(4000, control="attitude") for _ in range(2)]
+    for sim in sims:
+        sim.step()
+    expected = on_xla(sims[0], 60)
+    threads = [threading.Thread(target=sim.step, args=(60,)) for sim in sims]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(trees_equal(sim.data.states, expected.states) for sim in sims)
+
+
+def test_a_kernel_without_memory_is_an_error(monkeypatch):
+    monkeypatch.setenv("CXXFLAGS", "-O0 '-DALLOCATE(size)=nullptr'")
+    sim = Sim(2, 9, control="attitude")
+    sim.add(Downwash())
+    with pytest.raises(MemoryError, match="no memory"):
+        sim.step()
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no memory"):
+        jax.block_until_ready(on_xla(sim, 1))
 
 
 def test_populations_that_do_not_depend_on_each_other_are_stepped_alike():

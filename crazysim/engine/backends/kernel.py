@@ -102,12 +102,14 @@ class Body:
         """Expression of each number."""
         self.starts: dict[Slot, str] = {}
         """Expression of each number that stages write, before the first of them."""
+        self._n_shared = 0
 
     def write_loads(self) -> list[list[str]]:
         """Write loads and the stages before the steps; return the hoisted values of each segment of the loop."""
         program, exchange, writer, names = self.program, self.exchange, self.writer, self.names
         written, slots = self._slots()
-        loaded, deferred, rank = _loaded(program), _deferred(program), program.ranks
+        loaded, rank = _loaded(program), program.ranks
+        deferred = set() if exchange.depth else _deferred(program)
         names.update({(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots})
         shared = [slot for slot in slots if program.leaves[slot[0]].scope not in ("drone", "world")]
         for slot in shared:
@@ -117,7 +119,12 @@ class Body:
                 writer.line(f"const auto {names[slot]} = {_load(program, slot)};", 1)
             else:
                 names[slot] = _load(program, slot)
+        self._n_shared = len(writer.lines)
         exchange.begin(writer, 1)
+        own = [slot for slot in slots if slot not in shared and (slot not in written or slot in loaded)]
+        for i in dict.fromkeys(i for i, _ in own if i not in program.rows):
+            size, drones = program.leaves[i].size, _drones(program, i)
+            writer.line(rows(f"p{rank[i]}", _type(program, i), size, drones), self._depth)
         for slot in slots:
             kind, access = _type(program, slot[0]), _load(program, slot)
             if slot in shared:
@@ -150,11 +157,16 @@ class Body:
         self.exchange.begin(writer, 1)
         if check is not None:
             (flagged,) = writer.block(check.block, [self.names[slot] for slot in check.reads], self._depth)
-            writer.line(f"STORE(1, 1, flagged, 0, b1_lanes({flagged}))", self._depth)
+            write_results(writer, "flagged", "b1", 1, [flagged], self._depth)
         self._write_phase("last")
-        for slot in self.stored:
-            value = f"{_type(program, slot[0])}_lanes({self.names[slot]})"
-            writer.line(_store(program, slot, value), self._depth)
+        for leaf in program.written:
+            kind, pointer = _type(program, leaf), f"q{program.ranks[leaf]}"
+            values = [self.names[leaf, k] for k in range(program.leaves[leaf].size)]
+            if leaf in program.rows:
+                for k, x in enumerate(values):
+                    writer.line(f"STORE_ROW({pointer}, {k}, {kind}_lanes({x}))", self._depth)
+            else:
+                write_results(writer, pointer, kind, _drones(program, leaf), values, self._depth)
         self.exchange.end(writer, 1)
 
     def kernel(
@@ -178,11 +190,11 @@ class Body:
         """
         program, target = self.program, self.target
         threads, lanes = lanes_of_block(program.group)
-        code = "\n".join(self.writer.lines)
+        shared, code = self.writer.lines[: self._n_shared], self.writer.lines[self._n_shared :]
         if target == "cuda":
-            frame = _cuda(pointers, code, threads, lanes)
+            frame = _cuda(pointers, "\n".join(shared + code), threads, lanes)
         else:
-            frame = _host(pointers, code, self.exchange.depth > 0, kept is not None)
+            frame = _host(pointers, "\n".join(shared), "\n".join(code), self.exchange.depth > 0, kept is not None)
         widest = 8 if any("f64*" in pointer for pointer in pointers) else 4
         defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n#define BLOCK_THREADS {threads}\n"
         defines += f"#define OPERATIONS {sum(map(_n_operations, blocks))}\n"
@@ -338,11 +350,34 @@ def _load(program: Program, slot: Slot) -> str:
     return f"LOAD({program.leaves[leaf].size}, {_drones(program, leaf)}, p{rank}, {k})"
 
 
-def _store(program: Program, slot: Slot, value: str) -> str:
-    (leaf, k), rank = slot, program.ranks[slot[0]]
-    if leaf in program.rows:
-        return f"STORE_ROW(q{rank}, {k}, {value})"
-    return f"STORE({program.leaves[leaf].size}, {_drones(program, leaf)}, q{rank}, {k}, {value})"
+def rows(pointer: str, kind: str, size: int, drones: int = 1) -> str:
+    """Return the line that finds the rows of an input, one for each lane, before its loads.
+
+    Args:
+        pointer: The input.
+        kind: Type of its numbers.
+        size: Numbers of a row.
+        drones: Lanes that have the same row.
+    """
+    return f"ROWS({kind}, {size}, {drones}, {pointer})"
+
+
+def write_results(writer: Writer, pointer: str, kind: str, drones: int, values: Sequence[str], depth: int) -> None:
+    """Write the stores of all numbers of an output.
+
+    Args:
+        writer: Takes the lines.
+        pointer: The output.
+        kind: Type of its numbers.
+        drones: Lanes that have the same numbers.
+        values: Expressions of the numbers of a lane.
+        depth: Depth of the lines.
+    """
+    size = len(values)
+    writer.line(f"RESULT({kind}, {size}, {pointer})", depth)
+    for k, x in enumerate(values):
+        writer.line(f"STORE({size}, {drones}, {pointer}, {k}, {kind}_lanes({x}))", depth)
+    writer.line(f"PUT({size}, {drones}, {pointer})", depth)
 
 
 def _drones(program: Program, leaf: int) -> int:
@@ -367,42 +402,34 @@ extern "C" __global__ void __launch_bounds__({threads}, {UNBOUNDED}) advance({ar
 """
 
 
-def _host(pointers: Sequence[str], body: str, in_memory: bool, keeps: bool) -> str:
-    arguments = ", ".join(pointers)
-    kinds = [p.split("*")[0].removeprefix("const ") for p in pointers]
+def _host(pointers: Sequence[str], shared: str, body: str, in_memory: bool, keeps: bool) -> str:
+    """Return the function of a range of lanes: it computes what all share once, and the rest for each block of them."""
     n_in = sum(p.startswith("const") for p in pointers)
-    buffers = [f"({kind}*)in[{k}]" if k < n_in else f"({kind}*)out[{k - n_in}]" for k, kind in enumerate(kinds)]
-    call = f"n_lanes, n_steps, {', '.join(buffers)}"
-    sizes = "int64_t n_lanes, int n_steps"
-    memory = ("", "")
-    if keeps:
-        sizes, call = f"{sizes}, int interval, char* kept", call.replace("n_steps", "n_steps, interval, kept")
-        memory = (  # the number of steps, which XLA passes before the inputs, is followed by the interval
-            """    const int interval = ((int*)in[-1])[1];
-    char* const kept = static_cast<char*>(aligned_alloc(64, KEPT_BYTES));
-""",
-            "\n    free(kept);",
-        )
+    buffers = [f"in[{k}]" if k < n_in else f"out[{k - n_in}]" for k in range(len(pointers))]
+    defined = []
+    for pointer, buffer in zip(pointers, buffers, strict=True):
+        kind, name = pointer.split("* __restrict__ ")
+        defined.append(f"  {kind}* __restrict__ const {name} = ({kind}*){buffer};")
+    pointed, memory, free = "\n".join(defined), "", ""
+    if keeps:  # the number of steps, which XLA passes before the inputs, is followed by the interval
+        memory = """
+  const int interval = ((int*)in[-1])[1];
+  char* const kept = static_cast<char*>(ALLOCATE(KEPT_BYTES));
+  if (kept == nullptr) return false;"""
+        free = "\n  free(kept);"
     if in_memory:
-        block = f"static void advance_world(World& w, int64_t begin, {sizes}, {arguments}) {{\n"
-        each = f"""    World* const w = static_cast<World*>(aligned_alloc(64, (sizeof(World) + 63) / 64 * 64));
-    for (int64_t first = begin; first < end; first += GROUP) advance_world(*w, first, {call});
-    free(w);"""
-    else:
-        block = f"""static void advance_block(int64_t first, {sizes}, {arguments}) {{
-  const int n_active = n_lanes - first < LANES ? int(n_lanes - first) : LANES;
-  const i32v own = numbers() % GROUP;
-"""
-        each = f"    for (int64_t first = begin; first < end; first += LANES) advance_block(first, {call});"
-        each = each.join(memory)
+        memory = """
+  World* const memory = static_cast<World*>(ALLOCATE(sizeof(World)));
+  if (memory == nullptr) return false;
+  World& w = *memory;"""
+        free = "\n  free(memory);"
     return f"""
-{block}{body}
-}}
-
-static __attribute__((noinline)) void advance(int64_t n_lanes, int n_steps, void** in, void** out) {{
-  const auto run = [=](int64_t begin, int64_t end) {{
-{each}
-  }};
-  in_parallel(n_lanes, n_steps, run);
+static bool advance_range(int64_t from, int64_t to, int64_t n_lanes, int n_steps, void** in, void** out) {{
+{pointed}{memory}
+{shared}
+  {"EACH_WORLD" if in_memory else "EACH_BLOCK"} {{
+{body}
+  }}{free}
+  return true;
 }}
 """

@@ -81,14 +81,14 @@ class HostLaunch:
         run = jax.ffi.ffi_call(self._name, list(outputs), input_output_aliases=self._aliases)
         return list(run(np.asarray([n_lanes], np.int32), count, *inputs))
 
-    def on_memory(self) -> Callable[[int, int, Any, int], None]:
+    def on_memory(self) -> Callable[[int, int, Any, int], int]:
         """Return the kernel as a function on memory, without XLA, which waits until it is done.
 
         It takes the number of lanes, that of steps, the addresses of inputs and outputs (a ``ctypes`` array), and the
-        number of inputs.
+        number of inputs. It returns 0 if there was no memory for it.
         """
         call = _LOADED[self._name].crazysim_call
-        call.restype = None
+        call.restype = ctypes.c_int
         call.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_int]
         return call
 

@@ -254,6 +254,8 @@ def write(reverse: Reverse) -> Kernel:
             return type_name(s.hoisted.outputs[slot[1]].dtype)
         return type_name(program.leaves[slot[0]].number)
 
+    for i in reverse.seeds:
+        writer.line(kernel.rows(f"s{rank[i]}", type_name(program.leaves[i].number), program.leaves[i].size), 1)
     for i, k in reverse.slots():
         primal = i - n
         name = f"g{i - 2 * n}_{k}" if i >= 2 * n else f"c{rank[primal]}_{k}"
@@ -312,10 +314,10 @@ def write(reverse: Reverse) -> Kernel:
                 for i in kernel.needed(program)]  # fmt: skip
     pointers += [f"const {type_name(program.leaves[i].number)}* __restrict__ s{rank[i]}" for i in reverse.seeds]
     for i in reverse.perturbed:
-        pointers.append(f"{type_name(program.leaves[i].number)}* __restrict__ d{rank[i]}")
-        size = program.leaves[i].size
-        for k in range(size):
-            writer.line(f"STORE({size}, 1, d{rank[i]}, {k}, {names[n + i, k]})", 1)
+        number, pointer = type_name(program.leaves[i].number), f"d{rank[i]}"
+        pointers.append(f"{number}* __restrict__ {pointer}")
+        values = [names[n + i, k] for k in range(program.leaves[i].size)]
+        kernel.write_results(writer, pointer, number, 1, values, 1)
     blocks = [*(s.block for s in each for _ in range(2)), *(reverse.back[s].block for s in each)]
     return body.kernel(pointers, needed(reverse), (), (), blocks, len(carried))
 

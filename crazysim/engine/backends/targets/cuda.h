@@ -32,6 +32,9 @@ FN b1 b1_lanes(b1 x) { return x; }
 template <class T> FN T of_drone(T x, int d) { return GROUP == 1 ? x : __shfl_sync(0xffffffffu, x, threadIdx.x % 32 / GROUP * GROUP + d); }
 FN b1 of_drone(b1 x, int d) { return of_drone(i32(x), d) != 0; }
 
+#define ROWS(T, SIZE, DRONES, p)
+#define RESULT(T, SIZE, p)
+#define PUT(SIZE, DRONES, p)
 #define LOAD(SIZE, DRONES, p, k) p[lane / DRONES * SIZE + k]
 #define STORE(SIZE, DRONES, p, k, value) if (active && lane % DRONES == 0) p[lane / DRONES * SIZE + k] = value;
 // A row of numbers, one for each lane.

@@ -6,6 +6,7 @@
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "xla/ffi/api/c_api.h"
@@ -38,10 +39,16 @@ static inline unsigned bits_of_float(float x) { unsigned y; memcpy(&y, &x, 4); r
 #endif
 #define LANES_OF_BLOCK (VECTORS == 1 && GROUP <= 8 ? LANES : GROUP)
 #define UNROLL _Pragma("GCC unroll 8")
-// What is computed for one vector of a world after the other.
+// What is computed for one block of lanes after the other; and where a group has several vectors, for one world after
+// the other, and in it for one vector after the other.
+#define EACH_BLOCK \
+  for (int64_t first = from; first < to; first += LANES) \
+    if (const int n_active = n_lanes - first < LANES ? int(n_lanes - first) : LANES; true) \
+      if (const i32v own = numbers() % GROUP; true)
+#define EACH_WORLD for (int64_t world = from; world < to; world += GROUP)
 #define SWEEP \
   for (int v = 0; v < VECTORS; ++v) \
-    if (const int64_t first = begin + v * W; true) \
+    if (const int64_t first = world + v * W; true) \
       if (const int n_active = GROUP - v * W < W ? GROUP - v * W : W; true) \
         if (const i32v own = numbers() + v * W; true)
 
@@ -242,52 +249,128 @@ template <class V> FN u32v bits_u32(V x) { return (u32v)x; }
 template <class V> FN i32v bits_i32(V x) { return (i32v)x; }
 template <class V> FN f32v bits_f32(V x) { return (f32v)x; }
 
-// A block's lanes lie one after the other, each with SIZE numbers, of which the one at K is meant; where there are
-// several drones a world, a number of the world is that of lane / DRONES. Lanes beyond the last repeat it.
+// Rows of SIZE numbers, one for each lane, are loaded and stored four numbers at a time, and transposed in registers.
+#if W % 4 == 0 && defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+#define TRANSPOSES
+#endif
+#endif
+#ifdef TRANSPOSES
+template <class T> struct quad { typedef T type __attribute__((vector_size(4 * sizeof(T)))); };
+template <class T> FN typename quad<T>::type quad_at(const T* p) { typename quad<T>::type x; memcpy(&x, p, sizeof(x)); return x; }
+// A choice of four numbers of each quad of two vectors, 0 to 3 of the first and 4 to 7 of the second; a vector of the
+// quads of lanes i, i + 4, ...; and a quad of a vector.
+#define AT(i, quad) ((i) / 4 * W + (i) % 4 + 4 * (quad))
+#define OF_QUAD(quad, i, j, k, l) AT(i, quad), AT(j, quad), AT(k, quad), AT(l, quad)
+#if W == 4
+#define OF_QUADS(i, j, k, l) i, j, k, l
+#define JOINED(row, i) row(i)
+#define EACH_QUAD(F) F(0)
+#elif W == 8
+#define OF_QUADS(i, j, k, l) OF_QUAD(0, i, j, k, l), OF_QUAD(1, i, j, k, l)
+#define JOINED(row, i) __builtin_shufflevector(row(i), row(i + 4), 0, 1, 2, 3, 4, 5, 6, 7)
+#define EACH_QUAD(F) F(0) F(1)
+#else
+#define OF_QUADS(i, j, k, l) OF_QUAD(0, i, j, k, l), OF_QUAD(1, i, j, k, l), OF_QUAD(2, i, j, k, l), OF_QUAD(3, i, j, k, l)
+#define JOINED_TWO(row, i) __builtin_shufflevector(row(i), row(i + 4), 0, 1, 2, 3, 4, 5, 6, 7)
+#define JOINED(row, i) __builtin_shufflevector(JOINED_TWO(row, i), JOINED_TWO(row, i + 8), 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
+#define EACH_QUAD(F) F(0) F(1) F(2) F(3)
+#endif
+#define CHOSEN(a, b, i, j, k, l) __builtin_shufflevector(a, b, OF_QUADS(i, j, k, l))
+template <class V> FN void transpose(V* r) {
+  const V a = CHOSEN(r[0], r[1], 0, 4, 1, 5), b = CHOSEN(r[2], r[3], 0, 4, 1, 5);
+  const V c = CHOSEN(r[0], r[1], 2, 6, 3, 7), d = CHOSEN(r[2], r[3], 2, 6, 3, 7);
+  r[0] = CHOSEN(a, b, 0, 1, 4, 5); r[1] = CHOSEN(a, b, 2, 3, 6, 7);
+  r[2] = CHOSEN(c, d, 0, 1, 4, 5); r[3] = CHOSEN(c, d, 2, 3, 6, 7);
+}
+#endif
 #define RARELY static __attribute__((noinline))
-template <class V, class T> RARELY void load_each(V& x, const T* p, int size, int drones, int64_t first, int n) {
-  for (int i = 0; i < W; ++i) x[i] = p[(first + (i < n ? i : n - 1)) / drones * size];
+// The rows of a block: lanes beyond the last repeat it. Where there are several drones a world, a row of the world is
+// that of lane / DRONES.
+template <int SIZE, int DRONES, class T> RARELY const T* copied(T* to, const T* p, int64_t first, int n) {
+  for (int i = 0; i < W; ++i) memcpy(to + i * SIZE, p + (first + (i < n ? i : n - 1)) / DRONES * SIZE, SIZE * sizeof(T));
+  return to;
 }
-template <class T, class V> RARELY void store_each(T* p, int size, int drones, int64_t first, int n, const V& x) {
-  for (int i = 0; i < n; ++i) p[(first + i) / drones * size] = x[i];
+template <int SIZE, int DRONES, class T> FN const T* rows(T* buffer, const T* p, int64_t first, int n) {
+  return DRONES > 1 || n < LANES ? copied<SIZE, DRONES>(buffer, p, first, n) : p + first * SIZE;
 }
-template <int SIZE, int DRONES, class T> FN typename vec<T>::type load(const T* p, int64_t first, int n, int k) {
-  typedef typename vec<T>::type V;
-  V x;
-  if (n < LANES) load_each(x, p + k, SIZE, DRONES, first, n);
-  else for (int i = 0; i < W; ++i) x[i] = p[(first + (i < LANES ? i : LANES - 1)) / DRONES * SIZE + k];
-  return x;
+template <int SIZE, int DRONES, class T> RARELY void copy_back(const T* from, T* p, int64_t first, int n) {
+  for (int i = 0; i < n; ++i) memcpy(p + (first + i) / DRONES * SIZE, from + i * SIZE, SIZE * sizeof(T));
 }
-template <int SIZE, int DRONES> FN b1v load(const b1* p, int64_t first, int n, int k) {
-  i32v x;
-  load_each(x, p + k, SIZE, DRONES, first, n);
-  return {-x};
+template <class V> FN V as_lanes(V x) { return x; }
+typedef uint8_t u8v __attribute__((vector_size(W)));
+FN b1v as_lanes(u8v x) { return {-__builtin_convertvector(x, i32v)}; }
+template <class V> FN V as_stored(V x) { return x; }
+FN u8v as_stored(b1v x) { return __builtin_convertvector(-x.m, u8v); }
+// Number k of each row of a block.
+template <int SIZE, class T> FN typename vec<T>::type column(const T* p, int k) {
+  decltype(as_stored(typename vec<T>::type())) x;
+  if (SIZE == 1 && LANES == W) {
+    memcpy(&x, p, sizeof(x));
+    return as_lanes(x);
+  }
+#ifdef TRANSPOSES
+  if constexpr (SIZE >= 3 && sizeof(T) >= 4) {
+    const int from = SIZE <= 4 ? 0 : k / 4 * 4 + 4 <= SIZE ? k / 4 * 4 : SIZE - 4;
+    const auto row = [=](int i) __attribute__((always_inline)) -> typename quad<T>::type {
+      const T* const at = p + (i < LANES ? i : LANES - 1) * SIZE + from;
+      if (SIZE > 3 || i < LANES - 1) return quad_at(at);
+      const auto x = quad_at(at - 1);  // behind the last row there may be nothing
+      return __builtin_shufflevector(x, x, 1, 2, 3, 3);
+    };
+    typename vec<T>::type r[4] = {JOINED(row, 0), JOINED(row, 1), JOINED(row, 2), JOINED(row, 3)};
+    transpose(r);
+    return r[k - from];
+  }
+#endif
+  for (int i = 0; i < W; ++i) x[i] = p[(i < LANES ? i : LANES - 1) * SIZE + k];
+  return as_lanes(x);
 }
-template <int SIZE, int DRONES, class T, class V> FN void store(T* p, int64_t first, int n, int k, V x) {
-  if (n < LANES) return store_each(p + k, SIZE, DRONES, first, n, x);
-  for (int i = 0; i < LANES; ++i) p[(first + i) / DRONES * SIZE + k] = x[i];
+// Of rows of three, the next overwrites what is too much.
+#define PUT_QUAD(quad) UNROLL for (int j = 0; j < 4 && 4 * quad + j < LANES; ++j) { \
+  const auto y = __builtin_shufflevector(r[j], r[j], 4 * quad, 4 * quad + 1, 4 * quad + 2, 4 * quad + 3); \
+  memcpy(p + (4 * quad + j) * SIZE + from, &y, (SIZE == 3 && 4 * quad + j == LANES - 1 ? 3 : 4) * sizeof(T)); \
 }
-template <int SIZE, int DRONES> FN void store(b1* p, int64_t first, int n, int k, b1v x) {
-  if (n < LANES) return store_each(p + k, SIZE, DRONES, first, n, -x.m);
-  for (int i = 0; i < LANES; ++i) p[(first + i) / DRONES * SIZE + k] = -x.m[i];
+template <int SIZE, class T, class V> FN void put_rows(T* p, const V* x) {
+  if (SIZE == 1) {
+    const auto y = as_stored(x[0]);
+    memcpy(p, &y, LANES * sizeof(T));
+    return;
+  }
+#ifdef TRANSPOSES
+  if constexpr (SIZE >= 3 && sizeof(T) >= 4) {
+    UNROLL for (int k = 0; k < SIZE; k += 4) {
+      const int from = SIZE <= 4 ? 0 : k + 4 <= SIZE ? k : SIZE - 4;
+      V r[4] = {x[from], x[from + 1], x[from + 2], x[from + (SIZE > 3 ? 3 : 2)]};
+      transpose(r);
+      EACH_QUAD(PUT_QUAD)
+    }
+    return;
+  }
+#endif
+  for (int k = 0; k < SIZE; ++k) {
+    const auto y = as_stored(x[k]);
+    for (int i = 0; i < LANES; ++i) p[i * SIZE + k] = y[i];
+  }
 }
-#define LOAD(SIZE, DRONES, p, k) load<SIZE, DRONES>(p, first, n_active, k)
-#define STORE(SIZE, DRONES, p, k, value) store<SIZE, DRONES>(p, first, n_active, k, value);
+template <int SIZE, int DRONES, class T, class V> FN void put(T* p, int64_t first, int n, const V* x) {
+  T buffer[SIZE * W];
+  const bool direct = DRONES == 1 && n == LANES;
+  put_rows<SIZE>(direct ? p + first * SIZE : buffer, x);
+  if (!direct) copy_back<SIZE, DRONES>(buffer, p, first, n);
+}
+#define ROWS(T, SIZE, DRONES, p) T buffer_##p[SIZE * W]; const T* const rows_##p = rows<SIZE, DRONES>(buffer_##p, p, first, n_active);
+#define LOAD(SIZE, DRONES, p, k) column<SIZE>(rows_##p, k)
+#define RESULT(T, SIZE, p) vec<T>::type result_##p[SIZE];
+#define STORE(SIZE, DRONES, p, k, value) result_##p[k] = value;
+#define PUT(SIZE, DRONES, p) put<SIZE, DRONES>(p, first, n_active, result_##p);
 // A row of numbers, one for each lane.
 template <class T> FN typename vec<T>::type load_row(const T* p, int n) {
-  typename vec<T>::type x;
-  if (n < LANES) load_each(x, p, 1, 1, 0, n);
-  else if (LANES == W) memcpy(&x, p, sizeof(x));
-  else for (int i = 0; i < W; ++i) x[i] = p[i < LANES ? i : LANES - 1];
-  return x;
+  T buffer[W];
+  return column<1>(rows<1, 1>(buffer, p, 0, n), 0);
 }
-FN b1v load_row(const b1* p, int n) { i32v x; load_each(x, p, 1, 1, 0, n); return {-x}; }
-template <class T, class V> FN void store_row(T* p, int n, V x) {
-  if (n < W) store_each(p, 1, 1, 0, n, x); else memcpy(p, &x, sizeof(x));
-}
-FN void store_row(b1* p, int n, b1v x) { store_each(p, 1, 1, 0, n, -x.m); }
 #define LOAD_ROW(p, k) load_row(p + (k) * n_lanes + first, n_active)
-#define STORE_ROW(p, k, value) store_row(p + (k) * n_lanes + first, n_active, value);
+#define STORE_ROW(p, k, value) { const auto x = value; put<1, 1>(p + (k) * n_lanes, first, n_active, &x); }
 
 // Tables: constants, and the entry of one at index + k; where that is a multiple of four, also that and the next three.
 #define TABLE static const
@@ -309,65 +392,24 @@ FN four<f32> lookup_four(const f32* p, i32 index, i32 k) {
   memcpy(&r, p + index + k, sizeof(r));
   return r;
 }
-// Rows of four numbers are loaded whole and transposed, four at a time.
-typedef f32 f32x4 __attribute__((vector_size(16)));
 FN four<f32v> lookup_four(const f32* p, i32v index, i32 k) {
   if (!any(ne_(index, index[0]))) {
     const four<f32> r = lookup_four(p, index[0], k);
     return {{lift(r.x[0]), lift(r.x[1]), lift(r.x[2]), lift(r.x[3])}};
   }
-  f32 columns[4][W];
-  int i = 0;
-#if defined(__GNUC__) && !defined(__clang__)
-  typedef i32 i32x4 __attribute__((vector_size(16)));
-  for (; i + 4 <= W; i += 4) {
-    f32x4 r[4];
-    for (int j = 0; j < 4; ++j) memcpy(&r[j], p + index[i + j] + k, 16);
-    const f32x4 a = __builtin_shuffle(r[0], r[1], i32x4{0, 4, 1, 5}), b = __builtin_shuffle(r[2], r[3], i32x4{0, 4, 1, 5});
-    const f32x4 c = __builtin_shuffle(r[0], r[1], i32x4{2, 6, 3, 7}), d = __builtin_shuffle(r[2], r[3], i32x4{2, 6, 3, 7});
-    const f32x4 out[4] = {__builtin_shuffle(a, b, i32x4{0, 1, 4, 5}), __builtin_shuffle(a, b, i32x4{2, 3, 6, 7}),
-                          __builtin_shuffle(c, d, i32x4{0, 1, 4, 5}), __builtin_shuffle(c, d, i32x4{2, 3, 6, 7})};
-    for (int j = 0; j < 4; ++j) memcpy(&columns[j][i], &out[j], 16);
-  }
-#endif
-  for (; i < W; ++i) for (int j = 0; j < 4; ++j) columns[j][i] = p[index[i] + k + j];
+#ifdef TRANSPOSES
+  const auto row = [=](int i) __attribute__((always_inline)) { return quad_at(p + index[i] + k); };
+  four<f32v> r = {{JOINED(row, 0), JOINED(row, 1), JOINED(row, 2), JOINED(row, 3)}};
+  transpose(r.x);
+#else
   four<f32v> r;
-  memcpy(&r, columns, sizeof(r));
+  for (int i = 0; i < W; ++i) for (int j = 0; j < 4; ++j) r.x[j][i] = p[index[i] + k + j];
+#endif
   return r;
 }
 
-// Work that is worth it is shared between the cores, in whole blocks of lanes. Of the system's headers the small ones:
-// reading those of std::thread would take as long as reading all of this.
-static int64_t n_cores() {  // that this process may use
-#if defined(__linux__)
-  cpu_set_t set;
-  if (sched_getaffinity(0, sizeof(set), &set) == 0) return CPU_COUNT(&set);
+// Memory, at the beginning of a line of the cache.
+#ifndef ALLOCATE
+#define ALLOCATE(size) aligned_alloc(64, ((size) + 63) / 64 * 64)
 #endif
-  return sysconf(_SC_NPROCESSORS_ONLN);
-}
-// Operations on a block that are worth a thread: some 50 us, as a sleeping core takes up to 100 us to wake. Loading and
-// storing a block takes as long as some steps.
-#define WORTH_A_THREAD (1 << 19)
-#define IO_STEPS 8
-static int64_t least(int64_t a, int64_t b) { return b < a ? b : a; }
-template <class F> struct Share { const F* run; int64_t from, to; pthread_t thread; bool begun; };
-template <class F> static void* work(void* share) {
-  const auto s = static_cast<Share<F>*>(share);
-  (*s->run)(s->from, s->to);
-  return nullptr;
-}
-template <class F> static void in_parallel(int64_t n_lanes, int64_t n_steps, const F& run) {
-  const int most = 256;
-  const int64_t n_blocks = (n_lanes + LANES_OF_BLOCK - 1) / LANES_OF_BLOCK;
-  const int64_t worth = n_blocks * VECTORS * (n_steps + IO_STEPS) * OPERATIONS / WORTH_A_THREAD;
-  const int64_t n_threads = worth < 2 ? 1 : least(least(n_cores(), most), worth);
-  const auto bound = [=](int64_t k) { return least(n_lanes, n_blocks * k / n_threads * LANES_OF_BLOCK); };
-  Share<F> shares[most];
-  for (int64_t k = 1; k < n_threads; ++k) {
-    shares[k] = {&run, bound(k), bound(k + 1), pthread_t(), false};
-    shares[k].begun = pthread_create(&shares[k].thread, nullptr, work<F>, &shares[k]) == 0;
-    if (!shares[k].begun) work<F>(&shares[k]);
-  }
-  run(0, bound(1));
-  for (int64_t k = 1; k < n_threads; ++k) if (shares[k].begun) pthread_join(shares[k].thread, nullptr);
-}
+
