@@ -38,8 +38,14 @@ def compiled(*static: str) -> Callable[[F], F]:
 
 def to_host(x: Any, rows: Any) -> NDArray:
     """Return ``x[rows]`` on the host; rows of an array of the CPU are read there, without a compiled call."""
-    on_cpu = not isinstance(x, jax.Array) or all(device.platform == "cpu" for device in x.devices())
-    return np.asarray(x)[rows] if on_cpu else np.asarray(x[rows])
+    return np.asarray(x)[rows] if on_host(x) else np.asarray(x[rows])
+
+
+def on_host(x: Any) -> bool:
+    """Return whether NumPy reads an array without copying it from a device, or has it already."""
+    if isinstance(x, jax.core.Tracer):
+        return False
+    return not isinstance(x, jax.Array) or all(device.platform == "cpu" for device in x.devices())
 
 
 def is_traced(values: Sequence[Any]) -> bool:

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from crazysim import jaxcompat
 from crazysim.core import functional as F
 from crazysim.core.data import SimData, command_shape
 from crazysim.core.locking import locked
 from crazysim.core.population import Population
-from crazysim.eager import compiled
+from crazysim.eager import compiled, on_host
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import PyTree
 
@@ -102,7 +103,7 @@ class Member:
             return command
         return np.pad(np.asarray(command), [(0, 0)] * (np.ndim(command) - 1) + [(0, n_rotors - own)])
 
-    def _with_checked_row(self, what: str, x: Array, value: ArrayLike) -> Array:
+    def _with_checked_row(self, what: str, x: Array, value: ArrayLike) -> Array | NDArray:
         shape = x.shape[:1] + x.shape[2:]
         if np.shape(value) not in (shape[1:], shape):
             raise ValueError(
@@ -134,15 +135,31 @@ class Member:
         return f"<{self.name}: {self.population} {self.index}>"
 
 
-@compiled()
-def _row(x: Array, index: Array | int) -> Array:
+def _row(x: Array | NDArray, index: int) -> Any:
     """Return the row of one drone or member. (n_worlds, ...)"""
+    if isinstance(x, np.ndarray):
+        return x[:, index]
+    if on_host(x) and not jaxcompat.is_key(x):
+        return jaxcompat.put_own(np.asarray(x)[:, index].copy(), x.sharding)
+    return _row_on_device(x, index)
+
+
+def _with_row(x: Array, index: int, value: ArrayLike) -> Array | NDArray:
+    """Return rows with that of one drone or member replaced, on the host if all are there. (n_worlds, n, ...)"""
+    if on_host(x) and not isinstance(value, jax.Array):
+        rows = np.array(x)
+        rows[:, index] = value
+        return rows
+    return _with_row_on_device(x, index, value)
+
+
+@compiled()
+def _row_on_device(x: Array, index: Array | int) -> Array:
     return x[:, index]
 
 
 @compiled()
-def _with_row(x: Array, index: Array | int, value: ArrayLike) -> Array:
-    """Return rows with that of one drone or member replaced. (n_worlds, n, ...)"""
+def _with_row_on_device(x: Array, index: Array | int, value: ArrayLike) -> Array:
     return x.at[:, index].set(value)
 
 
