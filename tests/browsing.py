@@ -82,8 +82,8 @@ class Browser:
         return np.nonzero(of_colour(self.picture(), rgb))
 
     def find(self, rgb, near):
-        """Return column and row of the middle of what has a hue, once that is near a place or half a minute is over."""
-        place, deadline = np.full(2, np.inf), time.monotonic() + 30
+        """Return column and row of the middle of what has a hue, once that is near a place."""
+        place, deadline = np.full(2, np.inf), time.monotonic() + 300
         while time.monotonic() < deadline and not np.allclose(place, near, atol=NEAR):
             rows, columns = self.mask(rgb)
             if len(rows) > 20:

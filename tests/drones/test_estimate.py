@@ -1,7 +1,6 @@
 """Airframes that are estimated from a few numbers."""
 
 import tomllib
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +12,10 @@ from crazysim.dynamics import supported_dynamics
 
 pytestmark = pytest.mark.fast
 
-QUAD: dict[str, Any] = {"mass": 1.2, "propeller": 0.127, "arm": 0.12, "thrust_to_weight": 4.0}
-SMALL: dict[str, Any] = {"mass": 0.25, "propeller": 0.0762, "arm": 0.07, "thrust_to_weight": 4.0}
-HEXA: dict[str, Any] = {"mass": 4.0, "propeller": 0.33, "arm": 0.36, "n_rotors": 6, "thrust_to_weight": 2.4}
-TABLE: dict[str, Any] = {"throttle": [30, 60, 100], "thrust_g": [200, 600, 1200], "rpm": [10e3, 17.3e3, 24.5e3]}
+QUAD = {"mass": 1.2, "propeller": 0.127, "arm": 0.12, "thrust_to_weight": 4.0}
+SMALL = {"mass": 0.25, "propeller": 0.0762, "arm": 0.07, "thrust_to_weight": 4.0}
+HEXA = {"mass": 4.0, "propeller": 0.33, "arm": 0.36, "n_rotors": 6, "thrust_to_weight": 2.4}
+TABLE = {"throttle": [30, 60, 100], "thrust_g": [200, 600, 1200], "rpm": [10e3, 17.3e3, 24.5e3]}
 
 
 def load(**numbers):

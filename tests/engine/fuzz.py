@@ -83,7 +83,7 @@ SPECIAL = np.float32(
 
 def given(rng: np.random.Generator) -> Given:
     """Return inputs: ordinary numbers in a third of the worlds, ties in the next, special numbers in the last."""
-    fields: list[dict[str, Any]] = [{}, {}, {}]
+    fields: list[dict] = [{}, {}, {}]
     for letter, shapes in SHAPES.items():
         for shape in shapes:
             size = (N_WORLDS, N_DRONES, *shape)
@@ -102,7 +102,7 @@ def given(rng: np.random.Generator) -> Given:
     return Given(*fields)
 
 
-def flat(g: Given) -> dict[str, Any]:
+def flat(g: Given) -> dict:
     """Return inputs by name."""
     return {**g.numbers, **g.vectors, **g.matrices}
 
@@ -132,7 +132,7 @@ class Case:
     def stage(self, name: str) -> Stage:
         """Return a stage that writes all values of the program under a name."""
 
-        def write(data: Any) -> Any:
+        def write(data):
             results = data.plugins["results"]
             floats, others = packed(self.program.values(flat(data.plugins["given"])), len(self.program.inputs))
             new = getattr(results, self.scope) | {f"{name}f": floats, f"{name}o": others}
@@ -140,7 +140,7 @@ class Case:
 
         return Stage(write, self.scope, name=name)
 
-    def blank(self, name: str) -> dict[str, Any]:
+    def blank(self, name: str) -> dict:
         """Return the slots that the stage writes to, of all worlds."""
         results = self.avals[len(self.program.inputs) :]
         n_floats = sum(aval.size for aval in results if jnp.issubdtype(aval.dtype, jnp.floating))
@@ -170,7 +170,7 @@ class Case:
         return values
 
 
-def packed(values: Sequence[Any], n_inputs: int) -> tuple[Any, Any]:
+def packed(values: Sequence, n_inputs: int) -> tuple:
     """Return the values behind the inputs as one vector of floats and one of integers."""
     floats, others = [jnp.zeros(0, np.float32)], [jnp.zeros(0, np.int32)]
     for x in values[n_inputs:]:
@@ -183,7 +183,7 @@ def packed(values: Sequence[Any], n_inputs: int) -> tuple[Any, Any]:
 
 
 @stage("drone")
-def turned(data: Any) -> Any:
+def turned(data):
     """Turn the vectors round, so that they are not the same at every step; engines hoist what is."""
     given = data.plugins["given"]
     vectors = {name: x[::-1] for name, x in given.vectors.items()}
@@ -272,7 +272,7 @@ class Fuzzer:
 
     def _step_of(self, cases: Sequence[Case]) -> tuple[Any, dict[str, Stage]]:
         stages = {f"p{k}": case.stage(f"p{k}") for k, case in enumerate(cases)} | {"turned": turned}
-        slots: dict[str, dict[str, Any]] = {"drone": {}, "world": {}}
+        slots: dict[str, dict] = {"drone": {}, "world": {}}
         for k, case in enumerate(cases):
             slots[case.scope] |= case.blank(f"p{k}")
         plugins = {"given": self.given, "results": Results(**slots)}
@@ -319,7 +319,7 @@ class Fuzzer:
                 yield find
                 break
 
-    def _first_difference(self, case: Case, engine: str, plain: list[Any], other: list[Any]) -> Find | None:
+    def _first_difference(self, case: Case, engine: str, plain: list, other: list) -> Find | None:
         """Return the first value that differs for no good reason."""
         n = len(case.program.inputs)
         inputs = [self._lanes(case.scope, name) for name in case.program.inputs]
@@ -347,15 +347,15 @@ class Fuzzer:
         return x.reshape(-1, *x.shape[2:]) if scope == "drone" else x
 
 
-def _of_values(line: str, *values: Any) -> Any:
+def _of_values(line: str, *values: Any):
     return evaluate(line, values)
 
 
-def _of_inputs(program: Program, k: int, *inputs: Any) -> Any:
+def _of_inputs(program: Program, k: int, *inputs: Any):
     return program.values(dict(zip(program.inputs, inputs, strict=True)))[k]
 
 
-def _text(x: Any) -> str:
+def _text(x) -> str:
     x = np.asarray(x)
     return np.array2string(x.astype(np.float32) if x.dtype.kind == "V" else x, separator=",", precision=9).replace(
         "\n", ""

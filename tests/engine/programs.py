@@ -21,7 +21,7 @@ from jax import lax
 LARGEST = 24
 """Most elements of a value; larger ones only make programs slow."""
 
-NAMES: dict[str, Any] = {"jax": jax, "jnp": jnp, "lax": lax, "np": np}
+NAMES: dict = {"jax": jax, "jnp": jnp, "lax": lax, "np": np}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Program:
     lines: tuple[str, ...]
     """Expressions, each of which is the next value."""
 
-    def values(self, given: dict[str, Any]) -> list[Any]:
+    def values(self, given: dict) -> list:
         """Return all values: the inputs, and those of the lines."""
         values = [given[name] for name in self.inputs]
         for line in self.lines:
@@ -47,12 +47,12 @@ class Program:
 
 
 @functools.cache
-def _compiled(line: str, n: int) -> Callable[..., Any]:
+def _compiled(line: str, n: int) -> Callable:
     arguments = ", ".join(f"v{k}" for k in range(n))
     return eval(f"lambda {arguments}: {line}", dict(NAMES))
 
 
-def evaluate(line: str, values: Sequence[Any]) -> Any:
+def evaluate(line: str, values: Sequence):
     """Return the value of a line."""
     return _compiled(line, len(values))(*values)
 
@@ -66,7 +66,7 @@ class Draw:
         self.shape: tuple[int, ...] = ()
         """Shape of the value that was chosen last."""
 
-    def choice(self, options: Sequence[Any]) -> Any:
+    def choice(self, options: Sequence):
         """Return one of some options."""
         return options[int(self.rng.integers(len(options)))]
 
@@ -99,7 +99,7 @@ class Draw:
         return self.choice(["0.5", "2.0", "-1.0", "3.0", "0.25", "1e-3", "-2.5", "1.0", "7.0"])
 
 
-def _kind(dtype: Any) -> str:
+def _kind(dtype) -> str:
     return "f" if jnp.issubdtype(dtype, jnp.floating) else np.dtype(dtype).kind
 
 
@@ -553,7 +553,7 @@ def draw(rng: np.random.Generator, given: dict[str, jax.ShapeDtypeStruct], n_lin
     return shortened(Program(inputs, tuple(lines)))
 
 
-def _drawn(rng: np.random.Generator, fn: Template, avals: Sequence[Any]) -> tuple[str, Any]:
+def _drawn(rng: np.random.Generator, fn: Template, avals: Sequence) -> tuple[str, Any]:
     """Return a line and its shape and type; None instead of those if JAX refuses it or it is too large."""
     try:
         line = fn(Draw(rng, avals))

@@ -35,12 +35,12 @@ MOVES_ONLY = frozenset(
 functions."""
 
 
-def keeps_sign_of_zero(fn: Any, avals: Sequence[Any]) -> bool:
+def keeps_sign_of_zero(fn, avals: Sequence) -> bool:
     """Return True where a function of values of these shapes and types only moves, selects and compares numbers."""
     return all(name in MOVES_ONLY for name in _primitives(_inlined(fn, avals).jaxpr))
 
 
-def _primitives(jaxpr: Any) -> Iterator[str]:
+def _primitives(jaxpr) -> Iterator[str]:
     for eqn in jaxpr.eqns:
         yield eqn.primitive.name
         for x in jax.tree.leaves(
@@ -50,7 +50,7 @@ def _primitives(jaxpr: Any) -> Iterator[str]:
                 yield from _primitives(getattr(x, "jaxpr", x))
 
 
-def _inlined(fn: Any, args: Sequence[Any]) -> Any:
+def _inlined(fn, args: Sequence):
     """Return the jaxpr of a function, with the functions that it calls inlined if JAX can do that."""
     try:
         with jax.disable_jit():
@@ -72,7 +72,7 @@ def close(a: np.ndarray, b: np.ndarray, signed: bool) -> np.ndarray:
     return ((a == b) & zeros) | (np.isnan(a) & np.isnan(b)) | (near & zeros & np.isfinite(a) & np.isfinite(b))
 
 
-def explained(fn: Any, values: list[np.ndarray], found: np.ndarray, signed: bool) -> np.ndarray:
+def explained(fn, values: list[np.ndarray], found: np.ndarray, signed: bool) -> np.ndarray:
     """Return for which lanes a value is what a function gives for its operands, within rounding.
 
     The function is computed primitive by primitive, many times, and every result of arithmetic disturbed by a few units
@@ -99,23 +99,23 @@ EXACT = MOVES_ONLY | {"max", "min", "sort", "while", "scan", "cond", "reduce_max
 """Primitives whose results are not disturbed: they do not round, or consist of others."""
 
 
-def _abs_finite(x: Any) -> Any:
+def _abs_finite(x):
     return jnp.where(jnp.isfinite(x), jnp.abs(x), 1)
 
 
-def _product_leaves_range(eqn: Any, x: Any) -> Any:
+def _product_leaves_range(eqn, x):
     """Return where some order of multiplication overflows or vanishes on the way."""
     size = jnp.where(np.asarray(x) == 0, 1, _abs_finite(x))
     (largest,), (smallest,) = _apply(eqn, [jnp.maximum(size, 1)]), _apply(eqn, [jnp.minimum(size, 1)])
     return jnp.isinf(largest) | (smallest < TINY)
 
 
-def _sum_leaves_range(eqn: Any, *args: Any) -> Any:
+def _sum_leaves_range(eqn, *args: Any):
     """Return where some order of addition overflows on the way."""
     return jnp.isinf(_apply(eqn, [_abs_finite(x) for x in args])[0])
 
 
-def _denormal_divisor(eqn: Any, x: Any, y: Any) -> Any:
+def _denormal_divisor(eqn, x, y):
     y = np.asarray(y)  # in NumPy, which takes them for what they are
     return np.broadcast_to((y != 0) & (np.abs(y) < TINY), np.broadcast_shapes(np.shape(x), y.shape))
 
@@ -123,7 +123,7 @@ def _denormal_divisor(eqn: Any, x: Any, y: Any) -> Any:
 ANY = (np.inf, -np.inf, np.nan, 0.0)
 """Numbers that span all."""
 
-ALTERNATIVES: dict[tuple[str, str], tuple[Callable[..., Any], tuple[float, ...]]] = {
+ALTERNATIVES: dict[tuple[str, str], tuple[Callable, tuple[float, ...]]] = {
     # Where a product overflows before it is added, a contracted multiply-add has a finite sum, or another infinity.
     ("mul", "f"): (_sum_leaves_range, ANY),
     ("dot_general", "f"): (_sum_leaves_range, ANY),
@@ -150,7 +150,7 @@ LARGEST_ANGLE = 1e12
 def allow_gpu() -> None:
     """Allow what kernels on a GPU may find besides, from now on: any sine, cosine and tangent of a very large angle."""
 
-    def is_large(eqn: Any, x: Any) -> Any:
+    def is_large(eqn, x):
         del eqn
         return jnp.abs(x) > LARGEST_ANGLE
 
@@ -158,13 +158,13 @@ def allow_gpu() -> None:
         ALTERNATIVES[name, "f"] = is_large, numbers
 
 
-def alternatives(eqn: Any, args: Sequence[Any], out: Any) -> tuple[Any, tuple[float, ...]] | None:
+def alternatives(eqn, args: Sequence, out) -> tuple[Any, tuple[float, ...]] | None:
     """Return where the result of an equation is not defined to a few units, and what it may be there."""
     where, numbers = ALTERNATIVES.get((eqn.primitive.name, np.dtype(out.dtype).kind), (None, ()))
     return None if where is None else (where(eqn, *args), numbers)
 
 
-def _disturbed(fn: Any, values: list[np.ndarray], n_lanes: int) -> Any:
+def _disturbed(fn, values: list[np.ndarray], n_lanes: int):
     """Return a function's value with disturbed arithmetic. (SAMPLES, n_lanes, ...)"""
     rng = np.random.default_rng(0)
     samples = [jnp.broadcast_to(x, (SAMPLES, *x.shape)) for x in values]
@@ -172,10 +172,10 @@ def _disturbed(fn: Any, values: list[np.ndarray], n_lanes: int) -> Any:
     jaxpr = _inlined(jax.vmap(each, axis_size=SAMPLES), samples)
     strength = np.linspace(0, 4, SAMPLES)  # the first is not disturbed
 
-    def is_sampled(x: Any) -> bool:
+    def is_sampled(x) -> bool:
         return not jax.dtypes.issubdtype(x.dtype, jax.dtypes.extended) and x.shape[:2] == (SAMPLES, n_lanes)
 
-    def noisy(x: Any, absolute: float = 0.0) -> Any:
+    def noisy(x, absolute: float = 0.0):
         if not is_sampled(x) or not jnp.issubdtype(x.dtype, jnp.floating):
             return x
         unit = (rng.uniform(-1, 1, x.shape) * strength.reshape(-1, *[1] * (x.ndim - 1))).astype(np.float32)
@@ -188,7 +188,7 @@ def _disturbed(fn: Any, values: list[np.ndarray], n_lanes: int) -> Any:
         kept = jnp.where(denormal & flushed, jnp.zeros_like(x), x)
         return jnp.where(jnp.isfinite(disturbed) & ~denormal, disturbed, kept)
 
-    def any_alternative(eqn: Any, args: list[Any], out: Any) -> Any:
+    def any_alternative(eqn, args: list, out):
         found = alternatives(eqn, args, out) if is_sampled(out) else None
         if found is None:
             return out
@@ -199,7 +199,7 @@ def _disturbed(fn: Any, values: list[np.ndarray], n_lanes: int) -> Any:
             out = jnp.where(where & (pick == k), jnp.asarray(number, out.dtype), out)
         return out
 
-    env: dict[Any, Any] = dict(zip(jaxpr.jaxpr.constvars, jaxpr.consts, strict=True))
+    env: dict = dict(zip(jaxpr.jaxpr.constvars, jaxpr.consts, strict=True))
     env.update(zip(jaxpr.jaxpr.invars, map(noisy, samples), strict=True))
     for eqn in jaxpr.jaxpr.eqns:
         args = [v.val if hasattr(v, "val") else env[v] for v in eqn.invars]
@@ -212,6 +212,6 @@ def _disturbed(fn: Any, values: list[np.ndarray], n_lanes: int) -> Any:
     return out.val if hasattr(out, "val") else env[out]
 
 
-def _apply(eqn: Any, args: list[Any]) -> list[Any]:
+def _apply(eqn, args: list) -> list:
     out = eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(eqn.params))
     return list(out) if eqn.primitive.multiple_results else [out]

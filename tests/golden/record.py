@@ -35,7 +35,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -103,7 +102,7 @@ def variants(dynamics: str, control: str) -> dict[str, tuple[str, dict[str, int]
     return found
 
 
-def hover_thrust(params: dict[str, Any]) -> float:
+def hover_thrust(params: dict) -> float:
     """Compute the collective thrust command in N that holds the weight of an airframe."""
     weight = float(params["mass"]) * GRAVITY
     if "cmd_f_coef" in params:
@@ -111,13 +110,13 @@ def hover_thrust(params: dict[str, Any]) -> float:
     return weight
 
 
-def force_to_rpm(force: float, params: dict[str, Any]) -> float:
+def force_to_rpm(force: float, params: dict) -> float:
     """Solve the quadratic thrust curve of one rotor for its speed in rpm."""
     c, b, a = (float(x) for x in np.ravel(params["rpm2thrust"]))
     return (-b + np.sqrt(b * b - 4.0 * a * (c - force))) / (2.0 * a)
 
 
-def rotor_limits(dynamics: str, params: dict[str, Any]) -> tuple[float, float]:
+def rotor_limits(dynamics: str, params: dict) -> tuple[float, float]:
     """Compute the bounds of `rotor_vel`: rpm of one rotor, or N of collective thrust for fitted dynamics."""
     low, high = float(params["thrust_min"]), float(params["thrust_max"])
     if dynamics == "first_principles":
@@ -141,7 +140,7 @@ def nearly_level_rotors(rng: np.random.Generator) -> np.ndarray:
     return 1.0 + twist * YAW + tilt[0] * ROLL + tilt[1] * PITCH
 
 
-def draw_world(dynamics: str, control: str, params: dict[str, Any], world: int) -> dict[str, np.ndarray]:
+def draw_world(dynamics: str, control: str, params: dict, world: int) -> dict[str, np.ndarray]:
     """Draw the start, the external force and torque and the command of one world."""
     rng = np.random.default_rng([SEED, world])
     open_loop = control in OPEN_LOOP
@@ -210,13 +209,13 @@ def draw_world(dynamics: str, control: str, params: dict[str, Any], world: int) 
     }
 
 
-def draw_flight(dynamics: str, control: str, params: dict[str, Any]) -> dict[str, np.ndarray]:
+def draw_flight(dynamics: str, control: str, params: dict) -> dict[str, np.ndarray]:
     """Draw what both worlds begin with, with shape (worlds, 1, k) for each quantity."""
     worlds = [draw_world(dynamics, control, params, world) for world in range(N_WORLDS)]
     return {what: np.stack([world[what] for world in worlds])[:, None, :] for what in worlds[0]}
 
 
-def check_dtypes(sim: Any, dtype: np.dtype, where: str) -> None:
+def check_dtypes(sim, dtype: np.dtype, where: str) -> None:
     """Raise unless the data of a sim and everything that its step computes have one float type."""
     import jax
     import jax.numpy as jnp
@@ -230,7 +229,7 @@ def check_dtypes(sim: Any, dtype: np.dtype, where: str) -> None:
         raise RuntimeError(f"{where}: the step computes in another float type than {dtype}")
 
 
-def check_params(sim: Any, params: dict[str, Any], gains: dict[str, Any], dtype: np.dtype, where: str) -> None:
+def check_params(sim, params: dict, gains: dict, dtype: np.dtype, where: str) -> None:
     """Raise unless the parameters inside a sim are those of the peer's files to the last bit of the type.
 
     A parameter that was float32 for a moment is float64 again afterwards, but has lost its last digits.

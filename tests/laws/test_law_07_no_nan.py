@@ -191,7 +191,7 @@ def test_a_minute_of_any_constant_command_stays_finite(dynamics, control, integr
     for _ in range(60):
         sim.step(sim.freq)
         fastest = np.maximum(fastest, np.abs(np.asarray(sim.data.states.ang_vel)[:, 0]).max(-1))
-    for field in dataclasses.fields(sim.data.states):  # type: ignore[arg-type]
+    for field in dataclasses.fields(sim.data.states):
         name, x = field.name, getattr(sim.data.states, field.name)
         assert np.all(np.isfinite(x)), (
             name,
