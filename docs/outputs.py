@@ -1,7 +1,8 @@
 """Printed output of the Python blocks of a page: run them, compare, and write the output into the page.
 
-A block ``text`` that follows a block ``python`` shows what that block prints. ``python docs/outputs.py PAGE ...`` runs
-pages and writes the outputs that are missing or have changed; ``tests/docs/test_pages.py`` compares them.
+A block ``text`` that follows a block ``python`` shows what that block prints. ``text title="for example"`` shows what
+it printed once: times and other numbers that differ from run to run are not compared. ``python docs/outputs.py PAGE``
+runs a page and writes the outputs that are missing or have changed; ``tests/docs/test_pages.py`` compares them.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 BLOCK = re.compile(
-    r"^```python\n(?P<code>.*?)^```\n(?:\n```text\n(?P<output>.*?)^```\n)?",
+    r"^```python\n(?P<code>.*?)^```\n(?:\n```text(?P<example> title=\"for example\")?\n(?P<output>.*?)^```\n)?",
     re.DOTALL | re.MULTILINE,
 )
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -34,6 +35,9 @@ class Block(NamedTuple):
     output: str | None
     """Output that the page shows below the block; None where it shows none."""
 
+    example: bool
+    """True where the output is an example: other runs print other numbers, or other numbers of lines."""
+
     end: int
     """Offset in the page of the end of the block, its output included."""
 
@@ -42,7 +46,7 @@ def blocks(text: str) -> Iterator[Block]:
     """Yield the Python blocks of a page in order."""
     for match in BLOCK.finditer(text):
         code = "\n" * text[: match.start("code")].count("\n") + match["code"]
-        yield Block(code, match["output"], match.end())
+        yield Block(code, match["output"], match["example"] is not None, match.end())
 
 
 def run(block: Block, page: Path, namespace: dict[str, Any]) -> str:
@@ -52,12 +56,15 @@ def run(block: Block, page: Path, namespace: dict[str, Any]) -> str:
     return "".join(f"{line.rstrip()}\n" for line in printed.getvalue().strip("\n").splitlines())
 
 
-def same(shown: str, printed: str) -> bool:
+def same(shown: str, printed: str, example: bool = False) -> bool:
     """Return True where the output that a page shows is that of its block.
 
-    ``...`` stands for any text. Spaces and line breaks do not count. Integers are equal. Other numbers may differ by
-    2%, by 2 in the last digit that the page shows, or by 2e-5: processors and versions of JAX round differently.
+    An example has the same words, whatever the numbers. In other outputs ``...`` stands for any text. Spaces and line
+    breaks do not count. Integers are equal. Other numbers may differ by 2%, by 2 in the last digit that the page shows,
+    or by 2e-5: processors and versions of JAX round differently.
     """
+    if example:
+        return _words(shown) == _words(printed)
     parts = [TOKEN.findall(part) for part in shown.split("...")]
     tokens = TOKEN.findall(printed)
     if len(parts) == 1:
@@ -73,6 +80,10 @@ def same(shown: str, printed: str) -> bool:
             return False
         start = found + len(part)
     return True
+
+
+def _words(text: str) -> set[str]:
+    return {token for token in TOKEN.findall(text) if not NUMBER.fullmatch(token)}
 
 
 def _equal(shown: list[str], printed: list[str]) -> bool:
@@ -101,10 +112,11 @@ def _update(page: Path) -> int:
         printed = run(block, page, namespace)
         piece = text[start : block.end]
         start = block.end
-        if printed and not (block.output is not None and same(block.output, printed)):
+        if printed and not (block.output is not None and same(block.output, printed, block.example)):
             if block.output is not None:
-                piece = piece[: piece.rindex("\n```text\n")]
-            piece += f"\n```text\n{printed}```\n"
+                piece = piece[: piece.rindex("\n```text")]
+            title = ' title="for example"' if block.example else ""
+            piece += f"\n```text{title}\n{printed}```\n"
             changed += 1
         pieces.append(piece)
     if changed:

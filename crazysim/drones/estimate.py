@@ -41,6 +41,8 @@ CELL_VOLTAGE = 3.7
 """Nominal voltage of a lithium-polymer cell, V."""
 CELL_RESISTANCE = 0.015
 """Resistance of a cell times its capacity, ohm A h."""
+DISC_LOADING = 1e4
+"""Thrust over disc area that only wrong units exceed, N/m^2: an induced velocity of 64 m/s; bumblebee has 1,200."""
 COLUMNS = {
     "throttle": ("throttle", 1.0),
     "thrust_n": ("thrust", 1.0),
@@ -159,6 +161,7 @@ def estimate_airframe(
     )
     file.add("rotors", "yaw_torque_sign", signs, "1", "spins" if positions is not None or spins else "layout")
     thrust = _thrusts(file, mass, len(places), propeller, thrust_to_weight, motor_table, pitch)
+    _plausible(mass, propeller, places, thrust)
     file.add("rotors", "thrust_min", IDLE * thrust, "N", "thrust_min")
     blade = 0.015 * (propeller / 0.279) ** 2
     file.add("rotors", "inertia", blade * propeller**2 / 12, "kg m^2", "rotor_inertia")
@@ -251,7 +254,7 @@ def _rotors(
     if closest < propeller * (1 - 1e-6):
         raise ConfigError(
             f"expected propellers that do not touch, got a diameter of {propeller:g} m and rotors {closest:.3g} m "
-            f"apart. Use a longer arm, a smaller propeller, or other heights of the rotors."
+            f"apart. Use a longer arm, a smaller propeller (5 inches are 0.127 m), or other heights of the rotors."
         )
     if spins is None:
         if len(places) % 2:
@@ -318,6 +321,17 @@ def _thrusts(file: _File, mass: float, n: int, diameter: float, ratio: Any, tabl
         source = "motor_power"
     file.add("rotors", "torque_curve", np.array([0, 0, torque]), "N m, N m/rpm, N m/rpm^2", source, merit=merit)
     return thrust
+
+
+def _plausible(mass: float, propeller: float, places: NDArray, thrust: float) -> None:
+    """Refuse numbers in other units, such as grams or inches."""
+    pressure, reach = thrust / (np.pi * propeller**2 / 4), float(np.max(np.linalg.norm(places, axis=-1)))
+    if pressure > DISC_LOADING or reach > 20 * propeller:
+        raise ConfigError(
+            f"expected mass in kg and lengths in m, got {mass:g} kg, propellers of {propeller:g} m, rotors up to "
+            f"{reach:.3g} m from the centre, and {thrust:.3g} N of thrust each: {pressure:.3g} N/m^2 of propeller. "
+            f"Convert units: 5 inches are 0.127 m."
+        )
 
 
 def _quadratic(rpm: NDArray, values: NDArray) -> tuple[float, float]:

@@ -143,7 +143,7 @@ class Env(ABC):
 
     def _kind_of_step(self) -> str:
         """Return the part of ``explain`` about the step: that it is one kernel, or that it is not, with the reason."""
-        return "not one kernel: new episodes do not begin within it; see AutoReset"
+        return "not one kernel: it begins no new episodes. AutoReset(env), which training and Gymnasium use, does"
 
     def target(self, state: EnvState) -> Array | None:
         """Return the place where each drone should be, or several marks, for images, m; None if the task has none.

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.tree_util import keystr, tree_leaves_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
@@ -22,6 +23,7 @@ from crazysim.envs.hooks import Hooks
 from crazysim.envs.random import episode_key
 from crazysim.envs.state import EnvState
 from crazysim.envs.task import Task, total
+from crazysim.errors import ConfigError
 
 Apply = Callable[[Callable[..., Any], bool], Callable[..., Any]]
 """``apply(fn, batched)``: the function as a phase calls it; ``batched`` for functions that take all worlds anyway."""
@@ -119,7 +121,7 @@ class Phases:
         data = apply(task.spawn, task.batched)(before, key)
         for wrapper in self.wrappers:
             data = apply(wrapper.after_spawn, wrapper.batched)(data)
-        data = jax.tree.map(_like, before, data)
+        data = _like(task, before, data)
 
         def start(state: EnvState, obs: Any, info: Any) -> EnvState:
             dtype = state.data.states.pos.dtype
@@ -148,6 +150,18 @@ def _step_info(task: Task, data: SimData) -> dict[str, Array]:
     return {"error": task.error(data)} | task.info(data)
 
 
-def _like(old: Any, new: Any) -> Any:
-    """Return an array in shape and type of the old one: of another type, the next step would be compiled again."""
-    return new if new is old else jnp.broadcast_to(jnp.asarray(new, old.dtype), old.shape)
+def _like(task: Task, old: SimData, new: Any) -> SimData:
+    """Return the data of a start with the shapes and types of before: of another type, a step would compile again.
+
+    Raises:
+        ConfigError: If it has other leaves.
+    """
+    if jax.tree.structure(new) != jax.tree.structure(old):
+        had, has = ({keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (old, new))
+        what = ", ".join([f"without {x}" for x in sorted(had - has)] + [f"with {x}" for x in sorted(has - had)])
+        raise ConfigError(
+            f"task {task.name!r}: expected spawn to return the data that it is given with other values, got a "
+            f"{type(new).__name__} {what or 'of another structure'}. The task's record is data.plugins['task']; "
+            f"docs/guides/tasks.md has an example."
+        )
+    return jax.tree.map(lambda x, y: y if y is x else jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape), old, new)

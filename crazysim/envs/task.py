@@ -123,7 +123,7 @@ class Task:
         return None
 
     def camera(self, n_drones: int) -> Mapping[str, Any] | None:
-        """Return the camera of images and films: lookat, distance, azimuth, elevation; None for the usual one."""
+        """Return the camera of images and films, lookat, distance, azimuth and elevation; None to frame all starts."""
         del n_drones
         return None
 

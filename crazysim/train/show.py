@@ -137,6 +137,13 @@ def read_curve(folder: Path) -> Any:
         return json.loads(path.read_bytes())
 
 
+def _whole(pos: Array, targets: Array | None, n_worlds: int) -> dict[str, Any]:
+    """Return a camera that has the starts of the first worlds, and their marks, in its picture."""
+    points = [np.reshape(x[:n_worlds], (-1, 3)) for x in (pos, targets) if x is not None]
+    low, high = np.min(np.concatenate(points), axis=0), np.max(np.concatenate(points), axis=0)
+    return {"lookat": (low + high) / 2, "distance": 1.5 + 1.2 * np.linalg.norm(high - low), "elevation": -20}
+
+
 def film(
     env: DroneEnv, policy: Policy, path: str | Path, worlds: int = 4, seed: int = 1, progress: bool = False
 ) -> int:
@@ -160,12 +167,15 @@ def film(
     def draw_target(sim: Sim, world: int) -> None:
         target = targets(state)
         if target is not None:
-            draw_points(sim, np.asarray(target[world]).reshape(-1, 3), TARGET_COLOR, 0.04)
+            size = max(0.04, 0.0125 * camera.get("distance", 3.2))
+            draw_points(sim, np.asarray(target[world]).reshape(-1, 3), TARGET_COLOR, size)
 
     targets = jax.jit(env.target)
     step = jax.jit(lambda state: env.step(state, policy(state.obs)))
     state = jax.jit(env.reset)(jax.random.key(seed))
     shown = min(worlds, sim.n_worlds)
+    camera = env.task.camera(sim.n_drones)
+    camera = _whole(state.data.states.pos[:shown], targets(state), shown) if camera is None else camera
     rows, columns = View(worlds=range(shown)).grid
     width, height = film_size(960, 2 * round(360 * rows / columns))  # 4:3 for each world
     view = View(
@@ -175,7 +185,7 @@ def film(
         trail=1.5,
         text="{time:.1f} s",
         draw=draw_target,
-        cam_config=env.task.camera(sim.n_drones),
+        cam_config=camera,
     )
     n_frames = env.max_steps // skip + 1
     with Film(path, view, fps=rate / skip, progress=progress, total=n_frames) as recording:

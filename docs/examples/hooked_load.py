@@ -1,7 +1,5 @@
 """A Bumblebee with a hook carries a load of 0.2 kg in hover, under an LQR of drone and load."""
 
-import numpy as np
-
 from crazysim import Hook, Sim
 from crazysim.control import LoadLQR
 
@@ -10,9 +8,7 @@ def main(n_worlds=1):
     sim = Sim(n_worlds, drone="bumblebee", control="state", controller=LoadLQR(load_mass=0.22, length=0.4))
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos.at[..., 2].set(1.2)))
     hook = sim.add(Hook.bumblebee(0.2, dof=2))
-    command = np.zeros((n_worlds, 1, 16))
-    command[..., :3], command[..., 12] = [0.5, 0.0, 0.8], 1.0  # of the load
-    sim.state_control(command)
+    sim.state_control(pos=[0.5, 0.0, 0.8])  # of the load
     sim.step(2500)
     print("load", hook.read(sim.data).pos[0, 0], "drone", sim.data.states.pos[0, 0])
 

@@ -10,13 +10,13 @@ SECONDS = 5
 
 def main() -> None:
     sim = Sim(n_worlds=len(HEIGHTS), control="state")
-    setpoint = np.zeros((sim.n_worlds, sim.n_drones, 16))
-    setpoint[:, 0, 2] = HEIGHTS
+    targets = np.zeros((sim.n_worlds, 1, 3))
+    targets[:, 0, 2] = HEIGHTS
     heavier = np.array([1.0, 1.2, 1.0, 1.2])[:, None, None] * np.asarray(sim.data.params.mass)
     sim.data = sim.data.replace(params=sim.data.params.replace(mass=heavier))
 
     for _ in range(SECONDS * sim.control_freq):
-        sim.state_control(setpoint)
+        sim.state_control(pos=targets)
         sim.step(sim.freq // sim.control_freq)
 
     height = np.asarray(sim.data.states.pos[:, 0, 2])

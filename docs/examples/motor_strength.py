@@ -28,8 +28,7 @@ def randomize_motors(data, default_data, mask=None, spread=0.0):
 def hover(controller: str) -> None:
     """Print the errors of 64 hovers after 5 s, for three spreads."""
     sim = Sim(n_worlds=64, control="state", controller=controller, rng_key=3)
-    states, setpoint = sim.data.states, np.zeros((sim.n_worlds, 1, 16))
-    setpoint[..., 2] = 1.0
+    states, target = sim.data.states, np.array([0.0, 0.0, 1.0])
     rotor_vel = jnp.broadcast_to(dynamics.hover_rotor_vel(sim.data.params), states.rotor_vel.shape)
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0), rotor_vel=rotor_vel))
     sim.build_default_data()
@@ -37,9 +36,9 @@ def hover(controller: str) -> None:
     for spread in (0.0, 0.02, 0.05):
         sim.reset_pipeline["motors"] = partial(randomize_motors, spread=spread)
         sim.reset()
-        sim.state_control(setpoint)
+        sim.state_control(pos=target)
         sim.step(5 * sim.freq)
-        error = np.asarray(sim.data.states.pos)[:, 0] - setpoint[:, 0, :3]
+        error = np.asarray(sim.data.states.pos)[:, 0] - target
         sideways = np.linalg.norm(error[:, :2], axis=-1)
         print(f"{controller}, spread {spread:.0%}: off by up to {sideways.max():.3f} m sideways,", end=" ")
         print(f"{error[:, 2].min():+.3f} to {error[:, 2].max():+.3f} m in height")

@@ -74,9 +74,9 @@ def main() -> None:
 
     def advance(data: SimData, mocap_pos: Array) -> tuple[SimData, Array]:
         time = data.core.steps[..., None] / data.core.freq
-        setpoint = jnp.zeros((N_WORLDS, 1, 16)).at[..., 2].set(0.7).at[..., 12].set(1.0)
-        setpoint = setpoint.at[..., 0:1].set(SPEED * time).at[..., 3].set(SPEED)
-        data = step(F.state_control(data, setpoint), sim.freq // CHECKS_PER_SECOND)
+        pos = SPEED * time * jnp.array([1.0, 0.0, 0.0]) + jnp.array([0.0, 0.0, 0.7])
+        data = F.state_control(data, pos=pos, vel=[SPEED, 0.0, 0.0])
+        data = step(data, sim.freq // CHECKS_PER_SECOND)
         return data, check_contacts(data, mocap_pos)
 
     @jax.jit

@@ -23,7 +23,7 @@ def fly(source, record=None, seconds=4.0):
     states = sim.data.states
     sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0)))
     twins = Twins(sim, source, {"cf": Twin.drone()}, ["cf7"], record=record)
-    home, command, closest, path = np.array([0.0, 0.0, 1.0]), np.zeros((1, 1, 16)), np.inf, []
+    home, closest, path = np.array([0.0, 0.0, 1.0]), np.inf, []
     with twins:
         for _ in range(round(100 * seconds)):
             twins.update(sim)
@@ -31,8 +31,7 @@ def fly(source, record=None, seconds=4.0):
             away[2] = 0.0
             gap = np.linalg.norm(away)
             target = home if gap > KEEP else twins.pose("cf7")[0] + 1.5 * KEEP * away / gap
-            command[0, 0, :3], command[0, 0, 12] = target, 1.0
-            sim.state_control(command)
+            sim.state_control(pos=target)
             sim.step(5)
             report = sim.contact_report(twins.handles["cf7"], floor=False, drones=False)
             closest = min(closest, float(report.object_distance[0, 0, 0]))

@@ -30,15 +30,15 @@ def main() -> None:
 
     for around in (False, True):
         sim.reset()
-        setpoint, closest, n_touching = np.zeros((1, N_DRONES, 16)), np.inf, 0
+        closest, n_touching = np.inf, 0
         for tick in range(10 * (SECONDS + 1)):
             part = min(1.0, tick / (10 * SECONDS))
-            setpoint[0, :, :3] = places(part**2 * (3 - 2 * part), around)
-            sim.state_control(setpoint)
+            targets = places(part**2 * (3 - 2 * part), around)
+            sim.state_control(pos=targets)
             sim.step(sim.freq // 10)
             closest = min(closest, closest_pair(np.asarray(sim.data.states.pos[0])))
             n_touching = max(n_touching, int(sim.contacts().sum()))
-        off = np.linalg.norm(np.asarray(sim.data.states.pos[0]) - setpoint[0, :, :3], axis=-1).max()
+        off = np.linalg.norm(np.asarray(sim.data.states.pos[0]) - targets, axis=-1).max()
         way = "around" if around else "straight"
         print(f"{way:8s}: closest {closest:.3f} m, at most {n_touching} contacts at once, {off:.3f} m off at the end")
 

@@ -50,11 +50,10 @@ def main() -> None:
         sim = Sim(n_worlds=32, control="state", rng_key=5)
         if windy:
             sim.add(Gusts())
-        setpoint = np.zeros((sim.n_worlds, 1, 16))
-        setpoint[..., 2] = 1.0
-        sim.state_control(setpoint)
+        target = np.array([0.0, 0.0, 1.0])
+        sim.state_control(pos=target)
         sim.step(4 * sim.freq)
-        off = np.asarray(sim.data.states.pos - setpoint[..., :3])[:, 0]
+        off = np.asarray(sim.data.states.pos)[:, 0] - target
         name = "wind" if windy else "calm"
         print(f"{name}: x {off[:, 0].mean():+.3f} m (deviation {off[:, 0].std():.3f} m), y {off[:, 1].mean():+.3f} m")
 

@@ -24,7 +24,7 @@ def test_page_runs(page, tmp_path, monkeypatch, opengl):
     for block in outputs.blocks(text):
         printed = outputs.run(block, page, namespace)
         line = text[: block.end].count("\n")
-        if block.output is not None and not outputs.same(block.output, printed):
+        if block.output is not None and not outputs.same(block.output, printed, block.example):
             name = page.relative_to(ROOT)
             pytest.fail(f"the block that ends at line {line} prints\n{printed}; run `python docs/outputs.py {name}`")
 
@@ -86,6 +86,15 @@ def test_pages_have_code():
 )
 def test_outputs_are_compared_to_the_digits_that_a_page_shows(shown, printed, same):
     assert outputs.same(shown, printed) is same
+
+
+def test_an_example_has_the_words_of_the_output_and_other_numbers():
+    text = '```python\nprint(1)\n```\n\n```text title="for example"\nsuccess 0.5% in 12 s\n```\n'
+    (block,) = outputs.blocks(text)
+    assert block.example
+    assert outputs.same(block.output, "success 100% in 3.2 s", block.example)
+    assert not outputs.same(block.output, "crashed 100% in 3.2 s", block.example)
+    assert not outputs.same(block.output, "success 100% in 3.2 s")
 
 
 def test_an_output_belongs_to_the_block_before_it():

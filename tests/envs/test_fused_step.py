@@ -291,7 +291,7 @@ def test_a_step_that_the_engine_cannot_lower_warns_once_or_raises(hover):
 
 def test_every_environment_explains_its_step(hover):
     """One without automatic resets is not one kernel; those of other libraries have it inside."""
-    assert hover.explain().startswith("a step is not one kernel: new episodes do not begin within it; see AutoReset\n")
+    assert hover.explain().startswith("a step is not one kernel: it begins no new episodes. AutoReset(env)")
     for adapted in (
         envs.DroneVectorEnv(hover),
         envs.BraxEnv(hover),

@@ -159,6 +159,17 @@ def test_law_09_wrong_shapes_of_a_task_are_refused_at_making(two_drones, case):
         DroneEnv(two_drones, wrong)
 
 
+def test_law_09_a_start_with_other_leaves_is_refused(two_drones):
+    class Misspelt(Still):
+        """A record under another name than the task's."""
+
+        def spawn(self, data, key):
+            return data.replace(plugins=data.plugins | {"tsk": data.states.pos})
+
+    with pytest.raises(ConfigError, match=r"task 'still': expected spawn .*with \.plugins\['tsk'\].*plugins\['task'\]"):
+        jax.eval_shape(DroneEnv(two_drones, Misspelt()).reset, jax.random.key(0))
+
+
 def test_law_09_shapes_of_a_batched_task_have_worlds_in_front(two_drones):
     class Batched(Still):
         """All worlds at once."""
