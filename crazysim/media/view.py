@@ -23,6 +23,11 @@ BORDER_COLOR = 40
 MAX_PIXELS = 16_384
 """Largest width and height of an image."""
 
+LEAST_RADIUS = 0.25
+"""Least radius around points that a camera holds in view, m: at it a Crazyflie is a sixth of the image's height."""
+ROOM = 1.25
+"""Distance of a camera that holds points in view, as a multiple of that from which they just fit."""
+
 
 @dataclass
 class View:
@@ -43,8 +48,11 @@ class View:
     """Settings of the free camera, or a function from time, s, to settings for a moving camera."""
     follow: int | None = None
     """Index of the drone that the free camera looks at; None for none."""
+    hold: Callable[[Sim, int], ArrayLike] | None = None
+    """Function that returns points of a world, ``hold(sim, world)``, world frame, m (n, 3): the free camera holds them
+    and all drones in view, from a distance that fits; None for none."""
     lag: float = 0.3
-    """Time constant with which the camera follows that drone, s."""
+    """Time constant with which the camera follows what ``follow`` or ``hold`` names, s."""
     trail: float = 0.0
     """Duration of the drones' trails, s; 0 for none."""
     setpoints: bool = False
@@ -60,7 +68,7 @@ class View:
     border: int = 2
     """Width of the lines between worlds, pixels."""
     _trail: Trail | None = field(default=None, init=False, repr=False)
-    _lookat: dict[int, tuple[float, NDArray]] = field(default_factory=dict, init=False, repr=False)
+    _aim: dict[int, tuple[float, NDArray]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation.
@@ -84,10 +92,12 @@ class View:
                 f"expected an image that {len(self.worlds)} worlds fit into, got {self.width} x {self.height} pixels. "
                 f"Show fewer worlds or increase the size."
             )
-        if self.follow is not None and self.camera != -1:
+        if self.follow is not None and self.hold is not None:
+            raise ConfigError("expected a drone to follow or points to hold in view, got both. Return the drone's.")
+        if (self.follow is not None or self.hold is not None) and self.camera != -1:
             raise ConfigError(
-                f"expected camera=-1, the free camera, to follow a drone, got {self.camera!r}. Drones carry the "
-                f"cameras track_cam:i and fpv_cam:i."
+                f"expected camera=-1, the free camera, to follow a drone or hold points in view, got "
+                f"{self.camera!r}. Drones carry the cameras track_cam:i and fpv_cam:i."
             )
         if not np.isfinite(self.lag) or self.lag < 0:
             raise ConfigError(f"expected a lag of 0 s or more, got {self.lag!r}")
@@ -135,7 +145,7 @@ class View:
             for k, world in enumerate(self.worlds):
                 sim.overlays.restore(before)
                 self._draw(sim, k, time[k])
-                config = self._cam_config(k, time[k], pos[k])
+                config = self._cam_config(sim, k, time[k], pos[k])
                 image[self.tile(k)] = np.asarray(sim.render("rgb_array", world, self.camera, config, width, height))
         except Exception:
             sim.overlays.restore(before)  # they are kept for the next image
@@ -151,7 +161,9 @@ class View:
         """
         time, pos = self._sample(sim)
         self._draw(sim, 0, time[0])
-        sim.render("human", self.worlds[0], self.camera, self._cam_config(0, time[0], pos[0]), self.width, self.height)
+        sim.render(
+            "human", self.worlds[0], self.camera, self._cam_config(sim, 0, time[0], pos[0]), self.width, self.height
+        )
 
     def _sample(self, sim: Sim) -> tuple[NDArray, NDArray]:
         """Return times, s (n,), and drone positions, m (n, n_drones, 3), of the worlds, and extend the trails."""
@@ -177,18 +189,40 @@ class View:
         if self.text is not None:
             draw_text(sim, _fill(self.text, self.worlds[k], time))
 
-    def _cam_config(self, k: int, time: float, pos: NDArray) -> dict[str, Any]:
+    def _cam_config(self, sim: Sim, k: int, time: float, pos: NDArray) -> dict[str, Any]:
         """Return the settings of the free camera for the k-th world, with drones at ``pos``."""
         config = dict((self.cam_config(time) if callable(self.cam_config) else self.cam_config) or {})
         if self.follow is not None:
-            before, point = self._lookat.get(k, (np.inf, pos[self.follow]))
-            # First-order lag; after a reset of the world the camera jumps to the drone.
-            weight = 1.0 if time < before or self.lag == 0 else 1 - np.exp(-(time - before) / self.lag)
-            if np.isfinite(pos[self.follow]).all():
-                point = point + weight * (pos[self.follow] - point)
-            self._lookat[k] = (time, point)
-            config["lookat"] = point
+            config["lookat"] = self._smooth(k, time, pos[self.follow])
+        if self.hold is not None:
+            points = np.concatenate([pos, np.asarray(self.hold(sim, self.worlds[k]), float).reshape(-1, 3)])
+            aim = self._smooth(k, time, _aim_at(points, float(sim.mj_model.vis.global_.fovy)))
+            config |= {"lookat": aim[:3], "distance": aim[3]}
         return config
+
+    def _smooth(self, k: int, time: float, aim: NDArray) -> NDArray:
+        """Return where the camera of the k-th world aims, with first-order lag; after a reset it jumps."""
+        before, value = self._aim.get(k, (np.inf, aim))
+        weight = 1.0 if time < before or self.lag == 0 else 1 - np.exp(-(time - before) / self.lag)
+        if np.isfinite(aim).all():
+            value = value + weight * (aim - value)
+        self._aim[k] = (time, value)
+        return value
+
+
+def _aim_at(points: NDArray, fovy: float) -> NDArray:
+    """Return the middle of points, m, and the distance from which all are in view, m. (n, 3) -> (4,)
+
+    Args:
+        points: Points, those that are not finite are left out.
+        fovy: Vertical field of view, degrees; images are at least as wide as high.
+    """
+    points = points[np.isfinite(points).all(-1)]
+    if not len(points):
+        return np.full(4, np.nan)
+    middle = (points.min(0) + points.max(0)) / 2
+    radius = max(float(np.linalg.norm(points - middle, axis=-1).max()), LEAST_RADIUS)
+    return np.append(middle, ROOM * radius / np.sin(np.radians(fovy) / 2))
 
 
 def _fill(text: str | None, world: int, time: float) -> str:

@@ -21,8 +21,8 @@ from crazysim.train.evaluation import HELD_OUT, TERM, as_tree, fly
 from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE
 
-TARGET_COLOR = (0.1, 0.8, 0.3, 0.6)
-"""Colour of the target of a drone, RGBA."""
+TARGET_COLOR, TARGET_SIZE = (0.1, 0.8, 0.3, 0.6), 0.03
+"""Colour of the target of a drone, RGBA, and its least radius, m."""
 
 
 def plot_curve(curves: dict[str, Any], path: Path) -> None:
@@ -137,13 +137,6 @@ def read_curve(folder: Path) -> Any:
         return json.loads(path.read_bytes())
 
 
-def _whole(pos: Array, targets: Array | None, n_worlds: int) -> dict[str, Any]:
-    """Return a camera that has the starts of the first worlds, and their marks, in its picture."""
-    points = [np.reshape(x[:n_worlds], (-1, 3)) for x in (pos, targets) if x is not None]
-    low, high = np.min(np.concatenate(points), axis=0), np.max(np.concatenate(points), axis=0)
-    return {"lookat": (low + high) / 2, "distance": 1.5 + 1.2 * np.linalg.norm(high - low), "elevation": -20}
-
-
 def film(
     env: DroneEnv, policy: Policy, path: str | Path, worlds: int = 4, seed: int = 1, progress: bool = False
 ) -> int:
@@ -164,18 +157,21 @@ def film(
     sim, rate = env.sim, env.freq
     skip = max(rate // 25, 1)
 
-    def draw_target(sim: Sim, world: int) -> None:
+    def places(_: Sim, world: int) -> np.ndarray:
         target = targets(state)
-        if target is not None:
-            size = max(0.04, 0.0125 * camera.get("distance", 3.2))
-            draw_points(sim, np.asarray(target[world]).reshape(-1, 3), TARGET_COLOR, size)
+        return np.zeros((0, 3)) if target is None else np.asarray(target[world]).reshape(-1, 3)
+
+    def draw_target(sim: Sim, world: int) -> None:
+        at = places(sim, world)
+        if len(at):
+            away = np.abs(at[:, None] - np.asarray(sim.data.states.pos[world])).max()
+            draw_points(sim, at, TARGET_COLOR, max(TARGET_SIZE, 0.02 * float(away)))
 
     targets = jax.jit(env.target)
     step = jax.jit(lambda state: env.step(state, policy(state.obs)))
     state = jax.jit(env.reset)(jax.random.key(seed))
     shown = min(worlds, sim.n_worlds)
-    camera = env.task.camera(sim.n_drones)
-    camera = _whole(state.data.states.pos[:shown], targets(state), shown) if camera is None else camera
+    camera = dict(env.task.camera(sim.n_drones) or {"elevation": -20})
     rows, columns = View(worlds=range(shown)).grid
     width, height = film_size(960, 2 * round(360 * rows / columns))  # 4:3 for each world
     view = View(
@@ -186,6 +182,8 @@ def film(
         text="{time:.1f} s",
         draw=draw_target,
         cam_config=camera,
+        hold=None if "distance" in camera else places,
+        lag=0.6,
     )
     n_frames = env.max_steps // skip + 1
     with Film(path, view, fps=rate / skip, progress=progress, total=n_frames) as recording:

@@ -148,6 +148,30 @@ def test_a_camera_that_follows_keeps_each_worlds_drone_in_its_middle(sim):
         assert abs(dark(fixed.render(sim)[fixed.tile(k)])[1] - WIDTH / 2) > 20
 
 
+def test_a_camera_holds_drones_and_points_of_each_world_in_view(sim):
+    """The points of every world are in its tile, near its edges; a second image without lag is the same."""
+    goal = {0: [0.9, 0.3, 0.5], 2: [-0.2, 1.0, 0.8]}
+    place(sim, PLACES, 0.0)
+    held = view(
+        worlds=[0, 2],
+        camera=-1,
+        cam_config={"azimuth": 90, "elevation": -90},
+        hold=lambda _, world: goal[world],
+        draw=lambda sim, world: draw_points(sim, np.array([goal[world]]), (1, 0, 0, 1), 0.1),
+        lag=0,
+        width=2 * WIDTH,
+        border=0,
+    )
+    image = held.render(sim)
+    for k in range(2):
+        tile = image[held.tile(k)]
+        spots = np.array([dark(tile), np.argwhere(of_colour(tile, RED)).mean(axis=0)])
+        off = np.linalg.norm(spots - [HEIGHT / 2, WIDTH / 2], axis=-1)
+        assert (off > 0.25 * HEIGHT).all()
+        assert (off < 0.45 * HEIGHT).all()
+    np.testing.assert_array_equal(held.render(sim), image)
+
+
 def test_a_camera_that_follows_lags_behind(sim):
     """After a jump of 0.2 m its centre has moved by 1 - exp(-t / lag) of it; after a reset by all of it."""
     config = {"distance": 1.5, "azimuth": 90, "elevation": -90}

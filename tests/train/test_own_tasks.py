@@ -217,34 +217,35 @@ def test_a_film_shows_several_marks_of_a_drone(tmp_path, opengl):
     assert set(drawn) == {(24, 3)}
 
 
-def test_a_film_of_a_task_without_a_camera_has_all_starts_and_marks_in_the_picture(tmp_path, monkeypatch, opengl):
-    """Seen from the camera, starts at 3 m and marks at -3 m lie within the 45 degrees of view."""
+@pytest.mark.parametrize("camera", [None, {"elevation": -30}, {"lookat": (0, 0, 1), "distance": 2.0}])
+def test_a_film_holds_targets_in_view_unless_the_task_has_a_distance(tmp_path, monkeypatch, opengl, camera):
     from crazysim.train.show import film
 
     class Wide(Low):
-        """Low, far from the start."""
-
-        def spawn(self, data, key):
-            return super().spawn(data, key).replace(states=data.states.replace(pos=jnp.full((1, 3), 3.0)))
+        """Low, with a target far away."""
 
         def target(self, data):
             return jnp.array([[-3.0, -3.0, 1.0]])
 
         def camera(self, n_drones):
-            return None
+            return camera
 
-    cameras = []
+    views = []
 
     def open_film(path, view, **_):
-        cameras.append(view.cam_config)
+        views.append(view)
         raise NotImplementedError
 
     monkeypatch.setattr("crazysim.train.show.Film", open_film)
+    env = envs.make(Wide(seconds=0.04))
     with pytest.raises(NotImplementedError):
-        film(envs.make(Wide(seconds=0.04)), lambda obs: jnp.zeros((1, 1, 4)), tmp_path / "wide.gif", worlds=1)
-    camera = cameras[0]
-    np.testing.assert_allclose(camera["lookat"], [0.0, 0.0, 2.0], atol=1e-5)
-    assert 0.5 * np.linalg.norm([6, 6, 2]) < camera["distance"] * np.tan(np.deg2rad(22.5))
+        film(env, lambda obs: jnp.zeros((1, 1, 4)), tmp_path / "wide.gif", worlds=1)
+    view = views[0]
+    assert view.cam_config == (camera or {"elevation": -20})
+    if camera and "distance" in camera:
+        assert view.hold is None
+    else:
+        np.testing.assert_array_equal(view.hold(env.sim, 0), [[-3.0, -3.0, 1.0]])
 
 
 def test_the_worlds_of_a_film_are_wider_than_high(tmp_path, monkeypatch, opengl):

@@ -231,7 +231,7 @@ class Avoid(Task):
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
-        return {"lookat": (0, 0, 0.5), "distance": 6.5, "elevation": -45}
+        return {"elevation": -35}
 
     def target(self, data: SimData) -> Array:
         """Return the goal, m."""

@@ -59,4 +59,4 @@ class Hover(GoalTask):
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
-        return {"lookat": (0, 0, 1.2), "distance": 3.2, "elevation": -20}
+        return {"elevation": -20}

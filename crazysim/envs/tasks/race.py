@@ -208,7 +208,7 @@ class Race(Task):
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
-        return {"lookat": (0, 0, 0.7), "distance": 6.0, "elevation": -40}
+        return {"elevation": -30}
 
     def target(self, data: SimData) -> Array:
         """Return the middle of the next gate, m."""
