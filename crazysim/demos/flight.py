@@ -102,7 +102,7 @@ def build(n_worlds: int, n_drones: int, device: str) -> Sim:
     sim = Sim(n_worlds=n_worlds, n_drones=n_drones, drone="cf2x_L250", control="state", device=device)
     offset = np.random.default_rng(0).uniform(-0.4, 0.4, (n_worlds, 2, 3)) * [1, 1, 0]
     places = offset + [[-0.6 * WIDTH, 0, 0], [0.6 * WIDTH, 0, 0]]
-    sim.scene.add("pole", count=2, pos=places, height=2.0, radius=POLE_RADIUS)
+    sim.scene.add("pole", count=2, pos=places, height=1.7, radius=POLE_RADIUS)
 
     start = reference(on_device(np.zeros((n_worlds, 1))), n_drones)
     rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(sim.data.params), (n_worlds, n_drones, 4))
@@ -221,7 +221,7 @@ def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
     for place in np.asarray(sim.data.objects.pos[0, 0]):
         left.add_patch(plt.Circle(place[:2], POLE_RADIUS, color="0.2"))
     left.set(title="Tracks in world 0, seen from above", xlabel="x, m", ylabel="y, m", aspect="equal")
-    left.legend(loc="upper right", fontsize=8)
+    left.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     flat = 100 * errors.reshape(len(errors), -1)
     seconds = np.arange(len(flat)) / sim.control_freq
     right.fill_between(seconds, *np.percentile(flat, [5, 95], axis=1), color="0.85", label="5th to 95th percentile")
@@ -251,4 +251,4 @@ def record(sim: Sim, flight: Flight, path: Path) -> None:
 
 def orbiting_camera(time: float) -> dict[str, Any]:
     """Return the settings of a free camera that orbits the scene slowly."""
-    return {"lookat": [0, 0, 0.8], "distance": 3.0, "azimuth": 110 + 3 * time, "elevation": -28}
+    return {"lookat": [0, 0, 0.8], "distance": 2.7, "azimuth": 100 + 3 * time, "elevation": -28}

@@ -37,6 +37,8 @@ INNER, OUTER = (1.3, 1.1, 7.5), (2.8, 2.2, 13.0)
 """Half axes of the cars' paths, m, and their periods, s."""
 ABOVE = 0.45
 """Height of the second Crazyflie above the path of the car that it escorts, m."""
+CAMERA = {"lookat": [0, 0, 0.75], "distance": 5.6, "azimuth": 90, "elevation": -26}
+"""Camera of the film, which has both ellipses and the figure eight in its picture."""
 SETTLED = 2.0
 """Time after which tracking errors count: until then cars and drones gather speed, s."""
 
@@ -86,9 +88,7 @@ def run(
         f"{counted(n_worlds, 'world')} of {', '.join(sim.names)}, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}"
     )
     width, height = film_size(960, 544)
-    view = View(
-        width=width, height=height, trail=1.5, cam_config={"lookat": [0, 0, 0.6], "distance": 5.2, "elevation": -24}
-    )
+    view = View(width=width, height=height, trail=1.5, cam_config=CAMERA)
     out.mkdir(parents=True, exist_ok=True)
     flight = FilmedFlight(sim, out / "mixed.mp4", view, film)
     measure, frames = build_measure(sim), []

@@ -34,6 +34,8 @@ GRIP, RELEASE, SECONDS = 6.0, 20.0, 25.0
 """Times at which the hook is commanded to pick up and to let go, and duration of the flight, s."""
 PLACED = 0.03
 """Largest distance of a load that is set down from the middle of the pad, m."""
+SHOWN = np.array([[0.0, 0.0, -LENGTH - 0.45], [0.0, 0.0, 0.25]])
+"""Lowest and highest place that a film shows, from the drone, m. (2, 3)"""
 AISLE = 4.0
 """Distance between the drones of a world along y, m."""
 
@@ -65,7 +67,13 @@ def run(
     fleet = f"{counted(n_worlds, 'world')} of {counted(n_drones, 'drone')}"
     print(f"{fleet}, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
     width, height = film_size(960, 544)
-    view = View(width=width, height=height, follow=0, trail=1.5, cam_config={"distance": 1.7, "elevation": -20})
+    view = View(
+        width=width,
+        height=height,
+        trail=1.5,
+        cam_config={"elevation": -20},
+        hold=lambda sim, world: np.asarray(sim.data.states.pos[world, 0]) + SHOWN,
+    )
     out.mkdir(parents=True, exist_ok=True)
     recorder, flight = Recorder(sim, worlds=[0]), FilmedFlight(sim, out / "pick.mp4", view, film)
     setpoints = jax.jit(lambda t: jax.vmap(lambda plan: plan.evaluate(t).pos)(plans).reshape(n_worlds, n_drones, 3))
