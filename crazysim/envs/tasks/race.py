@@ -208,7 +208,7 @@ class Race(Task):
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
-        return {"elevation": -30}
+        return {"elevation": -50}
 
     def target(self, data: SimData) -> Array:
         """Return the middle of the next gate, m."""
